@@ -1,0 +1,54 @@
+# make demo | test | check | format: each makes .venv and installs what it needs; the second time that costs nothing.
+
+PYTHON ?= python3
+BIN    := .venv/bin
+STAMP  := .venv/.installed
+DEMO   := demo
+APT    := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0
+
+.PHONY: demo test check format install
+.DEFAULT_GOAL := test
+
+demo: $(STAMP)
+	@$(BIN)/python -m tests.synthetic $(DEMO)/session
+	@$(BIN)/stillbed track $(DEMO)/session -o $(DEMO)/track --force
+	@$(BIN)/stillbed replay $(DEMO)/session --path data/paths/square_10mm.csv -o $(DEMO)/replay --force
+	@$(BIN)/python -m hardware.report $(DEMO)/track
+
+test: $(STAMP)
+	$(BIN)/python -m pytest
+
+check: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest tests/test_floors.py
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "stillbed needs Python 3.11 or newer; try: make PYTHON=python3.12"; exit 1; }
+	@$(call apt,python3-venv,$(PYTHON) -c 'import ensurepip')
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@$(call apt,$(APT),$(BIN)/python -c 'import open3d')
+	@touch $@
+
+# $(call apt,PACKAGES,CHECK): where CHECK fails, install PACKAGES if we may, else say the one line to run, and go on.
+define apt
+if ! $(2) >/dev/null 2>&1; then \
+	if [ "$$(id -u)" = 0 ]; then sudo=; else sudo="sudo -n"; fi; \
+	if command -v apt-get >/dev/null && { [ -z "$$sudo" ] || $$sudo true 2>/dev/null; }; then \
+		echo "installing $(1)"; \
+		$$sudo apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$sudo apt-get install -y -qq $(1) >/dev/null || \
+			echo "that failed; please run: sudo apt-get install -y $(1)"; \
+	else \
+		echo "please run: sudo apt-get install -y $(1)"; \
+	fi; \
+fi
+endef

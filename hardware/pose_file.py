@@ -1,0 +1,171 @@
+"""poses.tum and poses.csv: what a tracking run leaves behind, written line by line and read back.
+
+`poses.tum` holds the measured poses only, as evo reads them: `stamp x y z qx qy qz qw`, s and mm. `poses.csv` holds one
+line per frame set: stamp, frames given, pose, upper triangle of the covariance, twist, state, tracks per camera,
+milliseconds per stage, reason. Every line is flushed, so a killed run leaves whole lines.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import se3
+from estimation.errors import InputError
+from estimation.pose import SurfacePose, TrackState
+from estimation.se3 import Array
+
+TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
+_UPPER = np.triu_indices(6)
+_POSE = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
+_COVARIANCE = tuple(f"cov_{TANGENT[i]}_{TANGENT[j]}" for i, j in zip(*_UPPER, strict=True))
+_TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_mm_s", "vy_mm_s", "vz_mm_s")
+_HEAD = ("stamp_s", "frames", *_POSE, *_COVARIANCE, *_TWIST, "state", "cameras")
+_STATES = tuple(state.value for state in TrackState)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseTable:
+    """A run as parallel arrays, one row per frame set.
+
+    stamps: (N,) s. frames: (N,) images given. base_from_surface: (N, 4, 4) mm. covariance: (N, 6, 6) and twist: (N, 6)
+    as in SurfacePose. states: (N,) of TrackState. used: (N, C) tracks that carry the pose, per camera. seconds: (N, S+1)
+    per stage and in all. cameras: the C names. stages: the S + 1 names, the last "total". reasons: N sentences.
+    """
+
+    stamps: Array
+    frames: NDArray[np.int64]
+    base_from_surface: Array
+    covariance: Array
+    twist: Array
+    states: tuple[TrackState, ...]
+    used: NDArray[np.int64]
+    seconds: Array
+    reasons: tuple[str, ...]
+    cameras: tuple[str, ...]
+    stages: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(N,) rows whose newest images took part in the pose."""
+        return np.array([state.measured for state in self.states], bool)
+
+    def is_state(self, state: TrackState) -> NDArray[np.bool_]:
+        """(N,) rows in `state`."""
+        return np.array([s is state for s in self.states], bool)
+
+
+class PoseWriter:
+    """Writes poses.csv and poses.tum into a folder, a flushed line at a time; closes them as a context manager."""
+
+    def __init__(self, folder: Path, cameras: Sequence[str], stages: Sequence[str]) -> None:
+        self._csv_file = (folder / "poses.csv").open("w", newline="", encoding="utf-8")
+        self._tum_file = (folder / "poses.tum").open("w", encoding="utf-8")
+        self._csv = csv.writer(self._csv_file, lineterminator="\n")
+        used = [f"tracks_{name}" for name in cameras]
+        self._csv.writerow([*_HEAD, *used, *(f"ms_{s}" for s in (*stages, "total")), "reason"])
+        self._tum_file.write("# base_from_surface: stamp_s x y z qx qy qz qw (mm)\n")
+
+    def write(
+        self, pose: SurfacePose, frames: int, used: NDArray[np.int64], seconds: Array, total: float
+    ) -> None:
+        """One frame set: its pose, images given, tracks used (C,), seconds per stage (S,) and `total` s."""
+        numbers = _pose_numbers(pose.base_from_surface)
+        upper = pose.covariance[_UPPER]
+        milliseconds = [f"{1000 * s:.4f}" for s in (*seconds, total)]
+        self._csv.writerow(
+            [f"{pose.stamp:.6f}", frames, *numbers, *(f"{v:.9g}" for v in (*upper, *pose.twist))]
+            + [pose.state.value, int(np.count_nonzero(used)), *(int(n) for n in used), *milliseconds, pose.reason]
+        )
+        self._csv_file.flush()
+        if pose.state.measured:
+            self._tum_file.write(f"{pose.stamp:.6f} {' '.join(numbers)}\n")
+            self._tum_file.flush()
+
+    def close(self) -> None:
+        """Close both files; a second call does nothing."""
+        self._csv_file.close()
+        self._tum_file.close()
+
+    def __enter__(self) -> PoseWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+
+def _pose_numbers(transform: Array) -> list[str]:
+    quaternion = se3.quaternion_from_rotation(transform[:3, :3])
+    return [*(f"{v:.6f}" for v in transform[:3, 3]), *(f"{v:.12f}" for v in quaternion)]
+
+
+def read_poses(path: Path) -> PoseTable:
+    """The table that a PoseWriter wrote to `path`; a last line cut short by a kill is left out.
+
+    Raises InputError naming file, line and column for anything else that PoseWriter would not have written.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.reader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(path, "file", str(error), "a poses.csv of stillbed track") from None
+    head = rows[0] if rows else []
+    if tuple(head[: len(_HEAD)]) != _HEAD or head[-1:] != ["reason"]:
+        raise InputError(path, "header", ",".join(head[:4]), f"{','.join(_HEAD[:4])}, ...")
+    body = rows[1:]
+    if body and len(body[-1]) != len(head):
+        body = body[:-1]
+    return _table(path, head, body)
+
+
+def _table(path: Path, head: list[str], body: list[list[str]]) -> PoseTable:
+    cameras = tuple(name.removeprefix("tracks_") for name in head if name.startswith("tracks_"))
+    stages = tuple(name.removeprefix("ms_") for name in head if name.startswith("ms_"))
+    state_column = head.index("state")
+    for number, row in enumerate(body, start=2):
+        if len(row) != len(head):
+            raise InputError(path, f"line {number}", f"{len(row)} columns", f"{len(head)} columns")
+        if row[state_column] not in _STATES:
+            raise InputError(path, f"line {number}: state", row[state_column], ", ".join(_STATES))
+    numbers = _numbers(path, head, [row[:state_column] + row[state_column + 1 : -1] for row in body])
+    stamps, frames, positions, quaternions, upper, twist, cameras_used, used, milliseconds = np.split(
+        numbers, np.cumsum([1, 1, 3, 4, 21, 6, 1, len(cameras)]), axis=1
+    )
+    del cameras_used  # it is np.count_nonzero(used, 1)
+    covariance = np.zeros((len(body), 6, 6))
+    covariance[:, _UPPER[0], _UPPER[1]] = covariance[:, _UPPER[1], _UPPER[0]] = upper
+    return PoseTable(
+        stamps=stamps[:, 0],
+        frames=frames[:, 0].astype(np.int64),
+        base_from_surface=se3.make(se3.rotation_from_quaternion(quaternions), positions),
+        covariance=covariance,
+        twist=twist,
+        states=tuple(TrackState(row[state_column]) for row in body),
+        used=used.astype(np.int64),
+        seconds=milliseconds / 1000,
+        reasons=tuple(row[-1] for row in body),
+        cameras=cameras,
+        stages=stages,
+    )
+
+
+def _numbers(path: Path, head: list[str], cells: list[list[str]]) -> Array:
+    """The numeric cells (N, M); `head` is the whole header, whose text columns are `state` and the last."""
+    names = [name for name in head[:-1] if name != "state"]
+    out = np.empty((len(cells), len(names)))
+    for i, row in enumerate(cells):
+        for j, cell in enumerate(row):
+            try:
+                out[i, j] = float(cell)
+            except ValueError:
+                raise InputError(path, f"line {i + 2}: {names[j]}", cell, "a number") from None
+    return out
