@@ -1,0 +1,28 @@
+"""What perception hands to the estimator: where each track stands in each camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.se3 import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """The tracks of one frame set, as parallel arrays.
+
+    stamp: s. camera: (N,) number in the rig. track: (N,) id of the landmark. pixels: (N, 2) undistorted px of the
+    camera's own matrix. sigma: (N,) px, one standard deviation per axis.
+    """
+
+    stamp: float
+    camera: NDArray[np.int64]
+    track: NDArray[np.int64]
+    pixels: Array
+    sigma: Array
+
+    def __len__(self) -> int:
+        return len(self.camera)

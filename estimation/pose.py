@@ -1,0 +1,75 @@
+"""The estimate: where the surface is, how fast it moves, how sure we are, and whether to trust it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import Enum
+
+import numpy as np
+
+from estimation import se3
+from estimation.se3 import Array
+
+
+class TrackState(Enum):
+    """How much a pose is worth. TRACKING and DEGRADED are measured, the others are not."""
+
+    INITIALISING = "INITIALISING"  # no surface map yet
+    TRACKING = "TRACKING"  # two cameras or more agree on enough tracks
+    DEGRADED = "DEGRADED"  # measured, with fewer cameras or tracks than TRACKING asks for
+    COASTING = "COASTING"  # predicted only
+    LOST = "LOST"  # predicted for too long to be of use
+
+    @property
+    def measured(self) -> bool:
+        """Whether the newest images took part in the pose."""
+        return self in (TrackState.TRACKING, TrackState.DEGRADED)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfacePose:
+    """Pose of the surface at one instant.
+
+    stamp: s, middle of the exposure. base_from_surface: (4, 4) mm. covariance: (6, 6) of the right perturbation
+    [rx ry rz tx ty tz], rad and mm, in the surface frame. twist: (6,) body velocity, rad/s and mm/s. twist_covariance:
+    (6, 6). acceleration_psd: (6,) spectral density of the white-noise acceleration between poses, rad^2/s^3 and
+    mm^2/s^3. reason: why the state is what it is, in words for the operator.
+    """
+
+    stamp: float
+    base_from_surface: Array
+    covariance: Array
+    twist: Array
+    state: TrackState
+    twist_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    acceleration_psd: Array = field(default_factory=lambda: np.zeros(6))
+    reason: str = ""
+
+    def predict(self, stamp: float) -> SurfacePose:
+        """The pose at `stamp` (s) under constant body velocity, with the covariance grown to match.
+
+        White noise on acceleration (Barfoot 2017, 11.1): P + dt^2 P_twist + q dt^3 / 3, carried along the geodesic.
+        A stamp before the pose's own runs the same model backwards.
+        """
+        dt = stamp - self.stamp
+        step = se3.exp(self.twist * dt)
+        carry = se3.adjoint(se3.inverse(step))
+        grown = (
+            carry @ self.covariance @ carry.T
+            + dt**2 * self.twist_covariance
+            + np.diag(self.acceleration_psd) * abs(dt) ** 3 / 3
+        )
+        twist_grown = self.twist_covariance + np.diag(self.acceleration_psd) * abs(dt)
+        return replace(
+            self,
+            stamp=stamp,
+            base_from_surface=self.base_from_surface @ step,
+            covariance=(grown + grown.T) / 2,
+            twist_covariance=twist_grown,
+        )
+
+    def error_at(self, points_surface: Array) -> Array:
+        """Standard deviation (N,), mm, of the position of points (N, 3) given in the surface frame."""
+        jacobian = np.concatenate([-se3.hat(points_surface), np.broadcast_to(np.eye(3), (len(points_surface), 3, 3))], -1)
+        spread = jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2)  # (N, 3, 3)
+        return np.asarray(np.sqrt(np.linalg.eigvalsh(spread)[:, -1]))

@@ -1,0 +1,186 @@
+"""Rigid motions: exp, log, adjoint, inverse and interpolation of (..., 4, 4) transforms, vectorised.
+
+Tangent order [rx ry rz tx ty tz] (rad, mm), right perturbation, both GTSAM's. The series near the identity are
+those of Barfoot, State Estimation for Robotics (2017), 7.1, switched where they are exact to double precision.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+_SMALL = 1e-4  # rad: below, the fourth-order series is exact to 1e-16 relative
+
+
+def hat(v: ArrayLike) -> Array:
+    """Skew matrices (..., 3, 3) of vectors (..., 3): hat(v) @ w = cross(v, w)."""
+    v = np.asarray(v, float)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
+    """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 with their series near zero."""
+    small = angle < _SMALL
+    a = np.where(small, 1.0, angle)
+    a2 = angle**2
+    s = np.where(small, 1 - a2 / 6, np.sin(a) / a)
+    c = np.where(small, 0.5 - a2 / 24, 2 * np.sin(a / 2) ** 2 / a**2)
+    d = np.where(angle < 0.05, 1 / 6 - a2 / 120 + a2**2 / 5040 - a2**3 / 362880, (a - np.sin(a)) / a**3)
+    return s, c, d
+
+
+def exp_rotation(w: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad (Rodrigues)."""
+    w = np.asarray(w, float)
+    s, c, _ = _coefficients(np.linalg.norm(w, axis=-1))
+    h = hat(w)
+    return np.asarray(np.eye(3) + s[..., None, None] * h + c[..., None, None] * (h @ h))
+
+
+def log_rotation(rotation: ArrayLike) -> Array:
+    """Rotation vectors (..., 3), rad, of length at most pi, of rotation matrices (..., 3, 3)."""
+    q = quaternion_from_rotation(rotation)
+    q = np.where(q[..., 3:] < 0, -q, q)
+    n = np.linalg.norm(q[..., :3], axis=-1)
+    angle = 2 * np.arctan2(n, q[..., 3])
+    scale = np.where(n < 1e-8, 2.0, angle / np.where(n < 1e-8, 1.0, n))
+    return np.asarray(scale[..., None] * q[..., :3])
+
+
+def exp(xi: ArrayLike) -> Array:
+    """Transforms (..., 4, 4) of tangent vectors (..., 6): the exponential map of SE(3)."""
+    xi = np.asarray(xi, float)
+    w, v = xi[..., :3], xi[..., 3:]
+    _, c, d = _coefficients(np.linalg.norm(w, axis=-1))
+    h = hat(w)
+    left = np.eye(3) + c[..., None, None] * h + d[..., None, None] * (h @ h)
+    return make(exp_rotation(w), (left @ v[..., None])[..., 0])
+
+
+def log(transform: ArrayLike) -> Array:
+    """Tangent vectors (..., 6) of transforms (..., 4, 4): inverse of `exp` for rotations below pi."""
+    transform = np.asarray(transform, float)
+    w = log_rotation(transform[..., :3, :3])
+    angle = np.linalg.norm(w, axis=-1)
+    s, c, _ = _coefficients(angle)
+    small = angle < 0.05
+    e = np.where(small, 1 / 12 + angle**2 / 720 + angle**4 / 30240, (1 - s / (2 * c)) / np.where(small, 1.0, angle) ** 2)
+    h = hat(w)
+    inverse_left = np.eye(3) - 0.5 * h + e[..., None, None] * (h @ h)
+    return np.concatenate([w, (inverse_left @ transform[..., :3, 3:])[..., 0]], axis=-1)
+
+
+def make(rotation: ArrayLike, translation: ArrayLike) -> Array:
+    """Transforms (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3), mm."""
+    rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
+    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    out = np.zeros((*shape, 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, translation, 1.0
+    return out
+
+
+def inverse(transform: ArrayLike) -> Array:
+    """b_from_a (..., 4, 4) of a_from_b."""
+    transform = np.asarray(transform, float)
+    r = np.swapaxes(transform[..., :3, :3], -1, -2)
+    return make(r, -(r @ transform[..., :3, 3:])[..., 0])
+
+
+def adjoint(transform: ArrayLike) -> Array:
+    """Ad (..., 6, 6) with T @ exp(xi) @ inverse(T) = exp(Ad(T) @ xi)."""
+    transform = np.asarray(transform, float)
+    r = transform[..., :3, :3]
+    out = np.zeros((*transform.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = r
+    out[..., 3:, :3] = hat(transform[..., :3, 3]) @ r
+    return out
+
+
+def interpolate(a: ArrayLike, b: ArrayLike, u: ArrayLike) -> Array:
+    """Geodesic from a (..., 4, 4) at u = 0 to b at u = 1; u (...) may lie outside [0, 1]."""
+    a, b, u = np.asarray(a, float), np.asarray(b, float), np.asarray(u, float)
+    return np.asarray(a @ exp(u[..., None] * log(inverse(a) @ b)))
+
+
+def transform_points(a_from_b: ArrayLike, points_b: ArrayLike) -> Array:
+    """Points in a (..., N, 3), mm, from points in b (..., N, 3)."""
+    a_from_b = np.asarray(a_from_b, float)
+    rotated = np.asarray(points_b, float) @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
+    return np.asarray(rotated + a_from_b[..., None, :3, 3])
+
+
+def angle_of(rotation: ArrayLike) -> Array:
+    """Rotation angle (...), rad in [0, pi], of rotations (..., 3, 3) or transforms (..., 4, 4)."""
+    return np.asarray(np.linalg.norm(log_rotation(np.asarray(rotation, float)[..., :3, :3]), axis=-1))
+
+
+def is_transform(matrix: ArrayLike, tolerance: float = 1e-5) -> bool:
+    """Whether a (4, 4) matrix is a rigid motion: finite, orthonormal, right-handed, last row 0 0 0 1."""
+    m = np.asarray(matrix, float)
+    if m.shape != (4, 4) or not np.isfinite(m).all() or np.abs(m[3] - [0, 0, 0, 1]).max() > tolerance:
+        return False
+    r = m[:3, :3]
+    return bool(np.abs(r @ r.T - np.eye(3)).max() < tolerance and np.linalg.det(r) > 0)
+
+
+def orthonormalise(transform: ArrayLike) -> Array:
+    """The nearest rigid motion to a nearly rigid (4, 4) matrix (polar decomposition of its rotation)."""
+    transform = np.asarray(transform, float)
+    u, _, vt = np.linalg.svd(transform[:3, :3])
+    return make(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt, transform[:3, 3])
+
+
+def quaternion_from_rotation(rotation: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) [qx qy qz qw] of rotations (..., 3, 3) (Bar-Itzhack, largest of four candidates)."""
+    r = np.asarray(rotation, float)
+    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    a, b, c = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
+    d, e, f = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
+    candidates = np.stack(
+        [
+            np.stack([1 + xx - yy - zz, d, e, a], -1),
+            np.stack([d, 1 - xx + yy - zz, f, b], -1),
+            np.stack([e, f, 1 - xx - yy + zz, c], -1),
+            np.stack([a, b, c, 1 + xx + yy + zz], -1),
+        ],
+        -2,
+    )
+    norms = np.linalg.norm(candidates, axis=-1)
+    best = np.argmax(norms, axis=-1)[..., None]
+    chosen = np.take_along_axis(candidates, best[..., None], -2)[..., 0, :]
+    return np.asarray(chosen / np.take_along_axis(norms, best, -1))
+
+
+def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) of quaternions (..., 4) [qx qy qz qw]; they need not be of unit length."""
+    q = np.asarray(quaternion, float)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    h = hat(q[..., :3])
+    return np.asarray(np.eye(3) + 2 * q[..., 3, None, None] * h + 2 * (h @ h))
+
+
+def rotation_from_euler(angles: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) of [alpha beta gamma] (..., 3), rad: Rz(gamma) @ Ry(beta) @ Rx(alpha), thesis Eq. 5.1-5.3.
+
+    The thesis turns about one axis at a time and row vectors from the right (Eq. 5.5); the product below is the
+    order in which its angles are recovered (Eq. 4.3), for column vectors.
+    """
+    angles = np.asarray(angles, float)
+    x, y, z = (exp_rotation(angles[..., i, None] * np.eye(3)[i]) for i in range(3))
+    return np.asarray(z @ y @ x)
+
+
+def euler_from_rotation(rotation: ArrayLike) -> Array:
+    """[alpha beta gamma] (..., 3), rad, of rotations (..., 3, 3): thesis Eq. 4.3; at beta = +-pi/2 gamma is 0."""
+    r = np.asarray(rotation, float)
+    cos_y = np.hypot(r[..., 0, 0], r[..., 1, 0])
+    y = np.arctan2(-r[..., 2, 0], cos_y)
+    lock = cos_y < 1e-9
+    x = np.where(lock, np.arctan2(-r[..., 1, 2], r[..., 1, 1]), np.arctan2(r[..., 2, 1], r[..., 2, 2]))
+    z = np.where(lock, 0.0, np.arctan2(r[..., 1, 0], r[..., 0, 0]))
+    return np.stack([x, y, z], axis=-1)

@@ -1,0 +1,64 @@
+"""The stored map of the surface: landmarks in the surface frame, against which every frame is matched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from estimation import se3
+from estimation.pose_solver import Index
+from estimation.se3 import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceMap:
+    """Landmarks as parallel arrays.
+
+    track: (N,) id of the landmark, increasing. points: (N, 3) mm, normals: (N, 3) unit, out of the surface, both in the
+    surface frame. covariance: (3N, 3N) mm^2, joint. A landmark that proved wrong is dropped, one that is hidden stays.
+    """
+
+    track: Index
+    points: Array
+    normals: Array
+    covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.track)
+
+
+def local_normals(points: Array, outward: Array, neighbours: int = 12) -> Array:
+    """Unit normals (N, 3) of points (N, 3) by a plane through each one's nearest neighbours, on the side of `outward`.
+
+    outward: (3,) or (N, 3), a rough direction out of the surface, the same frame. Where the neighbours lie on a line or
+    scatter in depth, the normal leans towards that of all points: it is a prior for the patches, not a measurement.
+    """
+    k = min(neighbours, len(points))
+    _, index = cKDTree(points).query(points, k=k)
+    spread = points[index] - points[index].mean(1, keepdims=True)  # (N, k, 3)
+    local = np.swapaxes(spread, 1, 2) @ spread / k
+    centred = points - points.mean(0)
+    whole = centred.T @ centred / len(points)
+    values, vectors = np.linalg.eigh(local + 0.02 * whole)
+    normals = vectors[:, :, 0]
+    sign = np.sign(np.einsum("ni,ni->n", normals, np.broadcast_to(outward, normals.shape)))
+    return np.asarray(normals * np.where(sign == 0, 1.0, sign)[:, None])
+
+
+def surface_frame(points_base: Array, towards: Array, right: Array) -> Array:
+    """base_from_surface (4, 4) for a surface without a scan: origin at the points' centroid, z out of the surface.
+
+    points_base: (N, 3) mm. towards: (3,), a point on the outer side (the cameras' centre). right: (3,), the direction
+    that x follows as far as the surface's plane allows.
+    """
+    centroid = np.median(points_base, axis=0)
+    centred = points_base - centroid
+    near = centred[np.linalg.norm(centred, axis=1) <= 2.5 * np.median(np.linalg.norm(centred, axis=1))]
+    z = np.linalg.eigh(near.T @ near)[1][:, 0]
+    z = z if z @ (towards - centroid) > 0 else -z
+    x = right - z * (z @ right)
+    x = x if np.linalg.norm(x) > 1e-3 else np.cross([0.0, 1.0, 0.0], z)
+    x = x / np.linalg.norm(x)
+    return se3.make(np.stack([x, np.cross(z, x), z], axis=1), near.mean(0) + centroid)

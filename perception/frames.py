@@ -1,0 +1,38 @@
+"""Images with their instants, and the sets of frames that belong together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.se3 import Array
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image. camera: number in the rig. stamp: s, middle of the exposure. image: (H, W) grey or (H, W, 3) BGR."""
+
+    camera: int
+    stamp: float
+    image: Image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSet:
+    """The frames of one instant, at most one per camera, in the rig's order; a camera may be missing. stamp: s."""
+
+    stamp: float
+    frames: tuple[Frame, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Roi:
+    """Where the surface is in one image. camera: number in the rig. stamp: s. polygon: (N, 2) px, may leave the image."""
+
+    camera: int
+    stamp: float
+    polygon: Array

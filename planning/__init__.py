@@ -1,0 +1,1 @@
+"""From checkpoints on the surface to motion that arm and tissue can bear (floor 1; knows nothing of images)."""
