@@ -47,9 +47,16 @@ class Errors:
     nees: Array
 
     @property
+    def mean_nees(self) -> float:
+        """Mean NEES of the poses that have a covariance; NaN without any."""
+        known = self.nees[np.isfinite(self.nees)]
+        return float(known.mean()) if len(known) else float("nan")
+
+    @property
     def nees_inside(self) -> float:
-        """Share of the poses whose NEES is inside the 95 % bound."""
-        return float(np.mean(self.nees <= NEES_BOUND)) if len(self.nees) else float("nan")
+        """Share of those poses whose NEES is inside the 95 % bound; NaN without any."""
+        known = self.nees[np.isfinite(self.nees)]
+        return float(np.mean(known <= NEES_BOUND)) if len(known) else float("nan")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +85,7 @@ def spread(errors: Array) -> Spread:
 
 
 def associate(stamps: Array, truth_stamps: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows (M,) of `stamps` (N,) and of `truth_stamps` (K,) that name one instant: the nearest, at most half a period off.
+    """Rows (M,) of `stamps` (N,) and of `truth_stamps` (K,) of one instant: the nearest, at most half a period off.
 
     The period is the smaller of the two median steps, so each row of the sparser one is matched once.
     """
@@ -180,3 +187,28 @@ def state_shares(table: PoseTable, since: float = -np.inf) -> dict[str, float]:
     if not len(rows):
         return {}
     return {state.value: float(np.mean(table.is_state(state)[rows])) for state in TrackState}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """All that the report says about one run.
+
+    title: the session's name. comparison: None without truth or reference. shares: per state, of the frame sets from
+    `since` (s) on. complete: whether the session was run to its end.
+    """
+
+    title: str
+    table: PoseTable
+    comparison: Comparison | None
+    latency: Latency
+    shares: dict[str, float]
+    since: float
+    complete: bool
+
+
+def evaluate(
+    table: PoseTable, truth: Trajectory | None, title: str = "", since: float = -np.inf, complete: bool = True
+) -> Evaluation:
+    """Everything about one run; `since` (s) is the instant from which its states count."""
+    comparison = None if truth is None else compare(table, truth)
+    return Evaluation(title, table, comparison, latency(table), state_shares(table, since), since, complete)

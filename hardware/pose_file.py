@@ -34,9 +34,9 @@ _STATES = tuple(state.value for state in TrackState)
 class PoseTable:
     """A run as parallel arrays, one row per frame set.
 
-    stamps: (N,) s. frames: (N,) images given. base_from_surface: (N, 4, 4) mm. covariance: (N, 6, 6) and twist: (N, 6)
-    as in SurfacePose. states: (N,) of TrackState. used: (N, C) tracks that carry the pose, per camera. seconds: (N, S+1)
-    per stage and in all. cameras: the C names. stages: the S + 1 names, the last "total". reasons: N sentences.
+    stamps: (N,) s. frames: (N,) images given. base_from_surface: (N, 4, 4) mm. covariance: (N, 6, 6) and twist:
+    (N, 6) as in SurfacePose. states: N of TrackState. used: (N, C) tracks that carry the pose, per camera. seconds:
+    (N, S + 1) per stage and in all. reasons: N sentences. cameras: the C names. stages: the S + 1 names, the last "total".
     """
 
     stamps: Array

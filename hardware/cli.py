@@ -1,0 +1,161 @@
+"""The command line: stillbed import, export, track, replay. Imports its work lazily, so that help is instant."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from estimation.errors import StillbedError
+
+INTERRUPTED = 130  # what a shell expects after Ctrl-C
+WRONG_INPUT = 2
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one sub-command and return its exit code: 0, 2 for wrong input (one line on stderr), 130 after Ctrl-C."""
+    arguments = parser().parse_args(argv)
+    try:
+        arguments.run(arguments)
+    except (StillbedError, OSError) as error:
+        print(f"stillbed: {error}", file=sys.stderr)
+        return WRONG_INPUT
+    except KeyboardInterrupt:
+        print(f"\nstillbed: interrupted; {kept(arguments.out)}", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def kept(out: Path) -> str:
+    """What an interrupted command left behind, in words."""
+    if out.is_dir():
+        names = sorted(file.name for file in out.iterdir())
+        return f"kept in {out}: {', '.join(names)}" if names else f"nothing was written to {out}"
+    if out.exists():
+        return f"kept {out}, readable up to its last whole chunk"
+    return "nothing was written"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    top = argparse.ArgumentParser(
+        prog="stillbed",
+        description="Make a moving wound look like a still print bed.",
+        epilog="A SESSION is a folder with rig.toml and frames.csv, or an .mcap file. `stillbed COMMAND --help` says more.",
+    )
+    top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    commands = top.add_subparsers(metavar="COMMAND", required=True)
+    _add_track(commands)
+    _add_replay(commands)
+    _add_import(commands)
+    _add_export(commands)
+    return top
+
+
+class _Version(argparse.Action):
+    """Prints the installed version; asks for it only then."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            print(f"stillbed {version('stillbed')}")
+        except PackageNotFoundError:
+            print("stillbed, not installed")
+        parser.exit()
+
+
+Commands = Any  # argparse's own type for this is private
+
+
+def _command(commands: Commands, name: str, summary: str, text: str, example: str) -> argparse.ArgumentParser:
+    made: argparse.ArgumentParser = commands.add_parser(
+        name,
+        help=summary,
+        description=text,
+        epilog=f"example:\n  {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    return made
+
+
+def _add_track(commands: Commands) -> None:
+    command = _command(
+        commands,
+        "track",
+        "follow the surface through a session",
+        "Follow the surface through a recorded session, causally: the pose of a frame set uses nothing after it.\n"
+        "Writes, as it goes, poses.csv and poses.tum, and at the end report.html and summary.json.",
+        "stillbed track sessions/monday -o out/monday",
+    )
+    command.add_argument("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
+    command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
+    command.add_argument("--record", type=Path, metavar="X.mcap", help="also record images, tracks and poses as MCAP")
+    command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
+    command.set_defaults(run=_track)
+
+
+def _add_replay(commands: Commands) -> None:
+    command = _command(
+        commands,
+        "replay",
+        "run tracking and motion on a session under a simulated clock",
+        "Run tracking and motion on a recorded session under a simulated clock, as a live run would, without an arm.\n"
+        "Writes commands.csv and frames.bin, the bytes the arm would get. Same input, same bytes.",
+        "stillbed replay sessions/monday --path data/paths/square_10mm.csv -o out/replay",
+    )
+    command.add_argument("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
+    command.add_argument("--path", type=Path, required=True, metavar="PATH.csv", help="checkpoints on the surface")
+    command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
+    command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
+    command.set_defaults(run=_replay)
+
+
+def _add_import(commands: Commands) -> None:
+    command = _command(
+        commands,
+        "import",
+        "turn a session folder into one MCAP file",
+        "Turn a session folder (rig.toml, frames.csv, a video or images per camera) into one MCAP file.",
+        "stillbed import sessions/monday -o monday.mcap",
+    )
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="session folder")
+    command.add_argument("-o", "--out", type=Path, required=True, metavar="X.mcap", help="file to write")
+    command.set_defaults(run=_import)
+
+
+def _add_export(commands: Commands) -> None:
+    command = _command(
+        commands,
+        "export",
+        "turn an MCAP file into a session folder",
+        "Turn an MCAP file into a session folder: rig.toml, frames.csv and the images of each camera.",
+        "stillbed export monday.mcap -o sessions/monday",
+    )
+    command.add_argument("mcap", type=Path, metavar="X.mcap", help="recording")
+    command.add_argument("-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder to write, new or empty")
+    command.set_defaults(run=_export)
+
+
+def _track(arguments: argparse.Namespace) -> None:
+    from hardware.track import run_track
+
+    print(run_track(arguments.session, arguments.out, arguments.record, arguments.force))
+
+
+def _replay(arguments: argparse.Namespace) -> None:
+    raise NotImplementedError
+
+
+def _import(arguments: argparse.Namespace) -> None:
+    raise NotImplementedError
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    raise NotImplementedError
+
+
+if __name__ == "__main__":
+    sys.exit(main())

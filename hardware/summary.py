@@ -1,0 +1,129 @@
+"""The figures of one run in words, as a text table and as summary.json."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimation.pose import TrackState
+from hardware.evaluation import OFF_MM, Comparison, Errors, Evaluation, Spread, spread
+
+
+def measured_share(result: Evaluation) -> float:
+    """Share of the frame sets that were TRACKING or DEGRADED; 0 where there are none."""
+    return sum(share for name, share in result.shares.items() if TrackState(name).measured)
+
+
+def verdict(result: Evaluation) -> list[str]:
+    """The run in a few sentences."""
+    counted = int(np.sum(result.table.stamps >= result.since - 1e-6))
+    followed = round(measured_share(result) * counted)
+    sentences = [f"The surface was followed in {followed} of {counted} frame sets ({percent(measured_share(result))})."]
+    if not result.complete:
+        sentences.insert(0, "This run was cut short; what follows is about the part that was done.")
+    if result.comparison is not None:
+        sentences += _judgement(result.comparison)
+    if len(result.latency.total):
+        middle, tail = result.latency.p50[-1], result.latency.p99[-1]
+        sentences.append(f"A pose took {middle:.1f} ms (median), {tail:.1f} ms at the 99th percentile.")
+    return sentences
+
+
+def _judgement(comparison: Comparison) -> list[str]:
+    error = spread(comparison.start.translation)
+    turn = math.degrees(spread(comparison.start.rotation).median)
+    against = "exact truth" if comparison.exact else "measured reference"
+    sentences = [f"Against the {against} it was off by {error.median:.2f} mm and {turn:.2f}° (median)."]
+    if len(comparison.off):
+        sentences.append(f"{len(comparison.off)} poses were off by more than {OFF_MM:.0f} mm while the state said TRACKING.")
+    else:
+        sentences.append(f"No pose was off by more than {OFF_MM:.0f} mm while the state said TRACKING.")
+    return sentences
+
+
+def percent(share: float) -> str:
+    """0.965 as 96.5 %, without needless zeros."""
+    return f"{100 * share:.1f}".removesuffix(".0") + " %"
+
+
+def as_dict(result: Evaluation) -> dict[str, Any]:
+    """The summary as plain values, ready for JSON; a figure that does not exist is None."""
+    late = result.latency
+    percentiles = zip(late.stages, late.p50, late.p95, late.p99, late.max, strict=True)
+    summary = {
+        "session": result.title,
+        "complete": result.complete,
+        "frame_sets": len(result.table),
+        "states_since_s": result.since,
+        "states": result.shares,
+        "measured_share": measured_share(result),
+        "latency_ms": {name: {"p50": a, "p95": b, "p99": c, "max": d} for name, a, b, c, d in percentiles},
+        "initialisation_ms": late.initialisation,
+        "initialisation_frame_sets": late.initial_sets,
+        "errors": None if result.comparison is None else _comparison_dict(result.comparison),
+    }
+    cleaned: dict[str, Any] = _finite(summary)
+    return cleaned
+
+
+def _comparison_dict(comparison: Comparison) -> dict[str, Any]:
+    return {
+        "against": "truth" if comparison.exact else "reference",
+        "poses": len(comparison.rows),
+        "median_stamp_gap_s": comparison.stamp_gap,
+        "off_by_more_than_10_mm_while_tracking": len(comparison.off),
+        "start": _errors_dict(comparison.start),
+        "aligned": _errors_dict(comparison.aligned),
+    }
+
+
+def _errors_dict(errors: Errors) -> dict[str, Any]:
+    return {
+        "translation_mm": _spread_dict(spread(errors.translation)),
+        "rotation_deg": _spread_dict(spread(np.degrees(errors.rotation))),
+        "nees_over_6": errors.mean_nees / 6,
+        "nees_inside_95": errors.nees_inside,
+        "truth_surface_from_estimated_surface": errors.truth_surface_from_estimated_surface.tolist(),
+    }
+
+
+def _spread_dict(value: Spread) -> dict[str, float]:
+    return {"median": value.median, "rmse": value.rmse, "p95": value.p95, "max": value.max}
+
+
+def _finite(value: Any) -> Any:
+    """The same value with every number that JSON cannot hold as None, and numpy's floats as Python's."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def write_summary(path: Path, result: Evaluation) -> None:
+    """Write summary.json."""
+    path.write_text(json.dumps(as_dict(result), indent=2) + "\n", encoding="utf-8")
+
+
+def summary_text(result: Evaluation) -> str:
+    """The verdict and the error table, for a terminal."""
+    lines = verdict(result)
+    if result.comparison is not None:
+        lines += ["", *error_table(result.comparison)]
+    return "\n".join(lines)
+
+
+def error_table(comparison: Comparison) -> list[str]:
+    """Lines of a table of errors, for a terminal."""
+    lines = [f"{'error':<28}{'median':>9}{'RMSE':>9}{'P95':>9}{'max':>9}"]
+    for name, errors in (("from the start", comparison.start), ("aligned", comparison.aligned)):
+        for what, values in (("mm", errors.translation), ("deg", np.degrees(errors.rotation))):
+            s = spread(values)
+            lines.append(f"{name + ', ' + what:<28}{s.median:>9.3f}{s.rmse:>9.3f}{s.p95:>9.3f}{s.max:>9.3f}")
+    return lines

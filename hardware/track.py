@@ -1,0 +1,111 @@
+"""`stillbed track`: the tracking step over a recorded session, its poses written as they come, and the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.pose import SurfacePose
+from estimation.trajectory import Trajectory
+from hardware.clock import WallClock
+from hardware.evaluation import evaluate
+from hardware.pose_file import PoseWriter, read_poses
+from hardware.progress import Progress, Report
+from hardware.report import write_report
+from hardware.summary import summary_text, write_summary
+from perception.frames import FrameSet
+from perception.tracking import STAGES, StepReport
+
+
+class Step(Protocol):
+    """What is driven: perception.tracking.TrackingStep, or anything that answers like it."""
+
+    last: StepReport
+
+    def __call__(self, frames: FrameSet) -> SurfacePose:
+        """The pose at `frames.stamp`."""
+        ...
+
+    def idle(self) -> None:
+        """Work that no pose waits for."""
+        ...
+
+
+Sink = Callable[[FrameSet, SurfacePose, StepReport], None]  # what else is done with each pose, e.g. recording it
+
+
+def follow(
+    frame_sets: Iterable[FrameSet],
+    step: Step,
+    writer: PoseWriter,
+    now: Callable[[], float],
+    progress: Report,
+    total: int,
+    sinks: Sequence[Sink] = (),
+) -> int:
+    """Drive `step` over the frame sets, each pose written before the next is asked for; how many there were.
+
+    `total` is for the progress only. The step's own time is measured by `now` and ends before anything is written.
+    """
+    done = 0
+    for frames in frame_sets:
+        start = now()
+        pose = step(frames)
+        spent = now() - start
+        writer.write(pose, len(frames.frames), step.last.used, step.last.seconds, spent)
+        for sink in sinks:
+            sink(frames, pose, step.last)
+        step.idle()
+        done += 1
+        progress(done, total)
+    return done
+
+
+def finish(out: Path, title: str, truth: Trajectory | None, since: float, complete: bool) -> str:
+    """Judge what poses.csv in `out` holds; writes report.html and summary.json there and returns the summary as text.
+
+    since: s, from which instant on the states count. complete: whether the session was run to its end.
+    """
+    result = evaluate(read_poses(out / "poses.csv"), truth, title, since, complete)
+    write_summary(out / "summary.json", result)
+    write_report(out / "report.html", result)
+    return summary_text(result)
+
+
+def prepare_out(out: Path, force: bool) -> None:
+    """Make the folder `out`; raises InputError where it is a file, or holds something and `force` is not set."""
+    if out.exists() and not out.is_dir():
+        raise InputError(out, "--out", "a file", "a folder, new or empty")
+    if out.is_dir() and any(out.iterdir()) and not force:
+        raise InputError(out, "--out", f"a folder with {len(list(out.iterdir()))} entries", "a new or empty one, or --force")
+    out.mkdir(parents=True, exist_ok=True)
+
+
+def run_track(path: Path, out: Path, record: Path | None = None, force: bool = False) -> str:
+    """Track the session at `path` into the folder `out`; returns the summary as text.
+
+    Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of all frame sets until then.
+    """
+    from hardware.session import open_session
+    from perception.tracking import TrackingStep
+
+    session = open_session(path)
+    prepare_out(out, force)
+    clock = WallClock()
+    step = TrackingStep(session.rig, session.roi, clock.now)
+    cameras = [camera.name for camera in session.rig.cameras]
+    progress = Progress("track", "frame sets", clock.now)
+    since = min((roi.stamp for roi in session.roi), default=-np.inf)
+    complete = False
+    try:
+        with PoseWriter(out, cameras, STAGES) as writer:
+            follow(session.frame_sets(), step, writer, clock.now, progress, len(session))
+        complete = True
+    finally:
+        progress.close()
+        text = finish(out, path.name, session.truth, since, complete)
+    return f"{text}\nreport: {out / 'report.html'}"
