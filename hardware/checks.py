@@ -1,0 +1,103 @@
+"""Reading tables of unknown origin: each value checked as it is taken, each fault one InputError."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from collections.abc import Collection, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.se3 import Array
+
+Table = dict[str, Any]
+
+
+def read_toml(path: Path) -> Table:
+    """The table in a TOML file; InputError where it is missing, empty, not text or not TOML."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(path, "file", error, "a readable UTF-8 text file") from error
+    if not text.strip():
+        raise InputError(path, "file", "empty", "TOML")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(path, "syntax", error, "valid TOML") from error
+
+
+def check_keys(where: object, prefix: str, table: Table, required: Iterable[str], optional: Iterable[str] = ()) -> None:
+    """InputError for a required key that is not there, or for one that nobody reads (with the one it may have meant)."""
+    known = [*required, *optional]
+    for key in table:
+        if key not in known:
+            raise InputError(where, prefix + key, "unknown key", meant(key, known))
+    for key in required:
+        if key not in table:
+            raise InputError(where, prefix + key, "missing", f"this key ({', '.join(required)} are required)")
+
+
+def meant(word: str, known: Collection[str]) -> str:
+    """The allowed words, the nearest one first by name if there is a near one."""
+    near = difflib.get_close_matches(word, known, 1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return f"one of {', '.join(known)}{hint}"
+
+
+def tables(where: object, key: str, value: object) -> list[Table]:
+    """A non-empty list of tables, as `[[key]]` gives."""
+    if not isinstance(value, list) or not value or not all(isinstance(v, dict) for v in value):
+        raise InputError(where, key, value, f"one [[{key}]] table or more")
+    return value
+
+
+def text(where: object, key: str, value: object) -> str:
+    """A string that is not empty."""
+    if not isinstance(value, str) or not value:
+        raise InputError(where, key, value, "a text that is not empty")
+    return value
+
+
+def integer(where: object, key: str, value: object, low: int) -> int:
+    """A whole number, at least `low`."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < low:
+        raise InputError(where, key, value, f"a whole number >= {low}")
+    return value
+
+
+def number(where: object, key: str, value: object) -> float:
+    """A finite number."""
+    return float(numbers(where, key, value, ()))
+
+
+def numbers(where: object, key: str, value: object, shape: tuple[int | None, ...], unit: str = "") -> Array:
+    """A float64 array of finite numbers; None in `shape` stands for any length."""
+    allowed = " x ".join("N" if n is None else str(n) for n in shape) + " finite numbers" if shape else "a finite number"
+    allowed += f", {unit}" if unit else ""
+    try:
+        array = np.array(value) if _all_numbers(value) else None
+    except ValueError:
+        array = None
+    if array is None or array.ndim != len(shape) or array.dtype.kind not in "iuf":
+        raise InputError(where, key, value, allowed)
+    if any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
+        raise InputError(where, key, value, allowed)
+    if not np.isfinite(array).all():
+        raise InputError(where, key, value, allowed)
+    return array.astype(np.float64)
+
+
+def _all_numbers(value: object) -> bool:
+    if isinstance(value, list):
+        return all(_all_numbers(v) for v in value)
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def toml_numbers(array: Array) -> str:
+    """An array as TOML, every number with the digits that give the same float64 back."""
+    return json.dumps(array.tolist())

@@ -1,0 +1,86 @@
+"""Images in and out of files: videos frame by frame, pictures, and the bytes that a recording stores (owns cv2)."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg's own lines on stderr: our errors say it instead
+
+import cv2  # noqa: E402  (reads the level above when it is first used)
+import numpy as np  # noqa: E402
+
+from estimation.errors import InputError  # noqa: E402
+from perception.frames import Image  # noqa: E402
+
+PNG_LEVEL = 1  # 0-9: a higher level costs three times the time and saves a tenth of the bytes on photographs
+
+
+class Video:
+    """A video read forward, one frame at a time; frames are (H, W, 3) BGR. InputError where it cannot be decoded."""
+
+    def __init__(self, path: Path) -> None:
+        if not path.is_file():
+            raise InputError(path, "video", "no such file", "a video file that OpenCV decodes")
+        self.path, self.next = path, 0
+        self._capture = cv2.VideoCapture(str(path))
+        if not self._capture.isOpened():
+            raise InputError(path, "video", f"{path.stat().st_size} bytes, undecodable", "a video that OpenCV decodes")
+
+    def told_count(self) -> int:
+        """Number of frames as the container tells it; it may be wrong, or 0 where it tells none."""
+        return max(0, int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+
+    def read(self) -> Image | None:
+        """The next frame, None at the end (of the video, or of what can be decoded of it)."""
+        ok, image = self._capture.read()
+        self.next += ok
+        return np.asarray(image, np.uint8) if ok else None
+
+    def skip(self) -> bool:
+        """Step over the next frame; False at the end."""
+        ok = bool(self._capture.grab())
+        self.next += ok
+        return ok
+
+    def close(self) -> None:
+        """Give the decoder back."""
+        self._capture.release()
+
+
+def count_by_decoding(path: Path) -> int:
+    """Number of frames that can be decoded, by going through the whole video."""
+    video = Video(path)
+    while video.skip():
+        pass
+    video.close()
+    return video.next
+
+
+def encode(image: Image, jpeg_quality: int | None = None) -> tuple[str, bytes]:
+    """Format ("png", exact, or "jpeg" at 0-100) and bytes of an (H, W) grey or (H, W, 3) BGR image."""
+    if jpeg_quality is None:
+        kind, suffix, options = "png", ".png", [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
+    else:
+        kind, suffix, options = "jpeg", ".jpg", [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
+    ok, data = cv2.imencode(suffix, image, options)
+    assert ok
+    return kind, data.tobytes()
+
+
+def decode(data: bytes, where: object, what: str) -> Image:
+    """Image (H, W) grey or (H, W, 3) BGR uint8 of an encoded picture; InputError (where, what) if it is none."""
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR) if data else None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise InputError(where, what, f"{len(data)} bytes, undecodable", "a picture that OpenCV decodes")
+    return np.asarray(image, np.uint8)
+
+
+def check_size(image: Image, size: tuple[int, int], where: object, what: str) -> None:
+    """InputError unless the image is `size` (W, H) px."""
+    height, width = image.shape[:2]
+    if (width, height) != size:
+        raise InputError(where, what, f"{width} x {height} px", f"{size[0]} x {size[1]} px, the camera's `size`")
