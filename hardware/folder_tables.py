@@ -1,0 +1,135 @@
+"""The small tables of a session folder: frames.csv (stamps) and roi.toml (where the surface is at the start)."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.rig import Rig
+from estimation.se3 import Array
+from hardware import checks
+from hardware.session import FrameRef
+from perception.frames import Roi
+
+COLUMNS = ("camera", "frame", "stamp_s")
+
+
+def read_frames(path: Path, rig: Rig) -> list[Array]:
+    """Stamps (N,), s, of each camera's frames 0..N-1 as its own clock gave them: finite, rising, none left out."""
+    names = [c.name for c in rig.cameras]
+    found: list[dict[int, float]] = [{} for _ in names]
+    for line, row in _rows(path):
+        camera, frame, stamp = _frame_row(path, line, row, names)
+        if frame in found[camera]:
+            raise InputError(path, f"line {line}: camera,frame", f"{names[camera]},{frame}", "each frame once")
+        found[camera][frame] = stamp
+    stamps = [_camera_stamps(path, name, frames) for name, frames in zip(names, found, strict=True)]
+    if not any(len(s) for s in stamps):
+        raise InputError(path, "frames", "none", f"at least one line {','.join(COLUMNS)}")
+    return stamps
+
+
+def _rows(path: Path) -> list[tuple[int, dict[str, str | None]]]:
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            header = [name.strip() for name in reader.fieldnames or []]
+            reader.fieldnames = header
+            rows = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(path, "file", error, "a readable CSV file") from error
+    for column in COLUMNS:
+        if column not in header:
+            raise InputError(path, "header", ",".join(header) or "empty", ",".join(COLUMNS))
+    return rows
+
+
+def _frame_row(path: Path, line: int, row: dict[str, str | None], names: Sequence[str]) -> tuple[int, int, float]:
+    name, frame, stamp = ((row[c] or "").strip() for c in COLUMNS)
+    if name not in names:
+        raise InputError(path, f"line {line}: camera", name, f"a camera of rig.toml, {checks.meant(name, names)}")
+    if not (frame.isascii() and frame.isdigit()):
+        raise InputError(path, f"line {line}: frame", frame, "a whole number >= 0")
+    try:
+        value = float(stamp)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(path, f"line {line}: stamp_s", stamp, "a finite number of seconds")
+    return names.index(name), int(frame), value
+
+
+def _camera_stamps(path: Path, name: str, frames: dict[int, float]) -> Array:
+    for number, frame in enumerate(sorted(frames)):
+        if frame != number:
+            raise InputError(path, f"camera {name!r}: frame", f"{frame} after {number - 1}", "every frame from 0 on")
+    stamps = np.array([frames[i] for i in range(len(frames))], float)
+    back = np.flatnonzero(np.diff(stamps) <= 0)
+    if len(back):
+        i = int(back[0]) + 1
+        allowed = f"later than frame {i - 1}, {stamps[i - 1]:g} s"
+        raise InputError(path, f"camera {name!r}: stamp_s of frame {i}", float(stamps[i]), allowed)
+    return stamps
+
+
+def write_frames(path: Path, rig: Rig, refs: Iterable[FrameRef]) -> None:
+    """Write frames.csv, camera by camera, every stamp with the digits that give the same float64 back."""
+    with open(path, "w", encoding="utf-8") as file:
+        file.write(",".join(COLUMNS) + "\n")
+        for ref in sorted(refs, key=lambda r: (r.camera, r.number)):
+            file.write(f"{rig.cameras[ref.camera].name},{ref.number},{ref.camera_stamp!r}\n")
+
+
+def read_roi(path: Path, rig: Rig, stamps: Sequence[Array]) -> tuple[Roi, ...]:
+    """The polygons of roi.toml; stamps: (N,) per camera, s, of its frames on the common clock."""
+    table = checks.read_toml(path)
+    checks.check_keys(path, "", table, ["roi"])
+    entries = checks.tables(path, "roi", table["roi"])
+    rois = [_roi(path, f"roi[{i}].", entry, rig, stamps) for i, entry in enumerate(entries)]
+    seen = [(r.camera, r.stamp) for r in rois]
+    for i, key in enumerate(seen):
+        if key in seen[:i]:
+            raise InputError(path, f"roi[{i}]", f"{entries[i]['camera']}, frame {entries[i]['frame']}", "each frame once")
+    return tuple(rois)
+
+
+def _roi(path: Path, key: str, entry: checks.Table, rig: Rig, stamps: Sequence[Array]) -> Roi:
+    checks.check_keys(path, key, entry, ["camera", "frame", "polygon"])
+    name = checks.text(path, key + "camera", entry["camera"])
+    names = [c.name for c in rig.cameras]
+    if name not in names:
+        raise InputError(path, key + "camera", name, f"a camera of rig.toml, {checks.meant(name, names)}")
+    camera = names.index(name)
+    frame = checks.integer(path, key + "frame", entry["frame"], 0)
+    if frame >= len(stamps[camera]):
+        raise InputError(path, key + "frame", frame, f"a frame of {name!r} in frames.csv, 0..{len(stamps[camera]) - 1}")
+    polygon = checks.numbers(path, key + "polygon", entry["polygon"], (None, 2), "px")
+    check_polygon(path, key + "polygon", polygon, rig.cameras[camera].size)
+    return Roi(camera, float(stamps[camera][frame]), polygon)
+
+
+def check_polygon(where: object, key: str, polygon: Array, size: tuple[int, int]) -> None:
+    """InputError unless the polygon (N, 2), px, has three corners, an area, and a part of its box in the image."""
+    if len(polygon) < 3:
+        raise InputError(where, key, f"{len(polygon)} points", "3 points or more, px")
+    x, y = (polygon - polygon[0]).T
+    if abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2 < 1:
+        raise InputError(where, key, polygon.tolist(), "a polygon of at least 1 px^2, not a line")
+    if (polygon.max(axis=0) < 0).any() or (polygon.min(axis=0) > size).any():
+        raise InputError(where, key, polygon.tolist(), f"a polygon that reaches into the image, {size[0]} x {size[1]} px")
+
+
+def write_roi(path: Path, rig: Rig, rois: Sequence[Roi], frames: Sequence[int]) -> None:
+    """Write roi.toml; frames: the number, in its camera, of the frame that each polygon was drawn in."""
+    blocks = ["# where the surface is: per camera a polygon in pixels of that frame\n"]
+    for roi, frame in zip(rois, frames, strict=True):
+        name = json.dumps(rig.cameras[roi.camera].name, ensure_ascii=False)
+        polygon = checks.toml_numbers(roi.polygon)
+        blocks.append(f"[[roi]]\ncamera = {name}\nframe = {frame}\npolygon = {polygon}\n")
+    path.write_text("\n".join(blocks), encoding="utf-8")
