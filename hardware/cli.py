@@ -135,7 +135,9 @@ def _add_export(commands: Commands) -> None:
         "stillbed export monday.mcap -o sessions/monday",
     )
     command.add_argument("mcap", type=Path, metavar="X.mcap", help="recording")
-    command.add_argument("-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder to write, new or empty")
+    command.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder to write, new or empty"
+    )
     command.set_defaults(run=_export)
 
 

@@ -75,9 +75,7 @@ class PoseWriter:
         self._csv.writerow([*_HEAD, *used, *(f"ms_{s}" for s in (*stages, "total")), "reason"])
         self._tum_file.write("# base_from_surface: stamp_s x y z qx qy qz qw (mm)\n")
 
-    def write(
-        self, pose: SurfacePose, frames: int, used: NDArray[np.int64], seconds: Array, total: float
-    ) -> None:
+    def write(self, pose: SurfacePose, frames: int, used: NDArray[np.int64], seconds: Array, total: float) -> None:
         """One frame set: its pose, images given, tracks used (C,), seconds per stage (S,) and `total` s."""
         numbers = _pose_numbers(pose.base_from_surface)
         upper = pose.covariance[_UPPER]

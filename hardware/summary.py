@@ -39,7 +39,9 @@ def _judgement(comparison: Comparison) -> list[str]:
     against = "exact truth" if comparison.exact else "measured reference"
     sentences = [f"Against the {against} it was off by {error.median:.2f} mm and {turn:.2f}° (median)."]
     if len(comparison.off):
-        sentences.append(f"{len(comparison.off)} poses were off by more than {OFF_MM:.0f} mm while the state said TRACKING.")
+        sentences.append(
+            f"{len(comparison.off)} poses were off by more than {OFF_MM:.0f} mm while the state said TRACKING."
+        )
     else:
         sentences.append(f"No pose was off by more than {OFF_MM:.0f} mm while the state said TRACKING.")
     return sentences
@@ -57,6 +59,7 @@ def as_dict(result: Evaluation) -> dict[str, Any]:
     summary = {
         "session": result.title,
         "complete": result.complete,
+        "verdict": verdict(result),
         "frame_sets": len(result.table),
         "states_since_s": result.since,
         "states": result.shares,
@@ -113,17 +116,17 @@ def write_summary(path: Path, result: Evaluation) -> None:
 
 def summary_text(result: Evaluation) -> str:
     """The verdict and the error table, for a terminal."""
-    lines = verdict(result)
-    if result.comparison is not None:
-        lines += ["", *error_table(result.comparison)]
+    return text_of(as_dict(result))
+
+
+def text_of(summary: dict[str, Any]) -> str:
+    """The same from a summary as `as_dict` gives it; KeyError where a figure is missing."""
+    lines = list(summary["verdict"])
+    if summary["errors"] is not None:
+        lines += ["", f"{'error':<22}{'median':>9}{'RMSE':>9}{'95 %':>9}{'max':>9}"]
+        for name, kind in (("from the start", "start"), ("aligned", "aligned")):
+            for unit, key in (("mm", "translation_mm"), ("deg", "rotation_deg")):
+                figures = summary["errors"][kind][key]
+                cells = "".join(f"{figures[part]:>9.3f}" for part in ("median", "rmse", "p95", "max"))
+                lines.append(f"{f'{name}, {unit}':<22}{cells}")
     return "\n".join(lines)
-
-
-def error_table(comparison: Comparison) -> list[str]:
-    """Lines of a table of errors, for a terminal."""
-    lines = [f"{'error':<28}{'median':>9}{'RMSE':>9}{'P95':>9}{'max':>9}"]
-    for name, errors in (("from the start", comparison.start), ("aligned", comparison.aligned)):
-        for what, values in (("mm", errors.translation), ("deg", np.degrees(errors.rotation))):
-            s = spread(values)
-            lines.append(f"{name + ', ' + what:<28}{s.median:>9.3f}{s.rmse:>9.3f}{s.p95:>9.3f}{s.max:>9.3f}")
-    return lines

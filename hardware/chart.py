@@ -1,0 +1,213 @@
+"""Charts as plain SVG text: scales, and a plot that collects lines, bands, dots and bars. No script, no network."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.se3 import Array
+
+MOST_POINTS = 3000  # a line is thinned to its extremes beyond: no screen shows more
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Values from `low` to `high` along `start` to `end` px, linearly or by their logarithm."""
+
+    low: float
+    high: float
+    start: float
+    end: float
+    logarithmic: bool = False
+
+    def __call__(self, values: Array) -> Array:
+        """Positions (N,), px, of values (N,); outside values are moved to the border of what is drawn."""
+        v = np.clip(np.asarray(values, float), self.low, self.high)
+        low, high = self.low, self.high
+        if self.logarithmic:
+            v, low, high = np.log10(v), math.log10(low), math.log10(high)
+        return np.asarray(self.start + (v - low) / (high - low) * (self.end - self.start))
+
+    def ticks(self, count: int = 5) -> list[float]:
+        """About `count` round values inside; on a logarithmic scale the powers of ten."""
+        if self.logarithmic:
+            first, last = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
+            return [10.0**power for power in range(first, last + 1)]
+        step = round_step((self.high - self.low) / count)
+        first = math.ceil(self.low / step - 1e-9)
+        last = math.floor(self.high / step + 1e-9)
+        return [i * step for i in range(first, last + 1)]
+
+
+def round_step(rough: float) -> float:
+    """The smallest of 1, 2, 5, 10 times a power of ten that is at least `rough`."""
+    power = 10.0 ** math.floor(math.log10(rough))
+    return next(k * power for k in (1.0, 2.0, 5.0, 10.0) if k * power >= rough * (1 - 1e-9))
+
+
+def spanning(values: Sequence[Array], margin: float = 0.06, least: float = 1e-3) -> tuple[float, float]:
+    """Low and high that hold all finite `values` with a margin; a span under `least` is widened to it."""
+    flat = np.concatenate([np.ravel(v) for v in values]) if values else np.empty(0)
+    flat = flat[np.isfinite(flat)]
+    if not len(flat):
+        return 0.0, 1.0
+    low, high = float(flat.min()), float(flat.max())
+    if high - low < least:
+        middle = (low + high) / 2
+        low, high = middle - least / 2, middle + least / 2
+    pad = margin * (high - low)
+    return low - pad, high + pad
+
+
+def thinned(y: Array, most: int = MOST_POINTS) -> NDArray[np.int64]:
+    """Rows (M,) of y (N,) that keep the look of a line: all, or the lowest and highest of each of most / 2 stretches."""
+    if len(y) <= most:
+        return np.arange(len(y))
+    kept: list[int] = []
+    for rows in np.array_split(np.arange(len(y)), most // 2):
+        filled = np.where(np.isfinite(y[rows]), y[rows], 0.0)
+        kept += sorted({int(rows[filled.argmin()]), int(rows[filled.argmax()])})
+    return np.array(kept)
+
+
+def stretches(usable: NDArray[np.bool_]) -> list[slice]:
+    """Runs of neighbouring True in `usable` (N,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(np.int8)))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def number(value: float) -> str:
+    """A tick's label: short, without noise digits."""
+    text = f"{value:.6g}"
+    return "0" if text == "-0" else text.replace("-", "\N{MINUS SIGN}")
+
+
+class Plot:
+    """One chart of `width` x `height` px; things are drawn in the order of the calls."""
+
+    left, right, top, bottom = 56, 14, 12, 26
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        x: tuple[float, float],
+        y: tuple[float, float],
+        log_y: bool = False,
+        label: str = "",
+        x_ticks: bool = True,
+    ) -> None:
+        self.width, self.height, self.label = width, height, label
+        floor = height - (self.bottom if x_ticks else 10)
+        self.x = Scale(*x, self.left, width - self.right)
+        self.y = Scale(*y, floor, self.top, log_y)
+        self._floor = floor
+        self._parts: list[str] = []
+        self._grid(x_ticks)
+
+    def _grid(self, x_ticks: bool) -> None:
+        right = self.width - self.right
+        for value in self.y.ticks(max(2, int((self._floor - self.top) / 32))):
+            at = self.y(np.array([value]))[0]
+            self._parts.append(f'<path class="grid" d="M{self.left} {at:.1f}H{right}"/>')
+            self._parts.append(
+                f'<text class="tick" x="{self.left - 8}" y="{at + 3.5:.1f}" text-anchor="end">{number(value)}</text>'
+            )
+        for value in self.x.ticks(9) if x_ticks else ():
+            at = self.x(np.array([value]))[0]
+            self._parts.append(f'<path class="grid" d="M{at:.1f} {self._floor}v4"/>')
+            self._parts.append(
+                f'<text class="tick" x="{at:.1f}" y="{self._floor + 17}" text-anchor="middle">{number(value)}</text>'
+            )
+
+    def line(self, x: Array, y: Array, style: str) -> None:
+        """A line through (N,) points, broken where y is not finite; a lone point becomes a dot. style: a CSS class."""
+        for part in stretches(np.isfinite(y)):
+            rows = thinned(y[part])
+            points = self._points(x[part][rows], y[part][rows])
+            if len(points) == 1:
+                self.dots(x[part], y[part], f"{style} lone")
+            else:
+                self._parts.append(f'<path class="{style}" d="M{"L".join(points)}"/>')
+
+    def band(self, x: Array, low: Array, high: Array, style: str) -> None:
+        """The area between low and high (N,), broken where either is not finite."""
+        for part in stretches(np.isfinite(low) & np.isfinite(high)):
+            rows = thinned((high - low)[part])
+            there = self._points(x[part][rows], high[part][rows])
+            back = self._points(x[part][rows], low[part][rows])[::-1]
+            self._parts.append(f'<path class="{style}" d="M{"L".join(there + back)}Z"/>')
+
+    def dots(self, x: Array, y: Array, style: str, radius: float = 1.6) -> None:
+        """A dot at each finite of (N,) points."""
+        keep = np.flatnonzero(np.isfinite(y))
+        keep = keep[thinned(y[keep])]
+        spots = zip(self.x(x[keep]), self.y(y[keep]), strict=True)
+        self._parts.append(
+            "".join(f'<circle class="{style}" cx="{a:.1f}" cy="{b:.1f}" r="{radius}"/>' for a, b in spots)
+        )
+
+    def bars(self, edges: Array, heights: Array, style: str) -> None:
+        """Histogram bars of `heights` (B,) between `edges` (B + 1,)."""
+        floor = float(self.y(np.array([self.y.low]))[0])
+        for a, b, h in zip(self.x(edges[:-1]), self.x(edges[1:]), heights, strict=True):
+            if h > 0:
+                top = min(float(self.y(np.array([h]))[0]), floor - 1.5)  # one frame set must still be seen
+                width = max(b - a - 1, 1)
+                self._parts.append(
+                    f'<rect class="{style}" x="{a + 0.5:.1f}" y="{top:.1f}" width="{width:.1f}" height="{floor - top:.1f}" rx="1"/>'
+                )
+
+    def mark(self, x: float, text: str, style: str) -> None:
+        """A vertical line at x with a word beside it."""
+        at = float(self.x(np.array([x]))[0])
+        end = ' text-anchor="end"' if at > self.width - 110 else ""
+        shift = -5 if end else 5
+        self._parts.append(f'<path class="{style}" d="M{at:.1f} {self.top}V{self._floor}"/>')
+        self._parts.append(f'<text class="tick" x="{at + shift:.1f}" y="{self.top + 9}"{end}>{escape(text)}</text>')
+
+    def level(self, y: float, text: str, style: str) -> None:
+        """A horizontal line at y with a word at its right end, if y is inside."""
+        if self.y.low <= y <= self.y.high:
+            at = float(self.y(np.array([y]))[0])
+            right = self.width - self.right
+            self._parts.append(f'<path class="{style}" d="M{self.left} {at:.1f}H{right}"/>')
+            self._parts.append(
+                f'<text class="tick" x="{right}" y="{at - 4:.1f}" text-anchor="end">{escape(text)}</text>'
+            )
+
+    def svg(self) -> str:
+        """The chart as one SVG element."""
+        name = (
+            f'<text class="label" x="{self.left + 6}" y="{self.top + 9}">{escape(self.label)}</text>'
+            if self.label
+            else ""
+        )
+        return (
+            f'<svg class="plot" viewBox="0 0 {self.width} {self.height}" role="img" aria-label="{escape(self.label)}">'
+            f"{''.join(self._parts)}{name}</svg>"
+        )
+
+    def _points(self, x: Array, y: Array) -> list[str]:
+        return [f"{a:.1f} {b:.1f}" for a, b in zip(self.x(x), self.y(y), strict=True)]
+
+
+def ribbon(edges: Array, styles: Sequence[str], titles: Sequence[str], x: tuple[float, float], width: int) -> str:
+    """A strip of coloured stretches: the i-th from edges[i] to edges[i + 1] (s), equal neighbours joined."""
+    scale = Scale(*x, Plot.left, width - Plot.right)
+    parts = []
+    start = 0
+    for i in range(1, len(styles) + 1):
+        if i == len(styles) or styles[i] != styles[start]:
+            a, b = scale(edges[[start, i]])
+            parts.append(
+                f'<rect class="{styles[start]}" x="{a:.1f}" y="2" width="{max(b - a, 1.2):.1f}" height="20">'
+                f"<title>{escape(titles[start])}</title></rect>"
+            )
+            start = i
+    return f'<svg class="plot" viewBox="0 0 {width} 24" role="img" aria-label="states over time">{"".join(parts)}</svg>'

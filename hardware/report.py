@@ -1,0 +1,295 @@
+"""report.html: one run on one page, in one file that needs no network."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from estimation import se3
+from estimation.errors import InputError, StillbedError
+from estimation.pose import TrackState
+from estimation.se3 import Array
+from hardware.chart import Plot, ribbon, spanning
+from hardware.evaluation import NEES_BOUND, OFF_MM, Comparison, Evaluation, spread
+from hardware.summary import measured_share, percent, text_of, verdict
+
+WIDTH = 1030  # px of a chart across the page
+HALF = 480  # px of one of two
+MOST_EVENTS = 40  # rows of the table of state changes
+
+
+def write_report(path: Path, result: Evaluation) -> None:
+    """Write the page to `path`."""
+    path.write_text(page(result), encoding="utf-8")
+
+
+def page(result: Evaluation) -> str:
+    """The page as HTML text."""
+    style = (files("hardware") / "report.css").read_text(encoding="utf-8")
+    sections = [_states(result), _trajectory(result), _errors(result), _tracks(result), _latency(result)]
+    title = escape(result.title or "a session")
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{title} · stillbed track</title>'
+        f'<meta name="viewport" content="width=device-width"><style>\n{style}</style></head><body><main>\n'
+        f'<header><div class="kind">stillbed track</div><h1>{title}</h1>'
+        f'<p class="lead">{escape(" ".join(verdict(result)))}</p></header>\n'
+        f"{_tiles(result)}\n{chr(10).join(part for part in sections if part)}\n"
+        f"<footer>Lengths in mm, time in s from the session's own clock; poses are base_from_surface.</footer>"
+        f"</main></body></html>\n"
+    )
+
+
+def _tile(value: str, unit: str, caption: str) -> str:
+    return f'<div class="tile"><b>{escape(value)}<small>{escape(unit)}</small></b><span>{escape(caption)}</span></div>'
+
+
+def _tiles(result: Evaluation) -> str:
+    tiles = [_tile(percent(measured_share(result)).removesuffix(" %"), "%", "of the frame sets followed")]
+    if result.comparison is not None:
+        start, aligned = result.comparison.start, result.comparison.aligned
+        tiles.append(_tile(_figure(spread(start.translation).median), "mm", "median error from the start"))
+        tiles.append(_tile(_figure(math.degrees(spread(start.rotation).median)), "°", "median error from the start"))
+        tiles.append(_tile(_figure(spread(aligned.translation).rmse), "mm", "RMSE, aligned"))
+    if len(result.latency.total):
+        tiles.append(
+            _tile(f"{result.latency.p50[-1]:.1f}", "ms", f"per pose; 99 % under {result.latency.p99[-1]:.1f} ms")
+        )
+    return f'<div class="tiles">{"".join(tiles)}</div>'
+
+
+def _figure(value: float) -> str:
+    """Three significant digits, and a dash for what is not known."""
+    if not math.isfinite(value):
+        return "–"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}" if abs(value) >= 0.01 else f"{value:.4f}"
+
+
+def _span(result: Evaluation) -> tuple[float, float]:
+    """First and last instant (s) of the run, never equal."""
+    stamps = result.table.stamps
+    low, high = (float(stamps[0]), float(stamps[-1])) if len(stamps) else (0.0, 1.0)
+    return low, high if high > low else low + 1.0
+
+
+def _section(title: str, explanation: str, body: str) -> str:
+    return f"<section><h2>{escape(title)}</h2><p>{escape(explanation)}</p>{body}</section>"
+
+
+def _table(head: list[str], rows: list[list[str]], last_total: bool = False) -> str:
+    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
+    lines = []
+    for i, row in enumerate(rows):
+        style = ' class="total"' if last_total and i == len(rows) - 1 else ""
+        lines.append(f"<tr{style}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
+    return f"<table><thead><tr>{top}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+
+
+def _states(result: Evaluation) -> str:
+    table = result.table
+    if not len(table):
+        return _section("States", "No frame set was given.", "")
+    last = table.stamps[-1] + (np.median(np.diff(table.stamps)) if len(table) > 1 else 1.0)
+    edges = np.append(table.stamps, last)
+    names = [state.value for state in table.states]
+    titles = [
+        f"{s:.2f} s: {name}. {reason}" for s, name, reason in zip(table.stamps, names, table.reasons, strict=True)
+    ]
+    strip = ribbon(edges, names, titles, _span(result), WIDTH)
+    legend = "".join(
+        f'<span><svg viewBox="0 0 18 10"><rect class="{name}" width="18" height="10" rx="2"/></svg>{name} {percent(share)}</span>'
+        for name, share in result.shares.items()
+        if share > 0
+    )
+    since = (
+        "" if not math.isfinite(result.since) else f" Shares count from {result.since:.2f} s, the instant of the roi."
+    )
+    text = "TRACKING and DEGRADED are measured, COASTING is predicted, LOST is of no use." + since
+    return _section("States", text, f'{strip}<div class="legend">{legend}</div>{_events(result)}')
+
+
+def _events(result: Evaluation) -> str:
+    """The state changes as a table, with the reason the tracker gave."""
+    table = result.table
+    changes = [i for i in range(len(table)) if i == 0 or table.states[i] is not table.states[i - 1]]
+    rows = "".join(
+        f"<tr><td>{table.stamps[i]:.2f} s</td><td class=words>{table.states[i].value}</td>"
+        f"<td class=words>{escape(table.reasons[i])}</td></tr>"
+        for i in changes[:MOST_EVENTS]
+    )
+    more = len(changes) - MOST_EVENTS
+    rest = f"<p>and {more} more, all in poses.csv</p>" if more > 0 else ""
+    return f"<details><summary>{len(changes)} states in a row, and why</summary><table>{rows}</table>{rest}</details>"
+
+
+def _drawn(result: Evaluation) -> Array:
+    """(N,) 1 where a pose is worth drawing, NaN where it is not: before there is a map, and when lost."""
+    hidden = result.table.is_state(TrackState.INITIALISING) | result.table.is_state(TrackState.LOST)
+    return np.where(hidden, np.nan, 1.0)
+
+
+def _components(poses: Array, origin: Array) -> Array:
+    """(N, 6): x y z in base, mm, and the rotation vector against `origin` (4, 4), degrees."""
+    turns = se3.log_rotation(origin[:3, :3].T @ poses[:, :3, :3])
+    return np.concatenate([poses[:, :3, 3], np.degrees(turns)], axis=-1)
+
+
+def _deviations(poses: Array, covariance: Array) -> Array:
+    """(N, 6): one standard deviation of what `_components` shows; rotations to first order."""
+    rotations = poses[:, :3, :3]
+    position = rotations @ covariance[:, 3:, 3:] @ np.swapaxes(rotations, -1, -2)
+    variances = np.concatenate(
+        [np.diagonal(position, axis1=1, axis2=2), np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2)], -1
+    )
+    deviations = np.sqrt(np.maximum(variances, 0))
+    deviations[:, 3:] = np.degrees(deviations[:, 3:])
+    return np.asarray(deviations)
+
+
+def _trajectory(result: Evaluation) -> str:
+    table = result.table
+    drawn = _drawn(result)
+    if not np.isfinite(drawn).any():
+        return ""
+    origin = table.base_from_surface[int(np.flatnonzero(np.isfinite(drawn))[0])]
+    values = _components(table.base_from_surface, origin) * drawn[:, None]
+    sigma = 2 * _deviations(table.base_from_surface, table.covariance) * drawn[:, None]
+    truth = None
+    if result.comparison is not None:
+        target = result.comparison.expected @ result.comparison.start.truth_surface_from_estimated_surface
+        truth = (table.stamps[result.comparison.rows], _components(target, origin))
+    names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
+    plots = []
+    for i, name in enumerate(names):
+        seen = [values[:, i]] if truth is None else [values[:, i], truth[1][:, i]]
+        plot = Plot(HALF, 150, _span(result), spanning(seen, 0.12, 0.5), label=name)
+        plot.band(table.stamps, values[:, i] - sigma[:, i], values[:, i] + sigma[:, i], "spread")
+        if truth is not None:
+            plot.line(*(truth[0], truth[1][:, i]), "truth")
+        plot.line(table.stamps, values[:, i], "estimate")
+        plots.append(plot.svg())
+    pairs = [plots[i] for i in (0, 3, 1, 4, 2, 5)]
+    legend = _line_key("estimate", "estimate, with two standard deviations")
+    if result.comparison is not None:
+        legend += _line_key("truth", "truth" if result.comparison.exact else "reference")
+    body = f'<div class="legend">{legend}</div><div class="two">{"".join(pairs)}</div>'
+    text = "Position of the surface's origin in base, and its rotation since the first pose. Time in s."
+    return _section("Trajectory", text, body)
+
+
+def _line_key(style: str, words: str) -> str:
+    return f'<span><svg viewBox="0 0 18 10"><path class="{style}" d="M0 5H18"/></svg>{escape(words)}</span>'
+
+
+def _errors(result: Evaluation) -> str:
+    comparison = result.comparison
+    if comparison is None:
+        return _section(
+            "Errors", "The session has neither truth.tum nor reference.tum, or no measured pose beside it.", ""
+        )
+    stamps = result.table.stamps[comparison.rows]
+    plots = [
+        _error_plot(result, stamps, comparison.start.translation, "distance, mm", comparison),
+        _error_plot(result, stamps, np.degrees(comparison.start.rotation), "angle, °", None),
+    ]
+    text = (
+        f"Against the {'exact truth' if comparison.exact else 'measured reference, whose own error is part of this'}, at "
+        f"{len(comparison.rows)} measured poses. From the start: the constant transform between the two surface frames is "
+        "taken at the first measured pose, nothing is fitted. Aligned: the best constant transform over the run."
+    )
+    return _section("Errors", text, "".join(plots) + _error_table(comparison) + _consistency(comparison))
+
+
+def _error_plot(result: Evaluation, stamps: Array, errors: Array, label: str, comparison: Comparison | None) -> str:
+    positive = errors[errors > 1e-9]
+    high = max(float(positive.max()) * 1.5, 1e-2) if len(positive) else 1.0
+    low = max(float(np.percentile(positive, 2)) / 2, high / 1e5) if len(positive) else 0.1
+    plot = Plot(WIDTH, 150, _span(result), (min(low, high / 10), high), log_y=True, label=label)
+    plot.level(float(np.median(errors)), "median", "median")
+    plot.line(stamps, errors, "estimate")
+    if comparison is not None:
+        plot.level(OFF_MM, f"{OFF_MM:.0f} mm", "limit")
+        off = np.isin(comparison.rows, comparison.off)
+        plot.dots(stamps[off], errors[off], "off", 3)
+    return plot.svg()
+
+
+def _error_table(comparison: Comparison) -> str:
+    rows = []
+    for name, errors in (("from the start", comparison.start), ("aligned", comparison.aligned)):
+        for unit, values in (("mm", errors.translation), ("°", np.degrees(errors.rotation))):
+            s = spread(values)
+            rows.append([f"{name}, {unit}", *(_figure(v) for v in (s.median, s.rmse, s.p95, s.max))])
+    return _table(["", "median", "RMSE", "95 %", "max"], rows)
+
+
+def _consistency(comparison: Comparison) -> str:
+    start, aligned = comparison.start, comparison.aligned
+    text = (
+        f"NEES / 6: {_figure(start.mean_nees / 6)} from the start, {_figure(aligned.mean_nees / 6)} aligned; "
+        f"{_percent_or_dash(aligned.nees_inside)} of the aligned poses are under {NEES_BOUND:.1f}, where 95 % should be. "
+    )
+    if not comparison.exact:
+        text += "It says little here: it holds the reference's own error against the tracker's covariance."
+    return f'<p style="color:var(--soft);font-size:13.5px;margin:10px 0 0">{escape(text)}</p>'
+
+
+def _percent_or_dash(share: float) -> str:
+    return percent(share) if math.isfinite(share) else "–"
+
+
+def _tracks(result: Evaluation) -> str:
+    table = result.table
+    if not len(table):
+        return ""
+    plot = Plot(WIDTH, 170, _span(result), (0.0, max(float(table.used.max(initial=0)) * 1.08, 1.0)))
+    legend = ""
+    for i, name in enumerate(table.cameras):
+        plot.line(table.stamps, table.used[:, i].astype(float), f"series c{i % 5}")
+        legend += _line_key(f"series c{i % 5}", f"{name}, median {np.median(table.used[:, i]):.0f}")
+    text = "Tracks that carry the pose, per camera."
+    return _section("Tracks", text, f'<div class="legend">{legend}</div>{plot.svg()}')
+
+
+def _latency(result: Evaluation) -> str:
+    late = result.latency
+    text = (
+        f"From the decoded frames to the pose, without decoding and without the map refinement between two poses. The first "
+        f"{late.initial_sets} frame sets, up to the first map, took {late.initialisation:.0f} ms and are not counted."
+    )
+    if not len(late.total):
+        return _section("Latency", text, "")
+    rows = [
+        [name, *(f"{v:.2f}" for v in values)]
+        for name, *values in zip(late.stages, late.p50, late.p95, late.p99, late.max, strict=True)
+    ]
+    figures = _table(["stage, ms", "median", "95 %", "99 %", "max"], rows, last_total=True)
+    high = max(float(np.percentile(late.total, 99.5)) * 1.25, 1.0)
+    counts, edges = np.histogram(np.minimum(late.total, high * (1 - 1e-9)), bins=40, range=(0, high))
+    plot = Plot(HALF, 210, (0, high), (0, max(float(counts.max()) * 1.1, 1.0)), label="frame sets by total, ms")
+    plot.bars(edges, counts.astype(float), "bar")
+    plot.mark(float(late.p50[-1]), "median", "median")
+    plot.mark(float(late.p99[-1]), "99 %", "median")
+    return _section("Latency", text, f'<div class="two"><div>{figures}</div><div>{plot.svg()}</div></div>')
+
+
+def main(arguments: list[str]) -> int:
+    """`python -m hardware.report OUT`: say again what the run in the folder OUT came to."""
+    path = Path(arguments[0]) / "summary.json"
+    try:
+        print(text_of(json.loads(path.read_text(encoding="utf-8"))))
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(path, "file", str(error), "the summary.json of stillbed track") from None
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except StillbedError as error:
+        sys.exit(f"stillbed: {error}")
