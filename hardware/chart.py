@@ -34,10 +34,12 @@ class Scale:
         return np.asarray(self.start + (v - low) / (high - low) * (self.end - self.start))
 
     def ticks(self, count: int = 5) -> list[float]:
-        """About `count` round values inside; on a logarithmic scale the powers of ten."""
+        """About `count` round values inside; on a logarithmic scale the powers of ten, or 1, 2 and 5 of each."""
         if self.logarithmic:
             first, last = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
-            return [10.0**power for power in range(first, last + 1)]
+            powers = [10.0**power for power in range(first, last + 1)]
+            finer = [k * 10.0**power for power in range(first - 1, last + 1) for k in (1, 2, 5)]
+            return powers if len(powers) > 2 else [v for v in finer if self.low <= v <= self.high]
         step = round_step((self.high - self.low) / count)
         first = math.ceil(self.low / step - 1e-9)
         last = math.floor(self.high / step + 1e-9)
@@ -65,7 +67,7 @@ def spanning(values: Sequence[Array], margin: float = 0.06, least: float = 1e-3)
 
 
 def thinned(y: Array, most: int = MOST_POINTS) -> NDArray[np.int64]:
-    """Rows (M,) of y (N,) that keep the look of a line: all, or the lowest and highest of each of most / 2 stretches."""
+    """Rows (M,) of y (N,) that keep the look of a line: all, or the extremes of each of most / 2 stretches."""
     if len(y) <= most:
         return np.arange(len(y))
     kept: list[int] = []
@@ -90,7 +92,7 @@ def number(value: float) -> str:
 class Plot:
     """One chart of `width` x `height` px; things are drawn in the order of the calls."""
 
-    left, right, top, bottom = 56, 14, 12, 26
+    left, right, top, bottom = 56, 14, 28, 26
 
     def __init__(
         self,
@@ -112,18 +114,14 @@ class Plot:
 
     def _grid(self, x_ticks: bool) -> None:
         right = self.width - self.right
-        for value in self.y.ticks(max(2, int((self._floor - self.top) / 32))):
+        for value in self.y.ticks(max(2, int((self._floor - self.top) / 22))):
             at = self.y(np.array([value]))[0]
             self._parts.append(f'<path class="grid" d="M{self.left} {at:.1f}H{right}"/>')
-            self._parts.append(
-                f'<text class="tick" x="{self.left - 8}" y="{at + 3.5:.1f}" text-anchor="end">{number(value)}</text>'
-            )
+            self._text(self.left - 8, at + 3.5, number(value), "end")
         for value in self.x.ticks(9) if x_ticks else ():
             at = self.x(np.array([value]))[0]
             self._parts.append(f'<path class="grid" d="M{at:.1f} {self._floor}v4"/>')
-            self._parts.append(
-                f'<text class="tick" x="{at:.1f}" y="{self._floor + 17}" text-anchor="middle">{number(value)}</text>'
-            )
+            self._text(at, self._floor + 17, number(value), "middle")
 
     def line(self, x: Array, y: Array, style: str) -> None:
         """A line through (N,) points, broken where y is not finite; a lone point becomes a dot. style: a CSS class."""
@@ -147,10 +145,8 @@ class Plot:
         """A dot at each finite of (N,) points."""
         keep = np.flatnonzero(np.isfinite(y))
         keep = keep[thinned(y[keep])]
-        spots = zip(self.x(x[keep]), self.y(y[keep]), strict=True)
-        self._parts.append(
-            "".join(f'<circle class="{style}" cx="{a:.1f}" cy="{b:.1f}" r="{radius}"/>' for a, b in spots)
-        )
+        for a, b in zip(self.x(x[keep]), self.y(y[keep]), strict=True):
+            self._parts.append(f'<circle class="{style}" cx="{a:.1f}" cy="{b:.1f}" r="{radius}"/>')
 
     def bars(self, edges: Array, heights: Array, style: str) -> None:
         """Histogram bars of `heights` (B,) between `edges` (B + 1,)."""
@@ -158,18 +154,14 @@ class Plot:
         for a, b, h in zip(self.x(edges[:-1]), self.x(edges[1:]), heights, strict=True):
             if h > 0:
                 top = min(float(self.y(np.array([h]))[0]), floor - 1.5)  # one frame set must still be seen
-                width = max(b - a - 1, 1)
-                self._parts.append(
-                    f'<rect class="{style}" x="{a + 0.5:.1f}" y="{top:.1f}" width="{width:.1f}" height="{floor - top:.1f}" rx="1"/>'
-                )
+                place = f'x="{a + 0.5:.1f}" y="{top:.1f}" width="{max(b - a - 1, 1):.1f}" height="{floor - top:.1f}"'
+                self._parts.append(f'<rect class="{style}" {place} rx="1"/>')
 
     def mark(self, x: float, text: str, style: str) -> None:
         """A vertical line at x with a word beside it."""
         at = float(self.x(np.array([x]))[0])
-        end = ' text-anchor="end"' if at > self.width - 110 else ""
-        shift = -5 if end else 5
         self._parts.append(f'<path class="{style}" d="M{at:.1f} {self.top}V{self._floor}"/>')
-        self._parts.append(f'<text class="tick" x="{at + shift:.1f}" y="{self.top + 9}"{end}>{escape(text)}</text>')
+        self._text(at, self.top - 5, text, "middle")
 
     def level(self, y: float, text: str, style: str) -> None:
         """A horizontal line at y with a word at its right end, if y is inside."""
@@ -177,21 +169,18 @@ class Plot:
             at = float(self.y(np.array([y]))[0])
             right = self.width - self.right
             self._parts.append(f'<path class="{style}" d="M{self.left} {at:.1f}H{right}"/>')
-            self._parts.append(
-                f'<text class="tick" x="{right}" y="{at - 4:.1f}" text-anchor="end">{escape(text)}</text>'
-            )
+            self._text(right, at - 4, text, "end")
 
     def svg(self) -> str:
         """The chart as one SVG element."""
-        name = (
-            f'<text class="label" x="{self.left + 6}" y="{self.top + 9}">{escape(self.label)}</text>'
-            if self.label
-            else ""
-        )
-        return (
-            f'<svg class="plot" viewBox="0 0 {self.width} {self.height}" role="img" aria-label="{escape(self.label)}">'
-            f"{''.join(self._parts)}{name}</svg>"
-        )
+        label = escape(self.label)
+        name = f'<text class="label" x="{self.left}" y="{self.top - 12}">{label}</text>'
+        box = f'viewBox="0 0 {self.width} {self.height}"'
+        return f'<svg class="plot" {box} role="img" aria-label="{label}">{"".join(self._parts)}{name}</svg>'
+
+    def _text(self, x: float, y: float, text: str, anchor: str) -> None:
+        at = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"'
+        self._parts.append(f'<text class="tick" {at}>{escape(text)}</text>')
 
     def _points(self, x: Array, y: Array) -> list[str]:
         return [f"{a:.1f} {b:.1f}" for a, b in zip(self.x(x), self.y(y), strict=True)]

@@ -57,9 +57,8 @@ def _tiles(result: Evaluation) -> str:
         tiles.append(_tile(_figure(math.degrees(spread(start.rotation).median)), "°", "median error from the start"))
         tiles.append(_tile(_figure(spread(aligned.translation).rmse), "mm", "RMSE, aligned"))
     if len(result.latency.total):
-        tiles.append(
-            _tile(f"{result.latency.p50[-1]:.1f}", "ms", f"per pose; 99 % under {result.latency.p99[-1]:.1f} ms")
-        )
+        late = result.latency
+        tiles.append(_tile(f"{late.p50[-1]:.1f}", "ms", f"per pose; 99 % under {late.p99[-1]:.1f} ms"))
     return f'<div class="tiles">{"".join(tiles)}</div>'
 
 
@@ -67,7 +66,7 @@ def _figure(value: float) -> str:
     """Three significant digits, and a dash for what is not known."""
     if not math.isfinite(value):
         return "–"
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}" if abs(value) >= 0.01 else f"{value:.4f}"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}" if abs(value) >= 0.01 else f"{value:.4f}"
 
 
 def _span(result: Evaluation) -> tuple[float, float]:
@@ -97,19 +96,17 @@ def _states(result: Evaluation) -> str:
     last = table.stamps[-1] + (np.median(np.diff(table.stamps)) if len(table) > 1 else 1.0)
     edges = np.append(table.stamps, last)
     names = [state.value for state in table.states]
-    titles = [
-        f"{s:.2f} s: {name}. {reason}" for s, name, reason in zip(table.stamps, names, table.reasons, strict=True)
-    ]
+    titles = [f"{s:.2f} s: {n}. {why}" for s, n, why in zip(table.stamps, names, table.reasons, strict=True)]
     strip = ribbon(edges, names, titles, _span(result), WIDTH)
     legend = "".join(
-        f'<span><svg viewBox="0 0 18 10"><rect class="{name}" width="18" height="10" rx="2"/></svg>{name} {percent(share)}</span>'
+        f'<span><svg viewBox="0 0 18 10"><rect class="{name}" width="18" height="10" rx="2"/></svg>'
+        f"{name} {percent(share)}</span>"
         for name, share in result.shares.items()
         if share > 0
     )
-    since = (
-        "" if not math.isfinite(result.since) else f" Shares count from {result.since:.2f} s, the instant of the roi."
-    )
-    text = "TRACKING and DEGRADED are measured, COASTING is predicted, LOST is of no use." + since
+    text = "TRACKING and DEGRADED are measured, COASTING is predicted, LOST is of no use."
+    if math.isfinite(result.since):
+        text += f" Shares count from {result.since:.2f} s, the instant of the roi."
     return _section("States", text, f'{strip}<div class="legend">{legend}</div>{_events(result)}')
 
 
@@ -143,12 +140,9 @@ def _deviations(poses: Array, covariance: Array) -> Array:
     """(N, 6): one standard deviation of what `_components` shows; rotations to first order."""
     rotations = poses[:, :3, :3]
     position = rotations @ covariance[:, 3:, 3:] @ np.swapaxes(rotations, -1, -2)
-    variances = np.concatenate(
-        [np.diagonal(position, axis1=1, axis2=2), np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2)], -1
-    )
-    deviations = np.sqrt(np.maximum(variances, 0))
-    deviations[:, 3:] = np.degrees(deviations[:, 3:])
-    return np.asarray(deviations)
+    both = np.stack([position, covariance[:, :3, :3]], axis=1)  # (N, 2, 3, 3)
+    deviations = np.sqrt(np.maximum(np.diagonal(both, axis1=2, axis2=3), 0)).reshape(-1, 6)
+    return np.asarray(deviations * np.repeat([1, 180 / np.pi], 3))
 
 
 def _trajectory(result: Evaluation) -> str:
@@ -162,15 +156,16 @@ def _trajectory(result: Evaluation) -> str:
     truth = None
     if result.comparison is not None:
         target = result.comparison.expected @ result.comparison.start.truth_surface_from_estimated_surface
-        truth = (table.stamps[result.comparison.rows], _components(target, origin))
+        truth = np.full((len(table), 6), np.nan)
+        truth[result.comparison.rows] = _components(target, origin)
     names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
     plots = []
     for i, name in enumerate(names):
-        seen = [values[:, i]] if truth is None else [values[:, i], truth[1][:, i]]
-        plot = Plot(HALF, 150, _span(result), spanning(seen, 0.12, 0.5), label=name)
+        seen = [values[:, i]] if truth is None else [values[:, i], truth[:, i]]
+        plot = Plot(HALF, 165, _span(result), spanning(seen, 0.12, 0.5), label=name)
         plot.band(table.stamps, values[:, i] - sigma[:, i], values[:, i] + sigma[:, i], "spread")
         if truth is not None:
-            plot.line(*(truth[0], truth[1][:, i]), "truth")
+            plot.line(table.stamps, truth[:, i], "truth")
         plot.line(table.stamps, values[:, i], "estimate")
         plots.append(plot.svg())
     pairs = [plots[i] for i in (0, 3, 1, 4, 2, 5)]
@@ -192,30 +187,31 @@ def _errors(result: Evaluation) -> str:
         return _section(
             "Errors", "The session has neither truth.tum nor reference.tum, or no measured pose beside it.", ""
         )
-    stamps = result.table.stamps[comparison.rows]
     plots = [
-        _error_plot(result, stamps, comparison.start.translation, "distance, mm", comparison),
-        _error_plot(result, stamps, np.degrees(comparison.start.rotation), "angle, °", None),
+        _error_plot(result, comparison, comparison.start.translation, "distance from the start on, mm", OFF_MM),
+        _error_plot(result, comparison, np.degrees(comparison.start.rotation), "angle from the start on, °"),
     ]
     text = (
-        f"Against the {'exact truth' if comparison.exact else 'measured reference, whose own error is part of this'}, at "
-        f"{len(comparison.rows)} measured poses. From the start: the constant transform between the two surface frames is "
-        "taken at the first measured pose, nothing is fitted. Aligned: the best constant transform over the run."
+        f"Against the {'exact truth' if comparison.exact else 'measured reference, whose own error is part of this'}, "
+        f"at {len(comparison.rows)} measured poses. From the start: the constant transform between the two surface "
+        "frames is taken at the first measured pose, nothing is fitted. Aligned: the best constant over the run."
     )
     return _section("Errors", text, "".join(plots) + _error_table(comparison) + _consistency(comparison))
 
 
-def _error_plot(result: Evaluation, stamps: Array, errors: Array, label: str, comparison: Comparison | None) -> str:
+def _error_plot(result: Evaluation, comparison: Comparison, errors: Array, label: str, limit: float = np.inf) -> str:
+    """Errors (M,) over time on a logarithmic scale; those of poses that are off get a dot, `limit` a line."""
     positive = errors[errors > 1e-9]
     high = max(float(positive.max()) * 1.5, 1e-2) if len(positive) else 1.0
     low = max(float(np.percentile(positive, 2)) / 2, high / 1e5) if len(positive) else 0.1
-    plot = Plot(WIDTH, 150, _span(result), (min(low, high / 10), high), log_y=True, label=label)
+    plot = Plot(WIDTH, 170, _span(result), (min(low, high / 10), high), log_y=True, label=label)
+    stamps, over_time = result.table.stamps, np.full(len(result.table), np.nan)
+    over_time[comparison.rows] = errors
+    plot.line(stamps, over_time, "estimate")
     plot.level(float(np.median(errors)), "median", "median")
-    plot.line(stamps, errors, "estimate")
-    if comparison is not None:
-        plot.level(OFF_MM, f"{OFF_MM:.0f} mm", "limit")
-        off = np.isin(comparison.rows, comparison.off)
-        plot.dots(stamps[off], errors[off], "off", 3)
+    if math.isfinite(limit):
+        plot.level(limit, f"{limit:.0f} mm", "limit")
+        plot.dots(stamps[comparison.off], over_time[comparison.off], "off", 3)
     return plot.svg()
 
 
@@ -231,12 +227,14 @@ def _error_table(comparison: Comparison) -> str:
 def _consistency(comparison: Comparison) -> str:
     start, aligned = comparison.start, comparison.aligned
     text = (
-        f"NEES / 6: {_figure(start.mean_nees / 6)} from the start, {_figure(aligned.mean_nees / 6)} aligned; "
-        f"{_percent_or_dash(aligned.nees_inside)} of the aligned poses are under {NEES_BOUND:.1f}, where 95 % should be. "
+        f"NEES / 6: {_figure(start.mean_nees / 6)} from the start, which counts the first pose's own error in all poses, "
+        f"and {_figure(aligned.mean_nees / 6)} aligned. "
+        f"{_percent_or_dash(aligned.nees_inside)} of the aligned poses have a NEES under {NEES_BOUND:.1f}, "
+        "where 95 % should be. "
     )
     if not comparison.exact:
         text += "It says little here: it holds the reference's own error against the tracker's covariance."
-    return f'<p style="color:var(--soft);font-size:13.5px;margin:10px 0 0">{escape(text)}</p>'
+    return f'<p class="note">{escape(text)}</p>'
 
 
 def _percent_or_dash(share: float) -> str:
@@ -259,7 +257,7 @@ def _tracks(result: Evaluation) -> str:
 def _latency(result: Evaluation) -> str:
     late = result.latency
     text = (
-        f"From the decoded frames to the pose, without decoding and without the map refinement between two poses. The first "
+        "From the decoded frames to the pose, without the map refinement that no pose waits for. The first "
         f"{late.initial_sets} frame sets, up to the first map, took {late.initialisation:.0f} ms and are not counted."
     )
     if not len(late.total):
@@ -271,7 +269,7 @@ def _latency(result: Evaluation) -> str:
     figures = _table(["stage, ms", "median", "95 %", "99 %", "max"], rows, last_total=True)
     high = max(float(np.percentile(late.total, 99.5)) * 1.25, 1.0)
     counts, edges = np.histogram(np.minimum(late.total, high * (1 - 1e-9)), bins=40, range=(0, high))
-    plot = Plot(HALF, 210, (0, high), (0, max(float(counts.max()) * 1.1, 1.0)), label="frame sets by total, ms")
+    plot = Plot(HALF, 210, (0, high), (0, max(float(counts.max()) * 1.1, 1.0)), label="total, ms")
     plot.bars(edges, counts.astype(float), "bar")
     plot.mark(float(late.p50[-1]), "median", "median")
     plot.mark(float(late.p99[-1]), "99 %", "median")

@@ -38,13 +38,8 @@ def _judgement(comparison: Comparison) -> list[str]:
     turn = math.degrees(spread(comparison.start.rotation).median)
     against = "exact truth" if comparison.exact else "measured reference"
     sentences = [f"Against the {against} it was off by {error.median:.2f} mm and {turn:.2f}° (median)."]
-    if len(comparison.off):
-        sentences.append(
-            f"{len(comparison.off)} poses were off by more than {OFF_MM:.0f} mm while the state said TRACKING."
-        )
-    else:
-        sentences.append(f"No pose was off by more than {OFF_MM:.0f} mm while the state said TRACKING.")
-    return sentences
+    many = {0: "No pose was", 1: "One pose was"}.get(len(comparison.off), f"{len(comparison.off)} poses were")
+    return [*sentences, f"{many} off by more than {OFF_MM:.0f} mm while the state said TRACKING."]
 
 
 def percent(share: float) -> str:

@@ -81,9 +81,7 @@ def prepare_out(out: Path, force: bool) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(out, "--out", "a file", "a folder, new or empty")
     if out.is_dir() and any(out.iterdir()) and not force:
-        raise InputError(
-            out, "--out", f"a folder with {len(list(out.iterdir()))} entries", "a new or empty one, or --force"
-        )
+        raise InputError(out, "--out", "a folder that is not empty", "a new or empty one, or --force")
     out.mkdir(parents=True, exist_ok=True)
 
 

@@ -1,0 +1,58 @@
+"""Made-up tracking runs with a known truth: what pose files, evaluation and report are tested on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimation import se3
+from estimation.pose import TrackState
+from estimation.se3 import Array
+from estimation.trajectory import Trajectory
+from hardware.pose_file import PoseTable
+
+STAGES = ("prepare", "flow", "total")
+
+
+def breathing(stamps: Array) -> Array:
+    """base_from_surface (N, 4, 4): 10 mm and 3 degrees of breathing, 400 mm in front of base."""
+    phase = 2 * np.pi * 0.25 * stamps
+    xi = np.stack(
+        [0.05 * np.sin(phase), 0.02 * np.cos(phase), 0 * phase, 0.3 * stamps, 0 * phase, 5 * np.sin(phase)], -1
+    )
+    return se3.make(se3.exp_rotation([0.4, -0.2, 1.0]), [30.0, -20.0, 400.0]) @ se3.exp(xi)
+
+
+def run(
+    count: int = 60,
+    sigma: Array | None = None,
+    surface_change: Array | None = None,
+    states: dict[int, TrackState] | None = None,
+    seed: int = 5,
+) -> tuple[PoseTable, Trajectory]:
+    """A run of `count` frame sets at 30 Hz and its exact truth.
+
+    sigma: (6,) standard deviations of the right perturbation that is added and claimed, zeros by default.
+    surface_change: (4, 4) truth_surface_from_estimated_surface. states: by row; the first is INITIALISING otherwise.
+    """
+    draw = np.random.default_rng(seed)
+    stamps = np.arange(count) / 30
+    truth = breathing(stamps)
+    sigma = np.zeros(6) if sigma is None else sigma
+    change = np.eye(4) if surface_change is None else surface_change
+    estimate = truth @ change @ se3.exp(draw.normal(size=(count, 6)) * sigma)
+    named = {0: TrackState.INITIALISING, **(states or {})}
+    seconds = draw.gamma(4.0, 0.001, size=(count, 2))
+    table = PoseTable(
+        stamps=stamps,
+        frames=np.full(count, 3),
+        base_from_surface=estimate,
+        covariance=np.broadcast_to(np.diag(np.maximum(sigma, 1e-9) ** 2), (count, 6, 6)).copy(),
+        twist=draw.normal(size=(count, 6)),
+        states=tuple(named.get(i, TrackState.TRACKING) for i in range(count)),
+        used=draw.integers(30, 60, size=(count, 3)),
+        seconds=np.concatenate([seconds, seconds.sum(axis=1, keepdims=True)], axis=1),
+        reasons=tuple(f'row {i}, <so> & "so"' for i in range(count)),
+        cameras=("left", "top", "right"),
+        stages=STAGES,
+    )
+    return table, Trajectory(stamps, truth, True)

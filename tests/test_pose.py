@@ -1,0 +1,109 @@
+"""SurfacePose: the laws of prediction, and the error it claims at a point."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from estimation import se3
+from estimation.pose import SurfacePose, TrackState
+
+
+def pose(seed: int) -> SurfacePose:
+    draw = np.random.default_rng(seed)
+    a, b = draw.normal(size=(2, 6, 6)) * np.array([0.01, 0.01, 0.01, 0.1, 0.1, 0.1])[:, None]
+    return SurfacePose(
+        stamp=draw.uniform(0, 100),
+        base_from_surface=se3.exp(draw.normal(size=6) * [1, 1, 1, 300, 300, 300]),
+        covariance=a @ a.T,
+        twist=draw.normal(size=6) * [0.2, 0.2, 0.2, 20, 20, 20],
+        state=TrackState.TRACKING,
+        twist_covariance=b @ b.T,
+        acceleration_psd=draw.uniform(0.1, 2, 6),
+        reason="because",
+    )
+
+
+seeds = st.integers(0, 10_000)
+
+
+@given(seeds)
+def test_predicting_to_its_own_stamp_changes_nothing(seed: int) -> None:
+    p = pose(seed)
+    same = p.predict(p.stamp)
+    assert np.array_equal(same.base_from_surface, p.base_from_surface)
+    assert np.allclose(same.covariance, p.covariance, atol=1e-15)
+    assert np.array_equal(same.twist_covariance, p.twist_covariance)
+    assert (same.stamp, same.state, same.reason) == (p.stamp, p.state, p.reason)
+
+
+@given(seeds, st.floats(0, 0.5), st.floats(0, 0.5))
+def test_two_steps_end_where_one_does(seed: int, first: float, second: float) -> None:
+    p = pose(seed)
+    twice = p.predict(p.stamp + first).predict(p.stamp + first + second)
+    once = p.predict(p.stamp + first + second)
+    assert np.abs(twice.base_from_surface - once.base_from_surface).max() < 1e-8
+    assert np.array_equal(twice.twist, once.twist)
+    assert np.allclose(twice.twist_covariance, once.twist_covariance)
+
+
+@given(seeds, st.floats(-0.5, 0.5))
+def test_there_and_back_is_the_same_place(seed: int, dt: float) -> None:
+    p = pose(seed)
+    back = p.predict(p.stamp + dt).predict(p.stamp)
+    assert np.abs(back.base_from_surface - p.base_from_surface).max() < 1e-8
+
+
+@given(seeds, st.floats(-1, 1))
+def test_covariance_stays_symmetric_and_positive(seed: int, dt: float) -> None:
+    later = pose(seed).predict(pose(seed).stamp + dt)
+    assert np.array_equal(later.covariance, later.covariance.T)
+    assert np.linalg.eigvalsh(later.covariance).min() > -1e-12
+    assert np.linalg.eigvalsh(later.twist_covariance).min() > -1e-12
+
+
+@given(seeds, st.floats(0.001, 1))
+def test_a_resting_surface_is_known_less_the_longer_it_is_not_seen(seed: int, dt: float) -> None:
+    p = pose(seed)
+    resting = SurfacePose(
+        p.stamp, p.base_from_surface, p.covariance, np.zeros(6), p.state, p.twist_covariance, p.acceleration_psd
+    )
+    for sign in (1, -1):
+        later, much_later = resting.predict(p.stamp + sign * dt), resting.predict(p.stamp + 2 * sign * dt)
+        assert np.linalg.eigvalsh(later.covariance - p.covariance).min() > 0
+        assert np.linalg.eigvalsh(much_later.covariance - later.covariance).min() > 0
+        assert np.array_equal(later.base_from_surface, p.base_from_surface)
+
+
+@given(seeds, st.floats(0.01, 1))
+def test_motion_carries_the_volume_of_the_covariance_and_only_noise_adds(seed: int, dt: float) -> None:
+    p = pose(seed)
+    noiseless = SurfacePose(p.stamp, p.base_from_surface, p.covariance, p.twist, p.state)
+    later = noiseless.predict(p.stamp + dt)
+    assert np.isclose(np.linalg.slogdet(later.covariance)[1], np.linalg.slogdet(p.covariance)[1], atol=1e-4)
+    assert np.linalg.slogdet(p.predict(p.stamp + dt).covariance)[1] > np.linalg.slogdet(p.covariance)[1]
+
+
+def test_the_predicted_covariance_is_that_of_predicted_samples() -> None:
+    p, draw, dt = pose(4), np.random.default_rng(4), 0.3
+    noiseless = SurfacePose(p.stamp, p.base_from_surface, p.covariance, p.twist, p.state)
+    later = noiseless.predict(p.stamp + dt)
+    samples = p.base_from_surface @ se3.exp(draw.multivariate_normal(np.zeros(6), p.covariance, 20_000))
+    moved = samples @ se3.exp(p.twist * dt)
+    found = np.cov(se3.log(se3.inverse(later.base_from_surface) @ moved).T)
+    scale = np.sqrt(np.outer(np.diag(later.covariance), np.diag(later.covariance)))
+    assert (np.abs(found - later.covariance) / scale).max() < 0.05
+
+
+def test_the_error_at_a_point_is_that_of_samples() -> None:
+    p, draw = pose(9), np.random.default_rng(9)
+    points = np.array([[0.0, 0, 0], [30, 0, 0], [-20, 10, 5]])
+    moves = se3.exp(draw.multivariate_normal(np.zeros(6), p.covariance / 100, 20_000))  # small: to first order
+    seen = se3.transform_points(moves, points)  # (20000, 3, 3)
+    worst = [10 * np.sqrt(np.linalg.eigvalsh(np.cov(seen[:, i].T))[-1]) for i in range(3)]
+    assert np.allclose(p.error_at(points), worst, rtol=0.05)
+
+
+def test_only_tracking_and_degraded_are_measured() -> None:
+    assert [s for s in TrackState if s.measured] == [TrackState.TRACKING, TrackState.DEGRADED]
