@@ -32,7 +32,7 @@ def read_toml(path: Path) -> Table:
 
 
 def check_keys(where: object, prefix: str, table: Table, required: Iterable[str], optional: Iterable[str] = ()) -> None:
-    """InputError for a required key that is not there, or for one that nobody reads (with the one it may have meant)."""
+    """InputError for a required key that is not there, or for one that nobody reads."""
     known = [*required, *optional]
     for key in table:
         if key not in known:
@@ -77,8 +77,7 @@ def number(where: object, key: str, value: object) -> float:
 
 def numbers(where: object, key: str, value: object, shape: tuple[int | None, ...], unit: str = "") -> Array:
     """A float64 array of finite numbers; None in `shape` stands for any length."""
-    allowed = " x ".join("N" if n is None else str(n) for n in shape) + " finite numbers" if shape else "a finite number"
-    allowed += f", {unit}" if unit else ""
+    allowed = _shape_words(shape) + (f", {unit}" if unit else "")
     try:
         array = np.array(value) if _all_numbers(value) else None
     except ValueError:
@@ -90,6 +89,12 @@ def numbers(where: object, key: str, value: object, shape: tuple[int | None, ...
     if not np.isfinite(array).all():
         raise InputError(where, key, value, allowed)
     return array.astype(np.float64)
+
+
+def _shape_words(shape: tuple[int | None, ...]) -> str:
+    if not shape:
+        return "a finite number"
+    return " x ".join("N" if n is None else str(n) for n in shape) + " finite numbers"
 
 
 def _all_numbers(value: object) -> bool:

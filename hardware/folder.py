@@ -105,16 +105,19 @@ def open_folder(folder: Path) -> Session:
 
 def truth_of(folder: Path) -> Trajectory | None:
     """The trajectory in truth.tum, else in reference.tum, else None."""
-    for name, exact in TRUTH_FILES:
-        if (folder / name).exists():
-            return read_tum(folder / name, exact)
-    return None
+    found = truth_file(folder)
+    return None if found is None else read_tum(*found)
+
+
+def truth_file(folder: Path) -> tuple[Path, bool] | None:
+    """The trajectory file that counts, and whether it is exact."""
+    return next(((folder / name, exact) for name, exact in TRUTH_FILES if (folder / name).exists()), None)
 
 
 def _files(folder: Path, camera: Camera, source: ImageSource | None) -> CameraFiles:
     if source is None:
-        where = folder / "rig.toml"
-        raise InputError(where, f"camera {camera.name!r}", "neither video nor images", "`video = ` file or `images = ` glob")
+        where, allowed = folder / "rig.toml", "`video = ` file or `images = ` glob"
+        raise InputError(where, f"camera {camera.name!r}", "neither video nor images", allowed)
     if source.kind == "video":
         return CameraFiles(camera, folder / source.pattern, ())
     try:
@@ -164,7 +167,8 @@ def _surface(folder: Path, rig_file: RigFile) -> Path | None:
     else:
         found = [p for s in SURFACE_SUFFIXES if (p := folder / f"surface{s}").exists()]
     if len(found) > 1:
-        raise InputError(folder, "surface", ", ".join(p.name for p in found), "one of them (or `surface = ` in rig.toml)")
+        names = ", ".join(p.name for p in found)
+        raise InputError(folder, "surface", names, "one of them (or `surface = ` in rig.toml)")
     if found and not found[0].stat().st_size:
         raise InputError(found[0], "file", "empty", "a scan of the surface, mm")
     return found[0] if found else None

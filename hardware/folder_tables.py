@@ -95,7 +95,8 @@ def read_roi(path: Path, rig: Rig, stamps: Sequence[Array]) -> tuple[Roi, ...]:
     seen = [(r.camera, r.stamp) for r in rois]
     for i, key in enumerate(seen):
         if key in seen[:i]:
-            raise InputError(path, f"roi[{i}]", f"{entries[i]['camera']}, frame {entries[i]['frame']}", "each frame once")
+            got = f"{entries[i]['camera']}, frame {entries[i]['frame']}"
+            raise InputError(path, f"roi[{i}]", got, "each frame once")
     return tuple(rois)
 
 
@@ -122,7 +123,8 @@ def check_polygon(where: object, key: str, polygon: Array, size: tuple[int, int]
     if abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2 < 1:
         raise InputError(where, key, polygon.tolist(), "a polygon of at least 1 px^2, not a line")
     if (polygon.max(axis=0) < 0).any() or (polygon.min(axis=0) > size).any():
-        raise InputError(where, key, polygon.tolist(), f"a polygon that reaches into the image, {size[0]} x {size[1]} px")
+        allowed = f"a polygon that reaches into the image, {size[0]} x {size[1]} px"
+        raise InputError(where, key, polygon.tolist(), allowed)
 
 
 def write_roi(path: Path, rig: Rig, rois: Sequence[Roi], frames: Sequence[int]) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg's own lines on stderr: our errors say it instead
 
-import cv2  # noqa: E402  (reads the level above when it is first used)
-import numpy as np  # noqa: E402
+import cv2
+import numpy as np
 
-from estimation.errors import InputError  # noqa: E402
-from perception.frames import Image  # noqa: E402
+from estimation.errors import InputError
+from perception.frames import Image
 
 PNG_LEVEL = 1  # 0-9: a higher level costs three times the time and saves a tenth of the bytes on photographs
 

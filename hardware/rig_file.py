@@ -17,6 +17,7 @@ from hardware import checks
 from hardware.checks import Table
 
 CAMERA_KEYS = ("name", "size", "matrix", "distortion", "base_from_camera")
+PINHOLE = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px"
 ROTATION_TOLERANCE = 1e-3  # four digits written by hand pass (and are made orthonormal); a wrong matrix does not
 EXACT_ROTATION = 1e-12  # below, the matrix is kept bit by bit, so that a rig written by us comes back the same
 NEAREST_RIG = 10.0  # mm: two lenses cannot stand closer, but a rig of up to 10 m given in metres does
@@ -112,7 +113,7 @@ def _camera(where: object, key: str, entry: Table, also: Sequence[str]) -> Camer
     size = checks.numbers(where, key + "size", entry["size"], (2,), "[width, height] in px")
     if (size < 1).any() or (size != np.round(size)).any():
         raise InputError(where, key + "size", entry["size"], "[width, height], whole px >= 1")
-    matrix = checks.numbers(where, key + "matrix", entry["matrix"], (3, 3), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px")
+    matrix = checks.numbers(where, key + "matrix", entry["matrix"], (3, 3), PINHOLE)
     _check_matrix(where, key + "matrix", matrix, float(size.max()))
     distortion = checks.numbers(where, key + "distortion", entry["distortion"], (5,), "k1 k2 p1 p2 k3")
     base_from_camera = checks.numbers(where, key + "base_from_camera", entry["base_from_camera"], (4, 4), "mm")
@@ -124,7 +125,7 @@ def _camera(where: object, key: str, entry: Table, also: Sequence[str]) -> Camer
 def _name(where: object, key: str, value: object) -> str:
     name = checks.text(where, key, value)
     if name.startswith(".") or len(name) > 64 or any(c in '/\\,"' or not c.isprintable() for c in name):
-        raise InputError(where, key, name, "up to 64 printable characters without / \\ , \" and no dot in front")
+        raise InputError(where, key, name, 'up to 64 printable characters without / \\ , " and no dot in front')
     return name
 
 
@@ -133,10 +134,11 @@ def _check_matrix(where: object, key: str, matrix: Array, longer_side: float) ->
         if focal <= 0:
             raise InputError(where, f"{key} {name}", focal, "a focal length > 0 px")
         if focal < SHORTEST_FOCAL * longer_side:
-            allowed = f">= {SHORTEST_FOCAL} of the image's longer side, {SHORTEST_FOCAL * longer_side:g} px (px, not mm)"
+            least = SHORTEST_FOCAL * longer_side
+            allowed = f">= {least:g} px, {SHORTEST_FOCAL} of the image's longer side (px, not mm)"
             raise InputError(where, f"{key} {name}", focal, allowed)
     if matrix[0, 1] or matrix[1, 0] or (matrix[2] != [0, 0, 1]).any():
-        raise InputError(where, key, matrix.tolist(), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+        raise InputError(where, key, matrix.tolist(), PINHOLE)
 
 
 def _rigid(where: object, key: str, matrix: Array) -> Array:

@@ -1,0 +1,71 @@
+"""Reading what a run recorded, one channel at a time, in the order of the file; a damaged file up to its damage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.observations import Observations
+from estimation.pose import SurfacePose
+from estimation.se3 import Array
+from hardware import messages
+from hardware.mcap_walk import ChunkOf, parse, walk
+from hardware.messages import Message
+from planning.command import Command
+
+T = TypeVar("T")
+
+
+def read_poses(path: str | Path) -> Iterator[SurfacePose]:
+    """Estimated poses."""
+    return _read(path, {"/pose": messages.pose_from_message})
+
+
+def read_observations(path: str | Path) -> Iterator[Observations]:
+    """Observations."""
+    return _read(path, {"/observations": messages.observations_from_message})
+
+
+def read_commands(path: str | Path) -> Iterator[Command]:
+    """Moves and holds as they were decided."""
+    return _read(path, {"/move": messages.move_from_message, "/hold": messages.hold_from_message})
+
+
+def read_sent(path: str | Path) -> Iterator[tuple[float, bytes]]:
+    """Stamps (s) and bytes of what went to the arm."""
+    return _read(path, {"/arm/sent": _stamped_bytes})
+
+
+def read_received(path: str | Path) -> Iterator[tuple[float, bytes]]:
+    """Stamps (s) and bytes of what came from the arm."""
+    return _read(path, {"/arm/received": _stamped_bytes})
+
+
+def read_events(path: str | Path) -> Iterator[tuple[float, int, str]]:
+    """Stamp (s), level and words of every event."""
+    return _read(path, {"/events": lambda m: (m["stamp"], m["level"], m["message"])})
+
+
+def read_truth_rows(path: str | Path) -> Array:
+    """Truth or reference as stored, rows (N, 8) of stamp x y z qx qy qz qw, s and mm, in order of stamp."""
+    return np.array(sorted(_read(path, {"/truth": messages.truth_row})), float).reshape(-1, 8)
+
+
+def _stamped_bytes(message: Message) -> tuple[float, bytes]:
+    return message["stamp"], messages.bytes_from_message(message)
+
+
+def _read(path: str | Path, decoders: dict[str, Callable[[Message], T]]) -> Iterator[T]:
+    path = Path(path)
+    for part in walk(path):
+        for stored in part.messages if isinstance(part, ChunkOf) else ():
+            if stored.topic in decoders:
+                message = parse(path, stored)
+                try:
+                    yield decoders[stored.topic](message)
+                except (KeyError, TypeError, ValueError) as error:
+                    raise InputError(path, stored.topic, repr(error), "a message of its schema") from error

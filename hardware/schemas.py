@@ -1,0 +1,197 @@
+"""The published schemas of a recording: every channel's messages, as JSON Schema.
+
+Foxglove's well-known messages where one fits (foxglove.*: field names and meanings are theirs, lengths in metres),
+our own otherwise (stillbed.*: mm, s, rad, px). The float64 `stamp` of our own messages is exact; the file's
+log times are the same instants in whole nanoseconds, moved by `Recorder`'s epoch so that none is negative.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+Schema = dict[str, Any]
+
+NUMBER: Schema = {"type": "number"}
+TEXT: Schema = {"type": "string"}
+WHOLE: Schema = {"type": "integer", "minimum": 0}
+FLAG: Schema = {"type": "boolean"}
+BASE64: Schema = {"type": "string", "contentEncoding": "base64"}
+TIME = {
+    "type": "object",
+    "title": "time",
+    "properties": {"sec": WHOLE, "nsec": {**WHOLE, "maximum": 999_999_999}},
+    "required": ["sec", "nsec"],
+}
+
+
+def _array(items: Schema, count: int | None = None, about: str = "") -> Schema:
+    length = {} if count is None else {"minItems": count, "maxItems": count}
+    return {"type": "array", "items": items, **length, **({"description": about} if about else {})}
+
+
+def _matrix(rows: int, columns: int, about: str) -> Schema:
+    return _array(_array({"type": ["number", "null"]}, columns), rows, about)
+
+
+def _object(title: str, about: str, **properties: Schema) -> Schema:
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": title,
+        "description": about,
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+    }
+
+
+def _about(schema: Schema, words: str) -> Schema:
+    return {**schema, "description": words}
+
+
+STAMP = _about(NUMBER, "s, exact")
+XYZ = {"type": "object", "properties": {"x": NUMBER, "y": NUMBER, "z": NUMBER}, "required": ["x", "y", "z"]}
+QUATERNION = {
+    "type": "object",
+    "properties": {"x": NUMBER, "y": NUMBER, "z": NUMBER, "w": NUMBER},
+    "required": ["x", "y", "z", "w"],
+}
+CAMERA = {
+    "type": "object",
+    "properties": {
+        "name": TEXT,
+        "size": _array(WHOLE, 2, "[width, height], px"),
+        "matrix": _matrix(3, 3, "px"),
+        "distortion": _array(NUMBER, 5, "k1 k2 p1 p2 k3"),
+        "base_from_camera": _matrix(4, 4, "mm"),
+        "clock_offset_s": _about(NUMBER, "s, to be added to the camera's stamps"),
+    },
+    "required": ["name", "size", "matrix", "distortion", "base_from_camera"],
+}
+
+IMAGE = _object(
+    "foxglove.CompressedImage",
+    "An image as the camera gave it",
+    timestamp=TIME,
+    frame_id=TEXT,
+    data=BASE64,
+    format=_about(TEXT, "png or jpeg"),
+)
+CALIBRATION = _object(
+    "foxglove.CameraCalibration",
+    "A camera of the rig",
+    timestamp=TIME,
+    frame_id=TEXT,
+    width=WHOLE,
+    height=WHOLE,
+    distortion_model=TEXT,
+    D=_array(NUMBER),
+    K=_array(NUMBER, 9),
+    R=_array(NUMBER, 9),
+    P=_array(NUMBER, 12),
+)
+TRANSFORM = _object(
+    "foxglove.FrameTransform",
+    "Pose of a child frame in its parent, metres",
+    timestamp=TIME,
+    parent_frame_id=TEXT,
+    child_frame_id=TEXT,
+    translation=XYZ,
+    rotation=QUATERNION,
+)
+LOG = _object(
+    "foxglove.Log",
+    "Something that happened",
+    timestamp=TIME,
+    level=_about(WHOLE, "1 debug, 2 info, 3 warning, 4 error, 5 fatal"),
+    message=TEXT,
+    name=TEXT,
+    file=TEXT,
+    line=WHOLE,
+    stamp=STAMP,
+)
+RIG = _object("stillbed.Rig", "The calibrated cameras; mm, px", camera=_array(CAMERA))
+ROI = _object(
+    "stillbed.Roi",
+    "Where the surface is in one image, px",
+    stamp=STAMP,
+    camera=WHOLE,
+    polygon=_array(_array(NUMBER, 2)),
+)
+FRAME = _object(
+    "stillbed.Frame",
+    "When an image was taken; the image is the message of the same sequence number on its camera's channel",
+    stamp=_about(NUMBER, "s on the common clock, exact"),
+    camera_stamp=_about(NUMBER, "s on the camera's own clock, exact"),
+    camera=WHOLE,
+    number=_about(WHOLE, "sequence number of the image"),
+)
+TRUTH = _object(
+    "stillbed.Truth",
+    "Known or measured pose of the surface in the base frame, mm",
+    stamp=STAMP,
+    position=_array(NUMBER, 3, "mm"),
+    quaternion=_array(NUMBER, 4, "qx qy qz qw"),
+    exact=_about(FLAG, "true: a simulator's or an instrument's; false: a measured reference"),
+)
+OBSERVATIONS = _object(
+    "stillbed.Observations",
+    "Tracks of one frame set, parallel arrays of length N",
+    stamp=STAMP,
+    camera=_array(WHOLE),
+    track=_array({"type": "integer"}),
+    pixels=_array(_array({"type": ["number", "null"]}, 2), None, "undistorted px"),
+    sigma=_array({"type": ["number", "null"]}, None, "px, one standard deviation"),
+)
+POSE = _object(
+    "stillbed.SurfacePose",
+    "Estimated pose of the surface; mm, rad, s; tangent order rx ry rz tx ty tz, right perturbation; null: not finite",
+    stamp=STAMP,
+    base_from_surface=_matrix(4, 4, "mm"),
+    covariance=_matrix(6, 6, "rad, mm"),
+    twist=_array({"type": ["number", "null"]}, 6, "rad/s, mm/s, surface frame"),
+    state=TEXT,
+    twist_covariance=_matrix(6, 6, "rad/s, mm/s"),
+    acceleration_psd=_array({"type": ["number", "null"]}, 6, "rad^2/s^3, mm^2/s^3"),
+    reason=TEXT,
+)
+MOVE = _object(
+    "stillbed.Move",
+    "Go to the machine axes on the way to a checkpoint",
+    stamp=STAMP,
+    axes=_array(NUMBER, 6, "X Y Z A B C, mm and rad"),
+    feed=_about(NUMBER, "mm/s"),
+    checkpoint={"type": "integer"},
+    extrude=FLAG,
+)
+HOLD = _object("stillbed.Hold", "Stay, because of the reason", stamp=STAMP, duration=_about(NUMBER, "s"), reason=TEXT)
+BYTES = _object("stillbed.Bytes", "Bytes on the arm's link", stamp=STAMP, data=BASE64)
+
+TOPICS: dict[str, Schema] = {
+    "/rig": RIG,
+    "/roi": ROI,
+    "/frames": FRAME,
+    "/truth": TRUTH,
+    "/observations": OBSERVATIONS,
+    "/pose": POSE,
+    "/move": MOVE,
+    "/hold": HOLD,
+    "/arm/sent": BYTES,
+    "/arm/received": BYTES,
+    "/events": LOG,
+    "/tf": TRANSFORM,
+}
+
+
+def image_topic(camera: str) -> str:
+    """The channel of a camera's images."""
+    return f"/camera/{camera}/image"
+
+
+def calibration_topic(camera: str) -> str:
+    """The channel of a camera's calibration, where Foxglove looks for it beside the images."""
+    return f"/camera/{camera}/calibration"
+
+
+def camera_frame(camera: str) -> str:
+    """The name of a camera's frame for viewers."""
+    return f"camera/{camera}"
