@@ -1,0 +1,127 @@
+"""poses.csv and poses.tum: what is written is read back, by us and by evo, to the last whole line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.errors import InputError
+from estimation.pose import SurfacePose, TrackState
+from hardware.pose_file import PoseTable, PoseWriter, read_poses
+from tests.runs import run
+
+STATES = {3: TrackState.DEGRADED, 4: TrackState.COASTING, 5: TrackState.LOST}
+
+
+def pose(table: PoseTable, i: int) -> SurfacePose:
+    return SurfacePose(
+        table.stamps[i],
+        table.base_from_surface[i],
+        table.covariance[i],
+        table.twist[i],
+        table.states[i],
+        reason=table.reasons[i],
+    )
+
+
+def write(folder: Path, table: PoseTable) -> Path:
+    with PoseWriter(folder, table.cameras, table.stages[:-1]) as writer:
+        for i in range(len(table)):
+            seconds = table.seconds[i]
+            writer.write(pose(table, i), int(table.frames[i]), table.used[i], seconds[:-1], float(seconds[-1]))
+    return folder / "poses.csv"
+
+
+def test_csv_round_trip(tmp_path: Path) -> None:
+    table, _ = run(20, sigma=np.full(6, 0.01), states=STATES)
+    back = read_poses(write(tmp_path, table))
+    assert (back.states, back.reasons, back.cameras, back.stages) == (
+        table.states,
+        table.reasons,
+        table.cameras,
+        table.stages,
+    )
+    assert np.array_equal(back.frames, table.frames)
+    assert np.array_equal(back.used, table.used)
+    assert np.abs(back.stamps - table.stamps).max() < 1e-6
+    assert np.abs(back.base_from_surface - table.base_from_surface).max() < 1e-6
+    assert np.allclose(back.covariance, table.covariance, rtol=1e-8)
+    assert np.allclose(back.twist, table.twist, rtol=1e-8)
+    assert np.abs(back.seconds - table.seconds).max() < 1e-7
+
+
+def test_a_second_round_trip_changes_no_byte(tmp_path: Path) -> None:
+    table, _ = run(20, sigma=np.full(6, 0.01), states=STATES)
+    first = write(tmp_path, table)
+    (tmp_path / "again").mkdir()
+    assert write(tmp_path / "again", read_poses(first)).read_bytes() == first.read_bytes()
+
+
+def test_a_pose_that_is_not_known_yet_round_trips(tmp_path: Path) -> None:
+    table, _ = run(3)
+    table.base_from_surface[0, :3] = np.nan
+    table.covariance[0] = np.inf
+    back = read_poses(write(tmp_path, table))
+    assert np.isnan(back.base_from_surface[0, :3]).all()
+    assert np.isinf(back.covariance[0]).all()
+
+
+def test_tum_holds_the_measured_poses_and_loads_in_evo(tmp_path: Path) -> None:
+    from evo.tools import file_interface
+
+    table, _ = run(20, states=STATES)
+    write(tmp_path, table)
+    loaded = file_interface.read_tum_trajectory_file(str(tmp_path / "poses.tum"))
+    assert loaded.check()[0]
+    assert loaded.num_poses == table.measured.sum() == 17
+    expected = table.base_from_surface[table.measured]
+    assert np.abs(np.array(loaded.poses_se3) - expected).max() < 1e-6
+
+
+def test_every_line_stands_before_the_next_pose_is_known(tmp_path: Path) -> None:
+    table, _ = run(5)
+    with PoseWriter(tmp_path, table.cameras, table.stages[:-1]) as writer:
+        for i in range(5):
+            writer.write(pose(table, i), 3, table.used[i], table.seconds[i, :-1], 0.01)
+            assert len(read_poses(tmp_path / "poses.csv")) == i + 1
+
+
+def test_a_file_cut_anywhere_is_read_to_its_last_whole_line(tmp_path: Path) -> None:
+    table, _ = run(4)
+    whole = write(tmp_path, table).read_bytes()
+    head = whole.index(b"\n") + 1
+    cut = tmp_path / "cut.csv"
+    for end in range(head, len(whole), 37):
+        cut.write_bytes(whole[:end])
+        lines = whole[head:end].count(b"\n")
+        assert len(read_poses(cut)) in (lines, lines + 1)  # cut inside the reason, a line is whole already
+
+
+def test_an_empty_run_is_an_empty_table(tmp_path: Path) -> None:
+    table, _ = run(2)
+    with PoseWriter(tmp_path, table.cameras, table.stages[:-1]):
+        pass
+    assert len(read_poses(tmp_path / "poses.csv")) == 0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("stamp_s,", "time,", "header"),
+        ("TRACKING", "FLYING", "state = 'FLYING'"),
+        ("0.033333", "soon", "stamp_s = 'soon'"),
+        ("0.033333,", "0.033333,7,", "columns"),
+    ],
+)
+def test_a_wrong_file_is_told_by_line_and_column(tmp_path: Path, old: str, new: str, says: str) -> None:
+    path = write(tmp_path, run(4)[0])
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(InputError, match=says):
+        read_poses(path)
+
+
+def test_a_missing_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"poses\.csv"):
+        read_poses(tmp_path / "poses.csv")
