@@ -6,9 +6,12 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from estimation.errors import StillbedError
+
+if TYPE_CHECKING:
+    from hardware.progress import Progress
 
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
 WRONG_INPUT = 2
@@ -43,7 +46,7 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(
         prog="stillbed",
         description="Make a moving wound look like a still print bed.",
-        epilog="A SESSION is a folder with rig.toml and frames.csv, or an .mcap file. `stillbed COMMAND --help` says more.",
+        epilog="A SESSION is a folder with rig.toml and frames.csv, or an .mcap file. More: stillbed COMMAND --help",
     )
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = top.add_subparsers(metavar="COMMAND", required=True)
@@ -123,6 +126,8 @@ def _add_import(commands: Commands) -> None:
     )
     command.add_argument("folder", type=Path, metavar="FOLDER", help="session folder")
     command.add_argument("-o", "--out", type=Path, required=True, metavar="X.mcap", help="file to write")
+    command.add_argument("--jpeg-quality", type=int, metavar="Q", help="store images smaller and not exactly, 0 to 100")
+    command.add_argument("--force", action="store_true", help="overwrite the file")
     command.set_defaults(run=_import)
 
 
@@ -148,15 +153,38 @@ def _track(arguments: argparse.Namespace) -> None:
 
 
 def _replay(arguments: argparse.Namespace) -> None:
-    raise NotImplementedError
+    from hardware.replay import replay_session
+    from hardware.session import open_session
+    from hardware.track import prepare_out
+
+    session = open_session(arguments.session)
+    prepare_out(arguments.out, arguments.force)
+    with _progress("replay", "frame sets") as progress:
+        replay_session(session, arguments.path, arguments.out, progress)
+    print(f"commands.csv and frames.bin are in {arguments.out}")
 
 
 def _import(arguments: argparse.Namespace) -> None:
-    raise NotImplementedError
+    from hardware.convert import import_folder
+
+    with _progress("import", "images") as progress:
+        import_folder(arguments.folder, arguments.out, progress, arguments.force, arguments.jpeg_quality)
+    print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB")
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    raise NotImplementedError
+    from hardware.convert import export_recording
+
+    with _progress("export", "images") as progress:
+        export_recording(arguments.mcap, arguments.out, progress)
+    print(f"a session folder is in {arguments.out}")
+
+
+def _progress(what: str, unit: str) -> Progress:
+    from hardware.clock import WallClock
+    from hardware.progress import Progress
+
+    return Progress(what, unit, WallClock().now)
 
 
 if __name__ == "__main__":

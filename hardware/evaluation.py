@@ -194,7 +194,7 @@ class Evaluation:
     """All that the report says about one run.
 
     title: the session's name. comparison: None without truth or reference. shares: per state, of the frame sets from
-    `since` (s) on. complete: whether the session was run to its end.
+    `since` (s) on. complete: whether the session was run to its end. damage: what was lost of its file, "" if nothing.
     """
 
     title: str
@@ -204,11 +204,17 @@ class Evaluation:
     shares: dict[str, float]
     since: float
     complete: bool
+    damage: str
 
 
 def evaluate(
-    table: PoseTable, truth: Trajectory | None, title: str = "", since: float = -np.inf, complete: bool = True
+    table: PoseTable,
+    truth: Trajectory | None,
+    title: str = "",
+    since: float = -np.inf,
+    complete: bool = True,
+    damage: str = "",
 ) -> Evaluation:
     """Everything about one run; `since` (s) is the instant from which its states count."""
     comparison = None if truth is None else compare(table, truth)
-    return Evaluation(title, table, comparison, latency(table), state_shares(table, since), since, complete)
+    return Evaluation(title, table, comparison, latency(table), state_shares(table, since), since, complete, damage)

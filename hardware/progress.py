@@ -39,7 +39,10 @@ class Progress:
         self._stream.flush()
         self._open = self._tty
 
-    def close(self) -> None:
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         """End the line that stands on the terminal."""
         if self._open:
             self._stream.write("\n")

@@ -25,6 +25,8 @@ def verdict(result: Evaluation) -> list[str]:
     sentences = [f"The surface was followed in {followed} of {counted} frame sets ({percent(measured_share(result))})."]
     if not result.complete:
         sentences.insert(0, "This run was cut short; what follows is about the part that was done.")
+    if result.damage:
+        sentences.insert(0, f"The recording is damaged: {result.damage}.")
     if result.comparison is not None:
         sentences += _judgement(result.comparison)
     if len(result.latency.total):

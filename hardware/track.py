@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Protocol
 
@@ -10,15 +11,16 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
-from estimation.trajectory import Trajectory
 from hardware.clock import WallClock
 from hardware.evaluation import evaluate
 from hardware.pose_file import PoseWriter, read_poses
 from hardware.progress import Progress, Report
 from hardware.report import write_report
+from hardware.session import Session, open_session
 from hardware.summary import summary_text, write_summary
+from hardware.track_recorder import TrackRecorder
 from perception.frames import FrameSet
-from perception.tracking import STAGES, StepReport
+from perception.tracking import STAGES, StepReport, TrackingStep
 
 
 class Step(Protocol):
@@ -65,12 +67,14 @@ def follow(
     return done
 
 
-def finish(out: Path, title: str, truth: Trajectory | None, since: float, complete: bool) -> str:
+def finish(out: Path, session: Session, complete: bool) -> str:
     """Judge what poses.csv in `out` holds; writes report.html and summary.json there and returns the summary as text.
 
-    since: s, from which instant on the states count. complete: whether the session was run to its end.
+    complete: whether the session was run to its end.
     """
-    result = evaluate(read_poses(out / "poses.csv"), truth, title, since, complete)
+    since = min((roi.stamp for roi in session.roi), default=-np.inf)
+    table = read_poses(out / "poses.csv")
+    result = evaluate(table, session.truth, session.path.name, since, complete, session.damage)
     write_summary(out / "summary.json", result)
     write_report(out / "report.html", result)
     return summary_text(result)
@@ -90,22 +94,19 @@ def run_track(path: Path, out: Path, record: Path | None = None, force: bool = F
 
     Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of all frame sets until then.
     """
-    from hardware.session import open_session
-    from perception.tracking import TrackingStep
-
     session = open_session(path)
     prepare_out(out, force)
     clock = WallClock()
     step = TrackingStep(session.rig, session.roi, clock.now)
     cameras = [camera.name for camera in session.rig.cameras]
-    progress = Progress("track", "frame sets", clock.now)
-    since = min((roi.stamp for roi in session.roi), default=-np.inf)
     complete = False
-    try:
-        with PoseWriter(out, cameras, STAGES) as writer:
-            follow(session.frame_sets(), step, writer, clock.now, progress, len(session))
-        complete = True
-    finally:
-        progress.close()
-        text = finish(out, path.name, session.truth, since, complete)
+    with ExitStack() as stack:
+        sinks = [] if record is None else [stack.enter_context(TrackRecorder(record, session, force)).write]
+        writer = stack.enter_context(PoseWriter(out, cameras, STAGES))
+        progress = stack.enter_context(Progress("track", "frame sets", clock.now))
+        try:
+            follow(session.frame_sets(), step, writer, clock.now, progress, len(session), sinks)
+            complete = True
+        finally:
+            text = finish(out, session, complete)
     return f"{text}\nreport: {out / 'report.html'}"

@@ -1,0 +1,202 @@
+"""The command line: instant help, one line for wrong input, and nothing lost when it is cut short."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+from estimation.errors import InputError
+from estimation.observations import Observations
+from estimation.pose import SurfacePose
+from hardware.cli import kept, main
+from hardware.pose_file import PoseWriter, read_poses
+from hardware.progress import Progress, duration
+from hardware.track import follow, prepare_out
+from perception.frames import FrameSet
+from perception.tracking import STAGES, StepReport
+from tests.runs import run
+
+ROOT = Path(__file__).parents[1]
+COMMANDS = ([], ["track"], ["replay"], ["import"], ["export"])
+
+
+def stillbed(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "hardware.cli", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_is_there_in_half_a_second(command: list[str]) -> None:
+    seconds = []
+    for _ in range(3):
+        start = perf_counter()
+        done = stillbed(*command, "--help")
+        seconds.append(perf_counter() - start)
+        assert done.returncode == 0
+        assert "usage: stillbed" in done.stdout
+    assert min(seconds) < 0.5
+
+
+def test_version() -> None:
+    assert stillbed("--version").stdout.startswith("stillbed")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["track", "{missing}", "-o", "{out}"],
+        ["replay", "{missing}", "--path", "{missing}", "-o", "{out}"],
+        ["import", "{missing}", "-o", "{out}"],
+        ["export", "{missing}", "-o", "{out}"],
+        ["track", "{empty}", "-o", "{out}"],
+        ["export", "{empty}", "-o", "{out}"],
+    ],
+)
+def test_wrong_input_is_one_line_and_exit_code_2(arguments: list[str], tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    names = {name: str(tmp_path / name) for name in ("missing", "empty", "out")}
+    done = stillbed(*(argument.format(**names) for argument in arguments))
+    assert done.returncode == 2
+    assert done.stdout == ""
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("stillbed: ")
+    assert "allowed" in lines[0]
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("arguments", [[], ["dance"], ["track"], ["track", "x"], ["track", "x", "-o", "y", "--speed"]])
+def test_a_wrong_command_line_is_exit_code_2(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+
+
+def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="--force"):
+        prepare_out(tmp_path, force=False)
+    prepare_out(tmp_path, force=True)
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    with pytest.raises(InputError, match="a file"):
+        prepare_out(tmp_path / "mine.txt", force=True)
+    prepare_out(tmp_path / "deep" / "er", force=False)
+    assert (tmp_path / "deep" / "er").is_dir()
+
+
+def test_what_was_kept_is_said(tmp_path: Path) -> None:
+    assert kept(tmp_path / "nothing") == "nothing was written"
+    (tmp_path / "poses.csv").write_text("x")
+    assert kept(tmp_path) == f"kept in {tmp_path}: poses.csv"
+    assert "readable" in kept(tmp_path / "poses.csv")
+
+
+class Replayed:
+    """Answers as TrackingStep does, with the poses of a made-up run; `log` tells the order of what was asked."""
+
+    def __init__(self, log: list[str]) -> None:
+        self.table, _ = run(20)
+        self.log = log
+        self.asked = 0
+        self.last: StepReport
+
+    def __call__(self, frames: FrameSet) -> SurfacePose:
+        i = self.asked
+        self.asked += 1
+        self.log.append("step")
+        nothing = np.empty(0, np.int64)
+        observations = Observations(frames.stamp, nothing, nothing, np.empty((0, 2)), np.empty(0))
+        self.last = StepReport(observations, self.table.used[i], np.full(len(STAGES), 0.001))
+        t = self.table
+        return SurfacePose(frames.stamp, t.base_from_surface[i], t.covariance[i], t.twist[i], t.states[i])
+
+    def idle(self) -> None:
+        self.log.append("idle")
+
+
+def frame_sets(count: int, ending: BaseException | None = None) -> Iterator[FrameSet]:
+    for i in range(count):
+        yield FrameSet(i / 30, ())
+    if ending is not None:
+        raise ending
+
+
+def writer(folder: Path) -> PoseWriter:
+    return PoseWriter(folder, ("left", "top", "right"), STAGES)
+
+
+def test_each_pose_is_written_before_the_step_may_idle(tmp_path: Path) -> None:
+    log: list[str] = []
+    step, ticks = Replayed(log), iter(range(1000))
+    counts: list[tuple[int, int]] = []
+
+    def sink(frames: FrameSet, pose: SurfacePose, report: StepReport) -> None:
+        log.append(f"written {len(read_poses(tmp_path / 'poses.csv'))}")
+
+    def count(done: int, total: int) -> None:
+        counts.append((done, total))
+
+    with writer(tmp_path) as poses:
+        done = follow(frame_sets(3), step, poses, lambda: float(next(ticks)), count, 3, [sink])
+    assert done == 3
+    assert log == ["step", "written 1", "idle", "step", "written 2", "idle", "step", "written 3", "idle"]
+    assert counts == [(1, 3), (2, 3), (3, 3)]
+    assert np.array_equal(read_poses(tmp_path / "poses.csv").seconds[:, -1], [1, 1, 1])  # one tick: the step alone
+
+
+@pytest.mark.parametrize("ending", [KeyboardInterrupt(), InputError("cam.mp4", "frame 7", "truncated", "a whole file")])
+def test_nothing_is_lost_when_a_run_is_cut_short(tmp_path: Path, ending: BaseException) -> None:
+    with pytest.raises(type(ending)), writer(tmp_path) as poses:
+        follow(frame_sets(7, ending), Replayed([]), poses, lambda: 0.0, lambda done, total: None, 20)
+    assert len(read_poses(tmp_path / "poses.csv")) == 7
+    assert len((tmp_path / "poses.tum").read_text().splitlines()) == 1 + 6  # a comment; the first row is INITIALISING
+
+
+class Terminal(StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_progress_on_a_terminal_is_one_line_that_changes() -> None:
+    now, stream = [0.0], Terminal()
+    with Progress("track", "frame sets", lambda: now[0], stream) as progress:
+        for done in range(1, 101):
+            now[0] += 0.05
+            progress(done, 100)
+    text = stream.getvalue()
+    assert text.count("\n") == 1
+    assert text.count("\r") == 50
+    assert text.endswith("track: 100 of 100 frame sets, 20.0/s\n")
+    assert "track: 50 of 100 frame sets, 20.0/s, 2 s left" in text
+
+
+def test_progress_in_a_log_is_a_line_every_few_seconds() -> None:
+    now, stream = [0.0], StringIO()
+    with Progress("import", "images", lambda: now[0], stream) as progress:
+        for done in range(1, 101):
+            now[0] += 0.2
+            progress(done, 100)
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 4
+    assert "\r" not in stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(8.4, "8 s"), (59.9, "1 min 0 s"), (200, "3 min 20 s"), (3900, "1 h 5 min")]
+)
+def test_durations_are_said_as_people_do(seconds: float, words: str) -> None:
+    assert duration(seconds) == words
+
+
+def test_help_needs_no_library() -> None:
+    code = "import sys, hardware.cli; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, env=os.environ)
+    assert {"numpy", "cv2", "gtsam", "mcap", "open3d"}.isdisjoint(done.stdout.split())
