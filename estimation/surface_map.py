@@ -8,25 +8,23 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from estimation import se3
-from estimation.pose_solver import Index
 from estimation.se3 import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceMap:
-    """Landmarks as parallel arrays.
+    """Landmarks as parallel arrays; a landmark's row is the id of its track.
 
-    track: (N,) id of the landmark, increasing. points: (N, 3) mm, normals: (N, 3) unit, out of the surface, both in the
-    surface frame. covariance: (3N, 3N) mm^2, joint. A landmark that proved wrong is dropped, one that is hidden stays.
+    points: (N, 3) mm, normals: (N, 3) unit, out of the surface, both in the surface frame. covariance: (3N, 3N) mm^2,
+    joint.
     """
 
-    track: Index
     points: Array
     normals: Array
     covariance: Array
 
     def __len__(self) -> int:
-        return len(self.track)
+        return len(self.points)
 
 
 def local_normals(points: Array, outward: Array, neighbours: int = 12) -> Array:

@@ -1,20 +1,36 @@
-"""TrackingStep: one frame set in, one surface pose out; no I/O and no clock of its own."""
+"""TrackingStep: one frame set in, one surface pose out; no I/O and no clock of its own.
+
+Flow from the last images predicts where each landmark is, alignment with the landmark's reference picture measures it, the
+estimator fits the pose. When too little is found the surface is searched by its SIFT features. Cameras run in threads
+(OpenCV releases the GIL); results do not depend on their order.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.estimator import Estimator, Fit, identity_pose
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
+from estimation.pose_solver import solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
-from perception.frames import FrameSet, Roi
+from perception.features import grey
+from perception.first_map import build_first_map
+from perception.flow import flow
+from perception.frames import FrameSet, Image, Roi
+from perception.lens import Lenses, undistort
+from perception.patches import Alignment, Templates, align, project_squares, pyramid
+from perception.relocalise import Relocaliser
 
-STAGES = ("prepare", "flow", "align", "pose", "window")
+STAGES = ("prepare", "flow", "align", "pose", "search")
+Pyramid = tuple[Image, Image]
+LOOSE = np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3)  # how far one camera's own pose may stray from the joint one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,18 +42,222 @@ class StepReport:
     seconds: Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What one camera last saw: its image, where landmarks (rows) stood in it, and the pose then."""
+
+    image: Image
+    rows: NDArray[np.int64]
+    pixels: Array
+    base_from_surface: Array
+
+
 class TrackingStep:
     """Follows one surface through frame sets; deterministic, causal."""
 
     last: StepReport
 
     def __init__(self, rig: Rig, roi: Sequence[Roi] = (), clock: Callable[[], float] = lambda: 0.0) -> None:
-        raise NotImplementedError
+        self.rig, self.roi, self._clock = rig, tuple(roi), clock
+        self._lenses = Lenses(rig)
+        self._estimator = Estimator(rig)
+        self._search = Relocaliser(self._lenses)
+        self._templates: Templates | None = None
+        self._views: dict[int, View] = {}
+        self._threads = ThreadPoolExecutor(max_workers=len(rig))
+        self._spent = np.zeros(len(STAGES))
+        self._lap = 0.0
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
         """The pose at `frames.stamp` from this frame set and the ones before."""
-        raise NotImplementedError
+        self._spent = np.zeros(len(STAGES))
+        self._lap = self._clock()
+        pyramids = dict(self._threads.map(lambda f: (f.camera, pyramid(grey(f.image))), frames.frames))
+        self._took("prepare")
+        if self._templates is None:
+            pose, observations, used = self._initialise(frames, pyramids)
+        else:
+            pose, observations, used = self._track(frames.stamp, pyramids)
+        self.last = StepReport(observations, used, self._spent)
+        return pose
 
     def idle(self) -> None:
         """Work that no pose waits for (map refinement); the caller's loop calls it once a pose is handed over."""
-        raise NotImplementedError
+
+    def _took(self, stage: str) -> None:
+        now = self._clock()
+        self._spent[STAGES.index(stage)] += now - self._lap
+        self._lap = now
+
+    # -- the first map
+
+    def _initialise(
+        self, frames: FrameSet, pyramids: dict[int, Pyramid]
+    ) -> tuple[SurfacePose, Observations, NDArray[np.int64]]:
+        none = np.zeros(len(self.rig), np.int64)
+        polygons = self._polygons(frames)
+        if isinstance(polygons, str):
+            return identity_pose(frames.stamp, polygons), _no_observations(frames.stamp), none
+        first = build_first_map(self._lenses, pyramids, polygons)
+        self._took("search")
+        if isinstance(first, str):
+            return identity_pose(frames.stamp, first), _no_observations(frames.stamp), none
+        self._templates = first.templates
+        pose = self._estimator.begin(frames.stamp, first.base_from_surface, first.map)
+        everything = np.arange(len(first.map))
+        observations = self._align(frames.stamp, pyramids, dict.fromkeys(polygons, first.base_from_surface), everything)
+        fit = self._estimator.fit(observations, first.base_from_surface)
+        self._remember(pyramids, observations, fit.inlier, first.base_from_surface)
+        for camera in polygons:
+            self._search.learn(camera, pyramids[camera][0], first.base_from_surface, first.map)
+        self._took("search")
+        return pose, observations, fit.used
+
+    def _polygons(self, frames: FrameSet) -> dict[int, Array] | str:
+        """Where the surface is in these images, by camera, or why that is not known yet."""
+        if not self.roi:
+            return {
+                f.camera: np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float) * self.rig.cameras[f.camera].size
+                for f in frames.frames
+            }
+        start = max(r.stamp for r in self.roi)
+        if frames.stamp < start - 0.1:
+            return f"waiting for the region of interest at {start:.3f} s"
+        return {r.camera: r.polygon for r in self.roi if any(f.camera == r.camera for f in frames.frames)}
+
+    # -- every frame after it
+
+    def _track(
+        self, stamp: float, pyramids: dict[int, Pyramid]
+    ) -> tuple[SurfacePose, Observations, NDArray[np.int64]]:
+        estimator = self._estimator
+        assert estimator.map is not None and estimator.pose is not None
+        everything = np.arange(len(estimator.map))
+        guess = estimator.predict(stamp)
+        joint, single = self._flow(pyramids, guess)
+        self._took("flow")
+        observations = self._align(stamp, pyramids, single, everything)
+        self._took("align")
+        fit = estimator.fit(observations, joint)
+        self._took("pose")
+        if self._doubtful(fit, pyramids):
+            fit, observations = self._second_try(stamp, pyramids, fit, observations)
+            self._took("search")
+        if fit.measured:
+            pose = estimator.accept(fit, observations)
+            self._remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)
+        else:
+            pose = estimator.coast(stamp, fit.reason)
+        self._took("pose")
+        return pose, observations, fit.used
+
+    def _flow(self, pyramids: dict[int, Pyramid], guess: Array) -> tuple[Array, dict[int, Array]]:
+        """The joint pose by optical flow, and each camera's own: cameras are seldom exposed at the same instant."""
+        assert self._estimator.map is not None
+        points = self._estimator.map.points
+        ready = [c for c in pyramids if c in self._views and len(self._views[c].rows) >= 6]
+        moved = dict(zip(ready, self._threads.map(lambda c: self._flow_one(c, pyramids[c][0], guess), ready), strict=True))
+        single = dict.fromkeys(pyramids, guess)
+        if not moved or sum(len(rows) for rows, _ in moved.values()) < 6:
+            return guess, single
+        camera = np.concatenate([np.full(len(rows), c) for c, (rows, _) in moved.items()])
+        rows = np.concatenate([rows for rows, _ in moved.values()])
+        pixels = np.concatenate([pixels for _, pixels in moved.values()])
+        sigma = np.ones(len(rows))
+        fit = solve_pose(self.rig, camera, points[rows], pixels, sigma, guess, scales=(8.0, 3.0, 1.0))
+        good = fit.weights > 0.2
+        for c in pyramids:
+            mine = good & (camera == c)
+            single[c] = fit.base_from_surface
+            if mine.sum() >= 8:
+                own = solve_pose(
+                    self.rig, camera[mine], points[rows[mine]], pixels[mine], sigma[mine], single[c], prior=LOOSE
+                )
+                single[c] = own.base_from_surface
+        return fit.base_from_surface, single
+
+    def _flow_one(self, camera: int, image: Image, guess: Array) -> tuple[NDArray[np.int64], Array]:
+        assert self._estimator.map is not None and self._templates is not None
+        view, surface_map = self._views[camera], self._estimator.map
+        points, normals = surface_map.points[view.rows], surface_map.normals[view.rows]
+        axes = self._templates.axes[view.rows]
+        before = project_squares(self._lenses, camera, view.base_from_surface, points, normals, axes).centre
+        after = project_squares(self._lenses, camera, guess, points, normals, axes).centre
+        found, ok = flow(view.image, image, view.pixels, view.pixels + after - before)
+        return view.rows[ok], undistort(self.rig.cameras[camera], found[ok])
+
+    def _align(
+        self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array], rows: NDArray[np.int64]
+    ) -> Observations:
+        """Measure landmarks (rows) in every camera, each begun where the camera's own pose puts them."""
+        cameras = [c for c in pyramids if c in poses]
+        results = list(self._threads.map(lambda c: self._align_one(c, pyramids[c], poses[c], rows), cameras))
+        found = [rows[r.found] for r in results]
+        pixels = [undistort(self.rig.cameras[c], r.pixels[r.found]) for c, r in zip(cameras, results, strict=True)]
+        return Observations(
+            stamp,
+            np.concatenate([np.full(len(f), c, np.int64) for c, f in zip(cameras, found, strict=True)]),
+            np.concatenate(found),
+            np.concatenate(pixels),
+            np.concatenate([r.sigma[r.found] for r in results]),
+        )
+
+    def _align_one(self, camera: int, images: Pyramid, pose: Array, rows: NDArray[np.int64]) -> Alignment:
+        assert self._estimator.map is not None and self._templates is not None
+        surface_map, templates = self._estimator.map, self._templates
+        where = project_squares(
+            self._lenses, camera, pose, surface_map.points[rows], surface_map.normals[rows], templates.axes[rows]
+        )
+        return align(templates, images, where, where.centre)
+
+    def _doubtful(self, fit: Fit, pyramids: dict[int, Pyramid]) -> bool:
+        """Whether to search: no measurement, or a camera that carried the last pose now hardly sees the surface."""
+        if not fit.measured:
+            return True
+        for c in pyramids:
+            before = len(self._views[c].rows) if c in self._views else 0
+            if before >= 20 and fit.used[c] < 0.3 * before:
+                return True
+        return False
+
+    def _second_try(
+        self, stamp: float, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations
+    ) -> tuple[Fit, Observations]:
+        """Align again from the pose that the other cameras give, then from the pose that SIFT finds; keep the best."""
+        assert self._estimator.map is not None
+        everything = np.arange(len(self._estimator.map))
+        best = fit, observations
+        starts: list[Callable[[], Array | None]] = []
+        if fit.measured:
+            starts.append(lambda: fit.solution.base_from_surface)
+        starts.append(lambda: self._searched(pyramids))
+        for start in starts:
+            pose = start()
+            if pose is None:
+                continue
+            again = self._align(stamp, pyramids, dict.fromkeys(pyramids, pose), everything)
+            refit = self._estimator.fit(again, pose)
+            if refit.measured and (not best[0].measured or refit.used.sum() > best[0].used.sum()):
+                best = refit, again
+            if not self._doubtful(best[0], pyramids):
+                break
+        return best
+
+    def _searched(self, pyramids: dict[int, Pyramid]) -> Array | None:
+        found = self._search.find({c: images[0] for c, images in pyramids.items()})
+        return None if found is None else found.base_from_surface
+
+    def _remember(
+        self, pyramids: dict[int, Pyramid], observations: Observations, inlier: NDArray[np.bool_], pose: Array
+    ) -> None:
+        for c, images in pyramids.items():
+            mine = inlier & (observations.camera == c)
+            from_lens, _ = self._lenses.image(c, observations.pixels[mine], np.full(int(mine.sum()), 1e3))
+            self._views[c] = View(images[0], observations.track[mine], from_lens, pose)
+
+
+def _no_observations(stamp: float) -> Observations:
+    nothing = np.zeros(0, np.int64)
+    return Observations(stamp, nothing, nothing, np.zeros((0, 2)), np.zeros(0))
+
+

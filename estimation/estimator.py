@@ -1,0 +1,247 @@
+"""From observations to surface poses: robust fit to the map, honest covariance, sliding window, state.
+
+The covariance of one fit has three parts: the tracks' noise, the map's joint error, and the cameras' capture instants. The
+last is a common shift of all tracks of one camera along their image velocity, so it does not average out over tracks;
+its size (`skew`) is learned from how far the cameras disagree while the surface moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.observations import Observations
+from estimation.pose import SurfacePose, TrackState
+from estimation.pose_solver import PoseFit, solve_pose
+from estimation.rig import Rig
+from estimation.se3 import Array
+from estimation.smoother import Measured, Smoother
+from estimation.surface_map import SurfaceMap
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorSettings:
+    """When a fit counts as a measurement, and what it is called.
+
+    Two thresholds keep the state from flickering: `enter` to become TRACKING, `leave` to stop being it.
+    """
+
+    least_tracks: int = 10  # six unknowns need three tracks; ten leave room to see an outlier
+    least_share: float = 0.4  # of the tracks found: with fewer in agreement the surface is not what is seen
+    enter_tracks: int = 30
+    leave_tracks: int = 20
+    camera_tracks: int = 6  # fewer say nothing of that camera
+    sigma_tracking: float = 2.0  # mm: a pose less certain than this is DEGRADED
+    sigma_measured: float = 10.0  # mm: a pose less certain than this is no measurement
+    coast: float = 0.5  # s without a measurement until LOST
+    floor_sigma: float = 0.1  # px: alignment claims less on clean images, interpolation and lens model do not allow it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A fit to one frame set, judged. used: (C,) inliers per camera. reason: why it is no measurement, or ''."""
+
+    stamp: float
+    solution: PoseFit
+    covariance: Array
+    inlier: NDArray[np.bool_]
+    used: NDArray[np.int64]
+    reason: str
+
+    @property
+    def measured(self) -> bool:
+        """Whether the fit may enter the window."""
+        return not self.reason
+
+
+class Skew:
+    """How far apart the cameras' capture instants lie, s, learned from their disagreement along the motion."""
+
+    PRIOR, TRUST, MEMORY = 0.002, 6.0, 0.98
+
+    def __init__(self) -> None:
+        self._weight, self._sum = self.TRUST, self.TRUST * self.PRIOR**2
+
+    @property
+    def sigma(self) -> float:
+        """One standard deviation, s."""
+        return float(np.sqrt(self._sum / self._weight))
+
+    def learn(self, camera: NDArray[np.int64], residual: Array, velocity: Array, sigma: Array, count: int) -> None:
+        """Residuals (N, 2) px after the joint fit, image velocities (N, 2) px/s, sigma (N,) px of the inliers."""
+        seen = np.unique(camera)
+        if len(seen) < 2:
+            return
+        self._weight = self.TRUST + (self._weight - self.TRUST) * self.MEMORY
+        self._sum = self.TRUST * self.PRIOR**2 + (self._sum - self.TRUST * self.PRIOR**2) * self.MEMORY
+        for c in seen:
+            mine = camera == c
+            information = float((velocity[mine] ** 2).sum(1) @ (1 / sigma[mine] ** 2))
+            if mine.sum() < 6 or information <= 0:
+                continue
+            delay = float((velocity[mine] * residual[mine]).sum(1) @ (1 / sigma[mine] ** 2)) / information
+            trust = min(1.0, information * 0.002**2)  # full once the delay is known to 2 ms
+            self._weight += trust
+            self._sum += trust * min(delay, 0.1) ** 2 * len(seen) / (len(seen) - 1)
+
+
+class Estimator:
+    """Owns the map, the window and the state of one surface."""
+
+    def __init__(self, rig: Rig, settings: EstimatorSettings | None = None) -> None:
+        self.rig = rig
+        self.settings = settings or EstimatorSettings()
+        self.map: SurfaceMap | None = None
+        self.skew = Skew()
+        self._smoother = Smoother()
+        self._pose: SurfacePose | None = None
+        self._measured_stamp = -np.inf
+        self._tracking = False
+
+    @property
+    def pose(self) -> SurfacePose | None:
+        """The last pose given, or None before there is a map."""
+        return self._pose
+
+    def predict(self, stamp: float) -> Array:
+        """Where the surface is expected at `stamp`: (4, 4). Only after the first map."""
+        assert self._pose is not None
+        return self._pose.predict(stamp).base_from_surface
+
+    def sigma(self) -> float:
+        """Standard deviation, mm, of the last pose's position."""
+        return np.inf if self._pose is None else _position_sigma(self._pose.covariance)
+
+    def fit(self, observations: Observations, start: Array, scales: tuple[float, ...] = (4.0, 1.0)) -> Fit:
+        """Fit the pose to observations of the map's landmarks, from a rough pose `start` (4, 4); nothing is changed.
+
+        observations.track counts rows of the map.
+        """
+        assert self.map is not None
+        count, settings = len(self.rig), self.settings
+        used = np.zeros(count, np.int64)
+        if len(observations) < settings.least_tracks:
+            nothing = PoseFit(start, np.zeros((6, 6)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 6)), 1.0)
+            reason = f"{len(observations)} tracks found, {settings.least_tracks} needed"
+            none = np.zeros(len(observations), bool)
+            return Fit(observations.stamp, nothing, np.full((6, 6), np.inf), none, used, reason)
+        points = self.map.points[observations.track]
+        sigma = np.maximum(observations.sigma, settings.floor_sigma)
+        solution = solve_pose(self.rig, observations.camera, points, observations.pixels, sigma, start, scales=scales)
+        inlier = solution.weights > 0.2
+        used = np.bincount(observations.camera[inlier], minlength=count)
+        covariance = self._covariance(observations, solution, sigma)
+        reason = self._judge(len(observations), int(inlier.sum()), covariance)
+        return Fit(observations.stamp, solution, covariance, inlier, used, reason)
+
+    def _judge(self, found: int, agreed: int, covariance: Array) -> str:
+        s = self.settings
+        if agreed < s.least_tracks:
+            return f"{agreed} tracks agree, {s.least_tracks} needed"
+        if agreed < s.least_share * found:
+            return f"only {agreed} of {found} tracks agree"
+        spread = _position_sigma(covariance)
+        if not spread <= s.sigma_measured:
+            return f"the pose is uncertain to {spread:.1f} mm"
+        return ""
+
+    def _covariance(self, observations: Observations, solution: PoseFit, sigma: Array) -> Array:
+        assert self.map is not None
+        information = solution.information + 1e-9 * np.eye(6) * np.trace(solution.information)
+        noise = np.linalg.pinv(information, hermitian=True)
+        weight = solution.weights / (sigma * solution.scale) ** 2
+        weighted = solution.jacobians * weight[:, None, None]
+        by_point = np.einsum("nki,nkj->nij", weighted, solution.jacobians[:, :, 3:])  # (N, 6, 3)
+        spread = np.zeros((len(self.map), 6, 3))
+        np.add.at(spread, observations.track, by_point)
+        shift = spread.transpose(1, 0, 2).reshape(6, -1)
+        total = noise + noise @ (shift @ self.map.covariance @ shift.T) @ noise
+        twist = self._pose.twist if self._pose is not None else np.zeros(6)
+        velocity = solution.jacobians @ twist  # (N, 2)
+        pull = np.zeros((len(self.rig), 6))
+        np.add.at(pull, observations.camera, np.einsum("nki,nk->ni", weighted, velocity))
+        late = noise @ pull.T
+        total = total + self.skew.sigma**2 * late @ late.T
+        return np.asarray((total + total.T) / 2)
+
+    def begin(self, stamp: float, base_from_surface: Array, surface_map: SurfaceMap) -> SurfacePose:
+        """Take the first map, which defines the surface frame at `stamp`."""
+        self.map = surface_map
+        self._smoother.reset()
+        covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
+        return self._enter(stamp, base_from_surface, covariance, TrackState.DEGRADED, "first map, not yet confirmed")
+
+    def accept(self, fit: Fit, observations: Observations) -> SurfacePose:
+        """Take a measured fit into the window and give the pose."""
+        assert fit.measured
+        if self._pose is not None:
+            velocity = fit.solution.jacobians @ self._pose.twist
+            keep = fit.inlier
+            sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
+            self.skew.learn(
+                observations.camera[keep], fit.solution.residuals[keep], velocity[keep], sigma[keep], len(self.rig)
+            )
+        state, reason = self._grade(fit)
+        return self._enter(fit.stamp, fit.solution.base_from_surface, fit.covariance, state, reason)
+
+    def _grade(self, fit: Fit) -> tuple[TrackState, str]:
+        s = self.settings
+        cameras = int((fit.used >= s.camera_tracks).sum())
+        spread = _position_sigma(fit.covariance)
+        if cameras < 2:
+            return TrackState.DEGRADED, "one camera alone carries the pose"
+        if spread > s.sigma_tracking * (1.25 if self._tracking else 1.0):
+            return TrackState.DEGRADED, f"the pose is uncertain to {spread:.1f} mm"
+        if fit.used.sum() < (s.leave_tracks if self._tracking else s.enter_tracks):
+            return TrackState.DEGRADED, f"{fit.used.sum()} tracks carry the pose, {s.enter_tracks} wanted"
+        return TrackState.TRACKING, ""
+
+    def _enter(self, stamp: float, pose: Array, covariance: Array, state: TrackState, reason: str) -> SurfacePose:
+        window = self._smoother.add(Measured(stamp, pose, covariance))
+        self._tracking = state is TrackState.TRACKING
+        self._measured_stamp = stamp
+        self._pose = SurfacePose(
+            stamp,
+            window.pose,
+            window.covariance,
+            window.twist,
+            state,
+            window.twist_covariance,
+            window.acceleration_psd,
+            reason,
+        )
+        return self._pose
+
+    def coast(self, stamp: float, reason: str) -> SurfacePose:
+        """No measurement at `stamp`: predict, and say for how long already."""
+        assert self._pose is not None
+        away = stamp - self._measured_stamp
+        lost = away > self.settings.coast
+        self._tracking = False
+        predicted = self._pose.predict(stamp)
+        self._pose = replace(
+            predicted,
+            twist=np.zeros(6) if lost else predicted.twist,  # a velocity that old would carry the pose away
+            state=TrackState.LOST if lost else TrackState.COASTING,
+            reason=f"{reason}; {away:.2f} s since the last measurement",
+        )
+        return self._pose
+
+    def replace_map(self, surface_map: SurfaceMap) -> None:
+        """Take a refined map of the same surface frame; rows keep their meaning."""
+        assert self.map is not None and len(surface_map) == len(self.map)
+        self.map = surface_map
+
+
+def _position_sigma(covariance: Array) -> float:
+    block = covariance[3:, 3:]
+    return float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0))) if np.isfinite(block).all() else float("inf")
+
+
+def identity_pose(stamp: float, reason: str) -> SurfacePose:
+    """The pose before there is any: INITIALISING, at the base's origin, without any certainty."""
+    return SurfacePose(
+        stamp, np.eye(4), np.diag([np.pi**2] * 3 + [1e6] * 3), np.zeros(6), TrackState.INITIALISING, reason=reason
+    )

@@ -1,0 +1,127 @@
+"""Finding the surface again without knowing where it was: SIFT against what was learned from reference images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import se3
+from estimation.pose_solver import project, solve_pose
+from estimation.rig import ideal_pixels
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap
+from estimation.triangulation import rays
+from perception.features import match, sift
+from perception.frames import Image
+from perception.lens import Lenses, undistort
+
+Pyramid = tuple[Image, Image]
+CAPACITY = 4000  # descriptors: matching 1500 features against them takes 40 ms
+LEAST_MATCHES = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """A relocalised pose. base_from_surface: (4, 4). matches: how many features agree."""
+
+    base_from_surface: Array
+    matches: int
+
+
+class Relocaliser:
+    """Descriptors of the surface, and the pose they give in new images."""
+
+    def __init__(self, lenses: Lenses) -> None:
+        self.lenses = lenses
+        self._descriptors = np.zeros((0, 128), np.float32)
+        self._points = np.zeros((0, 3))
+
+    def learn(self, camera: int, image: Image, base_from_surface: Array, surface_map: SurfaceMap) -> None:
+        """Add the features of one image in which the surface's pose is known: each is put on the landmarks' surface."""
+        lens = self.lenses.rig.cameras[camera]
+        points_base = se3.transform_points(base_from_surface, surface_map.points)
+        ideal, depth = ideal_pixels(lens, points_base)
+        imaged, seen = self.lenses.image(camera, ideal, depth)
+        seen &= ((imaged >= 0) & (imaged < lens.size)).all(1)
+        if seen.sum() < 8:
+            return
+        mask = np.zeros((lens.size[1], lens.size[0]), np.uint8)
+        hull = cv2.convexHull(imaged[seen].astype(np.float32)).reshape(-1, 2)
+        cv2.fillConvexPoly(mask, np.round(hull).astype(np.int32), 255)
+        mask = np.asarray(cv2.dilate(mask, np.ones((9, 9), np.uint8)), np.uint8)
+        keypoints, descriptors = sift(image, mask)
+        if not len(keypoints):
+            return
+        points = self._on_surface(camera, undistort(lens, keypoints), base_from_surface, surface_map, ideal, seen)
+        near = np.isfinite(points).all(1)
+        self._points = np.concatenate([self._points, points[near]])[-CAPACITY:]
+        self._descriptors = np.concatenate([self._descriptors, descriptors[near]])[-CAPACITY:]
+
+    def _on_surface(
+        self,
+        camera: int,
+        pixels: Array,
+        base_from_surface: Array,
+        surface_map: SurfaceMap,
+        landmark_pixels: Array,
+        seen: NDArray[np.bool_],
+    ) -> Array:
+        """Points (N, 3), surface frame, where rays meet the mean plane of the six nearest landmarks; nan if it is steep."""
+        index = np.nonzero(seen)[0]
+        gap = ((pixels[:, None] - landmark_pixels[index]) ** 2).sum(2)
+        near = index[np.argsort(gap, axis=1)[:, :6]]
+        normal = surface_map.normals[near].mean(1)
+        anchor = surface_map.points[near].mean(1)
+        origins, directions = rays(self.lenses.rig, np.full(len(pixels), camera), pixels)
+        surface_from_base = se3.inverse(base_from_surface)
+        origins = se3.transform_points(surface_from_base, origins)
+        directions = directions @ surface_from_base[:3, :3].T
+        slope = np.einsum("ni,ni->n", directions, normal)
+        steep = np.abs(slope) < 0.1
+        reach = np.einsum("ni,ni->n", anchor - origins, normal) / np.where(steep, 1.0, slope)
+        return np.asarray(np.where(steep[:, None], np.nan, origins + reach[:, None] * directions))
+
+    def find(self, images: dict[int, Image], masks: dict[int, NDArray[np.uint8]] | None = None) -> Found | None:
+        """The pose of the surface in images (by camera), searched everywhere or inside masks (by camera), or None."""
+        rig = self.lenses.rig
+        if len(self._points) < LEAST_MATCHES:
+            return None
+        camera: list[int] = []
+        points, pixels, candidates = [], [], []
+        for c, image in images.items():
+            keypoints, descriptors = sift(image, None if masks is None else masks.get(c))
+            pairs = match(descriptors, self._descriptors, 0.85)
+            if len(pairs) < LEAST_MATCHES:
+                continue
+            mine, ideal = self._points[pairs[:, 1]], undistort(rig.cameras[c], keypoints[pairs[:, 0]])
+            camera += [c] * len(pairs)
+            points.append(mine)
+            pixels.append(ideal)
+            candidate = _pnp(mine, ideal, rig.matrices[c])
+            if candidate is not None:
+                candidates.append(rig.cameras[c].base_from_camera @ candidate)
+        if not candidates:
+            return None
+        which, all_points, all_pixels = np.array(camera), np.concatenate(points), np.concatenate(pixels)
+        sigma = np.full(len(which), 3.0)
+        best: Found | None = None
+        for candidate in candidates:
+            fit = solve_pose(rig, which, all_points, all_pixels, sigma, candidate, scales=(4.0, 2.0))
+            residual = project(rig, which, fit.base_from_surface, all_points)[0] - all_pixels
+            agreed = int((np.linalg.norm(residual, axis=1) < 12.0).sum())
+            if agreed >= LEAST_MATCHES and (best is None or agreed > best.matches):
+                best = Found(fit.base_from_surface, agreed)
+        return best
+
+
+def _pnp(points: Array, pixels: Array, matrix: Array) -> Array | None:
+    """camera_from_surface (4, 4) by RANSAC over points (N, 3) and ideal pixels (N, 2), or None. Seeded by OpenCV."""
+    ok, rotation, translation, inliers = cv2.solvePnPRansac(
+        points, pixels, matrix, None, iterationsCount=400, reprojectionError=6.0, flags=cv2.SOLVEPNP_SQPNP
+    )
+    if not ok or inliers is None or len(inliers) < LEAST_MATCHES:
+        return None
+    return se3.make(cv2.Rodrigues(rotation)[0], np.asarray(translation).ravel())
