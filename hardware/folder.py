@@ -135,14 +135,14 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def _check_count(frames_csv: Path, files: CameraFiles, named: int) -> None:
-    """InputError unless frames.csv names every image once; a video whose container tells otherwise is counted out."""
+    """InputError unless frames.csv names every image once; a video that seems not to is counted out."""
     if files.video is None:
         there, what = len(files.pictures), "pictures"
     else:
         video = Video(files.video)
-        there, what = video.told_count(), f"frames in {files.video.name}"
+        whole, what = video.reaches(named), f"frames that decode in {files.video.name}"
         video.close()
-        there = there if there == named else count_by_decoding(files.video)
+        there = named if whole else count_by_decoding(files.video)
     if there != named:
         key = f"number of frames of camera {files.camera.name!r}"
         raise InputError(frames_csv, key, named, f"{there}, as many as there are {what}")

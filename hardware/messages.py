@@ -33,7 +33,7 @@ def time_of(log_time: int) -> dict[str, int]:
 
 def message_from_roi(roi: Roi) -> Message:
     """A polygon as a message."""
-    return {"stamp": roi.stamp, "camera": roi.camera, "polygon": roi.polygon.tolist()}
+    return {"stamp": roi.stamp, "camera": int(roi.camera), "polygon": roi.polygon.tolist()}
 
 
 def roi_from_message(message: Message) -> Roi:
@@ -98,8 +98,8 @@ def message_from_move(move: Move) -> Message:
         "stamp": move.stamp,
         "axes": move.axes.tolist(),
         "feed": move.feed,
-        "checkpoint": move.checkpoint,
-        "extrude": move.extrude,
+        "checkpoint": int(move.checkpoint),
+        "extrude": bool(move.extrude),
     }
 
 

@@ -112,7 +112,7 @@ class Recorder:
         self._check_rising(f"stamp of camera {name!r}", stamp)
         image = messages.message_from_image(kind, data, name, self._log_time(stamp))
         self._message(image_topic(name), stamp, image, IMAGE, number)
-        entry = {"stamp": stamp, "camera_stamp": own, "camera": camera, "number": number}
+        entry = {"stamp": stamp, "camera_stamp": own, "camera": int(camera), "number": number}
         self._message("/frames", stamp, entry)  # after the image: where this can be read, the image can
         self._numbers[camera] += 1
 

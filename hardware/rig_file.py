@@ -93,7 +93,7 @@ def write_rig(path: str | Path, rig: Rig, sources: Sequence[ImageSource | None])
             lines.append(f"{key} = {checks.toml_numbers(array)}")
         lines.append(f"base_from_camera = {checks.toml_numbers(camera.base_from_camera)}")
         if camera.clock_offset:
-            lines.append(f"clock_offset_s = {camera.clock_offset!r}")
+            lines.append(f"clock_offset_s = {float(camera.clock_offset)!r}")
         blocks.append("\n".join(lines) + "\n")
     Path(path).write_text("\n".join(blocks), encoding="utf-8")
 
