@@ -43,6 +43,9 @@ class Progress:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
         """End the line that stands on the terminal."""
         if self._open:
             self._stream.write("\n")
