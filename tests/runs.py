@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from estimation import se3
-from estimation.pose import TrackState
+from estimation.observations import Observations
+from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
 from hardware.pose_file import PoseTable
+from perception.frames import FrameSet
+from perception.tracking import STAGES as STEP_STAGES
+from perception.tracking import StepReport
 
 STAGES = ("prepare", "flow", "total")
 
@@ -56,3 +60,26 @@ def run(
         stages=STAGES,
     )
     return table, Trajectory(stamps, truth, True)
+
+
+class Replayed:
+    """Answers as TrackingStep does, with the poses of a made-up run; `log` tells the order of what was asked."""
+
+    def __init__(self, log: list[str]) -> None:
+        self.table, _ = run(20)
+        self.log = log
+        self.asked = 0
+        self.last: StepReport
+
+    def __call__(self, frames: FrameSet) -> SurfacePose:
+        i = self.asked
+        self.asked += 1
+        self.log.append("step")
+        nothing = np.empty(0, np.int64)
+        observations = Observations(frames.stamp, nothing, nothing, np.empty((0, 2)), np.empty(0))
+        self.last = StepReport(observations, self.table.used[i], np.full(len(STEP_STAGES), 0.001))
+        t = self.table
+        return SurfacePose(frames.stamp, t.base_from_surface[i], t.covariance[i], t.twist[i], t.states[i])
+
+    def idle(self) -> None:
+        self.log.append("idle")

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from hardware.cli import kept, main
 from hardware.pose_file import PoseWriter, read_poses
@@ -22,7 +21,7 @@ from hardware.progress import Progress, duration
 from hardware.track import follow, prepare_out
 from perception.frames import FrameSet
 from perception.tracking import STAGES, StepReport
-from tests.runs import run
+from tests.runs import Replayed
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = ([], ["track"], ["replay"], ["import"], ["export"])
@@ -97,29 +96,6 @@ def test_what_was_kept_is_said(tmp_path: Path) -> None:
     (tmp_path / "poses.csv").write_text("x")
     assert kept(tmp_path) == f"kept in {tmp_path}: poses.csv"
     assert "readable" in kept(tmp_path / "poses.csv")
-
-
-class Replayed:
-    """Answers as TrackingStep does, with the poses of a made-up run; `log` tells the order of what was asked."""
-
-    def __init__(self, log: list[str]) -> None:
-        self.table, _ = run(20)
-        self.log = log
-        self.asked = 0
-        self.last: StepReport
-
-    def __call__(self, frames: FrameSet) -> SurfacePose:
-        i = self.asked
-        self.asked += 1
-        self.log.append("step")
-        nothing = np.empty(0, np.int64)
-        observations = Observations(frames.stamp, nothing, nothing, np.empty((0, 2)), np.empty(0))
-        self.last = StepReport(observations, self.table.used[i], np.full(len(STAGES), 0.001))
-        t = self.table
-        return SurfacePose(frames.stamp, t.base_from_surface[i], t.covariance[i], t.twist[i], t.states[i])
-
-    def idle(self) -> None:
-        self.log.append("idle")
 
 
 def frame_sets(count: int, ending: BaseException | None = None) -> Iterator[FrameSet]:

@@ -1,0 +1,139 @@
+"""`stillbed track` from a session folder to its files, also when it is cut short, and its recording as a session."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+
+from estimation.rig import Rig
+from hardware.channels import read_events
+from hardware.channels import read_poses as read_recorded_poses
+from hardware.cli import main
+from hardware.folder_tables import write_frames
+from hardware.pose_file import read_poses
+from hardware.rig_file import ImageSource, write_rig
+from hardware.session import FrameRef, open_session
+from hardware.track_recorder import TrackRecorder
+from tests.runs import Replayed
+from tests.synthetic import still, write_session
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten frame sets at 10 Hz of the synthetic surface, breathing."""
+    folder = tmp_path_factory.mktemp("session") / "breathing"
+    write_session(folder, seconds=1.0, rate=10.0, seed=2)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tracked(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `stillbed track --record` made of it."""
+    out = tmp_path_factory.mktemp("tracked") / "out"
+    assert main(["track", str(session), "-o", str(out), "--record", str(out.parent / "run.mcap")]) == 0
+    return out
+
+
+def test_the_recording_of_a_run_is_its_session_again(session: Path, tmp_path: Path) -> None:
+    original, step = open_session(session), Replayed([])
+    with TrackRecorder(tmp_path / "run.mcap", original, overwrite=False) as recorder:
+        for frames in original.frame_sets():
+            recorder.write(frames, step(frames), step.last)
+    again = open_session(tmp_path / "run.mcap")
+    assert again.truth is not None
+    assert original.truth is not None
+    assert np.array_equal(again.truth.stamps, original.truth.stamps)
+    assert np.allclose(again.truth.base_from_surface, original.truth.base_from_surface)
+    assert [r.stamp for r in again.roi] == [r.stamp for r in original.roi]
+    for a, b in zip(again.frame_sets(), original.frame_sets(), strict=True):
+        assert a.stamp == pytest.approx(b.stamp)
+        assert all(np.array_equal(x.image, y.image) for x, y in zip(a.frames, b.frames, strict=True))
+    poses = list(read_recorded_poses(tmp_path / "run.mcap"))
+    assert [p.state for p in poses] == list(step.table.states[:10])
+    assert [text.split(":")[0] for _, _, text in read_events(tmp_path / "run.mcap")] == ["INITIALISING", "TRACKING"]
+
+
+def test_a_run_leaves_its_files_and_they_agree(tracked: Path) -> None:
+    assert sorted(f.name for f in tracked.iterdir()) == ["poses.csv", "poses.tum", "report.html", "summary.json"]
+    table = read_poses(tracked / "poses.csv")
+    summary = json.loads((tracked / "summary.json").read_text())
+    assert (len(table), summary["frame_sets"], summary["complete"]) == (10, 10, True)
+    lines = (tracked / "poses.tum").read_text().splitlines()
+    assert len(lines) - 1 == table.measured.sum()
+    assert (table.seconds[:, -1] >= table.seconds[:, :-1].sum(axis=1) - 1e-4).all()
+
+
+def test_the_synthetic_surface_is_followed(tracked: Path) -> None:
+    summary = json.loads((tracked / "summary.json").read_text())
+    assert summary["measured_share"] >= 0.8
+    assert summary["errors"]["against"] == "truth"
+    assert summary["errors"]["start"]["translation_mm"]["max"] < 0.5
+    assert summary["errors"]["start"]["rotation_deg"]["max"] < 0.5
+    assert summary["errors"]["off_by_more_than_10_mm_while_tracking"] == 0
+
+
+def test_the_recording_of_the_run_tracks_to_the_same_poses(tracked: Path, tmp_path: Path) -> None:
+    assert main(["track", str(tracked.parent / "run.mcap"), "-o", str(tmp_path / "again")]) == 0
+    assert (tmp_path / "again" / "poses.tum").read_bytes() == (tracked / "poses.tum").read_bytes()
+
+
+def test_a_video_that_ends_early_costs_only_what_comes_after(
+    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = shutil.copytree(session, tmp_path / "broken")
+    whole = (broken / "cam_1.avi").read_bytes()
+    (broken / "cam_1.avi").write_bytes(whole[: len(whole) * 6 // 10])
+    assert main(["track", str(broken), "-o", str(tmp_path / "out")]) == 2
+    assert "cam_1.avi" in capsys.readouterr().err
+    if (tmp_path / "out").exists():  # the fault came up on the way, not at the door
+        assert 3 <= len(read_poses(tmp_path / "out" / "poses.csv")) < 10
+        assert json.loads((tmp_path / "out" / "summary.json").read_text())["complete"] is False
+
+
+def endless(folder: Path) -> Path:
+    """A session of 2000 frame sets, all the same three pictures."""
+    write_session(folder, seconds=0.1, rate=10.0, motion=still, video=False)
+    rig = open_session(folder).rig
+    for camera in rig.cameras:
+        first = next((folder / camera.name).glob("*.png"))
+        for i in range(2000):
+            os.link(first, folder / camera.name / f"{i + 1:06d}x.png")
+        first.unlink()
+    write_table(folder, rig)
+    return folder
+
+
+def write_table(folder: Path, rig: Rig) -> None:
+    refs = [FrameRef(c, i, i / 10, i / 10) for c in range(len(rig)) for i in range(2000)]
+    write_frames(folder / "frames.csv", rig, refs)
+    write_rig(folder / "rig.toml", rig, [ImageSource("images", f"{c.name}/*.png") for c in rig.cameras])
+
+
+def test_ctrl_c_keeps_what_was_written_and_says_so(tmp_path: Path) -> None:
+    folder, out = endless(tmp_path / "endless"), tmp_path / "out"
+    command = [sys.executable, "-m", "hardware.cli", "track", str(folder), "-o", str(out)]
+    running = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = monotonic() + 60
+    while running.poll() is None and monotonic() < deadline:
+        if (out / "poses.csv").exists() and (out / "poses.csv").read_bytes().count(b"\n") > 5:
+            break
+        sleep(0.05)
+    running.send_signal(signal.SIGINT)
+    _, said = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert "interrupted; kept in" in said
+    assert "Traceback" not in said
+    assert 5 <= len(read_poses(out / "poses.csv")) < 2000
+    assert json.loads((out / "summary.json").read_text())["complete"] is False
+    assert "cut short" in (out / "report.html").read_text()
