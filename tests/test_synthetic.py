@@ -56,7 +56,9 @@ def test_a_point_of_the_texture_is_imaged_where_the_rig_projects_it(radius: floa
         pixels, _ = pixels_from_points(camera, points)
         error = centroids(image, pixels) - pixels
         assert len(error) == len(DOTS)
-        assert np.abs(error.mean(0)).max() < 0.01  # no shift of the whole picture
+        assert (
+            np.abs(error.mean(0)).max() < 0.015
+        )  # no shift of the whole picture (a bent dot's own centroid moves by 0.01)
         assert np.median(np.linalg.norm(error, axis=1)) < 0.02
         assert np.linalg.norm(error, axis=1).max() < 0.05
 
@@ -141,7 +143,7 @@ def test_a_written_session_reads_back(tmp_path: Path, video: bool) -> None:
                     ).mean()
                 ),
             )
-    assert worst < (1.5 if video else 1e-9)
+    assert worst < (2.0 if video else 1e-9)
 
 
 def test_a_lossless_video_keeps_every_pixel(tmp_path: Path) -> None:
@@ -200,8 +202,7 @@ def test_a_pose_solver_finds_the_truth_in_the_tracks() -> None:
     made = tracks(seconds=0.5, sigma=0.1, seed=8)
     errors = []
     for pose, o in zip(made.truth.base_from_surface, made.observations, strict=True):
-        fit = solve_pose(
-            made.rig, made.truth.base_from_surface[0], o.camera, made.landmarks[o.track], o.pixels, o.sigma
-        )
+        start = made.truth.base_from_surface[0]
+        fit = solve_pose(made.rig, o.camera, made.landmarks[o.track], o.pixels, o.sigma, start)
         errors.append(se3.log(se3.inverse(pose) @ fit.base_from_surface))
     assert np.sqrt(np.mean(np.square(np.array(errors)[:, 3:]))) < 0.02
