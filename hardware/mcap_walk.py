@@ -84,6 +84,9 @@ def walk(path: Path) -> Iterator[Part]:
                 yield _damage(offset, size, "a record is cut short or broken")
                 return
             if opcode == Opcode.FOOTER:
+                file.seek(length, 1)
+                if file.read() != MCAP0_MAGIC:
+                    yield _damage(offset, size, "the end is not an MCAP file's")
                 return
             if opcode not in (Opcode.CHUNK, Opcode.ATTACHMENT):
                 file.seek(length, 1)
