@@ -7,6 +7,7 @@ they are, so importing an export gives the same stamps, numbers and pixels again
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import heapq
 import os
@@ -64,7 +65,8 @@ def import_folder(
     except OSError as error:
         raise StillbedError(f"{target}: cannot write: {error}") from error
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # it is renamed, or was never there
+            part.unlink()
 
 
 def export_recording(mcap_path: str | Path, folder: str | Path, progress: Progress = _silent) -> None:
