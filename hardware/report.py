@@ -17,7 +17,7 @@ from estimation.pose import TrackState
 from estimation.se3 import Array
 from hardware.chart import Plot, ribbon, spanning
 from hardware.evaluation import NEES_BOUND, OFF_MM, Comparison, Evaluation, spread
-from hardware.summary import measured_share, percent, text_of, verdict
+from hardware.summary import figure, measured_share, percent, text_of, verdict
 
 WIDTH = 1030  # px of a chart across the page
 HALF = 480  # px of one of two
@@ -53,27 +53,26 @@ def _tiles(result: Evaluation) -> str:
     tiles = [_tile(percent(measured_share(result)).removesuffix(" %"), "%", "of the frame sets followed")]
     if result.comparison is not None:
         start, aligned = result.comparison.start, result.comparison.aligned
-        tiles.append(_tile(_figure(spread(start.translation).median), "mm", "median error from the start"))
-        tiles.append(_tile(_figure(math.degrees(spread(start.rotation).median)), "°", "median error from the start"))
-        tiles.append(_tile(_figure(spread(aligned.translation).rmse), "mm", "RMSE, aligned"))
+        tiles.append(_tile(figure(spread(start.translation).median), "mm", "median error from the start"))
+        tiles.append(_tile(figure(math.degrees(spread(start.rotation).median)), "°", "median error from the start"))
+        tiles.append(_tile(figure(spread(aligned.translation).rmse), "mm", "RMSE, aligned"))
     if len(result.latency.total):
         late = result.latency
         tiles.append(_tile(f"{late.p50[-1]:.1f}", "ms", f"per pose; 99 % under {late.p99[-1]:.1f} ms"))
     return f'<div class="tiles">{"".join(tiles)}</div>'
 
 
-def _figure(value: float) -> str:
-    """Three significant digits, and a dash for what is not known."""
-    if not math.isfinite(value):
-        return "–"
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}" if abs(value) >= 0.01 else f"{value:.4f}"
-
-
-def _span(result: Evaluation) -> tuple[float, float]:
-    """First and last instant (s) of the run, never equal."""
-    stamps = result.table.stamps
+def _span(stamps: Array) -> tuple[float, float]:
+    """First and last of the stamps (s), never equal."""
     low, high = (float(stamps[0]), float(stamps[-1])) if len(stamps) else (0.0, 1.0)
     return low, high if high > low else low + 1.0
+
+
+def _followed(result: Evaluation) -> tuple[float, float]:
+    """First and last instant (s) from the first map on; of the whole run where there never was one."""
+    stamps = result.table.stamps
+    later = stamps[~result.table.is_state(TrackState.INITIALISING)]
+    return _span(later if len(later) else stamps)
 
 
 def _section(title: str, explanation: str, body: str) -> str:
@@ -97,7 +96,7 @@ def _states(result: Evaluation) -> str:
     edges = np.append(table.stamps, last)
     names = [state.value for state in table.states]
     titles = [f"{s:.2f} s: {n}. {why}" for s, n, why in zip(table.stamps, names, table.reasons, strict=True)]
-    strip = ribbon(edges, names, titles, _span(result), WIDTH)
+    strip = ribbon(edges, names, titles, _span(table.stamps), WIDTH)
     legend = "".join(
         f'<span><svg viewBox="0 0 18 10"><rect class="{name}" width="18" height="10" rx="2"/></svg>'
         f"{name} {percent(share)}</span>"
@@ -162,7 +161,7 @@ def _trajectory(result: Evaluation) -> str:
     plots = []
     for i, name in enumerate(names):
         seen = [values[:, i]] if truth is None else [values[:, i], truth[:, i]]
-        plot = Plot(HALF, 165, _span(result), spanning(seen, 0.12, 0.5), label=name)
+        plot = Plot(HALF, 165, _followed(result), spanning(seen, 0.12, 0.5), label=name)
         plot.band(table.stamps, values[:, i] - sigma[:, i], values[:, i] + sigma[:, i], "spread")
         if truth is not None:
             plot.line(table.stamps, truth[:, i], "truth")
@@ -204,7 +203,7 @@ def _error_plot(result: Evaluation, comparison: Comparison, errors: Array, label
     positive = errors[errors > 1e-9]
     high = max(float(positive.max()) * 1.5, 1e-2) if len(positive) else 1.0
     low = max(float(np.percentile(positive, 2)) / 2, high / 1e5) if len(positive) else 0.1
-    plot = Plot(WIDTH, 170, _span(result), (min(low, high / 10), high), log_y=True, label=label)
+    plot = Plot(WIDTH, 170, _followed(result), (min(low, high / 10), high), log_y=True, label=label)
     stamps, over_time = result.table.stamps, np.full(len(result.table), np.nan)
     over_time[comparison.rows] = errors
     plot.line(stamps, over_time, "estimate")
@@ -220,15 +219,15 @@ def _error_table(comparison: Comparison) -> str:
     for name, errors in (("from the start", comparison.start), ("aligned", comparison.aligned)):
         for unit, values in (("mm", errors.translation), ("°", np.degrees(errors.rotation))):
             s = spread(values)
-            rows.append([f"{name}, {unit}", *(_figure(v) for v in (s.median, s.rmse, s.p95, s.max))])
+            rows.append([f"{name}, {unit}", *(figure(v) for v in (s.median, s.rmse, s.p95, s.max))])
     return _table(["", "median", "RMSE", "95 %", "max"], rows)
 
 
 def _consistency(comparison: Comparison) -> str:
     start, aligned = comparison.start, comparison.aligned
     text = (
-        f"NEES / 6: {_figure(start.mean_nees / 6)} from the start, which counts the first pose's own error in all poses, "
-        f"and {_figure(aligned.mean_nees / 6)} aligned. "
+        f"NEES / 6: {figure(start.mean_nees / 6)} from the start, with the first pose's own error in all poses, "
+        f"and {figure(aligned.mean_nees / 6)} aligned. "
         f"{_percent_or_dash(aligned.nees_inside)} of the aligned poses have a NEES under {NEES_BOUND:.1f}, "
         "where 95 % should be. "
     )
@@ -245,11 +244,13 @@ def _tracks(result: Evaluation) -> str:
     table = result.table
     if not len(table):
         return ""
-    plot = Plot(WIDTH, 170, _span(result), (0.0, max(float(table.used.max(initial=0)) * 1.08, 1.0)))
+    plot = Plot(WIDTH, 170, _followed(result), (0.0, max(float(table.used.max(initial=0)) * 1.08, 1.0)))
     legend = ""
+    counted = ~table.is_state(TrackState.INITIALISING)
     for i, name in enumerate(table.cameras):
-        plot.line(table.stamps, table.used[:, i].astype(float), f"series c{i % 5}")
-        legend += _line_key(f"series c{i % 5}", f"{name}, median {np.median(table.used[:, i]):.0f}")
+        plot.line(table.stamps, np.where(counted, table.used[:, i], np.nan), f"series c{i % 5}")
+        middle = np.median(table.used[counted, i]) if counted.any() else 0
+        legend += _line_key(f"series c{i % 5}", f"{name}, median {middle:.0f}")
     text = "Tracks that carry the pose, per camera."
     return _section("Tracks", text, f'<div class="legend">{legend}</div>{plot.svg()}')
 
@@ -269,11 +270,17 @@ def _latency(result: Evaluation) -> str:
     figures = _table(["stage, ms", "median", "95 %", "99 %", "max"], rows, last_total=True)
     high = max(float(np.percentile(late.total, 99.5)) * 1.25, 1.0)
     counts, edges = np.histogram(np.minimum(late.total, high * (1 - 1e-9)), bins=40, range=(0, high))
-    plot = Plot(HALF, 210, (0, high), (0, max(float(counts.max()) * 1.1, 1.0)), label="total, ms")
+    plot = Plot(
+        HALF,
+        210,
+        (0, high),
+        (0, max(float(counts.max()) * 1.1, 1.0)),
+    )
     plot.bars(edges, counts.astype(float), "bar")
     plot.mark(float(late.p50[-1]), "median", "median")
     plot.mark(float(late.p99[-1]), "99 %", "median")
-    return _section("Latency", text, f'<div class="two"><div>{figures}</div><div>{plot.svg()}</div></div>')
+    caption = '<div class="caption">frame sets by their total, ms</div>'
+    return _section("Latency", text, f'<div class="two"><div>{figures}</div><div>{caption}{plot.svg()}</div></div>')
 
 
 def main(arguments: list[str]) -> int:

@@ -39,7 +39,7 @@ def _judgement(comparison: Comparison) -> list[str]:
     error = spread(comparison.start.translation)
     turn = math.degrees(spread(comparison.start.rotation).median)
     against = "exact truth" if comparison.exact else "measured reference"
-    sentences = [f"Against the {against} it was off by {error.median:.2f} mm and {turn:.2f}° (median)."]
+    sentences = [f"Against the {against} it was off by {figure(error.median)} mm and {figure(turn)}° (median)."]
     many = {0: "No pose was", 1: "One pose was"}.get(len(comparison.off), f"{len(comparison.off)} poses were")
     return [*sentences, f"{many} off by more than {OFF_MM:.0f} mm while the state said TRACKING."]
 
@@ -47,6 +47,13 @@ def _judgement(comparison: Comparison) -> list[str]:
 def percent(share: float) -> str:
     """0.965 as 96.5 %, without needless zeros."""
     return f"{100 * share:.1f}".removesuffix(".0") + " %"
+
+
+def figure(value: float) -> str:
+    """Three significant digits, and a dash for what is not known."""
+    if not math.isfinite(value):
+        return "–"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}" if abs(value) >= 0.001 else f"{value:.4f}"
 
 
 def as_dict(result: Evaluation) -> dict[str, Any]:

@@ -89,7 +89,7 @@ def test_a_run_without_any_known_pose_has_a_page() -> None:
 def test_a_perfect_run_has_a_page() -> None:
     table, truth = run(40)
     table.base_from_surface[:] = truth.base_from_surface[:] = np.eye(4)
-    assert "0.00 mm" in text_of_page(page(evaluate(table, truth)))
+    assert "0.0000 mm" in text_of_page(page(evaluate(table, truth)))
 
 
 def test_a_measured_reference_is_not_called_truth() -> None:
