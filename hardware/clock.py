@@ -1,0 +1,48 @@
+"""The clock: the only file that knows what time it is. `WallClock` and `SimClock` are interchangeable."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """What loops need of time: now, in s, and to wait."""
+
+    def now(self) -> float:
+        """Instant, s; never goes back."""
+        ...
+
+    def wait_until(self, instant: float) -> None:
+        """Return once `now()` is at least `instant`, s; at once if it already is."""
+        ...
+
+
+class WallClock:
+    """The machine's monotonic clock, which camera drivers stamp by as well."""
+
+    def now(self) -> float:
+        """Instant, s since an arbitrary one."""
+        return time.monotonic()
+
+    def wait_until(self, instant: float) -> None:
+        """Sleep until `instant`, s."""
+        while (left := instant - time.monotonic()) > 0:
+            time.sleep(left)
+
+
+class SimClock:
+    """A clock that moves only when it is waited for."""
+
+    def __init__(self, start: float = 0.0) -> None:
+        self._now = start
+
+    def now(self) -> float:
+        """Instant, s."""
+        return self._now
+
+    def wait_until(self, instant: float) -> None:
+        """Move on to `instant`, s, at once."""
+        assert not math.isnan(instant)
+        self._now = max(self._now, instant)
