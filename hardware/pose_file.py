@@ -36,7 +36,7 @@ class PoseTable:
 
     stamps: (N,) s. frames: (N,) images given. base_from_surface: (N, 4, 4) mm. covariance: (N, 6, 6) and twist:
     (N, 6) as in SurfacePose. states: N of TrackState. used: (N, C) tracks that carry the pose, per camera. seconds:
-    (N, S + 1) per stage and in all. reasons: N sentences. cameras: the C names. stages: the S + 1 names, the last "total".
+    (N, S + 1) per stage and in all. reasons: N sentences. cameras: C names. stages: S + 1 names, the last "total".
     """
 
     stamps: Array

@@ -18,7 +18,7 @@ OWNERS = {  # library: the files that may import it
     "gtsam": ("estimation/*.py",),
     "mcap": ("hardware/mcap_walk.py", "hardware/recording.py", "hardware/recording_file.py"),
     "onnxruntime": ("perception/*.py",),
-    "open3d": ("perception/*.py",),
+    "open3d": ("hardware/mesh_file.py",),
     "ruckig": ("planning/*.py",),
     "serial": ("hardware/*.py",),
     "time": ("hardware/clock.py",),
