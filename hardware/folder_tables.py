@@ -54,7 +54,7 @@ def _frame_row(path: Path, line: int, row: dict[str, str | None], names: Sequenc
     name, frame, stamp = ((row[c] or "").strip() for c in COLUMNS)
     if name not in names:
         raise InputError(path, f"line {line}: camera", name, f"a camera of rig.toml, {checks.meant(name, names)}")
-    if not (frame.isascii() and frame.isdigit()):
+    if not (frame.isascii() and frame.isdigit() and len(frame) < 10):
         raise InputError(path, f"line {line}: frame", frame, "a whole number >= 0")
     try:
         value = float(stamp)

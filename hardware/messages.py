@@ -1,6 +1,6 @@
 """Records as the JSON messages of a recording, and back: what is written is read back to the same float64s.
 
-Numbers that are not finite become null, which reads as NaN (JSON has no other way to say so).
+Matrices are flat, row by row. An array that is not finite becomes an empty one, which reads as NaN throughout.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ import numpy as np
 from estimation import se3
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
-from estimation.rig import Camera
+from estimation.rig import Camera, Rig
 from estimation.se3 import Array
+from hardware.rig_file import rig_from_table, table_from_rig
 from hardware.schemas import camera_frame
 from perception.frames import Roi
 from planning.command import Hold, Move
@@ -23,6 +24,13 @@ Message = dict[str, Any]
 
 SURFACE_FRAME = "surface"
 BASE_FRAME = "base"
+_POSE_SHAPES = {
+    "base_from_surface": (4, 4),
+    "covariance": (6, 6),
+    "twist": (6,),
+    "twist_covariance": (6, 6),
+    "acceleration_psd": (6,),
+}
 _MM = 1e-3  # viewers count in metres
 
 
@@ -31,14 +39,34 @@ def time_of(log_time: int) -> dict[str, int]:
     return {"sec": log_time // 1_000_000_000, "nsec": log_time % 1_000_000_000}
 
 
+def message_from_rig(rig: Rig) -> Message:
+    """The cameras as a message."""
+    table = table_from_rig(rig)
+    for entry, camera in zip(table["camera"], rig.cameras, strict=True):
+        entry["matrix"] = camera.matrix.ravel().tolist()
+        entry["base_from_camera"] = camera.base_from_camera.ravel().tolist()
+    return table
+
+
+def rig_from_message(where: object, message: Message) -> Rig:
+    """The cameras from their message, checked like a rig.toml; InputError (where)."""
+    cameras = message["camera"]
+    for camera in cameras if isinstance(cameras, list) else ():
+        for key, rows in (("matrix", 3), ("base_from_camera", 4)):
+            if isinstance(camera, dict) and isinstance(camera.get(key), list):
+                flat = camera[key]
+                camera[key] = [flat[i : i + rows] for i in range(0, len(flat), rows)]
+    return rig_from_table(where, message)
+
+
 def message_from_roi(roi: Roi) -> Message:
     """A polygon as a message."""
-    return {"stamp": roi.stamp, "camera": int(roi.camera), "polygon": roi.polygon.tolist()}
+    return {"stamp": roi.stamp, "camera": int(roi.camera), "polygon": roi.polygon.ravel().tolist()}
 
 
 def roi_from_message(message: Message) -> Roi:
     """A polygon from its message."""
-    return Roi(message["camera"], message["stamp"], np.array(message["polygon"], float))
+    return Roi(message["camera"], message["stamp"], np.array(message["polygon"], float).reshape(-1, 2))
 
 
 def message_from_truth(row: Array, exact: bool) -> Message:
@@ -58,8 +86,8 @@ def message_from_observations(observations: Observations) -> Message:
         "stamp": observations.stamp,
         "camera": observations.camera.tolist(),
         "track": observations.track.tolist(),
-        "pixels": _nullable(observations.pixels),
-        "sigma": _nullable(observations.sigma),
+        "pixels": _flat(observations.pixels),
+        "sigma": _flat(observations.sigma),
     }
 
 
@@ -67,7 +95,11 @@ def observations_from_message(message: Message) -> Observations:
     """Observations from their message."""
     camera, track = (np.array(message[key], np.int64) for key in ("camera", "track"))
     return Observations(
-        message["stamp"], camera, track, _array(message["pixels"]).reshape(-1, 2), _array(message["sigma"])
+        message["stamp"],
+        camera,
+        track,
+        _array(message["pixels"], (len(camera), 2)),
+        _array(message["sigma"], (len(camera),)),
     )
 
 
@@ -75,20 +107,19 @@ def message_from_pose(pose: SurfacePose) -> Message:
     """An estimated pose as a message."""
     return {
         "stamp": pose.stamp,
-        "base_from_surface": _nullable(pose.base_from_surface),
-        "covariance": _nullable(pose.covariance),
-        "twist": _nullable(pose.twist),
+        "base_from_surface": _flat(pose.base_from_surface),
+        "covariance": _flat(pose.covariance),
+        "twist": _flat(pose.twist),
         "state": pose.state.value,
-        "twist_covariance": _nullable(pose.twist_covariance),
-        "acceleration_psd": _nullable(pose.acceleration_psd),
+        "twist_covariance": _flat(pose.twist_covariance),
+        "acceleration_psd": _flat(pose.acceleration_psd),
         "reason": pose.reason,
     }
 
 
 def pose_from_message(message: Message) -> SurfacePose:
     """An estimated pose from its message."""
-    keys = ("base_from_surface", "covariance", "twist", "twist_covariance", "acceleration_psd")
-    arrays = {key: _array(message[key]) for key in keys}
+    arrays = {key: _array(message[key], shape) for key, shape in _POSE_SHAPES.items()}
     return SurfacePose(stamp=message["stamp"], state=TrackState(message["state"]), reason=message["reason"], **arrays)
 
 
@@ -170,13 +201,12 @@ def message_from_event(stamp: float, level: int, text: str, name: str, log_time:
     return {"timestamp": time, "level": level, "message": text, "name": name, "file": "", "line": 0, "stamp": stamp}
 
 
-def _nullable(array: Array) -> Any:
-    if np.isfinite(array).all():
-        return array.tolist()
-    objects = array.astype(object)
-    objects[~np.isfinite(array)] = None
-    return objects.tolist()
+def _flat(array: Array) -> list[float]:
+    values: list[float] = array.ravel().tolist()
+    return values if np.isfinite(array).all() else []
 
 
-def _array(values: Any) -> Array:
-    return np.array(values, np.float64)
+def _array(values: list[float], shape: tuple[int, ...]) -> Array:
+    if not values:
+        return np.full(shape, np.nan)
+    return np.array(values, np.float64).reshape(shape)

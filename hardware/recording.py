@@ -22,7 +22,6 @@ from estimation.trajectory import Trajectory
 from hardware import messages
 from hardware.images import check_size, encode
 from hardware.messages import SURFACE_FRAME, Message
-from hardware.rig_file import table_from_rig
 from hardware.schemas import CALIBRATION, IMAGE, TOPICS, Schema, calibration_topic, camera_frame, image_topic
 from hardware.session import SURFACE_SUFFIXES
 from hardware.tum import rows_from_trajectory
@@ -199,7 +198,7 @@ class Recorder:
         self._epoch = 0 if stamp > WALL_CLOCK else EPOCH
         epoch = {"epoch_s": str(self._epoch), "units": "mm, s, rad, px"}
         self._guarded(lambda: self._writer.add_metadata("stillbed", epoch))
-        self._message("/rig", stamp, table_from_rig(self.rig))
+        self._message("/rig", stamp, messages.message_from_rig(self.rig))
         log_time = self._log_time(stamp)
         for camera in self.rig.cameras:
             calibration = messages.message_from_calibration(camera, log_time)

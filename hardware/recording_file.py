@@ -20,7 +20,6 @@ from hardware.folder_tables import check_polygon
 from hardware.images import check_size, decode
 from hardware.mcap_walk import Attached, Damage, Stored, chunk_messages, parse, walk
 from hardware.messages import Message
-from hardware.rig_file import rig_from_table
 from hardware.schemas import image_topic
 from hardware.session import SURFACE_SUFFIXES, FrameRef, Session, pair_refs
 from hardware.tum import trajectory_from_rows
@@ -95,7 +94,7 @@ def _take(path: Path, contents: Contents, place: tuple[int, int], stored: Stored
 
 def _take_message(path: Path, contents: Contents, topic: str, message: Message) -> None:
     if topic == "/rig":
-        contents.rig = rig_from_table(f"{path} /rig", message)
+        contents.rig = messages.rig_from_message(f"{path} /rig", message)
     elif topic == "/roi":
         contents.rois.append(messages.roi_from_message(message))
     elif topic == "/truth":

@@ -3,6 +3,8 @@
 Foxglove's well-known messages where one fits (foxglove.*: field names and meanings are theirs, lengths in metres),
 our own otherwise (stillbed.*: mm, s, rad, px). The float64 `stamp` of our own messages is exact; the file's
 log times are the same instants in whole nanoseconds, moved by `Recorder`'s epoch so that none is negative.
+Foxglove reads neither arrays of arrays nor lists of types, so matrices are flat, row by row, and an array that is
+not finite is written as an empty one (JSON knows no NaN).
 """
 
 from __future__ import annotations
@@ -29,8 +31,12 @@ def _array(items: Schema, count: int | None = None, about: str = "") -> Schema:
     return {"type": "array", "items": items, **length, **({"description": about} if about else {})}
 
 
-def _matrix(rows: int, columns: int, about: str) -> Schema:
-    return _array(_array({"type": ["number", "null"]}, columns), rows, about)
+def _numbers(count: int, about: str) -> Schema:
+    return _array(NUMBER, count, about)
+
+
+def _perhaps(about: str) -> Schema:
+    return _array(NUMBER, None, f"{about}; empty: not finite")
 
 
 def _object(title: str, about: str, **properties: Schema) -> Schema:
@@ -60,9 +66,9 @@ CAMERA = {
     "properties": {
         "name": TEXT,
         "size": _array(WHOLE, 2, "[width, height], px"),
-        "matrix": _matrix(3, 3, "px"),
+        "matrix": _numbers(9, "3x3, px"),
         "distortion": _array(NUMBER, 5, "k1 k2 p1 p2 k3"),
-        "base_from_camera": _matrix(4, 4, "mm"),
+        "base_from_camera": _numbers(16, "4x4, mm"),
         "clock_offset_s": _about(NUMBER, "s, to be added to the camera's stamps"),
     },
     "required": ["name", "size", "matrix", "distortion", "base_from_camera"],
@@ -115,7 +121,7 @@ ROI = _object(
     "Where the surface is in one image, px",
     stamp=STAMP,
     camera=WHOLE,
-    polygon=_array(_array(NUMBER, 2)),
+    polygon=_array(NUMBER, None, "x y of each corner"),
 )
 FRAME = _object(
     "stillbed.Frame",
@@ -139,19 +145,19 @@ OBSERVATIONS = _object(
     stamp=STAMP,
     camera=_array(WHOLE),
     track=_array({"type": "integer"}),
-    pixels=_array(_array({"type": ["number", "null"]}, 2), None, "undistorted px"),
-    sigma=_array({"type": ["number", "null"]}, None, "px, one standard deviation"),
+    pixels=_perhaps("x y of each track, undistorted px"),
+    sigma=_perhaps("px, one standard deviation per axis"),
 )
 POSE = _object(
     "stillbed.SurfacePose",
-    "Estimated pose of the surface; mm, rad, s; tangent order rx ry rz tx ty tz, right perturbation; null: not finite",
+    "Estimated pose of the surface; mm, rad, s; tangent order rx ry rz tx ty tz, right perturbation",
     stamp=STAMP,
-    base_from_surface=_matrix(4, 4, "mm"),
-    covariance=_matrix(6, 6, "rad, mm"),
-    twist=_array({"type": ["number", "null"]}, 6, "rad/s, mm/s, surface frame"),
+    base_from_surface=_perhaps("4x4, mm"),
+    covariance=_perhaps("6x6, rad, mm"),
+    twist=_perhaps("6, rad/s, mm/s, surface frame"),
     state=TEXT,
-    twist_covariance=_matrix(6, 6, "rad/s, mm/s"),
-    acceleration_psd=_array({"type": ["number", "null"]}, 6, "rad^2/s^3, mm^2/s^3"),
+    twist_covariance=_perhaps("6x6, rad/s, mm/s"),
+    acceleration_psd=_perhaps("6, rad^2/s^3, mm^2/s^3"),
     reason=TEXT,
 )
 MOVE = _object(

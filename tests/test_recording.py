@@ -29,8 +29,10 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from hardware import channels
 from hardware.mcap_walk import ChunkOf, Damage, walk
+from hardware.messages import message_from_rig
 from hardware.recording import CHUNK_SECONDS, EPOCH, WARNING, Recorder
 from hardware.rig_file import table_from_rig
+from hardware.schemas import CALIBRATION, IMAGE, TOPICS
 from hardware.session import open_session
 from hardware.tum import rows_from_trajectory
 from perception.frames import Frame, Roi
@@ -59,6 +61,9 @@ def pose(stamp: float, seed: int = 0) -> SurfacePose:
         draw.random(6),
         'why "so"',
     )
+
+
+LOST = SurfacePose(0.0, np.full((4, 4), np.nan), np.full((6, 6), np.inf), np.zeros(6), TrackState.LOST)
 
 
 @pytest.mark.parametrize("start", [-10.83, 0.0, 1.7e9 + 1 / 3])
@@ -127,9 +132,8 @@ def test_every_record_comes_back_bit_by_bit(
 
 
 def test_a_pose_that_is_not_finite_reads_as_nan_and_stays_valid_json(tmp_path: Path) -> None:
-    lost = SurfacePose(0.0, np.full((4, 4), np.nan), np.full((6, 6), np.inf), np.zeros(6), TrackState.LOST)
     with Recorder(tmp_path / "x.mcap", rig()) as recorder:
-        recorder.write(lost)
+        recorder.write(LOST)
     (back,) = channels.read_poses(tmp_path / "x.mcap")
     assert np.isnan(back.base_from_surface).all() and np.isnan(back.covariance).all()
     assert b"NaN" not in (tmp_path / "x.mcap").read_bytes()
@@ -354,7 +358,7 @@ def foreign(path: Path, messages: list[tuple[str, object]]) -> None:
 
 
 FRAME = {"stamp": 0.0, "camera_stamp": 0.0, "camera": 0, "number": 0}
-RIG = table_from_rig(rig(2))
+RIG = message_from_rig(rig(2))
 
 
 @pytest.mark.parametrize(
@@ -437,9 +441,10 @@ def test_every_message_fits_its_published_schema(tmp_path: Path) -> None:
         write_frames(recorder, 2, 3)
         recorder.surface(tmp_path / "scan.obj")
         recorder.truth(trajectory(2, True))
-        pixels = np.array([[1.0, 2.0], [np.nan, 0.0]])
+        pixels = np.array([[1.0, 2.0], [3.0, 0.0]])
         recorder.write(Observations(0.0, np.array([0, 1]), np.array([5, -1]), pixels, np.ones(2)))
         recorder.write(pose(0.0))
+        recorder.write(LOST)
         recorder.write(Move(0.0, np.zeros(6), 1.0, 0, False))
         recorder.write(Hold(0.0, 0.1, "why"))
         recorder.write(Roi(0, 0.0, np.eye(3)[:, :2]))
@@ -458,6 +463,24 @@ def test_every_message_fits_its_published_schema(tmp_path: Path) -> None:
             seen.add(schema.name)
     assert {"foxglove.CompressedImage", "foxglove.CameraCalibration", "foxglove.FrameTransform", "foxglove.Log"} <= seen
     assert len(seen) == 13
+
+
+def plain(schema: dict[str, object]) -> bool:
+    """Whether Foxglove can read it: each field has one type, and arrays hold no arrays."""
+    fields = schema.get("properties", {})
+    assert isinstance(fields, dict)
+    for field in fields.values():
+        inner = field["items"] if field["type"] == "array" else field
+        allowed = {"boolean", "string", "number", "integer", "object"}
+        if not isinstance(inner["type"], str) or inner["type"] not in allowed or not plain(inner):
+            return False
+    return True
+
+
+def test_every_schema_is_one_that_foxglove_reads() -> None:
+    every = [*TOPICS.values(), IMAGE, CALIBRATION]
+    assert all(plain(schema) for schema in every)
+    assert not plain({"type": "object", "properties": {"m": {"type": "array", "items": {"type": "array"}}}})
 
 
 def test_images_are_given_to_viewers_at_their_stamp(whole: Path) -> None:
