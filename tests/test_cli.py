@@ -44,6 +44,18 @@ def test_help_is_there_in_half_a_second(command: list[str]) -> None:
     assert min(seconds) < 0.5
 
 
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    code = (
+        "import sys; from hardware import cli; cli._track = lambda a: print('x' * 99); sys.exit(cli.main(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", code, "track", "x", "-o", "y"]
+    done = subprocess.run(command, cwd=ROOT, stdout=write, stderr=subprocess.PIPE, text=True, timeout=60)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_version() -> None:
     assert stillbed("--version").stdout.startswith("stillbed")
 
