@@ -31,6 +31,14 @@ def read_toml(path: Path) -> Table:
         raise InputError(path, "syntax", error, "valid TOML") from error
 
 
+def read_bytes(path: Path) -> bytes:
+    """A file's bytes; InputError where it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(path, "file", error, "a readable file") from error
+
+
 def check_keys(where: object, prefix: str, table: Table, required: Iterable[str], optional: Iterable[str] = ()) -> None:
     """InputError for a required key that is not there, or for one that nobody reads."""
     known = [*required, *optional]

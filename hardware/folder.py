@@ -13,6 +13,7 @@ from pathlib import Path
 from estimation.errors import InputError
 from estimation.rig import Camera
 from estimation.trajectory import Trajectory
+from hardware import checks
 from hardware.folder_tables import read_frames, read_roi
 from hardware.images import Video, check_size, count_by_decoding, decode
 from hardware.rig_file import ImageSource, RigFile, read_rig
@@ -55,7 +56,7 @@ class FolderReader:
         files = self._cameras[ref.camera]
         if files.video is None:
             path = files.pictures[ref.number]
-            image = decode(read_bytes(path), path, "picture")
+            image = decode(checks.read_bytes(path), path, "picture")
             check_size(image, files.camera.size, path, "size")
             return image
         frame = self._video(ref.camera, files.video, ref.number).read()
@@ -80,7 +81,7 @@ class FolderReader:
         if files.video is not None:
             return None
         kind = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}.get(files.pictures[ref.number].suffix.lower())
-        return None if kind is None else (kind, read_bytes(files.pictures[ref.number]))
+        return None if kind is None else (kind, checks.read_bytes(files.pictures[ref.number]))
 
     def close(self) -> None:
         """Give the decoders back."""
@@ -172,11 +173,3 @@ def _surface(folder: Path, rig_file: RigFile) -> Path | None:
     if found and not found[0].stat().st_size:
         raise InputError(found[0], "file", "empty", "a scan of the surface, mm")
     return found[0] if found else None
-
-
-def read_bytes(path: Path) -> bytes:
-    """A file's bytes; InputError where it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "file", error, "a readable file") from error

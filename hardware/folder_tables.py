@@ -117,6 +117,8 @@ def _roi(path: Path, key: str, entry: checks.Table, rig: Rig, stamps: Sequence[A
 
 def check_polygon(where: object, key: str, polygon: Array, size: tuple[int, int]) -> None:
     """InputError unless the polygon (N, 2), px, has three corners, an area, and a part of its box in the image."""
+    if not np.isfinite(polygon).all():
+        raise InputError(where, key, polygon.tolist(), "finite numbers, px")
     if len(polygon) < 3:
         raise InputError(where, key, f"{len(polygon)} points", "3 points or more, px")
     x, y = (polygon - polygon[0]).T

@@ -20,6 +20,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
 from hardware import messages
+from hardware.checks import read_bytes
 from hardware.images import check_size, encode
 from hardware.messages import SURFACE_FRAME, Message
 from hardware.schemas import CALIBRATION, IMAGE, TOPICS, Schema, calibration_topic, camera_frame, image_topic
@@ -129,7 +130,7 @@ class Recorder:
         """Attach the scan (ply, stl or obj, mm) as it is."""
         if path.suffix.lower() not in SURFACE_SUFFIXES:
             raise InputError(path, "surface", path.name, f"a file {', '.join(SURFACE_SUFFIXES)}")
-        data = path.read_bytes()
+        data = read_bytes(path)
         name = f"surface{path.suffix.lower()}"
         self._guarded(lambda: self._writer.add_attachment(0, 0, name, "model/" + path.suffix.lower()[1:], data))
 

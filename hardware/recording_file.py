@@ -27,18 +27,23 @@ from perception.frames import Image, Roi
 
 CACHED_CHUNKS = 4  # frames of one instant lie in neighbouring chunks
 
+SURFACE_NAMES = tuple(f"surface{suffix}" for suffix in SURFACE_SUFFIXES)  # an attachment with a path in it is none
+
 Places = dict[tuple[str, int], tuple[int, int]]  # of an image's topic and number: offset of its chunk, place in it
 
 
 @dataclass(slots=True)
 class Contents:
-    """What a walk through a recording found: everything but the images, and the chunk each image is in."""
+    """What a walk through a recording found: everything but the images, and the chunk each image is in.
+
+    A run that is interrupted while it writes may store a chunk twice: what is told twice counts once.
+    """
 
     rig: Rig | None = None
-    rois: list[Roi] = field(default_factory=list)
-    truth: list[list[float]] = field(default_factory=list)
+    rois: dict[tuple[int, float], Roi] = field(default_factory=dict)
+    truth: set[tuple[float, ...]] = field(default_factory=set)
     exact: bool = False
-    frames: list[FrameRef] = field(default_factory=list)
+    frames: dict[tuple[int, int], FrameRef] = field(default_factory=dict)
     places: Places = field(default_factory=dict)
     surface: Attached | None = None
     damage: str = ""
@@ -50,21 +55,17 @@ def open_recording(path: Path) -> Session:
     rig = contents.rig
     if rig is None:
         raise InputError(path, "/rig", contents.damage or "no message", "a stillbed.Rig (written at the first stamp)")
+    frames = list(contents.frames.values())
     _check_frames(path, contents, rig)
-    stamps = [np.array(sorted(r.stamp for r in contents.frames if r.camera == c)) for c in range(len(rig))]
+    stamps = [np.array(sorted(r.stamp for r in frames if r.camera == c)) for c in range(len(rig))]
     for camera, times in zip(rig.cameras, stamps, strict=True):
         if (np.diff(times) <= 0).any():
             raise InputError(path, f"/frames: stamp of camera {camera.name!r}", "one stamp twice", "each stamp once")
     store = RecordingStore(path, rig, contents.places)
-    _check_first_images(store, contents.frames)
-    for i, roi in enumerate(contents.rois):
-        if not 0 <= roi.camera < len(rig) or roi.polygon.ndim != 2:
-            raise InputError(path, f"/roi[{i}]", f"camera {roi.camera}", f"a camera of /rig, 0..{len(rig) - 1}")
-        check_polygon(path, f"/roi[{i}]", roi.polygon, rig.cameras[roi.camera].size)
-    truth = _truth(path, contents)
-    surface = _unpacked_surface(contents.surface, store)
-    sets = pair_refs(contents.frames, stamps, len(rig))
-    return Session(path, rig, tuple(contents.rois), surface, truth, sets, store, contents.damage)
+    _check_first_images(store, frames)
+    rois = _checked_rois(path, contents, rig)
+    truth, surface = _truth(path, contents), _unpacked_surface(contents.surface, store)
+    return Session(path, rig, rois, surface, truth, pair_refs(frames, stamps, len(rig)), store, contents.damage)
 
 
 def _contents(path: Path) -> Contents:
@@ -73,7 +74,7 @@ def _contents(path: Path) -> Contents:
         if isinstance(part, Damage):
             contents.damage = part.text
         elif isinstance(part, Attached):
-            if Path(part.name).stem == "surface" and Path(part.name).suffix in SURFACE_SUFFIXES:
+            if part.name in SURFACE_NAMES:
                 contents.surface = part
         else:
             for index, stored in enumerate(part.messages):
@@ -96,19 +97,21 @@ def _take_message(path: Path, contents: Contents, topic: str, message: Message) 
     if topic == "/rig":
         contents.rig = messages.rig_from_message(f"{path} /rig", message)
     elif topic == "/roi":
-        contents.rois.append(messages.roi_from_message(message))
+        roi = messages.roi_from_message(message)
+        contents.rois[roi.camera, roi.stamp] = roi
     elif topic == "/truth":
-        contents.truth.append(messages.truth_row(message))
+        contents.truth.add(tuple(messages.truth_row(message)))
         contents.exact = bool(message["exact"])
     else:
         own, common = float(message["camera_stamp"]), float(message["stamp"])
-        contents.frames.append(FrameRef(int(message["camera"]), int(message["number"]), own, common))
+        camera, number = int(message["camera"]), int(message["number"])
+        contents.frames[camera, number] = FrameRef(camera, number, own, common)
 
 
 def _check_frames(path: Path, contents: Contents, rig: Rig) -> None:
     if not contents.frames:
         raise InputError(path, "/frames", contents.damage or "no message", "at least one image")
-    for ref in contents.frames:
+    for ref in contents.frames.values():
         if not 0 <= ref.camera < len(rig):
             raise InputError(path, "/frames: camera", ref.camera, f"a camera of /rig, 0..{len(rig) - 1}")
         if not np.isfinite([ref.stamp, ref.camera_stamp]).all():
@@ -118,6 +121,15 @@ def _check_frames(path: Path, contents: Contents, rig: Rig) -> None:
             raise InputError(
                 path, f"{topic}: image", f"no number {ref.number}", "an image for every message of /frames"
             )
+
+
+def _checked_rois(path: Path, contents: Contents, rig: Rig) -> tuple[Roi, ...]:
+    for i, roi in enumerate(contents.rois.values()):
+        if not 0 <= roi.camera < len(rig) or not np.isfinite(roi.stamp):
+            got = f"camera {roi.camera} at {roi.stamp} s"
+            raise InputError(path, f"/roi[{i}]", got, f"a camera of /rig, 0..{len(rig) - 1}, and a finite stamp")
+        check_polygon(path, f"/roi[{i}]", roi.polygon, rig.cameras[roi.camera].size)
+    return tuple(contents.rois.values())
 
 
 def _check_first_images(store: RecordingStore, frames: list[FrameRef]) -> None:

@@ -28,8 +28,9 @@ from estimation.errors import InputError, StillbedError
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from hardware import channels
+from hardware.images import encode
 from hardware.mcap_walk import ChunkOf, Damage, walk
-from hardware.messages import message_from_rig
+from hardware.messages import message_from_image, message_from_rig
 from hardware.recording import CHUNK_SECONDS, EPOCH, WARNING, Recorder
 from hardware.rig_file import table_from_rig
 from hardware.schemas import CALIBRATION, IMAGE, TOPICS
@@ -211,6 +212,31 @@ def test_a_file_cut_at_any_byte_is_readable_up_to_its_last_whole_chunk(
     assert sum(1 for _ in channels.read_poses(part)) >= expected // 2 - 1
 
 
+def test_a_chunk_that_an_interrupted_run_wrote_twice_counts_once(whole: Path) -> None:
+    data, ends = whole.read_bytes(), [end for end, _ in chunk_ends(whole)]
+    starts = [p.offset for p in walk(whole) if isinstance(p, ChunkOf)]
+    again = whole.parent / "again.mcap"
+    again.write_bytes(data[: ends[1]] + data[starts[1] : ends[1]] + data[ends[1] :])
+    session = open_session(again)
+    assert sum(map(len, session.sets)) == 48 == sum(len(s.frames) for s in session.frame_sets())
+
+
+def test_an_attachment_cannot_choose_where_it_is_unpacked(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
+        write_frames(recorder, 2)
+    with open(tmp_path / "y.mcap", "wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_attachment(0, 0, "../surface.ply", "model/ply", b"ply")
+        for part in walk(tmp_path / "x.mcap"):
+            for stored in part.messages if isinstance(part, ChunkOf) else ():
+                channel = writer.register_channel(stored.topic, "json", 0)
+                writer.add_message(channel, 0, stored.data, 0, stored.sequence)
+        writer.finish()  # type: ignore[no-untyped-call]
+    session = open_session(tmp_path / "y.mcap")
+    assert len(session) == 2 and session.surface is None
+
+
 @settings(max_examples=60)
 @given(where=st.floats(0.01, 0.999), bit=st.integers(0, 7))
 def test_a_flipped_bit_never_gives_a_wrong_image(whole: Path, where: float, bit: int) -> None:
@@ -359,6 +385,11 @@ def foreign(path: Path, messages: list[tuple[str, object]]) -> None:
 
 FRAME = {"stamp": 0.0, "camera_stamp": 0.0, "camera": 0, "number": 0}
 RIG = message_from_rig(rig(2))
+ONE_FRAME = [
+    ("/rig", RIG),
+    ("/camera/left/image", message_from_image(*encode(image(0, 0)), "left", 0)),
+    ("/frames", FRAME),
+]
 
 
 @pytest.mark.parametrize(
@@ -372,6 +403,10 @@ RIG = message_from_rig(rig(2))
         ([("/rig", RIG), ("/frames", {**FRAME, "camera": 2})], "allowed a camera of /rig, 0..1"),
         ([("/rig", RIG), ("/frames", {**FRAME, "stamp": float("nan")})], "finite"),
         ([("/rig", RIG), ("/frames", {"camera": 0})], "message of its schema"),
+        ([*ONE_FRAME, ("/roi", {"stamp": 0.0, "camera": 2, "polygon": [0, 0, 9, 0, 9, 9]})], "a camera of /rig, 0..1"),
+        ([*ONE_FRAME, ("/roi", {"stamp": 0.0, "camera": 0, "polygon": [0, 0, 9, 0, 9, float("nan")]})], "finite"),
+        ([*ONE_FRAME, ("/roi", {"stamp": 0.0, "camera": 0, "polygon": [0, 0, 9, 0]})], "3 points"),
+        ([*ONE_FRAME, ("/truth", {"stamp": 0, "position": [1, 2, 3], "quaternion": [0] * 4, "exact": True})], "unit"),
         ([("/rig", RIG), ("/camera/left/image", {"data": "", "format": "png"}), ("/frames", FRAME)], "undecodable"),
         ([("/rig", RIG), ("/camera/left/image", {"data": 3}), ("/frames", FRAME)], "CompressedImage"),
     ],
