@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from estimation.scan import Index, Scan, face_areas, face_normals, normals_at, open_edges
+from estimation.scan import Index, Scan, face_areas, normals_at, open_edges
 from estimation.se3 import Array
 
 SAMPLES = 15_000  # about so many spread over the scan; a 100 x 100 mm scan gets one every 0.8 mm
@@ -36,9 +36,9 @@ class ScanIndex:
         areas = face_areas(scan)
         self.spacing = float(np.sqrt(areas.sum() / SAMPLES))
         self.triangle, weights = _spread(scan, self.spacing)
-        self.samples = np.einsum("sk,ski->si", weights, scan.corners[self.triangle])
+        self._corners = scan.corners
+        self.samples = np.einsum("sk,ski->si", weights, self._corners[self.triangle])
         self.normals = normals_at(scan, self.triangle, weights)
-        self.face_normals = face_normals(scan)
         self.tree = cKDTree(self.samples)
         self.spacing = max(self.spacing, float(np.sqrt(np.quantile(areas, 0.9))))
         self._open = _open_sides(scan)
@@ -48,8 +48,9 @@ class ScanIndex:
         count = min(candidates, len(self.samples))
         _, near = self.tree.query(points, k=count)
         triangle = self.triangle[near.reshape(len(points), count)]  # (N, K)
-        weights = closest_weights(np.repeat(points, count, axis=0), self.scan.corners[triangle.ravel()])
-        found = np.einsum("mk,mki->mi", weights, self.scan.corners[triangle.ravel()]).reshape(len(points), count, 3)
+        corners = self._corners[triangle.ravel()]
+        weights = closest_weights(np.repeat(points, count, axis=0), corners)
+        found = np.einsum("mk,mki->mi", weights, corners).reshape(len(points), count, 3)
         best = np.argmin(np.linalg.norm(found - points[:, None], axis=2), axis=1)
         row = np.arange(len(points))
         chosen, weight = triangle[row, best], weights.reshape(len(points), count, 3)[row, best]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation import se3
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import PoseFit, solve_pose
@@ -34,7 +35,7 @@ class EstimatorSettings:
     leave_tracks: int = 20
     camera_tracks: int = 6  # fewer say nothing of that camera
     sigma_tracking: float = 2.0  # mm: a pose less certain than this is DEGRADED
-    sigma_measured: float = 10.0  # mm: a pose less certain than this is no measurement
+    sigma_measured: float = 50.0  # mm: a pose less certain than this is no measurement
     coast: float = 0.5  # s without a measurement until LOST
     floor_sigma: float = 0.1  # px: alignment claims less on clean images, interpolation and lens model do not allow it
 
@@ -57,9 +58,14 @@ class Fit:
 
 
 class Skew:
-    """How far apart the cameras' capture instants lie, s, learned from their disagreement along the motion."""
+    """How far apart the cameras' capture instants lie, s, learned from their disagreement along the motion.
 
-    PRIOR, TRUST, MEMORY = 0.002, 6.0, 0.98
+    One delay per camera and frame set is solved for beside the pose; its expected square, posterior mean and variance, feeds
+    a running variance (expectation maximisation), so frames in which nothing moves teach nothing.
+    """
+
+    PRIOR, TRUST, MEMORY = 0.02, 3.0, 0.98  # webcams stand 10 to 60 ms apart; a second in motion tells
+    SHARED = 0.2  # px: what lens model and map may shift all tracks of a camera by; that is no delay
 
     def __init__(self) -> None:
         self._weight, self._sum = self.TRUST, self.TRUST * self.PRIOR**2
@@ -69,22 +75,25 @@ class Skew:
         """One standard deviation, s."""
         return float(np.sqrt(self._sum / self._weight))
 
-    def learn(self, camera: NDArray[np.int64], residual: Array, velocity: Array, sigma: Array, count: int) -> None:
-        """Residuals (N, 2) px after the joint fit, image velocities (N, 2) px/s, sigma (N,) px of the inliers."""
-        seen = np.unique(camera)
-        if len(seen) < 2:
+    def learn(self, camera: NDArray[np.int64], residual: Array, jacobian: Array, twist: Array, sigma: Array) -> None:
+        """Residuals (N, 2) px after the joint fit, jacobians (N, 2, 6), twist (6,) per s, sigma (N,) px of the inliers."""
+        cameras, index, count = np.unique(camera, return_inverse=True, return_counts=True)
+        if len(cameras) < 2 or count.min() < 6:
             return
-        self._weight = self.TRUST + (self._weight - self.TRUST) * self.MEMORY
-        self._sum = self.TRUST * self.PRIOR**2 + (self._sum - self.TRUST * self.PRIOR**2) * self.MEMORY
-        for c in seen:
-            mine = camera == c
-            information = float((velocity[mine] ** 2).sum(1) @ (1 / sigma[mine] ** 2))
-            if mine.sum() < 6 or information <= 0:
-                continue
-            delay = float((velocity[mine] * residual[mine]).sum(1) @ (1 / sigma[mine] ** 2)) / information
-            trust = min(1.0, information * 0.002**2)  # full once the delay is known to 2 ms
-            self._weight += trust
-            self._sum += trust * min(delay, 0.1) ** 2 * len(seen) / (len(seen) - 1)
+        weight = 1 / (sigma**2 + count[index] * self.SHARED**2)
+        velocity = jacobian @ twist
+        information = np.einsum("nki,n,nkj->ij", jacobian, weight, jacobian)
+        pull, own, right = np.zeros((len(cameras), 6)), np.zeros(len(cameras)), np.zeros(len(cameras))
+        np.add.at(pull, index, np.einsum("nki,n,nk->ni", jacobian, weight, velocity))
+        np.add.at(own, index, weight * (velocity**2).sum(1))
+        np.add.at(right, index, weight * (velocity * residual).sum(1))
+        gradient = np.einsum("nki,n,nk->i", jacobian, weight, residual)
+        solved = np.linalg.solve(information + 1e-9 * np.trace(information) * np.eye(6), np.c_[pull.T, gradient])
+        inverse = np.linalg.inv(np.diag(own) - pull @ solved[:, :-1] + np.eye(len(cameras)) / self.sigma**2)
+        delay = inverse @ (right - pull @ solved[:, -1])
+        self._weight = self.TRUST + (self._weight - self.TRUST) * self.MEMORY + len(cameras)
+        kept = self.TRUST * self.PRIOR**2 + (self._sum - self.TRUST * self.PRIOR**2) * self.MEMORY
+        self._sum = kept + float((np.minimum(delay, 0.1) ** 2 + np.diag(inverse)).sum())
 
 
 class Estimator:
@@ -171,17 +180,17 @@ class Estimator:
         self.map = surface_map
         self._smoother.reset()
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
-        return self._enter(stamp, base_from_surface, covariance, TrackState.DEGRADED, "first map, not yet confirmed")
+        return self._enter(stamp, base_from_surface, covariance, TrackState.INITIALISING, "a first map, to be confirmed")
 
     def accept(self, fit: Fit, observations: Observations) -> SurfacePose:
         """Take a measured fit into the window and give the pose."""
         assert fit.measured
         if self._pose is not None:
-            velocity = fit.solution.jacobians @ self._pose.twist
-            keep = fit.inlier
+            moved = se3.log(se3.inverse(self._pose.base_from_surface) @ fit.solution.base_from_surface)
+            twist, keep = moved / (fit.stamp - self._pose.stamp), fit.inlier
             sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
             self.skew.learn(
-                observations.camera[keep], fit.solution.residuals[keep], velocity[keep], sigma[keep], len(self.rig)
+                observations.camera[keep], fit.solution.residuals[keep], fit.solution.jacobians[keep], twist, sigma[keep]
             )
         state, reason = self._grade(fit)
         return self._enter(fit.stamp, fit.solution.base_from_surface, fit.covariance, state, reason)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from estimation import se3
 from estimation.closest import ScanIndex
@@ -20,9 +21,11 @@ from estimation.se3 import Array
 FEWEST = 12  # points: six unknowns, and as many again to see that they fit
 YAWS = 24  # starts per place: 15 degrees apart, half of it is within reach of the refinement
 PLACES = 150  # at most
-COARSE_POINTS = 60
+FIRST_POINTS, COARSE_POINTS = 24, 60  # spread over all, while there are many poses to be tried
 KEPT = 80  # starts that are refined roughly
-FINAL = 6  # and of these finely
+FINE = 6  # and of these, those refined with exact nearest points
+FINAL = 3  # and of these, those refined with all points: more than one, to see whether the best is alone
+COARSE_SAMPLES = 4000  # of the scan: enough to lay a part of it under the points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,19 +65,22 @@ def register(points_base: Array, sigma: float, scan: Scan, outward: Array) -> Re
     index = ScanIndex(scan)
     if len(points_base) < FEWEST:
         return _nothing(index, len(points_base))
-    few = points_base[_spread_out(points_base, min(COARSE_POINTS, len(points_base)))]
+    few = points_base[_spread_out(points_base, min(COARSE_POINTS, len(points_base)))]  # the first ones furthest apart
     reach = 0.1 * _radius(points_base) + 3 * sigma  # mm: further off counts no more
     poses = _starts(points_base, outward, index)
-    poses = poses[np.argsort(_costs(index, poses, few, reach), kind="stable")[:KEPT]]
+    poses = poses[np.argsort(_costs(index, poses, few[:FIRST_POINTS], reach), kind="stable")[:KEPT]]
     for step in range(8):
         poses = _rough_step(index, poses, few, reach * 0.75**step)
     ranked = poses[np.argsort(_costs(index, poses, few, reach), kind="stable")]
-    chosen = _distinct(ranked, few, FINAL)
-    fits = sorted((_refine(index, pose, points_base, sigma, reach) for pose in chosen), key=lambda f: f.cost)
-    return _judge(index, fits, points_base, sigma)
+    finer = [_refine(index, pose, few, sigma, reach, 12) for pose in _distinct(ranked, few, FINE)]
+    fits = [_measure(index, pose, gate, points_base, sigma) for pose, gate in finer]
+    best = sorted(zip(fits, finer, strict=True), key=lambda f: f[0].cost)[:FINAL]
+    finest = [_refine(index, pose, points_base, sigma, gate, 40) for _, (pose, gate) in best]
+    fits = [_measure(index, pose, gate, points_base, sigma) for pose, gate in finest]
+    return _judge(sorted(fits, key=lambda f: f.cost), points_base, sigma)
 
 
-def _judge(index: ScanIndex, fits: list[_Fit], points: Array, sigma: float) -> Registration:
+def _judge(fits: list[_Fit], points: Array, sigma: float) -> Registration:
     best = fits[0]
     free = best.freedom
     words = []
@@ -108,10 +114,12 @@ def _rival(fits: list[_Fit], points: Array, sigma: float) -> _Fit | None:
     return others[0] if others else None
 
 
-def _refine(index: ScanIndex, pose: Array, points: Array, sigma: float, reach: float) -> _Fit:
-    """Robust point-to-plane steps (Geman-McClure) with exact nearest points, the gate narrowed as they settle."""
-    gate = reach
-    for _ in range(40):
+def _refine(index: ScanIndex, pose: Array, points: Array, sigma: float, gate: float, steps: int) -> tuple[Array, float]:
+    """Robust point-to-plane steps (Geman-McClure) with exact nearest points: the pose, and the gate, mm.
+
+    The gate is narrowed to three of the residuals' own standard deviations as they settle.
+    """
+    for _ in range(steps):
         pull, offset, inner = _pull(index, pose, points)
         weight = (1 + (offset / gate) ** 2) ** -2
         jacobian = np.concatenate([np.cross(inner, pull), pull], axis=1)  # -d offset / d xi
@@ -127,6 +135,11 @@ def _refine(index: ScanIndex, pose: Array, points: Array, sigma: float, reach: f
         gate = min(gate, narrowed)
         if settled:
             break
+    return pose, gate
+
+
+def _measure(index: ScanIndex, pose: Array, gate: float, points: Array, sigma: float) -> _Fit:
+    """How well points (N, 3), base frame, fit at a pose; those within two gates count."""
     inner = se3.transform_points(se3.inverse(pose), points)
     near = index.closest(inner)
     distance = np.linalg.norm(inner - near.points, axis=1)
@@ -182,13 +195,14 @@ def _starts(points: Array, outward: Array, index: ScanIndex) -> Array:
     """Poses (H, 4, 4) that lay each part of the scan under the points, centres and normals matched, at every yaw."""
     radius = _radius(points)
     base_from_cap = _cap(points, np.asarray(outward, float))
-    places = index.samples[_spread_out(index.samples, PLACES, 0.5 * radius)]
+    stride = max(1, len(index.samples) // COARSE_SAMPLES)
+    samples, normals = index.samples[::stride], index.normals[::stride]
+    places = samples[_spread_out(samples, PLACES, 0.5 * radius)]
     yaws = se3.exp_rotation(np.arange(YAWS)[:, None] * [0.0, 0.0, 2 * np.pi / YAWS])
     turned = base_from_cap @ se3.make(yaws, np.zeros(3))  # (Y, 4, 4)
     poses = []
-    for near in index.tree.query_ball_point(places, 1.6 * radius):
-        surface_from_cap = _cap(index.samples[near], index.normals[near].mean(0))
-        poses.append(turned @ se3.inverse(surface_from_cap))
+    for near in cKDTree(samples).query_ball_point(places, 1.6 * radius):
+        poses.append(turned @ se3.inverse(_cap(samples[near], normals[near].mean(0))))
     return np.concatenate(poses)
 
 

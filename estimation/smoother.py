@@ -100,6 +100,17 @@ class Smoother:
         grouped = np.repeat([seen[:3].mean(), seen[3:].mean()], 3)
         self._psd = np.maximum((1 - share) * self._psd + share * grouped, QUIET_PSD)
 
+    def _surprise(self, measured: Measured) -> Array:
+        """The density that makes this measurement a third of a sigma: a jerk of the hand loosens the prior at once.
+
+        The prior is there to bridge gaps and to give the twist; where motion is not smooth it must not drag the pose.
+        """
+        assert self._newest is not None
+        dt = measured.stamp - self._newest.stamp
+        expected = self._newest.pose @ se3.exp(self._newest.twist * dt)
+        off = se3.log(se3.inverse(expected) @ measured.pose)
+        return np.asarray(np.repeat([(off[:3] ** 2).mean(), (off[3:] ** 2).mean()], 3) * 30 / dt**3)
+
     def _extend(self, measured: Measured) -> Window:
         graph, values, stamps = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}
         pose, twist = gtsam.symbol("x", self._key), gtsam.symbol("v", self._key)
@@ -114,7 +125,7 @@ class Smoother:
                 gtsam.WnoaMotionFactorPose3(
                     gtsam.StateData(old_pose, old_twist, self._newest.stamp),
                     gtsam.StateData(pose, twist, measured.stamp),
-                    self._psd,
+                    np.maximum(self._psd, self._surprise(measured)),
                 )
             )
         noise = gtsam.noiseModel.Gaussian.Covariance(_symmetric(measured.covariance))

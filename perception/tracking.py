@@ -8,7 +8,7 @@ estimator fits the pose. When too little is found the surface is searched by its
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from estimation.estimator import Estimator, Fit, identity_pose
 from estimation.observations import Observations
-from estimation.pose import SurfacePose
+from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import solve_pose
+from estimation.refiner import Refiner
 from estimation.rig import Rig
 from estimation.se3 import Array
 from perception.features import grey
@@ -57,14 +58,28 @@ class TrackingStep:
 
     last: StepReport
 
-    def __init__(self, rig: Rig, roi: Sequence[Roi] = (), clock: Callable[[], float] = lambda: 0.0) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        roi: Sequence[Roi] = (),
+        clock: Callable[[], float] = lambda: 0.0,
+        executor: Executor | None = None,
+    ) -> None:
+        """Ready for the first frame set.
+
+        roi: where the surface is when it first comes into view; without one, whatever two cameras see is the surface.
+        clock: only to fill `StepReport.seconds`. executor: where the map is refined (a process of its own keeps GTSAM's
+        hold on the interpreter away from the frames); without one it is done in `idle`. Poses are the same either way.
+        """
         self.rig, self.roi, self._clock = rig, tuple(roi), clock
+        self._refiner = Refiner(rig, executor)
         self._lenses = Lenses(rig)
         self._estimator = Estimator(rig)
         self._search = Relocaliser(self._lenses)
         self._templates: Templates | None = None
         self._views: dict[int, View] = {}
         self._threads = ThreadPoolExecutor(max_workers=len(rig))
+        self._agrees = np.zeros(0, bool)
         self._spent = np.zeros(len(STAGES))
         self._lap = 0.0
 
@@ -78,11 +93,16 @@ class TrackingStep:
             pose, observations, used = self._initialise(frames, pyramids)
         else:
             pose, observations, used = self._track(frames.stamp, pyramids)
+            self._refiner.tick()
         self.last = StepReport(observations, used, self._spent)
         return pose
 
     def idle(self) -> None:
-        """Work that no pose waits for (map refinement); the caller's loop calls it once a pose is handed over."""
+        """Work that no pose waits for; the caller's loop calls it once a pose is handed over."""
+        refined = self._refiner.poll()
+        if refined is not None:
+            self._estimator.replace_map(refined.map)
+            self._agrees = refined.agrees
 
     def _took(self, stage: str) -> None:
         now = self._clock()
@@ -104,9 +124,10 @@ class TrackingStep:
             return identity_pose(frames.stamp, first), _no_observations(frames.stamp), none
         self._templates = first.templates
         pose = self._estimator.begin(frames.stamp, first.base_from_surface, first.map)
-        everything = np.arange(len(first.map))
-        observations = self._align(frames.stamp, pyramids, dict.fromkeys(polygons, first.base_from_surface), everything)
+        self._agrees = np.ones(len(first.map), bool)
+        observations = self._align(frames.stamp, pyramids, dict.fromkeys(polygons, first.base_from_surface))
         fit = self._estimator.fit(observations, first.base_from_surface)
+        self._refiner.begin(first.map, frames.stamp, first.base_from_surface, observations)
         self._remember(pyramids, observations, fit.inlier, first.base_from_surface)
         for camera in polygons:
             self._search.learn(camera, pyramids[camera][0], first.base_from_surface, first.map)
@@ -132,11 +153,10 @@ class TrackingStep:
     ) -> tuple[SurfacePose, Observations, NDArray[np.int64]]:
         estimator = self._estimator
         assert estimator.map is not None and estimator.pose is not None
-        everything = np.arange(len(estimator.map))
         guess = estimator.predict(stamp)
         joint, single = self._flow(pyramids, guess)
         self._took("flow")
-        observations = self._align(stamp, pyramids, single, everything)
+        observations = self._align(stamp, pyramids, single)
         self._took("align")
         fit = estimator.fit(observations, joint)
         self._took("pose")
@@ -144,12 +164,25 @@ class TrackingStep:
             fit, observations = self._second_try(stamp, pyramids, fit, observations)
             self._took("search")
         if fit.measured:
+            if estimator.pose.state is TrackState.INITIALISING:
+                fit = self._confirm(fit, observations)
             pose = estimator.accept(fit, observations)
+            self._refiner.offer(fit, observations, pose.twist, estimator.skew.sigma)
             self._remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)
         else:
             pose = estimator.coast(stamp, fit.reason)
         self._took("pose")
         return pose, observations, fit.used
+
+    def _confirm(self, fit: Fit, observations: Observations) -> Fit:
+        """The first measured frame set after the first map: correct the map by it and fit again."""
+        refined = self._refiner.confirm(fit, observations, self._estimator.skew.sigma)
+        if refined is None:
+            return fit
+        self._estimator.replace_map(refined.map)
+        self._agrees = refined.agrees
+        again = self._estimator.fit(observations, fit.solution.base_from_surface)
+        return again if again.measured else fit
 
     def _flow(self, pyramids: dict[int, Pyramid], guess: Array) -> tuple[Array, dict[int, Array]]:
         """The joint pose by optical flow, and each camera's own: cameras are seldom exposed at the same instant."""
@@ -186,10 +219,9 @@ class TrackingStep:
         found, ok = flow(view.image, image, view.pixels, view.pixels + after - before)
         return view.rows[ok], undistort(self.rig.cameras[camera], found[ok])
 
-    def _align(
-        self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array], rows: NDArray[np.int64]
-    ) -> Observations:
-        """Measure landmarks (rows) in every camera, each begun where the camera's own pose puts them."""
+    def _align(self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array]) -> Observations:
+        """Measure the landmarks in every camera, each begun where the camera's own pose puts them."""
+        rows = np.nonzero(self._agrees)[0]
         cameras = [c for c in pyramids if c in poses]
         results = list(self._threads.map(lambda c: self._align_one(c, pyramids[c], poses[c], rows), cameras))
         found = [rows[r.found] for r in results]
@@ -208,7 +240,7 @@ class TrackingStep:
         where = project_squares(
             self._lenses, camera, pose, surface_map.points[rows], surface_map.normals[rows], templates.axes[rows]
         )
-        return align(templates, images, where, where.centre)
+        return align(templates.take(rows), images, where, where.centre)
 
     def _doubtful(self, fit: Fit, pyramids: dict[int, Pyramid]) -> bool:
         """Whether to search: no measurement, or a camera that carried the last pose now hardly sees the surface."""
@@ -224,8 +256,6 @@ class TrackingStep:
         self, stamp: float, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations
     ) -> tuple[Fit, Observations]:
         """Align again from the pose that the other cameras give, then from the pose that SIFT finds; keep the best."""
-        assert self._estimator.map is not None
-        everything = np.arange(len(self._estimator.map))
         best = fit, observations
         starts: list[Callable[[], Array | None]] = []
         if fit.measured:
@@ -235,7 +265,7 @@ class TrackingStep:
             pose = start()
             if pose is None:
                 continue
-            again = self._align(stamp, pyramids, dict.fromkeys(pyramids, pose), everything)
+            again = self._align(stamp, pyramids, dict.fromkeys(pyramids, pose))
             refit = self._estimator.fit(again, pose)
             if refit.measured and (not best[0].measured or refit.used.sum() > best[0].used.sum()):
                 best = refit, again

@@ -1,0 +1,176 @@
+"""Refining the map from key frames: one GTSAM bundle adjustment, made away from the frame's path (it takes 20-300 ms).
+
+Unknown are the landmarks, the surface's pose at each key frame, and, because cameras are seldom exposed together, each
+camera's own pose of the surface at its own instant, tied to the key frame's by the distance it may have moved meanwhile.
+The surface frame stays where it was given out: the refined poses of the key frames agree with the ones that were published,
+on the whole, so that the path does not jump under the nozzle when a better map comes into force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import se3
+from estimation.observations import Observations
+from estimation.pose_solver import project
+from estimation.rig import Rig
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap, local_normals
+
+LEAST_SIGHTINGS = 3
+FREE = 50.0  # mm: how far a landmark may lie from where it was; only there to keep a hardly seen one finite
+ROBUST = 3.0  # sigmas
+LEAST_DRIFT = np.array([1e-5] * 3 + [1e-3] * 3)  # rad, mm: so that the tie stays well conditioned
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyFrame:
+    """One frame set worth keeping. observations.track counts rows of the map. drift: (6,) the surface's own twist times
+    one standard deviation of the cameras' instants, rad and mm: how far it may have moved from one image to the next."""
+
+    base_from_surface: Array
+    observations: Observations
+    drift: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjusted:
+    """The refined map, in the same rows and the same surface frame. agrees: (N,) whether a landmark moved with the rest."""
+
+    map: SurfaceMap
+    agrees: NDArray[np.bool_]
+
+
+def adjust(rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame]) -> Adjusted | None:
+    """The map that fits all key frames best, or None if they do not determine one.
+
+    Base and surface swap roles (X = surface_from_base), so that GTSAM's stock projection factor with
+    body_P_sensor = base_from_camera is the measurement.
+    """
+    sightings = np.zeros(len(surface_map), int)
+    for frame in keyframes:
+        np.add.at(sightings, frame.observations.track, 1)
+    rows = np.nonzero(sightings >= LEAST_SIGHTINGS)[0]
+    if len(rows) < 12 or len(keyframes) < 2:
+        return None
+    graph, values = _graph(rig, surface_map, keyframes, set(rows.tolist()))
+    try:
+        solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        covariance = _joint_covariance(graph.linearize(solved), rows)
+    except (RuntimeError, np.linalg.LinAlgError):
+        return None
+    points = surface_map.points.copy()
+    points[rows] = [solved.atPoint3(gtsam.symbol("l", int(r))) for r in rows]
+    if not np.isfinite(points).all() or not np.isfinite(covariance).all():
+        return None
+    whole = surface_map.covariance.copy()
+    covariance = without_frame(covariance, points[rows])
+    place = (3 * rows[:, None] + np.arange(3)).ravel()
+    whole[place] = whole[:, place] = 0.0
+    whole[np.ix_(place, place)] = covariance
+    agrees = _agreement(rig, points, keyframes, solved)
+    if agrees.sum() < 12:
+        return None
+    refined = np.stack([se3.inverse(solved.atPose3(gtsam.symbol("x", i)).matrix()) for i in range(len(keyframes))])
+    points = se3.transform_points(frame_change(keyframes, refined), points)
+    normals = surface_map.normals.copy()
+    normals[agrees] = local_normals(points[agrees], surface_map.normals[agrees].mean(0))
+    return Adjusted(SurfaceMap(points, normals, whole), agrees)
+
+
+def without_frame(covariance: Array, points: Array) -> Array:
+    """Covariance (3N, 3N) of points (N, 3) without the part that moves all of them as one: the frame is theirs."""
+    motion = np.concatenate([-se3.hat(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], -1).reshape(-1, 6)
+    basis = np.linalg.qr(motion * [0.01, 0.01, 0.01, 1, 1, 1])[0]
+    left = covariance - basis @ (basis.T @ covariance)
+    return np.asarray(left - (left @ basis) @ basis.T)
+
+
+def frame_change(keyframes: list[KeyFrame], refined: Array) -> Array:
+    """old_surface_from_new (4, 4): what makes refined poses (K, 4, 4) agree with the published ones in the mean.
+
+    A key frame counts the less the farther the surface may have moved between its cameras' instants.
+    """
+    published = np.stack([f.base_from_surface for f in keyframes])
+    drift = np.array([np.linalg.norm(f.drift[3:]) for f in keyframes])
+    weight = 1 / (0.05**2 + drift**2)
+    change = np.eye(4)
+    for _ in range(3):
+        rest = se3.log(se3.inverse(published) @ refined @ se3.inverse(change))
+        change = se3.exp(weight @ rest / weight.sum()) @ change
+    return change
+
+
+def _camera_key(camera: int, frame: int) -> int:
+    return int(gtsam.symbol(chr(ord("A") + camera), frame))
+
+
+def _graph(
+    rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], rows: set[int]
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    lenses = [gtsam.Cal3_S2(m[0, 0], m[1, 1], 0.0, m[0, 2], m[1, 2]) for m in rig.matrices]
+    sensors = [gtsam.Pose3(c.base_from_camera) for c in rig.cameras]
+    loss = gtsam.noiseModel.mEstimator.Cauchy.Create(ROBUST)
+    for i, frame in enumerate(keyframes):
+        body = gtsam.symbol("x", i)
+        start = gtsam.Pose3(se3.inverse(frame.base_from_surface))
+        values.insert(body, start)
+        # T exp(d) has the inverse X exp(-Ad(T) d): the same drift, seen from the base
+        carry = se3.adjoint(frame.base_from_surface)
+        along = np.outer(frame.drift, frame.drift) + np.diag((0.3 * np.abs(frame.drift) + LEAST_DRIFT) ** 2)
+        loose = gtsam.noiseModel.Gaussian.Covariance(carry @ along @ carry.T)
+        seen = frame.observations
+        for c in np.unique(seen.camera):
+            values.insert(_camera_key(int(c), i), start)
+            graph.add(gtsam.BetweenFactorPose3(body, _camera_key(int(c), i), gtsam.Pose3(), loose))
+        for c, row, pixel, sigma in zip(seen.camera, seen.track, seen.pixels, seen.sigma, strict=True):
+            if int(row) in rows:
+                noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(2, float(sigma)))
+                graph.add(
+                    gtsam.GenericProjectionFactorCal3_S2(
+                        pixel, noise, _camera_key(int(c), i), gtsam.symbol("l", int(row)), lenses[c], sensors[c]
+                    )
+                )
+    held = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    graph.add(gtsam.PriorFactorPose3(gtsam.symbol("x", 0), values.atPose3(gtsam.symbol("x", 0)), held))
+    far = gtsam.noiseModel.Isotropic.Sigma(3, FREE)
+    for row in sorted(rows):
+        key = gtsam.symbol("l", row)
+        values.insert(key, surface_map.points[row])
+        graph.add(gtsam.PriorFactorPoint3(key, surface_map.points[row], far))
+    return graph, values
+
+
+def _joint_covariance(linear: gtsam.GaussianFactorGraph, rows: NDArray[np.int64]) -> Array:
+    """Joint covariance (3M, 3M) of the landmarks `rows`, from the dense information with all poses eliminated."""
+    ordering = gtsam.Ordering()
+    landmarks = [gtsam.symbol("l", int(r)) for r in rows]
+    known = set(landmarks)
+    poses = [key for key in linear.keyVector() if key not in known]
+    for key in landmarks + poses:
+        ordering.push_back(key)
+    information, _ = linear.hessian(ordering)
+    n = 3 * len(rows)
+    cross = information[:n, n:]
+    schur = information[:n, :n] - cross @ np.linalg.solve(information[n:, n:], cross.T)
+    return np.linalg.inv((schur + schur.T) / 2)
+
+
+def _agreement(rig: Rig, points: Array, keyframes: list[KeyFrame], solved: gtsam.Values) -> NDArray[np.bool_]:
+    """Which landmarks (N,) fit most of their sightings: what stands still while the surface moves does not."""
+    fits, total = np.zeros(len(points)), np.zeros(len(points))
+    for i, frame in enumerate(keyframes):
+        seen = frame.observations
+        for c in np.unique(seen.camera):
+            mine = seen.camera == c
+            pose = se3.inverse(solved.atPose3(_camera_key(int(c), i)).matrix())
+            predicted = project(rig, seen.camera[mine], pose, points[seen.track[mine]])[0]
+            away = np.linalg.norm(predicted - seen.pixels[mine], axis=1) / seen.sigma[mine]
+            np.add.at(fits, seen.track[mine], away < 4 * ROBUST)
+            np.add.at(total, seen.track[mine], 1)
+    return np.asarray((total < LEAST_SIGHTINGS) | (fits >= 0.5 * total))

@@ -1,0 +1,125 @@
+"""Choosing key frames and having the map refined from them, with results that come into force at a fixed frame set.
+
+The adjustment may run in another process; its map is taken over a fixed number of frame sets after it was asked for, so
+poses do not depend on how fast that process was.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor, Future
+
+import numpy as np
+
+from estimation import se3
+from estimation.adjustment import Adjusted, KeyFrame, adjust
+from estimation.estimator import Fit
+from estimation.observations import Observations
+from estimation.rig import Rig
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap
+
+DELAY = 3  # frame sets between the asking and the taking over
+MOST = 20  # key frames: 40 improved the pose by nothing and cost four times as much
+TURN, SHIFT = 0.07, 0.04  # rad, and parts of the distance to the cameras: a view that differs by this is worth keeping
+STEADY = 0.4  # s between key frames of the same view, of which a few average the tracks' noise
+STEADY_MOST = 6
+LEAST_SIGMA = 0.1  # px
+
+
+class Refiner:
+    """Keeps the key frames of one surface and asks for a new map when a new one is worth it."""
+
+    def __init__(self, rig: Rig, executor: Executor | None = None) -> None:
+        self._rig, self._executor = rig, executor
+        self._frames: list[KeyFrame] = []
+        self._stamps: list[float] = []
+        self._map: SurfaceMap | None = None
+        self._ask = False
+        self._due = 0
+        self._count = 0
+        self._job: Future[Adjusted | None] | Adjusted | None = None
+
+    def begin(self, surface_map: SurfaceMap, stamp: float, base_from_surface: Array, observations: Observations) -> None:
+        """The first map and the frame set that it was made from, whose pose defines the surface frame."""
+        self._map, self._frames, self._stamps = surface_map, [], []
+        self._job, self._ask = None, False
+        self._keep(stamp, base_from_surface, observations, np.zeros(6))
+
+    def confirm(self, fit: Fit, observations: Observations, skew: float) -> Adjusted | None:
+        """The second frame set: what it shows of the motion corrects the first map, on the spot.
+
+        Until then a surface that moved between the cameras' instants looks nearer or farther than it is.
+        """
+        first, dt = self._frames[0], fit.stamp - self._stamps[0]
+        moved = se3.log(se3.inverse(first.base_from_surface) @ fit.solution.base_from_surface)
+        drift = moved / dt * skew
+        self._frames[0] = KeyFrame(first.base_from_surface, first.observations, drift)
+        self._keep(fit.stamp, fit.solution.base_from_surface, _inliers(fit, observations), drift)
+        assert self._map is not None
+        refined = adjust(self._rig, self._map, self._frames)
+        if refined is not None:
+            self._map = refined.map
+        return refined
+
+    def offer(self, fit: Fit, observations: Observations, twist: Array, skew: float) -> None:
+        """A measured frame set; it is kept if it shows the surface anew."""
+        if self._is_new(fit.stamp, fit.solution.base_from_surface):
+            self._keep(fit.stamp, fit.solution.base_from_surface, _inliers(fit, observations), twist * skew)
+            self._ask = True
+
+    def _is_new(self, stamp: float, pose: Array) -> bool:
+        poses = np.stack([f.base_from_surface for f in self._frames])
+        turn = se3.angle_of(se3.inverse(poses) @ pose)
+        shift = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
+        centre = np.mean([c.base_from_camera[:3, 3] for c in self._rig.cameras], axis=0)
+        far = SHIFT * np.linalg.norm(pose[:3, 3] - centre)
+        alike = (turn < TURN) & (shift < far)
+        if not alike.any():
+            return True
+        return int(alike.sum()) < STEADY_MOST and stamp - self._stamps[-1] > STEADY
+
+    def _keep(self, stamp: float, pose: Array, observations: Observations, drift: Array) -> None:
+        self._frames.append(KeyFrame(pose, observations, drift))
+        self._stamps.append(stamp)
+        if len(self._frames) > MOST:
+            worst = self._most_alike()
+            del self._frames[worst], self._stamps[worst]
+
+    def _most_alike(self) -> int:
+        """The key frame, never the first, that others stand in for best."""
+        poses = np.stack([f.base_from_surface for f in self._frames])
+        between = se3.log(se3.inverse(poses)[:, None] @ poses[None])
+        size = np.linalg.norm(between[..., :3], axis=2) / TURN + np.linalg.norm(between[..., 3:], axis=2) / 40.0
+        size[np.diag_indices(len(poses))] = np.inf
+        return 1 + int(np.argmin(np.sort(size[1:], axis=1)[:, :2].sum(1)))
+
+    def tick(self) -> None:
+        """One more frame set has been tracked."""
+        self._count += 1
+
+    def poll(self) -> Adjusted | None:
+        """A refined map whose frame set has come, or None; asks for the next one when key frames call for it."""
+        result = None
+        if self._job is not None and self._count >= self._due:
+            result = self._job.result() if isinstance(self._job, Future) else self._job
+            self._job = None
+            if result is not None:
+                self._map = result.map
+        if self._ask and self._job is None and self._map is not None and len(self._frames) >= 3:
+            self._ask, self._due = False, self._count + DELAY
+            if self._executor is None:
+                self._job = adjust(self._rig, self._map, list(self._frames))
+            else:
+                self._job = self._executor.submit(adjust, self._rig, self._map, list(self._frames))
+        return result
+
+
+def _inliers(fit: Fit, observations: Observations) -> Observations:
+    keep = fit.inlier
+    return Observations(
+        fit.stamp,
+        observations.camera[keep],
+        observations.track[keep],
+        observations.pixels[keep],
+        np.maximum(observations.sigma[keep], LEAST_SIGMA),
+    )
