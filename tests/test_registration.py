@@ -22,7 +22,7 @@ seeds = st.integers(0, 2**32 - 1)
 def found(
     scan: Scan, seed: int, noise: float = 0.0, count: int = 250, wrong: float = 0.0
 ) -> tuple[Registration, Array]:
-    """What is found from points on the scan at a random pose, and how far (N,), mm, it lays them from where they are."""
+    """What is found from points on the scan at a random pose, and how far (N,), mm, it lays them from the truth."""
     rng = np.random.default_rng(seed)
     base_from_surface = se3.exp(np.r_[rng.uniform(-1.8, 1.8, 3), rng.normal(size=3) * 200])
     points = scans.points_on(scan, count, rng, MIDDLE)
@@ -67,7 +67,7 @@ def test_errors_and_covariance_agree() -> None:
 
 
 def test_wrong_points_do_not_pull() -> None:
-    result, error = found(BODY, 3, noise=0.05, wrong=0.2)
+    _, error = found(BODY, 3, noise=0.05, wrong=0.2)
     assert error.mean() < 0.2
 
 
