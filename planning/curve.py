@@ -1,0 +1,108 @@
+"""The way through checkpoints as a curve by length: straight between them, each corner a parabola.
+
+A cubic spline through sparse checkpoints was measured to leave the path by 1 mm and to run at 2.7 times the speed limit
+in corners. Here corners are blended on purpose (Kunz and Stilman 2012, with parabolas, which serve reversals as well):
+the first derivative is continuous and never longer than 1, so speed along the curve bounds the tool's speed everywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import se3
+from estimation.se3 import Array
+from planning.path import lengths
+
+SHORTEST = 1.0  # mm: a horizon in which any printing speed can be stopped
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """A way in the surface frame, by length s in mm (turns count too, see path.LEVER).
+
+    knots: (K,) s of the checkpoints, from 0. points: (K, 3) mm. rotations: (K, 3, 3) of the nozzle. direction:
+    (K-1, 3) and spin: (K-1, 3), body rad/mm, of each stretch. bend: (K, 3), change of direction at each checkpoint.
+    half: (K,), length of the blend before and after each, 0 where there is none. speed: (K-1,) mm/s allowed on each
+    stretch. corner: (K,) mm/s allowed in each blend.
+    """
+
+    knots: Array
+    points: Array
+    rotations: Array
+    direction: Array
+    spin: Array
+    bend: Array
+    half: Array
+    speed: Array
+    corner: Array
+
+    @property
+    def length(self) -> float:
+        """Its whole length, mm."""
+        return float(self.knots[-1])
+
+    def after(self, s: float, seconds: float) -> float:
+        """Where one is `seconds` s after s, mm, at the speeds allowed, and at least SHORTEST mm on; at most the end."""
+        due = np.concatenate([[0.0], np.cumsum(np.diff(self.knots) / self.speed)])
+        there = float(np.interp(np.interp(s, self.knots, due) + seconds, due, self.knots))
+        return min(max(there, s + SHORTEST), self.length)
+
+    def stretch(self, s: Array) -> NDArray[np.intp]:
+        """Number (...) of the stretch that each s (...) lies on; a checkpoint belongs to the stretch after it."""
+        return np.clip(np.searchsorted(self.knots, s, "right") - 1, 0, len(self.knots) - 2)
+
+    def poses(self, s: Array) -> Array:
+        """surface_from_nozzle (N, 4, 4) at s (N,), mm."""
+        i = self.stretch(s)
+        along = s - self.knots[i]
+        rotation = self.rotations[i] @ se3.exp_rotation(self.spin[i] * along[:, None])
+        into, out_of = self._blends(i, s)
+        rounding = self._per_bend(i, out_of**2) + self._per_bend(i + 1, into**2)
+        return se3.make(rotation, self.points[i] + self.direction[i] * along[:, None] + rounding)
+
+    def slope(self, s: Array) -> Array:
+        """First derivative (N, 3) of the position at s (N,); at most 1 long."""
+        i = self.stretch(s)
+        into, out_of = self._blends(i, s)
+        return np.asarray(self.direction[i] + 2 * (self._per_bend(i + 1, into) - self._per_bend(i, out_of)))
+
+    def curvature(self, s: Array) -> Array:
+        """Second derivative (N, 3), 1/mm, of the position at s (N,); where it steps, the stronger side."""
+        i = self.stretch(s)
+        into, out_of = self._blends(i, s, 1e-9)
+        return np.asarray(2 * (self._per_bend(i, 1.0 * (out_of > 0)) + self._per_bend(i + 1, 1.0 * (into > 0))))
+
+    def _blends(self, i: NDArray[np.intp], s: Array, slack: float = 0.0) -> tuple[Array, Array]:
+        """How deep s is in the blend at the end and at the start of its stretch i, mm, 0 outside."""
+        into = s - (self.knots[i + 1] - self.half[i + 1])
+        out_of = self.knots[i] + self.half[i] - s
+        return np.asarray(np.maximum(into + slack, 0.0)), np.asarray(np.maximum(out_of + slack, 0.0))
+
+    def _per_bend(self, i: NDArray[np.intp], value: NDArray[Any]) -> Array:
+        half = self.half[i]
+        scale = np.where(half > 0, value / np.where(half > 0, 4 * half, 1.0), 0.0)
+        return np.asarray(scale[:, None] * self.bend[i])
+
+
+def curve_through(surface_from_nozzle: Array, speed: Array, tolerance: float, swerve: float) -> Curve:
+    """The curve through poses (K, 4, 4), no two in a row the same.
+
+    speed: (K-1,) mm/s. tolerance: mm by which corners are cut. swerve: mm/s by which a corner may change the velocity.
+    """
+    length = lengths(surface_from_nozzle)
+    points, rotations = surface_from_nozzle[:, :3, 3], surface_from_nozzle[:, :3, :3]
+    direction = np.diff(points, axis=0) / length[:, None]
+    spin = se3.log_rotation(np.swapaxes(rotations[:-1], -1, -2) @ rotations[1:]) / length[:, None]
+    bend = np.zeros_like(points)
+    bend[1:-1] = np.diff(direction, axis=0)
+    turned = np.linalg.norm(bend, axis=1)
+    half = np.zeros(len(points))
+    wanted = 4 * tolerance / np.maximum(turned[1:-1], 1e-9)  # the curve passes a corner at |bend| * half / 4
+    half[1:-1] = np.where(turned[1:-1] > 1e-9, np.minimum(wanted, np.minimum(length[:-1], length[1:]) / 2), 0.0)
+    knots = np.concatenate([[0.0], np.cumsum(length)])
+    corner = np.where(half > 0, swerve / np.maximum(turned, 1e-9), np.inf)
+    return Curve(knots, points, rotations, direction, spin, bend, half, np.asarray(speed, float), corner)

@@ -1,0 +1,232 @@
+"""The planner: each tick one command that carries the path along with the surface, or a stop and its reason.
+
+The target of the nozzle is base_from_surface(t) @ surface_from_nozzle(s(t)): the surface as its pose predicts it, the
+place s on the path as TOPP-RA times it. Ruckig follows the target. Whatever stands in the way (no pose, a pose that is
+not worth following, a target out of reach, a failed solve) brakes the arm within its limits and then holds it; when it
+is gone the nozzle goes back to the very place where it stopped: nothing is left out and nothing printed twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimation import se3
+from estimation.pose import SurfacePose
+from estimation.se3 import Array
+from planning.command import Command, Hold, Move
+from planning.curve import Curve, curve_through
+from planning.follow import LEAD, Follower
+from planning.kinematics import SimpleArm, axes_from_nozzle, nozzle_from_axes
+from planning.legs import CORNER, SWERVE, Leg, Phase, entry, exit_from
+from planning.limits import Limits
+from planning.path import Path, check_path
+from planning.retime import Timing, retime
+
+HORIZON = 2.0  # s of path timed at once
+RENEW = 1.0  # s of it left when the next is timed; a horizon ends at rest
+STALL = 3.0  # ticks without a call after which the arm has come to rest by itself
+MARGIN = np.array([5.0, 5, 5, *np.deg2rad([2, 2, 2])])  # that targets keep from the bounds: braking needs room
+SHARE = 0.98  # of what the guard tolerates of a pose: the planner brakes before the guard would cut
+PATH_SPEED, PATH_ACCELERATION = 0.5, 0.2  # of the axes' limits, for the path alone; the rest carries the surface
+SLOWEST = 1.0  # mm/s, feed of a move that only turns
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far the print is. checkpoint: the one being printed, of `total`; place: of `length` mm of path."""
+
+    phase: Phase
+    checkpoint: int
+    total: int
+    place: float
+    length: float
+
+
+class Planner:
+    """Decides each tick where the nozzle goes next; remembers the place on the path and the arm's commanded motion."""
+
+    def __init__(self, path: Path, limits: Limits, arm: SimpleArm, tick: float) -> None:
+        self._path, self._limits, self._arm, self._tick = check_path(path), limits, arm, tick
+        self._curve = curve_through(path.surface_from_nozzle, path.speed[1:], CORNER, SWERVE)
+        self._follower = Follower(arm.home, limits, tick)
+        self._leg: Leg | None = None
+        self._place = 0.0  # mm of the path that are printed
+        self._finished = False
+        self._before = -np.inf
+
+    def __call__(self, pose: SurfacePose | None, now: float) -> Command:
+        """The command of the tick at `now`, s: its axes are reached one tick later. pose: the newest there is."""
+        if now - self._before > STALL * self._tick:
+            self._follower.rest()
+        self._before = now
+        if self._finished:
+            return self._stop(now, "path finished")
+        if pose is None:
+            return self._stop(now, "no pose yet")
+        reason = self._doubt(pose, now) or self._keep_leg(pose, now)
+        if reason:
+            return self._stop(now, reason)
+        if self._finished:
+            return self._stop(now, "path finished")
+        return self._follow(pose, now)
+
+    def refused(self, axes: Array) -> None:
+        """The last move was not sent: the arm stands at `axes` (6,), and the leg begins anew."""
+        self._follower.rest(axes)
+        self._leg = None
+
+    @property
+    def progress(self) -> Progress:
+        """How far the print is."""
+        phase = Phase.FINISHED if self._finished else Phase.WAITING if self._leg is None else self._leg.phase
+        return Progress(phase, self._checkpoint(), len(self._path), self._place, self._curve.length)
+
+    # -- whether to move
+
+    def _doubt(self, pose: SurfacePose, now: float) -> str:
+        """Why the pose must not be followed, "" if it may."""
+        limits, then = self._limits, now + self._tick
+        if not _finite(pose):
+            return "the pose is not finite"
+        if not pose.state.measured:
+            return f"surface is {pose.state.value}" + (f": {pose.reason}" if pose.reason else "")
+        age = now - pose.stamp
+        if not 0 <= age <= SHARE * limits.pose_age:
+            return f"pose is {age:.3f} s old, limit {limits.pose_age:g} s"
+        base_from_nozzle = nozzle_from_axes(self._arm, self._follower.position)
+        place = (se3.inverse(pose.base_from_surface) @ base_from_nozzle)[:3, 3]
+        turn, speed = pose.twist[:3], pose.twist[3:] + np.cross(pose.twist[:3], place)
+        if np.linalg.norm(speed) > SHARE * limits.surface_speed:
+            return f"surface moves at {np.linalg.norm(speed):.1f} mm/s, limit {limits.surface_speed:g} mm/s"
+        if np.linalg.norm(turn) > SHARE * limits.surface_turn:
+            turn_deg, limit_deg = np.rad2deg(np.linalg.norm(turn)), np.rad2deg(limits.surface_turn)
+            return f"surface turns at {turn_deg:.1f} degrees/s, limit {limit_deg:g} degrees/s"
+        error = float(pose.predict(then).error_at(place[None])[0])
+        if not error <= SHARE * limits.pose_error:
+            return f"nozzle is known to {error:.3f} mm only, limit {limits.pose_error:g} mm"
+        return ""
+
+    # -- where on which leg
+
+    def _keep_leg(self, pose: SurfacePose, now: float) -> str:
+        """See that there is a leg with a timing that lasts; why there is none, "" if there is."""
+        leg = self._leg
+        if leg is None:
+            return self._begin(pose, now)
+        off = self._error(pose, leg, now) > self._limits.on_path
+        if off and leg.phase is Phase.PRINTING:
+            return self._begin(pose, now)
+        if now < leg.timing.end - RENEW:
+            return ""
+        if leg.timing.places[-1] < leg.curve.length:
+            return self._renew(pose, leg, now)
+        if now < leg.timing.end or (off and leg.phase is Phase.ENTERING):
+            return ""
+        return self._next(pose, leg.phase, now)
+
+    def _begin(self, pose: SurfacePose, now: float) -> str:
+        """Go from where the nozzle is to where the path goes on, or up if it is done."""
+        self._leg = None
+        base_from_nozzle = nozzle_from_axes(self._arm, self._follower.position)
+        nozzle = se3.inverse(pose.predict(now).base_from_surface) @ base_from_nozzle
+        if self._place >= self._curve.length:
+            return self._start(pose, Phase.LEAVING, exit_from(nozzle), 0.0, now)
+        goal = self._curve.poses(np.array([self._place]))[0]
+        way = entry(nozzle, goal, float(self._path.speed[self._checkpoint()]))
+        if way is None:
+            return self._next(pose, Phase.ENTERING, now)
+        return self._start(pose, Phase.ENTERING, way, 0.0, now)
+
+    def _next(self, pose: SurfacePose, phase: Phase, now: float) -> str:
+        """Begin the leg after one of `phase`."""
+        if phase is Phase.ENTERING:
+            return self._start(pose, Phase.PRINTING, self._curve, self._place, now)
+        if phase is Phase.PRINTING:
+            self._place = self._curve.length
+            return self._begin(pose, now)
+        self._finished = True
+        return ""
+
+    def _start(self, pose: SurfacePose, phase: Phase, curve: Curve, place: float, now: float) -> str:
+        """Begin a leg from rest at `place`, mm; why that cannot be, or ""."""
+        timing = self._timed(pose, curve, place, 0.0, now)
+        self._leg = None if isinstance(timing, str) else Leg(phase, curve, timing)
+        return timing if isinstance(timing, str) else ""
+
+    def _renew(self, pose: SurfacePose, leg: Leg, now: float) -> str:
+        """Time the next horizon from where and how fast the old one is; if that fails, the old one ends at rest."""
+        place = float(leg.timing.at(np.array([now]))[0])
+        timing = self._timed(pose, leg.curve, place, leg.timing.speed_at(now), now)
+        if isinstance(timing, str):
+            return timing if now >= leg.timing.end else ""
+        self._leg = replace(leg, timing=timing)
+        return ""
+
+    def _timed(self, pose: SurfacePose, curve: Curve, place: float, speed: float, now: float) -> Timing | str:
+        turn = (self._arm.arm_from_base @ pose.base_from_surface)[:3, :3]
+        limits = PATH_SPEED * self._limits.speed, PATH_ACCELERATION * self._limits.acceleration
+        return retime(curve, place, curve.after(place, HORIZON), speed, now, turn, limits)
+
+    # -- the motion
+
+    def _follow(self, pose: SurfacePose, now: float) -> Command:
+        leg = self._leg
+        assert leg is not None
+        half = self._tick / 2
+        reference, before, ahead, after = self._targets(
+            pose, leg, now + np.array([2 * half, LEAD - half, LEAD, LEAD + half])
+        )
+        outside = np.flatnonzero((ahead < self._limits.low + MARGIN) | (ahead > self._limits.high - MARGIN))
+        if len(outside):
+            return self._stop(now, self._out_of_reach(int(outside[0]), ahead))
+        start = self._follower.position
+        axes = self._follower.aim(ahead, (after - before) / self._tick)
+        if isinstance(axes, str):
+            return self._stop(now, axes)
+        extrude = False
+        if leg.phase is Phase.PRINTING and np.linalg.norm(axes[:3] - reference[:3]) <= self._limits.on_path:
+            self._place = float(leg.timing.at(np.array([now + self._tick]))[0])
+            extrude = bool(self._path.extrude[self._checkpoint()])
+        return self._move(now, start, axes, extrude)
+
+    def _targets(self, pose: SurfacePose, leg: Leg, times: Array) -> Array:
+        """Machine axes (T, 6) that the leg asks for at times (T,), s."""
+        base_from_surface = pose.base_from_surface @ se3.exp(pose.twist * (times - pose.stamp)[:, None])
+        return axes_from_nozzle(self._arm, base_from_surface @ leg.curve.poses(leg.timing.at(times)))
+
+    def _error(self, pose: SurfacePose, leg: Leg, now: float) -> float:
+        """Distance, mm, of the nozzle from where the leg wants it at `now`."""
+        wanted = self._targets(pose, leg, np.array([now]))[0]
+        return float(np.linalg.norm(self._follower.position[:3] - wanted[:3]))
+
+    def _stop(self, now: float, reason: str) -> Command:
+        """Brake, and hold once at rest."""
+        self._leg = None
+        if not self._follower.at_rest:
+            start = self._follower.position
+            axes = self._follower.brake()
+            if not isinstance(axes, str):
+                return self._move(now, start, axes, extrude=False)
+            self._follower.rest()
+        return Hold(now, self._limits.pause, reason)
+
+    def _move(self, now: float, start: Array, axes: Array, extrude: bool) -> Move:
+        feed = max(float(np.linalg.norm(axes[:3] - start[:3])) / self._tick, SLOWEST)
+        return Move(now, axes, feed, self._checkpoint(), extrude)
+
+    def _checkpoint(self) -> int:
+        """The checkpoint that the place on the path leads to."""
+        return min(int(np.searchsorted(self._curve.knots, self._place, "left")), len(self._path) - 1)
+
+    def _out_of_reach(self, axis: int, axes: Array) -> str:
+        shown = np.array([axes, self._limits.low + MARGIN, self._limits.high - MARGIN])[:, axis]
+        got, low, high = np.rad2deg(shown) if axis > 2 else shown
+        allowed = f"{low:g} to {high:g} {'degrees' if axis > 2 else 'mm'}"
+        return f"checkpoint {self._checkpoint()} is out of reach: {'XYZABC'[axis]} = {got:.1f}, allowed {allowed}"
+
+
+def _finite(pose: SurfacePose) -> bool:
+    arrays = (pose.base_from_surface, pose.covariance, pose.twist, pose.twist_covariance, pose.acceleration_psd)
+    return bool(np.isfinite(pose.stamp) and all(np.isfinite(a).all() for a in arrays))
