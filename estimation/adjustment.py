@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.pose_solver import project
+from estimation.pose_solver import project, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals
@@ -75,7 +75,7 @@ def adjust(rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame]) -> Adju
     agrees = _agreement(rig, points, keyframes, solved)
     if agrees.sum() < 12:
         return None
-    refined = np.stack([se3.inverse(solved.atPose3(gtsam.symbol("x", i)).matrix()) for i in range(len(keyframes))])
+    refined = np.stack([_fit(rig, points, frame) for frame in keyframes])
     points = se3.transform_points(frame_change(keyframes, refined), points)
     normals = surface_map.normals.copy()
     normals[agrees] = local_normals(points[agrees], surface_map.normals[agrees].mean(0))
@@ -93,7 +93,8 @@ def without_frame(covariance: Array, points: Array) -> Array:
 def frame_change(keyframes: list[KeyFrame], refined: Array) -> Array:
     """old_surface_from_new (4, 4): what makes refined poses (K, 4, 4) agree with the published ones in the mean.
 
-    A key frame counts the less the farther the surface may have moved between its cameras' instants.
+    Both are plain fits to the same pixels, with the old map and with the new, so what the cameras' instants do to a fit
+    cancels. A key frame counts the less the farther the surface may have moved between its cameras' instants.
     """
     published = np.stack([f.base_from_surface for f in keyframes])
     drift = np.array([np.linalg.norm(f.drift[3:]) for f in keyframes])
@@ -103,6 +104,13 @@ def frame_change(keyframes: list[KeyFrame], refined: Array) -> Array:
         rest = se3.log(se3.inverse(published) @ refined @ se3.inverse(change))
         change = se3.exp(weight @ rest / weight.sum()) @ change
     return change
+
+
+def _fit(rig: Rig, points: Array, frame: KeyFrame) -> Array:
+    seen = frame.observations
+    return solve_pose(
+        rig, seen.camera, points[seen.track], seen.pixels, seen.sigma, frame.base_from_surface, scales=(4.0, 1.0)
+    ).base_from_surface
 
 
 def _camera_key(camera: int, frame: int) -> int:
