@@ -1,7 +1,7 @@
 """The arm's wire: G1, G4 and G54 as 48-byte frames (thesis Table 6.1). Degrees, mm/min and ms exist only here.
 
-Floats are IEEE 754 binary32, little-endian, as public drivers of the arm send them; there is no checksum. `decode` takes
-what `encode` can have made and refuses all else: for every frame it takes, encode(decode(frame)) == frame.
+Floats are IEEE 754 binary32, little-endian, as public drivers of the arm send them; there is no checksum. `decode`
+takes what `encode` can have made and refuses all else: for every frame it takes, encode(decode(frame)) == frame.
 """
 
 from __future__ import annotations
@@ -112,10 +112,12 @@ def _decode_move(fields: tuple[Any, ...], dialect: Dialect) -> G1:
 
 def _singles(numbers: list[float], where: str) -> list[float]:
     """Numbers as binary32 holds them."""
-    for number in numbers:
-        if not math.isfinite(number) or abs(number) > np.finfo(np.float32).max:
+    with np.errstate(over="ignore"):
+        singles = [float(np.float32(number)) for number in numbers]
+    for number, single in zip(numbers, singles, strict=True):
+        if not math.isfinite(single):
             raise InputError(where, "parameter", number, "a finite number that binary32 can hold")
-    return [float(np.float32(number)) for number in numbers]
+    return singles
 
 
 def _positive(where: str, what: str, value: float, unit: str) -> None:

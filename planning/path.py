@@ -14,6 +14,7 @@ from estimation.se3 import Array
 
 LEVER = 10.0  # mm per rad: what a turn counts as length, and so how long a turn on the spot takes
 NEAREST = 1e-3  # mm: checkpoints nearer than this, turn included, are one place and have no direction between them
+FARTHEST = 1000.0  # mm: beyond, the unit was mistaken (the arm reaches 650 mm)
 FASTEST = 200.0  # mm/s: above, the unit was mistaken (bioprinting is 1 to 30 mm/s, the arm's own top speed 250)
 COLDEST, HOTTEST = -50.0, 500.0  # degrees C: far below and above any bio-ink and any thermoplastic
 
@@ -44,8 +45,8 @@ def check_path(path: Path, where: object = "path", lines: Sequence[int] | None =
     """The path itself, if it can be printed; InputError names the first checkpoint that cannot.
 
     where, lines: file, and line of each checkpoint in it, for the message; without lines, checkpoints count from 0.
-    Refused: fewer than two checkpoints, columns of unequal length, what is no rigid motion (NaN), speeds that are not
-    positive, temperatures out of range, and two checkpoints in a row at the same place with the same direction.
+    Refused: fewer than two checkpoints, columns of unequal length, what is no rigid motion (NaN), places and temperatures
+    out of range, speeds that are not positive, and two checkpoints in a row at the same place with the same direction.
     """
     _check_lengths(path, where)
 
@@ -55,6 +56,9 @@ def check_path(path: Path, where: object = "path", lines: Sequence[int] | None =
     if (i := _first(~_rigid(path.surface_from_nozzle))) is not None:
         transform = path.surface_from_nozzle[i].tolist()
         raise InputError(where, f"{name(i)}: surface_from_nozzle", transform, "a finite rigid motion, mm")
+    if (i := _first(np.abs(path.surface_from_nozzle[:, :3, 3]).max(1) > FARTHEST)) is not None:
+        place = path.surface_from_nozzle[i, :3, 3].tolist()
+        raise InputError(where, f"{name(i)}: position", place, f"within {FARTHEST:g} mm of the surface's origin")
     speed, heat = path.speed, path.temperature
     if (i := _first(~((speed > 0) & (speed <= FASTEST)))) is not None:  # NaN fails every comparison
         raise InputError(where, f"{name(i)}: speed", float(speed[i]), f"0 < speed <= {FASTEST:g} mm/s")

@@ -1,0 +1,54 @@
+"""The arm's settings: where it stands, what it can bear, how its wire speaks; by default the thesis's SEED S6H4D."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from estimation import se3
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.protocol import LENGTH, THESIS, Dialect
+from planning.follow import LEAD
+from planning.kinematics import SimpleArm
+from planning.limits import Limits
+
+BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
+BENCH = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # arm_from_surface under the thesis's home, z up
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmProfile:
+    """One arm. InputError names a setting that makes no sense.
+
+    arm: its frame and home. limits: what it bears. dialect: its frames. baud: bits/s, 8N1. tick: s between commands.
+    """
+
+    arm: SimpleArm = field(default_factory=SimpleArm)
+    limits: Limits = field(default_factory=Limits)
+    dialect: Dialect = THESIS
+    baud: int = 115_200  # thesis 6.2; one public driver uses 9600, at which a frame takes 50 ms
+    tick: float = 0.02  # 50 commands a second: faster than any camera here, a fifth of what the wire carries
+
+    def __post_init__(self) -> None:
+        if not self.baud > 0:
+            raise InputError("arm profile", "baud", self.baud, "> 0 bits/s")
+        wire = self.frame_time
+        if not wire <= self.tick < LEAD / 2:
+            raise InputError("arm profile", "tick", self.tick, f"{wire:.5f} s, one frame on the wire, to {LEAD / 2} s")
+        arm, limits = self.arm, self.limits
+        if (arm.home < limits.low).any() or (arm.home > limits.high).any():
+            allowed = f"within {limits.low.tolist()} and {limits.high.tolist()}"
+            raise InputError("arm profile", "home", arm.home.tolist(), allowed)
+
+    @property
+    def frame_time(self) -> float:
+        """Seconds that one frame takes on the wire: 4.17 ms at 115200 bits/s."""
+        return LENGTH * BITS_PER_BYTE / self.baud
+
+
+def placed(profile: ArmProfile, base_from_surface: Array, arm_from_surface: Array = BENCH) -> ArmProfile:
+    """The profile with its arm put where the surface (4, 4), mm, then lies at `arm_from_surface`: below home, level."""
+    arm_from_base = arm_from_surface @ se3.inverse(base_from_surface)
+    return replace(profile, arm=replace(profile.arm, arm_from_base=arm_from_base))
