@@ -59,7 +59,7 @@ class Scene:
         layers = np.dstack([texture if colour else cv2.cvtColor(texture, cv2.COLOR_BGR2GRAY), opaque])
         self._layers = cv2.copyMakeBorder(layers, *[MARGIN] * 4, cv2.BORDER_CONSTANT, value=0)  # colours, opacity
         self._cloth = skin.cloth(1024, rng)
-        self._noise, self._rng = noise, rng
+        self._noise, self._seed = noise, seed
         self._grain: dict[tuple[int, int], NDArray[np.int16]] = {}
         self._views: dict[Camera, View] = {}
 
@@ -119,7 +119,8 @@ class Scene:
             return image
         h, w = image.shape[:2]
         if (h, w) not in self._grain:
-            field = self._rng.standard_normal((h + 256, w + 256, *image.shape[2:]), np.float32)
+            rng_of_field = np.random.default_rng([self._seed, h, w])
+            field = rng_of_field.standard_normal((h + 256, w + 256, *image.shape[2:]), np.float32)
             self._grain[h, w] = np.rint(self._noise * field).astype(np.int16)
         y, x = rng.integers(0, 256, 2)
         return np.asarray(cv2.add(image, self._grain[h, w][y : y + h, x : x + w], dtype=cv2.CV_8U), np.uint8)

@@ -35,7 +35,7 @@ def found(
     return result, np.linalg.norm(se3.transform_points(result.base_from_surface, points) - clean, axis=1)
 
 
-@settings(max_examples=6)
+@settings(max_examples=4)
 @given(seeds)
 def test_a_curved_scan_is_found_exactly_from_exact_points(seed: int) -> None:
     result, error = found(BODY, seed)
@@ -43,7 +43,7 @@ def test_a_curved_scan_is_found_exactly_from_exact_points(seed: int) -> None:
     assert result.sure and result.verdict.startswith("found") and len(result.free) == 0
 
 
-@settings(max_examples=6)
+@settings(max_examples=4)
 @given(seeds)
 def test_noise_costs_accuracy_as_the_covariance_says(seed: int) -> None:
     fine, fine_error = found(BODY, seed, noise=0.05)
