@@ -110,7 +110,8 @@ def _add_replay(commands: Commands) -> None:
         "replay",
         "run tracking and motion on a session under a simulated clock",
         "Run tracking and motion on a recorded session under a simulated clock, as a live run would, without an arm.\n"
-        "Writes commands.csv and frames.bin, the bytes the arm would get. Same input, same bytes.",
+        "Writes commands.csv, frames.bin, the bytes the arm would get, and arm.json, what was assumed of the arm.\n"
+        "Same input, same bytes.",
         "stillbed replay sessions/monday --path data/paths/square_10mm.csv -o out/replay",
     )
     command.add_argument("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
@@ -157,15 +158,19 @@ def _track(arguments: argparse.Namespace) -> None:
 
 
 def _replay(arguments: argparse.Namespace) -> None:
+    from hardware.out_folder import prepare_out
+    from hardware.path_file import read_path
     from hardware.replay import replay_session
     from hardware.session import open_session
-    from hardware.track import prepare_out
 
     session = open_session(arguments.session)
+    read_path(arguments.path)  # what is wrong with it is told before anything is made
     prepare_out(arguments.out, arguments.force)
     with _progress("replay", "frame sets") as progress:
         replay_session(session, arguments.path, arguments.out, progress)
-    print(f"commands.csv and frames.bin are in {arguments.out}")
+    rows = (arguments.out / "commands.csv").read_text(encoding="utf-8").splitlines()[1:]
+    moves = sum(row.split(",", 2)[1] == "move" for row in rows)
+    print(f"{moves} moves and {len(rows) - moves} holds: commands.csv and frames.bin in {arguments.out}")
 
 
 def _import(arguments: argparse.Namespace) -> None:

@@ -9,10 +9,10 @@ from typing import Protocol
 
 import numpy as np
 
-from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from hardware.clock import WallClock
 from hardware.evaluation import evaluate
+from hardware.out_folder import prepare_out
 from hardware.pose_file import PoseWriter, read_poses
 from hardware.progress import Progress, Report
 from hardware.report import write_report
@@ -78,15 +78,6 @@ def finish(out: Path, session: Session, complete: bool) -> str:
     write_summary(out / "summary.json", result)
     write_report(out / "report.html", result)
     return summary_text(result)
-
-
-def prepare_out(out: Path, force: bool) -> None:
-    """Make the folder `out`; raises InputError where it is a file, or holds something and `force` is not set."""
-    if out.exists() and not out.is_dir():
-        raise InputError(out, "--out", "a file", "a folder, new or empty")
-    if out.is_dir() and any(out.iterdir()) and not force:
-        raise InputError(out, "--out", "a folder that is not empty", "a new or empty one, or --force")
-    out.mkdir(parents=True, exist_ok=True)
 
 
 def run_track(path: Path, out: Path, record: Path | None = None, force: bool = False) -> str:

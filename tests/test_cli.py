@@ -16,9 +16,10 @@ import pytest
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from hardware.cli import kept, main
+from hardware.out_folder import prepare_out
 from hardware.pose_file import PoseWriter, read_poses
 from hardware.progress import Progress, duration
-from hardware.track import follow, prepare_out
+from hardware.track import follow
 from perception.frames import FrameSet
 from perception.tracking import STAGES, StepReport
 from tests.runs import Replayed
