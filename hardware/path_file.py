@@ -3,7 +3,7 @@
     x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,speed_mm_s,material,temperature_c,layer,extrude
 
 Position and angles (Rz(gamma) Ry(beta) Rx(alpha)) are those of the nozzle in the surface frame; 0 0 0 is upright.
-`layer` (0) and `extrude` (1) may be left out, `speed_mm_min` may stand for `speed_mm_s`, and any further column is kept.
+`layer` (0) and `extrude` (1) may be left out, `speed_mm_min` may stand for `speed_mm_s`, any further column is kept.
 """
 
 from __future__ import annotations

@@ -45,8 +45,8 @@ def check_path(path: Path, where: object = "path", lines: Sequence[int] | None =
     """The path itself, if it can be printed; InputError names the first checkpoint that cannot.
 
     where, lines: file, and line of each checkpoint in it, for the message; without lines, checkpoints count from 0.
-    Refused: fewer than two checkpoints, columns of unequal length, what is no rigid motion (NaN), places and temperatures
-    out of range, speeds that are not positive, and two checkpoints in a row at the same place with the same direction.
+    Refused: fewer than two checkpoints, columns of unequal length, what is no rigid motion (NaN), places and
+    temperatures out of range, speeds that are not positive, and two checkpoints in a row that are one and the same.
     """
     _check_lengths(path, where)
 
@@ -95,6 +95,8 @@ def _first(wrong: NDArray[np.bool_]) -> int | None:
 def _rigid(transforms: Array) -> NDArray[np.bool_]:
     """(N,) whether each of (N, 4, 4) is one, as se3.is_transform says it of one."""
     r = transforms[:, :3, :3]
-    off = np.abs(r @ np.swapaxes(r, -1, -2) - np.eye(3)).max((1, 2)) + np.abs(transforms[:, 3] - [0, 0, 0, 1]).max(1)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.isfinite(transforms).all((1, 2)) & (off < 1e-5) & (np.linalg.det(r) > 0))
+    with np.errstate(invalid="ignore"):  # what is not finite is no rigid motion, whatever else comes out
+        off = np.abs(r @ np.swapaxes(r, -1, -2) - np.eye(3)).max((1, 2))
+        last = np.abs(transforms[:, 3] - [0, 0, 0, 1]).max(1)
+        ok = np.isfinite(transforms).all((1, 2)) & (off < 1e-5) & (last < 1e-5) & (np.linalg.det(r) > 0)
+    return np.asarray(ok)

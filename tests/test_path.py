@@ -1,0 +1,217 @@
+"""Paths: what is refused and how it is said, the CSV's round trip, and the curve through the checkpoints."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path as File
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from estimation import se3
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.path_file import HEADER, read_path, write_path
+from planning.curve import curve_through
+from planning.path import LEVER, Path, check_path, lengths
+from planning.retime import retime
+from tests.moving import path_through, raster
+
+HEAD = ",".join(HEADER)
+GOOD = [f"{x},0,0,0,0,0,5,1,20,0,1" for x in range(3)]
+SAMPLE = File(__file__).parents[1] / "data/paths/square_10mm.csv"
+
+
+def csv_file(folder: File, *lines: str) -> File:
+    file = folder / "path.csv"
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return file
+
+
+def wandering(seed: int, count: int = 12) -> Path:
+    draw = np.random.default_rng(seed)
+    path = path_through(draw.uniform(-20, 20, (count, 3)))
+    rotations = se3.rotation_from_euler(draw.uniform(-1.2, 1.2, (count, 3)))
+    return replace(
+        path,
+        surface_from_nozzle=se3.make(rotations, path.surface_from_nozzle[:, :3, 3]),
+        speed=draw.uniform(1, 30, count),
+        temperature=draw.uniform(4, 37, count),
+        layer=draw.integers(0, 4, count),
+        extrude=draw.random(count) < 0.7,
+        material=np.array([f"gel {i % 3}" for i in range(count)]) if seed % 2 else draw.integers(0, 9, count),
+        extra={"wait_s": np.array([f"{v:.2f}" for v in draw.random(count)])},
+    )
+
+
+@given(st.integers(0, 10_000))
+def test_a_file_gives_the_path_back(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    path = wandering(seed)
+    file = tmp_path_factory.mktemp("path") / "path.csv"
+    write_path(file, path)
+    back = read_path(file)
+    assert np.abs(back.surface_from_nozzle - path.surface_from_nozzle).max() < 1e-12
+    assert np.array_equal(back.surface_from_nozzle[:, :3, 3], path.surface_from_nozzle[:, :3, 3])
+    for name in ("speed", "material", "temperature", "layer", "extrude"):
+        assert np.array_equal(getattr(back, name), getattr(path, name)), name
+    assert list(back.extra) == ["wait_s"]
+    assert np.array_equal(back.extra["wait_s"], path.extra["wait_s"])
+
+
+def test_a_file_as_people_write_it(tmp_path: File) -> None:
+    file = csv_file(
+        tmp_path,
+        "\ufeffx_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg, speed_mm_min, material, temperature_c",
+        " 0, 0, 0, 0, 0, 90, 300, collagen, 20",
+        "",
+        "10, 0, 0, 0, 0, 90, 300, collagen, 20",
+    )
+    path = read_path(file)
+    assert np.allclose(path.speed, 5.0)
+    assert np.allclose(path.surface_from_nozzle[1, :3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert path.material.tolist() == ["collagen"] * 2
+    assert path.layer.tolist() == [0, 0]
+    assert path.extrude.all()
+
+
+def test_the_sample_path_is_a_square_of_10_mm() -> None:
+    path = read_path(SAMPLE)
+    places = path.surface_from_nozzle[:, :3, 3]
+    assert np.ptp(places, axis=0).tolist() == [10, 10, 0]
+    assert (path.speed == 5).all()
+    assert not path.extrude[0]
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ([], ["file", "empty"]),
+        ([HEAD], ["checkpoints", "= 0", "2 or more"]),
+        ([HEAD, GOOD[0]], ["checkpoints", "= 1", "2 or more"]),
+        ([HEAD, GOOD[0], "nan,0,0,0,0,0,5,1,20,0,1"], ["line 3", "x_mm", "nan", "finite"]),
+        ([HEAD, GOOD[0], "1,0,0,0,inf,0,5,1,20,0,1"], ["line 3", "beta_deg", "inf", "finite"]),
+        ([HEAD, GOOD[0], "", "one,0,0,0,0,0,5,1,20,0,1"], ["line 4", "x_mm", "one"]),
+        ([HEAD, GOOD[0], "1,0,0,0,0,0,0,1,20,0,1"], ["line 3", "speed", "0.0", "200 mm/s"]),
+        ([HEAD, GOOD[0], "1,0,0,0,0,0,-5,1,20,0,1"], ["line 3", "speed", "-5.0"]),
+        ([HEAD, GOOD[0], "1,0,0,0,0,0,900,1,20,0,1"], ["line 3", "speed", "900.0"]),
+        ([HEAD, GOOD[0], "1,0,0,0,0,0,5,1,2000,0,1"], ["line 3", "temperature", "2000.0"]),
+        ([HEAD, GOOD[0], "1e9,0,0,0,0,0,5,1,20,0,1"], ["line 3", "position", "1000 mm"]),
+        ([HEAD, GOOD[0], "1,0,0,0,0,0,5,1,20,0"], ["line 3", "10 values", "11"]),
+        ([HEAD, GOOD[0], GOOD[1] + ",7"], ["line 3", "12 values", "11"]),
+        ([HEAD, *GOOD, GOOD[2]], ["line 5", "position", "line 4"]),
+        ([HEAD, GOOD[0], "1,0,0,0,0,0,5,,20,0,1"], ["line 3", "material"]),
+        ([HEAD, GOOD[0], "1,0,0,0,0,0,5,1,20,0.5,1"], ["line 3", "layer", "whole number"]),
+        ([HEAD, GOOD[0], "1,0,0,0,0,0,5,1,20,0,yes"], ["line 3", "extrude", "0 or 1"]),
+        ([HEAD.replace("x_mm", "x"), *GOOD], ["header, column 1", "'x'", "x_mm"]),
+        ([HEAD.replace("x_mm", "x_cm"), *GOOD], ["header, column 1", "'x_cm'", "x_mm"]),
+        ([HEAD.replace("speed_mm_s", "speed"), *GOOD], ["header, column 7", "'speed'", "speed_mm_"]),
+        ([HEAD.replace("layer", "layers"), *GOOD], ["header, column 10", "'layers'", "did you mean 'layer'"]),
+        ([HEAD.replace("y_mm", "x_mm"), *GOOD], ["header, column 2", "each once"]),
+        ([HEAD.replace("material", "colour"), *GOOD], ["header", "no material"]),
+        ([HEAD.replace("layer", "speed_mm_min"), *GOOD], ["header", "one of speed_mm_s, speed_mm_min"]),
+    ],
+)
+def test_what_cannot_be_printed_is_told_by_line_and_column(tmp_path: File, lines: list[str], words: list[str]) -> None:
+    file = tmp_path / "path.csv"
+    file.write_text("\n".join(lines), encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        read_path(file)
+    for word in [str(file), "allowed", *words]:
+        assert word in str(caught.value)
+
+
+def test_a_file_that_is_not_there_or_not_text(tmp_path: File) -> None:
+    for file in (tmp_path / "missing.csv", tmp_path):
+        with pytest.raises(InputError):
+            read_path(file)
+    (tmp_path / "binary.csv").write_bytes(bytes(range(256)))
+    with pytest.raises(InputError):
+        read_path(tmp_path / "binary.csv")
+
+
+@given(st.binary(max_size=300))
+def test_any_file_is_a_path_or_an_input_error(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
+    file = tmp_path_factory.mktemp("path") / "path.csv"
+    file.write_bytes(HEAD.encode() + b"\n" + content)
+    try:
+        assert len(read_path(file)) >= 2
+    except InputError as error:
+        assert "allowed" in str(error)
+
+
+@pytest.mark.parametrize("spoilt", [np.nan, np.inf])
+def test_no_pose_that_is_not_finite_gets_into_a_path(spoilt: float) -> None:
+    path = raster()
+    for at in ((2, 0, 3), (2, 1, 1), (2, 3, 3)):
+        transforms = path.surface_from_nozzle.copy()
+        transforms[at] = spoilt
+        with pytest.raises(InputError, match="checkpoint 2: surface_from_nozzle"):
+            check_path(replace(path, surface_from_nozzle=transforms))
+
+
+def test_columns_are_of_one_length() -> None:
+    path = raster()
+    with pytest.raises(InputError, match="wait = '2 values', allowed 6"):
+        check_path(replace(path, extra={"wait": np.array(["0", "0"])}))
+    with pytest.raises(InputError, match="speed"):
+        check_path(replace(path, speed=path.speed[1:]))
+
+
+def test_a_turn_on_the_spot_has_a_length() -> None:
+    path = path_through(np.zeros((2, 3)))
+    rotations = se3.exp_rotation([[0, 0, 0], [0, 0, 0.5]])
+    turned = replace(path, surface_from_nozzle=se3.make(rotations, np.zeros(3)))
+    assert lengths(check_path(turned).surface_from_nozzle) == pytest.approx([0.5 * LEVER])
+
+
+def steps(curve_length: float) -> Array:
+    return np.linspace(0, curve_length, 4001)
+
+
+@given(st.integers(0, 10_000))
+def test_the_curve_passes_near_each_checkpoint_and_never_outruns_its_length(seed: int) -> None:
+    path = wandering(seed)
+    curve = curve_through(path.surface_from_nozzle, path.speed[1:], 0.05, 4.0)
+    at_knots = curve.poses(curve.knots)
+    off = np.linalg.norm(at_knots[:, :3, 3] - path.surface_from_nozzle[:, :3, 3], axis=1)
+    assert off.max() <= 0.05 + 1e-9
+    assert np.abs(at_knots[:, :3, :3] - path.surface_from_nozzle[:, :3, :3]).max() < 1e-9
+    s = steps(curve.length)
+    assert np.linalg.norm(curve.slope(s), axis=1).max() <= 1 + 1e-12
+    places = curve.poses(s)[:, :3, 3]
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() <= s[1] * (1 + 1e-9)
+    middle = (s[1:] + s[:-1]) / 2
+    assert np.abs(np.diff(places, axis=0) / s[1] - curve.slope(middle)).max() < 2 * s[1] / curve.half[1:-1].min()
+
+
+@given(st.integers(0, 10_000), st.floats(0, 0.9), st.floats(0, 60))
+def test_timing_keeps_the_speed_of_every_stretch_and_ends_at_rest(seed: int, share: float, speed: float) -> None:
+    path = wandering(seed)
+    curve = curve_through(path.surface_from_nozzle, path.speed[1:], 0.05, 4.0)
+    start = share * curve.length
+    limits = np.full(6, 75.0), np.full(6, 300.0)
+    timing = retime(curve, start, curve.length, speed, 3.0, np.eye(3), limits)
+    if isinstance(timing, str):  # too fast to begin with
+        assert speed > 1
+        return
+    assert timing.at(np.array([-1.0, 3.0, timing.end, 1e9])) == pytest.approx(
+        np.array([start, start] + [curve.length] * 2)
+    )
+    t = np.linspace(3.0, timing.end, 5001)
+    places = timing.at(t)
+    assert (np.diff(places) >= -1e-9).all()
+    assert timing.speeds[-1] == 0
+    pace = np.diff(places) / np.diff(t)
+    allowed = np.maximum(curve.speed[curve.stretch(places[:-1])], curve.speed[curve.stretch(places[1:])])
+    assert (pace <= allowed * (1 + 1e-6)).all()
+    tip = curve.poses(places)[:, :3, 3]
+    assert (np.linalg.norm(np.diff(tip, axis=0), axis=1) <= np.diff(places) * (1 + 1e-9) + 1e-12).all()
+
+
+def test_a_horizon_that_cannot_be_stopped_in_is_no_timing() -> None:
+    curve = curve_through(raster(speed=150).surface_from_nozzle, np.full(5, 150.0), 0.05, 4.0)
+    weak = np.full(6, 200.0), np.full(6, 10.0)
+    assert isinstance(retime(curve, 1.0, 1.1, 100.0, 0.0, np.eye(3), weak), str)
+    assert not isinstance(retime(curve, 1.0, 1.1, 0.0, 0.0, np.eye(3), weak), str)
