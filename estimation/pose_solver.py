@@ -35,7 +35,7 @@ def project(rig: Rig, camera: Index, base_from_surface: Array, points: Array) ->
     """Ideal pixels (N, 2), depths (N,) and Jacobians (N, 2, 6) of surface points (N, 3), each in its own camera (N,)."""
     extrinsics = rig.camera_from_base @ base_from_surface  # (C, 4, 4) camera_from_surface
     rotation = extrinsics[camera, :3, :3]
-    in_camera = np.einsum("nij,nj->ni", rotation, points) + extrinsics[camera, :3, 3]
+    in_camera = (rotation @ points[..., None])[..., 0] + extrinsics[camera, :3, 3]
     matrices = rig.matrices[camera]
     fx, fy = matrices[:, 0, 0], matrices[:, 1, 1]
     depth = in_camera[:, 2]
@@ -45,8 +45,13 @@ def project(rig: Rig, camera: Index, base_from_surface: Array, points: Array) ->
     u = (fx * inverse_depth)[:, None] * (rotation[:, 0] - x[:, None] * rotation[:, 2])
     v = (fy * inverse_depth)[:, None] * (rotation[:, 1] - y[:, None] * rotation[:, 2])
     by_point = np.stack([u, v], 1)  # (N, 2, 3)
-    by_turn = np.cross(points[:, None, :], by_point)  # row @ -hat(p) = cross(p, row)
-    return pixels, depth, np.concatenate([by_turn, by_point], -1)
+    jacobian = np.empty((len(points), 2, 6))
+    jacobian[:, :, 3:] = by_point
+    px, py, pz = points[:, :1], points[:, 1:2], points[:, 2:]
+    jacobian[:, :, 0] = py * by_point[:, :, 2] - pz * by_point[:, :, 1]  # row @ -hat(p) = cross(p, row)
+    jacobian[:, :, 1] = pz * by_point[:, :, 0] - px * by_point[:, :, 2]
+    jacobian[:, :, 2] = px * by_point[:, :, 1] - py * by_point[:, :, 0]
+    return pixels, depth, jacobian
 
 
 def solve_pose(
@@ -68,24 +73,29 @@ def solve_pose(
     from coarse to fine. The unit is also widened to the tracks' own median residual, so that cameras that were not
     exposed together are averaged, not played off against each other. prior: (6, 6) information that holds `start`.
     """
-    pose, hold = start, np.zeros((6, 6)) if prior is None else prior
-    unit = 1.0
-    for widening in scales:
-        for iteration in range(iterations):
-            predicted, depth, jacobian = project(rig, camera, pose, points)
-            residual = predicted - pixels
-            squared = np.einsum("ni,ni->n", residual, residual) / sigma**2
-            if iteration < 3:
-                unit = float(np.sqrt(max(np.median(squared[depth > 0]) / 1.386, 1.0))) if (depth > 0).any() else 1.0
-            weight = np.where(depth > 0, (1 + squared / (gate * unit * widening) ** 2) ** -2, 0.0)
-            weighted = jacobian * (weight / sigma**2)[:, None, None]
-            information = np.einsum("nki,nkj->ij", weighted, jacobian, optimize=True)
-            gradient = np.einsum("nki,nk->i", weighted, residual) + hold @ se3.log(se3.inverse(start) @ pose)
-            damped = information + hold + np.diag(1e-9 + 1e-9 * np.diag(information))
-            step = -np.linalg.solve(damped, gradient)
-            pose = pose @ se3.exp(step)
-            if np.abs(step).max() < 1e-6:
-                break
+    pose, unit, precision = start, 1.0, 1 / sigma**2
     predicted, depth, jacobian = project(rig, camera, pose, points)
     residual = predicted - pixels
+    weight = np.zeros(len(points))
+    information = np.zeros((6, 6))
+    for widening in scales:
+        for iteration in range(iterations):
+            squared = (residual * residual).sum(1) * precision
+            front = depth > 0
+            if iteration < 3:
+                unit = float(np.sqrt(max(np.median(squared[front]) / 1.386, 1.0))) if front.any() else 1.0
+            weight = np.where(front, (1 + squared / (gate * unit * widening) ** 2) ** -2, 0.0)
+            weighted = (jacobian * (weight * precision)[:, None, None]).reshape(-1, 6)
+            information = weighted.T @ jacobian.reshape(-1, 6)
+            gradient = weighted.T @ residual.ravel()
+            damped = information + np.diag(1e-9 + 1e-9 * np.diag(information))
+            if prior is not None:
+                damped = damped + prior
+                gradient = gradient + prior @ se3.log(se3.inverse(start) @ pose)
+            step = -np.linalg.solve(damped, gradient)
+            pose = pose @ se3.exp(step)
+            predicted, depth, jacobian = project(rig, camera, pose, points)
+            residual = predicted - pixels
+            if np.abs(step).max() < 1e-6:
+                break
     return PoseFit(pose, information / unit**2, residual, weight, jacobian, unit)
