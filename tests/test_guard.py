@@ -1,0 +1,260 @@
+"""The guard: every limit met exactly passes, broken by one epsilon is refused; and it never changes a command."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from estimation import se3
+from estimation.errors import InputError
+from estimation.pose import SurfacePose, TrackState
+from estimation.se3 import Array
+from planning.command import Command, Hold, Move
+from planning.guard import Guard
+from planning.kinematics import SimpleArm
+from planning.limits import Limits
+
+TICK = 1 / 64  # powers of two, so that a limit can be met to the last bit
+ARM = SimpleArm(home=np.zeros(6))
+WIDE = Limits(
+    speed=np.full(6, 128.0),
+    jump=64.0,
+    turn=64.0,
+    low=np.array([-256.0, -256, -256, -1.5, -1.5, -1.5]),
+    high=np.array([256.0, 256, 256, 1.5, 1.5, 1.5]),
+    feed=250.0,
+    pose_age=0.25,
+    pose_error=0.5,
+    surface_speed=50.0,
+    surface_turn=0.75,
+    stop_time=0.5,
+    stop_distance=4.0,
+)
+
+
+def up(value: float) -> float:
+    return float(np.nextafter(value, np.inf))
+
+
+def pose(stamp: float = 0.0, **changes: object) -> SurfacePose:
+    covariance = np.diag([0.0, 0, 0, 0.01, 0.01, 0.01])
+    exact = SurfacePose(stamp, np.eye(4), covariance, np.zeros(6), TrackState.TRACKING)
+    return replace(exact, **changes)  # type: ignore[arg-type]
+
+
+def axes(*values: float) -> Array:
+    return np.array([*values, *[0.0] * (6 - len(values))])
+
+
+def move(target: Array, stamp: float = 1.0, feed: float = 5.0, extrude: bool = False) -> Move:
+    return Move(stamp, target, feed, 3, extrude)
+
+
+def judged(
+    command: Command, seen: SurfacePose | None = None, limits: Limits = WIDE, begin: Array | None = None
+) -> Command:
+    """What a guard that stands at `begin` (6,) makes of a command."""
+    guard = Guard(limits, replace(ARM, home=np.zeros(6) if begin is None else begin), TICK)
+    return guard(command, pose(command.stamp) if seen is None else seen, command.stamp)
+
+
+def refused(answer: Command, *words: str) -> bool:
+    return isinstance(answer, Hold) and all(word in answer.reason for word in ("refused", *words))
+
+
+@pytest.mark.parametrize("axis", range(6))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_the_bounds_of_each_axis(axis: int, side: int) -> None:
+    bound = (WIDE.low, WIDE.high)[side > 0][axis]
+    limits = replace(WIDE, speed=np.full(6, 1e9))
+    begin = np.zeros(6)
+    begin[axis] = bound - side * 0.25
+    target = begin.copy()
+    target[axis] = bound
+    exact = move(target)
+    assert judged(exact, limits=limits, begin=begin) is exact
+    target = target.copy()
+    target[axis] = np.nextafter(bound, side * np.inf)
+    assert refused(judged(move(target), limits=limits, begin=begin), "XYZABC"[axis], "allowed")
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_the_implied_speed_of_each_axis(axis: int) -> None:
+    limits = replace(WIDE, speed=np.full(6, 64.0))
+    target = np.zeros(6)
+    target[axis] = 1.0  # in a 64th of a second
+    exact = move(target)
+    assert judged(exact, limits=limits) is exact
+    target = target.copy()
+    target[axis] = up(1.0)
+    assert refused(judged(move(target), limits=limits), "XYZABC"[axis], "/s, limit")
+
+
+def test_the_jump_is_the_way_in_space() -> None:
+    limits = replace(WIDE, jump=5.0, speed=np.full(6, 1e9))
+    exact = move(axes(3, 4))
+    assert judged(exact, limits=limits) is exact
+    assert refused(judged(move(axes(3, up(up(4)))), limits=limits), "jump")
+
+
+def test_the_turn_of_one_tick() -> None:
+    limits = replace(WIDE, turn=0.25, speed=np.full(6, 1e9))
+    exact = move(axes(0, 0, 0, 0.25, -0.25, 0.25))
+    assert judged(exact, limits=limits) is exact
+    assert refused(judged(move(axes(0, 0, 0, 0.25, -up(0.25), 0)), limits=limits), "turn")
+
+
+@pytest.mark.parametrize(("feed", "passes"), [(250.0, True), (up(250.0), False), (5e-324, True), (0.0, False)])
+def test_the_feed(feed: float, passes: bool) -> None:
+    assert isinstance(judged(move(axes(1), feed=feed)), Move) is passes
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_only_finite_numbers_pass(bad: float) -> None:
+    for axis in range(6):
+        target = np.zeros(6)
+        target[axis] = bad
+        assert refused(judged(move(target)), "finite")
+    assert refused(judged(move(axes(1), feed=bad)), "feed")
+    assert refused(judged(move(axes(1)[:5])), "6 finite numbers")
+
+
+def test_stamps_go_on() -> None:
+    guard = Guard(WIDE, ARM, TICK)
+    assert isinstance(guard(move(axes(0.1), 1.0), pose(1.0), 1.0), Move)
+    assert refused(guard(move(axes(0.2), 1.0), pose(1.0), 1.0), "is not after")
+    assert refused(guard(move(axes(0.2), 0.5), pose(0.5), 0.5), "is not after")
+    assert refused(guard(move(axes(0.2), 2.0), pose(2.0), 2.5), "command of 2.0 s at 2.5 s")
+    assert refused(guard(move(axes(0.2), np.nan), pose(2.0), np.nan))
+    assert isinstance(guard(move(axes(0.2), up(1.0)), pose(1.0), up(1.0)), Move)
+
+
+Pose = Callable[[], SurfacePose | None]
+TRUST: list[tuple[str, Pose, bool]] = [
+    ("age met", lambda: pose(0.75), True),
+    ("age broken", lambda: pose(float(np.nextafter(0.75, 0))), False),
+    ("of this instant", lambda: pose(1.0), True),
+    ("of the future", lambda: pose(up(1.0)), False),
+    ("none", lambda: None, False),
+    ("nan stamp", lambda: pose(np.nan), False),
+    ("nan pose", lambda: pose(1.0, base_from_surface=np.full((4, 4), np.nan)), False),
+    ("nan twist", lambda: pose(1.0, twist=np.full(6, np.nan)), False),
+    ("inf covariance", lambda: pose(1.0, covariance=np.full((6, 6), np.inf)), False),
+    ("nan drift", lambda: pose(1.0, acceleration_psd=np.full(6, np.nan)), False),
+    ("degraded", lambda: pose(1.0, state=TrackState.DEGRADED), True),
+    ("coasting", lambda: pose(1.0, state=TrackState.COASTING), False),
+    ("lost", lambda: pose(1.0, state=TrackState.LOST), False),
+    ("initialising", lambda: pose(1.0, state=TrackState.INITIALISING), False),
+    ("error met", lambda: pose(1.0, covariance=np.diag([0.0, 0, 0, 0.25, 0, 0])), True),
+    ("error broken", lambda: pose(1.0, covariance=np.diag([0.0, 0, 0, up(up(0.25)), 0, 0])), False),
+    ("error negative", lambda: pose(1.0, covariance=-np.eye(6)), False),
+    ("speed met", lambda: pose(1.0, twist=axes(0, 0, 0, 30, 40)), True),
+    ("speed broken", lambda: pose(1.0, twist=axes(0, 0, 0, 30, up(up(40)))), False),
+    ("turn met", lambda: pose(1.0, twist=axes(0, 0, 0.75)), True),
+    ("turn broken", lambda: pose(1.0, twist=axes(0, 0, up(0.75))), False),
+]
+
+
+@pytest.mark.parametrize(("seen", "passes"), [(seen, passes) for _, seen, passes in TRUST], ids=[t[0] for t in TRUST])
+def test_what_a_pose_must_be_worth(seen: Pose, passes: bool) -> None:
+    guard = Guard(WIDE, ARM, TICK)
+    wanted = move(axes(0.5), extrude=True)
+    answer = guard(wanted, seen(), 1.0)
+    assert answer is wanted if passes else refused(answer)
+
+
+def test_drift_makes_a_pose_worth_less_with_time() -> None:
+    drifting = pose(0.75, twist_covariance=np.diag([0.0, 0, 0, 100, 0, 0]))  # 10 mm/s: 2.7 mm in 0.27 s
+    assert refused(judged(move(axes(0.5)), drifting), "the nozzle is known to 2.6")
+    assert isinstance(judged(move(axes(0.5)), replace(drifting, stamp=1.0)), Move)
+
+
+def test_a_turning_surface_is_fast_far_from_its_axis() -> None:
+    turning = pose(1.0, twist=axes(0, 0, 0.5))
+    assert isinstance(judged(move(axes(100)), turning, begin=axes(100.0)), Move)
+    assert refused(judged(move(axes(101)), turning, begin=axes(101.0)), "moves at 50.5")
+
+
+@pytest.mark.parametrize(
+    ("since", "way", "extrude", "passes"),
+    [
+        (0.5, 0.5, False, True),
+        (up(up(1.5)) - 1, 0.5, False, False),
+        (0.25, 4.0, False, True),
+        (0.25, up(4.0), False, False),
+        (0.25, 0.5, True, False),
+    ],
+)
+def test_without_a_pose_only_a_stop_follows(since: float, way: float, extrude: bool, passes: bool) -> None:
+    guard = Guard(replace(WIDE, speed=np.full(6, 1e9)), ARM, TICK)
+    assert isinstance(guard(Hold(1.0, 0.001, "here"), pose(1.0), 1.0), Hold)
+    answer = guard(move(axes(way), 1 + since, extrude=extrude), None, 1 + since)
+    assert isinstance(answer, Move) if passes else refused(answer, "there is no pose")
+
+
+def test_a_refused_move_leaves_the_arm_where_it_was() -> None:
+    guard = Guard(WIDE, ARM, TICK)
+    guard(move(axes(1.0), 1.0), pose(1.0), 1.0)
+    assert refused(guard(move(axes(1000.0), 2.0), pose(2.0), 2.0))
+    assert np.array_equal(guard.axes, axes(1.0))
+    assert isinstance(guard(move(axes(2.0), 3.0), pose(3.0), 3.0), Move)
+
+
+def test_a_hold_passes_and_moves_nothing() -> None:
+    guard = Guard(WIDE, ARM, TICK)
+    hold = Hold(1.0, 0.001, "lost")
+    assert guard(hold, None, 1.0) is hold
+    assert np.array_equal(guard.axes, np.zeros(6))
+
+
+@given(st.integers(0, 100_000))
+def test_nothing_that_breaks_a_limit_passes(seed: int) -> None:
+    """Random commands against an oracle that was written from the limits alone."""
+    draw = np.random.default_rng(seed)
+    guard, limits = Guard(Limits(), SimpleArm(), 0.02), Limits()
+    before, stamp = SimpleArm().home, 0.0
+    for _ in range(40):
+        stamp += draw.choice([0.02, 0.02, 0.02, 0.0, -0.02])
+        target = before + draw.normal(size=6) * limits.speed * 0.02 * draw.choice([0.2, 0.5, 1.0])
+        target[draw.integers(6)] *= draw.choice([1.0, 1.0, 1.0, np.nan, 5.0])
+        seen = pose(stamp - draw.choice([0.0, 0.1, 0.4]), state=draw.choice([TrackState.TRACKING, TrackState.LOST]))
+        wanted = move(target, stamp, feed=draw.choice([5.0, 100.0, 251.0]), extrude=True)
+        if isinstance(guard(wanted, seen, stamp), Move):
+            step = np.abs(target - before)
+            assert (target >= limits.low).all() and (target <= limits.high).all()
+            assert (step <= limits.speed * 0.02 * (1 + 1e-12)).all()
+            assert np.linalg.norm(step[:3]) <= limits.jump * (1 + 1e-12)
+            assert wanted.feed <= limits.feed
+            assert seen.state is TrackState.TRACKING and stamp - seen.stamp <= limits.pose_age
+            before = target
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("speed", np.zeros(6)),
+        ("jerk", np.full(6, np.nan)),
+        ("acceleration", np.ones(5)),
+        ("jump", -1.0),
+        ("pose_age", np.inf),
+        ("low", np.full(6, 900.0)),
+        ("high", np.array([650.0, 650, 500, 1, 1.6, 1])),
+    ],
+)
+def test_limits_are_checked(name: str, value: object) -> None:
+    with pytest.raises(InputError, match="limits"):
+        replace(Limits(), **{name: value})  # type: ignore[arg-type]
+
+
+def test_the_arm_is_checked() -> None:
+    with pytest.raises(InputError, match="arm_from_base"):
+        SimpleArm(arm_from_base=np.zeros((4, 4)))
+    with pytest.raises(InputError, match="arm_from_upright"):
+        SimpleArm(arm_from_upright=se3.exp_rotation([0, 0, 0.1]) * 2)
+    with pytest.raises(InputError, match="home"):
+        SimpleArm(home=np.full(6, np.nan))
