@@ -288,6 +288,7 @@ def main(arguments: list[str]) -> int:
     path = Path(arguments[0]) / "summary.json"
     try:
         print(text_of(json.loads(path.read_text(encoding="utf-8"))))
+        print(f"report: {path.with_name('report.html')}")
     except (OSError, ValueError, KeyError) as error:
         raise InputError(path, "file", str(error), "the summary.json of stillbed track") from None
     return 0
