@@ -65,6 +65,7 @@ def solve_pose(
     scales: tuple[float, ...] = (1.0,),
     prior: Array | None = None,
     iterations: int = 8,
+    tolerance: float = 1e-5,
 ) -> PoseFit:
     """Fit base_from_surface to tracks.
 
@@ -72,6 +73,7 @@ def solve_pose(
     sigmas at which a track's weight has fallen to a quarter. scales: widenings of the gate, solved one after the other
     from coarse to fine. The unit is also widened to the tracks' own median residual, so that cameras that were not
     exposed together are averaged, not played off against each other. prior: (6, 6) information that holds `start`.
+    tolerance: rad and mm, the last step's largest entry; 1e-5 is a hundredth of what a frame's noise moves.
     """
     pose, unit, precision = start, 1.0, 1 / sigma**2
     predicted, depth, jacobian = project(rig, camera, pose, points)
@@ -96,6 +98,6 @@ def solve_pose(
             pose = pose @ se3.exp(step)
             predicted, depth, jacobian = project(rig, camera, pose, points)
             residual = predicted - pixels
-            if np.abs(step).max() < 1e-6:
+            if np.abs(step).max() < tolerance:
                 break
     return PoseFit(pose, information / unit**2, residual, weight, jacobian, unit)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import cv2
@@ -29,6 +30,16 @@ class Found:
 
     base_from_surface: Array
     matches: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """Features of one camera: points (N, 3) in the surface frame, ideal pixels (N, 2), the pose they give alone."""
+
+    camera: int
+    points: Array
+    pixels: Array
+    alone: Array | None
 
 
 class Relocaliser:
@@ -84,41 +95,54 @@ class Relocaliser:
         reach = np.einsum("ni,ni->n", anchor - origins, normal) / np.where(steep, 1.0, slope)
         return np.asarray(np.where(steep[:, None], np.nan, origins + reach[:, None] * directions))
 
-    def find(self, images: dict[int, Image], masks: dict[int, NDArray[np.uint8]] | None = None) -> Found | None:
-        """The pose of the surface in images (by camera), searched everywhere or inside masks (by camera), or None."""
-        rig = self.lenses.rig
+    def find(self, pyramids: dict[int, Pyramid], threads: Executor) -> Found | None:
+        """The pose of the surface in images (by camera), searched everywhere, or None.
+
+        Half-size images first: a quarter of the time, and the features' scale does not matter; then full size.
+        """
         if len(self._points) < LEAST_MATCHES:
             return None
-        camera: list[int] = []
-        points, pixels, candidates = [], [], []
-        for c, image in images.items():
-            keypoints, descriptors = sift(image, None if masks is None else masks.get(c))
-            pairs = match(descriptors, self._descriptors, 0.85)
-            if len(pairs) < LEAST_MATCHES:
-                continue
-            mine, ideal = self._points[pairs[:, 1]], undistort(rig.cameras[c], keypoints[pairs[:, 0]])
-            camera += [c] * len(pairs)
-            points.append(mine)
-            pixels.append(ideal)
-            candidate = _pnp(mine, ideal, rig.matrices[c])
-            if candidate is not None:
-                candidates.append(rig.cameras[c].base_from_camera @ candidate)
-        if not candidates:
+        for half in (True, False):
+            seen = list(threads.map(lambda c: self._look(c, pyramids[c], half), pyramids))
+            found = self._agree([s for s in seen if s is not None])
+            if found is not None:
+                return found
+        return None
+
+    def _look(self, camera: int, images: Pyramid, half: bool) -> Sighting | None:
+        """What one camera shows of the surface, and the pose it gives alone."""
+        lens = self.lenses.rig.cameras[camera]
+        keypoints, descriptors = sift(images[1] if half else images[0], count=1000)
+        if half:
+            keypoints = 2 * keypoints + 0.5
+        pairs = match(descriptors, self._descriptors, 0.85)
+        if len(pairs) < LEAST_MATCHES:
             return None
-        which, all_points, all_pixels = np.array(camera), np.concatenate(points), np.concatenate(pixels)
-        sigma = np.full(len(which), 3.0)
+        points, pixels = self._points[pairs[:, 1]], undistort(lens, keypoints[pairs[:, 0]])
+        alone = _pnp(points, pixels, lens.matrix)
+        return Sighting(camera, points, pixels, None if alone is None else lens.base_from_camera @ alone)
+
+    def _agree(self, seen: list[Sighting]) -> Found | None:
+        """The camera's pose that most features of all cameras support, fitted to them."""
+        if not any(s.alone is not None for s in seen):
+            return None
+        rig = self.lenses.rig
+        camera = np.concatenate([np.full(len(s.points), s.camera) for s in seen])
+        points = np.concatenate([s.points for s in seen])
+        pixels = np.concatenate([s.pixels for s in seen])
+        sigma = np.full(len(camera), 3.0)  # px: SIFT on half-size images, cameras not exposed together
         best: Found | None = None
-        for candidate in candidates:
-            fit = solve_pose(rig, which, all_points, all_pixels, sigma, candidate, scales=(4.0, 2.0))
-            residual = project(rig, which, fit.base_from_surface, all_points)[0] - all_pixels
-            agreed = int((np.linalg.norm(residual, axis=1) < 12.0).sum())
+        for start in (s.alone for s in seen if s.alone is not None):
+            pose = solve_pose(rig, camera, points, pixels, sigma, start, scales=(4.0, 2.0)).base_from_surface
+            away = np.linalg.norm(project(rig, camera, pose, points)[0] - pixels, axis=1)
+            agreed = int((away < 4 * sigma).sum())
             if agreed >= LEAST_MATCHES and (best is None or agreed > best.matches):
-                best = Found(fit.base_from_surface, agreed)
+                best = Found(pose, agreed)
         return best
 
 
 def _pnp(points: Array, pixels: Array, matrix: Array) -> Array | None:
-    """camera_from_surface (4, 4) by RANSAC over points (N, 3) and ideal pixels (N, 2), or None. Seeded by OpenCV."""
+    """camera_from_surface (4, 4) by RANSAC over points (N, 3) and ideal pixels (N, 2), or None; OpenCV's own fixed seed."""
     ok, rotation, translation, inliers = cv2.solvePnPRansac(
         points, pixels, matrix, None, iterationsCount=400, reprojectionError=6.0, flags=cv2.SOLVEPNP_SQPNP
     )

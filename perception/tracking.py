@@ -32,6 +32,7 @@ from perception.relocalise import Relocaliser
 STAGES = ("prepare", "flow", "align", "pose", "search")
 Pyramid = tuple[Image, Image]
 LOOSE = np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3)  # how far one camera's own pose may stray from the joint one
+ROUGH = 1e-3  # rad, mm: a start for the alignment need not be better
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +81,7 @@ class TrackingStep:
         self._views: dict[int, View] = {}
         self._threads = ThreadPoolExecutor(max_workers=len(rig))
         self._agrees = np.zeros(0, bool)
+        self._lost: tuple[dict[int, Pyramid], list[int]] = {}, []
         self._spent = np.zeros(len(STAGES))
         self._lap = 0.0
 
@@ -103,6 +105,7 @@ class TrackingStep:
         if refined is not None:
             self._estimator.replace_map(refined.map)
             self._agrees = refined.agrees
+        self._recover()
 
     def _took(self, stage: str) -> None:
         now = self._clock()
@@ -125,7 +128,7 @@ class TrackingStep:
         self._templates = first.templates
         pose = self._estimator.begin(frames.stamp, first.base_from_surface, first.map)
         self._agrees = np.ones(len(first.map), bool)
-        observations = self._align(frames.stamp, pyramids, dict.fromkeys(polygons, first.base_from_surface))
+        observations = self._align(frames.stamp, pyramids, dict.fromkeys(polygons, first.base_from_surface), coarse=True)
         fit = self._estimator.fit(observations, first.base_from_surface)
         self._refiner.begin(first.map, frames.stamp, first.base_from_surface, observations)
         self._remember(pyramids, observations, fit.inlier, first.base_from_surface)
@@ -160,10 +163,11 @@ class TrackingStep:
         self._took("align")
         fit = estimator.fit(observations, joint)
         self._took("pose")
-        if self._doubtful(fit, pyramids):
+        if not fit.measured or self._missing(fit, pyramids):
             fit, observations = self._second_try(stamp, pyramids, fit, observations)
             self._took("search")
         if fit.measured:
+            self._lost = pyramids, self._missing(fit, pyramids)
             if estimator.pose.state is TrackState.INITIALISING:
                 fit = self._confirm(fit, observations)
             pose = estimator.accept(fit, observations)
@@ -197,14 +201,25 @@ class TrackingStep:
         rows = np.concatenate([rows for rows, _ in moved.values()])
         pixels = np.concatenate([pixels for _, pixels in moved.values()])
         sigma = np.ones(len(rows))
-        fit = solve_pose(self.rig, camera, points[rows], pixels, sigma, guess, scales=(8.0, 3.0, 1.0))
+        fit = solve_pose(
+            self.rig, camera, points[rows], pixels, sigma, guess, scales=(8.0, 1.5), iterations=5, tolerance=ROUGH
+        )
         good = fit.weights > 0.2
         for c in pyramids:
             mine = good & (camera == c)
             single[c] = fit.base_from_surface
             if mine.sum() >= 8:
+                where = rows[mine]
                 own = solve_pose(
-                    self.rig, camera[mine], points[rows[mine]], pixels[mine], sigma[mine], single[c], prior=LOOSE
+                    self.rig,
+                    camera[mine],
+                    points[where],
+                    pixels[mine],
+                    sigma[mine],
+                    single[c],
+                    prior=LOOSE,
+                    iterations=3,
+                    tolerance=ROUGH,
                 )
                 single[c] = own.base_from_surface
         return fit.base_from_surface, single
@@ -219,11 +234,13 @@ class TrackingStep:
         found, ok = flow(view.image, image, view.pixels, view.pixels + after - before)
         return view.rows[ok], undistort(self.rig.cameras[camera], found[ok])
 
-    def _align(self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array]) -> Observations:
-        """Measure the landmarks in every camera, each begun where the camera's own pose puts them."""
+    def _align(
+        self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array], coarse: bool = False
+    ) -> Observations:
+        """Measure the landmarks in every camera, each begun where the camera's own pose puts them; coarse: from afar."""
         rows = np.nonzero(self._agrees)[0]
         cameras = [c for c in pyramids if c in poses]
-        results = list(self._threads.map(lambda c: self._align_one(c, pyramids[c], poses[c], rows), cameras))
+        results = list(self._threads.map(lambda c: self._align_one(c, pyramids[c], poses[c], rows, coarse), cameras))
         found = [rows[r.found] for r in results]
         pixels = [undistort(self.rig.cameras[c], r.pixels[r.found]) for c, r in zip(cameras, results, strict=True)]
         return Observations(
@@ -234,48 +251,52 @@ class TrackingStep:
             np.concatenate([r.sigma[r.found] for r in results]),
         )
 
-    def _align_one(self, camera: int, images: Pyramid, pose: Array, rows: NDArray[np.int64]) -> Alignment:
+    def _align_one(
+        self, camera: int, images: Pyramid, pose: Array, rows: NDArray[np.int64], coarse: bool
+    ) -> Alignment:
         assert self._estimator.map is not None and self._templates is not None
         surface_map, templates = self._estimator.map, self._templates
         where = project_squares(
             self._lenses, camera, pose, surface_map.points[rows], surface_map.normals[rows], templates.axes[rows]
         )
-        return align(templates.take(rows), images, where, where.centre)
+        return align(templates.take(rows), images, where, where.centre, coarse=coarse)
 
-    def _doubtful(self, fit: Fit, pyramids: dict[int, Pyramid]) -> bool:
-        """Whether to search: no measurement, or a camera that carried the last pose now hardly sees the surface."""
-        if not fit.measured:
-            return True
-        for c in pyramids:
-            before = len(self._views[c].rows) if c in self._views else 0
-            if before >= 20 and fit.used[c] < 0.3 * before:
-                return True
-        return False
+    def _missing(self, fit: Fit, pyramids: dict[int, Pyramid]) -> list[int]:
+        """Cameras that carried the last pose and now hardly see the surface."""
+        before = {c: len(self._views[c].rows) if c in self._views else 0 for c in pyramids}
+        return [c for c, n in before.items() if n >= 20 and fit.used[c] < 0.3 * n]
 
     def _second_try(
         self, stamp: float, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations
     ) -> tuple[Fit, Observations]:
-        """Align again from the pose that the other cameras give, then from the pose that SIFT finds; keep the best."""
-        best = fit, observations
-        starts: list[Callable[[], Array | None]] = []
-        if fit.measured:
-            starts.append(lambda: fit.solution.base_from_surface)
-        starts.append(lambda: self._searched(pyramids))
-        for start in starts:
-            pose = start()
-            if pose is None:
-                continue
-            again = self._align(stamp, pyramids, dict.fromkeys(pyramids, pose))
-            refit = self._estimator.fit(again, pose)
-            if refit.measured and (not best[0].measured or refit.used.sum() > best[0].used.sum()):
-                best = refit, again
-            if not self._doubtful(best[0], pyramids):
-                break
-        return best
+        """What a missing camera, or all of them, show from a better start: the other cameras' pose, or one by SIFT.
 
-    def _searched(self, pyramids: dict[int, Pyramid]) -> Array | None:
-        found = self._search.find({c: images[0] for c, images in pyramids.items()})
-        return None if found is None else found.base_from_surface
+        The search takes 50-200 ms and holds the pose up, so it is made here only when there is no pose to hold up.
+        """
+        if fit.measured:
+            start: Array | None = fit.solution.base_from_surface
+        else:
+            found = self._search.find(pyramids, self._threads)
+            start = None if found is None else found.base_from_surface
+        if start is None:
+            return fit, observations
+        again = self._align(stamp, pyramids, dict.fromkeys(pyramids, start), coarse=True)
+        refit = self._estimator.fit(again, start)
+        better = refit.measured and (not fit.measured or refit.used.sum() > fit.used.sum())
+        return (refit, again) if better else (fit, observations)
+
+    def _recover(self) -> None:
+        """Search the last images by SIFT for cameras that have lost the surface, so that the next flow begins there."""
+        pyramids, missing = self._lost
+        self._lost = {}, []
+        found = self._search.find({c: pyramids[c] for c in missing}, self._threads) if missing else None
+        if found is None:
+            return
+        pose = found.base_from_surface
+        again = self._align(0.0, {c: pyramids[c] for c in missing}, dict.fromkeys(missing, pose), coarse=True)
+        fit = self._estimator.fit(again, pose)
+        if fit.measured:
+            self._remember({c: pyramids[c] for c in missing}, again, fit.inlier, fit.solution.base_from_surface)
 
     def _remember(
         self, pyramids: dict[int, Pyramid], observations: Observations, inlier: NDArray[np.bool_], pose: Array
