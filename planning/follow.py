@@ -1,8 +1,10 @@
 """The arm's commanded motion: six axes that follow a moving target under speed, acceleration and jerk limits.
 
-Ruckig (Berscheid and Kroeger 2021) is aimed at the state that the target will have LEAD s ahead, with LEAD as the least
-time to get there. Aimed at the present position and velocity it is a time-optimal controller and chatters between the
-limits (measured: 0.26 mm rms at the full acceleration limit; this way 0.02 mm at a third of it).
+Each axis is aimed at the state that the target will have LEAD s ahead, to be met in LEAD s: aimed at the present state,
+a time-optimal controller chatters between the limits (measured: 0.26 mm rms that way, 0.02 mm this way). Where the
+quintic from here to there keeps the limits it is taken, else Ruckig's motion (Berscheid and Kroeger 2021), which always
+does. Ruckig alone will not do: with a minimum duration its motions are not unique, and it was measured to send an axis
+that had nothing to do 0.17 mm away and back at full jerk (0.040 mm rms off a still path that way, 0.004 mm this way).
 """
 
 from __future__ import annotations
@@ -37,22 +39,34 @@ class Follower:
         self.position = self.position if axes is None else axes.copy()
         self.velocity, self.acceleration = np.zeros(6), np.zeros(6)
 
-    def aim(self, position: Array, velocity: Array) -> Array | str:
-        """Move one tick towards a target that in LEAD s will be at `position` (6,) with `velocity` (6,); new axes (6,).
+    def aim(self, position: Array, velocity: Array, acceleration: Array) -> Array | str:
+        """Move one tick towards a target that in LEAD s will be in the state given, each (6,); new axes (6,).
 
         A target faster than the limits is followed as fast as they allow. A str says why there is no such motion.
         """
-        request = self._request()
-        request.target_position = position
-        request.target_velocity = np.clip(velocity, -WITHIN * self._speed, WITHIN * self._speed)
-        request.minimum_duration = LEAD
-        return self._step(request)
+        start = np.stack([self.position, self.velocity, self.acceleration])
+        controls = _quintic(start, np.stack([position, velocity, acceleration]))
+        smooth = np.ones(6, bool)
+        for bound, limit in zip(controls[1:], (self._speed, self._acceleration, self._jerk), strict=True):
+            smooth &= (np.abs(bound) <= limit).all(axis=0)
+        state = np.stack([_bezier(control, self._tick / LEAD) for control in controls[:3]])
+        if not smooth.all():
+            request = self._request()
+            request.target_position = position
+            request.target_velocity = np.clip(velocity, -WITHIN * self._speed, WITHIN * self._speed)
+            request.minimum_duration = LEAD
+            limited = self._solve(request)
+            if isinstance(limited, str):
+                return limited
+            state = np.where(smooth, state, limited)
+        return self._take(state)
 
     def brake(self) -> Array | str:
         """Move one tick towards rest, as soon as the limits allow; new axes (6,)."""
         request = self._request()
         request.control_interface = ControlInterface.Velocity
-        return self._step(request)
+        state = self._solve(request)
+        return state if isinstance(state, str) else self._take(state)
 
     def _request(self) -> InputParameter:
         request = InputParameter(6)
@@ -61,16 +75,43 @@ class Follower:
         request.max_velocity, request.max_acceleration, request.max_jerk = self._speed, self._acceleration, self._jerk
         return request
 
-    def _step(self, request: InputParameter) -> Array | str:
-        motion = Trajectory(6)
+    def _solve(self, request: InputParameter) -> Array | str:
+        """Position, velocity and acceleration (3, 6) one tick on."""
+        motion = Trajectory(6)  # not Ruckig.update: it keeps its last input, and answers an equal one with nothing
         try:
             self._ruckig.calculate(request, motion)
         except RuckigError as error:
             return f"no motion within the limits: {error}"
-        state = np.array(motion.at_time(self._tick))  # (3, 6)
-        if not np.isfinite(state).all():
-            return "no motion within the limits: the solution is not finite"
+        state = np.array(motion.at_time(self._tick))
+        return state if np.isfinite(state).all() else "no motion within the limits: its solution is not finite"
+
+    def _take(self, state: Array) -> Array:
         self.position, self.velocity, self.acceleration = state
         if np.abs(self.velocity).max() < 1e-9 and np.abs(self.acceleration).max() < 1e-6:
             self.velocity, self.acceleration = np.zeros(6), np.zeros(6)
         return self.position.copy()
+
+
+def _quintic(start: Array, end: Array) -> tuple[Array, Array, Array, Array]:
+    """Control points (6 to 3, 6) of position, velocity, acceleration and jerk between two states (3, 6) LEAD s apart.
+
+    In Bernstein form: a derivative stays between the least and the greatest of its control points.
+    """
+    (p0, v0, a0), (p1, v1, a1) = start, end
+    fifth, twentieth = LEAD / 5, LEAD**2 / 20
+    position = np.stack(
+        [
+            *(p0, p0 + fifth * v0, p0 + 2 * fifth * v0 + twentieth * a0),
+            *(p1 - 2 * fifth * v1 + twentieth * a1, p1 - fifth * v1, p1),
+        ]
+    )
+    velocity = 5 / LEAD * np.diff(position, axis=0)
+    acceleration = 4 / LEAD * np.diff(velocity, axis=0)
+    return position, velocity, acceleration, np.asarray(3 / LEAD * np.diff(acceleration, axis=0))
+
+
+def _bezier(control: Array, u: float) -> Array:
+    """Value (6,) at u in 0..1 of the polynomial with control points (N, 6) (de Casteljau)."""
+    while len(control) > 1:
+        control = control[:-1] + u * (control[1:] - control[:-1])
+    return np.asarray(control[0])

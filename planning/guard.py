@@ -24,8 +24,14 @@ LINEAR = 3  # X Y Z are mm, the rest rad
 class Guard:
     """Checks commands in the order in which they are sent."""
 
-    def __init__(self, limits: Limits, arm: SimpleArm, tick: float) -> None:
+    def __init__(self, limits: Limits, arm: SimpleArm, tick: float, zone: Array | None = None) -> None:
+        """zone: (2, 3) mm, low and high corner in the surface frame of where is printed; without it, everywhere.
+
+        How well the surface is known and how fast it moves counts at the place of the zone that is nearest the nozzle:
+        far from it, on the way from home, a small turn of the surface is no reason to stop.
+        """
         self._limits, self._arm, self._tick = limits, arm, tick
+        self._zone = np.array([[-np.inf] * 3, [np.inf] * 3]) if zone is None else zone
         self._axes = arm.home.copy()  # the last let through
         self._stamp = -math.inf
         self._trusted_at = -math.inf
@@ -102,7 +108,7 @@ class Guard:
         if not 0 <= (age := now - pose.stamp) <= limits.pose_age:
             return f"the pose is {age:.3f} s old, limit {limits.pose_age:g} s"
         nozzle = nozzle_from_axes(self._arm, self._axes)[:3, 3]
-        place = se3.inverse(pose.base_from_surface)[:3] @ np.append(nozzle, 1.0)
+        place = np.clip(se3.inverse(pose.base_from_surface)[:3] @ np.append(nozzle, 1.0), *self._zone)
         speed = math.hypot(*(pose.twist[3:] + np.cross(pose.twist[:3], place)))
         if speed > limits.surface_speed:
             return f"the surface moves at {speed:.2f} mm/s, limit {limits.surface_speed:g} mm/s"
@@ -110,7 +116,7 @@ class Guard:
             return f"the surface turns at {np.rad2deg(turn):.2f} degrees/s, limit {np.rad2deg(limits.surface_turn):g}"
         error = _error(pose, place, age + self._tick)
         if not error <= limits.pose_error:
-            return f"the nozzle is known to {error:.3f} mm, limit {limits.pose_error:g} mm"
+            return f"the place under the nozzle is known to {error:.3f} mm, limit {limits.pose_error:g} mm"
         return ""
 
 

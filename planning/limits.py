@@ -20,8 +20,8 @@ class Limits:
 
     speed, acceleration, jerk: (6,) per axis and s, s^2, s^3. The planner stays within all three, the guard checks
     the speed. jump: mm, and turn: rad, of one tick. low, high: (6,) where the axes may be. feed: mm/s.
-    pose_age: s. pose_error: mm, one standard deviation of the nozzle's place on the surface. surface_speed: mm/s at
-    the nozzle. surface_turn: rad/s. stop_time: s, and stop_distance: mm, within which the arm comes to rest once it
+    pose_age: s. pose_error: mm, one standard deviation of the place under the nozzle. surface_speed: mm/s, there.
+    surface_turn: rad/s. stop_time: s, and stop_distance: mm, within which the arm comes to rest once it
     has no pose to trust. on_path: mm that the nozzle may be off its place and still print. pause: s of one hold.
     """
 

@@ -40,6 +40,12 @@ class Path:
     def __len__(self) -> int:
         return len(self.speed)
 
+    @property
+    def zone(self) -> Array:
+        """Low and high corner (2, 3), mm, in the surface frame of the box around all checkpoints."""
+        places = self.surface_from_nozzle[:, :3, 3]
+        return np.stack([places.min(axis=0), places.max(axis=0)])
+
 
 def check_path(path: Path, where: object = "path", lines: Sequence[int] | None = None) -> Path:
     """The path itself, if it can be printed; InputError names the first checkpoint that cannot.

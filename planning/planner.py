@@ -1,9 +1,9 @@
 """The planner: each tick one command that carries the path along with the surface, or a stop and its reason.
 
 The target of the nozzle is base_from_surface(t) @ surface_from_nozzle(s(t)): the surface as its pose predicts it, the
-place s on the path as TOPP-RA times it. Ruckig follows the target. Whatever stands in the way (no pose, a pose that is
-not worth following, a target out of reach, a failed solve) brakes the arm within its limits and then holds it; when it
-is gone the nozzle goes back to the very place where it stopped: nothing is left out and nothing printed twice.
+place s on the path as TOPP-RA times it. Whatever stands in the way (no pose, a pose that is not worth following, a target
+out of reach, a failed solve) brakes the arm within its limits and then holds it; when it is gone the nozzle goes back to
+the very place where it stopped: nothing is left out and nothing printed twice.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ class Planner:
     def __init__(self, path: Path, limits: Limits, arm: SimpleArm, tick: float) -> None:
         self._path, self._limits, self._arm, self._tick = check_path(path), limits, arm, tick
         self._curve = curve_through(path.surface_from_nozzle, path.speed[1:], CORNER, SWERVE)
+        self._zone = path.zone
         self._follower = Follower(arm.home, limits, tick)
         self._leg: Leg | None = None
         self._place = 0.0  # mm of the path that are printed
@@ -96,7 +97,8 @@ class Planner:
         if not 0 <= age <= SHARE * limits.pose_age:
             return f"pose is {age:.3f} s old, limit {limits.pose_age:g} s"
         base_from_nozzle = nozzle_from_axes(self._arm, self._follower.position)
-        place = (se3.inverse(pose.base_from_surface) @ base_from_nozzle)[:3, 3]
+        low, high = self._zone
+        place = np.clip((se3.inverse(pose.base_from_surface) @ base_from_nozzle)[:3, 3], low, high)
         turn, speed = pose.twist[:3], pose.twist[3:] + np.cross(pose.twist[:3], place)
         if np.linalg.norm(speed) > SHARE * limits.surface_speed:
             return f"surface moves at {np.linalg.norm(speed):.1f} mm/s, limit {limits.surface_speed:g} mm/s"
@@ -105,7 +107,7 @@ class Planner:
             return f"surface turns at {turn_deg:.1f} degrees/s, limit {limit_deg:g} degrees/s"
         error = float(pose.predict(then).error_at(place[None])[0])
         if not error <= SHARE * limits.pose_error:
-            return f"nozzle is known to {error:.3f} mm only, limit {limits.pose_error:g} mm"
+            return f"the place under the nozzle is known to {error:.3f} mm, limit {limits.pose_error:g} mm"
         return ""
 
     # -- where on which leg
@@ -182,7 +184,7 @@ class Planner:
         if len(outside):
             return self._stop(now, self._out_of_reach(int(outside[0]), ahead))
         start = self._follower.position
-        axes = self._follower.aim(ahead, (after - before) / self._tick)
+        axes = self._follower.aim(ahead, (after - before) / self._tick, (after - 2 * ahead + before) / half**2)
         if isinstance(axes, str):
             return self._stop(now, axes)
         extrude = False

@@ -170,7 +170,7 @@ def test_what_a_pose_must_be_worth(seen: Pose, passes: bool) -> None:
 
 def test_drift_makes_a_pose_worth_less_with_time() -> None:
     drifting = pose(0.75, twist_covariance=np.diag([0.0, 0, 0, 100, 0, 0]))  # 10 mm/s: 2.7 mm in 0.27 s
-    assert refused(judged(move(axes(0.5)), drifting), "the nozzle is known to 2.6")
+    assert refused(judged(move(axes(0.5)), drifting), "is known to 2.6")
     assert isinstance(judged(move(axes(0.5)), replace(drifting, stamp=1.0)), Move)
 
 
@@ -178,6 +178,16 @@ def test_a_turning_surface_is_fast_far_from_its_axis() -> None:
     turning = pose(1.0, twist=axes(0, 0, 0.5))
     assert isinstance(judged(move(axes(100)), turning, begin=axes(100.0)), Move)
     assert refused(judged(move(axes(101)), turning, begin=axes(101.0)), "moves at 50.5")
+
+
+def test_what_the_surface_does_counts_where_is_printed() -> None:
+    zone = np.array([[-10.0, -10, 0], [10, 10, 1]])
+    far = replace(ARM, home=axes(200.0))
+    turning = pose(1.0, twist=axes(0, 0, 0.5), covariance=np.diag([0, 0, 1e-4, 0.01, 0.01, 0.01]))
+    assert refused(Guard(WIDE, far, TICK)(move(axes(200)), turning, 1.0), "moves at 100.0")
+    assert isinstance(Guard(WIDE, far, TICK, zone)(move(axes(200)), turning, 1.0), Move)
+    unsure = replace(turning, covariance=turning.covariance * 30)
+    assert refused(Guard(WIDE, far, TICK, zone)(move(axes(200)), unsure, 1.0), "is known to")
 
 
 @pytest.mark.parametrize(
