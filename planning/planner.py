@@ -1,9 +1,9 @@
 """The planner: each tick one command that carries the path along with the surface, or a stop and its reason.
 
 The target of the nozzle is base_from_surface(t) @ surface_from_nozzle(s(t)): the surface as its pose predicts it, the
-place s on the path as TOPP-RA times it. Whatever stands in the way (no pose, a pose that is not worth following, a target
-out of reach, a failed solve) brakes the arm within its limits and then holds it; when it is gone the nozzle goes back to
-the very place where it stopped: nothing is left out and nothing printed twice.
+place s on the path as TOPP-RA times it. Whatever stands in the way (no pose, a pose that is not worth following, a
+target out of reach, a failed solve) brakes the arm within its limits and then holds it; when it is gone the nozzle goes
+back to the very place where it stopped: nothing is left out and nothing printed twice.
 """
 
 from __future__ import annotations

@@ -1,0 +1,41 @@
+"""The motion process: what it loads, seen from a fresh interpreter."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+HEAVY = {"gtsam", "cv2", "open3d", "onnxruntime"}
+RUN = """
+import sys
+from hardware.motion import MotionStep
+from planning.command import Move
+from tests.moving import breathing, pose_at, raster
+
+motion = MotionStep(raster())
+for k in range(20):
+    frame = motion(pose_at(breathing, k * 0.02), k * 0.02)
+assert isinstance(motion.last, Move) and len(frame) == 48
+print(*sys.modules)
+"""
+
+
+def loaded(code: str) -> set[str]:
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    return {name.split(".")[0] for name in done.stdout.split()}
+
+
+def test_a_running_motion_step_has_loaded_nothing_that_would_stall_it() -> None:
+    modules = loaded(RUN)
+    assert {"hardware", "planning", "toppra", "ruckig"} <= modules
+    assert HEAVY.isdisjoint(modules)
+
+
+def test_the_check_can_fail() -> None:
+    assert "cv2" in loaded("import cv2, sys; print(*sys.modules)")
+
+
+def test_replay_loads_no_images_before_it_has_a_session() -> None:
+    assert HEAVY.isdisjoint(loaded("import hardware.replay, sys; print(*sys.modules)"))
