@@ -33,7 +33,8 @@ class EstimatorSettings:
     least_share: float = 0.4  # of the tracks found: with fewer in agreement the surface is not what is seen
     enter_tracks: int = 30
     leave_tracks: int = 20
-    camera_tracks: int = 6  # fewer say nothing of that camera
+    camera_tracks: int = 6  # fewer say nothing of that camera,
+    camera_share: float = 0.1  # nor does a smaller part of the map's landmarks: so many agree by chance
     sigma_tracking: float = 2.0  # mm: a pose less certain than this is DEGRADED
     sigma_measured: float = 50.0  # mm: a pose less certain than this is no measurement
     coast: float = 0.5  # s without a measurement until LOST
@@ -182,6 +183,18 @@ class Estimator:
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
         return self._enter(stamp, base_from_surface, covariance, TrackState.INITIALISING, "a first map, to be confirmed")
 
+    def carriers(self, fit: Fit) -> NDArray[np.int64]:
+        """The cameras that carry a fit, by number."""
+        assert self.map is not None
+        least = max(self.settings.camera_tracks, self.settings.camera_share * len(self.map))
+        return np.nonzero(fit.used >= least)[0] if fit.measured else np.zeros(0, np.int64)
+
+    def wait(self, stamp: float, reason: str) -> SurfacePose:
+        """The first map is not confirmed at `stamp`: the pose stands still and counts for nothing."""
+        assert self._pose is not None
+        self._pose = replace(self._pose, stamp=stamp, reason=reason)
+        return self._pose
+
     def accept(self, fit: Fit, observations: Observations) -> SurfacePose:
         """Take a measured fit into the window and give the pose."""
         assert fit.measured
@@ -197,7 +210,7 @@ class Estimator:
 
     def _grade(self, fit: Fit) -> tuple[TrackState, str]:
         s = self.settings
-        cameras = int((fit.used >= s.camera_tracks).sum())
+        cameras = len(self.carriers(fit))
         spread = _position_sigma(fit.covariance)
         if cameras < 2:
             return TrackState.DEGRADED, "one camera alone carries the pose"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from itertools import repeat
 
 import cv2
 import numpy as np
@@ -26,9 +27,11 @@ LEAST_MATCHES = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """A relocalised pose. base_from_surface: (4, 4). matches: how many features agree."""
+    """A relocalised pose. base_from_surface: (4, 4), of all cameras together. single: by camera, its own, since cameras
+    are seldom exposed together. matches: how many features agree."""
 
     base_from_surface: Array
+    single: dict[int, Array]
     matches: int
 
 
@@ -103,7 +106,7 @@ class Relocaliser:
         if len(self._points) < LEAST_MATCHES:
             return None
         for half in (True, False):
-            seen = list(threads.map(lambda c: self._look(c, pyramids[c], half), pyramids))
+            seen = list(threads.map(self._look, pyramids, pyramids.values(), repeat(half)))
             found = self._agree([s for s in seen if s is not None])
             if found is not None:
                 return found
@@ -137,8 +140,17 @@ class Relocaliser:
             away = np.linalg.norm(project(rig, camera, pose, points)[0] - pixels, axis=1)
             agreed = int((away < 4 * sigma).sum())
             if agreed >= LEAST_MATCHES and (best is None or agreed > best.matches):
-                best = Found(pose, agreed)
-        return best
+                best = Found(pose, {}, agreed)
+        if best is None:
+            return None
+        near = {s.camera: s.alone for s in seen if s.alone is not None and _alike(s.alone, best.base_from_surface)}
+        return Found(best.base_from_surface, near, best.matches)
+
+
+def _alike(a: Array, b: Array) -> bool:
+    """Whether two poses could be one surface at two cameras' instants, one camera's depth being what it is."""
+    apart = se3.inverse(a) @ b
+    return bool(se3.angle_of(apart) < 0.35 and np.linalg.norm(apart[:3, 3]) < 60.0)
 
 
 def _pnp(points: Array, pixels: Array, matrix: Array) -> Array | None:

@@ -1,8 +1,8 @@
 """TrackingStep: one frame set in, one surface pose out; no I/O and no clock of its own.
 
-Flow from the last images predicts where each landmark is, alignment with the landmark's reference picture measures it, the
-estimator fits the pose. When too little is found the surface is searched by its SIFT features. Cameras run in threads
-(OpenCV releases the GIL); results do not depend on their order.
+Flow from the last images predicts where each landmark is, alignment with the landmark's reference picture measures it,
+the estimator fits the pose. When too little is found the surface is searched by its SIFT features. Cameras run in
+threads (OpenCV releases the GIL); results do not depend on their order.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation import se3
 from estimation.estimator import Estimator, Fit, identity_pose
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import solve_pose
 from estimation.refiner import Refiner
-from estimation.rig import Rig
+from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
 from perception.features import grey
 from perception.first_map import build_first_map
@@ -128,7 +129,8 @@ class TrackingStep:
         self._templates = first.templates
         pose = self._estimator.begin(frames.stamp, first.base_from_surface, first.map)
         self._agrees = np.ones(len(first.map), bool)
-        observations = self._align(frames.stamp, pyramids, dict.fromkeys(polygons, first.base_from_surface), coarse=True)
+        starts = dict.fromkeys(polygons, first.base_from_surface)
+        observations = self._align(frames.stamp, pyramids, starts, coarse=True)
         fit = self._estimator.fit(observations, first.base_from_surface)
         self._refiner.begin(first.map, frames.stamp, first.base_from_surface, observations)
         self._remember(pyramids, observations, fit.inlier, first.base_from_surface)
@@ -166,10 +168,13 @@ class TrackingStep:
         if not fit.measured or self._missing(fit, pyramids):
             fit, observations = self._second_try(stamp, pyramids, fit, observations)
             self._took("search")
+        if estimator.pose.state is TrackState.INITIALISING:
+            if len(self._carried(fit, pyramids)) < 2:
+                reason = f"the first map waits for a second look by two cameras ({fit.reason or 'one sees it'})"
+                return estimator.wait(stamp, reason), observations, fit.used
+            fit = self._confirm(fit, observations)
         if fit.measured:
             self._lost = pyramids, self._missing(fit, pyramids)
-            if estimator.pose.state is TrackState.INITIALISING:
-                fit = self._confirm(fit, observations)
             pose = estimator.accept(fit, observations)
             self._refiner.offer(fit, observations, pose.twist, estimator.skew.sigma)
             self._remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)
@@ -193,9 +198,10 @@ class TrackingStep:
         assert self._estimator.map is not None
         points = self._estimator.map.points
         ready = [c for c in pyramids if c in self._views and len(self._views[c].rows) >= 6]
-        moved = dict(zip(ready, self._threads.map(lambda c: self._flow_one(c, pyramids[c][0], guess), ready), strict=True))
+        flows = self._threads.map(lambda c: self._flow_one(c, pyramids[c][0], guess), ready)
+        moved = dict(zip(ready, flows, strict=True))
         single = dict.fromkeys(pyramids, guess)
-        if not moved or sum(len(rows) for rows, _ in moved.values()) < 6:
+        if sum(len(rows) for rows, _ in moved.values()) < 6:
             return guess, single
         camera = np.concatenate([np.full(len(rows), c) for c, (rows, _) in moved.items()])
         rows = np.concatenate([rows for rows, _ in moved.values()])
@@ -225,19 +231,22 @@ class TrackingStep:
         return fit.base_from_surface, single
 
     def _flow_one(self, camera: int, image: Image, guess: Array) -> tuple[NDArray[np.int64], Array]:
-        assert self._estimator.map is not None and self._templates is not None
-        view, surface_map = self._views[camera], self._estimator.map
-        points, normals = surface_map.points[view.rows], surface_map.normals[view.rows]
-        axes = self._templates.axes[view.rows]
-        before = project_squares(self._lenses, camera, view.base_from_surface, points, normals, axes).centre
-        after = project_squares(self._lenses, camera, guess, points, normals, axes).centre
+        view = self._views[camera]
+        before = self._imaged(camera, view.base_from_surface, view.rows)
+        after = self._imaged(camera, guess, view.rows)
         found, ok = flow(view.image, image, view.pixels, view.pixels + after - before)
         return view.rows[ok], undistort(self.rig.cameras[camera], found[ok])
+
+    def _imaged(self, camera: int, base_from_surface: Array, rows: NDArray[np.int64]) -> Array:
+        """Where landmarks (rows) fall in a camera's image, (N, 2) px."""
+        assert self._estimator.map is not None
+        points_base = se3.transform_points(base_from_surface, self._estimator.map.points[rows])
+        return self._lenses.image(camera, *ideal_pixels(self.rig.cameras[camera], points_base))[0]
 
     def _align(
         self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array], coarse: bool = False
     ) -> Observations:
-        """Measure the landmarks in every camera, each begun where the camera's own pose puts them; coarse: from afar."""
+        """Measure the landmarks in every camera, begun where the camera's own pose puts them; coarse: from afar."""
         rows = np.nonzero(self._agrees)[0]
         cameras = [c for c in pyramids if c in poses]
         results = list(self._threads.map(lambda c: self._align_one(c, pyramids[c], poses[c], rows, coarse), cameras))
@@ -271,19 +280,35 @@ class TrackingStep:
     ) -> tuple[Fit, Observations]:
         """What a missing camera, or all of them, show from a better start: the other cameras' pose, or one by SIFT.
 
-        The search takes 50-200 ms and holds the pose up, so it is made here only when there is no pose to hold up.
+        The search takes 50-200 ms and holds the pose up, so it is made here only when two cameras that agree are wanting.
         """
         if fit.measured:
-            start: Array | None = fit.solution.base_from_surface
-        else:
+            fit, observations = self._realign(stamp, pyramids, fit, observations, fit.solution.base_from_surface, {})
+        if len(self._carried(fit, pyramids)) < min(2, len(pyramids)):
             found = self._search.find(pyramids, self._threads)
-            start = None if found is None else found.base_from_surface
-        if start is None:
-            return fit, observations
-        again = self._align(stamp, pyramids, dict.fromkeys(pyramids, start), coarse=True)
+            if found is not None:
+                joint, single = found.base_from_surface, found.single
+                fit, observations = self._realign(stamp, pyramids, fit, observations, joint, single)
+        return fit, observations
+
+    def _realign(
+        self,
+        stamp: float,
+        pyramids: dict[int, Pyramid],
+        fit: Fit,
+        observations: Observations,
+        start: Array,
+        single: dict[int, Array],
+    ) -> tuple[Fit, Observations]:
+        """Align and fit again from another start, joint (4, 4) and by camera where it has its own; the better of both."""
+        again = self._align(stamp, pyramids, {c: single.get(c, start) for c in pyramids}, coarse=True)
         refit = self._estimator.fit(again, start)
         better = refit.measured and (not fit.measured or refit.used.sum() > fit.used.sum())
         return (refit, again) if better else (fit, observations)
+
+    def _carried(self, fit: Fit, pyramids: dict[int, Pyramid]) -> list[int]:
+        """The cameras that carry a fit as they carried the last one."""
+        return sorted(set(self._estimator.carriers(fit).tolist()) - set(self._missing(fit, pyramids)))
 
     def _recover(self) -> None:
         """Search the last images by SIFT for cameras that have lost the surface, so that the next flow begins there."""
@@ -293,7 +318,8 @@ class TrackingStep:
         if found is None:
             return
         pose = found.base_from_surface
-        again = self._align(0.0, {c: pyramids[c] for c in missing}, dict.fromkeys(missing, pose), coarse=True)
+        starts = {c: found.single.get(c, pose) for c in missing}
+        again = self._align(0.0, {c: pyramids[c] for c in missing}, starts, coarse=True)
         fit = self._estimator.fit(again, pose)
         if fit.measured:
             self._remember({c: pyramids[c] for c in missing}, again, fit.inlier, fit.solution.base_from_surface)
