@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.pose_solver import project, solve_pose
+from estimation.pose_solver import PoseFit, project, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals
@@ -24,6 +24,7 @@ from estimation.surface_map import SurfaceMap, local_normals
 LEAST_SIGHTINGS = 3
 FREE = 50.0  # mm: how far a landmark may lie from where it was; only there to keep a hardly seen one finite
 ROBUST = 3.0  # sigmas
+SINGLE = np.diag([1 / 0.05**2] * 3 + [1 / 10.0**2] * 3)  # rad, mm: how far one camera's instant may be from another's
 LEAST_DRIFT = np.array([1e-5] * 3 + [1e-3] * 3)  # rad, mm: so that the tie stays well conditioned
 
 
@@ -106,6 +107,21 @@ def frame_change(keyframes: list[KeyFrame], refined: Array) -> Array:
     return change
 
 
+def single_fit(rig: Rig, points: Array, seen: Observations, camera: int, near: Array) -> PoseFit:
+    """The fit to one camera's tracks alone, at its own instant, held to `near` (4, 4) where it sees little."""
+    mine = seen.camera == camera
+    return solve_pose(
+        rig,
+        seen.camera[mine],
+        points[seen.track[mine]],
+        seen.pixels[mine],
+        seen.sigma[mine],
+        near,
+        scales=(4.0, 1.0),
+        prior=SINGLE,
+    )
+
+
 def _fit(rig: Rig, points: Array, frame: KeyFrame) -> Array:
     seen = frame.observations
     return solve_pose(
@@ -134,7 +150,8 @@ def _graph(
         loose = gtsam.noiseModel.Gaussian.Covariance(carry @ along @ carry.T)
         seen = frame.observations
         for c in np.unique(seen.camera):
-            values.insert(_camera_key(int(c), i), start)
+            own = single_fit(rig, surface_map.points, seen, int(c), frame.base_from_surface).base_from_surface
+            values.insert(_camera_key(int(c), i), gtsam.Pose3(se3.inverse(own)))
             graph.add(gtsam.BetweenFactorPose3(body, _camera_key(int(c), i), gtsam.Pose3(), loose))
         for c, row, pixel, sigma in zip(seen.camera, seen.track, seen.pixels, seen.sigma, strict=True):
             if int(row) in rows:

@@ -78,7 +78,7 @@ def solve_pose(
     pose, unit, precision = start, 1.0, 1 / sigma**2
     predicted, depth, jacobian = project(rig, camera, pose, points)
     residual = predicted - pixels
-    weight = np.zeros(len(points))
+    weight, moved = np.zeros(len(points)), np.zeros(6)
     information = np.zeros((6, 6))
     for widening in scales:
         for iteration in range(iterations):
@@ -93,9 +93,9 @@ def solve_pose(
             damped = information + np.diag(1e-9 + 1e-9 * np.diag(information))
             if prior is not None:
                 damped = damped + prior
-                gradient = gradient + prior @ se3.log(se3.inverse(start) @ pose)
+                gradient = gradient + prior @ moved
             step = -np.linalg.solve(damped, gradient)
-            pose = pose @ se3.exp(step)
+            pose, moved = pose @ se3.exp(step), moved + step
             predicted, depth, jacobian = project(rig, camera, pose, points)
             residual = predicted - pixels
             if np.abs(step).max() < tolerance:

@@ -11,7 +11,7 @@ from concurrent.futures import Executor, Future
 import numpy as np
 
 from estimation import se3
-from estimation.adjustment import Adjusted, KeyFrame, adjust
+from estimation.adjustment import Adjusted, KeyFrame, adjust, single_fit
 from estimation.estimator import Fit
 from estimation.observations import Observations
 from estimation.rig import Rig
@@ -50,12 +50,13 @@ class Refiner:
 
         Until then a surface that moved between the cameras' instants looks nearer or farther than it is.
         """
-        first, dt = self._frames[0], fit.stamp - self._stamps[0]
-        moved = se3.log(se3.inverse(first.base_from_surface) @ fit.solution.base_from_surface)
-        drift = moved / dt * skew
-        self._frames[0] = KeyFrame(first.base_from_surface, first.observations, drift)
-        self._keep(fit.stamp, fit.solution.base_from_surface, _inliers(fit, observations), drift)
         assert self._map is not None
+        first, dt = self._frames[0], fit.stamp - self._stamps[0]
+        pose = fit.solution.base_from_surface
+        drift = se3.log(se3.inverse(first.base_from_surface) @ pose) / dt * skew
+        second = KeyFrame(pose, _inliers(self._rig, self._map, fit, observations), drift)
+        self._frames = [KeyFrame(first.base_from_surface, first.observations, drift), second]
+        self._stamps = [self._stamps[0], fit.stamp]
         refined = adjust(self._rig, self._map, self._frames)
         if refined is not None:
             self._map = refined.map
@@ -63,8 +64,9 @@ class Refiner:
 
     def offer(self, fit: Fit, observations: Observations, twist: Array, skew: float) -> None:
         """A measured frame set; it is kept if it shows the surface anew."""
+        assert self._map is not None
         if self._is_new(fit.stamp, fit.solution.base_from_surface):
-            self._keep(fit.stamp, fit.solution.base_from_surface, _inliers(fit, observations), twist * skew)
+            self._keep(fit.stamp, fit.solution.base_from_surface, _inliers(self._rig, self._map, fit, observations), twist * skew)
             self._ask = True
 
     def _is_new(self, stamp: float, pose: Array) -> bool:
@@ -114,12 +116,15 @@ class Refiner:
         return result
 
 
-def _inliers(fit: Fit, observations: Observations) -> Observations:
-    keep = fit.inlier
-    return Observations(
-        fit.stamp,
-        observations.camera[keep],
-        observations.track[keep],
-        observations.pixels[keep],
-        np.maximum(observations.sigma[keep], LEAST_SIGMA),
-    )
+def _inliers(rig: Rig, surface_map: SurfaceMap, fit: Fit, observations: Observations) -> Observations:
+    """The tracks that agree with the rest of their own camera: the joint fit leaves room for late cameras, and in it for
+    wrong matches too."""
+    sigma = np.maximum(observations.sigma, LEAST_SIGMA)
+    seen = Observations(fit.stamp, observations.camera, observations.track, observations.pixels, sigma)
+    keep = np.zeros(len(seen), bool)
+    for c in np.unique(seen.camera):
+        mine = seen.camera == c
+        if mine.sum() >= 8:
+            near = fit.solution.base_from_surface
+            keep[mine] = single_fit(rig, surface_map.points, seen, int(c), near).weights > 0.2
+    return Observations(seen.stamp, seen.camera[keep], seen.track[keep], seen.pixels[keep], seen.sigma[keep])

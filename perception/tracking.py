@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.adjustment import Adjusted, single_fit
 from estimation.estimator import Estimator, Fit, identity_pose
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
@@ -33,6 +34,7 @@ from perception.relocalise import Relocaliser
 STAGES = ("prepare", "flow", "align", "pose", "search")
 Pyramid = tuple[Image, Image]
 LOOSE = np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3)  # how far one camera's own pose may stray from the joint one
+FLOW_TRACKS = 80  # a camera: enough for a start, and flow is only that
 ROUGH = 1e-3  # rad, mm: a start for the alignment need not be better
 
 
@@ -104,8 +106,7 @@ class TrackingStep:
         """Work that no pose waits for; the caller's loop calls it once a pose is handed over."""
         refined = self._refiner.poll()
         if refined is not None:
-            self._estimator.replace_map(refined.map)
-            self._agrees = refined.agrees
+            self._take(refined)
         self._recover()
 
     def _took(self, stage: str) -> None:
@@ -172,7 +173,7 @@ class TrackingStep:
             if len(self._carried(fit, pyramids)) < 2:
                 reason = f"the first map waits for a second look by two cameras ({fit.reason or 'one sees it'})"
                 return estimator.wait(stamp, reason), observations, fit.used
-            fit = self._confirm(fit, observations)
+            fit, observations = self._confirm(pyramids, fit, observations)
         if fit.measured:
             self._lost = pyramids, self._missing(fit, pyramids)
             pose = estimator.accept(fit, observations)
@@ -183,15 +184,28 @@ class TrackingStep:
         self._took("pose")
         return pose, observations, fit.used
 
-    def _confirm(self, fit: Fit, observations: Observations) -> Fit:
-        """The first measured frame set after the first map: correct the map by it and fit again."""
-        refined = self._refiner.confirm(fit, observations, self._estimator.skew.sigma)
-        if refined is None:
-            return fit
+    def _confirm(
+        self, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations
+    ) -> tuple[Fit, Observations]:
+        """The first measured frame set after the first map: correct the map by it, look and fit again, twice."""
+        for _ in range(2):
+            refined = self._refiner.confirm(fit, observations, self._estimator.skew.sigma)
+            if refined is None:
+                break
+            self._take(refined)
+            pose, points = fit.solution.base_from_surface, refined.map.points
+            fits = {c: single_fit(self.rig, points, observations, c, pose) for c in pyramids}
+            starts = {c: own.base_from_surface for c, own in fits.items()}
+            again = self._align(fit.stamp, pyramids, starts, coarse=True)
+            refit = self._estimator.fit(again, pose)
+            if not refit.measured:
+                break
+            fit, observations = refit, again
+        return fit, observations
+
+    def _take(self, refined: Adjusted) -> None:
         self._estimator.replace_map(refined.map)
         self._agrees = refined.agrees
-        again = self._estimator.fit(observations, fit.solution.base_from_surface)
-        return again if again.measured else fit
 
     def _flow(self, pyramids: dict[int, Pyramid], guess: Array) -> tuple[Array, dict[int, Array]]:
         """The joint pose by optical flow, and each camera's own: cameras are seldom exposed at the same instant."""
@@ -208,7 +222,7 @@ class TrackingStep:
         pixels = np.concatenate([pixels for _, pixels in moved.values()])
         sigma = np.ones(len(rows))
         fit = solve_pose(
-            self.rig, camera, points[rows], pixels, sigma, guess, scales=(8.0, 1.5), iterations=5, tolerance=ROUGH
+            self.rig, camera, points[rows], pixels, sigma, guess, scales=(8.0, 1.5), iterations=4, tolerance=ROUGH
         )
         good = fit.weights > 0.2
         for c in pyramids:
@@ -224,7 +238,7 @@ class TrackingStep:
                     sigma[mine],
                     single[c],
                     prior=LOOSE,
-                    iterations=3,
+                    iterations=2,
                     tolerance=ROUGH,
                 )
                 single[c] = own.base_from_surface
@@ -232,10 +246,12 @@ class TrackingStep:
 
     def _flow_one(self, camera: int, image: Image, guess: Array) -> tuple[NDArray[np.int64], Array]:
         view = self._views[camera]
-        before = self._imaged(camera, view.base_from_surface, view.rows)
-        after = self._imaged(camera, guess, view.rows)
-        found, ok = flow(view.image, image, view.pixels, view.pixels + after - before)
-        return view.rows[ok], undistort(self.rig.cameras[camera], found[ok])
+        some = slice(None, None, 1 + len(view.rows) // FLOW_TRACKS)
+        rows, pixels = view.rows[some], view.pixels[some]
+        before = self._imaged(camera, view.base_from_surface, rows)
+        after = self._imaged(camera, guess, rows)
+        found, ok = flow(view.image, image, pixels, pixels + after - before)
+        return rows[ok], undistort(self.rig.cameras[camera], found[ok])
 
     def _imaged(self, camera: int, base_from_surface: Array, rows: NDArray[np.int64]) -> Array:
         """Where landmarks (rows) fall in a camera's image, (N, 2) px."""
