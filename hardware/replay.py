@@ -7,7 +7,6 @@ time that was measured, so the same input gives the same bytes on every machine.
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path as File
@@ -17,6 +16,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
+from hardware.arm_file import write_arm
 from hardware.arm_profile import ArmProfile, placed
 from hardware.clock import SimClock
 from hardware.motion import MotionStep
@@ -105,10 +105,10 @@ def _row(command: Command) -> list[str]:
 def replay_session(
     session: Session, path: File, out: File, progress: Report = silent, profile: ArmProfile | None = None
 ) -> None:
-    """Replay a session with the path at `path` (CSV) into the folder `out`: commands.csv, frames.bin, arm.json.
+    """Replay a session with the path at `path` (CSV) into the folder `out`: commands.csv, frames.bin, arm.toml.
 
     A recording knows no arm. Without a profile the default arm is placed so that the first measured surface lies on its
-    bench, level and below home; arm.json says where that is. What was written before an error stays readable.
+    bench, level and below home; arm.toml says where that is. What was written before an error stays readable.
     """
     from perception.tracking import TrackingStep  # loads cv2: the motion must not
 
@@ -124,7 +124,7 @@ def replay_session(
     poses: Iterable[SurfacePose] = track()
     if profile is None:
         poses, profile = placed_by(poses)
-    write_profile(out / "arm.json", profile)
+    write_arm(out / "arm.toml", profile, f"what this replay assumed; poses were known {DELAY} s after their stamps")
     with CommandWriter(out) as writer:
         for _, command, frame in replay(poses, MotionStep(checkpoints, profile)):
             writer.write(command, frame)
@@ -141,19 +141,3 @@ def placed_by(poses: Iterable[SurfacePose]) -> tuple[Iterator[SurfacePose], ArmP
         if pose.state.measured:
             return chain(waiting, coming), placed(ArmProfile(), pose.base_from_surface)
     return iter(waiting), ArmProfile()
-
-
-def write_profile(file: File, profile: ArmProfile) -> None:
-    """Write what a run assumed of the arm, as JSON (mm, rad, s)."""
-    arm, dialect = profile.arm, profile.dialect
-    table = {
-        "arm_from_base": arm.arm_from_base.tolist(),
-        "arm_from_upright": arm.arm_from_upright.tolist(),
-        "home": arm.home.tolist(),
-        "motion_byte": dialect.motion_byte,
-        "slots": list(dialect.slots),
-        "baud": profile.baud,
-        "tick": profile.tick,
-        "delay": DELAY,
-    }
-    file.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")

@@ -10,7 +10,7 @@ that had nothing to do 0.17 mm away and back at full jerk (0.040 mm rms off a st
 from __future__ import annotations
 
 import numpy as np
-from ruckig import ControlInterface, InputParameter, Ruckig, RuckigError, Trajectory
+from ruckig import ControlInterface, InputParameter, Ruckig, RuckigError, Synchronization, Trajectory
 
 from estimation.se3 import Array
 from planning.limits import Limits
@@ -56,6 +56,9 @@ class Follower:
             request.target_velocity = np.clip(velocity, -WITHIN * self._speed, WITHIN * self._speed)
             request.minimum_duration = LEAD
             limited = self._solve(request)
+            if isinstance(limited, str):  # the axes cannot be brought to one duration: each as soon as it can
+                request.synchronization, request.minimum_duration = Synchronization.No, None
+                limited = self._solve(request)
             if isinstance(limited, str):
                 return limited
             state = np.where(smooth, state, limited)
@@ -65,6 +68,7 @@ class Follower:
         """Move one tick towards rest, as soon as the limits allow; new axes (6,)."""
         request = self._request()
         request.control_interface = ControlInterface.Velocity
+        request.synchronization = Synchronization.No  # together, one brake in 30,000 ticks had no solution
         state = self._solve(request)
         return state if isinstance(state, str) else self._take(state)
 
@@ -81,7 +85,7 @@ class Follower:
         try:
             self._ruckig.calculate(request, motion)
         except RuckigError as error:
-            return f"no motion within the limits: {error}"
+            return f"no motion within the limits: {' '.join(str(error).split())[:80]}"
         state = np.array(motion.at_time(self._tick))
         return state if np.isfinite(state).all() else "no motion within the limits: its solution is not finite"
 

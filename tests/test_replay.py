@@ -16,13 +16,12 @@ import pytest
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
-from hardware.arm_profile import BENCH, ArmProfile
+from hardware.arm_profile import BENCH
 from hardware.motion import MotionStep
 from hardware.protocol import G1, G4, decode
-from hardware.replay import COLUMNS, CommandWriter, placed_by, replay, write_profile
+from hardware.replay import COLUMNS, CommandWriter, placed_by, replay
 from planning.command import Command, Hold, Move
 from planning.kinematics import nozzle_from_axes
-from planning.limits import Limits
 from tests.moving import breathing, pose_at, poses, raster
 
 ROOT = Path(__file__).parents[1]
@@ -162,12 +161,3 @@ def test_the_arm_is_placed_by_the_first_measured_pose_and_moves_only_then() -> N
     nothing, default = placed_by(unseen)
     assert len(list(nothing)) == 20
     assert np.array_equal(default.arm.arm_from_base, np.eye(4))
-
-
-def test_what_was_assumed_of_the_arm_is_written_down(tmp_path: Path) -> None:
-    import json
-
-    write_profile(tmp_path / "arm.json", ArmProfile(limits=Limits()))
-    written = json.loads((tmp_path / "arm.json").read_text())
-    assert written["arm_from_base"] == np.eye(4).tolist()
-    assert written["slots"] == ["J4", "J5", "J6"]

@@ -1,0 +1,107 @@
+"""Arm files: an ArmProfile as TOML, in mm, degrees and s; what a file leaves out keeps its default.
+
+home_mm_deg = [202.5, 225, 113, 0, 0, 0]      # X Y Z A B C
+arm_from_base = [[...], ...]                  # 4x4, mm
+arm_from_upright = [[...], ...]               # 3x3, the nozzle's rotation at A = B = C = 0
+motion_byte = 1                               # byte 2 of a G1 frame, 1 or 0
+slots = ["J4", "J5", "J6"]                    # which joint stands in each angle slot
+baud = 115200
+tick_s = 0.02
+[limits]                                      # as in planning/limits.py; arrays are X Y Z in mm, A B C in degrees
+speed = [150, 150, 150, 120, 120, 120]
+turn = 2.4
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware import checks
+from hardware.arm_profile import ArmProfile
+from hardware.protocol import Dialect
+from planning.kinematics import SimpleArm
+from planning.limits import Limits
+
+KEYS = ("home_mm_deg", "arm_from_base", "arm_from_upright", "motion_byte", "slots", "baud", "tick_s", "limits")
+LIMITS = tuple(f.name for f in fields(Limits))
+_AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
+_ANGLES = ("turn", "surface_turn")  # single numbers in rad
+_SHAPES: dict[str, tuple[int | None, ...]] = {"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3)}
+_TO_RAD = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])
+
+
+def read_arm(path: str | Path) -> ArmProfile:
+    """The profile in an arm file; InputError names the key that makes no sense."""
+    path = Path(path)
+    table = checks.read_toml(path)
+    checks.check_keys(path, "", table, (), KEYS)
+    default = ArmProfile()
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "home_mm_deg": (6,),
+        "arm_from_base": (4, 4),
+        "arm_from_upright": (3, 3),
+    }
+    given = {key: checks.numbers(path, key, table[key], shape) for key, shape in shapes.items() if key in table}
+    try:
+        return ArmProfile(
+            arm=SimpleArm(
+                given.get("arm_from_base", default.arm.arm_from_base),
+                given.get("arm_from_upright", default.arm.arm_from_upright),
+                given["home_mm_deg"] * _TO_RAD if "home_mm_deg" in given else default.arm.home,
+            ),
+            limits=_limits(path, table.get("limits", {})),
+            dialect=_dialect(path, table),
+            baud=checks.integer(path, "baud", table.get("baud", default.baud), 1),
+            tick=checks.number(path, "tick_s", table.get("tick_s", default.tick)),
+        )
+    except InputError as error:
+        if error.where == str(path):
+            raise
+        raise InputError(path, f"{error.where}: {error.what}", error.got, error.allowed) from None
+
+
+def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
+    """Write an arm file that gives the profile back, to rounding of angles."""
+    arm, dialect, limits = profile.arm, profile.dialect, profile.limits
+    lines = [f"# {line}" for line in remark.splitlines()] + [
+        f"home_mm_deg = {checks.toml_numbers(arm.home / _TO_RAD)}",
+        f"arm_from_base = {checks.toml_numbers(arm.arm_from_base)}",
+        f"arm_from_upright = {checks.toml_numbers(arm.arm_from_upright)}",
+        f"motion_byte = {dialect.motion_byte}",
+        "slots = [" + ", ".join(f'"{joint}"' for joint in dialect.slots) + "]",
+        f"baud = {profile.baud}",
+        f"tick_s = {profile.tick!r}",
+        "",
+        "[limits] # X Y Z in mm, A B C in degrees",
+        *(f"{name} = {checks.toml_numbers(getattr(limits, name) / _unit(name))}" for name in LIMITS),
+    ]
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _unit(name: str) -> Array:
+    """What the number in the file is times this, in mm and rad."""
+    return _TO_RAD if name in _AXES else np.asarray(np.deg2rad(1.0) if name in _ANGLES else 1.0)
+
+
+def _limits(path: Path, table: object) -> Limits:
+    if not isinstance(table, dict):
+        raise InputError(path, "limits", table, "a table [limits]")
+    checks.check_keys(path, "limits.", table, (), LIMITS)
+    given: dict[str, Array | float] = {}
+    for name, value in table.items():
+        number = checks.numbers(path, f"limits.{name}", value, (6,) if name in _AXES else ()) * _unit(name)
+        given[name] = number if name in _AXES else float(number)
+    return Limits(**given)  # type: ignore[arg-type]
+
+
+def _dialect(path: Path, table: checks.Table) -> Dialect:
+    default = Dialect()
+    slots = table.get("slots", list(default.slots))
+    if not (isinstance(slots, list) and len(slots) == 3 and all(isinstance(joint, str) for joint in slots)):
+        raise InputError(path, "slots", slots, 'three of "J4", "J5", "J6"')
+    return Dialect(checks.integer(path, "motion_byte", table.get("motion_byte", default.motion_byte), 0), tuple(slots))

@@ -1,0 +1,79 @@
+"""Arm files: round trip, defaults, and faults told by key."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from estimation import se3
+from estimation.errors import InputError
+from hardware.arm_file import read_arm, write_arm
+from hardware.arm_profile import ArmProfile
+from hardware.protocol import Dialect
+from planning.kinematics import SimpleArm
+from planning.limits import Limits
+
+
+def same(a: ArmProfile, b: ArmProfile) -> bool:
+    pairs = [
+        (getattr(x, f.name), getattr(y, f.name)) for x, y in ((a.arm, b.arm), (a.limits, b.limits)) for f in fields(x)
+    ]
+    numbers = all(np.allclose(x, y, rtol=1e-14, atol=1e-14) for x, y in pairs)
+    return numbers and (a.dialect, a.baud, a.tick) == (b.dialect, b.baud, b.tick)
+
+
+@given(st.integers(0, 10_000))
+def test_a_profile_comes_back(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    profile = ArmProfile(
+        SimpleArm(se3.exp(draw.normal(size=6)), se3.exp_rotation(draw.normal(size=3)), draw.uniform(-0.5, 0.5, 6)),
+        Limits(speed=draw.uniform(1, 100, 6), turn=draw.uniform(0.01, 0.1), surface_turn=draw.uniform(0.1, 1)),
+        Dialect(int(draw.integers(2)), ("J5", "J4", "J6")),
+        int(draw.integers(57_600, 1_000_000)),
+        draw.uniform(0.01, 0.04),
+    )
+    file = tmp_path_factory.mktemp("arm") / "arm.toml"
+    write_arm(file, profile, "made up\nfor a test")
+    assert same(read_arm(file), profile)
+
+
+def test_what_a_file_leaves_out_keeps_its_default(tmp_path: Path) -> None:
+    file = tmp_path / "arm.toml"
+    file.write_text("motion_byte = 0\n[limits]\nturn = 1.5\n", encoding="utf-8")
+    profile = read_arm(file)
+    assert same(profile, ArmProfile(limits=Limits(turn=np.deg2rad(1.5)), dialect=Dialect(0)))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ["empty"]),
+        ("baud = ", ["syntax"]),
+        ("boud = 9600", ["boud", "did you mean 'baud'"]),
+        ("baud = 9600", ["tick", "0.05"]),
+        ("baud = -1", ["baud", ">= 1"]),
+        ("motion_byte = 2", ["motion_byte", "0 or 1"]),
+        ('slots = ["J4", "J4", "J6"]', ["slots", "each once"]),
+        ("slots = 3", ["slots"]),
+        ("tick_s = nan", ["tick_s", "finite"]),
+        ("home_mm_deg = [0, 0]", ["home_mm_deg", "6 finite numbers"]),
+        ("home_mm_deg = [0, 0, 9000, 0, 0, 0]", ["home", "within"]),
+        ("arm_from_base = [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", ["arm_from_base", "rigid motion"]),
+        ("limits = 3", ["limits"]),
+        ("[limits]\nspeed = 100", ["limits.speed", "6 finite numbers"]),
+        ("[limits]\njump = -1", ["limits", "jump", "> 0"]),
+        ("[limits]\nspead = 1", ["limits.spead", "did you mean 'speed'"]),
+    ],
+)
+def test_faults_are_told_by_file_and_key(tmp_path: Path, text: str, words: list[str]) -> None:
+    file = tmp_path / "arm.toml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        read_arm(file)
+    for word in [str(file), "allowed", *words]:
+        assert word in str(caught.value)
