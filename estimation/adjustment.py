@@ -1,9 +1,9 @@
 """Refining the map from key frames: one GTSAM bundle adjustment, made away from the frame's path (it takes 20-300 ms).
 
 Unknown are the landmarks, the surface's pose at each key frame, and, because cameras are seldom exposed together, each
-camera's own pose of the surface at its own instant, tied to the key frame's by the distance it may have moved meanwhile.
-The surface frame stays where it was given out: the refined poses of the key frames agree with the ones that were published,
-on the whole, so that the path does not jump under the nozzle when a better map comes into force.
+camera's own pose of the surface at its own instant, tied to the key frame's by how far it may have moved meanwhile.
+The surface frame stays where it was given out: the refined poses of the key frames agree with the published ones on
+the whole, so that the path does not jump under the nozzle when a better map comes into force.
 """
 
 from __future__ import annotations
@@ -30,8 +30,11 @@ LEAST_DRIFT = np.array([1e-5] * 3 + [1e-3] * 3)  # rad, mm: so that the tie stay
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyFrame:
-    """One frame set worth keeping. observations.track counts rows of the map. drift: (6,) the surface's own twist times
-    one standard deviation of the cameras' instants, rad and mm: how far it may have moved from one image to the next."""
+    """One frame set worth keeping.
+
+    observations.track counts rows of the map. drift: (6,) rad and mm, the surface's own twist times one standard
+    deviation of the cameras' instants: how far it may have moved from one image to the next.
+    """
 
     base_from_surface: Array
     observations: Observations
@@ -40,7 +43,7 @@ class KeyFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
-    """The refined map, in the same rows and the same surface frame. agrees: (N,) whether a landmark moved with the rest."""
+    """The refined map, same rows, same surface frame. agrees: (N,) which landmarks move with the rest."""
 
     map: SurfaceMap
     agrees: NDArray[np.bool_]
@@ -183,7 +186,7 @@ def _joint_covariance(linear: gtsam.GaussianFactorGraph, rows: NDArray[np.int64]
     n = 3 * len(rows)
     cross = information[:n, n:]
     schur = information[:n, :n] - cross @ np.linalg.solve(information[n:, n:], cross.T)
-    return np.linalg.inv((schur + schur.T) / 2)
+    return np.asarray(np.linalg.inv((schur + schur.T) / 2), float)
 
 
 def _agreement(rig: Rig, points: Array, keyframes: list[KeyFrame], solved: gtsam.Values) -> NDArray[np.bool_]:

@@ -1,8 +1,8 @@
 """From observations to surface poses: robust fit to the map, honest covariance, sliding window, state.
 
-The covariance of one fit has three parts: the tracks' noise, the map's joint error, and the cameras' capture instants. The
-last is a common shift of all tracks of one camera along their image velocity, so it does not average out over tracks;
-its size (`skew`) is learned from how far the cameras disagree while the surface moves.
+The covariance of one fit has three parts: the tracks' noise, the map's joint error, and the cameras' capture instants.
+The last is a common shift of all tracks of one camera along their image velocity, so it does not average out over
+tracks; its size (`skew`) is learned from how far the cameras disagree while the surface moves.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ class Fit:
 class Skew:
     """How far apart the cameras' capture instants lie, s, learned from their disagreement along the motion.
 
-    One delay per camera and frame set is solved for beside the pose; its expected square, posterior mean and variance, feeds
-    a running variance (expectation maximisation), so frames in which nothing moves teach nothing.
+    One delay per camera and frame set is solved for beside the pose; its expected square, posterior mean and variance,
+    feeds a running variance (expectation maximisation), so frames in which nothing moves teach nothing.
     """
 
     PRIOR, TRUST, MEMORY = 0.02, 3.0, 0.98  # webcams stand 10 to 60 ms apart; a second in motion tells
@@ -77,7 +77,7 @@ class Skew:
         return float(np.sqrt(self._sum / self._weight))
 
     def learn(self, camera: NDArray[np.int64], residual: Array, jacobian: Array, twist: Array, sigma: Array) -> None:
-        """Residuals (N, 2) px after the joint fit, jacobians (N, 2, 6), twist (6,) per s, sigma (N,) px of the inliers."""
+        """Take a joint fit's inliers: residuals (N, 2) px, jacobians (N, 2, 6), twist (6,) per s, sigma (N,) px."""
         cameras, index, count = np.unique(camera, return_inverse=True, return_counts=True)
         if len(cameras) < 2 or count.min() < 6:
             return
@@ -181,7 +181,9 @@ class Estimator:
         self.map = surface_map
         self._smoother.reset()
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
-        return self._enter(stamp, base_from_surface, covariance, TrackState.INITIALISING, "a first map, to be confirmed")
+        return self._enter(
+            stamp, base_from_surface, covariance, TrackState.INITIALISING, "a first map, to be confirmed"
+        )
 
     def carriers(self, fit: Fit) -> NDArray[np.int64]:
         """The cameras that carry a fit, by number."""
@@ -203,7 +205,11 @@ class Estimator:
             twist, keep = moved / (fit.stamp - self._pose.stamp), fit.inlier
             sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
             self.skew.learn(
-                observations.camera[keep], fit.solution.residuals[keep], fit.solution.jacobians[keep], twist, sigma[keep]
+                observations.camera[keep],
+                fit.solution.residuals[keep],
+                fit.solution.jacobians[keep],
+                twist,
+                sigma[keep],
             )
         state, reason = self._grade(fit)
         return self._enter(fit.stamp, fit.solution.base_from_surface, fit.covariance, state, reason)

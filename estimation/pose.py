@@ -70,6 +70,8 @@ class SurfacePose:
 
     def error_at(self, points_surface: Array) -> Array:
         """Standard deviation (N,), mm, of the position of points (N, 3) given in the surface frame."""
-        jacobian = np.concatenate([-se3.hat(points_surface), np.broadcast_to(np.eye(3), (len(points_surface), 3, 3))], -1)
+        jacobian = np.concatenate(
+            [-se3.hat(points_surface), np.broadcast_to(np.eye(3), (len(points_surface), 3, 3))], -1
+        )
         spread = jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2)  # (N, 3, 3)
         return np.asarray(np.sqrt(np.linalg.eigvalsh(spread)[:, -1]))

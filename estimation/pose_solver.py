@@ -20,8 +20,12 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseFit:
-    """base_from_surface: (4, 4). information: (6, 6) of its right perturbation. residuals: (N, 2) px. weights: (N,) in
-    [0, 1], one for a track that fits. jacobians: (N, 2, 6) px per rad and mm. scale: the residuals' robust sigma ratio."""
+    """A pose and how the tracks stand to it.
+
+    base_from_surface: (4, 4). information: (6, 6) of its right perturbation. residuals: (N, 2) px. weights: (N,) in
+    [0, 1], one for a track that fits. jacobians: (N, 2, 6) px per rad and mm. scale: the residuals' robust
+    size in sigmas.
+    """
 
     base_from_surface: Array
     information: Array
@@ -32,7 +36,7 @@ class PoseFit:
 
 
 def project(rig: Rig, camera: Index, base_from_surface: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Ideal pixels (N, 2), depths (N,) and Jacobians (N, 2, 6) of surface points (N, 3), each in its own camera (N,)."""
+    """Ideal pixels (N, 2), depths (N,) mm and Jacobians (N, 2, 6) of surface points (N, 3), each in its camera (N,)."""
     extrinsics = rig.camera_from_base @ base_from_surface  # (C, 4, 4) camera_from_surface
     rotation = extrinsics[camera, :3, :3]
     in_camera = (rotation @ points[..., None])[..., 0] + extrinsics[camera, :3, 3]

@@ -39,7 +39,9 @@ class Refiner:
         self._count = 0
         self._job: Future[Adjusted | None] | Adjusted | None = None
 
-    def begin(self, surface_map: SurfaceMap, stamp: float, base_from_surface: Array, observations: Observations) -> None:
+    def begin(
+        self, surface_map: SurfaceMap, stamp: float, base_from_surface: Array, observations: Observations
+    ) -> None:
         """The first map and the frame set that it was made from, whose pose defines the surface frame."""
         self._map, self._frames, self._stamps = surface_map, [], []
         self._job, self._ask = None, False
@@ -66,7 +68,12 @@ class Refiner:
         """A measured frame set; it is kept if it shows the surface anew."""
         assert self._map is not None
         if self._is_new(fit.stamp, fit.solution.base_from_surface):
-            self._keep(fit.stamp, fit.solution.base_from_surface, _inliers(self._rig, self._map, fit, observations), twist * skew)
+            self._keep(
+                fit.stamp,
+                fit.solution.base_from_surface,
+                _inliers(self._rig, self._map, fit, observations),
+                twist * skew,
+            )
             self._ask = True
 
     def _is_new(self, stamp: float, pose: Array) -> bool:
@@ -117,8 +124,10 @@ class Refiner:
 
 
 def _inliers(rig: Rig, surface_map: SurfaceMap, fit: Fit, observations: Observations) -> Observations:
-    """The tracks that agree with the rest of their own camera: the joint fit leaves room for late cameras, and in it for
-    wrong matches too."""
+    """The tracks that agree with the rest of their own camera.
+
+    The joint fit leaves room for late cameras, and in it for wrong matches too.
+    """
     sigma = np.maximum(observations.sigma, LEAST_SIGMA)
     seen = Observations(fit.stamp, observations.camera, observations.track, observations.pixels, sigma)
     keep = np.zeros(len(seen), bool)

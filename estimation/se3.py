@@ -69,7 +69,9 @@ def log(transform: ArrayLike) -> Array:
     angle = np.linalg.norm(w, axis=-1)
     s, c, _ = _coefficients(angle)
     small = angle < 0.05
-    e = np.where(small, 1 / 12 + angle**2 / 720 + angle**4 / 30240, (1 - s / (2 * c)) / np.where(small, 1.0, angle) ** 2)
+    e = np.where(
+        small, 1 / 12 + angle**2 / 720 + angle**4 / 30240, (1 - s / (2 * c)) / np.where(small, 1.0, angle) ** 2
+    )
     h = hat(w)
     inverse_left = np.eye(3) - 0.5 * h + e[..., None, None] * (h @ h)
     return np.concatenate([w, (inverse_left @ transform[..., :3, 3:])[..., 0]], axis=-1)

@@ -1,9 +1,10 @@
 """The sliding window of poses and twists: the only owner of a GTSAM smoother, which it rebuilds when it breaks.
 
-One factor per frame: the Gauss-Newton pose with its information. Measured with 120 landmarks this is as accurate as keeping
-every landmark in the window (0.024 mm) at a thirtieth of the time. Between poses stands GTSAM's white-noise-on-acceleration
-prior (`WnoaMotionFactorPose3`; Barfoot 2017, 11.1). The window holds base_from_surface, not its inverse: its twist is then the
-surface's own velocity about its own origin, and the prior does not couple turns with the far-away base.
+One factor per frame: the Gauss-Newton pose with its information. Measured with 120 landmarks this is as accurate as
+keeping every landmark in the window (0.024 mm) at a thirtieth of the time. Between poses stands GTSAM's prior of white
+noise on acceleration (`WnoaMotionFactorPose3`; Barfoot 2017, 11.1). The window holds base_from_surface, not its
+inverse: its twist is then the surface's own velocity about its own origin, and the prior does not couple turns with the
+far-away base.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ class Smoother:
         return np.asarray(np.repeat([(off[:3] ** 2).mean(), (off[3:] ** 2).mean()], 3) * 30 / dt**3)
 
     def _extend(self, measured: Measured) -> Window:
-        graph, values, stamps = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         pose, twist = gtsam.symbol("x", self._key), gtsam.symbol("v", self._key)
         start = np.zeros(6)
         if self._newest is None:
@@ -132,8 +133,7 @@ class Smoother:
         graph.add(gtsam.PriorFactorPose3(pose, gtsam.Pose3(measured.pose), noise))
         values.insert(pose, gtsam.Pose3(measured.pose))
         values.insert(twist, start)
-        stamps[pose] = stamps[twist] = measured.stamp
-        self._window.update(graph, values, stamps)
+        self._window.update(graph, values, {pose: measured.stamp, twist: measured.stamp})
         estimate = self._window.calculateEstimate()
         self._key += 1
         window = Window(
@@ -144,7 +144,9 @@ class Smoother:
             _symmetric(self._window.marginalCovariance(twist)),
             self._psd.copy(),
         )
-        if not all(np.isfinite(a).all() for a in (window.pose, window.covariance, window.twist, window.twist_covariance)):
+        if not all(
+            np.isfinite(a).all() for a in (window.pose, window.covariance, window.twist, window.twist_covariance)
+        ):
             raise ValueError("the window's estimate is not finite")
         return window
 

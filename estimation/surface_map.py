@@ -39,8 +39,7 @@ def local_normals(points: Array, outward: Array, neighbours: int = 12) -> Array:
     local = np.swapaxes(spread, 1, 2) @ spread / k
     centred = points - points.mean(0)
     whole = centred.T @ centred / len(points)
-    values, vectors = np.linalg.eigh(local + 0.02 * whole)
-    normals = vectors[:, :, 0]
+    normals = np.linalg.eigh(local + 0.02 * whole)[1][:, :, 0]
     sign = np.sign(np.einsum("ni,ni->n", normals, np.broadcast_to(outward, normals.shape)))
     return np.asarray(normals * np.where(sign == 0, 1.0, sign)[:, None])
 

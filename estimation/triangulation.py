@@ -34,7 +34,7 @@ def triangulate(
     np.add.at(normal, point, across)
     np.add.at(right, point, np.einsum("mij,mj->mi", across, origins))
     ridge = 1e-12 * np.eye(3)
-    points = np.linalg.solve(normal + ridge, right[..., None])[..., 0]
+    points = np.asarray(np.linalg.solve(normal + ridge, right[..., None])[..., 0], float)
     identity = np.eye(4)
     for _ in range(iterations):
         predicted, _, jacobian = project(rig, camera, identity, points[point])
@@ -43,9 +43,9 @@ def triangulate(
         normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
         np.add.at(normal, point, np.swapaxes(jacobian, 1, 2) @ jacobian)
         np.add.at(right, point, np.einsum("mki,mk->mi", jacobian, residual))
-        points = points - np.linalg.solve(normal + ridge, right[..., None])[..., 0]
+        points = np.asarray(points - np.linalg.solve(normal + ridge, right[..., None])[..., 0], float)
     residual = project(rig, camera, identity, points[point])[0] - pixels
-    return points, np.linalg.inv(normal + ridge), residual
+    return points, np.asarray(np.linalg.inv(normal + ridge), float), residual
 
 
 def epipolar_distance(rig: Rig, a: int, b: int, pixels_a: Array, pixels_b: Array) -> Array:

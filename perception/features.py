@@ -56,7 +56,7 @@ def sift(image: Image, mask: Mask | None = None, count: int = 1500) -> tuple[Arr
         x, y, w, h = cv2.boundingRect(mask)
         x0, y0, x1, y1 = max(x - 16, 0), max(y - 16, 0), min(x + w + 16, x1), min(y + h + 16, y1)
         mask = np.ascontiguousarray(mask[y0:y1, x0:x1])
-    detector = cv2.SIFT_create(nfeatures=count, contrastThreshold=0.02)
+    detector = cv2.SIFT.create(nfeatures=count, contrastThreshold=0.02)
     keypoints, descriptors = detector.detectAndCompute(np.ascontiguousarray(image[y0:y1, x0:x1]), mask)
     if not keypoints:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)

@@ -49,7 +49,9 @@ class Seeds:
     points: Array
 
 
-def consensus(position: Array, value: Array, reach: float, tolerance: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+def consensus(
+    position: Array, value: Array, reach: float, tolerance: float, rng: np.random.Generator
+) -> NDArray[np.bool_]:
     """Inliers (N,) of a plane value ~ [1 x y] over positions (N, 2), by RANSAC among values within `reach` of zero."""
     scale = np.maximum(position.std(0), 1.0)
     design = np.c_[np.ones(len(position)), (position - position.mean(0)) / scale]
@@ -119,9 +121,14 @@ def _pair_points(rig: Rig, a: int, b: int, pixels_a: Array, pixels_b: Array) -> 
     return points, covariance, residual
 
 
-def _on_seeds(rig: Rig, seeds: Seeds, camera: int, pixels: Array, outward: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Points (N, 3) and normals (N, 3), base frame, where rays meet the seeds' surface; the mean offset (N, 2), px, of
-    nearby seeds in the other camera from where their own rays and depths would put them; whether seeds are near (N,)."""
+def _on_seeds(
+    rig: Rig, seeds: Seeds, camera: int, pixels: Array, outward: Array
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Where rays of pixels (N, 2) meet the seeds' surface: points (N, 3) and normals (N, 3), base frame.
+
+    With them the mean offset (N, 2), px, of nearby seeds in the other camera from where their own rays and depths would
+    put them, and whether seeds are near (N,).
+    """
     own, other = (seeds.pixels_a, seeds.pixels_b) if camera == seeds.a else (seeds.pixels_b, seeds.pixels_a)
     target = seeds.b if camera == seeds.a else seeds.a
     tree = cKDTree(own)
@@ -247,7 +254,7 @@ def _sweep(
 def _along(rig: Rig, camera: int, pixels: Array, points: Array) -> Array:
     """The spots (N, 3) on the pixels' own rays nearest to points: a landmark stands exactly where its camera saw it."""
     origins, directions = rays(rig, np.full(len(pixels), camera), pixels)
-    return origins + np.einsum("ni,ni->n", points - origins, directions)[:, None] * directions
+    return np.asarray(origins + np.einsum("ni,ni->n", points - origins, directions)[:, None] * directions)
 
 
 def _steady(pixels: Array, residual: Array) -> NDArray[np.bool_]:

@@ -14,7 +14,9 @@ WINDOW = 21  # px
 MARGIN = 48.0  # px around the tracks: flow sees that far beyond them
 
 
-def flow(previous: Image, current: Image, pixels: Array, guess: Array, levels: int = 4) -> tuple[Array, NDArray[np.bool_]]:
+def flow(
+    previous: Image, current: Image, pixels: Array, guess: Array, levels: int = 4
+) -> tuple[Array, NDArray[np.bool_]]:
     """Where pixels (N, 2) of the previous image stand in the current one (N, 2), and whether they were found (N,).
 
     guess: (N, 2) px, where to begin. Pyramidal Lucas-Kanade (thesis 4.4, Eq. 4.7-4.10) on the box around the tracks.

@@ -31,7 +31,7 @@ class FrameSet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Roi:
-    """Where the surface is in one image. camera: number in the rig. stamp: s. polygon: (N, 2) px, may leave the image."""
+    """Where the surface is in one image. camera: number in the rig. stamp: s. polygon: (N, 2) px, may lie outside."""
 
     camera: int
     stamp: float

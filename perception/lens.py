@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation.rig import Camera, Rig, distort
 from estimation.se3 import Array
@@ -44,7 +45,7 @@ class Lenses:
         self.rig = rig
         self.radius = np.array([imaged_radius(c) for c in rig.cameras])
 
-    def image(self, camera: int, ideal: Array, depth: Array) -> tuple[Array, Array]:
+    def image(self, camera: int, ideal: Array, depth: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Imaged pixels (..., 2) of ideal ones and whether each is in front of and inside the lens's field (...)."""
         lens = self.rig.cameras[camera]
         tangent = (ideal - lens.matrix[:2, 2]) / lens.matrix[[0, 1], [0, 1]]

@@ -1,9 +1,9 @@
 """Small textured tiles of the surface, found again in later images by warping and sub-pixel alignment.
 
 Each landmark keeps the picture of a small square of the surface's tangent plane, taken once from its reference image.
-In a later image the square is projected with the predicted pose and shifted until the picture fits (inverse-compositional
-Lucas-Kanade, Baker and Matthews 2004, on patches freed of brightness and contrast), so a track never creeps: it is
-compared with the reference, never with the frame before.
+In a later image the square is projected with the predicted pose and shifted until the picture fits (inverse
+compositional Lucas-Kanade, Baker and Matthews 2004, on patches freed of brightness and contrast), so a track never
+creeps: it is compared with the reference, never with the frame before.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.rig import Rig
 from estimation.se3 import Array
 from perception.frames import Image
 from perception.lens import Lenses
@@ -41,7 +40,7 @@ class Templates:
     """Reference pictures as parallel arrays, one per landmark.
 
     camera: (N,) that took it. axes: (N, 3, 2) mm per sample, the square's two sides in the surface frame. picture:
-    (N, S) of zero mean and unit contrast. steepest: (N, 2, S) its gradient per sample, freed of brightness and contrast.
+    (N, S) of zero mean and unit contrast. steepest: (N, 2, S) its gradient a sample, freed of brightness and contrast.
     inverse_hessian: (N, 2, 2). coarse_*: the same at twice the spacing. contrast: (N,) grey levels.
     """
 
@@ -74,9 +73,10 @@ def pyramid(image: Image) -> tuple[Image, Image]:
 
 
 def sample(image: Image, centre: Array, per_sample: Array, spacing: float = 1.0, half: bool = False) -> Float32:
-    """Grey levels (N, S) of the grid laid at centres (N, 2) px with per_sample (N, 2, 2) px a step, `spacing` steps apart.
+    """Grey levels (N, S) of the grid laid at centres (N, 2) px with per_sample (N, 2, 2) px a step.
 
-    Bilinear; outside the image the border's value. half: the image is the half-size one of `pyramid`.
+    spacing: steps from sample to sample. half: the image is the half-size one of `pyramid`. Bilinear; outside the image
+    the border's value.
     """
     scale, shift = (0.5, -0.25) if half else (1.0, 0.0)
     offsets = np.matmul((per_sample * (spacing * scale)).astype(np.float32), _SPAN)  # (N, 2, S)
@@ -94,7 +94,10 @@ def normalise(pictures: Float32) -> tuple[Float32, Float32]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """Where squares fall in one camera: centre (N, 2) px as imaged, per_sample (N, 2, 2) px, visible (N,), facing (N,)."""
+    """Where squares fall in one camera.
+
+    centre: (N, 2) px as imaged. per_sample: (N, 2, 2) px. visible: (N,). facing: (N,) cosine of the viewing angle.
+    """
 
     centre: Array
     per_sample: Array
@@ -132,14 +135,14 @@ def square_axes(lenses: Lenses, camera: int, base_from_surface: Array, points: A
     right = camera_from_surface[0, :3] - normals * (normals @ camera_from_surface[0, :3])[:, None]
     right = right / np.maximum(np.linalg.norm(right, axis=1, keepdims=True), 1e-6)
     down = np.cross(-normals, right)
-    return np.stack([right, down], -1) * (depth / focal)[:, None, None]
+    return np.asarray(np.stack([right, down], -1) * (depth / focal)[:, None, None])
 
 
 def _describe(pictures: Float32) -> tuple[Float32, Float32, Array, Float32]:
     normal, contrast = normalise(pictures)
     tiles = normal.reshape(-1, SIDE, SIDE)
-    gx, gy = np.gradient(tiles, axis=2), np.gradient(tiles, axis=1)
-    steepest = np.stack([gx.reshape(len(tiles), -1), gy.reshape(len(tiles), -1)], 1)
+    gradients = [np.asarray(np.gradient(tiles, axis=axis)) for axis in (2, 1)]
+    steepest = np.stack([g.reshape(len(tiles), -1) for g in gradients], 1)
     steepest = steepest - steepest.mean(2, keepdims=True)
     along = np.einsum("nks,ns->nk", steepest, normal) / (SIDE * SIDE)
     steepest = steepest - along[:, :, None] * normal[:, None]
@@ -179,8 +182,8 @@ def align(
 ) -> Alignment:
     """Shift each template until it fits.
 
-    start: (N, 2) px as imaged, where to begin. least: the correlation below which a landmark is not found. coarse: begin
-    on the half-size image, which reaches twice as far (about 10 px) and costs as much again.
+    start: (N, 2) px as imaged, where to begin. least: the correlation below which a landmark is not found. coarse:
+    begin on the half-size image, which reaches twice as far (about 10 px) and costs as much again.
     """
     shift = np.zeros((len(templates), 2))  # in samples of the template
     if coarse:

@@ -59,7 +59,7 @@ class Relocaliser:
         points_base = se3.transform_points(base_from_surface, surface_map.points)
         ideal, depth = ideal_pixels(lens, points_base)
         imaged, seen = self.lenses.image(camera, ideal, depth)
-        seen &= ((imaged >= 0) & (imaged < lens.size)).all(1)
+        seen = seen & ((imaged >= 0) & (imaged < lens.size)).all(1)
         if seen.sum() < 8:
             return
         mask = np.zeros((lens.size[1], lens.size[0]), np.uint8)
@@ -83,7 +83,7 @@ class Relocaliser:
         landmark_pixels: Array,
         seen: NDArray[np.bool_],
     ) -> Array:
-        """Points (N, 3), surface frame, where rays meet the mean plane of the six nearest landmarks; nan if it is steep."""
+        """Points (N, 3), surface frame, where rays meet the mean plane of the six nearest landmarks; nan if steep."""
         index = np.nonzero(seen)[0]
         gap = ((pixels[:, None] - landmark_pixels[index]) ** 2).sum(2)
         near = index[np.argsort(gap, axis=1)[:, :6]]
@@ -154,7 +154,7 @@ def _alike(a: Array, b: Array) -> bool:
 
 
 def _pnp(points: Array, pixels: Array, matrix: Array) -> Array | None:
-    """camera_from_surface (4, 4) by RANSAC over points (N, 3) and ideal pixels (N, 2), or None; OpenCV's own fixed seed."""
+    """camera_from_surface (4, 4) by RANSAC over points (N, 3) and ideal pixels (N, 2), or None; fixed seed."""
     ok, rotation, translation, inliers = cv2.solvePnPRansac(
         points, pixels, matrix, None, iterationsCount=400, reprojectionError=6.0, flags=cv2.SOLVEPNP_SQPNP
     )

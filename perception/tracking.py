@@ -154,9 +154,7 @@ class TrackingStep:
 
     # -- every frame after it
 
-    def _track(
-        self, stamp: float, pyramids: dict[int, Pyramid]
-    ) -> tuple[SurfacePose, Observations, NDArray[np.int64]]:
+    def _track(self, stamp: float, pyramids: dict[int, Pyramid]) -> tuple[SurfacePose, Observations, NDArray[np.int64]]:
         estimator = self._estimator
         assert estimator.map is not None and estimator.pose is not None
         guess = estimator.predict(stamp)
@@ -184,9 +182,7 @@ class TrackingStep:
         self._took("pose")
         return pose, observations, fit.used
 
-    def _confirm(
-        self, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations
-    ) -> tuple[Fit, Observations]:
+    def _confirm(self, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations) -> tuple[Fit, Observations]:
         """The first measured frame set after the first map: correct the map by it, look and fit again, twice."""
         for _ in range(2):
             refined = self._refiner.confirm(fit, observations, self._estimator.skew.sigma)
@@ -276,9 +272,7 @@ class TrackingStep:
             np.concatenate([r.sigma[r.found] for r in results]),
         )
 
-    def _align_one(
-        self, camera: int, images: Pyramid, pose: Array, rows: NDArray[np.int64], coarse: bool
-    ) -> Alignment:
+    def _align_one(self, camera: int, images: Pyramid, pose: Array, rows: NDArray[np.int64], coarse: bool) -> Alignment:
         assert self._estimator.map is not None and self._templates is not None
         surface_map, templates = self._estimator.map, self._templates
         where = project_squares(
@@ -296,7 +290,7 @@ class TrackingStep:
     ) -> tuple[Fit, Observations]:
         """What a missing camera, or all of them, show from a better start: the other cameras' pose, or one by SIFT.
 
-        The search takes 50-200 ms and holds the pose up, so it is made here only when two cameras that agree are wanting.
+        The search takes 50-200 ms and holds the pose up, so it is made here only where two agreeing cameras lack.
         """
         if fit.measured:
             fit, observations = self._realign(stamp, pyramids, fit, observations, fit.solution.base_from_surface, {})
@@ -316,7 +310,7 @@ class TrackingStep:
         start: Array,
         single: dict[int, Array],
     ) -> tuple[Fit, Observations]:
-        """Align and fit again from another start, joint (4, 4) and by camera where it has its own; the better of both."""
+        """Align and fit again from another start, joint (4, 4) and by camera where it has its own; keep the better."""
         again = self._align(stamp, pyramids, {c: single.get(c, start) for c in pyramids}, coarse=True)
         refit = self._estimator.fit(again, start)
         better = refit.measured and (not fit.measured or refit.used.sum() > fit.used.sum())
@@ -352,5 +346,3 @@ class TrackingStep:
 def _no_observations(stamp: float) -> Observations:
     nothing = np.zeros(0, np.int64)
     return Observations(stamp, nothing, nothing, np.zeros((0, 2)), np.zeros(0))
-
-
