@@ -186,6 +186,19 @@ def test_the_curve_passes_near_each_checkpoint_and_never_outruns_its_length(seed
     assert np.abs(np.diff(places, axis=0) / s[1] - curve.slope(middle)).max() < 2 * s[1] / curve.half[1:-1].min()
 
 
+@given(st.integers(0, 10_000), st.floats(0.02, 0.3))
+def test_corners_closer_than_their_blends_share_the_way_between_them(seed: int, spacing: float) -> None:
+    steps_mm = np.random.default_rng(seed).normal(size=(30, 3))
+    points = np.cumsum(steps_mm / np.linalg.norm(steps_mm, axis=1, keepdims=True) * spacing, axis=0)
+    curve = curve_through(path_through(points).surface_from_nozzle, np.full(29, 5.0), 0.05, 4.0)
+    reach = curve.knots + curve.half
+    assert (reach[:-1] <= (curve.knots - curve.half)[1:] + 1e-12).all()
+    s = steps(curve.length)
+    assert np.linalg.norm(curve.slope(s), axis=1).max() <= 1 + 1e-12
+    assert np.linalg.norm(np.diff(curve.poses(s)[:, :3, 3], axis=0), axis=1).max() <= s[1] * (1 + 1e-9)
+    assert np.linalg.norm(curve.poses(curve.knots)[:, :3, 3] - points, axis=1).max() <= 0.05 + 1e-9
+
+
 @given(st.integers(0, 10_000), st.floats(0, 0.9), st.floats(0, 60))
 def test_timing_keeps_the_speed_of_every_stretch_and_ends_at_rest(seed: int, share: float, speed: float) -> None:
     path = wandering(seed)

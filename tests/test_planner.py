@@ -162,6 +162,26 @@ def test_an_outage_is_braked_held_and_resumed_where_it_stopped() -> None:
     assert (np.diff(printed) >= 0).all()  # nor printed twice
 
 
+def test_a_surface_that_jumps_is_found_again_before_printing_goes_on() -> None:
+    def jumping(t: float) -> Array:
+        return REST @ se3.exp([0, 0, 0, 0, 0, 0 if t < 18.0 else -4.0])
+
+    path = raster()
+    stamps = 10 + TICK * np.arange(900)
+    result = run(path, [(t, replace(pose_at(jumping, t), twist=np.zeros(6))) for t in stamps.tolist()])
+    printing, where = extruding(result), tips(result, jumping)
+    assert printing[stamps < 18.0 - TICK].any()
+    assert result.reasons == {"path finished"}
+    assert over_limit(result.axes, LIMITS) <= 1
+    assert distance_to(where[printing], path).max() <= LIMITS.on_path
+    printed = result.places[printing]
+    assert printed[-1] == pytest.approx(40.0)
+    assert (np.diff(printed) >= 0).all()
+    assert np.diff(printed, prepend=0).max() < 0.25  # no part of the path was passed without printing
+    back = stamps[printing & (stamps >= 18.0)][0]
+    assert 18.1 < back < 20.0
+
+
 def stream(seed: int) -> tuple[Path, list[tuple[float, SurfacePose | None]]]:
     """Some 5 s of a print: a surface that moves anyhow, poses late, noisy, jumping, lost, not finite, or missing."""
     random = np.random.default_rng(seed)
