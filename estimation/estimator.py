@@ -109,6 +109,7 @@ class Estimator:
         self._pose: SurfacePose | None = None
         self._measured_stamp = -np.inf
         self._tracking = False
+        self._caveat = ""
 
     @property
     def pose(self) -> SurfacePose | None:
@@ -176,9 +177,12 @@ class Estimator:
         total = total + self.skew.sigma**2 * late @ late.T
         return np.asarray((total + total.T) / 2)
 
-    def begin(self, stamp: float, base_from_surface: Array, surface_map: SurfaceMap) -> SurfacePose:
-        """Take the first map, which defines the surface frame at `stamp`."""
-        self.map = surface_map
+    def begin(self, stamp: float, base_from_surface: Array, surface_map: SurfaceMap, caveat: str = "") -> SurfacePose:
+        """Take the first map, which defines the surface frame at `stamp`.
+
+        caveat: what is not known of that frame's place on the tissue; as long as it stands no pose is TRACKING.
+        """
+        self.map, self._caveat = surface_map, caveat
         self._smoother.reset()
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
         return self._enter(
@@ -224,6 +228,8 @@ class Estimator:
             return TrackState.DEGRADED, f"the pose is uncertain to {spread:.1f} mm"
         if fit.used.sum() < (s.leave_tracks if self._tracking else s.enter_tracks):
             return TrackState.DEGRADED, f"{fit.used.sum()} tracks carry the pose, {s.enter_tracks} wanted"
+        if self._caveat:
+            return TrackState.DEGRADED, self._caveat
         return TrackState.TRACKING, ""
 
     def _enter(self, stamp: float, pose: Array, covariance: Array, state: TrackState, reason: str) -> SurfacePose:

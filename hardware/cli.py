@@ -21,6 +21,7 @@ WRONG_INPUT = 2
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one sub-command and return its exit code: 0, 2 for wrong input (one line on stderr), 130 after Ctrl-C."""
     arguments = parser().parse_args(argv)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads only spin over matrices this small
     try:
         arguments.run(arguments)
         sys.stdout.flush()

@@ -110,22 +110,21 @@ def replay_session(
     A recording knows no arm. Without a profile the default arm is placed so that the first measured surface lies on its
     bench, level and below home; arm.toml says where that is. What was written before an error stays readable.
     """
-    from perception.tracking import TrackingStep  # loads cv2: the motion must not
+    from hardware.tracker import tracker  # loads cv2: the motion must not
 
     checkpoints = read_path(path)
-    step = TrackingStep(session.rig, session.roi)
+    with tracker(session) as step, CommandWriter(out) as writer:
 
-    def track() -> Iterator[SurfacePose]:
-        for done, frames in enumerate(session.frame_sets(), 1):
-            yield step(frames)
-            step.idle()
-            progress(done, len(session))
+        def track() -> Iterator[SurfacePose]:
+            for done, frames in enumerate(session.frame_sets(), 1):
+                yield step(frames)
+                step.idle()
+                progress(done, len(session))
 
-    poses: Iterable[SurfacePose] = track()
-    if profile is None:
-        poses, profile = placed_by(poses)
-    write_arm(out / "arm.toml", profile, f"what this replay assumed; poses were known {DELAY} s after their stamps")
-    with CommandWriter(out) as writer:
+        poses: Iterable[SurfacePose] = track()
+        if profile is None:
+            poses, profile = placed_by(poses)
+        write_arm(out / "arm.toml", profile, f"what this replay assumed; poses were known {DELAY} s after their stamps")
         for _, command, frame in replay(poses, MotionStep(checkpoints, profile)):
             writer.write(command, frame)
 

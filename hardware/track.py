@@ -19,8 +19,9 @@ from hardware.report import write_report
 from hardware.session import Session, open_session
 from hardware.summary import summary_text, write_summary
 from hardware.track_recorder import TrackRecorder
+from hardware.tracker import tracker
 from perception.frames import FrameSet
-from perception.tracking import STAGES, StepReport, TrackingStep
+from perception.tracking import STAGES, StepReport
 
 
 class Step(Protocol):
@@ -88,10 +89,10 @@ def run_track(path: Path, out: Path, record: Path | None = None, force: bool = F
     session = open_session(path)
     prepare_out(out, force)
     clock = WallClock()
-    step = TrackingStep(session.rig, session.roi, clock.now)
     cameras = [camera.name for camera in session.rig.cameras]
     complete = False
     with ExitStack() as stack:
+        step = stack.enter_context(tracker(session, clock.now))
         sinks = [] if record is None else [stack.enter_context(TrackRecorder(record, session, force)).write]
         writer = stack.enter_context(PoseWriter(out, cameras, STAGES))
         progress = stack.enter_context(Progress("track", "frame sets", clock.now))

@@ -7,7 +7,7 @@ Cameras are seldom exposed together: all epipolar distances of a moving surface 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,18 @@ class FirstMap:
     base_from_surface: Array
     map: SurfaceMap
     templates: Templates
+
+
+def in_frame(first: FirstMap, base_from_new: Array) -> FirstMap:
+    """The same map in another surface frame, as a scan's: base_from_new (4, 4)."""
+    new_from_old = se3.inverse(base_from_new) @ first.base_from_surface
+    turn = new_from_old[:3, :3]
+    count = len(first.map)
+    covariance = first.map.covariance.reshape(count, 3, count, 3)
+    turned = np.einsum("ai,minj,bj->manb", turn, covariance, turn, optimize=True).reshape(3 * count, 3 * count)
+    points = se3.transform_points(new_from_old, first.map.points)
+    templates = replace(first.templates, axes=turn @ first.templates.axes)
+    return FirstMap(base_from_new, SurfaceMap(points, first.map.normals @ turn.T, turned), templates)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

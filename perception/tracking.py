@@ -21,10 +21,12 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import solve_pose
 from estimation.refiner import Refiner
+from estimation.registration import register
 from estimation.rig import Rig, ideal_pixels
+from estimation.scan import Scan
 from estimation.se3 import Array
 from perception.features import grey
-from perception.first_map import build_first_map
+from perception.first_map import FirstMap, build_first_map, in_frame
 from perception.flow import flow
 from perception.frames import FrameSet, Image, Roi
 from perception.lens import Lenses, undistort
@@ -35,6 +37,7 @@ STAGES = ("prepare", "flow", "align", "pose", "search")
 Pyramid = tuple[Image, Image]
 LOOSE = np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3)  # how far one camera's own pose may stray from the joint one
 FLOW_TRACKS = 80  # a camera: enough for a start, and flow is only that
+LEAST_SCAN_SIGMA = 0.1  # mm: no handheld scan is better
 ROUGH = 1e-3  # rad, mm: a start for the alignment need not be better
 
 
@@ -68,15 +71,19 @@ class TrackingStep:
         roi: Sequence[Roi] = (),
         clock: Callable[[], float] = lambda: 0.0,
         executor: Executor | None = None,
+        scan: Scan | None = None,
     ) -> None:
         """Ready for the first frame set.
 
         roi: where the surface is when it first comes into view; without one, whatever two cameras see is the surface.
         clock: only to fill `StepReport.seconds`. executor: where the map is refined (a process of its own keeps GTSAM's
         hold on the interpreter away from the frames); without one it is done in `idle`. Poses are the same either way.
+        scan: its frame is the surface frame; without one that is laid into the first map (origin at the landmarks'
+        centroid, z out of the surface).
         """
         self.rig, self.roi, self._clock = rig, tuple(roi), clock
         self._refiner = Refiner(rig, executor)
+        self._scan = scan
         self._lenses = Lenses(rig)
         self._estimator = Estimator(rig)
         self._search = Relocaliser(self._lenses)
@@ -127,8 +134,11 @@ class TrackingStep:
         self._took("search")
         if isinstance(first, str):
             return identity_pose(frames.stamp, first), _no_observations(frames.stamp), none
+        caveat = ""
+        if self._scan is not None:
+            first, caveat = self._on_scan(first, self._scan)
         self._templates = first.templates
-        pose = self._estimator.begin(frames.stamp, first.base_from_surface, first.map)
+        pose = self._estimator.begin(frames.stamp, first.base_from_surface, first.map, caveat)
         self._agrees = np.ones(len(first.map), bool)
         starts = dict.fromkeys(polygons, first.base_from_surface)
         observations = self._align(frames.stamp, pyramids, starts, coarse=True)
@@ -139,6 +149,16 @@ class TrackingStep:
             self._search.learn(camera, pyramids[camera][0], first.base_from_surface, first.map)
         self._took("search")
         return pose, observations, fit.used
+
+    def _on_scan(self, first: FirstMap, scan: Scan) -> tuple[FirstMap, str]:
+        """The first map in the scan's frame, and what the scan's shape leaves open, or ''."""
+        points = se3.transform_points(first.base_from_surface, first.map.points)
+        blocks = first.map.covariance.reshape(len(points), 3, len(points), 3)
+        sigma = float(np.sqrt(np.median(np.einsum("nini->n", blocks))))
+        found = register(points, max(sigma, LEAST_SCAN_SIGMA), scan, first.base_from_surface[:3, 2])
+        return in_frame(
+            first, found.base_from_surface
+        ), "" if found.sure else f"the scan's place is open: {found.verdict}"
 
     def _polygons(self, frames: FrameSet) -> dict[int, Array] | str:
         """Where the surface is in these images, by camera, or why that is not known yet."""
