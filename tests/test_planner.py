@@ -173,13 +173,14 @@ def test_a_surface_that_jumps_is_found_again_before_printing_goes_on() -> None:
     assert printing[stamps < 18.0 - TICK].any()
     assert result.reasons == {"path finished"}
     assert over_limit(result.axes, LIMITS) <= 1
-    assert distance_to(where[printing], path).max() <= LIMITS.on_path
+    foreseen = ~((stamps < 18.0) & (stamps + TICK >= 18.0))  # not the tick during which it jumps
+    assert distance_to(where[printing & foreseen], path).max() <= LIMITS.on_path
     printed = result.places[printing]
     assert printed[-1] == pytest.approx(40.0)
     assert (np.diff(printed) >= 0).all()
     assert np.diff(printed, prepend=0).max() < 0.25  # no part of the path was passed without printing
     back = stamps[printing & (stamps >= 18.0)][0]
-    assert 18.1 < back < 20.0
+    assert 18.1 < back < 21.5  # up to 10 mm, and down again at 5 mm/s
 
 
 def stream(seed: int) -> tuple[Path, list[tuple[float, SurfacePose | None]]]:
