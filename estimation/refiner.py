@@ -37,6 +37,7 @@ class Refiner:
         self._ask = False
         self._due = 0
         self._count = 0
+        self._offered: tuple[Fit, Observations, Array] | None = None
         self._job: Future[Adjusted | None] | Adjusted | None = None
 
     def begin(
@@ -65,15 +66,18 @@ class Refiner:
         return refined
 
     def offer(self, fit: Fit, observations: Observations, twist: Array, skew: float) -> None:
-        """A measured frame set; it is kept if it shows the surface anew."""
-        assert self._map is not None
+        """A measured frame set; `poll` keeps it if it shows the surface anew."""
+        self._offered = fit, observations, twist * skew
+
+    def _choose(self) -> None:
+        """Whether the last frame set offered becomes a key frame."""
+        if self._offered is None or self._map is None:
+            return
+        fit, observations, drift = self._offered
+        self._offered = None
         if self._is_new(fit.stamp, fit.solution.base_from_surface):
-            self._keep(
-                fit.stamp,
-                fit.solution.base_from_surface,
-                _inliers(self._rig, self._map, fit, observations),
-                twist * skew,
-            )
+            kept = _inliers(self._rig, self._map, fit, observations)
+            self._keep(fit.stamp, fit.solution.base_from_surface, kept, drift)
             self._ask = True
 
     def _is_new(self, stamp: float, pose: Array) -> bool:
@@ -102,12 +106,13 @@ class Refiner:
         size[np.diag_indices(len(poses))] = np.inf
         return 1 + int(np.argmin(np.sort(size[1:], axis=1)[:, :2].sum(1)))
 
-    def tick(self) -> None:
-        """One more frame set has been tracked."""
-        self._count += 1
-
     def poll(self) -> Adjusted | None:
-        """A refined map whose frame set has come, or None; asks for the next one when key frames call for it."""
+        """A refined map whose frame set has come, or None; asks for the next one when key frames call for it.
+
+        To be called once a frame set, when its pose is handed over.
+        """
+        self._count += 1
+        self._choose()
         result = None
         if self._job is not None and self._count >= self._due:
             result = self._job.result() if isinstance(self._job, Future) else self._job

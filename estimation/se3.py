@@ -6,6 +6,8 @@ those of Barfoot, State Estimation for Robotics (2017), 7.1, switched where they
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -55,11 +57,36 @@ def log_rotation(rotation: ArrayLike) -> Array:
 def exp(xi: ArrayLike) -> Array:
     """Transforms (..., 4, 4) of tangent vectors (..., 6): the exponential map of SE(3)."""
     xi = np.asarray(xi, float)
+    if xi.ndim == 1:
+        return _exp_one(xi)
     w, v = xi[..., :3], xi[..., 3:]
     _, c, d = _coefficients(np.linalg.norm(w, axis=-1))
     h = hat(w)
     left = np.eye(3) + c[..., None, None] * h + d[..., None, None] * (h @ h)
     return make(exp_rotation(w), (left @ v[..., None])[..., 0])
+
+
+def _exp_one(xi: Array) -> Array:
+    """`exp` of one tangent vector in plain floats: forty times a frame, at a sixth of the arrays' time."""
+    x, y, z, tx, ty, tz = xi.tolist()
+    a2 = x * x + y * y + z * z
+    a = math.sqrt(a2)
+    if a < _SMALL:
+        s, c = 1 - a2 / 6, 0.5 - a2 / 24
+    else:
+        s, c = math.sin(a) / a, 2 * (math.sin(a / 2) / a) ** 2
+    d = 1 / 6 - a2 / 120 + a2**2 / 5040 - a2**3 / 362880 if a < 0.05 else (a - math.sin(a)) / (a2 * a)
+    wt = x * tx + y * ty + z * tz
+    e = 1 - d * a2  # of the left Jacobian: e I + c hat(w) + d w w^T
+    cos = 1 - c * a2
+    return np.array(
+        [
+            [cos + c * x * x, c * x * y - s * z, c * x * z + s * y, e * tx + c * (y * tz - z * ty) + d * wt * x],
+            [c * x * y + s * z, cos + c * y * y, c * y * z - s * x, e * ty + c * (z * tx - x * tz) + d * wt * y],
+            [c * x * z - s * y, c * y * z + s * x, cos + c * z * z, e * tz + c * (x * ty - y * tx) + d * wt * z],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def log(transform: ArrayLike) -> Array:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
 from dataclasses import dataclass
-from itertools import repeat
 
 import cv2
 import numpy as np
@@ -98,7 +96,7 @@ class Relocaliser:
         reach = np.einsum("ni,ni->n", anchor - origins, normal) / np.where(steep, 1.0, slope)
         return np.asarray(np.where(steep[:, None], np.nan, origins + reach[:, None] * directions))
 
-    def find(self, pyramids: dict[int, Pyramid], threads: Executor) -> Found | None:
+    def find(self, pyramids: dict[int, Pyramid]) -> Found | None:
         """The pose of the surface in images (by camera), searched everywhere, or None.
 
         Half-size images first: a quarter of the time, and the features' scale does not matter; then full size.
@@ -106,7 +104,7 @@ class Relocaliser:
         if len(self._points) < LEAST_MATCHES:
             return None
         for half in (True, False):
-            seen = list(threads.map(self._look, pyramids, pyramids.values(), repeat(half)))
+            seen = [self._look(c, images, half) for c, images in pyramids.items()]
             found = self._agree([s for s in seen if s is not None])
             if found is not None:
                 return found
