@@ -1,8 +1,8 @@
 """TrackingStep: one frame set in, one surface pose out; no I/O and no clock of its own.
 
 Flow from the last images predicts where each landmark is, alignment with the landmark's reference picture measures it,
-the estimator fits the pose. When too little is found the surface is searched by its SIFT features. Cameras take turns: a
-thread for each was measured to gain nothing (13.3 ms against 13.9, p99 16.6 against 30, three cameras on two cores),
+the estimator fits the pose. When too little is found the surface is searched by its SIFT features. Cameras take turns:
+a thread for each was measured to gain nothing (13.3 ms against 13.9, p99 16.6 against 30, three cameras, two cores),
 since most of the work is short numpy calls that hold the interpreter.
 """
 
