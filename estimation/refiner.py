@@ -6,7 +6,7 @@ poses do not depend on how fast that process was.
 
 from __future__ import annotations
 
-from concurrent.futures import Executor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future
 
 import numpy as np
 
@@ -38,14 +38,15 @@ class Refiner:
         self._due = 0
         self._count = 0
         self._offered: tuple[Fit, Observations, Array] | None = None
-        self._job: Future[Adjusted | None] | Adjusted | None = None
+        self._job: tuple[Rig, SurfaceMap, list[KeyFrame]] | None = None
+        self._future: Future[Adjusted | None] | None = None
 
     def begin(
         self, surface_map: SurfaceMap, stamp: float, base_from_surface: Array, observations: Observations
     ) -> None:
         """The first map and the frame set that it was made from, whose pose defines the surface frame."""
         self._map, self._frames, self._stamps = surface_map, [], []
-        self._job, self._ask = None, False
+        self._job, self._future, self._ask = None, None, False
         self._keep(stamp, base_from_surface, observations, np.zeros(6))
 
     def confirm(self, fit: Fit, observations: Observations, skew: float) -> Adjusted | None:
@@ -115,17 +116,25 @@ class Refiner:
         self._choose()
         result = None
         if self._job is not None and self._count >= self._due:
-            result = self._job.result() if isinstance(self._job, Future) else self._job
-            self._job = None
+            result = self._finish()
             if result is not None:
                 self._map = result.map
         if self._ask and self._job is None and self._map is not None and len(self._frames) >= 3:
             self._ask, self._due = False, self._count + DELAY
-            if self._executor is None:
-                self._job = adjust(self._rig, self._map, list(self._frames))
-            else:
-                self._job = self._executor.submit(adjust, self._rig, self._map, list(self._frames))
+            self._job = self._rig, self._map, list(self._frames)
+            self._future = None if self._executor is None else self._executor.submit(adjust, *self._job)
         return result
+
+    def _finish(self) -> Adjusted | None:
+        """The result that is due; without a process, or with one that died, it is made here, slower but the same."""
+        assert self._job is not None
+        job, future = self._job, self._future
+        self._job = self._future = None
+        try:
+            return adjust(*job) if future is None else future.result()
+        except BrokenExecutor:
+            self._executor = None
+            return adjust(*job)
 
 
 def _inliers(rig: Rig, surface_map: SurfaceMap, fit: Fit, observations: Observations) -> Observations:
