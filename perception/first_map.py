@@ -26,6 +26,7 @@ from perception.patches import FLAT, Templates, align, coarse_score, join, proje
 Pyramid = tuple[Image, Image]
 EPIPOLAR_REACH = 40.0  # px: 0.3 m/s at 60 ms between exposures, f 700 px, 400 mm away
 LEAST_SEEDS, LEAST_LANDMARKS = 10, 20
+SAME = 2.0  # px: features closer than this show one spot
 LANDMARKS = 240  # in all: more cost time and gain nothing (the map's own error stays)
 
 
@@ -111,8 +112,9 @@ def find_seeds(
     pairs = match(features[a][1], features[b][1], 0.85)
     if len(pairs) < LEAST_SEEDS:
         return None
-    pixels_a = undistort(cameras[a], features[a][0][pairs[:, 0]])
-    pixels_b = undistort(cameras[b], features[b][0][pairs[:, 1]])
+    both = np.concatenate([features[a][0][pairs[:, 0]], features[b][0][pairs[:, 1]]], 1)
+    _, first = np.unique(np.round(both / SAME), axis=0, return_index=True)  # one spot was found under several tilts
+    pixels_a, pixels_b = undistort(cameras[a], both[first, :2]), undistort(cameras[b], both[first, 2:])
     distance = epipolar_distance(lenses.rig, a, b, pixels_a, pixels_b)
     good = consensus(pixels_b, distance, EPIPOLAR_REACH, 2.0, rng)
     points, _, _ = _pair_points(lenses.rig, a, b, pixels_a[good], pixels_b[good])
@@ -293,7 +295,7 @@ def build_first_map(lenses: Lenses, pyramids: dict[int, Pyramid], polygons: dict
     if len(cameras) < 2:
         return "the surface must be seen by two cameras to be mapped"
     masks = {c: polygon_mask(rig.cameras[c].size, polygons[c]) for c in cameras}
-    features = {c: sift(pyramids[c][0], masks[c]) for c in cameras}
+    features = {c: sift(pyramids[c][0], masks[c], 1000, tilted=True) for c in cameras}
     best: dict[int, Landmarks] = {}  # by reference camera, with the partner that sees most of its corners
     for i, a in enumerate(cameras):
         for b in cameras[i + 1 :]:

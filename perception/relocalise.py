@@ -19,7 +19,7 @@ from perception.frames import Image
 from perception.lens import Lenses, undistort
 
 Pyramid = tuple[Image, Image]
-CAPACITY = 4000  # descriptors: matching 1500 features against them takes 40 ms
+CAPACITY = 8000  # descriptors: matching 1000 features against them takes 60 ms
 LEAST_MATCHES = 8
 
 
@@ -64,7 +64,7 @@ class Relocaliser:
         hull = cv2.convexHull(imaged[seen].astype(np.float32)).reshape(-1, 2)
         cv2.fillConvexPoly(mask, np.round(hull).astype(np.int32), 255)
         mask = np.asarray(cv2.dilate(mask, np.ones((9, 9), np.uint8)), np.uint8)
-        keypoints, descriptors = sift(image, mask)
+        keypoints, descriptors = sift(image, mask, 500, tilted=True)
         if not len(keypoints):
             return
         points = self._on_surface(camera, undistort(lens, keypoints), base_from_surface, surface_map, ideal, seen)
