@@ -53,8 +53,8 @@ def sift(
 ) -> tuple[Array, NDArray[np.float32]]:
     """SIFT keypoints (N, 2) px and descriptors (N, 128) inside a mask.
 
-    tilted: also as the image would look from the side (affine SIFT, Morel and Yu 2009): 0.1 s and ten times the features,
-    but cameras that stand 60 degrees apart then share hundreds of matches instead of ten.
+    tilted: also as the image would look from the side (affine SIFT, Morel and Yu 2009): 0.1 s and ten times the
+    features, but cameras that stand 60 degrees apart then share hundreds of matches instead of ten.
     """
     x0, y0, x1, y1 = 0, 0, image.shape[1], image.shape[0]
     if mask is not None:

@@ -19,7 +19,7 @@ from perception.frames import Image
 from perception.lens import Lenses, undistort
 
 Pyramid = tuple[Image, Image]
-CAPACITY = 8000  # descriptors: matching 1000 features against them takes 60 ms
+CAPACITY = 6000  # descriptors: matching 600 features against them takes 30 ms
 LEAST_MATCHES = 8
 
 
@@ -96,24 +96,20 @@ class Relocaliser:
         reach = np.einsum("ni,ni->n", anchor - origins, normal) / np.where(steep, 1.0, slope)
         return np.asarray(np.where(steep[:, None], np.nan, origins + reach[:, None] * directions))
 
-    def find(self, pyramids: dict[int, Pyramid]) -> Found | None:
+    def find(self, pyramids: dict[int, Pyramid], half: bool = True) -> Found | None:
         """The pose of the surface in images (by camera), searched everywhere, or None.
 
-        Half-size images first: a quarter of the time, and the features' scale does not matter; then full size.
+        half: in the half-size images, a quarter of the time (50 ms a camera); a far surface needs the whole size.
         """
         if len(self._points) < LEAST_MATCHES:
             return None
-        for half in (True, False):
-            seen = [self._look(c, images, half) for c, images in pyramids.items()]
-            found = self._agree([s for s in seen if s is not None])
-            if found is not None:
-                return found
-        return None
+        seen = [self._look(c, images, half) for c, images in pyramids.items()]
+        return self._agree([s for s in seen if s is not None])
 
     def _look(self, camera: int, images: Pyramid, half: bool) -> Sighting | None:
         """What one camera shows of the surface, and the pose it gives alone."""
         lens = self.lenses.rig.cameras[camera]
-        keypoints, descriptors = sift(images[1] if half else images[0], count=1000)
+        keypoints, descriptors = sift(images[1] if half else images[0], count=600 if half else 1500)
         if half:
             keypoints = 2 * keypoints + 0.5
         pairs = match(descriptors, self._descriptors, 0.85)

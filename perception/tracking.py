@@ -39,6 +39,7 @@ Pyramid = tuple[Image, Image]
 LOOSE = np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3)  # how far one camera's own pose may stray from the joint one
 FLOW_TRACKS = 80  # a camera: enough for a start, and flow is only that
 LEAST_SCAN_SIGMA = 0.1  # mm: no handheld scan is better
+FULL_SEARCH = 10  # frame sets of an absent surface between searches at full size, off the frame's path
 ROUGH = 1e-3  # rad, mm: a start for the alignment need not be better
 
 
@@ -92,6 +93,7 @@ class TrackingStep:
         self._views: dict[int, View] = {}
         self._agrees = np.zeros(0, bool)
         self._lost: tuple[dict[int, Pyramid], list[int]] = {}, []
+        self._absent = 0  # frame sets since the surface was last measured
         self._spent = np.zeros(len(STAGES))
         self._lap = 0.0
 
@@ -192,12 +194,14 @@ class TrackingStep:
                 return estimator.wait(stamp, reason), observations, fit.used
             fit, observations = self._confirm(pyramids, fit, observations)
         if fit.measured:
-            self._lost = pyramids, self._missing(fit, pyramids)
+            self._lost, self._absent = (pyramids, self._missing(fit, pyramids)), 0
             pose = estimator.accept(fit, observations)
             self._refiner.offer(fit, observations, pose.twist, estimator.skew.sigma)
             self._remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)
         else:
             pose = estimator.coast(stamp, fit.reason)
+            self._absent += 1
+            self._lost = pyramids, list(pyramids) if self._absent % FULL_SEARCH == 0 else []
         self._took("pose")
         return pose, observations, fit.used
 
@@ -342,7 +346,9 @@ class TrackingStep:
         """Search the last images by SIFT for cameras that have lost the surface, so that the next flow begins there."""
         pyramids, missing = self._lost
         self._lost = {}, []
-        found = self._search.find({c: pyramids[c] for c in missing}) if missing else None
+        if not missing:
+            return
+        found = self._search.find({c: pyramids[c] for c in missing}, half=self._absent % FULL_SEARCH != 0)
         if found is None:
             return
         pose = found.base_from_surface
