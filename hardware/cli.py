@@ -111,12 +111,14 @@ def _add_replay(commands: Commands) -> None:
         "replay",
         "run tracking and motion on a session under a simulated clock",
         "Run tracking and motion on a recorded session under a simulated clock, as a live run would, without an arm.\n"
-        "Writes commands.csv, frames.bin, the bytes the arm would get, and arm.json, what was assumed of the arm.\n"
-        "Same input, same bytes.",
+        "Writes commands.csv, frames.bin, the bytes the arm would get, and arm.toml, what was assumed of the arm.\n"
+        "Same input, same bytes. A recording knows no arm: without --arm the default one is placed so that the first\n"
+        "surface lies under its home.",
         "stillbed replay sessions/monday --path data/paths/square_10mm.csv -o out/replay",
     )
     command.add_argument("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
     command.add_argument("--path", type=Path, required=True, metavar="PATH.csv", help="checkpoints on the surface")
+    command.add_argument("--arm", type=Path, metavar="ARM.toml", help="the arm's place, limits and dialect of the link")
     command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
     command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     command.set_defaults(run=_replay)
@@ -159,6 +161,7 @@ def _track(arguments: argparse.Namespace) -> None:
 
 
 def _replay(arguments: argparse.Namespace) -> None:
+    from hardware.arm_file import read_arm
     from hardware.out_folder import prepare_out
     from hardware.path_file import read_path
     from hardware.replay import replay_session
@@ -166,9 +169,10 @@ def _replay(arguments: argparse.Namespace) -> None:
 
     session = open_session(arguments.session)
     read_path(arguments.path)  # what is wrong with it is told before anything is made
+    profile = None if arguments.arm is None else read_arm(arguments.arm)
     prepare_out(arguments.out, arguments.force)
     with _progress("replay", "frame sets") as progress:
-        replay_session(session, arguments.path, arguments.out, progress)
+        replay_session(session, arguments.path, arguments.out, progress, profile)
     rows = (arguments.out / "commands.csv").read_text(encoding="utf-8").splitlines()[1:]
     moves = sum(row.split(",", 2)[1] == "move" for row in rows)
     print(f"{moves} moves and {len(rows) - moves} holds: commands.csv and frames.bin in {arguments.out}")
