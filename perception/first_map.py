@@ -19,11 +19,9 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals, surface_frame
 from estimation.triangulation import epipolar_distance, rays, triangulate
 from perception.features import corners, match, polygon_mask, sift
-from perception.frames import Image
 from perception.lens import Lenses, undistort
-from perception.patches import FLAT, Templates, align, coarse_score, join, project_squares, take_templates
+from perception.patches import FLAT, Pyramid, Templates, align, coarse_score, join, project_squares, take_templates
 
-Pyramid = tuple[Image, Image]
 EPIPOLAR_REACH = 40.0  # px: 0.3 m/s at 60 ms between exposures, f 700 px, 400 mm away
 LEAST_SEEDS, LEAST_LANDMARKS = 10, 20
 SAME = 2.0  # px: features closer than this show one spot

@@ -24,6 +24,7 @@ SIDE = 2 * RADIUS + 1
 FLAT = 3.0  # grey levels: a patch with less contrast is not worth a track
 
 Float32 = NDArray[np.float32]
+Pyramid = tuple[Image, Image]  # an image and its half-size version
 
 
 def _grid() -> Array:
@@ -67,7 +68,7 @@ def join(parts: list[Templates]) -> Templates:
     return Templates(*(np.concatenate([getattr(p, name) for p in parts]) for name in Templates.__slots__))
 
 
-def pyramid(image: Image) -> tuple[Image, Image]:
+def pyramid(image: Image) -> Pyramid:
     """The image and its half-size version, as alignment takes them."""
     return image, np.asarray(cv2.pyrDown(image), np.uint8)
 
@@ -151,7 +152,7 @@ def _describe(pictures: Float32) -> tuple[Float32, Float32, Array, Float32]:
 
 
 def take_templates(
-    lenses: Lenses, images: tuple[Image, Image], camera: int, base_from_surface: Array, points: Array, normals: Array
+    lenses: Lenses, images: Pyramid, camera: int, base_from_surface: Array, points: Array, normals: Array
 ) -> Templates:
     """Cut the reference pictures of landmarks from one image (and its half-size version)."""
     axes = square_axes(lenses, camera, base_from_surface, points, normals)
@@ -174,7 +175,7 @@ class Alignment:
 
 def align(
     templates: Templates,
-    images: tuple[Image, Image],
+    images: Pyramid,
     where: Projection,
     start: Array,
     least: float = 0.75,
@@ -218,7 +219,7 @@ def _descend(
         busy = busy[length > 0.03]
 
 
-def coarse_score(templates: Templates, images: tuple[Image, Image], where: Projection, centre: Array) -> Array:
+def coarse_score(templates: Templates, images: Pyramid, where: Projection, centre: Array) -> Array:
     """Correlation (N,) in [-1, 1] of each template with the half-size image at centres (N, 2) px, without alignment."""
     current, _ = normalise(sample(images[1], centre, where.per_sample, 2.0, half=True))
     return np.asarray((current * templates.coarse_picture).mean(1), float)

@@ -17,8 +17,8 @@ from estimation.triangulation import rays
 from perception.features import match, sift
 from perception.frames import Image
 from perception.lens import Lenses, undistort
+from perception.patches import Pyramid
 
-Pyramid = tuple[Image, Image]
 CAPACITY = 6000  # descriptors: matching 600 features against them takes 30 ms
 LEAST_MATCHES = 8
 

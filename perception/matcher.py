@@ -1,0 +1,135 @@
+"""Where the landmarks are in new images: flow from the last ones is the start, the fit to the reference the measure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import se3
+from estimation.observations import Observations
+from estimation.pose_solver import solve_pose
+from estimation.rig import ideal_pixels
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap
+from perception.flow import flow as optical_flow
+from perception.frames import Image
+from perception.lens import Lenses, undistort
+from perception.patches import Alignment, Pyramid, Templates, project_squares
+from perception.patches import align as align_patches
+
+LOOSE = np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3)  # how far one camera's own pose may stray from the joint one
+FLOW_TRACKS = 80  # a camera: enough for a start, and flow is only that
+ROUGH = 1e-3  # rad, mm: a start for the alignment need not be better
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What one camera last saw: its image, where landmarks (rows) stood in it, and the pose then."""
+
+    image: Image
+    rows: NDArray[np.int64]
+    pixels: Array
+    base_from_surface: Array
+
+
+class Matcher:
+    """Finds the landmarks of one map; remembers what each camera last saw of them."""
+
+    def __init__(self, lenses: Lenses, surface_map: SurfaceMap, templates: Templates) -> None:
+        self.lenses, self.rig = lenses, lenses.rig
+        self.templates = templates
+        self.map = surface_map
+        self.agrees = np.ones(len(surface_map), bool)  # landmarks worth looking for
+        self._views: dict[int, View] = {}
+
+    def take(self, surface_map: SurfaceMap, agrees: NDArray[np.bool_]) -> None:
+        """A refined map, same rows, and which of them (N,) are worth looking for."""
+        self.map, self.agrees = surface_map, agrees
+
+    def seen(self, camera: int) -> int:
+        """How many landmarks a camera last saw."""
+        return len(self._views[camera].rows) if camera in self._views else 0
+
+    def flow(self, pyramids: dict[int, Pyramid], guess: Array) -> tuple[Array, dict[int, Array]]:
+        """The joint pose by optical flow, and each camera's own: cameras are seldom exposed at the same instant."""
+        points = self.map.points
+        ready = [c for c in pyramids if self.seen(c) >= 6]
+        moved = {c: self._flow_one(c, pyramids[c][0], guess) for c in ready}
+        single = dict.fromkeys(pyramids, guess)
+        if sum(len(rows) for rows, _ in moved.values()) < 6:
+            return guess, single
+        camera = np.concatenate([np.full(len(rows), c) for c, (rows, _) in moved.items()])
+        rows = np.concatenate([rows for rows, _ in moved.values()])
+        pixels = np.concatenate([pixels for _, pixels in moved.values()])
+        sigma = np.ones(len(rows))
+        fit = solve_pose(
+            self.rig, camera, points[rows], pixels, sigma, guess, scales=(8.0, 1.5), iterations=4, tolerance=ROUGH
+        )
+        good = fit.weights > 0.2
+        for c in pyramids:
+            mine = good & (camera == c)
+            single[c] = fit.base_from_surface
+            if mine.sum() >= 8 and fit.scale > 1.2:  # else the cameras agree within the flow's own error
+                where = rows[mine]
+                own = solve_pose(
+                    self.rig,
+                    camera[mine],
+                    points[where],
+                    pixels[mine],
+                    sigma[mine],
+                    single[c],
+                    prior=LOOSE,
+                    iterations=2,
+                    tolerance=ROUGH,
+                )
+                single[c] = own.base_from_surface
+        return fit.base_from_surface, single
+
+    def _flow_one(self, camera: int, image: Image, guess: Array) -> tuple[NDArray[np.int64], Array]:
+        view = self._views[camera]
+        some = slice(None, None, 1 + len(view.rows) // FLOW_TRACKS)
+        rows, pixels = view.rows[some], view.pixels[some]
+        before = self._imaged(camera, view.base_from_surface, rows)
+        after = self._imaged(camera, guess, rows)
+        found, ok = optical_flow(view.image, image, pixels, pixels + after - before)
+        return rows[ok], undistort(self.rig.cameras[camera], found[ok])
+
+    def _imaged(self, camera: int, base_from_surface: Array, rows: NDArray[np.int64]) -> Array:
+        """Where landmarks (rows) fall in a camera's image, (N, 2) px."""
+        points_base = se3.transform_points(base_from_surface, self.map.points[rows])
+        return self.lenses.image(camera, *ideal_pixels(self.rig.cameras[camera], points_base))[0]
+
+    def align(
+        self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array], coarse: bool = False
+    ) -> Observations:
+        """Measure the landmarks in every camera, begun where the camera's own pose puts them; coarse: from afar."""
+        rows = np.nonzero(self.agrees)[0]
+        cameras = [c for c in pyramids if c in poses]
+        results = [self._align_one(c, pyramids[c], poses[c], rows, coarse) for c in cameras]
+        found = [rows[r.found] for r in results]
+        pixels = [undistort(self.rig.cameras[c], r.pixels[r.found]) for c, r in zip(cameras, results, strict=True)]
+        return Observations(
+            stamp,
+            np.concatenate([np.full(len(f), c, np.int64) for c, f in zip(cameras, found, strict=True)]),
+            np.concatenate(found),
+            np.concatenate(pixels),
+            np.concatenate([r.sigma[r.found] for r in results]),
+        )
+
+    def _align_one(self, camera: int, images: Pyramid, pose: Array, rows: NDArray[np.int64], coarse: bool) -> Alignment:
+        surface_map, templates = self.map, self.templates
+        where = project_squares(
+            self.lenses, camera, pose, surface_map.points[rows], surface_map.normals[rows], templates.axes[rows]
+        )
+        return align_patches(templates.take(rows), images, where, where.centre, coarse=coarse)
+
+    def remember(
+        self, pyramids: dict[int, Pyramid], observations: Observations, inlier: NDArray[np.bool_], pose: Array
+    ) -> None:
+        """Keep what the cameras saw: images, the tracks that agreed (inlier, (N,)), the surface's pose (4, 4)."""
+        for c, images in pyramids.items():
+            mine = inlier & (observations.camera == c)
+            from_lens, _ = self.lenses.image(c, observations.pixels[mine], np.full(int(mine.sum()), 1e3))
+            self._views[c] = View(images[0], observations.track[mine], from_lens, pose)
