@@ -1,0 +1,282 @@
+"""The estimator: states that mean what they say, a covariance as wide as the errors, cameras out of step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from estimation import se3
+from estimation.estimator import Estimator, EstimatorSettings, identity_pose
+from estimation.observations import Observations
+from estimation.pose import SurfacePose, TrackState
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap
+from tests.scene import patch_points
+from tests.synthetic import REST, Motion, breathing, observations, rig
+
+RIG = rig()
+LANDMARKS = patch_points(np.random.default_rng(3).uniform(-0.5, 0.5, (60, 2)) * [60, 45], 70.0)
+RATE = 30.0
+
+
+def lively(stamp: float) -> Array:
+    """About 40 mm/s: fast enough for capture instants to show."""
+    w = 0.1 * np.sin(stamp * np.array([2.1, 2.7, 1.8]) + [0, 1, 2])
+    return REST @ se3.make(se3.exp_rotation(w), 12.0 * np.sin(stamp * np.array([3.1, 2.6, 3.7]) + [2, 0, 1]))
+
+
+def look(
+    motion: Motion,
+    stamp: float,
+    seed: int,
+    keep: int | None = None,
+    cameras: Sequence[int] = (0, 1, 2),
+    delays: Sequence[float] = (0, 0, 0),
+    outliers: float = 0.0,
+) -> Observations:
+    """What `cameras` see, each `delays` s late; keep: so many tracks of each, all by default."""
+    parts = []
+    for c in cameras:
+        only = np.zeros((len(RIG), len(LANDMARKS)), bool)
+        only[c, :keep] = True
+        draw = np.random.default_rng([seed, c, round(1000 * stamp)])
+        parts.append(observations(RIG, LANDMARKS, motion(stamp + delays[c]), stamp, draw, 0.3, outliers, only))
+    if not parts:
+        nothing = np.zeros(0, np.int64)
+        return Observations(stamp, nothing, nothing, np.zeros((0, 2)), np.zeros(0))
+    camera, track, pixels, sigma = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("camera", "track", "pixels", "sigma")
+    )
+    return Observations(stamp, camera, track, pixels, sigma)
+
+
+def begun(
+    motion: Motion, map_error: float = 0.0, seed: int = 0, settings: EstimatorSettings | None = None
+) -> Estimator:
+    """An estimator with a map whose landmarks are `map_error` mm off, one standard deviation an axis."""
+    estimator = Estimator(RIG, settings)
+    points = LANDMARKS + map_error * np.random.default_rng([seed, 9]).normal(size=LANDMARKS.shape)
+    normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    covariance = map_error**2 * np.eye(3 * len(points))
+    estimator.begin(0.0, motion(0.0), SurfaceMap(points, normals, covariance))
+    return estimator
+
+
+def step(estimator: Estimator, seen: Observations) -> SurfacePose:
+    """One frame set, as the tracker does it: fit from the prediction, take it or coast."""
+    fit = estimator.fit(seen, estimator.predict(seen.stamp))
+    return estimator.accept(fit, seen) if fit.measured else estimator.coast(seen.stamp, fit.reason)
+
+
+def stamps(seconds: float, first: float = 1 / RATE) -> Array:
+    return first + np.arange(round(seconds * RATE)) / RATE
+
+
+def follow(
+    estimator: Estimator, motion: Motion, seconds: float, seed: int = 1, first: float = 1 / RATE
+) -> list[SurfacePose]:
+    return [step(estimator, look(motion, float(t), seed)) for t in stamps(seconds, first)]
+
+
+def error(pose: SurfacePose, motion: Motion) -> float:
+    return float(np.linalg.norm(pose.base_from_surface[:3, 3] - motion(pose.stamp)[:3, 3]))
+
+
+def test_before_a_map_there_is_no_certainty() -> None:
+    pose = identity_pose(1.5, "waiting")
+    assert (pose.stamp, pose.state, pose.reason) == (1.5, TrackState.INITIALISING, "waiting")
+    assert np.sqrt(np.linalg.eigvalsh(pose.covariance)[-1]) >= 1000
+    assert Estimator(RIG).pose is None and Estimator(RIG).sigma() == np.inf
+
+
+def test_the_first_map_is_not_a_measurement_yet() -> None:
+    estimator = begun(breathing)
+    assert estimator.pose is not None
+    assert estimator.pose.state is TrackState.INITIALISING and estimator.pose.reason
+    waited = estimator.wait(0.2, "nothing seen")
+    assert (waited.state, waited.reason, waited.stamp) == (TrackState.INITIALISING, "nothing seen", 0.2)
+    assert np.array_equal(waited.base_from_surface, breathing(0.0))
+
+
+def test_a_clear_view_is_tracking_without_a_reason() -> None:
+    poses = follow(begun(breathing), breathing, 1.0)
+    assert all(p.state is TrackState.TRACKING and p.reason == "" for p in poses)
+    assert max(error(p, breathing) for p in poses) < 0.15
+
+
+def test_no_state_but_tracking_is_without_a_reason() -> None:
+    estimator, draw = begun(breathing), np.random.default_rng(4)
+    seen_states = set()
+    for i, t in enumerate(stamps(10.0)):
+        kind = draw.integers(0, 6) if i // 30 % 2 else 5
+        cameras = [(), (0,), (0, 1), (0, 1, 2), (2,), (0, 1, 2)][kind]
+        if 150 <= i < 180:
+            cameras = ()
+        pose = step(estimator, look(breathing, float(t), 2, keep=[60, 60, 30, 9, 8, 60][kind], cameras=cameras))
+        seen_states.add(pose.state)
+        assert (pose.reason == "") == (pose.state is TrackState.TRACKING)
+        assert np.isfinite(pose.base_from_surface).all() and np.isfinite(pose.covariance).all()
+    assert seen_states == set(TrackState) - {TrackState.INITIALISING}
+
+
+def test_one_camera_alone_is_degraded_and_says_so() -> None:
+    estimator = begun(breathing)
+    follow(estimator, breathing, 0.5)
+    for t in stamps(0.5, 0.55):
+        pose = step(estimator, look(breathing, float(t), 3, cameras=(1,)))
+        assert pose.state is TrackState.DEGRADED and "one camera" in pose.reason
+        assert error(pose, breathing) < 2.0
+    assert step(estimator, look(breathing, 1.1, 3)).state is TrackState.TRACKING
+
+
+def test_two_cameras_are_enough() -> None:
+    estimator = begun(breathing)
+    poses = [step(estimator, look(breathing, float(t), 3, cameras=(0, 2))) for t in stamps(0.5)]
+    assert all(p.state is TrackState.TRACKING for p in poses)
+
+
+def test_few_tracks_degrade_and_the_way_back_asks_for_more_than_the_way_out() -> None:
+    def after(keep: int, start: int) -> TrackState:
+        estimator = begun(breathing)
+        step(estimator, look(breathing, 1 / RATE, 3, keep=start))
+        return step(estimator, look(breathing, 2 / RATE, 3, keep=keep)).state
+
+    assert after(keep=8, start=60) is TrackState.TRACKING  # 24 tracks: enough to stay
+    assert after(keep=8, start=8) is TrackState.DEGRADED  # not enough to enter
+    assert after(keep=11, start=8) is TrackState.TRACKING
+    assert after(keep=6, start=60) is TrackState.DEGRADED
+
+
+def test_the_state_does_not_flicker_between_its_thresholds() -> None:
+    estimator = begun(breathing)
+    follow(estimator, breathing, 0.5)
+    draw = np.random.default_rng(8)
+    states = [
+        step(estimator, look(breathing, float(t), 3, keep=int(draw.integers(8, 13)))).state for t in stamps(2.0, 0.55)
+    ]
+    assert set(states) == {TrackState.TRACKING}
+
+
+def test_too_few_tracks_are_no_measurement() -> None:
+    estimator = begun(breathing)
+    fit = estimator.fit(look(breathing, 0.1, 3, keep=3), breathing(0.1))
+    assert not fit.measured and "9 tracks" in fit.reason
+    assert estimator.fit(look(breathing, 0.1, 3, keep=4), breathing(0.1)).measured
+
+
+@pytest.mark.parametrize("outliers", [0.3, 0.7, 1.0])
+def test_tracks_that_scatter_widen_the_claim_to_what_they_cost(outliers: float) -> None:
+    values = []
+    for seed in range(12):
+        estimator = begun(breathing)
+        follow(estimator, breathing, 0.2)
+        pose = step(estimator, look(breathing, 0.25, seed, outliers=outliers))
+        e = se3.log(se3.inverse(pose.base_from_surface) @ breathing(pose.stamp))
+        values.append(e @ np.linalg.solve(pose.covariance, e) / 6)
+    assert np.mean(values) < 1.5
+
+
+def test_a_pose_too_uncertain_is_no_measurement() -> None:
+    sure, unsure = begun(breathing), begun(breathing, settings=EstimatorSettings(sigma_measured=1e-3))
+    seen = look(breathing, 0.1, 3)
+    assert sure.fit(seen, breathing(0.1)).measured
+    fit = unsure.fit(seen, breathing(0.1))
+    assert not fit.measured and "uncertain" in fit.reason and len(unsure.carriers(fit)) == 0
+
+
+def test_an_outage_coasts_then_is_lost_and_then_found() -> None:
+    estimator = begun(breathing)
+    last = follow(estimator, breathing, 2.0)[-1]
+    dark = [step(estimator, look(breathing, float(t), 4, cameras=())) for t in stamps(1.0, last.stamp + 1 / RATE)]
+    for p in dark:
+        gone = p.stamp - last.stamp
+        assert p.state is (TrackState.LOST if gone > estimator.settings.coast else TrackState.COASTING)
+        assert f"{gone:.2f} s since" in p.reason
+    assert {p.state for p in dark} == {TrackState.COASTING, TrackState.LOST}
+    assert (dark[-1].twist == 0).all()
+    back = follow(estimator, breathing, 0.3, 5, dark[-1].stamp + 1 / RATE)
+    assert back[0].state is TrackState.TRACKING and max(error(p, breathing) for p in back) < 0.15
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_coasting_claims_less_with_every_frame_and_enough(seed: int) -> None:
+    estimator = begun(breathing)
+    last = follow(estimator, breathing, 2.0 + 0.7 * seed, seed)[-1]
+    sigma, inside = [estimator.sigma()], []
+    for t in stamps(0.45, last.stamp + 1 / RATE):
+        pose = step(estimator, look(breathing, float(t), 4, cameras=()))
+        sigma.append(estimator.sigma())
+        inside.append(error(pose, breathing) < 3 * sigma[-1])
+    assert (np.diff(sigma) > 0).all() and all(inside)
+
+
+@pytest.mark.parametrize("map_error", [0.0, 0.1])
+def test_the_covariance_is_as_wide_as_the_errors(map_error: float) -> None:
+    values = []
+    for seed in range(6):
+        estimator = begun(breathing, map_error, seed)
+        for pose in follow(estimator, breathing, 1.5, seed)[10::5]:
+            e = se3.log(se3.inverse(pose.base_from_surface) @ breathing(pose.stamp))
+            values.append(e @ np.linalg.solve(pose.covariance, e) / 6)
+    assert 0.3 < np.mean(values) < 1.3
+
+
+def run_skewed(delays: Sequence[float], seconds: float, motion: Motion = lively) -> Estimator:
+    estimator = begun(motion)
+    for t in stamps(seconds):
+        step(estimator, look(motion, float(t), 6, delays=delays))
+    return estimator
+
+
+def test_capture_offsets_are_learned_within_seconds() -> None:
+    assert 0.009 < run_skewed((0.016, 0.0, -0.016), 3.0).skew.sigma < 0.022
+
+
+def test_cameras_in_step_are_found_to_be() -> None:
+    early, late = run_skewed((0, 0, 0), 2.0).skew.sigma, run_skewed((0, 0, 0), 6.0).skew.sigma
+    assert late < 0.8 * early < 0.006
+
+
+def test_a_surface_at_rest_teaches_nothing_of_the_offsets() -> None:
+    estimator = begun(lambda stamp: REST)
+    before = estimator.skew.sigma
+    for t in stamps(2.0):
+        step(estimator, look(lambda stamp: REST, float(t), 6, delays=(0.016, 0.0, -0.016)))
+    assert 0.5 * before < estimator.skew.sigma < 1.5 * before
+
+
+def test_offsets_widen_the_claim_to_what_they_cost() -> None:
+    estimator, values, claimed = begun(lively), [], []
+    for t in stamps(4.0):
+        pose = step(estimator, look(lively, float(t), 6, delays=(0.016, 0.0, -0.016)))
+        if t > 2.0:
+            e = (se3.inverse(pose.base_from_surface) @ lively(pose.stamp))[:3, 3]
+            values.append(e @ np.linalg.solve(pose.covariance[3:, 3:], e) / 3)
+            claimed.append(estimator.sigma())
+    assert np.mean(values) < 2.0
+    assert np.median(claimed) > 3 * run_skewed((0, 0, 0), 2.0).sigma()
+
+
+def test_fitting_changes_nothing() -> None:
+    estimator = begun(breathing)
+    follow(estimator, breathing, 0.3)
+    pose, skew, surface_map = estimator.pose, estimator.skew.sigma, estimator.map
+    estimator.fit(look(lively, 0.4, 7), estimator.predict(0.4))
+    assert estimator.pose is pose and estimator.skew.sigma == skew and estimator.map is surface_map
+
+
+def test_a_caveat_keeps_every_pose_from_being_called_tracking() -> None:
+    estimator = Estimator(RIG)
+    normals = np.tile([0.0, 0.0, 1.0], (len(LANDMARKS), 1))
+    surface_map = SurfaceMap(LANDMARKS, normals, np.zeros((3 * len(LANDMARKS),) * 2))
+    estimator.begin(0.0, breathing(0.0), surface_map, "the scan's place is open")
+    for pose in follow(estimator, breathing, 0.3):
+        assert pose.state is TrackState.DEGRADED and pose.reason == "the scan's place is open"
+
+
+def test_two_runs_give_the_same_bits() -> None:
+    a, b = (follow(begun(lively), lively, 1.0)[-1] for _ in range(2))
+    assert a.base_from_surface.tobytes() == b.base_from_surface.tobytes()
+    assert a.covariance.tobytes() == b.covariance.tobytes()

@@ -1,0 +1,158 @@
+"""The sliding window: finds the motion, knows its error, outlives what breaks GTSAM's smoother."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimation import se3
+from estimation.se3 import Array
+from estimation.smoother import LAG, QUIET_PSD, Measured, Smoother, Window
+from tests.synthetic import REST, Motion, breathing
+
+NOISE = np.array([2e-3] * 3 + [0.03] * 3)  # rad, mm: what one frame set is worth
+COVARIANCE = np.diag(NOISE**2)
+
+
+def measure(motion: Motion, stamps: Array, seed: int, noise: Array = NOISE) -> list[Measured]:
+    draw = np.random.default_rng(seed)
+    return [Measured(float(t), motion(float(t)) @ se3.exp(noise * draw.normal(size=6)), COVARIANCE) for t in stamps]
+
+
+def run(measured: list[Measured], smoother: Smoother | None = None) -> list[Window]:
+    smoother = smoother or Smoother()
+    return [smoother.add(m) for m in measured]
+
+
+def turning(twist: Array) -> Motion:
+    return lambda stamp: REST @ se3.exp(twist * stamp)
+
+
+def nees(windows: list[Window], motion: Motion, skip: int = 15) -> float:
+    """Mean normalised squared pose error, 1 for an honest covariance."""
+    values = []
+    for w in windows[skip:]:
+        e = se3.log(se3.inverse(w.pose) @ motion(w.stamp))
+        values.append(e @ np.linalg.solve(w.covariance, e) / 6)
+    return float(np.mean(values))
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=12)
+def test_the_twist_of_a_constant_motion_is_found(seed: int) -> None:
+    twist = np.random.default_rng(seed).normal(size=6) * [0.2, 0.2, 0.2, 15, 15, 15]
+    motion = turning(twist)
+    newest = run(measure(motion, np.arange(20) / 30, seed, 0 * NOISE))[-1]
+    assert np.abs(newest.pose - motion(newest.stamp)).max() < 1e-3
+    assert np.allclose(newest.twist, twist, atol=5e-3 * (1 + np.abs(twist)))
+
+
+def test_the_twist_of_a_noisy_motion_is_found_within_what_it_claims() -> None:
+    twist = np.array([0.1, -0.05, 0.2, 8.0, -3.0, 5.0])
+    values = []
+    for seed in range(12):
+        newest = run(measure(turning(twist), np.arange(25) / 30, seed))[-1]
+        e = newest.twist - twist
+        values.append(e @ np.linalg.solve(newest.twist_covariance, e) / 6)
+    assert np.mean(values) < 1.3
+
+
+@pytest.mark.parametrize("rate", [6.0, 30.0])
+def test_the_covariance_is_as_wide_as_the_errors(rate: float) -> None:
+    values = [nees(run(measure(breathing, np.arange(90) / rate, s)), breathing) for s in range(6)]
+    assert 0.7 < np.mean(values) < 1.3
+
+
+def test_smoothing_a_calm_motion_never_costs_accuracy() -> None:
+    def error(poses: list[Array]) -> float:
+        e = se3.log(se3.inverse(np.stack(poses)) @ np.stack([breathing(m.stamp) for m in measured]))
+        return float(np.sqrt(np.mean((e[15:] / NOISE) ** 2)))
+
+    for seed in range(4):
+        measured = measure(breathing, np.arange(90) / 30, seed)
+        assert error([w.pose for w in run(measured)]) < error([m.pose for m in measured])
+
+
+def test_a_waving_hand_is_not_dragged() -> None:
+    """Half a metre a second, turned round within one frame: the window may not lag by more than the frame's noise."""
+
+    def waving(stamp: float) -> Array:
+        return REST @ se3.exp(np.array([0, 0.3 * np.sin(8 * stamp), 0, 60 * np.sin(8 * stamp), 0, 0]))
+
+    windows = run(measure(waving, np.arange(60) / 6, 3))
+    off = [se3.log(se3.inverse(w.pose) @ waving(w.stamp)) / NOISE for w in windows]
+    assert np.sqrt(np.mean(np.square(off))) < 1.3
+    assert (windows[-1].acceleration_psd > 10 * QUIET_PSD).all()
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_what_is_not_finite_never_reaches_the_window(wrong: float) -> None:
+    smoother = Smoother()
+    first = run(measure(breathing, np.arange(5) / 30, 1), smoother)[-1]
+    for pose, covariance in [(REST + wrong, COVARIANCE), (REST, COVARIANCE + wrong)]:
+        with pytest.raises(AssertionError):
+            smoother.add(Measured(1.0, pose, covariance))
+    assert smoother.newest is first and smoother.restarts == 0
+    assert smoother.add(measure(breathing, np.array([6 / 30]), 1)[0]).stamp == 6 / 30
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0])
+def test_a_covariance_that_is_none_does_not_break_what_comes_after(value: float) -> None:
+    smoother, measured = Smoother(), measure(breathing, np.arange(30) / 30, 1)
+    run(measured[:10], smoother)
+    with suppress(RuntimeError):
+        smoother.add(Measured(measured[10].stamp, measured[10].pose, value * COVARIANCE))
+    assert smoother.restarts >= 1
+    windows = run(measured[11:], smoother)
+    assert np.abs(windows[-1].pose - run(measured)[-1].pose).max() < 0.02
+    assert 0.5 < nees(windows, breathing, skip=0) < 2.0
+
+
+def test_a_gap_longer_than_the_window_begins_a_new_one() -> None:
+    smoother = Smoother()
+    run(measure(breathing, np.arange(20) / 30, 1), smoother)
+    after = measure(breathing, 19 / 30 + LAG + 0.5 + np.arange(20) / 30, 2)
+    windows = run(after, smoother)
+    alone = run(after)
+    assert smoother.restarts == 0
+    assert np.allclose(windows[0].pose, after[0].pose, atol=1e-9)
+    assert np.allclose(windows[0].covariance, COVARIANCE, rtol=1e-3)
+    assert np.abs(windows[-1].pose - alone[-1].pose).max() < 0.02
+
+
+def test_a_gap_shorter_than_the_window_is_bridged() -> None:
+    motion = turning(np.array([0, 0, 0.1, 5.0, 0, 0]))
+    stamps = np.r_[np.arange(20), np.arange(32, 40)] / 30
+    windows = run(measure(motion, stamps, 5))
+    assert np.allclose(windows[20].twist[3], 5.0, atol=0.5)
+
+
+def test_after_a_reset_nothing_is_left() -> None:
+    smoother = Smoother()
+    run(measure(breathing, np.arange(20) / 30, 1), smoother)
+    smoother.reset()
+    assert smoother.newest is None
+    later = measure(breathing, np.arange(3) / 30, 2)  # stamps that lie before the forgotten ones
+    assert np.allclose(smoother.add(later[0]).pose, later[0].pose)
+
+
+def test_two_runs_give_the_same_bits() -> None:
+    measured = measure(breathing, np.arange(60) / 30, 7)
+    for a, b in zip(run(measured), run(measured), strict=True):
+        assert a.pose.tobytes() == b.pose.tobytes() and a.covariance.tobytes() == b.covariance.tobytes()
+        assert a.twist.tobytes() == b.twist.tobytes() and a.twist_covariance.tobytes() == b.twist_covariance.tobytes()
+
+
+def test_the_window_holds_as_much_after_a_minute_as_after_a_second() -> None:
+    smoother, sizes = Smoother(), []
+    for m in measure(breathing, np.arange(1800) / 30, 8):
+        smoother.add(m)
+        sizes.append((smoother._window.getFactors().size(), len(smoother._window.timestamps())))
+    factors, keys = np.array(sizes).T
+    assert factors[60:].max() <= factors[30:60].max() and keys[60:].max() <= keys[30:60].max()
+    assert keys.max() <= 2 * (LAG * 30 + 2)
+    assert smoother.restarts == 0
