@@ -11,9 +11,8 @@ APT    := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0
 
 demo: $(STAMP)
 	@$(BIN)/python -m tests.synthetic $(DEMO)/session
-	@$(BIN)/stillbed track $(DEMO)/session -o $(DEMO)/track --force
 	@$(BIN)/stillbed replay $(DEMO)/session --path data/paths/square_10mm.csv -o $(DEMO)/replay --force
-	@$(BIN)/python -m hardware.report $(DEMO)/track
+	@$(BIN)/stillbed track $(DEMO)/session -o $(DEMO)/track --force
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
