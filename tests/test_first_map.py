@@ -1,0 +1,184 @@
+"""The first map lies on the true surface, or there is a reason why there is none."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from estimation import se3
+from estimation.rig import Rig
+from estimation.se3 import Array
+from perception.features import grey, polygon_mask
+from perception.first_map import FirstMap, build_first_map, in_frame
+from perception.frames import Image
+from perception.lens import Lenses
+from perception.patches import pyramid
+from tests.scene import Scene
+from tests.synthetic import REST, SCAN_FROM_SURFACE, render, rig, rois
+
+Pyramids = dict[int, tuple[Image, Image]]
+RIG = rig(size=(640, 480), focal=560.0)
+SCENE = Scene(1)
+
+
+def look(
+    scene: Scene = SCENE, cameras: Rig = RIG, pose: Array = REST, seed: int = 0
+) -> tuple[Pyramids, dict[int, Array]]:
+    """Images and polygons by camera."""
+    images = render(scene, cameras, pose, np.random.default_rng(seed))
+    return (
+        {c: pyramid(grey(image)) for c, image in enumerate(images)},
+        {roi.camera: roi.polygon for roi in rois(scene, cameras, pose, 0.0)},
+    )
+
+
+def build(*which: int) -> FirstMap:
+    pyramids, polygons = look()
+    first = build_first_map(Lenses(RIG), {c: pyramids[c] for c in which}, {c: polygons[c] for c in which})
+    assert not isinstance(first, str), first
+    return first
+
+
+@pytest.fixture(scope="module")
+def first() -> FirstMap:
+    return build(0, 1, 2)
+
+
+def on_patch(first: FirstMap, pose: Array = REST) -> Array:
+    """Landmarks (N, 3) mm in the scene's own frame."""
+    return se3.transform_points(se3.inverse(pose) @ first.base_from_surface, first.map.points)
+
+
+def off_surface(first: FirstMap, radius: float = 70.0) -> Array:
+    """Distances (N,) mm of the landmarks from the true cylinder."""
+    points = on_patch(first)
+    return np.abs(np.hypot(points[:, 1], points[:, 2] + radius) - radius)
+
+
+def test_the_landmarks_lie_on_the_true_surface(first: FirstMap) -> None:
+    """A pixel is 0.7 mm here; 0.1 px of it is 0.07 mm, and the depth's share of that a little more."""
+    off = off_surface(first)
+    assert len(off) > 100
+    assert np.median(off) < 0.08 and np.percentile(off, 95) < 0.3 and off.max() < 1.0
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (1, 2), (0, 2)])
+def test_two_cameras_are_enough(pair: tuple[int, int]) -> None:
+    off = off_surface(build(*pair))
+    assert len(off) > 60 and np.median(off) < 0.15 and np.percentile(off, 95) < 0.6
+
+
+def test_the_claimed_covariance_is_of_the_errors_size(first: FirstMap) -> None:
+    points = on_patch(first)
+    out = np.column_stack([np.zeros(len(points)), points[:, 1], points[:, 2] + 70.0])
+    out = out / np.linalg.norm(out, axis=1, keepdims=True) @ (se3.inverse(first.base_from_surface) @ REST)[:3, :3].T
+    n = len(points)
+    blocks = np.einsum("ninj->nij", first.map.covariance.reshape(n, 3, n, 3))
+    claimed = np.sqrt(np.einsum("ni,nij,nj->n", out, blocks, out))
+    assert 0.3 < np.median(off_surface(first)) / (0.6745 * np.median(claimed)) < 2.0
+    assert np.allclose(first.map.covariance, first.map.covariance.T)
+
+
+def test_normals_stand_on_the_surface(first: FirstMap) -> None:
+    points = on_patch(first)
+    normals = first.map.normals @ (se3.inverse(REST) @ first.base_from_surface)[:3, :3].T
+    true = np.column_stack([np.zeros(len(points)), points[:, 1] / 70.0, points[:, 2] / 70.0 + 1])
+    cosine = np.einsum("ni,ni->n", normals, true / np.linalg.norm(true, axis=1, keepdims=True))
+    assert np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))) < 6
+    assert np.percentile(cosine, 5) > np.cos(np.deg2rad(25))
+
+
+def test_the_frame_sits_amid_the_landmarks_and_looks_out(first: FirstMap) -> None:
+    pose, points = first.base_from_surface, first.map.points
+    assert se3.is_transform(pose)
+    assert np.linalg.norm(points.mean(0)) < 5  # mm
+    assert np.linalg.norm((se3.inverse(REST) @ pose)[:3, 3]) < 12
+    assert pose[:3, 2] @ REST[:3, 2] > np.cos(np.deg2rad(15))
+    assert (first.map.normals[:, 2] > 0).mean() > 0.95
+    assert len(first.map) == len(first.templates) == len(points)
+
+
+def test_every_landmark_lies_inside_its_cameras_polygon(first: FirstMap) -> None:
+    _, polygons = look()
+    lenses, points = Lenses(RIG), se3.transform_points(first.base_from_surface, first.map.points)
+    for c in range(3):
+        mine = first.templates.camera == c
+        inside = cv2.dilate(polygon_mask(RIG.cameras[c].size, polygons[c]), np.ones((7, 7), np.uint8)) > 0
+        in_camera = se3.transform_points(RIG.camera_from_base[c], points[mine])
+        m = RIG.matrices[c]
+        ideal = in_camera[:, :2] / in_camera[:, 2:] * m[[0, 1], [0, 1]] + m[:2, 2]
+        pixels = np.round(lenses.image(c, ideal, in_camera[:, 2])[0]).astype(int)
+        assert mine.sum() > 10 and inside[pixels[:, 1], pixels[:, 0]].all()
+
+
+def test_a_smaller_region_gives_a_smaller_map(first: FirstMap) -> None:
+    pyramids, _ = look()
+    polygons = {roi.camera: roi.polygon for roi in rois(SCENE, RIG, REST, 0.0, part=0.5)}
+    small = build_first_map(Lenses(RIG), pyramids, polygons)
+    assert not isinstance(small, str)
+    assert np.ptp(on_patch(small), axis=0)[0] < 0.8 * np.ptp(on_patch(first), axis=0)[0]
+    assert (np.abs(on_patch(small)[:, 0]) < 0.25 * SCENE.size[0] + 1).all()
+
+
+def test_a_map_is_the_same_map_in_another_frame(first: FirstMap) -> None:
+    other = first.base_from_surface @ se3.inverse(SCAN_FROM_SURFACE)
+    moved = in_frame(first, other)
+    assert np.array_equal(moved.base_from_surface, other)
+    turn, turned = first.base_from_surface[:3, :3], other[:3, :3]
+    points = se3.transform_points(first.base_from_surface, first.map.points)
+    assert np.allclose(points, se3.transform_points(other, moved.map.points), atol=1e-9)
+    assert np.allclose(first.map.normals @ turn.T, moved.map.normals @ turned.T, atol=1e-12)
+    assert np.allclose(turn @ first.templates.axes, turned @ moved.templates.axes, atol=1e-12)
+    back = in_frame(moved, first.base_from_surface)
+    assert np.allclose(back.map.points, first.map.points) and np.allclose(back.map.covariance, first.map.covariance)
+    assert np.isclose(np.trace(moved.map.covariance), np.trace(first.map.covariance))
+
+
+def test_two_runs_give_the_same_bits(first: FirstMap) -> None:
+    again = build(0, 1, 2)
+    assert again.map.points.tobytes() == first.map.points.tobytes()
+    assert again.map.covariance.tobytes() == first.map.covariance.tobytes()
+    assert again.base_from_surface.tobytes() == first.base_from_surface.tobytes()
+    assert again.templates.picture.tobytes() == first.templates.picture.tobytes()
+
+
+def test_a_flat_surface_is_mapped_flat() -> None:
+    flat = Scene(3, radius=np.inf)
+    pyramids, polygons = look(flat)
+    found = build_first_map(Lenses(RIG), pyramids, polygons)
+    assert not isinstance(found, str)
+    off = np.abs(on_patch(found)[:, 2])
+    assert np.median(off) < 0.08 and np.percentile(off, 95) < 0.3
+
+
+def test_one_camera_gives_a_reason() -> None:
+    pyramids, polygons = look()
+    for cameras, areas in [((0,), (0, 1, 2)), ((0, 1, 2), (1,)), ((0,), (1, 2)), ((), ())]:
+        first = build_first_map(Lenses(RIG), {c: pyramids[c] for c in cameras}, {c: polygons[c] for c in areas})
+        assert isinstance(first, str) and "two cameras" in first
+
+
+@pytest.mark.parametrize("level", [0, 120])
+def test_blank_images_give_a_reason(level: int) -> None:
+    _, polygons = look()
+    blank = pyramid(np.full((480, 640), level, np.uint8))
+    first = build_first_map(Lenses(RIG), dict.fromkeys(range(3), blank), polygons)
+    assert isinstance(first, str) and "matched" in first
+
+
+def test_noise_gives_a_reason() -> None:
+    _, polygons = look()
+    noise = {c: pyramid(np.random.default_rng(c).integers(0, 255, (480, 640), np.uint8)) for c in range(3)}
+    assert isinstance(build_first_map(Lenses(RIG), noise, polygons), str)
+
+
+def test_different_surfaces_in_each_camera_give_a_reason() -> None:
+    pyramids = {c: look(Scene(10 + c))[0][c] for c in range(3)}
+    assert isinstance(build_first_map(Lenses(RIG), pyramids, look()[1]), str)
+
+
+def test_polygons_outside_the_image_give_a_reason() -> None:
+    pyramids, polygons = look()
+    outside = {c: polygon + 5000.0 for c, polygon in polygons.items()}
+    assert isinstance(build_first_map(Lenses(RIG), pyramids, outside), str)

@@ -1,0 +1,193 @@
+"""Patches are found to a fraction of a pixel however they turned, never creep, and hidden ones are not found."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from estimation import se3
+from estimation.rig import pixels_from_points
+from estimation.se3 import Array
+from perception.features import grey
+from perception.frames import Image
+from perception.lens import Lenses
+from perception.patches import (
+    Alignment,
+    Projection,
+    Templates,
+    align,
+    coarse_score,
+    join,
+    normalise,
+    project_squares,
+    pyramid,
+    take_templates,
+)
+from tests.scene import Scene, render_one
+from tests.synthetic import REST, rig
+
+RIG = rig(size=(640, 480), focal=700.0)
+LENSES = Lenses(RIG)
+SCENE = Scene(2)
+FLAT = SCENE.grid(7.0, 0.7)
+POINTS, NORMALS = SCENE.points(FLAT), SCENE.normals(FLAT)
+
+
+def picture(pose: Array, camera: int = 0, seed: int = 0) -> Image:
+    return grey(SCENE.add_grain(render_one(SCENE, RIG.cameras[camera], pose), np.random.default_rng([seed, camera])))
+
+
+def true_pixels(pose: Array, camera: int = 0) -> Array:
+    return pixels_from_points(RIG.cameras[camera], se3.transform_points(pose, POINTS))[0]
+
+
+@pytest.fixture(scope="module")
+def templates() -> Templates:
+    return take_templates(LENSES, pyramid(picture(REST)), 0, REST, POINTS, NORMALS)
+
+
+def find(
+    templates: Templates,
+    image: Image,
+    predicted: Array,
+    camera: int = 0,
+    begin: Array | None = None,
+    coarse: bool = True,
+) -> tuple[Alignment, Projection]:
+    """Look for the patches in an image where the predicted pose puts them, or from `begin` (N, 2) px."""
+    where = project_squares(LENSES, camera, predicted, POINTS, NORMALS, templates.axes)
+    return align(templates, pyramid(image), where, where.centre if begin is None else begin, coarse=coarse), where
+
+
+def errors(found: Alignment, pose: Array, camera: int = 0) -> Array:
+    """Distances (M,) px of the patches found from the truth."""
+    return np.asarray(np.linalg.norm((found.pixels - true_pixels(pose, camera))[found.found], axis=1))
+
+
+MOTIONS = {
+    "still": np.zeros(6),
+    "shifted": np.array([0, 0, 0, 6.3, -4.1, 2.0]),
+    "rolled": np.array([0, 0, 0.6, 2, 0, 0]),
+    "tilted": np.array([0.35, -0.3, 0, 0, 1, 0]),
+    "nearer": np.array([0, 0, 0, 0, 0, 90.0]),
+    "further": np.array([0, 0, 0, 0, 0, -80.0]),
+}
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_patches_are_found_to_a_fraction_of_a_pixel(templates: Templates, name: str) -> None:
+    """The prediction is 0.6 mm and 0.6 degrees off, about 1.5 px."""
+    pose = REST @ se3.exp(MOTIONS[name])
+    found, where = find(
+        templates, picture(pose, seed=1), pose @ se3.exp(np.array([0.006, -0.006, 0.006, 0.4, -0.4, 0.2]))
+    )
+    away = errors(found, pose)
+    assert found.found.sum() > 0.85 * where.visible.sum() > 20
+    assert np.sqrt(np.mean(away**2)) < 0.15 and np.percentile(away, 95) < 0.3
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(0.5, 0.0), (0.7, 40.0), (1.0, -25.0), (1.1, 10.0)])
+def test_brightness_and_contrast_do_not_matter(templates: Templates, gain: float, offset: float) -> None:
+    pose = REST @ se3.exp(MOTIONS["shifted"])
+    image = np.clip(np.rint(gain * picture(pose, seed=1).astype(float) + offset), 0, 255).astype(np.uint8)
+    found, where = find(templates, image, pose)
+    assert found.found.sum() > 0.85 * where.visible.sum()
+    assert np.sqrt(np.mean(errors(found, pose) ** 2)) < 0.15
+
+
+def test_another_camera_finds_the_same_spots(templates: Templates) -> None:
+    found, where = find(templates, picture(REST, camera=1), REST, camera=1)
+    assert found.found.sum() > 0.7 * where.visible.sum() > 15
+    assert np.sqrt(np.mean(errors(found, REST, 1) ** 2)) < 0.25
+
+
+def test_the_claimed_error_is_of_the_true_ones_size(templates: Templates) -> None:
+    ratios = []
+    for seed in range(4):
+        pose = REST @ se3.exp(np.array([0, 0, 0.02, 0.37 * seed, 0.21 * seed, 0]))
+        found, _ = find(templates, picture(pose, seed=seed + 3), pose)
+        ratios.append(errors(found, pose) / (np.sqrt(2) * found.sigma[found.found]))
+    assert 0.3 < np.sqrt(np.mean(np.concatenate(ratios) ** 2)) < 1.5
+
+
+def test_the_coarse_image_reaches_five_pixels_from_any_side(templates: Templates) -> None:
+    image = picture(REST, seed=4)
+    for angle in range(6):
+        begin = true_pixels(REST) + 5.0 * np.array([np.cos(angle), np.sin(angle)])
+        far, near = (find(templates, image, REST, begin=begin, coarse=coarse)[0] for coarse in (True, False))
+        assert (errors(far, REST) < 0.5).sum() > 0.85 * len(POINTS)
+        assert (errors(near, REST) < 0.5).sum() < 0.5 * len(POINTS)
+
+
+def test_tracks_of_a_still_scene_never_creep(templates: Templates) -> None:
+    """Each frame begins where the last one ended; after 60 the tracks stand where they stood after the first."""
+    begin, mean = true_pixels(REST), []
+    for seed in range(60):
+        found, _ = find(templates, picture(REST, seed=10 + seed), REST, begin=begin, coarse=False)
+        begin = np.where(found.found[:, None], found.pixels, true_pixels(REST))
+        mean.append(begin - true_pixels(REST))
+    early, late = np.mean(mean[:10], axis=0), np.mean(mean[-10:], axis=0)
+    assert np.linalg.norm(late - early, axis=1).max() < 0.05
+    assert np.linalg.norm(late.mean(0)) < 0.02
+
+
+def test_hidden_patches_are_not_found(templates: Templates) -> None:
+    image, pixels = picture(REST, seed=5), true_pixels(REST)
+    edge = round(float(np.median(pixels[:, 0])))
+    cloth = np.random.default_rng(6).integers(60, 200, image.shape, np.uint8)
+    image[:, edge:] = cloth[:, edge:]
+    found, where = find(templates, image, REST)
+    hidden, clear = pixels[:, 0] > edge + 12, pixels[:, 0] < edge - 12
+    assert not found.found[hidden].any() and hidden.sum() > 15
+    assert found.found[clear & where.visible].mean() > 0.9
+
+
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_nothing_is_found_in_an_even_image(templates: Templates, level: int) -> None:
+    found, _ = find(templates, np.full((480, 640), level, np.uint8), REST)
+    assert not found.found.any() and np.isfinite(found.score).all()
+
+
+def test_what_turned_its_back_is_not_visible(templates: Templates) -> None:
+    over = REST @ se3.exp(np.array([np.pi, 0, 0, 0, 0, 0]))
+    found, where = find(templates, picture(REST), over)
+    assert not where.visible.any() and not found.found.any() and (where.facing < 0).all()
+
+
+def test_what_left_the_image_is_not_visible(templates: Templates) -> None:
+    aside = REST @ se3.exp(np.array([0, 0, 0, 300.0, 0, 0]))
+    found, where = find(templates, picture(REST), aside)
+    assert not where.visible.any() and not found.found.any()
+
+
+def test_a_square_is_about_a_pixel_a_sample_in_its_own_camera(templates: Templates) -> None:
+    where = project_squares(LENSES, 0, REST, POINTS, NORMALS, templates.axes)
+    assert np.allclose(where.centre, true_pixels(REST), atol=1e-6)
+    lengths = np.linalg.norm(where.per_sample, axis=1)
+    assert (lengths < 1.1).all() and (lengths > 0.5).all()
+
+
+def test_a_template_is_its_own_best_match(templates: Templates) -> None:
+    where = project_squares(LENSES, 0, REST, POINTS, NORMALS, templates.axes)
+    images = pyramid(picture(REST))
+    itself = align(templates, images, where, where.centre, coarse=False)
+    assert np.abs(itself.pixels - where.centre)[itself.found].max() < 0.05 and itself.score[itself.found].min() > 0.999
+    here = coarse_score(templates, images, where, where.centre)
+    beside = coarse_score(templates, images, where, where.centre + 9.0)
+    assert here.min() > 0.999 and beside.max() < 0.95
+
+
+def test_pictures_are_freed_of_mean_and_contrast() -> None:
+    raw = np.random.default_rng(1).normal(100, 20, (5, 225)).astype(np.float32)
+    normal, contrast = normalise(raw)
+    assert np.allclose(normal.mean(1), 0, atol=1e-4) and np.allclose(normal.std(1), 1, atol=1e-4)
+    again, twice = normalise(2 * raw - 30)
+    assert np.allclose(again, normal, atol=1e-4) and np.allclose(twice, 2 * contrast, rtol=1e-5)
+
+
+def test_templates_can_be_taken_apart_and_joined(templates: Templates) -> None:
+    odd = np.arange(len(templates)) % 2 == 1
+    again = join([templates.take(odd), templates.take(~odd)])
+    order = np.argsort(np.r_[np.flatnonzero(odd), np.flatnonzero(~odd)])
+    for name in Templates.__slots__:
+        assert np.array_equal(getattr(again.take(order), name), getattr(templates, name))
