@@ -96,9 +96,7 @@ def test_a_delayed_loop_prints_the_path_on_a_breathing_surface() -> None:
             errors.append(abs(tip[2, 3]))
     assert motion.progress.place == pytest.approx(40.0)
     assert isinstance(motion.last, Hold)
-    assert (
-        np.sqrt(np.mean(np.square(errors))) < 0.1
-    )  # mm along the normal; measured 0.071
+    assert np.sqrt(np.mean(np.square(errors))) < 0.1  # mm along the normal; measured 0.071
     assert max(errors) < 0.15  # measured 0.109
 
 
