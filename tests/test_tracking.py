@@ -241,6 +241,26 @@ def test_what_stands_outside_the_region_does_not_hold_it_back() -> None:
     assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses)[1:].max() < 0.1
 
 
+def test_without_a_region_whatever_two_cameras_see_is_the_surface(sets: list[FrameSet]) -> None:
+    """Before an even background, as a drape is: the patch is all there is to match."""
+    plain = []
+    for frames in sets[:6]:
+        patch = [
+            np.abs(f.image.astype(int) - SCENE.view(RIG.cameras[f.camera]).background).max(2) > 12
+            for f in frames.frames
+        ]
+        only = [cv2.morphologyEx(p.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0 for p in patch]
+        plain.append(change(frames, lambda c, i, only=only: np.where(only[c][..., None], i, 90).astype(np.uint8)))
+    poses = run(plain, roi=())
+    assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses)[1:].max() < 0.1
+
+
+def test_a_surface_at_rest_stays_at_rest() -> None:
+    poses = run(shot(lambda stamp: REST, STAMPS[:20], 5))
+    assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses, lambda stamp: REST)[1:].max() < 0.03
+    assert max(np.linalg.norm(p.twist[3:]) for p in poses[5:]) < 0.3
+
+
 def test_nothing_is_tracked_before_the_regions_instant(sets: list[FrameSet]) -> None:
     later = rois(SCENE, RIG, breathing(0.4), 0.4)
     poses = run(sets[:9], later)
