@@ -212,7 +212,7 @@ def test_coasting_claims_less_with_every_frame_and_enough(seed: int) -> None:
     assert (np.diff(sigma) > 0).all() and all(inside)
 
 
-@pytest.mark.parametrize("map_error", [0.0, 0.1])
+@pytest.mark.parametrize("map_error", [0.0, 0.1, 0.5])
 def test_the_covariance_is_as_wide_as_the_errors(map_error: float) -> None:
     values = []
     for seed in range(6):

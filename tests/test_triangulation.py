@@ -72,6 +72,17 @@ def test_the_covariance_is_as_wide_as_the_errors(cameras: list[int]) -> None:
     assert 0.9 < nees.mean() < 1.1  # 1800 squares: one standard deviation of the mean is 0.033
 
 
+def test_no_small_step_of_a_point_fits_its_pixels_better() -> None:
+    points, draw = cloud(4), np.random.default_rng(5)
+    point, camera, pixels = sightings(points, [0, 1, 2])
+    pixels = pixels + 3 * draw.normal(size=pixels.shape)
+    found, _, residual = triangulate(RIG, point, camera, pixels, len(points))
+    least = np.bincount(point, (residual**2).sum(1))
+    for step in 0.01 * np.concatenate([np.eye(3), -np.eye(3)]):
+        _, _, moved = sightings(found + step, [0, 1, 2])
+        assert (np.bincount(point, ((moved - pixels) ** 2).sum(1)) > least).all()
+
+
 def test_a_third_camera_makes_every_point_surer() -> None:
     points = cloud(3)
     two = triangulate(RIG, *sightings(points, [0, 1]), len(points))[1]
