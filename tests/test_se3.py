@@ -157,12 +157,20 @@ def test_points_move_as_homogeneous_vectors(t: Array, point: Array) -> None:
     assert close(se3.transform_points(t, point[None])[0], (t @ np.append(point, 1.0))[:3])
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 9e-5, 1.1e-4, 0.049, 0.051, 1.0, 3.1, 20.0])
+def test_one_vector_alone_gives_what_many_give(angle: float) -> None:
+    xi = np.random.default_rng(2).normal(size=(40, 6))
+    xi[:, :3] *= angle / np.linalg.norm(xi[:, :3], axis=1, keepdims=True)
+    for one, among_many in zip(xi, se3.exp(xi), strict=True):
+        assert np.allclose(se3.exp(one), among_many, rtol=0, atol=1e-13)
+
+
 def test_one_call_serves_any_shape() -> None:
     xi = np.random.default_rng(1).uniform(-1, 1, size=(2, 5, 6))
     many = se3.exp(xi)
     assert many.shape == (2, 5, 4, 4)
     for i in np.ndindex(2, 5):
-        assert np.array_equal(many[i], se3.exp(xi[i]))
+        assert np.allclose(many[i], se3.exp(xi[i]), rtol=0, atol=1e-14)  # one alone takes the short way
         assert np.allclose(se3.log(many)[i], xi[i])
         assert np.array_equal(se3.adjoint(many)[i], se3.adjoint(many[i]))
 
