@@ -22,6 +22,8 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals
 
 LEAST_SIGHTINGS = 3
+LEAST_JUDGES = 6  # key frames: fewer cannot tell a stray landmark from a bent map, and a stray one is not asked again
+ASTRAY = 3.0  # px: rolling shutters and late cameras bend images that much
 FREE = 50.0  # mm: how far a landmark may lie from where it was; only there to keep a hardly seen one finite
 ROBUST = 3.0  # sigmas
 SINGLE = np.diag([1 / 0.05**2] * 3 + [1 / 10.0**2] * 3)  # rad, mm: how far one camera's instant may be from another's
@@ -192,13 +194,15 @@ def _joint_covariance(linear: gtsam.GaussianFactorGraph, rows: NDArray[np.int64]
 def _agreement(rig: Rig, points: Array, keyframes: list[KeyFrame], solved: gtsam.Values) -> NDArray[np.bool_]:
     """Which landmarks (N,) fit most of their sightings: what stands still while the surface moves does not."""
     fits, total = np.zeros(len(points)), np.zeros(len(points))
+    if len(keyframes) < LEAST_JUDGES:
+        return np.ones(len(points), bool)
     for i, frame in enumerate(keyframes):
         seen = frame.observations
         for c in np.unique(seen.camera):
             mine = seen.camera == c
             pose = se3.inverse(solved.atPose3(_camera_key(int(c), i)).matrix())
             predicted = project(rig, seen.camera[mine], pose, points[seen.track[mine]])[0]
-            away = np.linalg.norm(predicted - seen.pixels[mine], axis=1) / seen.sigma[mine]
-            np.add.at(fits, seen.track[mine], away < 4 * ROBUST)
+            away = np.linalg.norm(predicted - seen.pixels[mine], axis=1)
+            np.add.at(fits, seen.track[mine], away < np.maximum(4 * ROBUST * seen.sigma[mine], ASTRAY))
             np.add.at(total, seen.track[mine], 1)
     return np.asarray((total < LEAST_SIGHTINGS) | (fits >= 0.5 * total))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import PoseFit, solve_pose
+from estimation.pose_solver import PoseFit, own_residuals, project, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.smoother import Measured, Smoother
@@ -35,6 +35,7 @@ class EstimatorSettings:
     leave_tracks: int = 20
     camera_tracks: int = 6  # fewer say nothing of that camera,
     camera_share: float = 0.1  # nor does a smaller part of the map's landmarks: so many agree by chance
+    disorder: float = 3.0  # px, median, within a camera whatever its own pose: matches by chance, not a surface
     sigma_tracking: float = 2.0  # mm: a pose less certain than this is DEGRADED
     sigma_measured: float = 50.0  # mm: a pose less certain than this is no measurement
     coast: float = 0.5  # s without a measurement until LOST
@@ -139,20 +140,35 @@ class Estimator:
             none = np.zeros(len(observations), bool)
             return Fit(observations.stamp, nothing, np.full((6, 6), np.inf), none, used, reason)
         points = self.map.points[observations.track]
-        sigma = np.maximum(observations.sigma, settings.floor_sigma)
+        sigma = np.hypot(np.maximum(observations.sigma, settings.floor_sigma), self._smear(observations, points, start))
         solution = solve_pose(self.rig, observations.camera, points, observations.pixels, sigma, start, scales=scales)
         inlier = solution.weights > 0.2
         used = np.bincount(observations.camera[inlier], minlength=count)
         covariance = self._covariance(observations, solution, sigma)
-        reason = self._judge(len(observations), int(inlier.sum()), covariance)
+        disorder = _disorder(observations, solution, inlier)
+        reason = self._judge(len(observations), used, covariance, disorder)
         return Fit(observations.stamp, solution, covariance, inlier, used, reason)
 
-    def _judge(self, found: int, agreed: int, covariance: Array) -> str:
-        s = self.settings
+    def _smear(self, observations: Observations, points: Array, start: Array) -> float:
+        """How far, px, the surface moves between the cameras' instants: beside that, sharper tracks count no more."""
+        if self._pose is None or not self._pose.twist.any():
+            return 0.0
+        velocity = project(self.rig, observations.camera, start, points)[2] @ self._pose.twist
+        return self.skew.sigma * float(np.median(np.linalg.norm(velocity, axis=1)))
+
+    def _judge(self, found: int, used: NDArray[np.int64], covariance: Array, disorder: float) -> str:
+        s, agreed = self.settings, int(used.sum())
         if agreed < s.least_tracks:
             return f"{agreed} tracks agree, {s.least_tracks} needed"
         if agreed < s.least_share * found:
             return f"only {agreed} of {found} tracks agree"
+        if used.max() < self._camera_least():
+            return f"no camera sees more than {used.max()} of {len(self.map or ())} landmarks"
+        bent = (
+            self._pose is not None and self._pose.state is TrackState.INITIALISING
+        )  # first maps of a moving surface are
+        if disorder > s.disorder * (3.0 if bent else 1.0):
+            return f"the tracks of a camera disagree among themselves by {disorder:.1f} px"
         spread = _position_sigma(covariance)
         if not spread <= s.sigma_measured:
             return f"the pose is uncertain to {spread:.1f} mm"
@@ -191,9 +207,16 @@ class Estimator:
 
     def carriers(self, fit: Fit) -> NDArray[np.int64]:
         """The cameras that carry a fit, by number."""
+        return np.nonzero(fit.used >= self._camera_least())[0] if fit.measured else np.zeros(0, np.int64)
+
+    def _camera_least(self) -> float:
         assert self.map is not None
-        least = max(self.settings.camera_tracks, self.settings.camera_share * len(self.map))
-        return np.nonzero(fit.used >= least)[0] if fit.measured else np.zeros(0, np.int64)
+        return max(self.settings.camera_tracks, self.settings.camera_share * len(self.map))
+
+    def moving(self, twist: Array) -> None:
+        """What is known of the velocity (6,) before the window can tell: the first pose's covariance needs it."""
+        assert self._pose is not None
+        self._pose = replace(self._pose, twist=twist)
 
     def wait(self, stamp: float, reason: str) -> SurfacePose:
         """The first map is not confirmed at `stamp`: the pose stands still and counts for nothing."""
@@ -267,6 +290,12 @@ class Estimator:
         """Take a refined map of the same surface frame; rows keep their meaning."""
         assert self.map is not None and len(surface_map) == len(self.map)
         self.map = surface_map
+
+
+def _disorder(observations: Observations, solution: PoseFit, inlier: NDArray[np.bool_]) -> float:
+    """Median residual, px, of the inliers when each camera may move for itself: what no pose of a surface explains."""
+    left = own_residuals(observations.camera, solution, inlier.astype(float))[inlier]
+    return float(np.median(np.linalg.norm(left, axis=1))) if len(left) else 0.0
 
 
 def _position_sigma(covariance: Array) -> float:

@@ -26,3 +26,9 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.camera)
+
+
+def no_observations(stamp: float) -> Observations:
+    """A frame set in which no track was found."""
+    nothing = np.zeros(0, np.int64)
+    return Observations(stamp, nothing, nothing, np.zeros((0, 2)), np.zeros(0))

@@ -106,3 +106,19 @@ def solve_pose(
             if np.abs(step).max() < tolerance:
                 break
     return PoseFit(pose, information / unit**2, residual, weight, jacobian, unit)
+
+
+def own_residuals(camera: Index, fit: PoseFit, sure: Array) -> Array:
+    """Residuals (N, 2) px that are left when each camera may move for itself, to first order.
+
+    sure: (N,) weights of the tracks that say how each camera moves. Cameras with fewer than eight keep theirs whole.
+    """
+    left = fit.residuals.copy()
+    for c in np.unique(camera):
+        mine = camera == c
+        root = np.sqrt(np.repeat(sure[mine], 2))
+        if np.count_nonzero(root) >= 16:
+            jacobian, residual = fit.jacobians[mine].reshape(-1, 6), fit.residuals[mine].ravel()
+            own = np.linalg.lstsq(jacobian * root[:, None], residual * root, rcond=None)[0]
+            left[mine] = (residual - jacobian @ own).reshape(-1, 2)
+    return left

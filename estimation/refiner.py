@@ -24,6 +24,7 @@ TURN, SHIFT = 0.07, 0.04  # rad, and parts of the distance to the cameras: a vie
 STEADY = 0.4  # s between key frames of the same view, of which a few average the tracks' noise
 STEADY_MOST = 6
 LEAST_SIGMA = 0.1  # px
+LEAST_OF_CAMERA = 12  # tracks: fewer may agree by chance, and so may less than half of those found
 
 
 class Refiner:
@@ -47,7 +48,13 @@ class Refiner:
         """The first map and the frame set that it was made from, whose pose defines the surface frame."""
         self._map, self._frames, self._stamps = surface_map, [], []
         self._job, self._future, self._ask = None, None, False
-        self._keep(stamp, base_from_surface, observations, np.zeros(6))
+        kept = _inliers(self._rig, surface_map, base_from_surface, observations)
+        self._keep(stamp, base_from_surface, kept, np.zeros(6))
+
+    def speed(self, fit: Fit) -> Array:
+        """The twist (6,) from the first key frame's pose to a fit."""
+        moved = se3.log(se3.inverse(self._frames[0].base_from_surface) @ fit.solution.base_from_surface)
+        return np.asarray(moved / (fit.stamp - self._stamps[0]))
 
     def confirm(self, fit: Fit, observations: Observations, skew: float) -> Adjusted | None:
         """The second frame set: what it shows of the motion corrects the first map, on the spot.
@@ -55,10 +62,8 @@ class Refiner:
         Until then a surface that moved between the cameras' instants looks nearer or farther than it is.
         """
         assert self._map is not None
-        first, dt = self._frames[0], fit.stamp - self._stamps[0]
-        pose = fit.solution.base_from_surface
-        drift = se3.log(se3.inverse(first.base_from_surface) @ pose) / dt * skew
-        second = KeyFrame(pose, _inliers(self._rig, self._map, fit, observations), drift)
+        first, pose, drift = self._frames[0], fit.solution.base_from_surface, self.speed(fit) * skew
+        second = KeyFrame(pose, _inliers(self._rig, self._map, pose, observations), drift)
         self._frames = [KeyFrame(first.base_from_surface, first.observations, drift), second]
         self._stamps = [self._stamps[0], fit.stamp]
         refined = adjust(self._rig, self._map, self._frames)
@@ -77,7 +82,7 @@ class Refiner:
         fit, observations, drift = self._offered
         self._offered = None
         if self._is_new(fit.stamp, fit.solution.base_from_surface):
-            kept = _inliers(self._rig, self._map, fit, observations)
+            kept = _inliers(self._rig, self._map, fit.solution.base_from_surface, observations)
             self._keep(fit.stamp, fit.solution.base_from_surface, kept, drift)
             self._ask = True
 
@@ -137,17 +142,17 @@ class Refiner:
             return adjust(*job)
 
 
-def _inliers(rig: Rig, surface_map: SurfaceMap, fit: Fit, observations: Observations) -> Observations:
+def _inliers(rig: Rig, surface_map: SurfaceMap, near: Array, observations: Observations) -> Observations:
     """The tracks that agree with the rest of their own camera.
 
     The joint fit leaves room for late cameras, and in it for wrong matches too.
     """
     sigma = np.maximum(observations.sigma, LEAST_SIGMA)
-    seen = Observations(fit.stamp, observations.camera, observations.track, observations.pixels, sigma)
+    seen = Observations(observations.stamp, observations.camera, observations.track, observations.pixels, sigma)
     keep = np.zeros(len(seen), bool)
     for c in np.unique(seen.camera):
         mine = seen.camera == c
-        if mine.sum() >= 8:
-            near = fit.solution.base_from_surface
-            keep[mine] = single_fit(rig, surface_map.points, seen, int(c), near).weights > 0.2
+        agrees = single_fit(rig, surface_map.points, seen, int(c), near).weights > 0.2
+        if agrees.sum() >= max(LEAST_OF_CAMERA, 0.5 * mine.sum()):
+            keep[mine] = agrees
     return Observations(seen.stamp, seen.camera[keep], seen.track[keep], seen.pixels[keep], seen.sigma[keep])

@@ -10,7 +10,7 @@ far-away base.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -49,7 +49,7 @@ class Smoother:
 
     def __init__(self) -> None:
         self._recent: deque[Measured] = deque(maxlen=8)
-        self._psd = QUIET_PSD * 10
+        self._excess = self._psd = QUIET_PSD * 10
         self.restarts = 0
         self._clear()
 
@@ -73,6 +73,7 @@ class Smoother:
     def add(self, measured: Measured) -> Window:
         """Take one measurement, newer than the ones before, and give the estimate at its stamp."""
         assert np.isfinite(measured.pose).all() and np.isfinite(measured.covariance).all()
+        measured = replace(measured, covariance=_proper(measured.covariance))
         before = self._newest
         if before is not None and measured.stamp - before.stamp > LAG:
             self.reset()
@@ -96,10 +97,11 @@ class Smoother:
         change = _twist(b, c) - _twist(a, b)
         noise = np.diag(a.covariance) / first**2 + np.diag(c.covariance) / second**2
         noise = noise + np.diag(b.covariance) * (1 / first + 1 / second) ** 2
-        seen = np.maximum(change**2 - noise, 0.0) / (0.5 * (first + second))
+        seen = (change**2 - noise) / (0.5 * (first + second))  # signed, else noise alone would pass for liveliness
         share = min(1.0, second / MEMORY)
         grouped = np.repeat([seen[:3].mean(), seen[3:].mean()], 3)
-        self._psd = np.maximum((1 - share) * self._psd + share * grouped, QUIET_PSD)
+        self._excess = (1 - share) * self._excess + share * grouped
+        self._psd = np.maximum(self._excess, QUIET_PSD)
 
     def _surprise(self, measured: Measured) -> Array:
         """The density that makes this measurement a third of a sigma: a jerk of the hand loosens the prior at once.
@@ -160,6 +162,12 @@ class Smoother:
 
 def _twist(a: Measured, b: Measured) -> Array:
     return se3.log(se3.inverse(a.pose) @ b.pose) / (b.stamp - a.stamp)
+
+
+def _proper(covariance: Array) -> Array:
+    """The covariance with no direction surer than 1e-6 rad or mm: GTSAM accepts a worse one and fails later."""
+    values, vectors = np.linalg.eigh(_symmetric(covariance))
+    return np.asarray((vectors * np.maximum(values, 1e-12)) @ vectors.T)
 
 
 def _symmetric(matrix: Array) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.observations import Observations
+from estimation.observations import Observations, no_observations
 from estimation.pose_solver import solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
@@ -107,6 +107,8 @@ class Matcher:
         """Measure the landmarks in every camera, begun where the camera's own pose puts them; coarse: from afar."""
         rows = np.nonzero(self.agrees)[0]
         cameras = [c for c in pyramids if c in poses]
+        if not cameras:
+            return no_observations(stamp)
         results = [self._align_one(c, pyramids[c], poses[c], rows, coarse) for c in cameras]
         found = [rows[r.found] for r in results]
         pixels = [undistort(self.rig.cameras[c], r.pixels[r.found]) for c, r in zip(cameras, results, strict=True)]

@@ -79,9 +79,9 @@ def sample(image: Image, centre: Array, per_sample: Array, spacing: float = 1.0,
     spacing: steps from sample to sample. half: the image is the half-size one of `pyramid`. Bilinear; outside the image
     the border's value.
     """
-    scale, shift = (0.5, -0.25) if half else (1.0, 0.0)
+    scale = 0.5 if half else 1.0  # cv2.pyrDown keeps every other pixel, so its pixel (i, j) is the image's (2 i, 2 j)
     offsets = np.matmul((per_sample * (spacing * scale)).astype(np.float32), _SPAN)  # (N, 2, S)
-    start = (centre * scale + shift).astype(np.float32)
+    start = (centre * scale).astype(np.float32)
     x, y = offsets[:, 0] + start[:, :1], offsets[:, 1] + start[:, 1:]
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
@@ -184,7 +184,7 @@ def align(
     """Shift each template until it fits.
 
     start: (N, 2) px as imaged, where to begin. least: the correlation below which a landmark is not found. coarse:
-    begin on the half-size image, which reaches twice as far (about 10 px) and costs as much again.
+    begin on the half-size image, which reaches twice as far (5 px surely, 8 mostly) and costs as much again.
     """
     shift = np.zeros((len(templates), 2))  # in samples of the template
     if coarse:

@@ -111,7 +111,7 @@ class Relocaliser:
         lens = self.lenses.rig.cameras[camera]
         keypoints, descriptors = sift(images[1] if half else images[0], count=600 if half else 1500)
         if half:
-            keypoints = 2 * keypoints + 0.5
+            keypoints = 2 * keypoints
         pairs = match(descriptors, self._descriptors, 0.85)
         if len(pairs) < LEAST_MATCHES:
             return None

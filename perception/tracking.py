@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.adjustment import Adjusted, single_fit
+from estimation.errors import InputError
 from estimation.estimator import Estimator, Fit, identity_pose
-from estimation.observations import Observations
+from estimation.observations import Observations, no_observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.refiner import Refiner
 from estimation.registration import register
@@ -35,6 +36,7 @@ from perception.relocalise import Relocaliser
 
 STAGES = ("prepare", "flow", "align", "pose", "search")
 LEAST_SCAN_SIGMA = 0.1  # mm: no handheld scan is better
+EAGER = 5  # tries for a first map, 0.5 s and more each, before only every tenth frame set is tried
 PATIENCE = 2.0  # s: a first map that nobody confirms is dropped, and the next images are tried
 FULL_SEARCH = 10  # frame sets of an absent surface between searches at full size, off the frame's path
 
@@ -77,6 +79,7 @@ class TrackingStep:
         self._search = Relocaliser(self._lenses)
         self._matcher: Matcher | None = None
         self._lost: dict[int, Pyramid] = {}  # images of cameras that are to be searched once the pose is handed over
+        self._tries, self._why = 0, ""  # to make a first map, and why the last one failed
         self._mapped = 0.0  # s, stamp of the first map
         self._absent = 0  # frame sets since the surface was last measured
         self._spent = np.zeros(len(STAGES))
@@ -86,6 +89,11 @@ class TrackingStep:
         """The pose at `frames.stamp` from this frame set and the ones before."""
         self._spent = np.zeros(len(STAGES))
         self._lap = self._clock()
+        last = self._estimator.pose
+        if last is not None and frames.stamp <= last.stamp:  # the same instant again tells nothing new
+            self.last = StepReport(no_observations(frames.stamp), np.zeros(len(self.rig), np.int64), self._spent)
+            return last
+        self._check(frames)
         pyramids = {f.camera: pyramid(grey(f.image)) for f in frames.frames}
         self._took("prepare")
         if self._matcher is None:
@@ -102,6 +110,12 @@ class TrackingStep:
             self._take(refined)
         self._recover()
 
+    def _check(self, frames: FrameSet) -> None:
+        for frame in frames.frames:
+            camera, (h, w) = self.rig.cameras[frame.camera], frame.image.shape[:2]
+            if (w, h) != camera.size:
+                raise InputError(f"camera {camera.name}", "image size", f"{w} x {h}", "{} x {} px".format(*camera.size))
+
     def _took(self, stage: str) -> None:
         now = self._clock()
         self._spent[STAGES.index(stage)] += now - self._lap
@@ -115,11 +129,15 @@ class TrackingStep:
         none = np.zeros(len(self.rig), np.int64)
         polygons = self._polygons(frames)
         if isinstance(polygons, str):
-            return identity_pose(frames.stamp, polygons), _no_observations(frames.stamp), none
+            return identity_pose(frames.stamp, polygons), no_observations(frames.stamp), none
+        self._tries += 1
+        if self._tries > EAGER and self._tries % FULL_SEARCH:
+            return identity_pose(frames.stamp, self._why), no_observations(frames.stamp), none
         first = build_first_map(self._lenses, pyramids, polygons)
         self._took("search")
         if isinstance(first, str):
-            return identity_pose(frames.stamp, first), _no_observations(frames.stamp), none
+            self._why = first
+            return identity_pose(frames.stamp, first), no_observations(frames.stamp), none
         caveat = ""
         if self._scan is not None:
             first, caveat = self._on_scan(first, self._scan)
@@ -203,6 +221,7 @@ class TrackingStep:
             if refined is None:
                 break
             self._take(refined)
+            self._estimator.moving(self._refiner.speed(fit))
             pose, points = fit.solution.base_from_surface, refined.map.points
             fits = {c: single_fit(self.rig, points, observations, c, pose) for c in pyramids}
             starts = {c: own.base_from_surface for c, own in fits.items()}
@@ -273,8 +292,3 @@ class TrackingStep:
         fit = self._estimator.fit(again, pose)
         if fit.measured:
             self._matcher.remember(pyramids, again, fit.inlier, fit.solution.base_from_surface)
-
-
-def _no_observations(stamp: float) -> Observations:
-    nothing = np.zeros(0, np.int64)
-    return Observations(stamp, nothing, nothing, np.zeros((0, 2)), np.zeros(0))
