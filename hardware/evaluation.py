@@ -1,8 +1,9 @@
 """How good a run was: errors against truth or reference, consistency of the covariance, states and latency.
 
 The tracker's surface frame is its own; the truth's is another. Both are rigidly attached to the surface, so
-`truth_surface_from_estimated_surface` is constant. It is taken at the first measured pose ("start": nothing is fitted,
-and the first pose's own error is in every later one) and, beside it, as the best constant over the run ("aligned").
+`truth_surface_from_estimated_surface` is constant. It is taken at the first TRACKING pose, or the first measured one
+where none is ("start": nothing is fitted, and that pose's own error is in every other one), and, beside it, as the best
+constant over the run ("aligned").
 """
 
 from __future__ import annotations
@@ -111,9 +112,10 @@ def compare(table: PoseTable, truth: Trajectory) -> Comparison | None:
     estimate, covariance = table.base_from_surface[rows], table.covariance[rows]
     expected = truth.base_from_surface[true_rows]
     changes = se3.inverse(expected) @ estimate  # (M, 4, 4)
-    start = errors_under(changes[0], expected, estimate, covariance)
-    aligned = errors_under(best_constant(changes), expected, estimate, covariance)
     tracking = table.is_state(TrackState.TRACKING)[rows]
+    first = int(np.argmax(tracking))  # 0 where none is
+    start = errors_under(changes[first], expected, estimate, covariance)
+    aligned = errors_under(best_constant(changes), expected, estimate, covariance)
     return Comparison(
         rows=rows,
         expected=expected,

@@ -193,7 +193,7 @@ def _errors(result: Evaluation) -> str:
     text = (
         f"Against the {'exact truth' if comparison.exact else 'measured reference, whose own error is part of this'}, "
         f"at {len(comparison.rows)} measured poses. From the start: the constant transform between the two surface "
-        "frames is taken at the first measured pose, nothing is fitted. Aligned: the best constant over the run."
+        "frames is taken at the first TRACKING pose, nothing is fitted. Aligned: the best constant over the run."
     )
     return _section("Errors", text, "".join(plots) + _error_table(comparison) + _consistency(comparison))
 
