@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -104,9 +102,7 @@ def test_what_is_not_finite_never_reaches_the_window(wrong: float) -> None:
 def test_a_covariance_that_is_none_does_not_break_what_comes_after(value: float) -> None:
     smoother, measured = Smoother(), measure(breathing, np.arange(30) / 30, 1)
     run(measured[:10], smoother)
-    with suppress(RuntimeError):
-        smoother.add(Measured(measured[10].stamp, measured[10].pose, value * COVARIANCE))
-    assert smoother.restarts >= 1
+    smoother.add(Measured(measured[10].stamp, measured[10].pose, value * COVARIANCE))
     windows = run(measured[11:], smoother)
     assert np.abs(windows[-1].pose - run(measured)[-1].pose).max() < 0.02
     assert 0.5 < nees(windows, breathing, skip=0) < 2.0
