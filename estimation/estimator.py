@@ -21,6 +21,8 @@ from estimation.se3 import Array
 from estimation.smoother import Measured, Smoother
 from estimation.surface_map import SurfaceMap
 
+ORDERLY = 1.5  # px of residual, at which nobody asks how much of it a camera's own motion explains
+
 
 @dataclass(frozen=True, slots=True)
 class EstimatorSettings:
@@ -294,8 +296,11 @@ class Estimator:
 
 def _disorder(observations: Observations, solution: PoseFit, inlier: NDArray[np.bool_]) -> float:
     """Median residual, px, of the inliers when each camera may move for itself: what no pose of a surface explains."""
+    whole = np.linalg.norm(solution.residuals[inlier], axis=1)
+    if not len(whole) or np.median(whole) < ORDERLY:
+        return 0.0  # what is left of so little need not be asked for
     left = own_residuals(observations.camera, solution, inlier.astype(float))[inlier]
-    return float(np.median(np.linalg.norm(left, axis=1))) if len(left) else 0.0
+    return float(np.median(np.linalg.norm(left, axis=1)))
 
 
 def _position_sigma(covariance: Array) -> float:
