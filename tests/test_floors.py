@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FLOORS = {"estimation": 0, "perception": 1, "planning": 1, "hardware": 2}
 OWNERS = {  # library: the files that may import it
-    "cv2": ("perception/*.py", "hardware/images.py"),
+    "cv2": ("perception/*.py", "hardware/images.py", "hardware/simulator/*.py"),
     "gtsam": ("estimation/*.py",),
     "mcap": ("hardware/mcap_walk.py", "hardware/recording.py", "hardware/recording_file.py"),
     "onnxruntime": ("perception/*.py",),
