@@ -7,6 +7,7 @@ motion_byte = 1                               # byte 2 of a G1 frame, 1 or 0
 slots = ["J4", "J5", "J6"]                    # which joint stands in each angle slot
 baud = 115200
 tick_s = 0.02
+lag_s = 0.024                                 # from the end of a tick until the arm is where it was sent in it
 [limits]                                      # as in planning/limits.py; arrays are X Y Z in mm, A B C in degrees
 speed = [150, 150, 150, 120, 120, 120]
 turn = 2.4
@@ -27,7 +28,7 @@ from hardware.protocol import Dialect
 from planning.kinematics import SimpleArm
 from planning.limits import Limits
 
-KEYS = ("home_mm_deg", "arm_from_base", "arm_from_upright", "motion_byte", "slots", "baud", "tick_s", "limits")
+KEYS = ("home_mm_deg", "arm_from_base", "arm_from_upright", "motion_byte", "slots", "baud", "tick_s", "lag_s", "limits")
 LIMITS = tuple(f.name for f in fields(Limits))
 _AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
 _ANGLES = ("turn", "surface_turn")  # single numbers in rad
@@ -58,6 +59,7 @@ def read_arm(path: str | Path) -> ArmProfile:
             dialect=_dialect(path, table),
             baud=checks.integer(path, "baud", table.get("baud", default.baud), 1),
             tick=checks.number(path, "tick_s", table.get("tick_s", default.tick)),
+            lag=checks.number(path, "lag_s", table.get("lag_s", default.lag)),
         )
     except InputError as error:
         if error.where == str(path):
@@ -76,6 +78,7 @@ def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
         "slots = [" + ", ".join(f'"{joint}"' for joint in dialect.slots) + "]",
         f"baud = {profile.baud}",
         f"tick_s = {profile.tick!r}",
+        f"lag_s = {profile.lag!r}",
         "",
         "[limits] # X Y Z in mm, A B C in degrees",
         *(f"{name} = {checks.toml_numbers(getattr(limits, name) / _unit(name))}" for name in LIMITS),

@@ -15,6 +15,7 @@ from planning.kinematics import SimpleArm
 from planning.limits import Limits
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
+LONGEST_LAG = 1.0  # s: nothing moving can be followed that far ahead
 BENCH = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # arm_from_surface under the thesis's home, z up
 
 
@@ -23,6 +24,7 @@ class ArmProfile:
     """One arm. InputError names a setting that makes no sense.
 
     arm: its frame and home. limits: what it bears. dialect: its frames. baud: bits/s, 8N1. tick: s between commands.
+    lag: s that it is later at a command's axes than one tick after the command was sent: wire, dead time, servo.
     """
 
     arm: SimpleArm = field(default_factory=SimpleArm)
@@ -30,6 +32,7 @@ class ArmProfile:
     dialect: Dialect = THESIS
     baud: int = 115_200  # thesis 6.2; one public driver uses 9600, at which a frame takes 50 ms
     tick: float = 0.02  # 50 commands a second: faster than any camera here, a fifth of what the wire carries
+    lag: float = 0.024  # 4 ms of wire, and 20 ms that a hobby servo is taken to follow behind until it is measured
 
     def __post_init__(self) -> None:
         if not self.baud > 0:
@@ -37,6 +40,8 @@ class ArmProfile:
         wire = self.frame_time
         if not wire <= self.tick < LEAD / 2:
             raise InputError("arm profile", "tick", self.tick, f"{wire:.5f} s, one frame on the wire, to {LEAD / 2} s")
+        if not 0 <= self.lag <= LONGEST_LAG:
+            raise InputError("arm profile", "lag", self.lag, f"0 to {LONGEST_LAG} s")
         arm, limits = self.arm, self.limits
         if (arm.home < limits.low).any() or (arm.home > limits.high).any():
             allowed = f"within {limits.low.tolist()} and {limits.high.tolist()}"

@@ -23,7 +23,8 @@ class MotionStep:
     def __init__(self, path: Path, profile: ArmProfile | None = None) -> None:
         self.profile = ArmProfile() if profile is None else profile
         settings = self.profile.limits, self.profile.arm, self.profile.tick
-        self._planner, self._guard = Planner(path, *settings), Guard(*settings, path.zone)
+        lag = self.profile.lag
+        self._planner, self._guard = Planner(path, *settings, lag), Guard(*settings, path.zone, lag)
 
     def __call__(self, pose: SurfacePose | None, now: float) -> bytes:
         """One frame for the tick at `now`, s: G1 of a move, G4 of a hold. pose: the newest there is."""

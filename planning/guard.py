@@ -24,13 +24,15 @@ LINEAR = 3  # X Y Z are mm, the rest rad
 class Guard:
     """Checks commands in the order in which they are sent."""
 
-    def __init__(self, limits: Limits, arm: SimpleArm, tick: float, zone: Array | None = None) -> None:
-        """zone: (2, 3) mm, low and high corner in the surface frame of where is printed; without it, everywhere.
+    def __init__(
+        self, limits: Limits, arm: SimpleArm, tick: float, zone: Array | None = None, lag: float = 0.0
+    ) -> None:
+        """lag: s that the arm is later at a command's axes than one tick after the command. zone: (2, 3) mm, low and high corner in the surface frame of where is printed; without it, everywhere.
 
         How well the surface is known and how fast it moves counts at the place of the zone that is nearest the nozzle:
         far from it, on the way from home, a small turn of the surface is no reason to stop.
         """
-        self._limits, self._arm, self._tick = limits, arm, tick
+        self._limits, self._arm, self._tick, self._lag = limits, arm, tick, lag
         self._zone = np.array([[-np.inf] * 3, [np.inf] * 3]) if zone is None else zone
         self._axes = arm.home.copy()  # the last let through
         self._stamp = -math.inf
@@ -114,7 +116,7 @@ class Guard:
             return f"the surface moves at {speed:.2f} mm/s, limit {limits.surface_speed:g} mm/s"
         if (turn := math.hypot(*pose.twist[:3])) > limits.surface_turn:
             return f"the surface turns at {np.rad2deg(turn):.2f} degrees/s, limit {np.rad2deg(limits.surface_turn):g}"
-        error = _error(pose, place, age + self._tick)
+        error = _error(pose, place, age + self._tick + self._lag)
         if not error <= limits.pose_error:
             return f"the place under the nozzle is known to {error:.3f} mm, limit {limits.pose_error:g} mm"
         return ""

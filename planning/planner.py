@@ -35,20 +35,25 @@ SLOWEST = 1.0  # mm/s, feed of a move that only turns
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far the print is. checkpoint: the one being printed, of `total`; place: of `length` mm of path."""
+    """How far the print is. checkpoint: the one being printed, of `total`; place: of `length` mm of path.
+
+    fraction: the same place counted in checkpoints: 2.35 is 35 % of the way from checkpoint 2 to 3.
+    """
 
     phase: Phase
     checkpoint: int
     total: int
     place: float
     length: float
+    fraction: float
 
 
 class Planner:
     """Decides each tick where the nozzle goes next; remembers the place on the path and the arm's commanded motion."""
 
-    def __init__(self, path: Path, limits: Limits, arm: SimpleArm, tick: float) -> None:
-        self._path, self._limits, self._arm, self._tick = check_path(path), limits, arm, tick
+    def __init__(self, path: Path, limits: Limits, arm: SimpleArm, tick: float, lag: float = 0.0) -> None:
+        """tick: s between calls. lag: s that the arm is later at a command's axes than one tick after the command."""
+        self._path, self._limits, self._arm, self._tick, self._lag = check_path(path), limits, arm, tick, lag
         self._curve = curve_through(path.surface_from_nozzle, path.speed[1:], CORNER, SWERVE)
         self._zone = path.zone
         self._follower = Follower(arm.home, limits, tick)
@@ -66,8 +71,10 @@ class Planner:
             return self._stop(now, "path finished")
         if pose is None:
             return self._stop(now, "no pose yet")
-        reason = self._doubt(pose, now) or self._keep_leg(pose, now)
-        if reason:
+        if reason := self._doubt(pose, now):
+            return self._stop(now, reason)
+        pose = _late(pose, self._lag)
+        if reason := self._keep_leg(pose, now):
             return self._stop(now, reason)
         if self._finished:
             return self._stop(now, "path finished")
@@ -82,13 +89,14 @@ class Planner:
     def progress(self) -> Progress:
         """How far the print is."""
         phase = Phase.FINISHED if self._finished else Phase.WAITING if self._leg is None else self._leg.phase
-        return Progress(phase, self._checkpoint(), len(self._path), self._place, self._curve.length)
+        fraction = float(np.interp(self._place, self._curve.knots, np.arange(len(self._path))))
+        return Progress(phase, self._checkpoint(), len(self._path), self._place, self._curve.length, fraction)
 
     # -- whether to move
 
     def _doubt(self, pose: SurfacePose, now: float) -> str:
         """Why the pose must not be followed, "" if it may."""
-        limits, then = self._limits, now + self._tick
+        limits, then = self._limits, now + self._tick + self._lag
         if not _finite(pose):
             return "the pose is not finite"
         if not pose.state.measured:
@@ -227,6 +235,11 @@ class Planner:
         got, low, high = np.rad2deg(shown) if axis > 2 else shown
         allowed = f"{low:g} to {high:g} {'degrees' if axis > 2 else 'mm'}"
         return f"checkpoint {self._checkpoint()} is out of reach: {'XYZABC'[axis]} = {got:.1f}, allowed {allowed}"
+
+
+def _late(pose: SurfacePose, lag: float) -> SurfacePose:
+    """The pose that an arm late by `lag` s will meet, under the stamp at which it is planned for."""
+    return replace(pose.predict(pose.stamp + lag), stamp=pose.stamp)
 
 
 def _finite(pose: SurfacePose) -> bool:

@@ -24,7 +24,7 @@ def same(a: ArmProfile, b: ArmProfile) -> bool:
         (getattr(x, f.name), getattr(y, f.name)) for x, y in ((a.arm, b.arm), (a.limits, b.limits)) for f in fields(x)
     ]
     numbers = all(np.allclose(x, y, rtol=1e-14, atol=1e-14) for x, y in pairs)
-    return numbers and (a.dialect, a.baud, a.tick) == (b.dialect, b.baud, b.tick)
+    return numbers and (a.dialect, a.baud, a.tick, a.lag) == (b.dialect, b.baud, b.tick, b.lag)
 
 
 @given(st.integers(0, 10_000))
@@ -36,6 +36,7 @@ def test_a_profile_comes_back(tmp_path_factory: pytest.TempPathFactory, seed: in
         Dialect(int(draw.integers(2)), ("J5", "J4", "J6")),
         int(draw.integers(57_600, 1_000_000)),
         draw.uniform(0.01, 0.04),
+        draw.uniform(0, 0.5),
     )
     file = tmp_path_factory.mktemp("arm") / "arm.toml"
     write_arm(file, profile, "made up\nfor a test")
@@ -61,6 +62,8 @@ def test_what_a_file_leaves_out_keeps_its_default(tmp_path: Path) -> None:
         ('slots = ["J4", "J4", "J6"]', ["slots", "each once"]),
         ("slots = 3", ["slots"]),
         ("tick_s = nan", ["tick_s", "finite"]),
+        ("lag_s = -0.01", ["lag", "0 to 1"]),
+        ("lag_s = 1.01", ["lag", "0 to 1"]),
         ("home_mm_deg = [0, 0]", ["home_mm_deg", "6 finite numbers"]),
         ("home_mm_deg = [0, 0, 9000, 0, 0, 0]", ["home", "within"]),
         ("arm_from_base = [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", ["arm_from_base", "rigid motion"]),

@@ -174,6 +174,12 @@ def test_drift_makes_a_pose_worth_less_with_time() -> None:
     assert isinstance(judged(move(axes(0.5)), replace(drifting, stamp=1.0)), Move)
 
 
+def test_a_late_arm_asks_more_of_a_pose() -> None:
+    drifting = pose(1.0, twist_covariance=np.diag([0.0, 0, 0, 100, 0, 0]))  # 10 mm/s
+    for lag, passes in ((0.0, True), (0.033, True), (0.034, False)):  # 0.5 mm after 49 ms, a tick of it
+        assert isinstance(Guard(WIDE, ARM, TICK, lag=lag)(move(axes(0.5)), drifting, 1.0), Move) is passes
+
+
 def test_a_turning_surface_is_fast_far_from_its_axis() -> None:
     turning = pose(1.0, twist=axes(0, 0, 0.5))
     assert isinstance(judged(move(axes(100)), turning, begin=axes(100.0)), Move)

@@ -129,6 +129,38 @@ def test_checkpoints_are_counted_and_their_extrusion_obeyed() -> None:
     assert {2, 4} <= on_lines
 
 
+@pytest.mark.parametrize("lag", [0.0, 0.03, 0.2])
+def test_a_late_arm_is_sent_to_where_the_surface_will_be(lag: float) -> None:
+    """A surface at constant velocity: what is commanded for a tick's end fits the surface `lag` s after it."""
+
+    def gliding(t: float) -> Array:
+        return REST @ se3.make(np.eye(3), np.array([12.0 * (t - 10), -5.0 * (t - 10), 0.0]))
+
+    planner = Planner(raster(), LIMITS, CLOSE, TICK, lag)
+    off = []
+    for k in range(300):
+        now = 10 + k * TICK
+        command = planner(pose_at(gliding, now), now)
+        if isinstance(command, Move) and command.extrude:
+            surface = gliding(now + TICK + lag)
+            place = planner._curve.poses(np.array([planner.progress.place]))[0]
+            off.append(command.axes[:3] - (surface @ place)[:3, 3])
+    assert len(off) > 50
+    assert np.abs(off).max() < 0.02  # in corners and at the start
+    assert np.median(np.abs(off)) < 1e-6
+
+
+def test_progress_counts_in_checkpoints_too() -> None:
+    planner = Planner(raster(lines=2, speed=10.0), LIMITS, CLOSE, TICK)
+    for k in range(300):
+        planner(pose_at(still, 10 + k * TICK), 10 + k * TICK)
+        knots = planner._curve.knots
+        i = min(int(planner.progress.fraction), len(knots) - 2)
+        share = planner.progress.fraction - i
+        assert np.isclose(planner.progress.place, knots[i] + share * (knots[i + 1] - knots[i]))
+    assert planner.progress.fraction == planner.progress.total - 1
+
+
 def test_the_speed_of_each_checkpoint_is_its_way_there() -> None:
     path = raster(size=20, lines=2)
     result = run(replace(path, speed=np.array([1.0, 4, 8, 2])), exact(still, 30))
