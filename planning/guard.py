@@ -27,10 +27,11 @@ class Guard:
     def __init__(
         self, limits: Limits, arm: SimpleArm, tick: float, zone: Array | None = None, lag: float = 0.0
     ) -> None:
-        """lag: s that the arm is later at a command's axes than one tick after the command. zone: (2, 3) mm, low and high corner in the surface frame of where is printed; without it, everywhere.
+        """lag: s that the arm is later at a command's axes than one tick after the command.
 
-        How well the surface is known and how fast it moves counts at the place of the zone that is nearest the nozzle:
-        far from it, on the way from home, a small turn of the surface is no reason to stop.
+        zone: (2, 3) mm, low and high corner in the surface frame of where is printed; without it, everywhere. How well
+        the surface is known and how fast it moves counts at the place of the zone that is nearest the nozzle: far from
+        it, on the way from home, a small turn of the surface is no reason to stop.
         """
         self._limits, self._arm, self._tick, self._lag = limits, arm, tick, lag
         self._zone = np.array([[-np.inf] * 3, [np.inf] * 3]) if zone is None else zone
