@@ -25,11 +25,12 @@ NEES_BOUND = 12.592  # chi-square of 6 degrees of freedom, 95 %
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Median, root mean square, 95th percentile and maximum of errors; NaN where there are none."""
+    """Median, root mean square, 95th and 99th percentile and maximum of errors; NaN where there are none."""
 
     median: float
     rmse: float
     p95: float
+    p99: float
     max: float
 
 
@@ -78,11 +79,11 @@ class Comparison:
 
 
 def spread(errors: Array) -> Spread:
-    """The four figures of `errors` (M,), in their own unit."""
+    """The figures of `errors` (M,), none below 0, in their own unit."""
     if not len(errors):
-        return Spread(*[float("nan")] * 4)
-    rmse = float(np.sqrt(np.mean(errors**2)))
-    return Spread(float(np.median(errors)), rmse, float(np.percentile(errors, 95)), float(errors.max()))
+        return Spread(*[float("nan")] * 5)
+    median, p95, p99, top = np.percentile(errors, [50, 95, 99, 100])
+    return Spread(float(median), float(np.sqrt(np.mean(errors**2))), float(p95), float(p99), float(top))
 
 
 def associate(stamps: Array, truth_stamps: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

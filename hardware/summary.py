@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,7 @@ def as_dict(result: Evaluation) -> dict[str, Any]:
         "initialisation_frame_sets": late.initial_sets,
         "errors": None if result.comparison is None else _comparison_dict(result.comparison),
     }
-    cleaned: dict[str, Any] = _finite(summary)
+    cleaned: dict[str, Any] = finite(summary)
     return cleaned
 
 
@@ -90,24 +91,25 @@ def _comparison_dict(comparison: Comparison) -> dict[str, Any]:
 
 def _errors_dict(errors: Errors) -> dict[str, Any]:
     return {
-        "translation_mm": _spread_dict(spread(errors.translation)),
-        "rotation_deg": _spread_dict(spread(np.degrees(errors.rotation))),
+        "translation_mm": spread_dict(spread(errors.translation)),
+        "rotation_deg": spread_dict(spread(np.degrees(errors.rotation))),
         "nees_over_6": errors.mean_nees / 6,
         "nees_inside_95": errors.nees_inside,
         "truth_surface_from_estimated_surface": errors.truth_surface_from_estimated_surface.tolist(),
     }
 
 
-def _spread_dict(value: Spread) -> dict[str, float]:
-    return {"median": value.median, "rmse": value.rmse, "p95": value.p95, "max": value.max}
+def spread_dict(value: Spread) -> dict[str, float]:
+    """The figures of a spread by name, in its own unit."""
+    return asdict(value)
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """The same value with every number that JSON cannot hold as None, and numpy's floats as Python's."""
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return value
