@@ -1,0 +1,140 @@
+"""Made-up nozzle logs whose error is known: what the error, the deposit, their file and their page are tested on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import se3
+from estimation.se3 import Array
+from hardware.simulator.nozzle_log import NozzleLog
+from hardware.simulator.planned_line import planned_line
+from planning.path import Path
+from tests.moving import REST
+
+Motion = Callable[[Array], Array]  # stamps (N,) s -> base_from_surface (N, 4, 4)
+
+
+def still(stamps: Array) -> Array:
+    """A surface that does not move."""
+    return np.broadcast_to(REST, (len(stamps), 4, 4)).copy()
+
+
+def breathing(stamps: Array) -> Array:
+    """10 mm up and down and 3 degrees of tilt, 15 times a minute."""
+    phase = 2 * np.pi * 0.25 * stamps
+    none = np.zeros_like(phase)
+    xi = np.stack([0.03 * np.sin(phase), 0.02 * np.cos(phase), none, none, none, 5 * np.sin(phase)], axis=-1)
+    return np.asarray(REST @ se3.exp(xi))
+
+
+def sliding(velocity: Array) -> Motion:
+    """A surface at constant velocity (3,), mm/s."""
+
+    def motion(stamps: Array) -> Array:
+        return se3.make(REST[:3, :3], REST[:3, 3] + stamps[:, None] * velocity)
+
+    return motion
+
+
+def due_place(path: Path, stamps: Array) -> Array:
+    """Place (N,) on the path, mm, at the speeds of its checkpoints, from 0 s on; it stays at the end."""
+    line = planned_line(path)
+    due = np.concatenate([[0.0], np.cumsum(np.diff(line.knots) / path.speed[1:])])
+    return np.interp(stamps, due, line.knots)
+
+
+def duration(path: Path) -> float:
+    """How long the path takes, s."""
+    return float(np.sum(np.diff(planned_line(path).knots) / path.speed[1:]))
+
+
+def on_path(path: Path, place: Array) -> Array:
+    """surface_from_nozzle (N, 4, 4) at places (N,), mm: straight from checkpoint to checkpoint."""
+    line, poses = planned_line(path), path.surface_from_nozzle
+    piece = line.piece(place)
+    share = (place - line.knots[piece]) / np.diff(line.knots)[piece]
+    return se3.interpolate(poses[piece], poses[piece + 1], share)
+
+
+def nozzle_log(
+    path: Path,
+    motion: Motion = still,
+    delay: float = 0.0,
+    offset: Array | None = None,
+    turn: Array | None = None,
+    seconds: float | None = None,
+    held: Callable[[Array], NDArray[np.str_]] | None = None,
+) -> NozzleLog:
+    """A nozzle that is where the target was `delay` s ago, off by `offset` (3,) mm in the surface frame.
+
+    turn: (3,) rad, of the nozzle in its own frame. seconds: s, all of the path by default. held: reason (N,) of the
+    rows (N,) by stamp, "" where it prints; held rows do not extrude, and the path does not go on in them.
+    """
+    stamps = np.arange(round((duration(path) if seconds is None else seconds) * 1000) + 1) / 1000
+    reason = np.zeros(len(stamps), "U1") if held is None else held(stamps)
+    moving = reason == ""
+    clock = np.concatenate([[0.0], np.cumsum(moving[1:] * 1e-3)])
+
+    def due(t: Array) -> Array:
+        return due_place(path, np.interp(t, stamps, clock))
+
+    surface, place = motion(stamps), due(stamps)
+    late = motion(stamps - delay) @ on_path(path, due(stamps - delay))
+    nozzle = late @ se3.exp([*(np.zeros(3) if turn is None else turn), 0, 0, 0])
+    if offset is not None:
+        nozzle[:, :3, 3] += surface[:, :3, :3] @ offset
+    line = planned_line(path)
+    piece = line.piece(place)
+    return NozzleLog(
+        stamps=stamps,
+        base_from_surface=surface,
+        base_from_nozzle=nozzle,
+        base_from_target=surface @ on_path(path, place),
+        place=place,
+        checkpoint=piece + 1,
+        extrude=line.printed[piece] & moving,
+        reason=reason,
+        surface_from_tip=(se3.inverse(surface) @ nozzle)[:, :3, 3],
+    )
+
+
+def straight(length: float = 20.0, speed: float = 5.0) -> Path:
+    """One upright line of `length` mm along x through the surface's origin."""
+    return through(np.array([[-length / 2, 0, 0], [length / 2, 0, 0]]), speed)
+
+
+def through(points: Array, speed: float = 5.0, extrude: Array | None = None, layer: Array | None = None) -> Path:
+    """An upright path through points (N, 3), mm."""
+    count = len(points)
+    return Path(
+        se3.make(np.eye(3), points),
+        np.full(count, speed),
+        np.ones(count, np.int64),
+        np.full(count, 20.0),
+        np.zeros(count, np.int64) if layer is None else layer,
+        np.ones(count, bool) if extrude is None else extrude,
+    )
+
+
+def part(log: NozzleLog, rows: slice) -> NozzleLog:
+    """Some rows of a log."""
+    return NozzleLog(**{name: getattr(log, name)[rows] for name in NozzleLog.__slots__})
+
+
+def joined(logs: list[NozzleLog]) -> NozzleLog:
+    """Logs one after the other."""
+    return NozzleLog(**{name: np.concatenate([getattr(log, name) for log in logs]) for name in NozzleLog.__slots__})
+
+
+def without_target(log: NozzleLog, rows: slice) -> NozzleLog:
+    """The log with no target in some rows."""
+    target, place = log.base_from_target.copy(), log.place.copy()
+    target[rows] = np.nan
+    place[rows] = np.nan
+    checkpoint = log.checkpoint.copy()
+    checkpoint[rows] = -1
+    return replace(log, base_from_target=target, place=place, checkpoint=checkpoint)

@@ -1,0 +1,261 @@
+"""The laws of the error at the nozzle: nothing wrong gives zero, and what was planted comes out as itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimation import se3
+from estimation.se3 import Array
+from hardware.simulator.hold_reasons import hold_spans, holds_of
+from hardware.simulator.lag import SEARCH, lag_of
+from hardware.simulator.nozzle_error import NozzleErrors, NozzleFigures, nozzle_errors, nozzle_figures
+from hardware.simulator.nozzle_log import NozzleLog
+from hardware.simulator.planned_line import planned_line
+from planning.path import Path
+from tests.moving import raster
+from tests.nozzle_logs import breathing, joined, nozzle_log, part, sliding, straight, through, without_target
+
+FEW = settings(max_examples=10, deadline=None)
+vectors = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
+
+
+def judged(log: NozzleLog, path: Path) -> tuple[NozzleErrors, NozzleFigures]:
+    line = planned_line(path)
+    errors = nozzle_errors(log, line)
+    return errors, nozzle_figures(log, line, errors)
+
+
+# -- error
+
+
+def test_a_perfect_run_has_no_error_and_full_duty() -> None:
+    path = raster()
+    _, figures = judged(nozzle_log(path, breathing), path)
+    for spread in (figures.position, figures.along, figures.across, figures.normal, figures.path, figures.angle):
+        assert spread.max < 1e-6
+    assert (figures.duty, figures.near, figures.finished) == (1.0, 1.0, True)
+    assert figures.holds == ()
+    assert abs(figures.lag.seconds) < 1e-4
+
+
+@FEW
+@given(vectors)
+def test_a_known_offset_comes_out_as_itself(offset: Array) -> None:
+    path = raster()
+    errors, figures = judged(nozzle_log(path, breathing, offset=offset), path)
+    assert np.allclose(errors.vector, offset, atol=1e-9)
+    assert np.allclose(figures.offset, offset, atol=1e-9)
+    assert figures.position.rmse == pytest.approx(np.linalg.norm(offset), abs=1e-9)
+    assert figures.position.median == pytest.approx(figures.position.max, abs=1e-9)
+
+
+@FEW
+@given(vectors, st.integers(0, 10_000))
+def test_the_parts_of_the_error_are_the_whole_on_any_surface_and_path(offset: Array, seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    tilted = se3.exp(np.concatenate([draw.normal(size=(6, 3)) * 0.3, draw.normal(size=(6, 3)) * 10], axis=1))
+    path = replace(raster(), surface_from_nozzle=tilted)
+    errors, _ = judged(nozzle_log(path, breathing, offset=offset, seconds=1.0), path)
+    assert np.allclose(np.linalg.norm(errors.split, axis=1), errors.distance, atol=1e-9)
+
+
+def test_ahead_left_and_up_are_positive() -> None:
+    path = straight()
+    for i, offset in enumerate(np.eye(3)):
+        errors, _ = judged(nozzle_log(path, breathing, offset=offset), path)
+        assert np.allclose(errors.split, np.eye(3)[i], atol=1e-9)
+
+
+@FEW
+@given(st.floats(1e-7, 1.0), st.floats(0, 6.28))
+def test_a_tilt_of_the_nozzle_is_the_angle_and_a_turn_about_its_axis_is_none(tilt: float, about: float) -> None:
+    path = straight()
+    turn = tilt * np.array([np.cos(about), np.sin(about), 0])
+    errors, _ = judged(nozzle_log(path, breathing, turn=turn, seconds=0.1), path)
+    assert np.allclose(errors.angle, tilt, rtol=1e-6, atol=1e-10)
+    errors, _ = judged(nozzle_log(path, breathing, turn=np.array([0, 0, tilt]), seconds=0.1), path)
+    assert errors.angle.max() < 1e-9
+
+
+@FEW
+@given(st.floats(0.002, 0.2), vectors.filter(lambda v: np.linalg.norm(v) > 0.3))
+def test_a_known_delay_of_a_surface_at_constant_speed_is_speed_times_delay(delay: float, direction: Array) -> None:
+    velocity = 10 * direction
+    path = straight(length=10.0, speed=2.0)
+    _, figures = judged(part(nozzle_log(path, sliding(velocity), delay), slice(300, None)), path)
+    relative = np.linalg.norm(velocity + [2.0, 0, 0])
+    if relative > 2:
+        assert figures.position.rmse == pytest.approx(relative * delay, rel=0.01)
+        assert figures.lag.seconds == pytest.approx(delay, abs=1e-4)
+
+
+@FEW
+@given(st.floats(-0.2, 0.2))
+def test_a_known_delay_of_a_breathing_surface_is_the_lag(delay: float) -> None:
+    path = straight(length=30.0)
+    figures = judged(part(nozzle_log(path, breathing, delay), slice(300, 5700)), path)[1]
+    assert figures.lag.seconds == pytest.approx(delay, abs=1e-4)
+
+
+def test_noise_does_not_move_the_lag_much() -> None:
+    log = nozzle_log(straight(length=30.0), breathing, 0.0304)
+    log.base_from_nozzle[:, :3, 3] += np.random.default_rng(3).normal(size=(len(log), 3)) * 0.05
+    assert lag_of(log).seconds == pytest.approx(0.0304, abs=1e-3)
+
+
+def test_the_lag_of_what_hardly_moves_or_is_too_late_cannot_be_told() -> None:
+    slow, quick = straight(length=5.0, speed=0.9), straight(length=30.0)
+    assert np.isnan(lag_of(nozzle_log(slow)).seconds)
+    assert np.isfinite(lag_of(nozzle_log(straight(length=5.0, speed=1.1))).seconds)
+    assert np.isnan(lag_of(part(nozzle_log(quick, delay=SEARCH + 0.05), slice(400, None))).seconds)
+    assert np.isnan(lag_of(nozzle_log(quick, seconds=2 * SEARCH - 0.01)).seconds)
+
+
+def test_the_lag_is_not_measured_across_a_gap() -> None:
+    path = straight(length=30.0)
+    log = nozzle_log(path, breathing, 0.03)
+    pieces = [part(log, slice(a, a + 450)) for a in range(0, 5000, 1000)]
+    assert np.isnan(lag_of(joined(pieces)).seconds)
+    assert np.isnan(lag_of(without_target(part(log, slice(0, 900)), slice(450, 451))).seconds)
+
+
+# -- the printed line
+
+
+@FEW
+@given(st.integers(0, 10_000))
+def test_the_distance_to_the_line_is_that_of_the_nearest_of_many_points_on_it(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    path = through(draw.normal(size=(7, 3)) * 10, extrude=np.array([0, 1, 0, 1, 1, 0, 1], bool))
+    points = draw.normal(size=(40, 3)) * 15
+    corners = path.surface_from_nozzle[:, :3, 3]
+    share = np.linspace(0, 1, 2001)[:, None]
+    dense = np.concatenate(
+        [(1 - share) * corners[i - 1] + share * corners[i] for i in np.flatnonzero(path.extrude) if i]
+    )
+    expected = np.linalg.norm(points[:, None] - dense, axis=2).min(axis=1)
+    assert np.allclose(planned_line(path).distance(points), expected, atol=1e-3)
+
+
+def test_being_late_is_no_distance_from_the_line() -> None:
+    path = straight()
+    _, figures = judged(part(nozzle_log(path, delay=0.1), slice(200, None)), path)
+    assert figures.position.rmse == pytest.approx(0.5, abs=1e-6)
+    assert figures.along.rmse == pytest.approx(0.5, abs=1e-6)
+    assert figures.path.max < 1e-9
+
+
+def test_a_path_that_prints_nothing_has_no_line() -> None:
+    path = through(np.array([[0.0, 0, 0], [5, 0, 0]]), extrude=np.zeros(2, bool))
+    _, figures = judged(nozzle_log(path), path)
+    assert np.isnan([figures.path.max, figures.duty, figures.position.max, figures.near]).all()
+
+
+def test_a_turn_on_the_spot_has_the_direction_of_the_piece_before() -> None:
+    poses = se3.make(np.eye(3), np.array([[0.0, 0, 0], [0, 4, 0], [0, 4, 0], [3, 4, 0]]))
+    poses[2:, :3, :3] = se3.exp_rotation([0, 0, 0.5])
+    line = planned_line(replace(through(np.zeros((4, 3))), surface_from_nozzle=poses))
+    assert np.allclose(line.direction(), [[0, 1, 0], [0, 1, 0], [1, 0, 0]])
+    assert line.knots.tolist() == pytest.approx([0, 4, 9, 12])
+
+
+# -- duty
+
+
+def held_from(start: float, end: float, reason: str = "surface is LOST"):
+    return lambda t: np.where((t >= start - 1e-9) & (t < end - 1e-9), reason, "")
+
+
+def test_a_hold_costs_duty_and_the_end_of_the_path_costs_none() -> None:
+    path = straight(length=20.0, speed=5.0)
+    log = nozzle_log(path, breathing, seconds=8.0, held=held_from(1.0, 2.0))
+    log.extrude[5000:] = False  # the path is finished after 5 s
+    log.reason[5001:] = "path finished"[: log.reason.itemsize // 4]
+    _, figures = judged(log, path)
+    assert figures.finished
+    assert figures.duty == pytest.approx(0.8, abs=1e-3)
+    assert figures.extruding == pytest.approx(4.0, abs=2e-3)
+    assert figures.printing == pytest.approx(5.0, abs=2e-2)
+    assert [(h.reason, h.count) for h in figures.holds] == [("surface is LOST", 1)]
+    assert figures.holds[0].seconds == pytest.approx(1.0)
+    assert figures.holds[0].first == pytest.approx(1.0)
+
+
+def test_a_run_that_never_finishes_pays_until_its_end() -> None:
+    path = straight(length=20.0, speed=5.0)
+    _, figures = judged(nozzle_log(path, seconds=4.0, held=held_from(1.0, 99.0)), path)
+    assert not figures.finished
+    assert figures.duty == pytest.approx(0.25, abs=1e-3)
+
+
+def test_travel_and_the_way_there_are_not_part_of_duty() -> None:
+    corners = np.array([[0.0, 0, 0], [5, 0, 0], [5, 5, 0], [0, 5, 0]])
+    path = through(corners, extrude=np.array([True, True, False, True]))
+    log = nozzle_log(path)
+    way = without_target(replace(log, extrude=np.zeros(len(log), bool)), slice(None))
+    _, figures = judged(joined([replace(way, stamps=way.stamps - 10), log]), path)
+    assert figures.duty == 1.0
+    assert figures.printing == pytest.approx(2.0, abs=2e-3)
+
+
+def test_what_extrudes_nothing_has_no_duty_and_no_error() -> None:
+    path = straight()
+    log = nozzle_log(path)
+    log.extrude[:] = False
+    _, figures = judged(log, path)
+    assert figures.duty == 0.0
+    assert np.isnan(figures.position.rmse)
+
+
+def test_an_empty_log_has_no_figures() -> None:
+    path = straight()
+    _, figures = judged(part(nozzle_log(path), slice(0, 0)), path)
+    assert np.isnan([figures.duty, figures.position.max, figures.lag.seconds]).all()
+
+
+def test_extruding_without_a_target_is_told_and_not_near() -> None:
+    path = straight()
+    log = without_target(nozzle_log(path), slice(1000, 1100))
+    _, figures = judged(log, path)
+    assert figures.untold == pytest.approx(0.1)
+    assert figures.near == pytest.approx(1 - 100 / len(log))
+    assert figures.position.max < 1e-9
+
+
+def test_the_share_near_the_target_ends_at_half_a_millimetre() -> None:
+    path = straight()
+    for off, near in ((0.5 - 1e-9, 1.0), (0.5 + 1e-9, 0.0)):
+        assert judged(nozzle_log(path, offset=np.array([0, off, 0])), path)[1].near == near
+
+
+# -- holds
+
+
+def spans_of(reasons: list[str]) -> tuple[list[str], list[float], list[float]]:
+    spans = hold_spans(np.arange(len(reasons)) * 0.001, np.array(reasons), 0.001)
+    return [s.reason for s in spans], [s.start for s in spans], [s.end for s in spans]
+
+
+def test_a_reason_whose_numbers_change_is_one_hold() -> None:
+    reasons, starts, ends = spans_of(["", *["pose is 0.181 s old"] * 2, "pose is 0.201 s old", "", "LOST", "no pose"])
+    assert reasons == ["pose is 0.181 s old", "LOST", "no pose"]
+    assert starts == pytest.approx([0.001, 0.005, 0.006])
+    assert ends == pytest.approx([0.004, 0.006, 0.007])
+
+
+def test_holds_of_one_kind_keep_the_numbers_they_share() -> None:
+    texts = ["", "cam2: -0.301 s old, limit 0.18 s", "", "cam2: 0.302 s old, limit 0.18 s", "cam3: 1 s old, limit 2 s"]
+    found = holds_of(hold_spans(np.arange(5) * 0.001, np.array(texts), 0.001))
+    assert [(h.reason, h.count) for h in found] == [("cam2: … s old, limit 0.18 s", 2), (texts[-1], 1)]
+    assert found[0].longest == pytest.approx(0.001)
+
+
+def test_a_gap_in_the_stamps_ends_a_hold() -> None:
+    stamps = np.array([0.0, 0.001, 0.5, 0.501])
+    assert len(hold_spans(stamps, np.array(["a"] * 4), 0.001)) == 2
+    assert hold_spans(stamps[:0], np.array([], "U1"), 0.001) == []
