@@ -1,0 +1,227 @@
+"""Motions and waveforms from a scenario's tables: one `[[motion]]` a part, composed in the order of the file.
+
+Every part may have `pivot_mm` (the point its rotation leaves alone) and its own `kind`:
+
+    breathing  period_s or rate_hz, inspiration, exponent, period_spread, depth_spread, sighs_per_min, sigh_factor,
+               pauses_per_min, pause_s                                        } of these four:
+    pulse      rate_hz, rate_spread, depth_spread                             } amplitude_mm along direction [x, y, z]
+    sine       rate_hz, phase_deg; mm_per_frame and fps for amplitude_mm      } (out of the surface), turn_deg [x, y, z]
+    steps      every_s, rise_s, start_s, pattern "turns" or "stairs"; its amplitude is height_mm }
+    tremor     rms_mm [x, y, z], rms_deg [x, y, z], band_hz
+    hand       the same, slower and counted from where it is at 0 s
+    drift      speed_mm_s, speed_deg_s [x, y, z]; walk_mm, walk_deg: RMS of a random walk after a minute
+    ramp       speed_mm_s, speed_deg_s, start_s, end_s (none: for ever), back, round_s
+    constant   the thesis's cube: unit_mm, speed_units_s, turn_deg_s, direction, axis, travel_s, round_s
+    turn       angles_deg, axis, duration_s, hold_s, start_s, repeat
+    trace      file, unit, rate_hz, start_s, scale, rotation, smooth_s, loop "back" or "hold"
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.checks import Table
+from hardware.simulator.draws import WIDEST, BreathingSpec, draw_breathing, draw_noise, draw_pulse, draw_walk
+from hardware.simulator.keys import Keys
+from hardware.simulator.motions import FRAMES_PER_S, Driven, Motion, Part, shaking_amplitude
+from hardware.simulator.trace_file import read_trace
+from hardware.simulator.traces import traced
+from hardware.simulator.waveforms import Corners, Levels, Sine, Steps, Waveform, Zigzag
+
+MOTION_STREAM = 1  # of the scenario's seed: no other draw of the simulator shares it
+OUTWARD = (0.0, 0.0, 1.0)  # the surface's normal
+UNIT_MM = 100.0  # the thesis's cube has an edge of 1 unit, 282 px: at 400 mm before 1109 px of focal length, 102 mm
+WIDEST_SPREAD = 0.9 / WIDEST  # no breath and no beat may come out with no length
+
+Random = np.random.Generator
+
+
+def motion_from_tables(where: object, tables: list[Table], folder: Path, seed: int) -> Motion:
+    """The motion that `[[motion]]` tables describe, none for a surface at rest.
+
+    folder: what a trace's file is relative to. seed: >= 0; part i draws from it and i alone. InputError names the key.
+    """
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        raise InputError(where, "motion", tables, "[[motion]] tables")
+    return Motion(tuple(_part(where, i, table, folder, seed) for i, table in enumerate(tables)))
+
+
+def waveform_from_table(where: object, key: str, table: Table, rng: Random) -> Waveform:
+    """A waveform alone, of height 1: a table `key` of kind breathing, pulse, sine or steps, without amplitude."""
+    if not isinstance(table, dict):
+        raise InputError(where, key, table, f"a table [{key}]")
+    keys = Keys(where, f"{key}.", table)
+    wave = WAVES[keys.word("kind", list(WAVES))](keys, rng)
+    keys.done()
+    return wave
+
+
+def _part(where: object, number: int, table: Table, folder: Path, seed: int) -> Part:
+    keys = Keys(where, f"motion[{number}].", table)
+    kind = keys.word("kind", [*WAVES, *PARTS])
+    rng = np.random.default_rng([seed, MOTION_STREAM, number])
+    pivot = keys.vector("pivot_mm", (0.0, 0.0, 0.0))
+    part = _driven(keys, kind, rng, pivot) if kind in WAVES else PARTS[kind](keys, rng, pivot, folder)
+    keys.done()
+    return part
+
+
+def _driven(keys: Keys, kind: str, rng: Random, pivot: Array) -> Driven:
+    """One waveform along one direction."""
+    wave = WAVES[kind](keys, rng)
+    direction, turn = keys.axis("direction", OUTWARD), np.deg2rad(keys.vector("turn_deg", (0.0, 0.0, 0.0)))
+    name = "height_mm" if kind == "steps" else "amplitude_mm"
+    if kind == "sine" and keys.has("mm_per_frame"):
+        if keys.has(name):
+            raise InputError(keys.where, keys.prefix + name, keys.table[name], "none beside mm_per_frame")
+        fps = keys.number("fps", FRAMES_PER_S, 0, open=True)
+        amplitude = shaking_amplitude(keys.number("mm_per_frame"), keys.number("rate_hz"), fps)
+    else:
+        amplitude = keys.number(name, 0.0 if turn.any() else None)
+    return Driven((wave,), np.concatenate([turn, amplitude * direction])[None], pivot)
+
+
+def _breathing(keys: Keys, rng: Random) -> Waveform:
+    usual = BreathingSpec()
+    if keys.has("rate_hz") and keys.has("period_s"):
+        raise InputError(keys.where, keys.prefix + "rate_hz", keys.table["rate_hz"], "one of rate_hz, period_s")
+    rate = keys.number("rate_hz", 1 / usual.period, 0.02, 5)
+    spec = BreathingSpec(
+        period=keys.number("period_s", 1 / rate, 0.2, 50),
+        inspiration=keys.number("inspiration", usual.inspiration, 0.1, 0.9),
+        exponent=keys.number("exponent", usual.exponent, 2, 20),
+        period_spread=keys.number("period_spread", usual.period_spread, 0, WIDEST_SPREAD),
+        depth_spread=keys.number("depth_spread", usual.depth_spread, 0, WIDEST_SPREAD),
+        sighs_per_min=keys.number("sighs_per_min", usual.sighs_per_min, 0, 10),
+        sigh_factor=keys.number("sigh_factor", usual.sigh_factor, 1, 5),
+        pauses_per_min=keys.number("pauses_per_min", usual.pauses_per_min, 0, 10),
+        pause=keys.number("pause_s", usual.pause, 0, 60),
+    )
+    return draw_breathing(spec, rng)
+
+
+def _pulse(keys: Keys, rng: Random) -> Waveform:
+    rate = keys.number("rate_hz", 1.15, 0.2, 5)
+    spreads = [keys.number(name, 0.05, 0, WIDEST_SPREAD) for name in ("rate_spread", "depth_spread")]
+    return draw_pulse(rate, spreads[0], spreads[1], rng)
+
+
+def _sine(keys: Keys, rng: Random) -> Waveform:
+    return Sine(keys.number("rate_hz", None, 0, 50, open=True), math.radians(keys.number("phase_deg", 0.0)))
+
+
+def _steps(keys: Keys, rng: Random) -> Waveform:
+    every = keys.number("every_s", 2.0, 0, open=True)
+    rise = keys.number("rise_s", min(0.05, every), 1e-3, every)
+    first = keys.number("start_s", every, 0)
+    return Steps(first, every, rise, keys.word("pattern", ["turns", "stairs"], "turns") == "stairs")
+
+
+def _tremor(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
+    return _noise(keys, rng, pivot, (8.0, 12.0), 0.0)
+
+
+def _hand(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
+    return _noise(keys, rng, pivot, (0.2, 3.0), 1.0)
+
+
+def _noise(keys: Keys, rng: Random, pivot: Array, band: tuple[float, float], tilt: float) -> Driven:
+    """Six noises of their own; tilt: 1 for one speed at every frequency, as of a hand, counted from its start."""
+    low, high = keys.band("band_hz", band)
+    rms = _six(keys, "rms_mm", "rms_deg", 0.0)
+    waves = tuple(draw_noise(low, high, tilt, rng) for _ in range(6))
+    return Driven(waves, np.diag(rms), pivot, from_start=tilt > 0)
+
+
+def _six(keys: Keys, shift: str, turn: str, low: float = -math.inf) -> Array:
+    """Rotation and shift (6,), rad and mm, of two keys; one of them must be there."""
+    if not keys.has(shift) and not keys.has(turn):
+        raise InputError(keys.where, keys.prefix + shift, "missing", f"{shift} or {turn}, 3 numbers")
+    zero = (0.0, 0.0, 0.0)
+    return np.concatenate([np.deg2rad(keys.vector(turn, zero, low)), keys.vector(shift, zero, low)])
+
+
+def _drift(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
+    speed = np.concatenate([np.deg2rad(keys.vector("speed_deg_s", (0, 0, 0))), keys.vector("speed_mm_s", (0, 0, 0))])
+    walk = np.concatenate([np.deg2rad(keys.vector("walk_deg", (0, 0, 0), 0)), keys.vector("walk_mm", (0, 0, 0), 0)])
+    if not speed.any() and not walk.any():
+        raise InputError(
+            keys.where, keys.prefix + "speed_mm_s", "missing", "speed_mm_s, speed_deg_s, walk_mm or walk_deg"
+        )
+    steady = Corners(np.zeros(1), np.ones(1), 1.0)  # from rest, at full speed after half a second
+    waves: list[Waveform] = [steady, *(draw_walk(rng) for _ in range(6))]
+    return Driven(tuple(waves), np.concatenate([speed[None], np.diag(walk)]), pivot)
+
+
+def _ramp(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
+    speed = _six(keys, "speed_mm_s", "speed_deg_s")
+    rounding = keys.number("round_s", 0.2, 1e-3)
+    start = keys.number("start_s", 0.0)
+    end = keys.number("end_s", math.inf, start + rounding)
+    back = keys.flag("back", False)
+    if math.isinf(end):
+        if back:
+            raise InputError(keys.where, keys.prefix + "end_s", "missing", "this key, where back = true")
+        times, bends = [start], [1.0]
+    elif back:
+        times, bends = [start, end, 2 * end - start], [1.0, -2.0, 1.0]
+    else:
+        times, bends = [start, end], [1.0, -1.0]
+    return Driven((Corners(np.array(times), np.array(bends), rounding),), speed[None], pivot)
+
+
+def _constant(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
+    """The thesis's cube (4.6): constant speed in all six degrees of freedom, 0.3 of both.
+
+    Its unit is the cube's edge; the rotation's is not said, rad/s are taken. It ran on for ever; here it comes back.
+    """
+    unit, speed = keys.number("unit_mm", UNIT_MM, 0, open=True), keys.number("speed_units_s", 0.3)
+    turn = math.radians(keys.number("turn_deg_s", math.degrees(0.3)))
+    along, about = (keys.vector(name, (1.0, 1.0, 1.0)) for name in ("direction", "axis"))
+    travel = keys.number("travel_s", 1.0, 0, open=True)
+    rounding = keys.number("round_s", min(0.2, travel), 1e-3, 2 * travel)
+    return Driven((Zigzag(travel, rounding),), np.concatenate([turn * about, unit * speed * along])[None], pivot)
+
+
+def _turn(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
+    """To each angle and back, with a rest before each change; the thesis's wrist (4.6) turned by 25 and -16 degrees."""
+    angles = keys.list_of_numbers("angles_deg", (25.0, -16.0))
+    axis = keys.axis("axis", OUTWARD)
+    duration, hold = keys.number("duration_s", 1.0, 1e-2), keys.number("hold_s", 1.0, 0)
+    start = keys.number("start_s", hold, 0)
+    starts = start + (duration + hold) * np.arange(2.0 * len(angles))
+    steps = np.stack([angles, -angles], axis=1).ravel()
+    period = float(starts[-1] + duration) if keys.flag("repeat", True) else math.inf
+    return Driven((Levels(starts, steps, duration, period),), np.deg2rad(np.append(axis, np.zeros(3)))[None], pivot)
+
+
+def _trace(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Part:
+    unit = keys.word("unit", ["mm", "m"]) if keys.has("unit") else None
+    rate = keys.number("rate_hz", None, 0, open=True) if keys.has("rate_hz") else None
+    trace = read_trace(folder / keys.text("file"), unit, rate, keys.number("start_s", 0.0, 0))
+    smooth = keys.number("smooth_s", None, 0) if keys.has("smooth_s") else None
+    back = keys.word("loop", ["back", "hold"], "back") == "back"
+    return traced(trace, keys.number("scale", 1.0), keys.flag("rotation", True), smooth, back, pivot)
+
+
+WAVES: dict[str, Callable[[Keys, Random], Waveform]] = {
+    "breathing": _breathing,
+    "pulse": _pulse,
+    "sine": _sine,
+    "steps": _steps,
+}
+PARTS: dict[str, Callable[[Keys, Random, Array, Path], Part]] = {
+    "tremor": _tremor,
+    "hand": _hand,
+    "drift": _drift,
+    "ramp": _ramp,
+    "constant": _constant,
+    "turn": _turn,
+    "trace": _trace,
+}
