@@ -85,7 +85,9 @@ def _check(path: Path, stamps: Array, places: Array, least: float) -> None:
         )
     span = float(np.ptp(places, axis=0).max())
     if 0 < span < least:
-        raise InputError(path, "places span", f"{span:g} mm", f'{least:g} mm or more; if they are metres: unit = "m"')
+        raise InputError(
+            path, "places span", f"{span:g} mm", f'{least:g} mm or more; if they are metres: unit = "m", columns tx_m'
+        )
     if span > MOST:
         raise InputError(path, "places span", f"{span:g} mm", f"at most {MOST:g} mm; are they mm, not metres?")
 
