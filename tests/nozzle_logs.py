@@ -67,15 +67,15 @@ def nozzle_log(
     offset: Array | None = None,
     turn: Array | None = None,
     seconds: float | None = None,
-    held: Callable[[Array], NDArray[np.str_]] | None = None,
+    reasons: Callable[[Array], NDArray[np.str_]] | None = None,
 ) -> NozzleLog:
     """A nozzle that is where the target was `delay` s ago, off by `offset` (3,) mm in the surface frame.
 
-    turn: (3,) rad, of the nozzle in its own frame. seconds: s, all of the path by default. held: reason (N,) of the
-    rows (N,) by stamp, "" where it prints; held rows do not extrude, and the path does not go on in them.
+    turn: (3,) rad, of the nozzle in its own frame. seconds: s, all of the path by default. reasons: (N,) of the rows
+    by stamp, "" where it prints; held rows do not extrude, and the path does not go on in them.
     """
     stamps = np.arange(round((duration(path) if seconds is None else seconds) * 1000) + 1) / 1000
-    reason = np.zeros(len(stamps), "U1") if held is None else held(stamps)
+    reason = np.zeros(len(stamps), "U1") if reasons is None else reasons(stamps)
     moving = reason == ""
     clock = np.concatenate([[0.0], np.cumsum(moving[1:] * 1e-3)])
 
@@ -100,6 +100,11 @@ def nozzle_log(
         reason=reason,
         surface_from_tip=(se3.inverse(surface) @ nozzle)[:, :3, 3],
     )
+
+
+def held(start: float, end: float, reason: str = "surface is LOST") -> Callable[[Array], NDArray[np.str_]]:
+    """A hold from `start` to `end`, s."""
+    return lambda stamps: np.where((stamps >= start - 1e-9) & (stamps < end - 1e-9), reason, "")
 
 
 def straight(length: float = 20.0, speed: float = 5.0) -> Path:

@@ -18,7 +18,7 @@ from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.planned_line import planned_line
 from planning.path import Path
 from tests.moving import raster
-from tests.nozzle_logs import breathing, joined, nozzle_log, part, sliding, straight, through, without_target
+from tests.nozzle_logs import breathing, held, joined, nozzle_log, part, sliding, straight, through, without_target
 
 FEW = settings(max_examples=10, deadline=None)
 vectors = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
@@ -167,13 +167,9 @@ def test_a_turn_on_the_spot_has_the_direction_of_the_piece_before() -> None:
 # -- duty
 
 
-def held_from(start: float, end: float, reason: str = "surface is LOST"):
-    return lambda t: np.where((t >= start - 1e-9) & (t < end - 1e-9), reason, "")
-
-
 def test_a_hold_costs_duty_and_the_end_of_the_path_costs_none() -> None:
     path = straight(length=20.0, speed=5.0)
-    log = nozzle_log(path, breathing, seconds=8.0, held=held_from(1.0, 2.0))
+    log = nozzle_log(path, breathing, seconds=8.0, reasons=held(1.0, 2.0))
     log.extrude[5000:] = False  # the path is finished after 5 s
     log.reason[5001:] = "path finished"[: log.reason.itemsize // 4]
     _, figures = judged(log, path)
@@ -188,7 +184,7 @@ def test_a_hold_costs_duty_and_the_end_of_the_path_costs_none() -> None:
 
 def test_a_run_that_never_finishes_pays_until_its_end() -> None:
     path = straight(length=20.0, speed=5.0)
-    _, figures = judged(nozzle_log(path, seconds=4.0, held=held_from(1.0, 99.0)), path)
+    _, figures = judged(nozzle_log(path, seconds=4.0, reasons=held(1.0, 99.0)), path)
     assert not figures.finished
     assert figures.duty == pytest.approx(0.25, abs=1e-3)
 
