@@ -1,0 +1,32 @@
+"""What the tests of the virtual arm share: where it stands, and frames for it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimation.se3 import Array
+from hardware.protocol import G1, THESIS, encode
+from hardware.simulator.arm_faults import ArmFault
+from hardware.simulator.arm_settings import ArmSettings
+from hardware.simulator.controller import VirtualArm
+
+HOME = np.array([202.5, 225, 113, 0, 0, 0])
+IDEAL = ArmSettings(servo_lag=0.0)
+
+
+def virtual_arm(settings: ArmSettings = IDEAL, *faults: ArmFault) -> VirtualArm:
+    return VirtualArm(settings, THESIS, HOME, faults)
+
+
+def move(feed: float, **axes: float) -> bytes:
+    """A frame that goes to home but for the named axes, x y z in mm and a b c in degrees, at `feed` mm/s."""
+    target = HOME.copy()
+    for name, value in axes.items():
+        target["xyzabc".index(name)] = value if name in "xyz" else np.deg2rad(value)
+    return encode(G1(target, feed))
+
+
+def axes_at(arm: VirtualArm, *instants: float) -> Array:
+    """Executed axes (N, 6), X Y Z in mm and A B C in degrees; time passes as far as needed."""
+    arm.advance(max(arm.now, *instants))
+    return arm.axes_at(np.array(instants)) * np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
