@@ -79,7 +79,7 @@ def _check(path: Path, stamps: Array, places: Array, least: float) -> None:
         k = int(np.argmax(steps <= 0))
         raise InputError(path, f"stamp of pose {k + 2}", stamps[k + 1], f"later than the one before, {stamps[k]} s")
     if steps.max() > LONGEST_GAP:
-        k = int(np.argmax(steps))
+        k = int(np.argmax(steps > LONGEST_GAP))
         raise InputError(
             path, f"gap after {stamps[k]:.10g} s", f"{steps[k]:g} s", f"at most {LONGEST_GAP:g} s (stamps in s)"
         )
