@@ -1,0 +1,146 @@
+"""The picture of the cloth: traced on a coarse lattice, coloured at every pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import se3
+from estimation.se3 import Array
+from hardware.simulator import cloth, nozzle_shape, sheet
+from hardware.simulator.lamps import AMBIENT
+from hardware.simulator.noise import Field
+from hardware.simulator.state import State, moved
+from hardware.simulator.view import Rays, View
+
+LATTICE = 4  # px
+SEARCH = 16  # px between the rays that are searched step by step
+STEPS = 40
+HIGHEST = 40.0  # mm above the rest plane: nothing of the cloth is higher
+DEEPEST = -130.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClothPicture:
+    """light: (H, W, 3) linear BGR of the whole image. depth: (h, w) mm along the optical axis, LATTICE px apart."""
+
+    light: NDArray[np.float32]
+    depth: Field
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Eye:
+    """A camera's rays in the moving grid frame and in the grid at rest: origin (3,) and rotation (3, 3) of each."""
+
+    state: State
+    grid_from_camera: Array
+    rest_from_camera: Array
+
+    def material(self, rays: Rays, depth: Field) -> tuple[Field, Field, Field]:
+        """Where on the cloth (x, y) and how far above its plane (z), mm, (H, W) each, points at `depth` are.
+
+        The cloth follows the body near the opening and rests far from it; between, it is a mixture of the two.
+        """
+        x, y, z = moved(self.grid_from_camera, rays.x * depth, rays.y * depth, depth)
+        ax, ay, az = moved(self.rest_from_camera, rays.x * depth, rays.y * depth, depth)
+        held = self.state.scene.sheet.held(x, y)
+        flat = np.stack([x / np.float32(self.state.factors[0]), y / np.float32(self.state.factors[1])], -1)
+        z = z - self.state.scene.deformation.lift(flat, self.state.instant.strain).astype(np.float32)
+        x, y = flat[..., 0], flat[..., 1]
+        return ax + held * (x - ax), ay + held * (y - ay), az + held * (z - az)
+
+    def left(self, rays: Rays, depth: Field) -> tuple[Field, Field, Field]:
+        """How far above the cloth points at `depth` are, mm, and where on it."""
+        x, y, z = self.material(rays, depth)
+        heights = self.state.scene.sheet.heights
+        u = x / np.float32(sheet.STEP) + np.float32((heights.shape[1] - 1) / 2)
+        v = y / np.float32(sheet.STEP) + np.float32((heights.shape[0] - 1) / 2)
+        return z - cv2.remap(heights, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), x, y
+
+
+def cloth_picture(state: State, view: View) -> ClothPicture:
+    """The cloth as one camera sees it, the shape taken away."""
+    eye = _Eye(
+        state,
+        se3.inverse(state.base_from_grid) @ view.camera.base_from_camera,
+        se3.inverse(state.scene.base_from_rest) @ view.camera.base_from_camera,
+    )
+    rays = view.coarse(LATTICE)
+    size = rays.x.shape[::-1]
+    depth = cv2.resize(_search(eye, view.coarse(SEARCH)), size, interpolation=cv2.INTER_LINEAR)
+    depth, x, y = _refined(eye, rays, depth)
+    passed = _passed(eye, rays, depth)
+    w, h = view.camera.size
+    whole = view.whole
+    fields = cv2.resize(np.dstack([x, y, *passed]), (whole.x1, whole.y1), interpolation=cv2.INTER_LINEAR)[:h, :w]
+    return ClothPicture(_coloured(state, fields), depth)
+
+
+def _search(eye: _Eye, rays: Rays) -> Field:
+    """Depth (H, W) mm at which rays first meet the cloth, by equal steps; the last one where they never do."""
+    m = eye.rest_from_camera
+    sink = np.minimum(m[2, 0] * rays.x + m[2, 1] * rays.y + m[2, 2], -0.15)
+    near, far = ((z - m[2, 3]) / sink for z in (HIGHEST, DEEPEST))
+    step = ((far - near) / STEPS).astype(np.float32)
+    depth = near = near.astype(np.float32)
+    above = np.full_like(depth, 1.0)
+    found, open_way = far.astype(np.float32), np.ones(depth.shape, bool)
+    for k in range(STEPS + 1):
+        depth = near + step * np.float32(k)
+        left, _, _ = eye.left(rays, depth)
+        new = (left <= 0) & open_way
+        found = np.where(new, depth + step * left / np.maximum(above - left, 1e-6), found)
+        open_way &= ~new
+        above = left
+    return np.asarray(found, np.float32)
+
+
+def _refined(eye: _Eye, rays: Rays, depth: Field) -> tuple[Field, Field, Field]:
+    """Depth and material x, y (H, W) mm after two rounds of the secant method."""
+    last = depth + np.float32(0.5)
+    left_last, _, _ = eye.left(rays, last)
+    left, x, y = eye.left(rays, depth)
+    for _ in range(2):
+        fall = (left - left_last) / np.where(depth == last, np.float32(1), depth - last)
+        move = np.clip(left / np.where(np.abs(fall) < 0.1, np.float32(-0.5), fall), -15, 15)
+        last, left_last = depth, left
+        depth = depth - move
+        left, x, y = eye.left(rays, depth)
+    return np.asarray(depth, np.float32), x, y
+
+
+def _passed(eye: _Eye, rays: Rays, depth: Field) -> list[Field]:
+    """Per lamp the light (H, W) that passes the nozzle on its way to the cloth."""
+    state = eye.state
+    if state.instant.base_from_nozzle is None:
+        return [np.ones_like(depth)]
+    nozzle_from_base = se3.inverse(state.instant.base_from_nozzle)
+    nozzle_from_camera = nozzle_from_base @ se3.inverse(state.base_from_grid @ se3.inverse(np.eye(4)))
+    nozzle_from_camera = nozzle_from_base @ state.base_from_grid @ eye.grid_from_camera
+    points = moved(nozzle_from_camera, rays.x * depth, rays.y * depth, depth)
+    nozzle_from_rest = nozzle_from_base @ state.scene.base_from_rest
+    return [nozzle_shape.lit(points, nozzle_from_rest, state.lamps[0])]
+
+
+def _coloured(state: State, fields: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Linear BGR (H, W, 3) of the cloth at material x, y and the share of the key lamp's light there (H, W, 3)."""
+    picture = state.scene.sheet.picture
+    u = fields[..., 0] * np.float32(1 / sheet.TEXEL) + np.float32((picture.shape[1] - 1) / 2)
+    v = fields[..., 1] * np.float32(1 / sheet.TEXEL) + np.float32((picture.shape[0] - 1) / 2)
+    found = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    shade, across, along, open_sky = cv2.split(found)
+    facing = 1 / cv2.sqrt(across * across + along * along + 1)
+    key, fill = state.lamps
+    passed = (fields[..., 2], None)
+    lights = [np.float32(state.scene.look.ambient * AMBIENT[c]) * (0.45 + 0.55 * facing) for c in range(3)]
+    for lamp, share in zip((key, fill), passed, strict=True):
+        d = lamp.towards.astype(np.float32)
+        cosine = np.maximum((d[2] - d[0] * across - d[1] * along) * facing + np.float32(0.1), 0)
+        cosine = cosine if share is None else cosine * share
+        for c in range(3):
+            lights[c] += cosine * np.float32(lamp.strength * lamp.colour[c] / 1.1)
+    shade = shade * open_sky
+    return np.asarray(cv2.merge([lights[c] * shade * cloth.TEAL[c] for c in range(3)]), np.float32)

@@ -1,0 +1,96 @@
+"""Where rays meet a height field: z = Z(x, y), in nodes, one unknown height per ray."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware.simulator.noise import Field, gradient
+
+STEPS = 56  # of the search downwards
+ROUNDS = 3  # of Newton's method after the first
+FLAT = 0.3  # rays that meet the surface more grazing than this (1: head on) are searched for one by one
+CLOSE = 2e-3  # mm that is left over where Newton's method did not come to rest
+
+Mask = NDArray[np.bool_]
+
+
+class Bundle(NamedTuple):
+    """Rays as lines over the height: at height z mm they stand over node (u + z du, v + z dv). All of one shape."""
+
+    u: Field
+    v: Field
+    du: Field
+    dv: Field
+
+
+class Relief(NamedTuple):
+    """A height field (H, W) mm, its slopes a node along u and v, and the heights it keeps within, mm."""
+
+    height: Field
+    slopes: NDArray[np.float32]  # (H, W, 2)
+    low: float
+    high: float
+
+
+def relief(height: Field) -> Relief:
+    """A height field with its slopes."""
+    return Relief(height, np.dstack(gradient(height, 1.0)), float(height.min()) - 0.1, float(height.max()) + 0.1)
+
+
+def meet(field: Relief, rays: Bundle, coarse: Bundle, scale: int) -> Field:
+    """Height z (H, W) mm where each ray first meets the field, which goes on beyond its edge as it is there.
+
+    coarse: the same rays at the middles of squares of `scale` rays. From their search the others start; Newton's method
+    ends within 1e-4 mm where the surface faces the ray, and where it grazes or hides itself the ray is searched alone.
+    """
+    found, facing = _search(field, coarse)
+    odd = cv2.dilate((facing < FLAT).astype(np.uint8), np.ones((3, 3), np.uint8))
+    size = rays.u.shape[::-1]
+    z, rest = _newton(field, rays, cv2.resize(found, size, interpolation=cv2.INTER_LINEAR))
+    doubt = (cv2.resize(odd, size, interpolation=cv2.INTER_NEAREST) > 0) | ~(np.abs(rest) < CLOSE)
+    place = np.nonzero(doubt)
+    if len(place[0]):
+        alone = Bundle(*(np.ascontiguousarray(part[place][:, None]) for part in rays))
+        searched, _ = _search(field, alone)
+        better, left = _newton(field, alone, searched)
+        z[place] = np.where(np.abs(left) < 10 * CLOSE, better, searched)[:, 0]
+    return z
+
+
+def _heights(field: Relief, rays: Bundle, z: Field) -> Field:
+    u, v = rays.u + z * rays.du, rays.v + z * rays.dv
+    return np.asarray(cv2.remap(field.height, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+
+
+def _newton(field: Relief, rays: Bundle, z: Field) -> tuple[Field, Field]:
+    """Heights nearer to the surface than z, and what was left over before the last round, mm; one slope for all."""
+    u, v = rays.u + z * rays.du, rays.v + z * rays.dv
+    slopes = cv2.remap(field.slopes, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    step = 1 / np.maximum(1 - slopes[..., 0] * rays.du - slopes[..., 1] * rays.dv, 0.15)
+    for _ in range(ROUNDS):
+        z = z - (z - _heights(field, rays, z)) * step
+    rest = z - _heights(field, rays, z)
+    return np.asarray(z - rest * step, np.float32), rest
+
+
+def _search(field: Relief, rays: Bundle) -> tuple[Field, Field]:
+    """Heights where rays first meet the field, by steps downwards, and how much it faces them there (1: head on)."""
+    step = np.float32((field.high - field.low) / (STEPS - 1))
+    z = np.full(rays.u.shape, field.low, np.float32)
+    facing = np.ones(z.shape, np.float32)
+    open_way = np.ones(z.shape, bool)
+    above = np.full(z.shape, step, np.float32)
+    for height in np.linspace(field.high, field.low, STEPS).astype(np.float32):
+        level = np.full_like(z, height)
+        left = level - _heights(field, rays, level)
+        new = (left <= 0) & open_way
+        fall = np.maximum(above - left, 1e-6)
+        z = np.where(new, height - step * left / fall, z)
+        facing = np.where(new, fall / step, facing)
+        open_way &= ~new
+        above = left
+    return z, facing

@@ -1,0 +1,110 @@
+"""Procedural fields that skin, flesh and cloth are made of: smooth noise, cells, spots and strokes, all (H, W) float32.
+
+Lengths are in texels. Each field is drawn coarsely where it is smooth, so that a large texture takes milliseconds.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.se3 import Array
+
+Field = NDArray[np.float32]  # (H, W)
+Size = tuple[int, int]  # H, W
+
+
+def smooth(shape: Size, scale: float, rng: np.random.Generator) -> Field:
+    """Gaussian noise of mean 0 and variance 1 whose hills are about `scale` texels wide."""
+    step = max(1, int(scale / 4))
+    coarse = (shape[0] // step + 8, shape[1] // step + 8)
+    blurred = cv2.GaussianBlur(rng.standard_normal(coarse, np.float32), (0, 0), max(0.4, 0.4 * scale / step))
+    blurred = (blurred - blurred.mean()) / blurred.std()
+    large = cv2.resize(blurred, (coarse[1] * step, coarse[0] * step), interpolation=cv2.INTER_CUBIC)
+    return np.asarray(large[3 * step : 3 * step + shape[0], 3 * step : 3 * step + shape[1]], np.float32)
+
+
+def octaves(shape: Size, scale: float, count: int, rng: np.random.Generator, fall: float = 0.6) -> Field:
+    """Noise of variance 1 at `count` scales, each half the one before and `fall` as strong."""
+    strength = fall ** np.arange(count) / np.linalg.norm(fall ** np.arange(count))
+    total = strength[0] * smooth(shape, scale, rng)
+    for k in range(1, count):
+        total += strength[k] * smooth(shape, scale / 2**k, rng)
+    return np.asarray(total, np.float32)
+
+
+def stretched(shape: Size, scale: tuple[float, float], rng: np.random.Generator) -> Field:
+    """Noise whose hills are `scale` (along x, along y) texels wide: grain, fibres, furrows of one direction."""
+    low = min(scale)
+    across = (max(8, round(shape[0] * low / scale[1])), max(8, round(shape[1] * low / scale[0])))
+    return np.asarray(cv2.resize(smooth(across, low, rng), shape[::-1], interpolation=cv2.INTER_CUBIC), np.float32)
+
+
+def cells(shape: Size, pitch: float, rng: np.random.Generator) -> tuple[Field, Field]:
+    """Voronoi cells about `pitch` texels wide: distance to the cell's edge in texels, and a number 0..1 of each cell."""
+    y, x = np.mgrid[-1 : shape[0] / pitch + 1, -1 : shape[1] / pitch + 1]
+    sites = (np.stack([y, x], -1) + rng.uniform(0.0, 1.0, (*y.shape, 2))).reshape(-1, 2) * pitch
+    sites = np.rint(sites[((sites >= 0) & (sites < np.array(shape) - 1)).all(1)]).astype(int)
+    ground = np.ones(shape, np.uint8)
+    ground[sites[:, 0], sites[:, 1]] = 0
+    _, label = cv2.distanceTransformWithLabels(ground, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    inner = np.ones(shape, np.uint8)
+    inner[:, :-1] &= label[:, :-1] == label[:, 1:]
+    inner[:-1] &= label[:-1] == label[1:]
+    edge = cv2.distanceTransform(inner, cv2.DIST_L2, 5)
+    value = rng.random(int(label.max()) + 1, np.float32)[label]
+    return np.asarray(edge, np.float32), np.asarray(value, np.float32)
+
+
+def spots(
+    shape: Size, pitch: float, radius: tuple[float, float], rng: np.random.Generator, kept: float = 1.0
+) -> Field:
+    """Soft round spots 0..1, one in each square of `pitch` with chance `kept`; radius: (from, to), one sigma."""
+    out = np.zeros(shape, np.float32)
+    y, x = np.mgrid[0 : shape[0] / pitch, 0 : shape[1] / pitch]
+    centres = (np.stack([x, y], -1) + rng.uniform(0, 1, (*x.shape, 2))).reshape(-1, 2) * pitch
+    sigma = radius[0] * (radius[1] / radius[0]) ** rng.uniform(0, 1, len(centres))
+    depth = rng.uniform(0.35, 1.0, len(centres))
+    for (cx, cy), s, d in zip(centres[rng.random(len(centres)) < kept], sigma, depth, strict=False):
+        r = int(2.6 * s) + 2
+        x0, x1 = max(0, int(cx) - r), min(shape[1], int(cx) + r + 1)
+        y0, y1 = max(0, int(cy) - r), min(shape[0], int(cy) + r + 1)
+        if x0 < x1 and y0 < y1:
+            gx = np.exp(-(((np.arange(x0, x1, dtype=np.float32) - cx) / s) ** 2) / 2)
+            gy = np.exp(-(((np.arange(y0, y1, dtype=np.float32) - cy) / s) ** 2) / 2)
+            patch = out[y0:y1, x0:x1]
+            np.maximum(patch, d * gy[:, None] * gx, out=patch)
+    return out
+
+
+def strokes(shape: Size, lines: list[Array], width: float, soft: float = 0.0) -> Field:
+    """Lines 0..1 through points (N, 2) texels each, `width` texels wide (thinner than one: fainter), blurred by `soft`."""
+    drawn = np.zeros(shape, np.uint8)
+    thick = max(1, round(width))
+    for line in lines:
+        points = np.rint(line * 16).astype(np.int32)
+        cv2.polylines(drawn, [points], False, 255, thick, cv2.LINE_AA, shift=4)
+    field = drawn.astype(np.float32) * (min(1.0, width) / 255)
+    return np.asarray(cv2.GaussianBlur(field, (0, 0), soft) if soft else field, np.float32)
+
+
+def wander(start: Array, angle: float, length: float, bend: float, rng: np.random.Generator, points: int = 12) -> Array:
+    """A line (points, 2) from `start` that turns at random, by `bend` rad (one sigma) over its whole length."""
+    turns = angle + np.cumsum(rng.normal(0, bend / np.sqrt(points), points - 1)) + np.linspace(0, rng.normal(0, bend), points - 1)
+    steps = np.column_stack([np.cos(turns), np.sin(turns)]) * (length / (points - 1))
+    return np.asarray(np.vstack([start, start + np.cumsum(steps, axis=0)]))
+
+
+def ramp(field: Field, low: float, high: float) -> Field:
+    """0 up to `low`, 1 from `high`, smooth between (high may be below low)."""
+    t = np.clip((field - np.float32(low)) / np.float32(high - low), 0, 1)
+    return np.asarray(t * t * (3 - 2 * t), np.float32)
+
+
+def gradient(height: Field, spacing: float) -> tuple[Field, Field]:
+    """Slopes along x and y of a height field whose nodes are `spacing` apart."""
+    kernel = np.array([[-0.5, 0.0, 0.5]], np.float32) / np.float32(spacing)
+    border = cv2.BORDER_REPLICATE
+    x = cv2.filter2D(height, cv2.CV_32F, kernel, borderType=border)
+    return np.asarray(x, np.float32), np.asarray(cv2.filter2D(height, cv2.CV_32F, kernel.T, borderType=border), np.float32)

@@ -1,0 +1,101 @@
+"""A scene: a shape, what is painted on it, the cloth round it, the lamps above it."""
+
+from __future__ import annotations
+
+import threading
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from estimation import se3
+from estimation.rig import Camera, Rig, pixels_from_points
+from estimation.se3 import Array
+from hardware.simulator import paint, sheet
+from hardware.simulator.default_rig import REST
+from hardware.simulator.deformation import Deformation
+from hardware.simulator.hits import Relief, relief
+from hardware.simulator.ink import Ink
+from hardware.simulator.look import Look
+from hardware.simulator.shape import Shape
+from hardware.simulator.view import View
+from perception.frames import Roi
+
+STILL = Deformation()
+
+
+class Scene:
+    """A body before the cameras; same arguments, same pictures.
+
+    base_from_rest: (4, 4) mm, base_from_surface when nothing moves: there the far cloth lies, and the lamps hang over it.
+    Only `ink` changes: pictures rendered after a bead was laid show it.
+    """
+
+    def __init__(
+        self,
+        shape: Shape,
+        look: Look | None = None,
+        deformation: Deformation = STILL,
+        seed: int = 0,
+        base_from_rest: Array = REST,
+    ) -> None:
+        self.shape, self.look, self.deformation = shape, look or Look(), deformation
+        self.base_from_rest = base_from_rest @ shape.surface_from_grid  # of the grid
+        half = paint.half_opening(shape) if self.look.drape else None
+        rng = np.random.default_rng([seed, 23])
+        self.relief = paint.relief(shape, half)
+        self.layers = paint.paint(shape, self.relief, half, self.look, seed)
+        self.sheet = sheet.bare(rng) if half is None else sheet.draped(shape, half, rng)
+        self.ink = Ink(self.layers)
+        self._at_rest = relief(self.relief)
+        self._views: dict[Camera, View] = {}
+        self._lock = threading.Lock()
+
+    def heights(self, amount: float) -> Relief:
+        """Heights on the nodes of material points under `amount` of the deformation, the drape's hem among them."""
+        if not amount * self.deformation.bulge:
+            return self._at_rest
+        lift = self.deformation.lift(np.stack(sheet.axes(self.shape.size, self.shape.step), -1), amount)
+        return relief(self.relief + lift.astype(np.float32))
+
+    @property
+    def opening(self) -> tuple[float, float]:
+        """Sides (x, y) mm of the part of the shape that no cloth covers."""
+        if not self.look.drape:
+            return self.shape.size
+        half = paint.half_opening(self.shape)
+        return 2 * half[0], 2 * half[1]
+
+    def displaced(self, points_surface: ArrayLike, amount: float) -> Array:
+        """Where points (N, 3) mm of the surface at rest are under `amount` of the deformation; both surface frame."""
+        grid = se3.transform_points(se3.inverse(self.shape.surface_from_grid), points_surface)
+        return se3.transform_points(self.shape.surface_from_grid, grid + self.deformation.displacement(grid, amount))
+
+    def at_rest(self, points_surface: ArrayLike, amount: float) -> Array:
+        """The inverse of `displaced`."""
+        grid = se3.transform_points(se3.inverse(self.shape.surface_from_grid), points_surface)
+        return se3.transform_points(self.shape.surface_from_grid, self.deformation.undo(grid, amount))
+
+    def view(self, camera: Camera) -> View:
+        """What stays the same between the pictures of one camera."""
+        with self._lock:
+            if camera not in self._views:
+                self._views[camera] = View(camera, self.base_from_rest)
+            return self._views[camera]
+
+
+def rois(scene: Scene, rig: Rig, base_from_surface: Array, stamp: float, part: float = 0.8) -> tuple[Roi, ...]:
+    """Polygons around what each camera sees of the ellipse that fills the central `part` of the opening."""
+    half = part * np.array(scene.opening) / 2
+    flat = scene.shape.grid(2.0)
+    flat = flat[np.linalg.norm(flat / half, axis=1) <= 1]
+    points = se3.transform_points(base_from_surface, scene.shape.points(flat))
+    normals = scene.shape.normals(flat) @ base_from_surface[:3, :3].T
+    found = []
+    for number, camera in enumerate(rig.cameras):
+        facing = np.einsum("ni,ni->n", normals, camera.base_from_camera[:3, 3] - points) > 0
+        pixels, depth = pixels_from_points(camera, points)
+        seen = pixels[facing & (depth > 1)].astype(np.float32)
+        if len(seen) >= 3:
+            found.append(Roi(number, stamp, cv2.convexHull(seen).reshape(-1, 2).astype(float)))
+    return tuple(found)

@@ -1,0 +1,68 @@
+"""The image sensor: grain, vignetting, sharpness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.errors import InputError
+from estimation.rig import Camera
+from perception.frames import Image
+
+ROOM = 256  # px by which the stored grain is larger than an image, so that each image takes another cut of it
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """What a camera does to the light.
+
+    noise: grey levels, one sigma. The display's value is the square root of the light, so the shot noise of the light is
+    the same everywhere in the image. vignetting: 1 is a bare lens's cos^4 law, 0 none. blur: px, one sigma, of lens and
+    colour filter.
+    """
+
+    noise: float = 1.5
+    vignetting: float = 0.8
+    blur: float = 0.45
+
+    def __post_init__(self) -> None:
+        for name, value, high in (("noise", self.noise, 50.0), ("vignetting", self.vignetting, 2.0)):
+            if not 0 <= value <= high:
+                raise InputError("sensor", name, value, f"0 to {high:g}")
+        if not 0 <= self.blur <= 10:
+            raise InputError("sensor", "blur", self.blur, "0 to 10 px")
+
+
+def expose(light: NDArray[np.float32], sensor: Sensor, fall: NDArray[np.float32], gain: float) -> NDArray[np.float32]:
+    """Display values 0..255, not yet rounded, (H, W, 3) of linear light (H, W, 3); fall: as `vignette` gives."""
+    if sensor.blur:
+        light = cv2.GaussianBlur(light, (0, 0), sensor.blur)
+    return np.asarray(cv2.sqrt(cv2.multiply(light, fall, scale=gain * 255.0**2)), np.float32)
+
+
+def vignette(camera: Camera, sensor: Sensor) -> NDArray[np.float32]:
+    """Share of the light (H, W, 3) that reaches each pixel."""
+    x = (np.arange(camera.size[0]) - camera.matrix[0, 2]) / camera.matrix[0, 0]
+    y = (np.arange(camera.size[1]) - camera.matrix[1, 2]) / camera.matrix[1, 1]
+    share = (1 + x**2 + y[:, None] ** 2) ** (-2 * sensor.vignetting)
+    return np.ascontiguousarray(np.repeat(share[..., None], 3, 2), np.float32)
+
+
+def develop(display: NDArray[np.float32], sensor: Sensor, rng: np.random.Generator) -> Image:
+    """The image (H, W, 3) with grain: a cut at random from one large field (drawing anew is ten times slower)."""
+    if not sensor.noise:
+        return np.asarray(np.clip(np.rint(display), 0, 255), np.uint8)
+    h, w = display.shape[:2]
+    y, x = rng.integers(0, ROOM, 2)
+    grain = _grain(h, w)[y : y + h, x : x + w]
+    return np.asarray(cv2.addWeighted(display, 1.0, grain, sensor.noise, 0.0, dtype=cv2.CV_8U), np.uint8)
+
+
+@lru_cache(maxsize=4)
+def _grain(h: int, w: int) -> NDArray[np.float32]:
+    """White noise of variance 1, (h + ROOM, w + ROOM, 3)."""
+    return np.random.default_rng([31, h, w]).standard_normal((h + ROOM, w + ROOM, 3), np.float32)

@@ -1,0 +1,97 @@
+"""The cloth beyond the skin: a height field that follows the body near the opening and rests on the table far away."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from hardware.simulator import cloth
+from hardware.simulator.layers import Texture
+from hardware.simulator.noise import Field, gradient, ramp
+from hardware.simulator.shape import Shape
+
+STEP = 2.0  # mm between nodes: the cloth is no measure of anything
+TEXEL = 0.5  # mm
+SPAN = (640.0, 520.0)  # mm, x and y; beyond, the picture is mirrored
+TABLE = -70.0  # mm below the wound's skin
+ALONE = -90.0  # mm: where the cloth lies behind a bare patch
+STEEPEST, FLATTEST = -0.9, -0.15  # slopes of the tent
+THICKNESS = 0.6  # mm
+HELD, FREE = 12.0, 140.0  # mm from the opening: up to here it moves with the body, from here it rests
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sheet:
+    """A cloth. heights: (H, W) mm, grid frame, nodes STEP apart. picture: (H, W, 4) shade, slopes x and y, occlusion.
+
+    half: half sides mm of the opening; None: no opening, the cloth does not move.
+    """
+
+    heights: Field
+    picture: Texture
+    half: tuple[float, float] | None
+
+    def held(self, x: Field, y: Field) -> Field:
+        """How much of the body's motion the cloth takes over at x, y mm: 1 near the opening, 0 far away."""
+        if self.half is None:
+            return np.zeros_like(x)
+        return ramp(cloth.opening(x, y, self.half), FREE, HELD)
+
+
+def axes(span: tuple[float, float], step: float) -> tuple[Field, Field]:
+    """x, y (H, W) mm of nodes `step` apart about the origin, over `span`."""
+    x, y = ((np.arange(round(s / step) + 1, dtype=np.float32) - round(s / step) / 2) * np.float32(step) for s in span)
+    return np.meshgrid(x, y)  # type: ignore[return-value]
+
+
+def thickness(outside: Field) -> Field:
+    """Height mm of a drape laid on the skin, by distance mm outside the opening's edge."""
+    return np.asarray(THICKNESS * ramp(outside, -0.1, 1.2), np.float32)
+
+
+def draped(shape: Shape, half: tuple[float, float], rng: np.random.Generator) -> Sheet:
+    """A drape over the shape with a rounded opening of half sides `half` mm, falling to the table all round."""
+    x, y = axes(SPAN, STEP)
+    reach = np.array(shape.size, np.float32) / 2
+    cx, cy = np.clip(x, -reach[0], reach[0]), np.clip(y, -reach[1], reach[1])
+    edge = np.stack([cx, cy], -1).reshape(-1, 2)
+    ground = shape.heights_at(edge).reshape(x.shape).astype(np.float32)
+    back = shape.heights_at(0.9 * edge).reshape(x.shape).astype(np.float32)
+    away = np.hypot(x - cx, y - cy)
+    slope = np.clip((ground - back) / np.maximum(0.1 * np.hypot(cx, cy), 1e-3), STEEPEST, FLATTEST)
+    tent = ground + slope * away
+    tent = TABLE + np.logaddexp(0, (tent - TABLE) / 12).astype(np.float32) * 12
+    outside = cloth.opening(x, y, half)
+    soft = cv2.GaussianBlur(tent, (0, 0), 7 / STEP)
+    tent += ramp(away, 0, 30) * (soft - tent)
+    wrinkles = cloth.folds(x.shape, STEP, rng) * ramp(outside, 8, 70)
+    heights = tent + thickness(outside) + wrinkles - 3 * (outside < -4)
+    return Sheet(np.asarray(heights, np.float32), _picture(heights, rng), half)
+
+
+def bare(rng: np.random.Generator) -> Sheet:
+    """A cloth at rest behind a bare patch."""
+    x, _ = axes(SPAN, STEP)
+    heights = ALONE + cloth.folds(x.shape, STEP, rng)
+    return Sheet(np.asarray(heights, np.float32), _picture(heights, rng), None)
+
+
+def _picture(heights: Field, rng: np.random.Generator) -> Texture:
+    size = (round(SPAN[0] / TEXEL), round(SPAN[1] / TEXEL))
+    shade, fibre = cloth.weave(size[::-1], TEXEL, rng)
+    large = _enlarged(np.asarray(heights, np.float32), size)
+    sx, sy = gradient(large, TEXEL)
+    fx, fy = gradient(fibre, TEXEL)
+    hollow = cv2.resize(cv2.GaussianBlur(heights, (0, 0), 12 / STEP) - heights, size)
+    occlusion = np.clip(1 - 0.06 * np.clip(hollow, -2, 8), 0.5, 1.0)
+    return np.ascontiguousarray(np.dstack([shade, sx + fx, sy + fy, occlusion]), np.float32)
+
+
+def _enlarged(heights: Field, size: tuple[int, int]) -> Field:
+    """Heights at the texels' middles (nodes lie on the rim of the span, texels within)."""
+    x, y = ((np.arange(n, dtype=np.float32) + 0.5) * np.float32(TEXEL / STEP) for n in size)
+    u, v = np.meshgrid(x, y)
+    soft = cv2.GaussianBlur(heights, (0, 0), 0.7)
+    return np.asarray(cv2.remap(soft, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.float32)
