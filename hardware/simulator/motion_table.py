@@ -34,7 +34,7 @@ from hardware.simulator.trace_file import read_trace
 from hardware.simulator.traces import traced
 from hardware.simulator.waveforms import Corners, Levels, Sine, Steps, Waveform, Zigzag
 
-MOTION_STREAM = 1  # of the scenario's seed: no other draw of the simulator shares it
+MOTION_STREAM = 21  # of the scenario's seed: no other draw of the simulator shares it
 OUTWARD = (0.0, 0.0, 1.0)  # the surface's normal
 UNIT_MM = 100.0  # the thesis's cube has an edge of 1 unit, 282 px: at 400 mm before 1109 px of focal length, 102 mm
 WIDEST_SPREAD = 0.9 / WIDEST  # no breath and no beat may come out with no length

@@ -1,0 +1,160 @@
+"""When each camera exposes and what becomes of each frame; nothing here knows what is in the pictures."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from hardware.simulator.camera_settings import CameraSettings
+
+FATE_STREAM, GAIN_STREAM = 22, 23  # of the scenario's seed: no other draw of the simulator shares them
+JITTER_LIMIT = 3.0  # standard deviations, or means of the transport's exponential, at which a draw is cut
+QUEUE = 1e-4  # s by which a frame that would overtake its camera's last one arrives after it instead
+SCAN = b"\xff\xda"  # a JPEG's start of scan: all that follows its header is entropy-coded
+HEAD = 64  # bytes kept of what is no JPEG
+SHORTEST, LONGEST = 64, 0.25  # of a damaged stretch: bytes, and share of the picture
+CUT_SHORT = 0.2  # share of damaged pictures that end early: OpenCV decodes none of them, and most of the others
+
+
+class Fate(Enum):
+    """What becomes of a frame on its way."""
+
+    DELIVERED = "delivered"
+    DROPPED = "dropped"
+    DUPLICATED = "duplicated"
+    GARBLED = "garbled"
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One frame of one camera, from its exposure to its arrival.
+
+    camera: its number in the rig. number: counts the camera's frames from 0. picture: number of the shot whose picture
+    it carries, its own unless duplicated. exposed: s, true middle of that picture's exposure. stamp: s, what the
+    software says it is. arrival: s, when the computer has it. exposure: s. gain: of the picture, 1 is nominal.
+    """
+
+    camera: int
+    number: int
+    picture: int
+    exposed: float
+    stamp: float
+    arrival: float
+    exposure: float
+    gain: float
+    fate: Fate
+
+
+@dataclass(frozen=True, slots=True)
+class _Draw:
+    """What chance decides of one frame: its lot in [0, 1), and s added to its stamp and to its way."""
+
+    lot: float
+    stamp: float
+    transport: float
+
+
+class SimulatedCameras:
+    """The cameras of a rig in time. A frame's draws depend on seed, camera and number alone."""
+
+    def __init__(self, settings: CameraSettings, seed: int) -> None:
+        """seed: >= 0."""
+        self.settings, self._seed = settings, seed
+        rng = np.random.default_rng([seed, GAIN_STREAM])
+        self._gain_phases = rng.uniform(0, 2 * math.pi, len(settings.phases)).tolist()
+
+    def __len__(self) -> int:
+        return len(self.settings.phases)
+
+    def shots(self, camera: int, until: float = math.inf) -> Iterator[Shot]:
+        """A camera's frames in order, those that are due before `until`, s, true time; without it they never end.
+
+        Stamps and, but for what is dropped, arrivals rise.
+        """
+        arrival, number = -math.inf, 0
+        while self.due(camera, number) < until:
+            shot = self._shot(camera, number, arrival + QUEUE)
+            if shot.fate is not Fate.DROPPED:
+                arrival = shot.arrival
+            yield shot
+            number += 1
+
+    def arrivals(self, until: float = math.inf) -> Iterator[Shot]:
+        """What arrives of all cameras, in order of arrival; `until` as in `shots`."""
+        streams = [self.shots(camera, until) for camera in range(len(self))]
+        merged = heapq.merge(*(_delivered(s) for s in streams), key=lambda shot: (shot.arrival, shot.camera))
+        yield from merged
+
+    def due(self, camera: int, number: int) -> float:
+        """True middle, s, of a camera's exposure."""
+        settings = self.settings
+        return settings.start + settings.phases[camera] + number * settings.every / settings.fps
+
+    def _shot(self, camera: int, number: int, earliest: float) -> Shot:
+        settings, due, draw = self.settings, self.due(camera, number), self._draw(camera, number)
+        fate = self._fate(camera, number, draw.lot)
+        picture = number
+        while picture and self._fate(camera, picture, self._draw(camera, picture).lot) is Fate.DUPLICATED:
+            picture -= 1
+        exposed = self.due(camera, picture)
+        arrival = due + settings.exposure / 2 + settings.transport + draw.transport
+        stamp = due - settings.offsets[camera] + draw.stamp
+        gain = self._gain(camera, exposed)
+        return Shot(camera, number, picture, exposed, stamp, max(arrival, earliest), settings.exposure, gain, fate)
+
+    def _draw(self, camera: int, number: int) -> _Draw:
+        rng = np.random.default_rng([self._seed, FATE_STREAM, camera, number])
+        stamp = float(np.clip(rng.standard_normal(), -JITTER_LIMIT, JITTER_LIMIT)) * self.settings.jitter
+        transport = min(rng.standard_exponential(), JITTER_LIMIT) * self.settings.transport_jitter
+        return _Draw(float(rng.random()), stamp, transport)
+
+    def _fate(self, camera: int, number: int, lot: float) -> Fate:
+        settings, due = self.settings, self.due(camera, number)
+        off = any(which == camera and start <= due < end for which, start, end in settings.off)
+        if off or lot < settings.drop:
+            return Fate.DROPPED
+        if lot < settings.drop + settings.duplicate and number:
+            return Fate.DUPLICATED
+        if settings.drop + settings.duplicate <= lot < settings.drop + settings.duplicate + settings.garble:
+            return Fate.GARBLED
+        return Fate.DELIVERED
+
+    def _gain(self, camera: int, exposed: float) -> float:
+        """Exposure control and lamps, whose light an exposure averages."""
+        settings = self.settings
+        drift = math.sin(2 * math.pi * exposed / settings.gain_period + self._gain_phases[camera])
+        light = math.sin(2 * math.pi * settings.flicker_hz * exposed) * np.sinc(settings.flicker_hz * settings.exposure)
+        return float((1 + settings.gain_drift * drift) * (1 + settings.flicker * light))
+
+
+def _delivered(shots: Iterator[Shot]) -> Iterator[Shot]:
+    return (shot for shot in shots if shot.fate is not Fate.DROPPED)
+
+
+def garble(data: bytes, rng: np.random.Generator) -> bytes:
+    """An encoded picture as a bad transfer leaves it: a stretch of it zeroed, repeated or missing, or no end.
+
+    The header stays whole. Most JPEGs still decode, with a damaged part; some do not.
+    """
+    first = _scan_start(data)
+    most = max(SHORTEST, int(LONGEST * len(data)))
+    length = int(np.exp(rng.uniform(np.log(SHORTEST), np.log(most + 1))))
+    start = int(rng.integers(first, max(first + 1, len(data) - length)))
+    end = min(start + length, len(data))
+    if rng.random() < CUT_SHORT:
+        return data[:start]
+    stretch = (bytes(end - start), data[max(first, start - (end - start)) : start], b"")[int(rng.integers(3))]
+    return data[:start] + stretch + data[end:]
+
+
+def _scan_start(data: bytes) -> int:
+    """Where the coded picture of a JPEG begins; of anything else, after its first bytes."""
+    marker = data.find(SCAN)
+    if data[:2] != b"\xff\xd8" or marker < 0:
+        return min(HEAD, len(data) // 2)
+    return min(marker + 2 + int.from_bytes(data[marker + 2 : marker + 4], "big"), len(data) - 1)
