@@ -1,8 +1,10 @@
-"""Which frames of several cameras belong to one instant: grouping by stamp, online or over a whole recording."""
+"""Which frames of several cameras belong to one instant: grouping by stamp, as they arrive or over a recording."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -12,6 +14,7 @@ from perception.frames import Frame, FrameSet
 
 DEFAULT_PERIOD = 1 / 30  # s: the rate of the thesis's cameras, where no camera has two frames to tell its own
 TOLERANCE_PERIODS = 0.5  # see `pairing_tolerance`
+SILENT_PERIODS = 5.0  # without a frame, after which no set waits for a camera: four lost in a row are rare
 
 
 class Stamped(Protocol):
@@ -85,3 +88,88 @@ def mean_stamp(items: Sequence[Stamped]) -> float:
 def frame_set(frames: Sequence[Frame]) -> FrameSet:
     """The frames of one instant as a set, at the mean of their stamps."""
     return FrameSet(mean_stamp(frames), tuple(sorted(frames, key=lambda f: f.camera)))
+
+
+class Pairing:
+    """Frame sets from frames as they arrive: in any order between cameras, some late, some never.
+
+    A set is given out as soon as no frame that is still to come can belong to it: it holds every camera that is alive,
+    or each one that it lacks has since delivered a younger frame. What is never to come is waited for `patience`
+    after the set's first arrival, and a camera silent for SILENT_PERIODS no longer at all. Sets come out in order of
+    stamp; a frame that is too late for that is left out and counted in `late`. The frames of one camera are taken to
+    arrive in order.
+    """
+
+    def __init__(self, cameras: int, period: float) -> None:
+        """cameras: in the rig. period: s, of its frames."""
+        self.late = 0
+        self.patience = pairing_tolerance(period)
+        self._tolerance, self._silent = pairing_tolerance(period), SILENT_PERIODS * period
+        self._open: list[_Open] = []  # oldest first
+        self._newest = [-math.inf] * cameras  # stamp
+        self._heard: list[float | None] = [None] * cameras  # s, arrival
+        self._given: _Open | None = None
+
+    def add(self, frame: Frame, now: float) -> list[FrameSet]:
+        """The sets that can be given out once a frame has arrived; now: s, rising from call to call."""
+        self._newest[frame.camera], self._heard[frame.camera] = frame.stamp, now
+        if self._given is not None and self._given.should_have_held(frame, self._tolerance):
+            self.late += 1
+        else:
+            self._place(frame, now)
+        return self.due(now)
+
+    def due(self, now: float) -> list[FrameSet]:
+        """The sets that need not or must not be waited for any longer at `now`, s."""
+        self._heard = [now if heard is None else heard for heard in self._heard]
+        count = 0
+        for i, group in enumerate(self._open, 1):
+            if self._is_finished(group, now):
+                count = i  # and all before it, so that stamps rise
+        out, self._open = self._open[:count], self._open[count:]
+        if out:
+            self._given = out[-1]
+        return [frame_set(list(group.frames.values())) for group in out]
+
+    def _place(self, frame: Frame, now: float) -> None:
+        for group in self._open:
+            if group.takes(frame, self._tolerance):
+                group.frames[frame.camera] = frame
+                return
+        self._open.append(_Open(now, {frame.camera: frame}))
+        self._open.sort(key=lambda group: group.first)
+
+    def _is_finished(self, group: _Open, now: float) -> bool:
+        return now >= group.arrived + self.patience or not any(
+            self._may_come(group, camera, now) for camera in range(len(self._newest)) if camera not in group.frames
+        )
+
+    def _may_come(self, group: _Open, camera: int, now: float) -> bool:
+        heard = self._heard[camera]
+        alive = heard is not None and now - heard <= self._silent
+        return alive and self._newest[camera] < group.first + self._tolerance
+
+
+@dataclass(slots=True)
+class _Open:
+    """A set that is being gathered. arrived: s, when its first frame came. frames: by camera."""
+
+    arrived: float
+    frames: dict[int, Frame]
+
+    @property
+    def first(self) -> float:
+        return min(frame.stamp for frame in self.frames.values())
+
+    @property
+    def last(self) -> float:
+        return max(frame.stamp for frame in self.frames.values())
+
+    def takes(self, frame: Frame, tolerance: float) -> bool:
+        """Whether a frame belongs here: its camera is not there yet, and no two stamps are further than `tolerance`."""
+        near = max(frame.stamp, self.last) - min(frame.stamp, self.first) <= tolerance
+        return near and frame.camera not in self.frames
+
+    def should_have_held(self, frame: Frame, tolerance: float) -> bool:
+        """Whether a frame belongs here or is older."""
+        return frame.stamp <= self.last or self.takes(frame, tolerance)

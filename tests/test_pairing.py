@@ -9,8 +9,17 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perception.frames import Frame
-from perception.pairing import DEFAULT_PERIOD, frame_period, frame_set, mean_stamp, pair, pairing_tolerance
+from perception.frames import Frame, FrameSet
+from perception.pairing import (
+    DEFAULT_PERIOD,
+    SILENT_PERIODS,
+    Pairing,
+    frame_period,
+    frame_set,
+    mean_stamp,
+    pair,
+    pairing_tolerance,
+)
 
 
 @dataclass(frozen=True)
@@ -94,3 +103,104 @@ def test_the_stamp_of_a_set_is_the_mean_also_far_from_zero() -> None:
     assert made.stamp == 1.7e9 + 0.25
     assert [f.camera for f in made.frames] == [0, 1]
     assert mean_stamp([Item(0, 0.1)]) == 0.1
+
+
+IMAGE = np.zeros((1, 1), np.uint8)
+PERIOD = 0.04
+
+
+def live(arrivals: list[tuple[float, Frame]], cameras: int) -> tuple[list[tuple[float, FrameSet]], Pairing]:
+    """Sets with the instants at which they come out, from frames with theirs; nobody looks later than needed."""
+    pairing = Pairing(cameras, PERIOD)
+    moments = [(now, i, frame) for i, (now, frame) in enumerate(arrivals)]
+    moments += [(now + pairing.patience, i, None) for now, i, _ in moments]  # type: ignore[misc]
+    out: list[tuple[float, FrameSet]] = []
+    for now, _, frame in sorted(moments, key=lambda m: (m[0], m[1])):
+        out += [(now, s) for s in (pairing.due(now) if frame is None else pairing.add(frame, now))]
+    return out, pairing
+
+
+def shaken(seed: int, cameras: int, count: int, jitter: float, way: float, drop: float) -> list[tuple[float, Frame]]:
+    """Arrivals of synchronous cameras: stamps off by `jitter`, ways longer by up to `way`, a share dropped."""
+    rng = np.random.default_rng(seed)
+    out, last = [], [-1.0] * cameras
+    for k in range(count):
+        for camera in range(cameras):
+            stamp = k * PERIOD + rng.uniform(-jitter, jitter)
+            arrival = max(last[camera] + 1e-6, k * PERIOD + 0.03 + rng.uniform(0, way))
+            if rng.random() >= drop:
+                last[camera] = arrival
+                out.append((arrival, Frame(camera, float(stamp), IMAGE)))
+    return sorted(out, key=lambda a: a[0])
+
+
+@given(seed=st.integers(0, 2**32 - 1), cameras=st.integers(1, 4), way=st.floats(0, 0.1), drop=st.floats(0, 0.6))
+def test_live_sets_rise_hold_each_frame_at_most_once_and_are_never_kept_waiting(
+    seed: int, cameras: int, way: float, drop: float
+) -> None:
+    arrivals = shaken(seed, cameras, 30, 0.018, way, drop)
+    out, pairing = live(arrivals, cameras)
+    frames = [f for _, s in out for f in s.frames]
+    assert len({id(f) for f in frames}) == len(frames)
+    assert len(frames) + pairing.late == len(arrivals)
+    arrived = {id(frame): now for now, frame in arrivals}
+    for now, s in out:
+        assert now <= min(arrived[id(f)] for f in s.frames) + pairing.patience + 1e-12
+        assert all(now >= arrived[id(f)] for f in s.frames)
+        stamps = [f.stamp for f in s.frames]
+        assert max(stamps) - min(stamps) <= pairing_tolerance(PERIOD)
+        assert [f.camera for f in s.frames] == sorted({f.camera for f in s.frames})
+    for (_, earlier), (_, later) in pairwise(out):
+        assert max(f.stamp for f in earlier.frames) < max(f.stamp for f in later.frames)
+        assert earlier.stamp < later.stamp
+
+
+@given(seed=st.integers(0, 2**32 - 1), cameras=st.integers(1, 4), drop=st.floats(0, 0.4))
+def test_live_sets_are_those_of_the_recording_where_frames_are_late_by_less_than_half_a_period(
+    seed: int, cameras: int, drop: float
+) -> None:
+    arrivals = shaken(seed, cameras, 30, 0.0095, 0.0195, drop)
+    out, pairing = live(arrivals, cameras)
+    in_order = sorted((f for _, f in arrivals), key=lambda f: f.stamp)
+    recorded = list(pair(in_order, pairing_tolerance(PERIOD), cameras))
+    assert pairing.late == 0
+    assert [[(f.camera, f.stamp) for f in s.frames] for _, s in out] == [
+        [(f.camera, f.stamp) for f in s] for s in recorded
+    ]
+
+
+def test_a_full_set_comes_out_with_its_last_frame_and_not_a_moment_later() -> None:
+    out, _ = live([(0.03, Frame(0, 0.0, IMAGE)), (0.031, Frame(1, 0.0, IMAGE)), (0.035, Frame(2, 0.001, IMAGE))], 3)
+    assert [now for now, _ in out] == [0.035]
+
+
+def test_a_dead_camera_delays_a_few_sets_by_half_a_period_and_then_none() -> None:
+    arrivals = [(k * PERIOD + 0.03 + 0.001 * c, Frame(c, k * PERIOD, IMAGE)) for k in range(20) for c in range(2)]
+    out, _ = live(arrivals, 3)
+    waits = np.array([now - s.stamp for now, s in out]) - 0.031  # after the second camera's frame
+    waiting = round(SILENT_PERIODS)
+    assert len(out) == 20
+    assert np.allclose(waits[:waiting], PERIOD / 2 - 0.001)
+    assert np.allclose(waits[waiting + 1 :], 0)
+    back = [*arrivals, *((k * PERIOD + 0.033, Frame(2, k * PERIOD, IMAGE)) for k in range(12, 20))]
+    out, pairing = live(sorted(back, key=lambda a: a[0]), 3)
+    assert [len(s.frames) for _, s in out] == [2] * 13 + [3] * 7  # its first frame comes after its set has gone
+    assert pairing.late == 1
+
+
+def test_a_set_without_a_dropped_frame_leaves_when_that_camera_has_a_younger_one() -> None:
+    pairing = Pairing(2, PERIOD)
+    pairing.patience = 10.0
+    assert not pairing.add(Frame(0, 0.0, IMAGE), 0.03)
+    (left,) = pairing.add(Frame(1, PERIOD, IMAGE), 0.07)
+    assert [f.camera for f in left.frames] == [0]
+    (full,) = pairing.add(Frame(0, PERIOD, IMAGE), 0.08)
+    assert [f.camera for f in full.frames] == [0, 1]
+
+
+def test_a_frame_of_a_set_that_has_gone_is_counted_and_left_out() -> None:
+    pairing = Pairing(2, PERIOD)
+    pairing.add(Frame(0, 1.0, IMAGE), 1.03)
+    assert len(pairing.due(1.03 + pairing.patience)) == 1
+    assert not pairing.add(Frame(1, 1.001, IMAGE), 1.06)
+    assert pairing.late == 1
