@@ -1,0 +1,150 @@
+"""The virtual arm as a device: a serial client writes to it, comes and goes, and finds it as it left it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import serial
+
+from estimation.errors import InputError
+from hardware.arm_profile import ArmProfile
+from hardware.clock import WallClock
+from hardware.replies import ReplyKind, reply_stream
+from hardware.simulator.arm_settings import ArmSettings, Replies
+from hardware.simulator.controller import VirtualArm
+from hardware.simulator.port import run_virtual_arm
+from hardware.simulator.pty_link import PtyLink
+from tests.virtual_arm import IDEAL, move
+
+CLOCK = WallClock()
+
+
+def wait(seconds: float) -> None:
+    CLOCK.wait_until(CLOCK.now() + seconds)
+
+
+@contextmanager
+def serving(link: Path, settings: ArmSettings = IDEAL, **more: object) -> Iterator[list[VirtualArm]]:
+    """A virtual arm that serves meanwhile; the list holds it afterwards."""
+    stop, ended = threading.Event(), list[VirtualArm]()
+    thread = threading.Thread(
+        target=lambda: ended.append(run_virtual_arm(settings, link=link, stop=stop, **more))  # type: ignore[arg-type]
+    )
+    thread.start()
+    try:
+        for _ in range(200):
+            if link.is_symlink():
+                break
+            wait(0.005)
+        yield ended
+    finally:
+        stop.set()
+        thread.join(5)
+
+
+def test_a_client_moves_the_arm_and_may_come_and_go(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    link, log = tmp_path / "arm", tmp_path / "motion.csv"
+    with serving(link, log=log) as ended:
+        device = os.readlink(link)
+        with serial.Serial(str(link), 115_200) as client:
+            client.write(b"\x00\x01" + move(100.0, x=207.5))
+        wait(0.15)
+        with serial.Serial(str(link), 9600) as client:
+            client.write(move(100.0, x=207.5, b=9) + move(100.0, x=212.5, b=9))
+            wait(0.4)
+    arm = ended[0]
+    assert (arm.frames, arm.ignored, arm.refused) == (3, [], [])
+    assert [data for _, data in arm.garbage] == [b"\x00\x01"]
+    assert not link.is_symlink() and not os.path.lexists(link)
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[:2] == [device, f"3 frames in {arm.now:.1f} s"]
+    assert "2 bytes in no frame" in printed[-1] and "00 01" in printed[-1]
+    rows = np.loadtxt(log, delimiter=",", skiprows=1)
+    assert log.read_text().splitlines()[0] == "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg"
+    assert rows[0].tolist() == [0, 202.5, 225, 113, 0, 0, 0]
+    assert rows[-1, 1:].tolist() == [212.5, 225, 113, 0, 9, 0]
+    assert np.diff(rows[:, 0]) == pytest.approx(0.001, abs=1e-9)
+    assert np.diff(rows[:, 1]).max() == pytest.approx(0.1, abs=1e-3)  # 100 mm/s
+
+
+def test_a_client_reads_replies(tmp_path: Path) -> None:
+    settings = ArmSettings(replies=Replies.STREAM, reply_period=0.01)
+    with serving(tmp_path / "arm", settings), serial.Serial(str(tmp_path / "arm"), 115_200, timeout=2) as client:
+        stream = reply_stream()
+        replies, _ = stream(client.read(30))
+        assert replies[0].kind in list(ReplyKind)
+        places = [reply for reply in replies + stream(client.read(60))[0] if reply.kind is ReplyKind.PLACE]
+        assert places[0].values == pytest.approx([202.5, 225, 113])
+
+
+def test_bytes_are_taken_no_faster_than_the_line_carries_them(tmp_path: Path) -> None:
+    with serving(tmp_path / "arm", profile=ArmProfile(baud=48_000)) as ended:
+        with serial.Serial(str(tmp_path / "arm"), 115_200) as client:
+            client.write(b"".join(move(1.0, x=202.5 + k) for k in range(1, 41)))
+        wait(0.2)  # room for 20 frames
+    assert 5 <= ended[0].frames <= 100 * ended[0].now + 1
+
+
+def test_a_link_never_overwrites_what_may_be_in_use(tmp_path: Path) -> None:
+    stop = threading.Event()
+    stop.set()
+    file, folder, used, left = (tmp_path / name for name in ("file", "folder", "used", "left"))
+    file.write_text("precious")
+    folder.mkdir()
+    used.symlink_to(file)
+    left.symlink_to(tmp_path / "gone")
+    for link in file, folder, used:
+        with pytest.raises(InputError, match="link = 'exists'"):
+            run_virtual_arm(IDEAL, link=link, stop=stop)
+    assert file.read_text() == "precious" and used.resolve() == file
+    run_virtual_arm(IDEAL, link=left, stop=stop)
+    assert not os.path.lexists(left)
+
+
+def test_a_log_never_overwrites_a_file(tmp_path: Path) -> None:
+    log = tmp_path / "motion.csv"
+    log.write_text("precious")
+    with pytest.raises(InputError, match="log"):
+        run_virtual_arm(IDEAL, log=log)
+    with pytest.raises(InputError, match="no such folder"):
+        run_virtual_arm(IDEAL, log=tmp_path / "none" / "motion.csv")
+    assert log.read_text() == "precious"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_in_order(tmp_path: Path, number: signal.Signals) -> None:
+    link, log = tmp_path / "arm", tmp_path / "motion.csv"
+    code = (
+        "from pathlib import Path; from hardware.simulator.port import *; from hardware.simulator.arm_settings import *;"
+        f"run_virtual_arm(ArmSettings(), link=Path({str(link)!r}), log=Path({str(log)!r}))"
+    )
+    root = Path(__file__).parents[1]
+    with subprocess.Popen([sys.executable, "-c", code], cwd=root, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip() == os.readlink(link)
+        process.send_signal(number)
+        assert process.stdout.readline().startswith("0 frames")
+    assert process.returncode == 0
+    assert not os.path.lexists(link)
+    assert log.read_text().splitlines()[1] == "0.000,202.500000,225.000000,113.000000,0.000000,0.000000,0.000000"
+
+
+def test_bytes_go_through_a_pty_unchanged_and_at_once() -> None:
+    rng = np.random.default_rng(0)
+    with PtyLink() as link:
+        assert link.name.startswith("/dev/")
+        for size in 1, 48, 256, 20_000:
+            data = rng.bytes(size)
+            assert link.transfer(data) == data
+        every = bytes(range(256)) * 2
+        assert link.transfer(every) == every
+        assert link.transfer(b"") == b""
