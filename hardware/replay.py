@@ -113,7 +113,7 @@ def replay_session(
     from hardware.tracker import tracker  # loads cv2: the motion must not
 
     checkpoints = read_path(path)
-    with tracker(session) as step, CommandWriter(out) as writer:
+    with tracker(session.rig, session.roi, session.surface) as step, CommandWriter(out) as writer:
 
         def track() -> Iterator[SurfacePose]:
             for done, frames in enumerate(session.frame_sets(), 1):

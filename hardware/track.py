@@ -92,7 +92,7 @@ def run_track(path: Path, out: Path, record: Path | None = None, force: bool = F
     cameras = [camera.name for camera in session.rig.cameras]
     complete = False
     with ExitStack() as stack:
-        step = stack.enter_context(tracker(session, clock.now))
+        step = stack.enter_context(tracker(session.rig, session.roi, session.surface, clock.now))
         sinks = [] if record is None else [stack.enter_context(TrackRecorder(record, session, force)).write]
         writer = stack.enter_context(PoseWriter(out, cameras, STAGES))
         progress = stack.enter_context(Progress("track", "frame sets", clock.now))
