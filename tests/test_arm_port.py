@@ -124,7 +124,7 @@ def test_a_log_never_overwrites_a_file(tmp_path: Path) -> None:
 def test_a_signal_ends_it_in_order(tmp_path: Path, number: signal.Signals) -> None:
     link, log = tmp_path / "arm", tmp_path / "motion.csv"
     code = (
-        "from pathlib import Path; from hardware.simulator.port import *; from hardware.simulator.arm_settings import *;"
+        "from pathlib import Path\nfrom hardware.simulator.port import *\n"
         f"run_virtual_arm(ArmSettings(), link=Path({str(link)!r}), log=Path({str(log)!r}))"
     )
     root = Path(__file__).parents[1]
@@ -132,7 +132,7 @@ def test_a_signal_ends_it_in_order(tmp_path: Path, number: signal.Signals) -> No
         assert process.stdout is not None
         assert process.stdout.readline().strip() == os.readlink(link)
         process.send_signal(number)
-        assert process.stdout.readline().startswith("0 frames")
+        assert process.communicate()[0].startswith("0 frames")
     assert process.returncode == 0
     assert not os.path.lexists(link)
     assert log.read_text().splitlines()[1] == "0.000,202.500000,225.000000,113.000000,0.000000,0.000000,0.000000"
