@@ -6,7 +6,6 @@ import json
 import math
 import sys
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from estimation.pose import TrackState
 from estimation.se3 import Array
 from hardware.chart import Plot, ribbon, spanning
 from hardware.evaluation import NEES_BOUND, OFF_MM, Comparison, Evaluation, spread
+from hardware.page import area_key, document, figures_table, legend, line_key, row_of_tiles, section, tile
 from hardware.summary import figure, measured_share, percent, text_of, verdict
 
 WIDTH = 1030  # px of a chart across the page
@@ -31,35 +31,28 @@ def write_report(path: Path, result: Evaluation) -> None:
 
 def page(result: Evaluation) -> str:
     """The page as HTML text."""
-    style = (files("hardware") / "report.css").read_text(encoding="utf-8")
-    sections = [_states(result), _trajectory(result), _errors(result), _tracks(result), _latency(result)]
-    title = escape(result.title or "a session")
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{title} · stillbed track</title>'
-        f'<meta name="viewport" content="width=device-width"><style>\n{style}</style></head><body><main>\n'
-        f'<header><div class="kind">stillbed track</div><h1>{title}</h1>'
-        f'<p class="lead">{escape(" ".join(verdict(result)))}</p></header>\n'
-        f"{_tiles(result)}\n{chr(10).join(part for part in sections if part)}\n"
-        f"<footer>Lengths in mm, time in s from the session's own clock; poses are base_from_surface.</footer>"
-        f"</main></body></html>\n"
-    )
+    body = [_tiles(result), *sections(result)]
+    footer = "Lengths in mm, time in s from the session's own clock; poses are base_from_surface."
+    return document("stillbed track", result.title or "a session", " ".join(verdict(result)), body, footer)
 
 
-def _tile(value: str, unit: str, caption: str) -> str:
-    return f'<div class="tile"><b>{escape(value)}<small>{escape(unit)}</small></b><span>{escape(caption)}</span></div>'
+def sections(result: Evaluation) -> list[str]:
+    """The parts of the page that follow its tiles, as HTML."""
+    parts = [_states(result), _trajectory(result), _errors(result), _tracks(result), _latency(result)]
+    return [part for part in parts if part]
 
 
 def _tiles(result: Evaluation) -> str:
-    tiles = [_tile(percent(measured_share(result)).removesuffix(" %"), "%", "of the frame sets followed")]
+    tiles = [tile(percent(measured_share(result)).removesuffix(" %"), "%", "of the frame sets followed")]
     if result.comparison is not None:
         start, aligned = result.comparison.start, result.comparison.aligned
-        tiles.append(_tile(figure(spread(start.translation).median), "mm", "median error from the start"))
-        tiles.append(_tile(figure(math.degrees(spread(start.rotation).median)), "°", "median error from the start"))
-        tiles.append(_tile(figure(spread(aligned.translation).rmse), "mm", "RMSE, aligned"))
+        tiles.append(tile(figure(spread(start.translation).median), "mm", "median error from the start"))
+        tiles.append(tile(figure(math.degrees(spread(start.rotation).median)), "°", "median error from the start"))
+        tiles.append(tile(figure(spread(aligned.translation).rmse), "mm", "RMSE, aligned"))
     if len(result.latency.total):
         late = result.latency
-        tiles.append(_tile(f"{late.p50[-1]:.1f}", "ms", f"per pose; 99 % under {late.p99[-1]:.1f} ms"))
-    return f'<div class="tiles">{"".join(tiles)}</div>'
+        tiles.append(tile(f"{late.p50[-1]:.1f}", "ms", f"per pose; 99 % under {late.p99[-1]:.1f} ms"))
+    return row_of_tiles(tiles)
 
 
 def _span(stamps: Array) -> tuple[float, float]:
@@ -75,38 +68,20 @@ def _followed(result: Evaluation) -> tuple[float, float]:
     return _span(later if len(later) else stamps)
 
 
-def _section(title: str, explanation: str, body: str) -> str:
-    return f"<section><h2>{escape(title)}</h2><p>{escape(explanation)}</p>{body}</section>"
-
-
-def _table(head: list[str], rows: list[list[str]], last_total: bool = False) -> str:
-    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
-    lines = []
-    for i, row in enumerate(rows):
-        style = ' class="total"' if last_total and i == len(rows) - 1 else ""
-        lines.append(f"<tr{style}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
-    return f"<table><thead><tr>{top}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
-
-
 def _states(result: Evaluation) -> str:
     table = result.table
     if not len(table):
-        return _section("States", "No frame set was given.", "")
+        return section("States", "No frame set was given.", "")
     last = table.stamps[-1] + (np.median(np.diff(table.stamps)) if len(table) > 1 else 1.0)
     edges = np.append(table.stamps, last)
     names = [state.value for state in table.states]
     titles = [f"{s:.2f} s: {n}. {why}" for s, n, why in zip(table.stamps, names, table.reasons, strict=True)]
     strip = ribbon(edges, names, titles, _span(table.stamps), WIDTH)
-    legend = "".join(
-        f'<span><svg viewBox="0 0 18 10"><rect class="{name}" width="18" height="10" rx="2"/></svg>'
-        f"{name} {percent(share)}</span>"
-        for name, share in result.shares.items()
-        if share > 0
-    )
+    keys = [area_key(name, f"{name} {percent(share)}") for name, share in result.shares.items() if share > 0]
     text = "TRACKING and DEGRADED are measured, COASTING is predicted, LOST is of no use."
     if math.isfinite(result.since):
         text += f" Shares count from {result.since:.2f} s, the instant of the roi."
-    return _section("States", text, f'{strip}<div class="legend">{legend}</div>{_events(result)}')
+    return section("States", text, strip + legend(keys) + _events(result))
 
 
 def _events(result: Evaluation) -> str:
@@ -168,22 +143,18 @@ def _trajectory(result: Evaluation) -> str:
         plot.line(table.stamps, values[:, i], "estimate")
         plots.append(plot.svg())
     pairs = [plots[i] for i in (0, 3, 1, 4, 2, 5)]
-    legend = _line_key("estimate", "estimate, with two standard deviations")
+    keys = [line_key("estimate", "estimate, with two standard deviations")]
     if result.comparison is not None:
-        legend += _line_key("truth", "truth" if result.comparison.exact else "reference")
-    body = f'<div class="legend">{legend}</div><div class="two">{"".join(pairs)}</div>'
+        keys.append(line_key("truth", "truth" if result.comparison.exact else "reference"))
+    body = f'{legend(keys)}<div class="two">{"".join(pairs)}</div>'
     text = "Position of the surface's origin in base, and its rotation since the first pose. Time in s."
-    return _section("Trajectory", text, body)
-
-
-def _line_key(style: str, words: str) -> str:
-    return f'<span><svg viewBox="0 0 18 10"><path class="{style}" d="M0 5H18"/></svg>{escape(words)}</span>'
+    return section("Trajectory", text, body)
 
 
 def _errors(result: Evaluation) -> str:
     comparison = result.comparison
     if comparison is None:
-        return _section(
+        return section(
             "Errors", "The session has neither truth.tum nor reference.tum, or no measured pose beside it.", ""
         )
     plots = [
@@ -195,7 +166,7 @@ def _errors(result: Evaluation) -> str:
         f"at {len(comparison.rows)} measured poses. From the start: the constant transform between the two surface "
         "frames is taken at the first TRACKING pose, nothing is fitted. Aligned: the best constant over the run."
     )
-    return _section("Errors", text, "".join(plots) + _error_table(comparison) + _consistency(comparison))
+    return section("Errors", text, "".join(plots) + _error_table(comparison) + _consistency(comparison))
 
 
 def _error_plot(result: Evaluation, comparison: Comparison, errors: Array, label: str, limit: float = np.inf) -> str:
@@ -220,7 +191,7 @@ def _error_table(comparison: Comparison) -> str:
         for unit, values in (("mm", errors.translation), ("°", np.degrees(errors.rotation))):
             s = spread(values)
             rows.append([f"{name}, {unit}", *(figure(v) for v in (s.median, s.rmse, s.p95, s.max))])
-    return _table(["", "median", "RMSE", "95 %", "max"], rows)
+    return figures_table(["", "median", "RMSE", "95 %", "max"], rows)
 
 
 def _consistency(comparison: Comparison) -> str:
@@ -245,14 +216,14 @@ def _tracks(result: Evaluation) -> str:
     if not len(table):
         return ""
     plot = Plot(WIDTH, 170, _followed(result), (0.0, max(float(table.used.max(initial=0)) * 1.08, 1.0)))
-    legend = ""
+    keys = []
     counted = ~table.is_state(TrackState.INITIALISING)
     for i, name in enumerate(table.cameras):
         plot.line(table.stamps, np.where(counted, table.used[:, i], np.nan), f"series c{i % 5}")
         middle = np.median(table.used[counted, i]) if counted.any() else 0
-        legend += _line_key(f"series c{i % 5}", f"{name}, median {middle:.0f}")
+        keys.append(line_key(f"series c{i % 5}", f"{name}, median {middle:.0f}"))
     text = "Tracks that carry the pose, per camera."
-    return _section("Tracks", text, f'<div class="legend">{legend}</div>{plot.svg()}')
+    return section("Tracks", text, legend(keys) + plot.svg())
 
 
 def _latency(result: Evaluation) -> str:
@@ -262,12 +233,12 @@ def _latency(result: Evaluation) -> str:
         f"{late.initial_sets} frame sets, up to the first map, took {late.initialisation:.0f} ms and are not counted."
     )
     if not len(late.total):
-        return _section("Latency", text, "")
+        return section("Latency", text, "")
     rows = [
         [name, *(f"{v:.2f}" for v in values)]
         for name, *values in zip(late.stages, late.p50, late.p95, late.p99, late.max, strict=True)
     ]
-    figures = _table(["stage, ms", "median", "95 %", "99 %", "max"], rows, last_total=True)
+    figures = figures_table(["stage, ms", "median", "95 %", "99 %", "max"], rows, last_total=True)
     high = max(float(np.percentile(late.total, 99.5)) * 1.25, 1.0)
     counts, edges = np.histogram(np.minimum(late.total, high * (1 - 1e-9)), bins=40, range=(0, high))
     plot = Plot(
@@ -280,7 +251,7 @@ def _latency(result: Evaluation) -> str:
     plot.mark(float(late.p50[-1]), "median", "median")
     plot.mark(float(late.p99[-1]), "99 %", "median")
     caption = '<div class="caption">frame sets by their total, ms</div>'
-    return _section("Latency", text, f'<div class="two"><div>{figures}</div><div>{caption}{plot.svg()}</div></div>')
+    return section("Latency", text, f'<div class="two"><div>{figures}</div><div>{caption}{plot.svg()}</div></div>')
 
 
 def main(arguments: list[str]) -> int:
