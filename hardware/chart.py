@@ -157,6 +157,13 @@ class Plot:
                 place = f'x="{a + 0.5:.1f}" y="{top:.1f}" width="{max(b - a - 1, 1):.1f}" height="{floor - top:.1f}"'
                 self._parts.append(f'<rect class="{style}" {place} rx="1"/>')
 
+    def shade(self, start: Array, end: Array, style: str, titles: Sequence[str] = ()) -> None:
+        """The whole height between start and end (N,) along x; titles: N, told of each to whoever points at it."""
+        for i, (a, b) in enumerate(zip(self.x(start), self.x(end), strict=True)):
+            place = f'x="{a:.1f}" y="{self.top}" width="{max(b - a, 0.8):.1f}" height="{self._floor - self.top}"'
+            title = f"<title>{escape(titles[i])}</title>" if titles else ""
+            self._parts.append(f'<rect class="{style}" {place}>{title}</rect>')
+
     def mark(self, x: float, text: str, style: str) -> None:
         """A vertical line at x with a word beside it."""
         at = float(self.x(np.array([x]))[0])
