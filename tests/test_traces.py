@@ -111,6 +111,7 @@ def test_smoothing_takes_the_noise_out_of_the_speed_and_leaves_the_breath(tmp_pa
     raw = play(tmp_path / "noisy.tum", smooth_s=0).twist(times)[:, 3:] - speed
     smoothed = play(tmp_path / "noisy.tum").twist(times)[:, 3:] - speed
     assert np.std(smoothed) < 0.4 * np.std(raw)
+    assert np.allclose(play(tmp_path / "noisy.tum")(0.0), np.eye(4), atol=1e-12)  # it still begins at the rest pose
     unspoilt = play(tmp_path / "clean.tum")(times)[:, :3, 3] - play(tmp_path / "clean.tum", smooth_s=0)(times)[:, :3, 3]
     assert np.std(unspoilt, axis=0).max() < 0.02  # mm of 5
 
