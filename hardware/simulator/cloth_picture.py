@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.se3 import Array
 from hardware.simulator import cloth, nozzle_shape, sheet
-from hardware.simulator.lamps import AMBIENT
 from hardware.simulator.noise import Field
 from hardware.simulator.state import State, moved
 from hardware.simulator.view import Rays, View
 
-LATTICE = 4  # px
+LATTICE = 8  # px
 SEARCH = 16  # px between the rays that are searched step by step
-STEPS = 40
+STEPS = 20
+STRIP = 48  # rows coloured at once: their fields stay in the cache
 HIGHEST = 40.0  # mm above the rest plane: nothing of the cloth is higher
 DEEPEST = -130.0
 
@@ -76,7 +76,10 @@ def cloth_picture(state: State, view: View) -> ClothPicture:
     w, h = view.camera.size
     whole = view.whole
     fields = cv2.resize(np.dstack([x, y, *passed]), (whole.x1, whole.y1), interpolation=cv2.INTER_LINEAR)[:h, :w]
-    return ClothPicture(_coloured(state, fields), depth)
+    light = np.empty((h, w, 3), np.float32)
+    for first in range(0, h, STRIP):
+        _coloured(state, fields[first : first + STRIP], light[first : first + STRIP])
+    return ClothPicture(light, depth)
 
 
 def _search(eye: _Eye, rays: Rays) -> Field:
@@ -116,31 +119,20 @@ def _passed(eye: _Eye, rays: Rays, depth: Field) -> list[Field]:
     """Per lamp the light (H, W) that passes the nozzle on its way to the cloth."""
     state = eye.state
     if state.instant.base_from_nozzle is None:
-        return [np.ones_like(depth)]
+        return []
     nozzle_from_base = se3.inverse(state.instant.base_from_nozzle)
-    nozzle_from_camera = nozzle_from_base @ se3.inverse(state.base_from_grid @ se3.inverse(np.eye(4)))
     nozzle_from_camera = nozzle_from_base @ state.base_from_grid @ eye.grid_from_camera
     points = moved(nozzle_from_camera, rays.x * depth, rays.y * depth, depth)
     nozzle_from_rest = nozzle_from_base @ state.scene.base_from_rest
     return [nozzle_shape.lit(points, nozzle_from_rest, state.lamps[0])]
 
 
-def _coloured(state: State, fields: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Linear BGR (H, W, 3) of the cloth at material x, y and the share of the key lamp's light there (H, W, 3)."""
+def _coloured(state: State, fields: NDArray[np.float32], light: NDArray[np.float32]) -> None:
+    """Fill in linear BGR (H, W, 3) of the cloth at material x, y, where a share of the key lamp's light falls."""
     picture = state.scene.sheet.picture
     u = fields[..., 0] * np.float32(1 / sheet.TEXEL) + np.float32((picture.shape[1] - 1) / 2)
     v = fields[..., 1] * np.float32(1 / sheet.TEXEL) + np.float32((picture.shape[0] - 1) / 2)
     found = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-    shade, across, along, open_sky = cv2.split(found)
-    facing = 1 / cv2.sqrt(across * across + along * along + 1)
-    key, fill = state.lamps
-    passed = (fields[..., 2], None)
-    lights = [np.float32(state.scene.look.ambient * AMBIENT[c]) * (0.45 + 0.55 * facing) for c in range(3)]
-    for lamp, share in zip((key, fill), passed, strict=True):
-        d = lamp.towards.astype(np.float32)
-        cosine = np.maximum((d[2] - d[0] * across - d[1] * along) * facing + np.float32(0.1), 0)
-        cosine = cosine if share is None else cosine * share
-        for c in range(3):
-            lights[c] += cosine * np.float32(lamp.strength * lamp.colour[c] / 1.1)
-    shade = shade * open_sky
-    return np.asarray(cv2.merge([lights[c] * shade * cloth.TEAL[c] for c in range(3)]), np.float32)
+    key = found[..., 3] * fields[..., 2] if fields.shape[2] > 2 else found[..., 3]
+    tint = cloth.TEAL * np.array(state.lamps[0].colour, np.float32)
+    cv2.merge([found[..., c] + key * tint[c] for c in range(3)], light)

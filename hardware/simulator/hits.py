@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hardware.simulator.noise import Field, gradient
 
 STEPS = 56  # of the search downwards
-ROUNDS = 3  # of Newton's method after the first
+ROUNDS = 2  # of Newton's method
 FLAT = 0.3  # rays that meet the surface more grazing than this (1: head on) are searched for one by one
 CLOSE = 2e-3  # mm that is left over where Newton's method did not come to rest
 
@@ -41,24 +41,30 @@ def relief(height: Field) -> Relief:
     return Relief(height, np.dstack(gradient(height, 1.0)), float(height.min()) - 0.1, float(height.max()) + 0.1)
 
 
-def meet(field: Relief, rays: Bundle, coarse: Bundle, scale: int) -> Field:
+def meet(field: Relief, rays: Bundle, start: Field, odd: Mask) -> Field:
     """Height z (H, W) mm where each ray first meets the field, which goes on beyond its edge as it is there.
 
-    coarse: the same rays at the middles of squares of `scale` rays. From their search the others start; Newton's method
-    ends within 1e-4 mm where the surface faces the ray, and where it grazes or hides itself the ray is searched alone.
+    start: (H, W) mm, near it. odd: (H, W) which rays are searched alone, because the surface there grazes them or hides
+    itself; the others, and those that do not come to rest, end within 1e-4 mm by Newton's method.
     """
-    found, facing = _search(field, coarse)
-    odd = cv2.dilate((facing < FLAT).astype(np.uint8), np.ones((3, 3), np.uint8))
-    size = rays.u.shape[::-1]
-    z, rest = _newton(field, rays, cv2.resize(found, size, interpolation=cv2.INTER_LINEAR))
-    doubt = (cv2.resize(odd, size, interpolation=cv2.INTER_NEAREST) > 0) | ~(np.abs(rest) < CLOSE)
+    z, rest = _newton(field, rays, start)
+    doubt = odd | ~(np.abs(rest) < CLOSE)
+    if doubt.any():
+        doubt &= near(field, rays, z)
     place = np.nonzero(doubt)
     if len(place[0]):
         alone = Bundle(*(np.ascontiguousarray(part[place][:, None]) for part in rays))
-        searched, _ = _search(field, alone)
+        searched, _ = search(field, alone)
         better, left = _newton(field, alone, searched)
         z[place] = np.where(np.abs(left) < 10 * CLOSE, better, searched)[:, 0]
     return z
+
+
+def near(field: Relief, rays: Bundle, z: Field, margin: float = 4.0) -> Mask:
+    """Whether rays stand over the field, or within `margin` nodes of it, at height z."""
+    rows, columns = field.height.shape
+    u, v = rays.u + z * rays.du, rays.v + z * rays.dv
+    return (u > -margin) & (u < columns + margin) & (v > -margin) & (v < rows + margin)
 
 
 def _heights(field: Relief, rays: Bundle, z: Field) -> Field:
@@ -77,7 +83,7 @@ def _newton(field: Relief, rays: Bundle, z: Field) -> tuple[Field, Field]:
     return np.asarray(z - rest * step, np.float32), rest
 
 
-def _search(field: Relief, rays: Bundle) -> tuple[Field, Field]:
+def search(field: Relief, rays: Bundle) -> tuple[Field, Field]:
     """Heights where rays first meet the field, by steps downwards, and how much it faces them there (1: head on)."""
     step = np.float32((field.high - field.low) / (STEPS - 1))
     z = np.full(rays.u.shape, field.low, np.float32)

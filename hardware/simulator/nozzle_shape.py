@@ -25,81 +25,77 @@ class Part(NamedTuple):
     metal: bool
 
 
-STEEL, PLASTIC, GEL, CAP, HOLDER = (
-    linear(bgr) for bgr in ([176, 178, 180], [196, 202, 200], [128, 172, 206], [96, 78, 52], [112, 114, 118])
+STEEL, PLASTIC, GEL, LUER, RING, CAP = (
+    linear(bgr)
+    for bgr in ([176, 178, 180], [190, 198, 198], [136, 176, 204], [62, 92, 196], [104, 106, 110], [150, 112, 62])
 )
 PARTS = (
-    Part(0.0, 3.0, 0.33, 0.45, STEEL, 0.8, True),
-    Part(3.0, 13.0, 0.45, 0.45, STEEL, 0.8, True),
-    Part(13.0, 14.5, 0.45, 2.1, CAP, 0.5, False),
-    Part(14.5, 24.0, 2.1, 3.4, CAP, 0.5, False),
-    Part(24.0, 26.0, 4.4, 4.4, CAP, 0.5, False),
-    Part(26.0, 31.0, 3.6, 8.0, PLASTIC, 0.6, False),
-    Part(31.0, 58.0, 8.0, 8.0, GEL, 0.65, False),
-    Part(58.0, 62.0, 8.6, 8.6, PLASTIC, 0.6, False),
-    Part(62.0, 96.0, 13.0, 13.0, HOLDER, 0.5, True),
+    Part(0.0, 2.0, 0.32, 0.42, STEEL, 0.8, True),
+    Part(2.0, 12.7, 0.42, 0.42, STEEL, 0.8, True),
+    Part(12.7, 13.6, 0.5, 1.5, LUER, 0.5, False),
+    Part(13.6, 21.0, 1.5, 2.5, LUER, 0.5, False),
+    Part(21.0, 23.0, 3.6, 3.6, LUER, 0.5, False),
+    Part(23.0, 27.0, 2.4, 4.6, PLASTIC, 0.6, False),
+    Part(27.0, 50.0, 4.6, 4.6, GEL, 0.65, False),
+    Part(50.0, 58.0, 4.6, 4.6, PLASTIC, 0.6, False),
+    Part(58.0, 76.0, 8.0, 8.0, RING, 0.5, True),
+    Part(76.0, 78.0, 8.0, 7.0, RING, 0.5, True),
+    Part(78.0, 88.0, 5.6, 5.2, CAP, 0.4, False),
+    Part(88.0, 96.0, 2.2, 2.2, STEEL, 0.6, True),
 )
 LENGTH = PARTS[-1].z1
+TURN = np.linspace(0, 2 * np.pi, 17)[:-1]
+
+Triple = tuple[Field, Field, Field]  # x, y, z
 
 
-def outline_points() -> Array:
-    """Points (N, 3) mm, nozzle frame, whose pictures hold the whole nozzle's."""
-    around = np.linspace(0, 2 * np.pi, 13)[:-1]
-    rings = [(z, 1.05 * r) for p in PARTS for z, r in ((p.z0, p.r0), (p.z1, p.r1))]
-    return np.array([[r * np.cos(a), r * np.sin(a), z] for z, r in rings for a in around])
+class Met(NamedTuple):
+    """What rays see of one part, all of the rays' shape. depth: in lengths of the ray, inf: nothing. x, y, z: normal."""
+
+    depth: Field
+    x: Field
+    y: Field
+    z: Field
+
+
+def outline(part: Part) -> Array:
+    """Points (N, 3) mm, nozzle frame, whose pictures hold the part's."""
+    rings = ((part.z0, 1.02 * part.r0), (part.z1, 1.02 * part.r1))
+    return np.array([[r * np.cos(a), r * np.sin(a), z] for z, r in rings for a in TURN])
 
 
 def radius_at(z: Field) -> Field:
     """Radius mm at heights z mm, for shadows: steps are bridged."""
-    return np.interp(z, [p.z0 for p in PARTS] + [LENGTH], [p.r0 for p in PARTS] + [PARTS[-1].r1]).astype(np.float32)
+    ends = np.interp(z, [p.z0 for p in PARTS] + [LENGTH], [p.r0 for p in PARTS] + [PARTS[-1].r1])
+    return np.asarray(ends, np.float32)
 
 
-class Seen(NamedTuple):
-    """What rays see of the nozzle, (N,) each. depth: in lengths of the ray, inf: nothing. part: its number in PARTS."""
-
-    depth: Field
-    part: np.ndarray[tuple[int], np.dtype[np.int64]]
-    normal: Array  # (N, 3), nozzle frame
-
-
-def trace(origin: Array, rays: Array) -> Seen:
-    """What rays (N, 3) from `origin` (3,), nozzle frame, see of the nozzle."""
-    depth = np.full(len(rays), np.inf)
-    which = np.zeros(len(rays), np.int64)
-    normal = np.zeros_like(rays)
-    for number, part in enumerate(PARTS):
-        for t, out in (_side(part, origin, rays), _disc(part.z0, part.r0, -1, origin, rays), _disc(part.z1, part.r1, 1, origin, rays)):
-            nearer = t < depth
-            depth[nearer], which[nearer], normal[nearer] = t[nearer], number, out[nearer]
-    return Seen(depth.astype(np.float32), which, normal)
-
-
-def _side(part: Part, origin: Array, rays: Array) -> tuple[Array, Array]:
-    """Depth (N,), inf for a miss, and normals (N, 3) where rays meet a frustum's side."""
-    k = (part.r1 - part.r0) / (part.z1 - part.z0)
-    r = part.r0 + k * (origin[2] - part.z0)
-    a = rays[:, 0] ** 2 + rays[:, 1] ** 2 - (k * rays[:, 2]) ** 2
-    b = rays[:, 0] * origin[0] + rays[:, 1] * origin[1] - k * rays[:, 2] * r
-    c = origin[0] ** 2 + origin[1] ** 2 - r**2
+def meet(part: Part, origin: Array, rays: Triple) -> Met:
+    """Where rays from `origin` (3,), nozzle frame, meet a part: its side or one of its flat ends."""
+    ox, oy, oz = (np.float32(v) for v in origin)
+    dx, dy, dz = rays
+    k = np.float32((part.r1 - part.r0) / (part.z1 - part.z0))
+    r = np.float32(part.r0 + k * (oz - part.z0))
+    a = dx * dx + dy * dy - (k * k) * dz * dz
+    b = dx * ox + dy * oy - (k * r) * dz
+    c = ox * ox + oy * oy - r * r
     with np.errstate(invalid="ignore", divide="ignore"):
-        t = (-b - np.sqrt(b * b - a * c)) / a
-        z = origin[2] + t * rays[:, 2]
-        t = np.where((t > 0) & (z >= part.z0) & (z <= part.z1), t, np.inf)
-    at = origin[:2] + np.where(np.isfinite(t), t, 0)[:, None] * rays[:, :2]
-    out = np.column_stack([at / np.maximum(np.linalg.norm(at, axis=1, keepdims=True), 1e-9), np.full(len(rays), -k)])
-    return t, out / np.hypot(1, k)
+        depth = (-b - np.sqrt(b * b - a * c)) / a
+        z = oz + depth * dz
+        depth = np.where((depth > 0) & (z >= part.z0) & (z <= part.z1), depth, np.float32(np.inf))
+        x, y = ox + depth * dx, oy + depth * dy
+        inverse = 1 / (np.hypot(x, y) * np.hypot(1, k))
+        met = Met(depth, x * inverse, y * inverse, np.full_like(x, -k / np.hypot(1, k)))
+        side, height, radius = (1, part.z1, part.r1) if oz > part.z1 else (-1, part.z0, part.r0)
+        if part.z0 <= oz <= part.z1:
+            return met
+        end = (np.float32(height) - oz) / dz
+        x, y = ox + end * dx, oy + end * dy
+        hit = (end > 0) & (x * x + y * y <= radius * radius) & (end < depth)
+    return Met(*(np.where(hit, new, old) for new, old in zip((end, 0, 0, side), met, strict=True)))
 
 
-def _disc(z: float, radius: float, side: int, origin: Array, rays: Array) -> tuple[Array, Array]:
-    """The same for a flat end at height z that faces up (1) or down (-1)."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        t = (z - origin[2]) / rays[:, 2]
-        at = origin[:2] + t[:, None] * rays[:, :2]
-        hit = (t > 0) & (rays[:, 2] * side < 0) & ((at**2).sum(1) <= radius**2)
-    return np.where(hit, t, np.inf), np.broadcast_to(np.array([0.0, 0.0, side]), rays.shape)
-
-
-def lit(points: tuple[Field, Field, Field], nozzle_from_rest: Array, lamp: Lamp) -> Field:
+def lit(points: Triple, nozzle_from_rest: Array, lamp: Lamp) -> Field:
     """Share of the lamp's light that passes the nozzle, at points given by x, y, z (H, W) mm, nozzle frame.
 
     The lamp is a disc: the shadow's edge softens with the distance between the nozzle and what it falls on.

@@ -14,7 +14,7 @@ from hardware.simulator.cloth_picture import LATTICE, ClothPicture, cloth_pictur
 from hardware.simulator.instant import Instant
 from hardware.simulator.nozzle_picture import nozzle_box, nozzle_picture
 from hardware.simulator.scene import Scene
-from hardware.simulator.sensor import Sensor, develop, expose
+from hardware.simulator.sensor import Sensor, expose
 from hardware.simulator.skin_picture import SkinPicture, skin_picture
 from hardware.simulator.state import State, state
 from hardware.simulator.view import SAMPLES, Box, View
@@ -54,8 +54,7 @@ def _finished(
     box = nozzle_box(state, view)
     if box is not None:
         _over(light, box, nozzle_picture(state, view, box, _behind(box, skin, cloth)))
-    display = expose(light, sensor, view.fall(sensor), state.instant.gain)
-    return develop(display, sensor, rng)
+    return expose(light, sensor, view.fall(sensor), state.instant.gain, rng)
 
 
 def _over(light: NDArray[np.float32], box: Box, layer: NDArray[np.float32]) -> None:

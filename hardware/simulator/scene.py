@@ -45,7 +45,7 @@ class Scene:
         rng = np.random.default_rng([seed, 23])
         self.relief = paint.relief(shape, half)
         self.layers = paint.paint(shape, self.relief, half, self.look, seed)
-        self.sheet = sheet.bare(rng) if half is None else sheet.draped(shape, half, rng)
+        self.sheet = sheet.bare(self.look, rng) if half is None else sheet.draped(shape, half, self.look, rng)
         self.ink = Ink(self.layers)
         self._at_rest = relief(self.relief)
         self._views: dict[Camera, View] = {}

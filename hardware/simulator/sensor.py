@@ -14,6 +14,7 @@ from estimation.rig import Camera
 from perception.frames import Image
 
 ROOM = 256  # px by which the stored grain is larger than an image, so that each image takes another cut of it
+STRIP = 48  # rows developed at once: they stay in the cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +38,6 @@ class Sensor:
             raise InputError("sensor", "blur", self.blur, "0 to 10 px")
 
 
-def expose(light: NDArray[np.float32], sensor: Sensor, fall: NDArray[np.float32], gain: float) -> NDArray[np.float32]:
-    """Display values 0..255, not yet rounded, (H, W, 3) of linear light (H, W, 3); fall: as `vignette` gives."""
-    if sensor.blur:
-        light = cv2.GaussianBlur(light, (0, 0), sensor.blur)
-    return np.asarray(cv2.sqrt(cv2.multiply(light, fall, scale=gain * 255.0**2)), np.float32)
-
-
 def vignette(camera: Camera, sensor: Sensor) -> NDArray[np.float32]:
     """Share of the light (H, W, 3) that reaches each pixel."""
     x = (np.arange(camera.size[0]) - camera.matrix[0, 2]) / camera.matrix[0, 0]
@@ -52,14 +46,24 @@ def vignette(camera: Camera, sensor: Sensor) -> NDArray[np.float32]:
     return np.ascontiguousarray(np.repeat(share[..., None], 3, 2), np.float32)
 
 
-def develop(display: NDArray[np.float32], sensor: Sensor, rng: np.random.Generator) -> Image:
-    """The image (H, W, 3) with grain: a cut at random from one large field (drawing anew is ten times slower)."""
-    if not sensor.noise:
-        return np.asarray(np.clip(np.rint(display), 0, 255), np.uint8)
-    h, w = display.shape[:2]
+def expose(
+    light: NDArray[np.float32], sensor: Sensor, fall: NDArray[np.float32], gain: float, rng: np.random.Generator
+) -> Image:
+    """The image (H, W, 3) BGR of linear light (H, W, 3); fall: as `vignette` gives.
+
+    The grain is a cut at random from one large field (drawing anew is ten times slower).
+    """
+    h, w = light.shape[:2]
+    if sensor.blur:
+        light = cv2.GaussianBlur(light, (0, 0), sensor.blur)
     y, x = rng.integers(0, ROOM, 2)
     grain = _grain(h, w)[y : y + h, x : x + w]
-    return np.asarray(cv2.addWeighted(display, 1.0, grain, sensor.noise, 0.0, dtype=cv2.CV_8U), np.uint8)
+    image = np.empty((h, w, 3), np.uint8)
+    for first in range(0, h, STRIP):
+        rows = slice(first, first + STRIP)
+        display = cv2.sqrt(cv2.multiply(light[rows], fall[rows], scale=gain * 255.0**2))
+        image[rows] = cv2.addWeighted(display, 1.0, grain[rows], sensor.noise, 0.0, dtype=cv2.CV_8U)
+    return image
 
 
 @lru_cache(maxsize=4)

@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 
 from hardware.simulator import cloth
+from hardware.simulator.lamps import AMBIENT, lamps
 from hardware.simulator.layers import Texture
+from hardware.simulator.look import Look
 from hardware.simulator.noise import Field, gradient, ramp
 from hardware.simulator.shape import Shape
 
@@ -24,7 +26,8 @@ HELD, FREE = 12.0, 140.0  # mm from the opening: up to here it moves with the bo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
-    """A cloth. heights: (H, W) mm, grid frame, nodes STEP apart. picture: (H, W, 4) shade, slopes x and y, occlusion.
+    """A cloth. heights: (H, W) mm, grid frame, nodes STEP apart. picture: (H, W, 4) linear BGR without the
+    key lamp, and what the key lamp adds to a white cloth.
 
     half: half sides mm of the opening; None: no opening, the cloth does not move.
     """
@@ -51,7 +54,7 @@ def thickness(outside: Field) -> Field:
     return np.asarray(THICKNESS * ramp(outside, -0.1, 1.2), np.float32)
 
 
-def draped(shape: Shape, half: tuple[float, float], rng: np.random.Generator) -> Sheet:
+def draped(shape: Shape, half: tuple[float, float], look: Look, rng: np.random.Generator) -> Sheet:
     """A drape over the shape with a rounded opening of half sides `half` mm, falling to the table all round."""
     x, y = axes(SPAN, STEP)
     reach = np.array(shape.size, np.float32) / 2
@@ -68,25 +71,33 @@ def draped(shape: Shape, half: tuple[float, float], rng: np.random.Generator) ->
     tent += ramp(away, 0, 30) * (soft - tent)
     wrinkles = cloth.folds(x.shape, STEP, rng) * ramp(outside, 8, 70)
     heights = tent + thickness(outside) + wrinkles - 3 * (outside < -4)
-    return Sheet(np.asarray(heights, np.float32), _picture(heights, rng), half)
+    return Sheet(np.asarray(heights, np.float32), _picture(heights, look, rng), half)
 
 
-def bare(rng: np.random.Generator) -> Sheet:
+def bare(look: Look, rng: np.random.Generator) -> Sheet:
     """A cloth at rest behind a bare patch."""
     x, _ = axes(SPAN, STEP)
     heights = ALONE + cloth.folds(x.shape, STEP, rng)
-    return Sheet(np.asarray(heights, np.float32), _picture(heights, rng), None)
+    return Sheet(np.asarray(heights, np.float32), _picture(heights, look, rng), None)
 
 
-def _picture(heights: Field, rng: np.random.Generator) -> Texture:
+def _picture(heights: Field, look: Look, rng: np.random.Generator) -> Texture:
+    """The cloth lit by the lamps, which hang over it at rest; that it turns with the body near it is left out."""
     size = (round(SPAN[0] / TEXEL), round(SPAN[1] / TEXEL))
     shade, fibre = cloth.weave(size[::-1], TEXEL, rng)
-    large = _enlarged(np.asarray(heights, np.float32), size)
-    sx, sy = gradient(large, TEXEL)
-    fx, fy = gradient(fibre, TEXEL)
+    across, along = gradient(_enlarged(np.asarray(heights, np.float32), size) + fibre, TEXEL)
     hollow = cv2.resize(cv2.GaussianBlur(heights, (0, 0), 12 / STEP) - heights, size)
-    occlusion = np.clip(1 - 0.06 * np.clip(hollow, -2, 8), 0.5, 1.0)
-    return np.ascontiguousarray(np.dstack([shade, sx + fx, sy + fy, occlusion]), np.float32)
+    shade *= np.clip(1 - 0.06 * np.clip(hollow, -2, 8), 0.5, 1.0)
+    facing = 1 / cv2.sqrt(across * across + along * along + 1)
+    key, fill = (
+        lamp.strength * np.maximum((d[2] - d[0] * across - d[1] * along) * facing + 0.1, 0) / np.float32(1.1)
+        for lamp in lamps(look)
+        for d in [lamp.towards.astype(np.float32)]
+    )
+    room = np.float32(look.ambient) * (0.45 + 0.55 * facing)
+    tints = zip(AMBIENT, lamps(look)[1].colour, cloth.TEAL, strict=True)
+    rest = [shade * (room * np.float32(a) + fill * np.float32(f)) * teal for a, f, teal in tints]
+    return np.ascontiguousarray(np.dstack([*rest, shade * key]), np.float32)
 
 
 def _enlarged(heights: Field, size: tuple[int, int]) -> Field:

@@ -14,12 +14,13 @@ from estimation.se3 import Array
 from hardware.simulator import hits, shading
 from hardware.simulator.hits import Bundle
 from hardware.simulator.noise import Field
-from hardware.simulator.state import SHADOW_STEP, State
+from hardware.simulator.state import SHADOW_STEP, State, turned
 from hardware.simulator.view import CELL, SAMPLES, Box, Rays, View
 
 GRAZING = -0.03  # of a ray's z: those that sink less never meet the shape
 OUTSIDE = -1e5  # a node where nothing is painted
 FRAME = 4.0  # mm between the points that tell which part of an image the shape covers
+STRIP = 4  # rows of cells worked on at once: their fields stay in the cache
 SMEAR = 1.5  # px between the instants of one exposure that a pixel holds
 MOST_INSTANTS = 8  # a sample; at more the picture is one smear anyway
 TIMES = np.array([[-3, 1], [3, -1]]) / 8  # of the exposure, for the samples (row, column) of a pixel
@@ -40,21 +41,69 @@ def skin_picture(state: State, view: View) -> SkinPicture | None:
     box = covered(state, view)
     if box is None:
         return None
-    scene = state.scene
+    lattice = _lattice(state, view, box)
+    light = np.empty((*box.size, 4), np.float32)
+    depth = None if state.shadow is None else np.empty((box.size[0] * SAMPLES, box.size[1] * SAMPLES), np.float32)
+    for first in range(0, box.size[0] // CELL, STRIP):
+        last = min(first + STRIP, box.size[0] // CELL)
+        rows = slice(first * CELL * SAMPLES, last * CELL * SAMPLES)
+        samples, deep = _strip(state, view, lattice, first, last)
+        shrunk = cv2.resize(samples, (box.size[1], (last - first) * CELL), interpolation=cv2.INTER_AREA)
+        light[first * CELL : last * CELL] = shrunk  # the mean of each pixel's samples
+        if depth is not None:
+            depth[rows] = deep
+    return SkinPicture(box, light, depth)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lattice:
+    """What varies slowly, (h, w) at the middles of a box's cells, and the box's rays, (H, W).
+
+    start: heights mm. odd: where rays must be searched one by one. mirrors: slopes that mirror the lamps, (h, w, 4).
+    speed: (h, w, 2) mm/s of material points past the rays.
+    """
+
+    grid_from_camera: Array
+    rays: Rays
+    start: Field
+    odd: NDArray[np.uint8]
+    mirrors: Field
+    speed: Field
+
+    def enlarged(self, field: NDArray[np.float32], first: int, last: int) -> NDArray[np.float32]:
+        """A field of the cells at the samples of the cell rows first to last."""
+        low, high = max(first - 1, 0), min(last + 1, len(field))
+        times = CELL * SAMPLES
+        size = (field.shape[1] * times, (high - low) * times)
+        large = cv2.resize(field[low:high], size, interpolation=cv2.INTER_LINEAR)
+        return np.asarray(large[(first - low) * times : (last - low) * times], np.float32)
+
+
+def _lattice(state: State, view: View, box: Box) -> _Lattice:
     grid_from_camera = se3.inverse(state.base_from_grid) @ view.camera.base_from_camera
     rays = view.rays(box)
     small = (box.size[1] // CELL, box.size[0] // CELL)
     cells = Rays(*(cv2.resize(r, small, interpolation=cv2.INTER_AREA) for r in rays))
-    lines, sink = _bundle(state, grid_from_camera, rays)
-    coarse, _ = _bundle(state, grid_from_camera, cells)
-    z = hits.meet(state.relief, lines, coarse, CELL * SAMPLES)
-    u, v = lines.u + z * lines.du, lines.v + z * lines.dv  # nodes of material points
-    directions = _turned(grid_from_camera[:3, :3], cells)
+    lines, _ = _bundle(state, grid_from_camera, cells)
+    start, facing = hits.search(state.relief, lines)
+    hard = (facing < hits.FLAT) & hits.near(state.relief, lines, start, CELL * SAMPLES)
+    odd = cv2.dilate(hard.astype(np.uint8), np.ones((3, 3), np.uint8))
+    directions = turned(grid_from_camera[:3, :3], *cells)
     mirrors = shading.half_slopes(directions, state.towards)
-    if state.instant.strain and scene.deformation.bulge:
-        pass
-    size = u.shape[::-1]
-    mirrors = cv2.resize(mirrors, size, interpolation=cv2.INTER_LINEAR)
+    speed = _speed(state, directions, lines.u + start * lines.du, lines.v + start * lines.dv, start)
+    return _Lattice(grid_from_camera, rays, start, odd, mirrors, speed)
+
+
+def _strip(
+    state: State, view: View, lattice: _Lattice, first: int, last: int
+) -> tuple[NDArray[np.float32], Field | None]:
+    """Light (H, W, 4) and depth (H, W) mm of the samples of cell rows first to last."""
+    scene, times = state.scene, CELL * SAMPLES
+    rays = Rays(*(r[first * times : last * times] for r in lattice.rays))
+    lines, sink = _bundle(state, lattice.grid_from_camera, rays)
+    odd = np.repeat(np.repeat(lattice.odd[first:last], times, 0), times, 1) > 0
+    z = hits.meet(state.relief, lines, lattice.enlarged(lattice.start, first, last), odd)
+    u, v = lines.u + z * lines.du, lines.v + z * lines.dv  # nodes of material points
     passed = None
     if state.shadow is not None:
         skip = np.float32(max(1, round(SHADOW_STEP / scene.shape.step)))
@@ -62,17 +111,16 @@ def skin_picture(state: State, view: View) -> SkinPicture | None:
     level = scene.layers.level(view.spacing)
     scale, ox, oy = scene.layers.offsets(level)
     to_texels = np.float32(scene.shape.step * scale)
-    half = np.array(scene.shape.size) / 2
-    tu = u * to_texels + np.float32(ox - half[0] * scale)
-    tv = v * to_texels + np.float32(oy - half[1] * scale)
-    speed = _speed(state, directions, small, u, v, z) * np.float32(scale)
-    colour, relief = _exposed(state, level, tu, tv, speed, view)
+    tu = u * to_texels + np.float32(ox - scene.shape.size[0] / 2 * scale)
+    tv = v * to_texels + np.float32(oy - scene.shape.size[1] / 2 * scale)
+    speed = lattice.enlarged(lattice.speed, first, last) if lattice.speed.any() else None
+    colour, relief = _exposed(state, view, level, tu, tv, speed)
+    mirrors = lattice.enlarged(lattice.mirrors, first, last)
     light = shading.shade(colour, relief, mirrors, passed, state.towards, state.lamps, scene.look.ambient)
-    light = cv2.resize(light, box.size[::-1], interpolation=cv2.INTER_AREA)
-    depth = None
-    if state.instant.base_from_nozzle is not None:
-        depth = np.where(colour[..., 3] > 0.5, (z - np.float32(grid_from_camera[2, 3])) * sink, np.float32(np.inf))
-    return SkinPicture(box, light, depth)
+    if state.shadow is None:
+        return light, None
+    deep = (z - np.float32(lattice.grid_from_camera[2, 3])) * sink
+    return light, np.where(colour[..., 3] > 0.5, deep, np.float32(np.inf))
 
 
 def covered(state: State, view: View) -> Box | None:
@@ -87,16 +135,9 @@ def covered(state: State, view: View) -> Box | None:
     return view.clip(pixels.min(0) - 4, pixels.max(0) + 4)
 
 
-def _turned(rotation: Array, rays: Rays) -> tuple[Field, Field, Field]:
-    """Directions x, y, z (H, W) in the grid frame of rays whose z in the camera frame is 1."""
-    m = rotation.astype(np.float32)
-    x, y, z = (m[i, 0] * rays.x + m[i, 1] * rays.y + m[i, 2] for i in range(3))
-    return x, y, z
-
-
 def _bundle(state: State, grid_from_camera: Array, rays: Rays) -> tuple[Bundle, Field]:
     """Rays as lines over the nodes of material points, and 1 / their z."""
-    x, y, z = _turned(grid_from_camera[:3, :3], rays)
+    x, y, z = turned(grid_from_camera[:3, :3], *rays)
     never = z > GRAZING
     sink = 1 / np.where(never, np.float32(-1), z)
     origin = grid_from_camera[:3, 3]
@@ -113,15 +154,12 @@ def _bundle(state: State, grid_from_camera: Array, rays: Rays) -> tuple[Bundle, 
     return Bundle(lines[0][0], lines[1][0], lines[0][1], lines[1][1]), sink
 
 
-def _speed(
-    state: State, directions: tuple[Field, Field, Field], small: tuple[int, int], u: Field, v: Field, z: Field
-) -> NDArray[np.float32]:
-    """Speed (h, w, 2) mm/s at which material points pass each cell's ray, as the surface moves."""
+def _speed(state: State, directions: tuple[Field, Field, Field], u: Field, v: Field, z: Field) -> Field:
+    """Speed (h, w, 2) mm/s at which material points pass the rays that meet node u, v at height z, as the surface moves."""
     twist = se3.adjoint(se3.inverse(state.scene.shape.surface_from_grid)) @ state.instant.twist
-    w, t = twist[:3].astype(np.float32), twist[3:].astype(np.float32)
     if not twist.any():
-        return np.zeros((*small[::-1], 2), np.float32)
-    u, v, z = (cv2.resize(f, small, interpolation=cv2.INTER_AREA) for f in (u, v, z))
+        return np.zeros((*u.shape, 2), np.float32)
+    w, t = twist[:3].astype(np.float32), twist[3:].astype(np.float32)
     shape, factors = state.scene.shape, state.factors
     slopes = cv2.remap(cv2.blur(state.relief.slopes, (9, 9)), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     sx, sy = slopes[..., 0] / (shape.step * factors[0]), slopes[..., 1] / (shape.step * factors[1])
@@ -131,27 +169,25 @@ def _speed(
     dx, dy, dz = directions
     towards = np.minimum(dz - sx * dx - sy * dy, -0.1)
     along = (vz - sx * vx - sy * vy) / towards
-    passing = np.dstack([(along * dx - vx) / factors[0], (along * dy - vy) / factors[1]])
-    return np.asarray(passing, np.float32)
+    return np.dstack([(along * dx - vx) / factors[0], (along * dy - vy) / factors[1]]).astype(np.float32)
 
 
 def _exposed(
-    state: State, level: int, tu: Field, tv: Field, speed: NDArray[np.float32], view: View
+    state: State, view: View, level: int, tu: Field, tv: Field, speed: Field | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Colour and relief (H, W, 4) at texels tu, tv, each sample at its own part of the exposure; speed: texels/s."""
+    """Colour and relief (H, W, 4) at texels tu, tv, each sample at its own part of the exposure; speed: mm/s."""
     layers, exposure = state.scene.layers, state.instant.exposure
     sources = layers.colour[level], layers.relief[level]
-    fastest = float(np.abs(speed).max()) * exposure
-    if fastest < 1e-3:
+    if speed is None or exposure == 0:
         colour, relief = (_looked_up(source, tu, tv) for source in sources)
         return colour, relief
-    pixel = SAMPLES * view.spacing * layers.offsets(level)[0]  # texels
-    count = int(np.clip(np.ceil(fastest / pixel / SMEAR / 4), 1, MOST_INSTANTS))
-    path = cv2.resize(speed * np.float32(exposure), tu.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    fastest = float(np.abs(speed).max()) * exposure / (SAMPLES * view.spacing)  # px
+    count = int(np.clip(np.ceil(fastest / SMEAR / TIMES.size), 1, MOST_INSTANTS))
+    path = speed * np.float32(exposure * layers.offsets(level)[0])
     times = np.tile(TIMES.astype(np.float32), (tu.shape[0] // 2, tu.shape[1] // 2))
     sums = []
     for k in range(count):
-        time = times + np.float32(((k + 0.5) / count - 0.5) / 4)
+        time = times + np.float32(((k + 0.5) / count - 0.5) / TIMES.size)
         u, v = tu + path[..., 0] * time, tv + path[..., 1] * time
         sums.append([_looked_up(source, u, v) for source in sources])
     colour, relief = (np.mean(part, axis=0, dtype=np.float32) for part in zip(*sums, strict=True))

@@ -77,3 +77,8 @@ def moved(transform: Array, x: Field, y: Field, z: Field) -> tuple[Field, Field,
     return a, b, c
 
 
+def turned(rotation: Array, x: Field, y: Field) -> tuple[Field, Field, Field]:
+    """Directions x, y, z (H, W) each, of rays (x, y, 1) carried by a rotation (3, 3)."""
+    m = rotation.astype(np.float32)
+    a, b, c = (np.asarray(m[i, 0] * x + m[i, 1] * y + m[i, 2], np.float32) for i in range(3))
+    return a, b, c
