@@ -38,12 +38,22 @@ def test_without_dead_time_lag_and_limit_it_is_the_setpoint_itself(parts: list[t
     assert (executed(line) == line.at(GRID)).all()
 
 
-@given(stretches, st.integers(1, 300))
-def test_dead_time_is_a_shift(parts: list[tuple[float, list[float]]], late: int) -> None:
+@settings(max_examples=40)
+@given(stretches, st.integers(1, 300), st.sampled_from([None, np.array([3000.0, 60])]))
+def test_dead_time_is_a_shift(parts: list[tuple[float, list[float]]], late: int, most: Array | None) -> None:
     line = line_of(parts)
-    shifted = executed(line, dead_time=late / 1000, tau=0.02)
-    assert np.abs(shifted[late:] - executed(line, tau=0.02)[:-late]).max() < 1e-9
+    shifted = executed(line, late / 1000, 0.02, most)
+    apart = np.abs(shifted[late:] - executed(line, 0.0, 0.02, most)[:-late]).max()
+    assert apart < (1e-9 if most is None else 2 * 0.2 * STEP)  # the limit's step of a bend may be the next one
     assert (shifted[:late] == HOME).all()
+
+
+@pytest.mark.parametrize("most", [None, np.array([3000.0, 60])])
+@pytest.mark.parametrize("tau", [0.0, 0.02])
+def test_nothing_moves_before_the_dead_time_is_over(tau: float, most: Array | None) -> None:
+    moved = executed(line_of([(1.0, [50.0] * 6)]), 0.1, tau, most)
+    assert (moved[:100] == HOME).all()
+    assert (moved[102] > HOME).all()
 
 
 @settings(max_examples=20)
