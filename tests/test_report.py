@@ -17,7 +17,7 @@ from hardware.summary import write_summary
 from tests.runs import run
 
 SIGMA = np.array([0.002, 0.002, 0.002, 0.1, 0.1, 0.1])
-VOID = {"meta", "path", "rect", "circle"}
+VOID = {"meta", "path", "rect", "circle", "image", "img"}
 
 
 class Nesting(HTMLParser):

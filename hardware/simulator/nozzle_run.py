@@ -15,7 +15,7 @@ from planning.path import Path
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NozzleRun:
-    """One simulated print. path: in the true surface frame; bead: width, mm; tracking: estimate against truth, if known.
+    """One simulated print. path: in the true surface frame. bead: width, mm. tracking: of the surface, where known.
 
     complete: whether it ran to its end. pictures: what to show of it, each a name and the bytes of a JPEG or PNG.
     files: what lies beside the page, each a name relative to it and what it holds.
