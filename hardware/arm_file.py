@@ -5,6 +5,8 @@ arm_from_base = [[...], ...]                  # 4x4, mm
 arm_from_upright = [[...], ...]               # 3x3, the nozzle's rotation at A = B = C = 0
 motion_byte = 1                               # byte 2 of a G1 frame, 1 or 0
 slots = ["J4", "J5", "J6"]                    # which joint stands in each angle slot
+origin_scale = 1                              # 10: the origin is sent in tenths of a millimetre
+pwm = 0                                       # bytes 27 to 30 of a G1 frame: 0, or 1500 as one driver sends
 baud = 115200
 tick_s = 0.02
 lag_s = 0.024                                 # from the end of a tick until the arm is where it was sent in it
@@ -28,7 +30,19 @@ from hardware.protocol import Dialect
 from planning.kinematics import SimpleArm
 from planning.limits import Limits
 
-KEYS = ("home_mm_deg", "arm_from_base", "arm_from_upright", "motion_byte", "slots", "baud", "tick_s", "lag_s", "limits")
+KEYS = (
+    "home_mm_deg",
+    "arm_from_base",
+    "arm_from_upright",
+    "motion_byte",
+    "slots",
+    "origin_scale",
+    "pwm",
+    "baud",
+    "tick_s",
+    "lag_s",
+    "limits",
+)
 LIMITS = tuple(f.name for f in fields(Limits))
 _AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
 _ANGLES = ("turn", "surface_turn")  # single numbers in rad
@@ -76,6 +90,8 @@ def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
         f"arm_from_upright = {checks.toml_numbers(arm.arm_from_upright)}",
         f"motion_byte = {dialect.motion_byte}",
         "slots = [" + ", ".join(f'"{joint}"' for joint in dialect.slots) + "]",
+        f"origin_scale = {dialect.origin_scale}",
+        f"pwm = {dialect.pwm!r}",
         f"baud = {profile.baud}",
         f"tick_s = {profile.tick!r}",
         f"lag_s = {profile.lag!r}",
@@ -107,4 +123,9 @@ def _dialect(path: Path, table: checks.Table) -> Dialect:
     slots = table.get("slots", list(default.slots))
     if not (isinstance(slots, list) and len(slots) == 3 and all(isinstance(joint, str) for joint in slots)):
         raise InputError(path, "slots", slots, 'three of "J4", "J5", "J6"')
-    return Dialect(checks.integer(path, "motion_byte", table.get("motion_byte", default.motion_byte), 0), tuple(slots))
+    return Dialect(
+        checks.integer(path, "motion_byte", table.get("motion_byte", default.motion_byte), 0),
+        tuple(slots),
+        checks.integer(path, "origin_scale", table.get("origin_scale", default.origin_scale), 1),
+        checks.number(path, "pwm", table.get("pwm", default.pwm)),
+    )

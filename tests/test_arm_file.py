@@ -33,7 +33,7 @@ def test_a_profile_comes_back(tmp_path_factory: pytest.TempPathFactory, seed: in
     profile = ArmProfile(
         SimpleArm(se3.exp(draw.normal(size=6)), se3.exp_rotation(draw.normal(size=3)), draw.uniform(-0.5, 0.5, 6)),
         Limits(speed=draw.uniform(1, 100, 6), turn=draw.uniform(0.01, 0.1), surface_turn=draw.uniform(0.1, 1)),
-        Dialect(int(draw.integers(2)), ("J5", "J4", "J6")),
+        Dialect(int(draw.integers(2)), ("J5", "J4", "J6"), (1, 10)[int(draw.integers(2))], (0.0, 1500.0)[seed % 2]),
         int(draw.integers(57_600, 1_000_000)),
         draw.uniform(0.01, 0.04),
         draw.uniform(0, 0.5),
@@ -59,6 +59,8 @@ def test_what_a_file_leaves_out_keeps_its_default(tmp_path: Path) -> None:
         ("baud = 9600", ["tick", "0.05"]),
         ("baud = -1", ["baud", ">= 1"]),
         ("motion_byte = 2", ["motion_byte", "0 or 1"]),
+        ("origin_scale = 2", ["origin_scale", "1 or 10"]),
+        ("pwm = 7", ["pwm", "1500"]),
         ('slots = ["J4", "J4", "J6"]', ["slots", "each once"]),
         ("slots = 3", ["slots"]),
         ("tick_s = nan", ["tick_s", "finite"]),
