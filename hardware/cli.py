@@ -1,4 +1,4 @@
-"""The command line: stillbed import, export, track, replay. Imports its work lazily, so that help is instant."""
+"""The command line: stillbed simulate, track, replay, arm, import, export. Imports lazily, so that help is instant."""
 
 from __future__ import annotations
 
@@ -14,16 +14,21 @@ from estimation.errors import StillbedError
 if TYPE_CHECKING:
     from hardware.progress import Progress
 
+MISSED = 1  # a simulation that ran to its end and did not reach its own limits
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
 WRONG_INPUT = 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one sub-command and return its exit code: 0, 2 for wrong input (one line on stderr), 130 after Ctrl-C."""
+    """Run one sub-command; returns its exit code.
+
+    0, 1 where a simulation misses its limits, 2 for wrong input (one line on stderr), 130 after Ctrl-C.
+    """
     arguments = parser().parse_args(argv)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads only spin over matrices this small
+    code: int | None = None
     try:
-        arguments.run(arguments)
+        code = arguments.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # nobody reads on, as after `| head`; the files are written all the same
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -33,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"\nstillbed: interrupted; {kept(arguments.out)}", file=sys.stderr)
         return INTERRUPTED
-    return 0
+    return code or 0
 
 
 def kept(out: Path) -> str:
@@ -55,8 +60,10 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = top.add_subparsers(metavar="COMMAND", required=True)
+    _add_simulate(commands)
     _add_track(commands)
     _add_replay(commands)
+    _add_arm(commands)
     _add_import(commands)
     _add_export(commands)
     return top
@@ -87,6 +94,43 @@ def _command(commands: Commands, name: str, summary: str, text: str, example: st
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     return made
+
+
+def _add_simulate(commands: Commands) -> None:
+    command = _command(
+        commands,
+        "simulate",
+        "print on a simulated wound, and measure the nozzle's error",
+        "Run a scenario in virtual time: the wound moves, cameras see it, tracking and motion are those of a live run,\n"
+        "a virtual arm executes, and every millisecond the nozzle is compared with its true checkpoint.\n"
+        "Writes the session (MCAP and folder), tracking/, commands.csv, frames.bin, nozzle.csv, summary.json and\n"
+        "report.html. Exit code 0 where the scenario's own limits are met, 1 where they are not.",
+        "stillbed simulate data/scenarios/breathing_calm.toml -o out/calm",
+    )
+    command.add_argument("scenario", type=Path, metavar="SCENARIO.toml", help="what is simulated; see data/scenarios")
+    command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
+    command.add_argument("--threads", type=int, default=2, metavar="N", help="threads that render; results do not vary")
+    command.add_argument("--pty", action="store_true", help="send the arm's bytes through a pseudo-terminal")
+    command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
+    command.set_defaults(run=_simulate)
+
+
+def _add_arm(commands: Commands) -> None:
+    command = _command(
+        commands,
+        "arm",
+        "serve a virtual arm on a pseudo-terminal",
+        "Serve a virtual SEED S6H4D on a pseudo-terminal, for any client that speaks its protocol, and print the\n"
+        "device's name. Ctrl-C ends it with a summary of what it received.",
+        "stillbed arm --virtual --link ./arm --replies stream --fault 'stall 600ms at 5s'",
+    )
+    command.add_argument("--virtual", action="store_true", required=True, help="the only kind of arm served so far")
+    command.add_argument("--link", type=Path, metavar="LINK", help="a symbolic link to make to the device")
+    command.add_argument("--replies", choices=("off", "stream", "stray"), default="off", help="what the arm sends")
+    command.add_argument("--fault", action="append", default=[], metavar="FAULT", help="e.g. 'slow 80%% at 2s for 1s'")
+    command.add_argument("--arm", type=Path, metavar="ARM.toml", help="its home, dialect and baud rate")
+    command.add_argument("--log", type=Path, metavar="X.csv", help="write the executed motion, a row a millisecond")
+    command.set_defaults(run=_arm)
 
 
 def _add_track(commands: Commands) -> None:
@@ -152,6 +196,27 @@ def _add_export(commands: Commands) -> None:
         "-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder to write, new or empty"
     )
     command.set_defaults(run=_export)
+
+
+def _simulate(arguments: argparse.Namespace) -> int:
+    from hardware.simulator.simulate import Options, run_simulation
+
+    options = Options(arguments.threads, arguments.pty, arguments.force)
+    outcome = run_simulation(arguments.scenario, arguments.out, options)
+    print(outcome.text)
+    return 0 if outcome.met else MISSED
+
+
+def _arm(arguments: argparse.Namespace) -> None:
+    from hardware.arm_file import read_arm
+    from hardware.simulator.arm_faults import fault_from_text
+    from hardware.simulator.arm_settings import arm_settings_from_table
+    from hardware.simulator.port import run_virtual_arm
+
+    settings = arm_settings_from_table("command line", {"replies": arguments.replies})
+    faults = [fault_from_text("command line", "--fault", text) for text in arguments.fault]
+    profile = None if arguments.arm is None else read_arm(arguments.arm)
+    run_virtual_arm(settings, profile, faults, arguments.link, arguments.log)
 
 
 def _track(arguments: argparse.Namespace) -> None:

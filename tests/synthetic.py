@@ -22,6 +22,7 @@ from estimation.se3 import Array
 from estimation.trajectory import Trajectory
 from hardware.folder_tables import write_frames, write_roi
 from hardware.images import encode
+from hardware.ply_file import write_ply
 from hardware.progress import Progress, Report, silent
 from hardware.rig_file import ImageSource, write_rig
 from hardware.session import FrameRef
@@ -230,15 +231,6 @@ def scan_of(scene: Scene, step: float = 1.0) -> tuple[Array, NDArray[np.int64]]:
     a, b, c, d = (m.ravel() for m in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
     triangles = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
     return se3.transform_points(SCAN_FROM_SURFACE, scene.points(flat)), triangles
-
-
-def write_ply(path: Path, vertices: Array, triangles: NDArray[np.int64]) -> None:
-    """Write vertices (V, 3) mm and triangles (T, 3) as a PLY file, in text."""
-    head = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}"]
-    head += [f"property double {axis}" for axis in "xyz"]
-    head += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header"]
-    body = [" ".join(repr(float(v)) for v in p) for p in vertices] + [f"3 {a} {b} {c}" for a, b, c in triangles]
-    path.write_text("\n".join(head + body) + "\n", encoding="ascii")
 
 
 class _PngFolder:

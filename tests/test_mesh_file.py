@@ -13,9 +13,10 @@ from estimation import se3
 from estimation.errors import InputError, StillbedError
 from estimation.scan import Scan
 from hardware.mesh_file import APT_LINE, read_mesh
+from hardware.ply_file import write_ply
 from tests import scans
 from tests.scene import Scene
-from tests.synthetic import SCAN_FROM_SURFACE, scan_of, write_ply
+from tests.synthetic import SCAN_FROM_SURFACE, scan_of
 
 try:
     import open3d  # noqa: F401

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,3 +34,9 @@ class NozzleLog:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+
+def joined(logs: Sequence[NozzleLog]) -> NozzleLog:
+    """One log of several that follow each other."""
+    columns = (np.concatenate([getattr(log, f.name) for log in logs]) for f in fields(NozzleLog))
+    return NozzleLog(*columns)

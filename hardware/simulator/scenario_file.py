@@ -1,0 +1,197 @@
+"""Scenario files: a simulated print as TOML, in mm, degrees, s and px; every key says its unit.
+
+title = "..."                    # what the scenario is; a comment above it says what it proves
+seconds = 20.0
+seed = 1
+path = "../paths/x.csv"          # checkpoints in the surface frame; files are relative to this one
+clearance_mm = 0.4               # lays the path onto the true surface at this height; left out: the path as it is
+bead_mm = 1.0
+faults = ["stall 600ms at 5s"]   # of the arm
+[scene]                          # the body or a scan, the wound, its wetness
+[[motion]]                       # composed in order; without any the surface is still
+[strain]                         # a waveform: the amount of [scene.deformation] over time
+[rig]                            # file, or angles_deg, distance_mm, focal_px, size, distortion
+[cameras]                        # rate, exposure, way to the computer, clock offsets, lost and damaged frames
+[sensor]                         # noise, vignetting, jpeg_quality (0 for lossless pictures)
+[tracking]                       # by = "pictures" or "truth"; processing_s = 0.02 or "measured"; register = "texture"
+                                 # or "scan"
+[arm]                            # file, assumed_lag_s, wire_baud, and the virtual controller: servo, dead time, replies
+[planted]                        # rig_offset_mm, arm_offset_mm: errors of calibration that nothing in the loop knows of
+[limits]                         # what the run must reach, for the exit code
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from estimation import se3
+from estimation.errors import InputError
+from estimation.rig import Rig
+from estimation.se3 import Array
+from hardware import checks
+from hardware.arm_file import read_arm
+from hardware.arm_profile import BITS_PER_BYTE, ArmProfile, placed
+from hardware.checks import Table
+from hardware.protocol import LENGTH
+from hardware.rig_file import read_rig
+from hardware.simulator.arm_faults import ArmFault, fault_from_text
+from hardware.simulator.arm_settings import ArmSettings, arm_settings_from_table
+from hardware.simulator.camera_settings import camera_settings_from_table
+from hardware.simulator.default_rig import REST, arc_rig
+from hardware.simulator.motion_table import motion_from_tables, waveform_from_table
+from hardware.simulator.run_limits import limits_from_table
+from hardware.simulator.scenario import Scenario, Tracking
+from hardware.simulator.scene_table import sensor_from_table
+
+KEYS = ("title", "seconds", "path")
+TABLES = ("scene", "strain", "rig", "cameras", "sensor", "tracking", "arm", "planted", "limits")
+OPTIONAL = ("seed", "clearance_mm", "bead_mm", "faults", "motion", *TABLES)
+LONGEST = 3600.0  # s: an hour of pictures is 300,000 of them
+STRAIN_STREAM = 11  # of random numbers, so that motions and strain do not share theirs
+
+
+def read_scenario(path: str | Path) -> Scenario:
+    """Read and check a scenario; InputError names the key that is wrong."""
+    path = Path(path)
+    table = checks.read_toml(path)
+    checks.check_keys(path, "", table, KEYS, OPTIONAL)
+    parts = {name: _table(path, table, name) for name in TABLES}
+    seed = checks.integer(path, "seed", table.get("seed", 1), 0)
+    rig = _rig(path, parts["rig"])
+    arm, profile, baud = _arm(path, parts["arm"])
+    rig_offset, arm_offset = _planted(path, parts["planted"])
+    quality = checks.integer(path, "sensor.jpeg_quality", parts["sensor"].pop("jpeg_quality", 90), 0)
+    known = replace(profile.arm, arm_from_base=profile.arm.arm_from_base @ se3.make(np.eye(3), arm_offset))
+    return Scenario(
+        file=path,
+        title=checks.text(path, "title", table["title"]),
+        seconds=_within(path, "seconds", table["seconds"], 0.1, LONGEST, "s"),
+        seed=seed,
+        path=path.parent / checks.text(path, "path", table["path"]),
+        clearance=None
+        if "clearance_mm" not in table
+        else _within(path, "clearance_mm", table["clearance_mm"], 0, 50, "mm"),
+        bead=_within(path, "bead_mm", table.get("bead_mm", 1.0), 0.05, 20.0, "mm"),
+        nozzle=_switch(path, "scene.nozzle", parts["scene"].pop("nozzle", True)),
+        beads=_switch(path, "scene.beads", parts["scene"].pop("beads", True)),
+        scene=parts["scene"],
+        motion=motion_from_tables(path, table.get("motion", []), path.parent, seed),
+        strain=waveform_from_table(path, "strain", parts["strain"], np.random.default_rng([seed, STRAIN_STREAM]))
+        if parts["strain"]
+        else None,
+        rest=REST,
+        rig=rig,
+        told_rig=_shifted(rig, rig_offset),
+        cameras=camera_settings_from_table(path, parts["cameras"], [camera.name for camera in rig.cameras]),
+        sensor=sensor_from_table(path, parts["sensor"]),
+        jpeg_quality=min(quality, 100) or None,
+        tracking=_tracking(path, parts["tracking"]),
+        arm=arm,
+        faults=_faults(path, table.get("faults", [])),
+        true_arm=profile.arm,
+        baud=baud,
+        profile=replace(profile, arm=known),
+        limits=limits_from_table(path, parts["limits"]),
+    )
+
+
+def _table(path: Path, table: Table, name: str) -> Table:
+    part = table.get(name, {})
+    if not isinstance(part, dict):
+        raise InputError(path, name, part, f"a table [{name}]")
+    return dict(part)
+
+
+def _within(path: Path, key: str, value: object, low: float, high: float, unit: str) -> float:
+    number = checks.number(path, key, value)
+    if not low <= number <= high:
+        raise InputError(path, key, number, f"{low:g} to {high:g} {unit}")
+    return number
+
+
+def _rig(path: Path, table: Table) -> Rig:
+    if "file" in table:
+        checks.check_keys(path, "rig.", table, ("file",))
+        return read_rig(path.parent / checks.text(path, "rig.file", table["file"])).rig
+    checks.check_keys(path, "rig.", table, (), ("angles_deg", "distance_mm", "focal_px", "size", "distortion"))
+    given: dict[str, object] = {}
+    if "angles_deg" in table:
+        given["angles_deg"] = tuple(checks.numbers(path, "rig.angles_deg", table["angles_deg"], (None,), "degrees"))
+    if "distance_mm" in table:
+        given["distance"] = _within(path, "rig.distance_mm", table["distance_mm"], 100, 2000, "mm")
+    if "focal_px" in table:
+        given["focal"] = _within(path, "rig.focal_px", table["focal_px"], 100, 10_000, "px")
+    if "size" in table:
+        width, height = checks.numbers(path, "rig.size", table["size"], (2,), "[width, height] in px")
+        given["size"] = (int(width), int(height))
+    if "distortion" in table:
+        given["distortion"] = tuple(checks.numbers(path, "rig.distortion", table["distortion"], (5,), "k1 k2 p1 p2 k3"))
+    return arc_rig(**given)  # type: ignore[arg-type]
+
+
+def _shifted(rig: Rig, offset: Array) -> Rig:
+    """The rig as it would be if its cameras stood `offset` (3,), mm, from where they do."""
+    shift = se3.make(np.eye(3), offset)
+    return Rig(tuple(replace(c, base_from_camera=shift @ c.base_from_camera) for c in rig.cameras))
+
+
+def _planted(path: Path, table: Table) -> tuple[Array, Array]:
+    keys = ("rig_offset_mm", "arm_offset_mm")
+    checks.check_keys(path, "planted.", table, (), keys)
+    rig, arm = (checks.numbers(path, f"planted.{key}", table.get(key, [0, 0, 0]), (3,), "mm") for key in keys)
+    return rig, arm
+
+
+def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:
+    """The virtual controller, what the motion knows of it (all of its lag, unless told), and its line's baud."""
+    file, assumed, baud = (table.pop(key, None) for key in ("file", "assumed_lag_s", "wire_baud"))
+    settings = arm_settings_from_table(path, table)
+    profile = placed(
+        ArmProfile() if file is None else read_arm(path.parent / checks.text(path, "arm.file", file)), REST
+    )
+    if baud is None:
+        baud = profile.baud
+    elif not isinstance(baud, (int, float)) or isinstance(baud, bool) or not baud >= profile.baud:
+        raise InputError(
+            path, "arm.wire_baud", baud, f"{profile.baud} bits/s, the arm's own, or more; inf for no delay"
+        )
+    lag = settings.dead_time + settings.servo_lag + LENGTH * BITS_PER_BYTE / baud
+    return (
+        settings,
+        replace(profile, lag=lag if assumed is None else checks.number(path, "arm.assumed_lag_s", assumed)),
+        float(baud),
+    )
+
+
+def _tracking(path: Path, table: Table) -> Tracking:
+    checks.check_keys(path, "tracking.", table, (), ("by", "processing_s", "register"))
+    by = _one_of(path, "tracking.by", table.get("by", "pictures"), ("pictures", "truth"))
+    register = _one_of(path, "tracking.register", table.get("register", "texture"), ("texture", "scan"))
+    spent = table.get("processing_s", Tracking().processing)
+    measured = spent == "measured"
+    processing = None if measured else _within(path, "tracking.processing_s", spent, 0, 10, 's, or "measured"')
+    return Tracking(by == "pictures", processing, register == "scan")
+
+
+def _switch(path: Path, key: str, value: object) -> bool:
+    if not isinstance(value, bool):
+        raise InputError(path, key, value, "true or false")
+    return value
+
+
+def _one_of(path: Path, key: str, value: object, allowed: tuple[str, ...]) -> str:
+    word = checks.text(path, key, value)
+    if word not in allowed:
+        raise InputError(path, key, word, checks.meant(word, allowed))
+    return word
+
+
+def _faults(path: Path, value: object) -> tuple[ArmFault, ...]:
+    if not isinstance(value, list):
+        raise InputError(path, "faults", value, 'a list of texts such as "stall 600ms at 5s"')
+    return tuple(
+        fault_from_text(path, f"faults[{i}]", checks.text(path, f"faults[{i}]", text)) for i, text in enumerate(value)
+    )

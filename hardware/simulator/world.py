@@ -1,0 +1,284 @@
+"""The closed loop in virtual time: the wound moves, cameras expose, poses and commands travel, the arm executes.
+
+Nothing here decides anything: TrackingStep and MotionStep are those of the live run, and the loop only lets time pass
+between them. Whatever takes time in a real run takes it here: the exposure's way to the computer, the tracking, the
+48 bytes on the wire, the arm's interpolation and its servo. Virtual time does not depend on how fast this runs, unless
+the scenario asks for measured tracking times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from estimation import se3
+from estimation.errors import InputError
+from estimation.observations import Observations
+from estimation.pose import SurfacePose, TrackState
+from estimation.se3 import Array
+from hardware.clock import Clock
+from hardware.images import decode
+from hardware.motion import MotionStep
+from hardware.recording import WARNING
+from hardware.simulator.agenda import ARRIVAL, EXPOSURE, KNOWN, TICK, Agenda
+from hardware.simulator.cameras import Fate, Shot, SimulatedCameras
+from hardware.simulator.controller import VirtualArm
+from hardware.simulator.instant import Instant
+from hardware.simulator.ledger import Ledger, executed_rows
+from hardware.simulator.nozzle_log import NozzleLog
+from hardware.simulator.pictures import Pictures
+from hardware.simulator.registering import truth_from_estimate
+from hardware.simulator.scenario import Scenario
+from hardware.simulator.scene import Scene
+from hardware.simulator.truth import Truth
+from hardware.simulator.wire import Wire
+from hardware.track import Step
+from perception.frames import Frame, FrameSet
+from perception.pairing import Pairing
+from perception.tracking import StepReport
+from planning.command import Command
+from planning.kinematics import nozzle_from_axes
+from planning.legs import Phase
+from planning.path import Path
+from planning.planner import Progress as Print
+
+BLOCK = 0.2  # s of rows given out at once
+REST = 1.0  # s that the run goes on after the path is finished
+NO_IMAGE = np.zeros((0, 0), np.uint8)  # of a frame that nobody looks at
+BEAD_STEP = 0.01  # s between the ends of the pieces in which a bead is drawn
+
+
+Exposures = dict[tuple[int, float], float]  # (camera, stamp): true middle of the exposure, s
+
+
+class Sink(Protocol):
+    """What is told of everything that passes."""
+
+    def picture(self, shot: Shot, kind: str, data: bytes) -> None:
+        """A picture has arrived, as encoded by its camera."""
+        ...
+
+    def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
+        """A pose was made of a frame set in `spent` s of real time."""
+        ...
+
+    def command(self, command: Command, progress: Print, frame: bytes, received: bytes) -> None:
+        """A command was sent, how far the print is by it, and what came from the arm since the last."""
+        ...
+
+    def rows(self, log: NozzleLog) -> None:
+        """The next rows of the truth at the nozzle."""
+        ...
+
+    def registered(self, truth_from_estimate: Array) -> None:
+        """The path was registered: truth_surface_from_estimated_surface (4, 4)."""
+        ...
+
+    def event(self, stamp: float, text: str, level: int = WARNING) -> None:
+        """Something that a person should know."""
+        ...
+
+
+class World:
+    """One run of one scenario; `run` lets its time pass."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        scene: Scene,
+        path: Path,
+        truth: Truth,
+        step: Step,
+        exposures: Exposures,
+        sink: Sink,
+        clock: Clock,
+        threads: int = 2,
+        line: Callable[[bytes], bytes] = bytes,
+    ) -> None:
+        """scene: the scenario's, rendered into. path: in the true surface frame. clock: measures tracking times.
+
+        exposures: filled with the true instant of each picture, for a step that may know. line: carries bytes from the
+        motion to the arm, e.g. over a pty.
+        """
+        self.scenario, self._scene, self._path, self._sink, self._clock = scenario, scene, path, sink, clock
+        self._truth, self._step, self._exposed = truth, step, exposures
+        profile = scenario.profile
+        self.arm = VirtualArm(scenario.arm, profile.dialect, profile.arm.home, scenario.faults, scenario.baud)
+        self._wire, self._line = Wire(scenario.baud), line
+        self._ledger = Ledger(path, scenario.true_arm, self._truth, profile.tick, profile.lag)
+        self._pictures: Pictures | None = None
+        if scenario.tracking.pictures:
+            quality = scenario.jpeg_quality
+            self._pictures = Pictures(
+                scene, scenario.rig.cameras, scenario.sensor, quality, scenario.seed, threads, self._lay
+            )
+        self._cameras = SimulatedCameras(scenario.cameras, scenario.seed)
+        self._instant_before: Instant | None = None
+        self._pairer = Pairing(len(scenario.rig), scenario.cameras.period)
+        self._agenda = Agenda()
+        self._busy = False  # the tracker
+        self._waiting: FrameSet | None = None  # the newest that came meanwhile
+        self.skipped = 0  # frame sets that the tracker had no time for
+        self._pose: SurfacePose | None = None
+        self._motion: MotionStep | None = None
+        self._ticks, self._given, self._laid = 0, 0.0, 0.0
+        self._bead: Array | None = None  # (2,) where the last piece of bead ended
+        self._end = scenario.seconds
+
+    def run(self, progress: Callable[[float], None] = lambda now: None) -> None:
+        """Let the scenario's time pass; progress is told the instant, s. What was given out stays so if this raises."""
+        for camera in range(len(self.scenario.rig)):
+            self._next_shot(self._cameras.shots(camera, self.scenario.seconds))
+        self._agenda.at(0.0, TICK, self._tick)
+        now = 0.0
+        try:
+            for now in self._agenda.run(np.inf):
+                progress(now)
+                if now >= self._end:
+                    break
+        finally:
+            self._give_rows(min(now, self._end))
+
+    # -- cameras
+
+    def _next_shot(self, shots: Iterator[Shot]) -> None:
+        shot = next(shots, None)
+        if shot is not None:
+            due = self._cameras.due(shot.camera, shot.number)
+            self._agenda.at(due, EXPOSURE, partial(self._expose, shot, shots))
+
+    def _expose(self, shot: Shot, shots: Iterator[Shot], now: float) -> None:
+        """A camera's shutter is half open: from here on the world may change, the picture may not."""
+        self._next_shot(shots)
+        if shot.fate is Fate.DROPPED:
+            return
+        self._exposed[shot.camera, shot.stamp] = shot.exposed
+        if self._pictures is not None:
+            self._pictures.expose(shot, self._instant(shot, now))
+        self._agenda.at(shot.arrival, ARRIVAL, partial(self._arrive, shot))
+
+    def _instant(self, shot: Shot, now: float) -> Instant:
+        """The world as a shot meets it; the very same object for cameras that expose together."""
+        last = self._instant_before
+        if last is not None and (last.stamp, last.gain) == (shot.exposed, shot.gain):
+            return last
+        times, truth, nozzle = np.array([shot.exposed]), self._truth, None
+        if self.scenario.nozzle:
+            self.arm.advance(now)
+            nozzle = nozzle_from_axes(self.scenario.true_arm, self.arm.axes_at(times)[0])
+        self._instant_before = Instant(
+            stamp=shot.exposed,
+            exposure=shot.exposure,
+            base_from_surface=truth.base_from_surface(times)[0],
+            twist=truth.twist(times)[0],
+            strain=float(truth.amount(times)[0]),
+            base_from_nozzle=nozzle,
+            gain=shot.gain,
+        )
+        return self._instant_before
+
+    def _arrive(self, shot: Shot, now: float) -> None:
+        frame = Frame(shot.camera, shot.stamp, NO_IMAGE)
+        if self._pictures is not None:
+            kind, data = self._pictures.take(shot)
+            self._sink.picture(shot, kind, data)
+            try:
+                image = decode(data, f"camera {self.scenario.rig.cameras[shot.camera].name}", f"picture {shot.number}")
+            except InputError as error:
+                self._sink.event(now, str(error))
+                return
+            frame = replace(frame, image=image)
+        self._formed(self._pairer.add(frame, now), now)
+        self._agenda.at(now + self._pairer.patience, ARRIVAL, self._overdue)
+
+    def _overdue(self, now: float) -> None:
+        self._formed(self._pairer.due(now), now)
+
+    # -- tracking
+
+    def _formed(self, sets: Sequence[FrameSet], now: float) -> None:
+        """New frame sets: the tracker takes the newest when it is free."""
+        for frames in sets:
+            if self._waiting is not None:
+                self.skipped += 1
+            self._waiting = frames
+        if not self._busy and self._waiting is not None:
+            self._track(now)
+
+    def _track(self, now: float) -> None:
+        assert self._waiting is not None
+        frames, self._waiting, self._busy = self._waiting, None, True
+        start = self._clock.now()
+        pose = self._step(frames)
+        spent = self._clock.now() - start
+        self._sink.pose(frames, pose, self._step.last, spent)
+        took = spent if self.scenario.tracking.processing is None else self.scenario.tracking.processing
+        self._agenda.at(now + took, KNOWN, partial(self._know, pose, frames, self._step.last.observations))
+        self._step.idle()
+
+    def _know(self, pose: SurfacePose, frames: FrameSet, seen: Observations, now: float) -> None:
+        """A pose has reached the motion."""
+        self._pose, self._busy = pose, False
+        if self._motion is None and pose.state is TrackState.TRACKING:
+            self._register(pose, frames, seen)
+        if self._waiting is not None:
+            self._track(now)
+
+    def _register(self, pose: SurfacePose, frames: FrameSet, seen: Observations) -> None:
+        """Tell the motion where its path lies on the surface that the tracker follows."""
+        scenario, change = self.scenario, np.eye(4)
+        if scenario.tracking.pictures and not scenario.tracking.scan:
+            exposed = np.full(len(scenario.rig), np.nan)
+            for frame in frames.frames:
+                exposed[frame.camera] = self._exposed[frame.camera, frame.stamp]
+            rigs = scenario.rig, scenario.told_rig
+            change = truth_from_estimate(pose, seen, rigs, self._truth, self._scene.shape, exposed)
+        moved = se3.inverse(change) @ self._path.surface_from_nozzle
+        self._motion = MotionStep(replace(self._path, surface_from_nozzle=moved), scenario.profile)
+        self._sink.registered(change)
+
+    # -- motion and arm
+
+    def _tick(self, now: float) -> None:
+        self._ticks += 1
+        self._agenda.at(self._ticks * self.scenario.profile.tick, TICK, self._tick)
+        if self._motion is not None:
+            frame = self._motion(self._pose, now)
+            arrival = float(self._wire.send(frame, now)[-1])
+            self._agenda.at(arrival, ARRIVAL, partial(self._receive, self._line(frame)))
+            self._ledger.write(self._motion.last, self._motion.progress)
+            self.arm.advance(now)
+            self._sink.command(self._motion.last, self._motion.progress, frame, self.arm.transmit(now))
+            if self._motion.progress.phase is Phase.FINISHED:
+                self._end = min(self._end, now + REST)
+        if now - self._given >= BLOCK:
+            self._give_rows(now)
+
+    def _receive(self, data: bytes, now: float) -> None:
+        self.arm.receive(data, now)
+
+    def _give_rows(self, now: float) -> None:
+        """Give out the truth at the nozzle up to `now`, s."""
+        self.arm.advance(now)
+        times = executed_rows(self._given, now)
+        if len(times):
+            self._given = now
+            self._sink.rows(self._ledger.rows(times, self.arm.axes_at))
+
+    def _lay(self, until: float) -> None:
+        """Bring the printed material in the pictures up to `until`, s."""
+        ends = np.arange(self._laid + BEAD_STEP, until, BEAD_STEP)
+        if not self.scenario.beads or not len(ends):
+            return
+        self._laid = float(ends[-1])
+        extruding = self._ledger.extruding(ends)
+        nozzle = nozzle_from_axes(self.scenario.true_arm, self.arm.axes_at(ends))
+        places = self._scene.shape.material(self._truth.material(ends, nozzle[:, :3, 3]))
+        for place, extrude in zip(places, extruding, strict=True):
+            if extrude and self._bead is not None:
+                self._scene.ink.lay(self._bead, place, self.scenario.bead)
+            self._bead = place if extrude else None
