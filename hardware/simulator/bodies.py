@@ -24,8 +24,8 @@ class Wound:
 
 
 def forearm(x: Array, y: Array) -> Array:
-    """Heights of a cylinder along x that tapers from 48 to 42 mm, its muscle bulging on one side."""
-    radius = 45.0 - 0.022 * x
+    """Heights of a cylinder along x that tapers from 50 to 45 mm, its muscle bulging on one side."""
+    radius = 47.5 - 0.022 * x
     return np.asarray(_arch(y, radius) + 0.022 * x + 1.1 * np.exp(-(((x + 40) / 35) ** 2) - ((y - 14) / 18) ** 2))
 
 
@@ -42,7 +42,7 @@ def foot(x: Array, y: Array) -> Array:
 
 
 BODIES: dict[str, tuple[Callable[[Array, Array], Array], tuple[float, float]]] = {
-    "forearm": (forearm, (120.0, 66.0)),
+    "forearm": (forearm, (120.0, 62.0)),
     "chest": (chest, (120.0, 90.0)),
     "foot": (foot, (110.0, 74.0)),
 }  # height and opening (x, y) mm of each
@@ -95,7 +95,7 @@ def _relief(inside: Array, step: float, wound: Wound, rng: np.random.Generator) 
 
 
 def _arch(y: Array, radius: Array | float) -> Array:
-    """Heights of a circle's top, going on straight where its slope passes 0.95: cloth and camera see no further."""
-    edge = radius * 0.95 / np.hypot(1, 0.95)
+    """Heights of a circle's top, going on straight where its slope passes 0.85: cloth and camera see no further."""
+    edge = radius * 0.85 / np.hypot(1, 0.85)
     near = np.clip(y, -edge, edge)
-    return np.asarray(np.sqrt(radius**2 - near**2) - radius - 0.95 * (np.abs(y) - np.abs(near)))
+    return np.asarray(np.sqrt(radius**2 - near**2) - radius - 0.85 * (np.abs(y) - np.abs(near)))

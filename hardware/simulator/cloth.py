@@ -6,29 +6,29 @@ import cv2
 import numpy as np
 
 from hardware.simulator.layers import Texture, linear
-from hardware.simulator.noise import Field, Size, octaves, ramp, smooth, stretched, strokes, wander
+from hardware.simulator.noise import Field, Size, octaves, ramp, stretched, strokes, wander
 
 TEAL = linear([136, 122, 44])
 HEM = linear([150, 138, 64])
 
 
 def folds(shape: Size, texel: float, rng: np.random.Generator) -> Field:
-    """Heights (H, W) mm of wrinkles and packing creases about the cloth's mean."""
-    height = 1.5 * octaves(shape, 90 / texel, 3, rng, 0.55)
-    lines, ridges = [], np.zeros(shape, np.float32)
-    for _ in range(26):
-        start = rng.uniform(-0.1, 1.1, 2) * shape[::-1]
-        lines.append(wander(start, rng.uniform(0, 2 * np.pi), rng.uniform(0.15, 0.5) * shape[1], 0.7, rng, 24))
-    for k, soft in enumerate((2.5, 4.5, 8.0)):  # mm
-        ridges += 2.5 * soft * strokes(shape, lines[k::3], 1.0, soft / texel) * soft / texel * np.float32(0.45)
-    height += ridges * np.clip(0.8 + 0.4 * smooth(shape, 60 / texel, rng), 0, 1.5)
+    """Heights (H, W) mm of wrinkles, tucks and packing creases about the cloth's mean."""
+    height = 4.0 * octaves(shape, 110 / texel, 3, rng, 0.5)
+    for width, tall, count in ((17.0, 7.0, 10), (9.0, 3.6, 16), (5.0, 1.6, 26)):  # mm
+        lines = []
+        for _ in range(count):
+            start = rng.uniform(-0.05, 1.05, 2) * shape[::-1]
+            lines.append(wander(start, rng.uniform(0, 2 * np.pi), rng.uniform(60, 240) / texel, 0.5, rng, 24))
+        ridge = strokes(shape, lines, 1.0, width / 2.2 / texel)
+        height += tall * np.tanh(1.6 * ridge / max(float(np.quantile(ridge, 0.985)), 1e-6))
     for axis, n in ((0, 4), (1, 5)):  # it was packed folded
         place = np.arange(shape[axis], dtype=np.float32) * texel
-        offset = rng.uniform(0, shape[axis] * texel / n)
-        distance = np.abs(np.mod(place - offset, shape[axis] * texel / n) - shape[axis] * texel / n / 2)
-        crease = (0.8 * np.exp(-distance / 2.2)).astype(np.float32)
+        pitch = shape[axis] * texel / n
+        distance = np.abs(np.mod(place - rng.uniform(0, pitch), pitch) - pitch / 2)
+        crease = (1.6 * np.exp(-distance / 2.4)).astype(np.float32)
         height += crease[:, None] if axis == 0 else crease
-    return cv2.GaussianBlur(np.asarray(height, np.float32), (0, 0), 0.9 / texel)
+    return np.asarray(cv2.GaussianBlur(height, (0, 0), 1.2 / texel), np.float32)
 
 
 def weave(shape: Size, texel: float, rng: np.random.Generator) -> tuple[Field, Field]:

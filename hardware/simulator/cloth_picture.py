@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.se3 import Array
 from hardware.simulator import cloth, nozzle_shape, sheet
+from hardware.simulator.hits import block
 from hardware.simulator.noise import Field
 from hardware.simulator.state import State, moved
 from hardware.simulator.view import Rays, View
 
-LATTICE = 8  # px
-SEARCH = 16  # px between the rays that are searched step by step
+LATTICE = 8  # px between the rays that are traced
 STEPS = 20
+JUMP = 15.0  # mm by which the depth between two rays differs from the mean of theirs where the cloth hides itself
 STRIP = 48  # rows coloured at once: their fields stay in the cache
 HIGHEST = 40.0  # mm above the rest plane: nothing of the cloth is higher
 DEEPEST = -130.0
@@ -69,13 +70,12 @@ def cloth_picture(state: State, view: View) -> ClothPicture:
         se3.inverse(state.scene.base_from_rest) @ view.camera.base_from_camera,
     )
     rays = view.coarse(LATTICE)
-    size = rays.x.shape[::-1]
-    depth = cv2.resize(_search(eye, view.coarse(SEARCH)), size, interpolation=cv2.INTER_LINEAR)
-    depth, x, y = _refined(eye, rays, depth)
+    depth, x, y = _refined(eye, rays, _search(eye, rays))
     passed = _passed(eye, rays, depth)
     w, h = view.camera.size
     whole = view.whole
     fields = cv2.resize(np.dstack([x, y, *passed]), (whole.x1, whole.y1), interpolation=cv2.INTER_LINEAR)[:h, :w]
+    _edges(eye, rays, depth, fields)
     light = np.empty((h, w, 3), np.float32)
     for first in range(0, h, STRIP):
         _coloured(state, fields[first : first + STRIP], light[first : first + STRIP])
@@ -102,17 +102,36 @@ def _search(eye: _Eye, rays: Rays) -> Field:
 
 
 def _refined(eye: _Eye, rays: Rays, depth: Field) -> tuple[Field, Field, Field]:
-    """Depth and material x, y (H, W) mm after two rounds of the secant method."""
+    """Depth and material x, y (H, W) mm after a round of the secant method."""
     last = depth + np.float32(0.5)
     left_last, _, _ = eye.left(rays, last)
     left, x, y = eye.left(rays, depth)
-    for _ in range(2):
+    for _ in range(1):
         fall = (left - left_last) / np.where(depth == last, np.float32(1), depth - last)
         move = np.clip(left / np.where(np.abs(fall) < 0.1, np.float32(-0.5), fall), -15, 15)
         last, left_last = depth, left
         depth = depth - move
         left, x, y = eye.left(rays, depth)
     return np.asarray(depth, np.float32), x, y
+
+
+def _edges(eye: _Eye, rays: Rays, depth: Field, fields: NDArray[np.float32]) -> None:
+    """Trace again, one by one, the pixels where the cloth hides itself and the lattice would draw steps.
+
+    fields: (H, W, 2 or more), x and y of which are put right.
+    """
+    bend = np.array([[1.0, -2.0, 1.0]], np.float32)
+    bent = np.maximum(*(np.abs(cv2.filter2D(depth, -1, k, borderType=cv2.BORDER_REPLICATE)) for k in (bend, bend.T)))
+    jump = bent > JUMP
+    if not jump.any():
+        return
+    h, w = fields.shape[:2]
+    place = np.nonzero(np.repeat(np.repeat(jump, LATTICE, 0), LATTICE, 1)[:h, :w])
+    at = [block(((p + 0.5) / LATTICE - 0.5).astype(np.float32)) for p in place]
+    border = cv2.BORDER_REPLICATE
+    alone = Rays(*(cv2.remap(r, at[1], at[0], cv2.INTER_LINEAR, borderMode=border) for r in rays))
+    _, x, y = _refined(eye, alone, _search(eye, alone))
+    fields[(*place, 0)], fields[(*place, 1)] = (f.reshape(-1)[: len(place[0])] for f in (x, y))
 
 
 def _passed(eye: _Eye, rays: Rays, depth: Field) -> list[Field]:

@@ -14,6 +14,7 @@ STEPS = 56  # of the search downwards
 ROUNDS = 2  # of Newton's method
 FLAT = 0.3  # rays that meet the surface more grazing than this (1: head on) are searched for one by one
 CLOSE = 2e-3  # mm that is left over where Newton's method did not come to rest
+WIDTH = 256
 
 Mask = NDArray[np.bool_]
 
@@ -53,11 +54,17 @@ def meet(field: Relief, rays: Bundle, start: Field, odd: Mask) -> Field:
         doubt &= near(field, rays, z)
     place = np.nonzero(doubt)
     if len(place[0]):
-        alone = Bundle(*(np.ascontiguousarray(part[place][:, None]) for part in rays))
+        alone = Bundle(*(block(part[place]) for part in rays))
         searched, _ = search(field, alone)
         better, left = _newton(field, alone, searched)
-        z[place] = np.where(np.abs(left) < 10 * CLOSE, better, searched)[:, 0]
+        z[place] = np.where(np.abs(left) < 10 * CLOSE, better, searched).reshape(-1)[: len(place[0])]
     return z
+
+
+def block(values: Field) -> Field:
+    """Values (N,) as rows of WIDTH, the last one filled up: OpenCV looks up no more than 32767 rows."""
+    rows = -(-len(values) // WIDTH)
+    return np.pad(values, (0, rows * WIDTH - len(values)), mode="edge").reshape(rows, WIDTH)
 
 
 def near(field: Relief, rays: Bundle, z: Field, margin: float = 4.0) -> Mask:

@@ -17,12 +17,14 @@ Size = tuple[int, int]  # H, W
 
 def smooth(shape: Size, scale: float, rng: np.random.Generator) -> Field:
     """Gaussian noise of mean 0 and variance 1 whose hills are about `scale` texels wide."""
-    step = max(1, int(scale / 4))
-    coarse = (shape[0] // step + 8, shape[1] // step + 8)
-    blurred = cv2.GaussianBlur(rng.standard_normal(coarse, np.float32), (0, 0), max(0.4, 0.4 * scale / step))
-    blurred = (blurred - blurred.mean()) / blurred.std()
-    large = cv2.resize(blurred, (coarse[1] * step, coarse[0] * step), interpolation=cv2.INTER_CUBIC)
-    return np.asarray(large[3 * step : 3 * step + shape[0], 3 * step : 3 * step + shape[1]], np.float32)
+    halvings = max(0, int(np.log2(max(scale, 1.0) / 3)))
+    coarse = ((shape[0] >> halvings) + 8, (shape[1] >> halvings) + 8)
+    field = cv2.GaussianBlur(rng.standard_normal(coarse, np.float32), (0, 0), max(0.4, 0.4 * scale / (1 << halvings)))
+    field = (field - field.mean()) / field.std()
+    for _ in range(halvings):
+        field = cv2.pyrUp(field)  # resize by cubics would leave a comb on every slope
+    edge = 3 << halvings
+    return np.asarray(field[edge : edge + shape[0], edge : edge + shape[1]], np.float32)
 
 
 def octaves(shape: Size, scale: float, count: int, rng: np.random.Generator, fall: float = 0.6) -> Field:
@@ -35,10 +37,10 @@ def octaves(shape: Size, scale: float, count: int, rng: np.random.Generator, fal
 
 
 def stretched(shape: Size, scale: tuple[float, float], rng: np.random.Generator) -> Field:
-    """Noise whose hills are `scale` (along x, along y) texels wide: grain, fibres, furrows of one direction."""
-    low = min(scale)
-    across = (max(8, round(shape[0] * low / scale[1])), max(8, round(shape[1] * low / scale[0])))
-    return np.asarray(cv2.resize(smooth(across, low, rng), shape[::-1], interpolation=cv2.INTER_CUBIC), np.float32)
+    """Noise of variance 1 whose hills are `scale` (along x, along y) texels wide: fibres of one direction."""
+    sigma = np.maximum(0.4 * np.array(scale), 0.3)
+    field = cv2.GaussianBlur(rng.standard_normal(shape, np.float32), (0, 0), sigma[0], sigmaY=sigma[1])
+    return np.asarray((field - field.mean()) / field.std(), np.float32)
 
 
 def cells(shape: Size, pitch: float, rng: np.random.Generator) -> tuple[Field, Field]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ TEXEL = 0.5  # mm
 SPAN = (640.0, 520.0)  # mm, x and y; beyond, the picture is mirrored
 TABLE = -70.0  # mm below the wound's skin
 ALONE = -90.0  # mm: where the cloth lies behind a bare patch
-STEEPEST, FLATTEST = -0.9, -0.15  # slopes of the tent
+STEEPEST, FLATTEST = -0.5, -0.15  # slopes of the tent
 THICKNESS = 0.6  # mm
 HELD, FREE = 12.0, 140.0  # mm from the opening: up to here it moves with the body, from here it rests
 
@@ -60,18 +60,29 @@ def draped(shape: Shape, half: tuple[float, float], look: Look, rng: np.random.G
     reach = np.array(shape.size, np.float32) / 2
     cx, cy = np.clip(x, -reach[0], reach[0]), np.clip(y, -reach[1], reach[1])
     edge = np.stack([cx, cy], -1).reshape(-1, 2)
-    ground = shape.heights_at(edge).reshape(x.shape).astype(np.float32)
-    back = shape.heights_at(0.9 * edge).reshape(x.shape).astype(np.float32)
+    even = _evened(shape)
     away = np.hypot(x - cx, y - cy)
-    slope = np.clip((ground - back) / np.maximum(0.1 * np.hypot(cx, cy), 1e-3), STEEPEST, FLATTEST)
+    ground = even.heights_at(edge).reshape(x.shape).astype(np.float32)
+    back = even.heights_at(0.85 * edge).reshape(x.shape).astype(np.float32)
+    slope = np.clip((ground - back) / np.maximum(0.15 * np.hypot(cx, cy), 1e-3), STEEPEST, FLATTEST)
     tent = ground + slope * away
-    tent = TABLE + np.logaddexp(0, (tent - TABLE) / 12).astype(np.float32) * 12
+    tent = TABLE + np.logaddexp(0, (tent - TABLE) / 14).astype(np.float32) * 14
+    soft = cv2.GaussianBlur(tent, (0, 0), 9 / STEP)
+    tent += ramp(away, 0, 25) * (soft - tent)
     outside = cloth.opening(x, y, half)
-    soft = cv2.GaussianBlur(tent, (0, 0), 7 / STEP)
-    tent += ramp(away, 0, 30) * (soft - tent)
-    wrinkles = cloth.folds(x.shape, STEP, rng) * ramp(outside, 8, 70)
-    heights = tent + thickness(outside) + wrinkles - 3 * (outside < -4)
+    exact = shape.heights_at(np.stack([x, y], -1).reshape(-1, 2)).reshape(x.shape).astype(np.float32)
+    tent += ramp(away, 4, 0) * (exact - tent)
+    wrinkles = cloth.folds(x.shape, STEP, rng) * ramp(outside, 6, 55)
+    heights = tent + thickness(outside) + wrinkles - 3 * ramp(outside, -4, -16)
     return Sheet(np.asarray(heights, np.float32), _picture(heights, look, rng), half)
+
+
+def _evened(shape: Shape) -> Shape:
+    """The shape without its small unevenness, which would draw stripes if it went on beyond the edge."""
+    sigma = 5 / shape.step
+    pad = int(3 * sigma)
+    wide = np.pad(shape.heights, pad, mode="reflect", reflect_type="odd")
+    return replace(shape, heights=cv2.GaussianBlur(wide, (0, 0), sigma)[pad:-pad, pad:-pad])
 
 
 def bare(look: Look, rng: np.random.Generator) -> Sheet:
@@ -104,5 +115,5 @@ def _enlarged(heights: Field, size: tuple[int, int]) -> Field:
     """Heights at the texels' middles (nodes lie on the rim of the span, texels within)."""
     x, y = ((np.arange(n, dtype=np.float32) + 0.5) * np.float32(TEXEL / STEP) for n in size)
     u, v = np.meshgrid(x, y)
-    soft = cv2.GaussianBlur(heights, (0, 0), 0.7)
-    return np.asarray(cv2.remap(soft, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.float32)
+    large = cv2.remap(heights, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.GaussianBlur(large, (0, 0), 0.5 * STEP / TEXEL), np.float32)

@@ -16,7 +16,6 @@ from hardware.simulator.noise import (
     ramp,
     smooth,
     spots,
-    stretched,
     strokes,
     wander,
 )
@@ -132,7 +131,3 @@ def _hairs(
     colour = colour * (1 - (roots + shade)[..., None])
     return colour + cover[..., None] * (dark - colour), height + 0.02 * cover
 
-
-def drying(shape: Size, texel: float, rng: np.random.Generator) -> Field:
-    """Fine flakes along one direction, 0..1 (H, W)."""
-    return ramp(stretched(shape, (1.4 / texel, 0.5 / texel), rng), 0.9, 2.2)
