@@ -164,6 +164,11 @@ def test_a_turn_on_the_spot_has_the_direction_of_the_piece_before() -> None:
     assert line.knots.tolist() == pytest.approx([0, 4, 9, 12])
 
 
+def test_a_checkpoint_belongs_to_the_piece_that_leads_to_it() -> None:
+    line = planned_line(through(np.array([[0.0, 0, 0], [2, 0, 0], [5, 0, 0]])))
+    assert line.piece(np.array([-1.0, 0.0, 1e-9, 2.0, 2.0 + 1e-9, 5.0, 9.0])).tolist() == [0, 0, 0, 0, 1, 1, 1]
+
+
 # -- duty
 
 
@@ -197,6 +202,17 @@ def test_travel_and_the_way_there_are_not_part_of_duty() -> None:
     _, figures = judged(joined([replace(way, stamps=way.stamps - 10), log]), path)
     assert figures.duty == 1.0
     assert figures.printing == pytest.approx(2.0, abs=2e-3)
+
+
+def test_a_place_that_is_not_known_is_the_last_one_that_was() -> None:
+    corners = np.array([[0.0, 0, 0], [5, 0, 0], [5, 5, 0], [0, 5, 0]])
+    path = through(corners, extrude=np.array([True, True, False, True]))
+    log = nozzle_log(path)
+    travelling = without_target(log, slice(1500, 1600))  # 1 to 2 s is travel
+    assert judged(travelling, path)[1].duty == 1.0
+    printing = without_target(log, slice(500, 600))
+    printing.extrude[500:600] = False
+    assert judged(printing, path)[1].duty == pytest.approx(0.95, abs=1e-3)
 
 
 def test_what_extrudes_nothing_has_no_duty_and_no_error() -> None:
