@@ -51,7 +51,11 @@ def lay_in(skin: Coat, bed: Coat, inside: Field, texel: float, rng: np.random.Ge
     new = np.exp(-(((ragged + 0.35) / 0.5) ** 2)) * np.clip(0.55 + 0.35 * smooth(shape, 5 / texel, rng), 0, 1)
     crust = np.exp(-(((ragged + 0.9) / 1.0) ** 2)) * ramp(octaves(shape, 3.2 / texel, 3, rng), 0.9, 2.0)
     light = skin.colour.mean() / 0.42  # the rim is as dark as the skin it belongs to
-    for amount, tint in ((0.62 * pale, MACERATED * light), (0.8 * new, NEW_SKIN * light), (0.75 * crust, YELLOW * 0.55)):
+    for amount, tint in (
+        (0.62 * pale, MACERATED * light),
+        (0.8 * new, NEW_SKIN * light),
+        (0.75 * crust, YELLOW * 0.55),
+    ):
         colour += amount[..., None] * (tint - colour)
     cover = ramp(ragged, -0.18, 0.22)
     colour += cover[..., None] * (bed.colour - colour)

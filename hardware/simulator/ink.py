@@ -54,7 +54,9 @@ class Ink:
         opacity = colour[..., 3:]
         self._layers.colour[0][y0:y1, x0:x1, :3] = colour[..., :3] * (1 - share) + GEL * opacity * share
         wet = np.clip(height / 0.06, 0, 1)[..., None]
-        over = np.dstack([relief[..., 0] * 0.5 + sx, relief[..., 1] * 0.5 + sy, np.full_like(height, GLOSS), relief[..., 3]])
+        over = np.dstack(
+            [relief[..., 0] * 0.5 + sx, relief[..., 1] * 0.5 + sy, np.full_like(height, GLOSS), relief[..., 3]]
+        )
         self._layers.relief[0][y0:y1, x0:x1] = relief * (1 - wet) + over * wet
 
 

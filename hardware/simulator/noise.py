@@ -59,9 +59,7 @@ def cells(shape: Size, pitch: float, rng: np.random.Generator) -> tuple[Field, F
     return np.asarray(edge, np.float32), np.asarray(value, np.float32)
 
 
-def spots(
-    shape: Size, pitch: float, radius: tuple[float, float], rng: np.random.Generator, kept: float = 1.0
-) -> Field:
+def spots(shape: Size, pitch: float, radius: tuple[float, float], rng: np.random.Generator, kept: float = 1.0) -> Field:
     """Soft round spots 0..1, one in each square of `pitch` with chance `kept`; radius: (from, to), one sigma."""
     out = np.zeros(shape, np.float32)
     y, x = np.mgrid[0 : shape[0] / pitch, 0 : shape[1] / pitch]
@@ -93,7 +91,11 @@ def strokes(shape: Size, lines: list[Array], width: float, soft: float = 0.0) ->
 
 def wander(start: Array, angle: float, length: float, bend: float, rng: np.random.Generator, points: int = 12) -> Array:
     """A line (points, 2) from `start` that turns at random, by `bend` rad (one sigma) over its whole length."""
-    turns = angle + np.cumsum(rng.normal(0, bend / np.sqrt(points), points - 1)) + np.linspace(0, rng.normal(0, bend), points - 1)
+    turns = (
+        angle
+        + np.cumsum(rng.normal(0, bend / np.sqrt(points), points - 1))
+        + np.linspace(0, rng.normal(0, bend), points - 1)
+    )
     steps = np.column_stack([np.cos(turns), np.sin(turns)]) * (length / (points - 1))
     return np.asarray(np.vstack([start, start + np.cumsum(steps, axis=0)]))
 
@@ -109,4 +111,6 @@ def gradient(height: Field, spacing: float) -> tuple[Field, Field]:
     kernel = np.array([[-0.5, 0.0, 0.5]], np.float32) / np.float32(spacing)
     border = cv2.BORDER_REPLICATE
     x = cv2.filter2D(height, cv2.CV_32F, kernel, borderType=border)
-    return np.asarray(x, np.float32), np.asarray(cv2.filter2D(height, cv2.CV_32F, kernel.T, borderType=border), np.float32)
+    return np.asarray(x, np.float32), np.asarray(
+        cv2.filter2D(height, cv2.CV_32F, kernel.T, borderType=border), np.float32
+    )

@@ -63,7 +63,9 @@ def _covered(shape: Shape, look: Look) -> tuple[Size, Size]:
     if look.texture is not None:
         got = look.texture.shape[:2]
         if abs(rows - got[0]) > 1 or abs(columns - got[1]) > 1 or look.texture.ndim != 3:
-            raise InputError("look", "texture", look.texture.shape, f"({rows}, {columns}, 3): {look.texel:g} mm a texel")
+            raise InputError(
+                "look", "texture", look.texture.shape, f"({rows}, {columns}, 3): {look.texel:g} mm a texel"
+            )
         rows, columns = got
     return (rows, columns), texels((columns * look.texel, rows * look.texel), look.texel)
 
@@ -88,7 +90,7 @@ def _picture(colour: Texture, size: Size, pad: tuple[int, int]) -> skin.Coat:
     x, y = pad
     right, bottom = size[1] - x - colour.shape[1], size[0] - y - colour.shape[0]
     whole = cv2.copyMakeBorder(colour, y, bottom, x, right, cv2.BORDER_REPLICATE)
-    return skin.Coat(whole, np.zeros(size, np.float32), np.full(size, 0.2, np.float32))
+    return skin.Coat(whole, np.zeros(size, np.float32), np.zeros(size, np.float32))
 
 
 def _wet(coat: skin.Coat, inside: Field, wetness: float) -> skin.Coat:

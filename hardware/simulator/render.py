@@ -72,7 +72,12 @@ def _behind(box: Box, skin: SkinPicture | None, cloth: ClothPicture) -> NDArray[
     depth = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_LINEAR), np.float32)
     if skin is None or skin.depth is None:
         return depth
-    x0, y0, x1, y1 = max(box.x0, skin.box.x0), max(box.y0, skin.box.y0), min(box.x1, skin.box.x1), min(box.y1, skin.box.y1)
+    x0, y0, x1, y1 = (
+        max(box.x0, skin.box.x0),
+        max(box.y0, skin.box.y0),
+        min(box.x1, skin.box.x1),
+        min(box.y1, skin.box.y1),
+    )
     if x1 <= x0 or y1 <= y0:
         return depth
     inner, near = (

@@ -130,4 +130,3 @@ def _hairs(
     shade = np.roll(cover, (2, 1), (0, 1)) * 0.25  # a hair's own shadow
     colour = colour * (1 - (roots + shade)[..., None])
     return colour + cover[..., None] * (dark - colour), height + 0.02 * cover
-

@@ -115,8 +115,10 @@ def _strip(
     tv = v * to_texels + np.float32(oy - scene.shape.size[1] / 2 * scale)
     speed = lattice.enlarged(lattice.speed, first, last) if lattice.speed.any() else None
     colour, relief = _exposed(state, view, level, tu, tv, speed)
-    mirrors = lattice.enlarged(lattice.mirrors, first, last)
-    light = shading.shade(colour, relief, mirrors, passed, state.towards, state.lamps, scene.look.ambient)
+    light = colour
+    if scene.look.lit:
+        mirrors = lattice.enlarged(lattice.mirrors, first, last)
+        light = shading.shade(colour, relief, mirrors, passed, state.towards, state.lamps, scene.look.ambient)
     if state.shadow is None:
         return light, None
     deep = (z - np.float32(lattice.grid_from_camera[2, 3])) * sink

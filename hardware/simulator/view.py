@@ -108,7 +108,12 @@ def _cubic(nodes: Array, places: Array) -> Array:
     t = u - first
     weights = np.zeros((len(places), len(nodes)))
     for k, w in enumerate(
-        (-t * (t - 1) * (t - 2) / 6, (t + 1) * (t - 1) * (t - 2) / 2, -(t + 1) * t * (t - 2) / 2, (t + 1) * t * (t - 1) / 6)
+        (
+            -t * (t - 1) * (t - 2) / 6,
+            (t + 1) * (t - 1) * (t - 2) / 2,
+            -(t + 1) * t * (t - 2) / 2,
+            (t + 1) * t * (t - 1) / 6,
+        )
     ):
         weights[np.arange(len(places)), first - 1 + k] = w
     return weights
