@@ -5,8 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from hardware.simulator.field import Field, Size, ramp
 from hardware.simulator.layers import Texture, linear
-from hardware.simulator.noise import Field, Size, octaves, ramp, stretched, strokes, wander
+from hardware.simulator.noise import octaves, stretched, strokes, wander
 
 TEAL = linear([136, 122, 44])
 HEM = linear([150, 138, 64])

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.se3 import Array
 from hardware.simulator import cloth, nozzle_shape, sheet
+from hardware.simulator.field import Field, enlarged, field, looked_up
 from hardware.simulator.hits import block
-from hardware.simulator.noise import Field
 from hardware.simulator.state import State, moved
 from hardware.simulator.view import Rays, View
 
@@ -28,7 +27,7 @@ DEEPEST = -130.0
 class ClothPicture:
     """light: (H, W, 3) linear BGR of the whole image. depth: (h, w) mm along the optical axis, LATTICE px apart."""
 
-    light: NDArray[np.float32]
+    light: Field
     depth: Field
 
 
@@ -59,7 +58,7 @@ class _Eye:
         heights = self.state.scene.sheet.heights
         u = x / np.float32(sheet.STEP) + np.float32((heights.shape[1] - 1) / 2)
         v = y / np.float32(sheet.STEP) + np.float32((heights.shape[0] - 1) / 2)
-        return z - cv2.remap(heights, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), x, y
+        return z - looked_up(heights, u, v), x, y
 
 
 def cloth_picture(state: State, view: View) -> ClothPicture:
@@ -74,7 +73,7 @@ def cloth_picture(state: State, view: View) -> ClothPicture:
     passed = _passed(eye, rays, depth)
     w, h = view.camera.size
     whole = view.whole
-    fields = cv2.resize(np.dstack([x, y, *passed]), (whole.x1, whole.y1), interpolation=cv2.INTER_LINEAR)[:h, :w]
+    fields = enlarged(field(np.dstack([x, y, *passed])), (whole.y1, whole.x1))[:h, :w]
     _edges(eye, rays, depth, fields)
     light = np.empty((h, w, 3), np.float32)
     for first in range(0, h, STRIP):
@@ -87,35 +86,29 @@ def _search(eye: _Eye, rays: Rays) -> Field:
     m = eye.rest_from_camera
     sink = np.minimum(m[2, 0] * rays.x + m[2, 1] * rays.y + m[2, 2], -0.15)
     near, far = ((z - m[2, 3]) / sink for z in (HIGHEST, DEEPEST))
-    step = ((far - near) / STEPS).astype(np.float32)
-    depth = near = near.astype(np.float32)
-    above = np.full_like(depth, 1.0)
-    found, open_way = far.astype(np.float32), np.ones(depth.shape, bool)
+    near, found, step = field(near), field(far), field((far - near) / STEPS)
+    above, open_way = np.ones_like(near), np.ones(near.shape, bool)
     for k in range(STEPS + 1):
         depth = near + step * np.float32(k)
         left, _, _ = eye.left(rays, depth)
         new = (left <= 0) & open_way
-        found = np.where(new, depth + step * left / np.maximum(above - left, 1e-6), found)
+        found = field(np.where(new, depth + step * left / np.maximum(above - left, 1e-6), found))
         open_way &= ~new
         above = left
-    return np.asarray(found, np.float32)
+    return found
 
 
 def _refined(eye: _Eye, rays: Rays, depth: Field) -> tuple[Field, Field, Field]:
     """Depth and material x, y (H, W) mm after a round of the secant method."""
-    last = depth + np.float32(0.5)
-    left_last, _, _ = eye.left(rays, last)
-    left, x, y = eye.left(rays, depth)
-    for _ in range(1):
-        fall = (left - left_last) / np.where(depth == last, np.float32(1), depth - last)
-        move = np.clip(left / np.where(np.abs(fall) < 0.1, np.float32(-0.5), fall), -15, 15)
-        last, left_last = depth, left
-        depth = depth - move
-        left, x, y = eye.left(rays, depth)
-    return np.asarray(depth, np.float32), x, y
+    left_last, _, _ = eye.left(rays, depth + np.float32(0.5))
+    left, _, _ = eye.left(rays, depth)
+    fall = 2 * (left_last - left)
+    depth = depth - field(np.clip(left / np.where(np.abs(fall) < 0.1, np.float32(-0.5), fall), -15, 15))
+    _, x, y = eye.left(rays, depth)
+    return depth, x, y
 
 
-def _edges(eye: _Eye, rays: Rays, depth: Field, fields: NDArray[np.float32]) -> None:
+def _edges(eye: _Eye, rays: Rays, depth: Field, fields: Field) -> None:
     """Trace again, one by one, the pixels where the cloth hides itself and the lattice would draw steps.
 
     fields: (H, W, 2 or more), x and y of which are put right.
@@ -128,10 +121,10 @@ def _edges(eye: _Eye, rays: Rays, depth: Field, fields: NDArray[np.float32]) -> 
     h, w = fields.shape[:2]
     place = np.nonzero(np.repeat(np.repeat(jump, LATTICE, 0), LATTICE, 1)[:h, :w])
     at = [block(((p + 0.5) / LATTICE - 0.5).astype(np.float32)) for p in place]
-    border = cv2.BORDER_REPLICATE
-    alone = Rays(*(cv2.remap(r, at[1], at[0], cv2.INTER_LINEAR, borderMode=border) for r in rays))
+    alone = Rays(*(looked_up(r, at[1], at[0]) for r in rays))
     _, x, y = _refined(eye, alone, _search(eye, alone))
-    fields[(*place, 0)], fields[(*place, 1)] = (f.reshape(-1)[: len(place[0])] for f in (x, y))
+    for k, put in enumerate((x, y)):
+        fields[place[0], place[1], k] = put.reshape(-1)[: len(place[0])]
 
 
 def _passed(eye: _Eye, rays: Rays, depth: Field) -> list[Field]:
@@ -146,7 +139,7 @@ def _passed(eye: _Eye, rays: Rays, depth: Field) -> list[Field]:
     return [nozzle_shape.lit(points, nozzle_from_rest, state.lamps[0])]
 
 
-def _coloured(state: State, fields: NDArray[np.float32], light: NDArray[np.float32]) -> None:
+def _coloured(state: State, fields: Field, light: Field) -> None:
     """Fill in linear BGR (H, W, 3) of the cloth at material x, y, where a share of the key lamp's light falls."""
     picture = state.scene.sheet.picture
     u = fields[..., 0] * np.float32(1 / sheet.TEXEL) + np.float32((picture.shape[1] - 1) / 2)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
+from hardware.simulator.field import Field, Size, blurred, field, ramp
 from hardware.simulator.layers import Texture, linear
-from hardware.simulator.noise import Field, Size, cells, octaves, ramp, smooth, spots, strokes, wander
+from hardware.simulator.noise import cells, octaves, smooth, spots, strokes, wander
 from hardware.simulator.skin import Coat
 
 RED = linear([38, 34, 158])
@@ -39,7 +39,7 @@ def flesh(shape: Size, texel: float, inside: Field, rng: np.random.Generator) ->
     height += 0.05 * clots
     shadowed = np.exp(-np.clip(inside, 0, None) / 0.8)  # the bed is darkest under the rim
     colour *= (1 - 0.42 * shadowed * np.clip(0.8 + 0.4 * smooth(shape, 4 / texel, rng), 0, 1.2))[..., None]
-    return Coat(np.asarray(colour, np.float32), np.asarray(height, np.float32), np.clip(gloss, 0, 1))
+    return Coat(np.asarray(colour, np.float32), np.asarray(height, np.float32), field(np.clip(gloss, 0, 1)))
 
 
 def lay_in(skin: Coat, bed: Coat, inside: Field, texel: float, rng: np.random.Generator) -> Coat:
@@ -62,7 +62,7 @@ def lay_in(skin: Coat, bed: Coat, inside: Field, texel: float, rng: np.random.Ge
     wet = np.exp(-np.clip(-ragged, 0, None) / 1.2)
     height = skin.height * (1 - cover) * (1 - 0.5 * pale) + bed.height * cover + 0.05 * pale + 0.10 * crust
     gloss = skin.gloss + (bed.gloss - skin.gloss) * np.clip(cover + 0.55 * wet * (1 - cover), 0, 1)
-    height = cv2.GaussianBlur(np.asarray(height, np.float32), (0, 0), 0.6)
+    height = blurred(field(height), 0.6)
     return Coat(np.asarray(colour, np.float32), height, np.asarray(gloss, np.float32))
 
 

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from hardware.simulator.noise import Field, gradient
+from hardware.simulator.field import Field, Mask, field, gradient, looked_up
 
 STEPS = 56  # of the search downwards
 ROUNDS = 2  # of Newton's method
 FLAT = 0.3  # rays that meet the surface more grazing than this (1: head on) are searched for one by one
 CLOSE = 2e-3  # mm that is left over where Newton's method did not come to rest
-WIDTH = 256
-
-Mask = NDArray[np.bool_]
+WIDTH = 256  # rays
 
 
 class Bundle(NamedTuple):
@@ -32,31 +28,31 @@ class Relief(NamedTuple):
     """A height field (H, W) mm, its slopes a node along u and v, and the heights it keeps within, mm."""
 
     height: Field
-    slopes: NDArray[np.float32]  # (H, W, 2)
+    slopes: Field  # (H, W, 2)
     low: float
     high: float
 
 
-def relief(height: Field) -> Relief:
+def relief_of(height: Field) -> Relief:
     """A height field with its slopes."""
-    return Relief(height, np.dstack(gradient(height, 1.0)), float(height.min()) - 0.1, float(height.max()) + 0.1)
+    return Relief(height, field(np.dstack(gradient(height, 1.0))), float(height.min()) - 0.1, float(height.max()) + 0.1)
 
 
-def meet(field: Relief, rays: Bundle, start: Field, odd: Mask) -> Field:
+def meet(relief: Relief, rays: Bundle, start: Field, odd: Mask) -> Field:
     """Height z (H, W) mm where each ray first meets the field, which goes on beyond its edge as it is there.
 
     start: (H, W) mm, near it. odd: (H, W) which rays are searched alone, because the surface there grazes them or hides
     itself; the others, and those that do not come to rest, end within 1e-4 mm by Newton's method.
     """
-    z, rest = _newton(field, rays, start)
+    z, rest = _newton(relief, rays, start)
     doubt = odd | ~(np.abs(rest) < CLOSE)
     if doubt.any():
-        doubt &= near(field, rays, z)
+        doubt &= near(relief, rays, z)
     place = np.nonzero(doubt)
     if len(place[0]):
         alone = Bundle(*(block(part[place]) for part in rays))
-        searched, _ = search(field, alone)
-        better, left = _newton(field, alone, searched)
+        searched, _ = search(relief, alone)
+        better, left = _newton(relief, alone, searched)
         z[place] = np.where(np.abs(left) < 10 * CLOSE, better, searched).reshape(-1)[: len(place[0])]
     return z
 
@@ -64,46 +60,49 @@ def meet(field: Relief, rays: Bundle, start: Field, odd: Mask) -> Field:
 def block(values: Field) -> Field:
     """Values (N,) as rows of WIDTH, the last one filled up: OpenCV looks up no more than 32767 rows."""
     rows = -(-len(values) // WIDTH)
-    return np.pad(values, (0, rows * WIDTH - len(values)), mode="edge").reshape(rows, WIDTH)
+    return field(np.pad(values, (0, rows * WIDTH - len(values)), mode="edge").reshape(rows, WIDTH))
 
 
-def near(field: Relief, rays: Bundle, z: Field, margin: float = 4.0) -> Mask:
+def near(relief: Relief, rays: Bundle, z: Field, margin: float = 4.0) -> Mask:
     """Whether rays stand over the field, or within `margin` nodes of it, at height z."""
-    rows, columns = field.height.shape
+    rows, columns = relief.height.shape
     u, v = rays.u + z * rays.du, rays.v + z * rays.dv
-    return (u > -margin) & (u < columns + margin) & (v > -margin) & (v < rows + margin)
+    over: Mask = (u > -margin) & (u < columns + margin) & (v > -margin) & (v < rows + margin)
+    return over
 
 
-def _heights(field: Relief, rays: Bundle, z: Field) -> Field:
+def _heights(relief: Relief, rays: Bundle, z: Field) -> Field:
     u, v = rays.u + z * rays.du, rays.v + z * rays.dv
-    return np.asarray(cv2.remap(field.height, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+    return looked_up(relief.height, u, v)
 
 
-def _newton(field: Relief, rays: Bundle, z: Field) -> tuple[Field, Field]:
+def _newton(relief: Relief, rays: Bundle, z: Field) -> tuple[Field, Field]:
     """Heights nearer to the surface than z, and what was left over before the last round, mm; one slope for all."""
     u, v = rays.u + z * rays.du, rays.v + z * rays.dv
-    slopes = cv2.remap(field.slopes, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    slopes = looked_up(relief.slopes, u, v)
     step = 1 / np.maximum(1 - slopes[..., 0] * rays.du - slopes[..., 1] * rays.dv, 0.15)
     for _ in range(ROUNDS):
-        z = z - (z - _heights(field, rays, z)) * step
-    rest = z - _heights(field, rays, z)
-    return np.asarray(z - rest * step, np.float32), rest
+        z = field(z - (z - _heights(relief, rays, z)) * step)
+    rest = z - _heights(relief, rays, z)
+    return field(z - rest * step), rest
 
 
-def search(field: Relief, rays: Bundle) -> tuple[Field, Field]:
+def search(relief: Relief, rays: Bundle) -> tuple[Field, Field]:
     """Heights where rays first meet the field, by steps downwards, and how much it faces them there (1: head on)."""
-    step = np.float32((field.high - field.low) / (STEPS - 1))
-    z = np.full(rays.u.shape, field.low, np.float32)
+    step = np.float32((relief.high - relief.low) / (STEPS - 1))
+    z = np.full(rays.u.shape, relief.low, np.float32)
     facing = np.ones(z.shape, np.float32)
     open_way = np.ones(z.shape, bool)
     above = np.full(z.shape, step, np.float32)
-    for height in np.linspace(field.high, field.low, STEPS).astype(np.float32):
+    for height in np.linspace(relief.high, relief.low, STEPS).astype(np.float32):
         level = np.full_like(z, height)
-        left = level - _heights(field, rays, level)
+        left = level - _heights(relief, rays, level)
         new = (left <= 0) & open_way
         fall = np.maximum(above - left, 1e-6)
-        z = np.where(new, height - step * left / fall, z)
-        facing = np.where(new, fall / step, facing)
+        z = field(np.where(new, height - step * left / fall, z))
+        facing = field(np.where(new, fall / step, facing))
         open_way &= ~new
+        if not open_way.any():
+            break
         above = left
     return z, facing

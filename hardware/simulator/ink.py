@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hardware.simulator.field import Field, gradient
 from hardware.simulator.layers import Layers, linear
-from hardware.simulator.noise import Field, gradient
 
 GEL = linear([120, 182, 236])  # linear BGR of a thick layer
 DENSITY = 2.6  # per mm: a bead 0.3 mm high covers half of what is below

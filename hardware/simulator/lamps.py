@@ -12,8 +12,11 @@ from hardware.simulator.look import Look
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lamp:
-    """A lamp far away. towards: (3,) unit, rest frame (z out of the wound). strength: irradiance. spread: its radius seen
-    from the wound, rad. colour: BGR."""
+    """A lamp far away.
+
+    towards: (3,) unit, rest frame (z out of the wound). strength: irradiance. spread: its radius seen from the wound,
+    rad. colour: BGR.
+    """
 
     towards: Array
     strength: float

@@ -15,7 +15,8 @@ class Layers:
     """Two textures over a rectangle, each with `LEVELS` levels of half the one before.
 
     colour: (H, W, 4) linear BGR of 0..1, times opacity, and opacity. relief: (H, W, 4) slope along x, along y, gloss
-    0..1, occlusion (1: open to the whole room). texel: mm. corner: x, y mm of the rectangle's corner at row 0 and column 0, its least.
+    0..1, occlusion (1: open to the whole room). texel: mm. corner: x, y mm of the rectangle's corner at row 0 and
+    column 0, where both are least.
     """
 
     def __init__(self, colour: Texture, relief: Texture, texel: float, corner: tuple[float, float]) -> None:

@@ -14,8 +14,8 @@ class Look:
     texel: mm of the texture. tone: 0 fair to 1 dark skin. wetness: 0 dry to 1 dripping. hair: 0 none, 1 an arm's.
     drape: whether a surgical drape with an opening lies round the skin and moves with it; without one the shape is a
     patch before a cloth at rest. texture: (H, W, 3) BGR over the whole shape (row 0 at the least y) instead of skin.
-    lit: whether light falls on it; else a texture is imaged as it is. ambient, key, fill: irradiance of the room, of the
-    lamp and of the one opposite, of a white surface that faces them.
+    lit: whether light falls on it; else a texture is imaged as it is. ambient, key, fill: what a white surface that
+    faces them gets of the room, of the lamp and of the one opposite.
     """
 
     texel: float = 0.1

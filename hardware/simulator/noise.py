@@ -7,24 +7,21 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation.se3 import Array
-
-Field = NDArray[np.float32]  # (H, W)
-Size = tuple[int, int]  # H, W
+from hardware.simulator.field import Field, Size, blurred, field
 
 
 def smooth(shape: Size, scale: float, rng: np.random.Generator) -> Field:
     """Gaussian noise of mean 0 and variance 1 whose hills are about `scale` texels wide."""
     halvings = max(0, int(np.log2(max(scale, 1.0) / 3)))
     coarse = ((shape[0] >> halvings) + 8, (shape[1] >> halvings) + 8)
-    field = cv2.GaussianBlur(rng.standard_normal(coarse, np.float32), (0, 0), max(0.4, 0.4 * scale / (1 << halvings)))
-    field = (field - field.mean()) / field.std()
+    drawn = blurred(rng.standard_normal(coarse, np.float32), max(0.4, 0.4 * scale / (1 << halvings)))
+    large = field((drawn - drawn.mean()) / drawn.std())
     for _ in range(halvings):
-        field = cv2.pyrUp(field)  # resize by cubics would leave a comb on every slope
+        large = field(cv2.pyrUp(large))  # resize by cubics would leave a comb on every slope
     edge = 3 << halvings
-    return np.asarray(field[edge : edge + shape[0], edge : edge + shape[1]], np.float32)
+    return large[edge : edge + shape[0], edge : edge + shape[1]]
 
 
 def octaves(shape: Size, scale: float, count: int, rng: np.random.Generator, fall: float = 0.6) -> Field:
@@ -33,18 +30,18 @@ def octaves(shape: Size, scale: float, count: int, rng: np.random.Generator, fal
     total = strength[0] * smooth(shape, scale, rng)
     for k in range(1, count):
         total += strength[k] * smooth(shape, scale / 2**k, rng)
-    return np.asarray(total, np.float32)
+    return field(total)
 
 
 def stretched(shape: Size, scale: tuple[float, float], rng: np.random.Generator) -> Field:
     """Noise of variance 1 whose hills are `scale` (along x, along y) texels wide: fibres of one direction."""
     sigma = np.maximum(0.4 * np.array(scale), 0.3)
-    field = cv2.GaussianBlur(rng.standard_normal(shape, np.float32), (0, 0), sigma[0], sigmaY=sigma[1])
-    return np.asarray((field - field.mean()) / field.std(), np.float32)
+    drawn = cv2.GaussianBlur(rng.standard_normal(shape, np.float32), (0, 0), sigma[0], sigmaY=sigma[1])
+    return field((drawn - drawn.mean()) / drawn.std())
 
 
 def cells(shape: Size, pitch: float, rng: np.random.Generator) -> tuple[Field, Field]:
-    """Voronoi cells about `pitch` texels wide: distance to the cell's edge in texels, and a number 0..1 of each cell."""
+    """Voronoi cells about `pitch` texels wide: distance to the edge in texels, and a number 0..1 of each cell."""
     y, x = np.mgrid[-1 : shape[0] / pitch + 1, -1 : shape[1] / pitch + 1]
     sites = (np.stack([y, x], -1) + rng.uniform(0.0, 1.0, (*y.shape, 2))).reshape(-1, 2) * pitch
     sites = np.rint(sites[((sites >= 0) & (sites < np.array(shape) - 1)).all(1)]).astype(int)
@@ -56,7 +53,7 @@ def cells(shape: Size, pitch: float, rng: np.random.Generator) -> tuple[Field, F
     inner[:-1] &= label[:-1] == label[1:]
     edge = cv2.distanceTransform(inner, cv2.DIST_L2, 5)
     value = rng.random(int(label.max()) + 1, np.float32)[label]
-    return np.asarray(edge, np.float32), np.asarray(value, np.float32)
+    return field(edge), field(value)
 
 
 def spots(shape: Size, pitch: float, radius: tuple[float, float], rng: np.random.Generator, kept: float = 1.0) -> Field:
@@ -79,14 +76,14 @@ def spots(shape: Size, pitch: float, radius: tuple[float, float], rng: np.random
 
 
 def strokes(shape: Size, lines: list[Array], width: float, soft: float = 0.0) -> Field:
-    """Lines 0..1 through points (N, 2) texels each, `width` texels wide (thinner than one: fainter), blurred by `soft`."""
+    """Lines 0..1 through points (N, 2) texels each, `width` texels wide (below one: fainter), blurred by `soft`."""
     drawn = np.zeros(shape, np.uint8)
     thick = max(1, round(width))
     for line in lines:
         points = np.rint(line * 16).astype(np.int32)
         cv2.polylines(drawn, [points], False, 255, thick, cv2.LINE_AA, shift=4)
-    field = drawn.astype(np.float32) * (min(1.0, width) / 255)
-    return np.asarray(cv2.GaussianBlur(field, (0, 0), soft) if soft else field, np.float32)
+    cover = field(drawn) * np.float32(min(1.0, width) / 255)
+    return blurred(cover, soft) if soft else cover
 
 
 def wander(start: Array, angle: float, length: float, bend: float, rng: np.random.Generator, points: int = 12) -> Array:
@@ -98,19 +95,3 @@ def wander(start: Array, angle: float, length: float, bend: float, rng: np.rando
     )
     steps = np.column_stack([np.cos(turns), np.sin(turns)]) * (length / (points - 1))
     return np.asarray(np.vstack([start, start + np.cumsum(steps, axis=0)]))
-
-
-def ramp(field: Field, low: float, high: float) -> Field:
-    """0 up to `low`, 1 from `high`, smooth between (high may be below low)."""
-    t = np.clip((field - np.float32(low)) / np.float32(high - low), 0, 1)
-    return np.asarray(t * t * (3 - 2 * t), np.float32)
-
-
-def gradient(height: Field, spacing: float) -> tuple[Field, Field]:
-    """Slopes along x and y of a height field whose nodes are `spacing` apart."""
-    kernel = np.array([[-0.5, 0.0, 0.5]], np.float32) / np.float32(spacing)
-    border = cv2.BORDER_REPLICATE
-    x = cv2.filter2D(height, cv2.CV_32F, kernel, borderType=border)
-    return np.asarray(x, np.float32), np.asarray(
-        cv2.filter2D(height, cv2.CV_32F, kernel.T, borderType=border), np.float32
-    )

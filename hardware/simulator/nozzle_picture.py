@@ -10,7 +10,7 @@ from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
 from hardware.simulator import nozzle_shape
-from hardware.simulator.noise import Field
+from hardware.simulator.field import Field
 from hardware.simulator.nozzle_shape import PARTS, Triple
 from hardware.simulator.state import State, turned
 from hardware.simulator.view import SAMPLES, Box, View

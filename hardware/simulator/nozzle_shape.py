@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from estimation.se3 import Array
+from hardware.simulator.field import Field, field
 from hardware.simulator.lamps import Lamp
 from hardware.simulator.layers import linear
-from hardware.simulator.noise import Field
 
 
 class Part(NamedTuple):
@@ -20,7 +20,7 @@ class Part(NamedTuple):
     z1: float
     r0: float
     r1: float
-    colour: Array
+    colour: Field
     gloss: float
     metal: bool
 
@@ -50,7 +50,7 @@ Triple = tuple[Field, Field, Field]  # x, y, z
 
 
 class Met(NamedTuple):
-    """What rays see of one part, all of the rays' shape. depth: in lengths of the ray, inf: nothing. x, y, z: normal."""
+    """What rays see of one part, each of their shape. depth: in lengths of the ray, inf: nothing. x, y, z: normal."""
 
     depth: Field
     x: Field
@@ -67,7 +67,7 @@ def outline(part: Part) -> Array:
 def radius_at(z: Field) -> Field:
     """Radius mm at heights z mm, for shadows: steps are bridged."""
     ends = np.interp(z, [p.z0 for p in PARTS] + [LENGTH], [p.r0 for p in PARTS] + [PARTS[-1].r1])
-    return np.asarray(ends, np.float32)
+    return field(ends)
 
 
 def meet(part: Part, origin: Array, rays: Triple) -> Met:
@@ -82,17 +82,24 @@ def meet(part: Part, origin: Array, rays: Triple) -> Met:
     with np.errstate(invalid="ignore", divide="ignore"):
         depth = (-b - np.sqrt(b * b - a * c)) / a
         z = oz + depth * dz
-        depth = np.where((depth > 0) & (z >= part.z0) & (z <= part.z1), depth, np.float32(np.inf))
+        depth = field(np.where((depth > 0) & (z >= part.z0) & (z <= part.z1), depth, np.inf))
         x, y = ox + depth * dx, oy + depth * dy
-        inverse = 1 / (np.hypot(x, y) * np.hypot(1, k))
-        met = Met(depth, x * inverse, y * inverse, np.full_like(x, -k / np.hypot(1, k)))
+        slant = np.float32(np.hypot(1, k))
+        inverse = 1 / (np.hypot(x, y) * slant)
+        met = Met(depth, x * inverse, y * inverse, np.full_like(x, -k / slant))
         side, height, radius = (1, part.z1, part.r1) if oz > part.z1 else (-1, part.z0, part.r0)
         if part.z0 <= oz <= part.z1:
             return met
         end = (np.float32(height) - oz) / dz
         x, y = ox + end * dx, oy + end * dy
         hit = (end > 0) & (x * x + y * y <= radius * radius) & (end < depth)
-    return Met(*(np.where(hit, new, old) for new, old in zip((end, 0, 0, side), met, strict=True)))
+    flat = np.float32(side)
+    return Met(
+        field(np.where(hit, end, met.depth)),
+        field(np.where(hit, 0, met.x)),
+        field(np.where(hit, 0, met.y)),
+        field(np.where(hit, flat, met.z)),
+    )
 
 
 def lit(points: Triple, nozzle_from_rest: Array, lamp: Lamp) -> Field:
@@ -103,12 +110,13 @@ def lit(points: Triple, nozzle_from_rest: Array, lamp: Lamp) -> Field:
     x, y, z = points
     lx, ly, lz = (np.float32(v) for v in nozzle_from_rest[:3, :3] @ lamp.towards)
     across = max(float(lx * lx + ly * ly), 1e-4)
-    away = np.maximum(-(x * lx + y * ly) / np.float32(across), 0)  # mm along the ray to where it passes the axis
-    height = np.clip(z + away * lz, 0, LENGTH)
-    away = np.maximum((height - z) / lz, 0) if abs(lz) > 0.2 else away
+    away = field(np.maximum(-(x * lx + y * ly) / np.float32(across), 0))  # mm along the ray to where it passes the axis
+    height = field(np.clip(z + away * lz, 0, LENGTH))
+    if abs(lz) > 0.2:
+        away = field(np.maximum((height - z) / lz, 0))
     gap = np.hypot(x + away * lx, y + away * ly)
     gap = np.hypot(gap, z + away * lz - height)
     soft = np.float32(0.25) + np.float32(lamp.spread) * away
     radius = radius_at(height)
     hidden = np.clip((radius + soft - gap) / (2 * soft), 0, 1) * np.minimum(1, (radius / soft) ** 0.7)
-    return np.asarray(1 - hidden * hidden * (3 - 2 * hidden), np.float32)
+    return field(1 - hidden * hidden * (3 - 2 * hidden))

@@ -8,9 +8,9 @@ import numpy as np
 from estimation.errors import InputError
 from hardware.simulator import cloth, flesh, sheet, skin
 from hardware.simulator.bodies import MARGIN
+from hardware.simulator.field import Field, Size, blurred, field, gradient, looked_up, ramp
 from hardware.simulator.layers import Layers, Texture, linear, texels
 from hardware.simulator.look import Look
-from hardware.simulator.noise import Field, Size, gradient, ramp
 from hardware.simulator.shape import Shape
 
 FADE = (5.5, 8.5)  # mm outside the opening: over this the painted drape hands over to the sheet
@@ -34,19 +34,19 @@ def paint(shape: Shape, heights: Field, half: tuple[float, float] | None, look: 
     if look.texture is not None:
         coat = _picture(linear(look.texture), size, pad)
     else:
-        inside = None if shape.inside is None else _enlarged(shape.inside, u, v)
+        inside = None if shape.inside is None else looked_up(field(shape.inside), u, v)
         coat = skin.skin(size, look.texel, inside, look.tone, look.hair, rng)
         if inside is not None:
             bed = flesh.flesh(size, look.texel, inside, rng)
             coat = _wet(flesh.lay_in(coat, bed, inside, look.texel, rng), inside, look.wetness)
     open_sky = _occlusion(heights, coat.height, shape.step, look.texel, u, v)
-    valid = np.ones(size, np.float32) if shape.valid is None else _enlarged(shape.valid.astype(float), u, v)
+    valid = np.ones(size, np.float32) if shape.valid is None else looked_up(field(shape.valid), u, v)
     opaque = ramp(valid, 0.4, 0.6)
     if half is not None:
         coat, open_sky, opaque = _draped(coat, open_sky, opaque, u, v, shape, half, look.texel, rng)
     sx, sy = gradient(heights, shape.step)
     mx, my = gradient(coat.height, look.texel)
-    across, along = _enlarged(sx, u, v) + mx, _enlarged(sy, u, v) + my
+    across, along = looked_up(sx, u, v) + mx, looked_up(sy, u, v) + my
     opaque *= _on(u, heights.shape[1]) * _on(v, heights.shape[0])
     colour = np.dstack([coat.colour * opaque[..., None], opaque])
     return Layers(colour, np.dstack([across, along, coat.gloss, open_sky]).astype(np.float32), look.texel, corner)
@@ -79,17 +79,11 @@ def _nodes(shape: Shape, size: Size, texel: float, corner: tuple[float, float]) 
     return u, v
 
 
-def _enlarged(field: object, u: Field, v: Field) -> Field:
-    """A field on the shape's nodes at the texels."""
-    source = np.asarray(field, np.float32)
-    return np.asarray(cv2.remap(source, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
-
-
 def _picture(colour: Texture, size: Size, pad: tuple[int, int]) -> skin.Coat:
     """The look's own picture, `pad` texels (x, y) from the corner of whole blocks."""
     x, y = pad
     right, bottom = size[1] - x - colour.shape[1], size[0] - y - colour.shape[0]
-    whole = cv2.copyMakeBorder(colour, y, bottom, x, right, cv2.BORDER_REPLICATE)
+    whole = field(cv2.copyMakeBorder(colour, y, bottom, x, right, cv2.BORDER_REPLICATE))
     return skin.Coat(whole, np.zeros(size, np.float32), np.zeros(size, np.float32))
 
 
@@ -97,18 +91,18 @@ def _wet(coat: skin.Coat, inside: Field, wetness: float) -> skin.Coat:
     """The wound as wet as the look says: a film darkens it and fills its finest hollows."""
     film = ramp(inside, -1.5, 0.5) * np.float32(wetness)
     colour = coat.colour * (1 - 0.14 * film)[..., None]
-    height = coat.height - 0.35 * film * (coat.height - cv2.GaussianBlur(coat.height, (0, 0), 3))
+    height = coat.height - 0.35 * film * (coat.height - blurred(coat.height, 3))
     gloss = coat.gloss * (1 - ramp(inside, -1.5, 0.5) + film)
-    return skin.Coat(np.asarray(colour, np.float32), np.asarray(height, np.float32), np.asarray(gloss, np.float32))
+    return skin.Coat(field(colour), field(height), field(gloss))
 
 
 def _occlusion(heights: Field, fine: Field, step: float, texel: float, u: Field, v: Field) -> Field:
     """How open each texel is to the room (H, W): less in the wound, under its rim and between its grains."""
     large = np.zeros_like(heights)
     for scale, strength in ((1.2, 0.35), (3.5, 0.16), (9.0, 0.05)):  # mm, per mm of depth below the mean around
-        large += strength * (cv2.GaussianBlur(heights, (0, 0), scale / step) - heights)
-    small = 3.0 * (cv2.GaussianBlur(fine, (0, 0), 0.45 / texel) - fine)
-    return np.asarray(np.clip(1 - _enlarged(large, u, v) - small, 0.35, 1.1), np.float32)
+        large += strength * (blurred(heights, scale / step) - heights)
+    small = 3.0 * (blurred(fine, 0.45 / texel) - fine)
+    return field(np.clip(1 - looked_up(large, u, v) - small, 0.35, 1.1))
 
 
 def _draped(
@@ -132,11 +126,11 @@ def _draped(
     colour = coat.colour + cover[..., None] * (cloth.colour(shade, outside) - coat.colour)
     height = coat.height * (1 - cover) + (weave * 0.5) * cover
     gloss = coat.gloss * (1 - cover) + 0.05 * cover
-    open_sky = open_sky * (1 - 0.4 * np.exp(-np.abs(outside) / 0.9) * (1 - cover))
-    colour = np.asarray(colour, np.float32)
+    open_sky = field(open_sky * (1 - 0.4 * np.exp(-np.abs(outside) / 0.9) * (1 - cover)))
+    colour = field(colour)
     opaque = np.maximum(opaque, cover) * ramp(outside, FADE[1], FADE[0])
-    painted = skin.Coat(colour, np.asarray(height, np.float32), np.asarray(gloss, np.float32))
-    return painted, np.asarray(open_sky, np.float32), np.asarray(opaque, np.float32)
+    painted = skin.Coat(colour, field(height), field(gloss))
+    return painted, field(open_sky), field(opaque)
 
 
 def half_opening(shape: Shape) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from estimation.se3 import Array
 from hardware.simulator import paint, sheet
 from hardware.simulator.default_rig import REST
 from hardware.simulator.deformation import Deformation
-from hardware.simulator.hits import Relief, relief
+from hardware.simulator.hits import Relief, relief_of
 from hardware.simulator.ink import Ink
 from hardware.simulator.look import Look
 from hardware.simulator.shape import Shape
@@ -27,7 +27,7 @@ STILL = Deformation()
 class Scene:
     """A body before the cameras; same arguments, same pictures.
 
-    base_from_rest: (4, 4) mm, base_from_surface when nothing moves: there the far cloth lies, and the lamps hang over it.
+    base_from_rest: (4, 4) mm, base_from_surface when nothing moves: there the far cloth lies and over it hang lamps.
     Only `ink` changes: pictures rendered after a bead was laid show it.
     """
 
@@ -47,7 +47,7 @@ class Scene:
         self.layers = paint.paint(shape, self.relief, half, self.look, seed)
         self.sheet = sheet.bare(self.look, rng) if half is None else sheet.draped(shape, half, self.look, rng)
         self.ink = Ink(self.layers)
-        self._at_rest = relief(self.relief)
+        self._at_rest = relief_of(self.relief)
         self._views: dict[Camera, View] = {}
         self._lock = threading.Lock()
 
@@ -56,7 +56,7 @@ class Scene:
         if not amount * self.deformation.bulge:
             return self._at_rest
         lift = self.deformation.lift(np.stack(sheet.axes(self.shape.size, self.shape.step), -1), amount)
-        return relief(self.relief + lift.astype(np.float32))
+        return relief_of(self.relief + lift.astype(np.float32))
 
     @property
     def opening(self) -> tuple[float, float]:

@@ -25,6 +25,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from estimation.errors import InputError
+from estimation.se3 import Array
 from hardware import checks
 from hardware.checks import Table
 from hardware.simulator.bodies import BODIES, Wound, body, with_wound
@@ -34,7 +35,6 @@ from hardware.simulator.look import Look
 from hardware.simulator.scene import Scene
 from hardware.simulator.sensor import Sensor
 from hardware.simulator.shape import Shape, shape_from_scan
-from estimation.se3 import Array
 
 LOOK = ("tone", "wetness", "hair", "drape", "texel_mm")
 KEYS = ("body", "scan", "wound", "wound_size_mm", "wound_depth_mm", "deformation", *LOOK)

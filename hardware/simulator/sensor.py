@@ -7,10 +7,10 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from estimation.rig import Camera
+from hardware.simulator.field import Field, blurred
 from perception.frames import Image
 
 ROOM = 256  # px by which the stored grain is larger than an image, so that each image takes another cut of it
@@ -21,8 +21,8 @@ STRIP = 48  # rows developed at once: they stay in the cache
 class Sensor:
     """What a camera does to the light.
 
-    noise: grey levels, one sigma. The display's value is the square root of the light, so the shot noise of the light is
-    the same everywhere in the image. vignetting: 1 is a bare lens's cos^4 law, 0 none. blur: px, one sigma, of lens and
+    noise: grey levels, one sigma. The display's value is the square root of the light, so the light's shot noise is the
+    same everywhere in the image. vignetting: 1 is a bare lens's cos^4 law, 0 none. blur: px, one sigma, of lens and
     colour filter.
     """
 
@@ -38,7 +38,7 @@ class Sensor:
             raise InputError("sensor", "blur", self.blur, "0 to 10 px")
 
 
-def vignette(camera: Camera, sensor: Sensor) -> NDArray[np.float32]:
+def vignette(camera: Camera, sensor: Sensor) -> Field:
     """Share of the light (H, W, 3) that reaches each pixel."""
     x = (np.arange(camera.size[0]) - camera.matrix[0, 2]) / camera.matrix[0, 0]
     y = (np.arange(camera.size[1]) - camera.matrix[1, 2]) / camera.matrix[1, 1]
@@ -46,16 +46,14 @@ def vignette(camera: Camera, sensor: Sensor) -> NDArray[np.float32]:
     return np.ascontiguousarray(np.repeat(share[..., None], 3, 2), np.float32)
 
 
-def expose(
-    light: NDArray[np.float32], sensor: Sensor, fall: NDArray[np.float32], gain: float, rng: np.random.Generator
-) -> Image:
+def expose(light: Field, sensor: Sensor, fall: Field, gain: float, rng: np.random.Generator) -> Image:
     """The image (H, W, 3) BGR of linear light (H, W, 3); fall: as `vignette` gives.
 
     The grain is a cut at random from one large field (drawing anew is ten times slower).
     """
     h, w = light.shape[:2]
     if sensor.blur:
-        light = cv2.GaussianBlur(light, (0, 0), sensor.blur)
+        light = blurred(light, sensor.blur)
     y, x = rng.integers(0, ROOM, 2)
     grain = _grain(h, w)[y : y + h, x : x + w]
     image = np.empty((h, w, 3), np.uint8)
@@ -67,6 +65,6 @@ def expose(
 
 
 @lru_cache(maxsize=4)
-def _grain(h: int, w: int) -> NDArray[np.float32]:
+def _grain(h: int, w: int) -> Field:
     """White noise of variance 1, (h + ROOM, w + ROOM, 3)."""
     return np.random.default_rng([31, h, w]).standard_normal((h + ROOM, w + ROOM, 3), np.float32)

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.se3 import Array
+from hardware.simulator.field import Field, field
 from hardware.simulator.lamps import AMBIENT, Lamp
-from hardware.simulator.noise import Field
 
 WRAP = (0.10, 0.13, 0.30)  # BGR: how far light creeps round into the shade under the skin, a share of the lamp's
 MIRROR = 0.045  # of light that a film of water and serum sends back
@@ -47,7 +47,7 @@ def shade(
     facing = 1 / cv2.sqrt(across * across + along * along + 1)
     room = open_sky * (0.45 + 0.55 * facing) * np.float32(ambient)
     wet, dry = gloss * gloss, np.float32(0.3) + gloss
-    lights: list[Field] = [room * np.float32(AMBIENT[k]) for k in range(3)]
+    lights = [field(room * np.float32(AMBIENT[k])) for k in range(3)]
     glint = 0.06 * wet * room  # the film mirrors the room
     for k, lamp in enumerate(lamps):
         if not lamp.strength:

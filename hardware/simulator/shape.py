@@ -65,7 +65,7 @@ class Shape:
         return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
 
     def mesh(self, step: float = 1.0) -> tuple[Array, NDArray[np.int64]]:
-        """Vertices (V, 3) mm, surface frame, and triangles (T, 3), anticlockwise from outside, nodes `step` mm apart."""
+        """Vertices (V, 3) mm, surface frame, `step` mm apart, and triangles (T, 3), anticlockwise from outside."""
         flat = self.grid(step)
         columns = int(np.flatnonzero(np.diff(flat[:, 1]))[0]) + 1
         corner = np.arange(len(flat)).reshape(-1, columns)

@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from hardware.simulator import cloth
+from hardware.simulator.field import Field, gradient, ramp
 from hardware.simulator.lamps import AMBIENT, lamps
 from hardware.simulator.layers import Texture
 from hardware.simulator.look import Look
-from hardware.simulator.noise import Field, gradient, ramp
 from hardware.simulator.shape import Shape
 
 STEP = 2.0  # mm between nodes: the cloth is no measure of anything
@@ -46,7 +47,7 @@ class Sheet:
 def axes(span: tuple[float, float], step: float) -> tuple[Field, Field]:
     """x, y (H, W) mm of nodes `step` apart about the origin, over `span`."""
     x, y = ((np.arange(round(s / step) + 1, dtype=np.float32) - round(s / step) / 2) * np.float32(step) for s in span)
-    return np.meshgrid(x, y)  # type: ignore[return-value]
+    return np.meshgrid(x, y)
 
 
 def thickness(outside: Field) -> Field:
@@ -82,7 +83,7 @@ def _evened(shape: Shape) -> Shape:
     sigma = 5 / shape.step
     pad = int(3 * sigma)
     wide = np.pad(shape.heights, pad, mode="reflect", reflect_type="odd")
-    return replace(shape, heights=cv2.GaussianBlur(wide, (0, 0), sigma)[pad:-pad, pad:-pad])
+    return replace(shape, heights=gaussian_filter(wide, sigma)[pad:-pad, pad:-pad])
 
 
 def bare(look: Look, rng: np.random.Generator) -> Sheet:

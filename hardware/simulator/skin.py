@@ -7,18 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from hardware.simulator.field import Field, Size, field, ramp
 from hardware.simulator.layers import Texture, linear
-from hardware.simulator.noise import (
-    Field,
-    Size,
-    cells,
-    octaves,
-    ramp,
-    smooth,
-    spots,
-    strokes,
-    wander,
-)
+from hardware.simulator.noise import cells, octaves, smooth, spots, strokes, wander
 
 TONES = np.array(  # display BGR from fair to dark
     [[172, 190, 228], [146, 172, 216], [108, 142, 190], [70, 98, 146], [44, 60, 92]], np.float32
@@ -88,8 +79,8 @@ def _round_wound(
     """Inflamed near the wound, uneven; stained further out."""
     away = np.clip(-inside, 0, None)
     patchy = np.clip(1 + 0.45 * octaves(shape, 9 / texel, 3, rng), 0.2, 2)
-    blood = blood + (0.62 * np.exp(-away / 4.5) + 0.28 * np.exp(-away / 14)) * patchy
-    melanin = melanin + 0.16 * np.exp(-away / 10) * np.clip(octaves(shape, 6 / texel, 3, rng), 0, 2)
+    blood += (0.62 * np.exp(-away / 4.5) + 0.28 * np.exp(-away / 14)) * patchy
+    melanin += 0.16 * np.exp(-away / 10) * np.clip(octaves(shape, 6 / texel, 3, rng), 0, 2)
     return np.asarray(blood, np.float32), np.asarray(melanin, np.float32)
 
 
@@ -128,5 +119,5 @@ def _hairs(
     roots = strokes(shape, [line[:2] for line in lines], 0.2 / texel, 0.1 / texel) * 0.3
     dark = base_colour(min(1.0, tone + 0.75)) * np.float32(0.25)
     shade = np.roll(cover, (2, 1), (0, 1)) * 0.25  # a hair's own shadow
-    colour = colour * (1 - (roots + shade)[..., None])
+    colour = field(colour * (1 - (roots + shade)[..., None]))
     return colour + cover[..., None] * (dark - colour), height + 0.02 * cover

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
 from hardware.simulator import hits, shading
+from hardware.simulator.field import Field, Mask, averaged, enlarged, field, looked_up, painted
 from hardware.simulator.hits import Bundle
-from hardware.simulator.noise import Field
 from hardware.simulator.state import SHADOW_STEP, State, turned
 from hardware.simulator.view import CELL, SAMPLES, Box, Rays, View
 
@@ -28,11 +27,14 @@ TIMES = np.array([[-3, 1], [3, -1]]) / 8  # of the exposure, for the samples (ro
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkinPicture:
-    """light: (H, W, 4) linear BGR times opacity, and opacity, of a box's pixels. depth: (2H, 2W) mm of its samples along
-    the optical axis, inf where there is no surface; None unless asked for."""
+    """The shape over a box.
+
+    light: (H, W, 4) linear BGR times opacity, and opacity. depth: (2H, 2W) mm of its samples along the optical axis,
+    inf where there is no surface; None where there is no nozzle to be hidden.
+    """
 
     box: Box
-    light: NDArray[np.float32]
+    light: Field
     depth: Field | None
 
 
@@ -48,8 +50,7 @@ def skin_picture(state: State, view: View) -> SkinPicture | None:
         last = min(first + STRIP, box.size[0] // CELL)
         rows = slice(first * CELL * SAMPLES, last * CELL * SAMPLES)
         samples, deep = _strip(state, view, lattice, first, last)
-        shrunk = cv2.resize(samples, (box.size[1], (last - first) * CELL), interpolation=cv2.INTER_AREA)
-        light[first * CELL : last * CELL] = shrunk  # the mean of each pixel's samples
+        light[first * CELL : last * CELL] = averaged(samples, ((last - first) * CELL, box.size[1]))
         if depth is not None:
             depth[rows] = deep
     return SkinPicture(box, light, depth)
@@ -66,63 +67,60 @@ class _Lattice:
     grid_from_camera: Array
     rays: Rays
     start: Field
-    odd: NDArray[np.uint8]
+    odd: Mask
     mirrors: Field
     speed: Field
 
-    def enlarged(self, field: NDArray[np.float32], first: int, last: int) -> NDArray[np.float32]:
+    def spread(self, cells: Field, first: int, last: int) -> Field:
         """A field of the cells at the samples of the cell rows first to last."""
-        low, high = max(first - 1, 0), min(last + 1, len(field))
+        low, high = max(first - 1, 0), min(last + 1, len(cells))
         times = CELL * SAMPLES
-        size = (field.shape[1] * times, (high - low) * times)
-        large = cv2.resize(field[low:high], size, interpolation=cv2.INTER_LINEAR)
-        return np.asarray(large[(first - low) * times : (last - low) * times], np.float32)
+        size = ((high - low) * times, cells.shape[1] * times)
+        return enlarged(cells[low:high], size)[(first - low) * times : (last - low) * times]
 
 
 def _lattice(state: State, view: View, box: Box) -> _Lattice:
     grid_from_camera = se3.inverse(state.base_from_grid) @ view.camera.base_from_camera
     rays = view.rays(box)
-    small = (box.size[1] // CELL, box.size[0] // CELL)
-    cells = Rays(*(cv2.resize(r, small, interpolation=cv2.INTER_AREA) for r in rays))
+    small = (box.size[0] // CELL, box.size[1] // CELL)
+    cells = Rays(*(averaged(r, small) for r in rays))
     lines, _ = _bundle(state, grid_from_camera, cells)
     start, facing = hits.search(state.relief, lines)
     hard = (facing < hits.FLAT) & hits.near(state.relief, lines, start, CELL * SAMPLES)
-    odd = cv2.dilate(hard.astype(np.uint8), np.ones((3, 3), np.uint8))
+    odd = np.asarray(cv2.dilate(hard.astype(np.uint8), np.ones((3, 3), np.uint8)), bool)
     directions = turned(grid_from_camera[:3, :3], *cells)
     mirrors = shading.half_slopes(directions, state.towards)
     speed = _speed(state, directions, lines.u + start * lines.du, lines.v + start * lines.dv, start)
     return _Lattice(grid_from_camera, rays, start, odd, mirrors, speed)
 
 
-def _strip(
-    state: State, view: View, lattice: _Lattice, first: int, last: int
-) -> tuple[NDArray[np.float32], Field | None]:
+def _strip(state: State, view: View, lattice: _Lattice, first: int, last: int) -> tuple[Field, Field | None]:
     """Light (H, W, 4) and depth (H, W) mm of the samples of cell rows first to last."""
     scene, times = state.scene, CELL * SAMPLES
     rays = Rays(*(r[first * times : last * times] for r in lattice.rays))
     lines, sink = _bundle(state, lattice.grid_from_camera, rays)
-    odd = np.repeat(np.repeat(lattice.odd[first:last], times, 0), times, 1) > 0
-    z = hits.meet(state.relief, lines, lattice.enlarged(lattice.start, first, last), odd)
+    odd = np.repeat(np.repeat(lattice.odd[first:last], times, 0), times, 1)
+    z = hits.meet(state.relief, lines, lattice.spread(lattice.start, first, last), odd)
     u, v = lines.u + z * lines.du, lines.v + z * lines.dv  # nodes of material points
     passed = None
     if state.shadow is not None:
         skip = np.float32(max(1, round(SHADOW_STEP / scene.shape.step)))
-        passed = cv2.remap(state.shadow, u / skip, v / skip, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        passed = looked_up(state.shadow, field(u / skip), field(v / skip))
     level = scene.layers.level(view.spacing)
     scale, ox, oy = scene.layers.offsets(level)
     to_texels = np.float32(scene.shape.step * scale)
     tu = u * to_texels + np.float32(ox - scene.shape.size[0] / 2 * scale)
     tv = v * to_texels + np.float32(oy - scene.shape.size[1] / 2 * scale)
-    speed = lattice.enlarged(lattice.speed, first, last) if lattice.speed.any() else None
+    speed = lattice.spread(lattice.speed, first, last) if lattice.speed.any() else None
     colour, relief = _exposed(state, view, level, tu, tv, speed)
     light = colour
     if scene.look.lit:
-        mirrors = lattice.enlarged(lattice.mirrors, first, last)
+        mirrors = lattice.spread(lattice.mirrors, first, last)
         light = shading.shade(colour, relief, mirrors, passed, state.towards, state.lamps, scene.look.ambient)
     if state.shadow is None:
         return light, None
     deep = (z - np.float32(lattice.grid_from_camera[2, 3])) * sink
-    return light, np.where(colour[..., 3] > 0.5, deep, np.float32(np.inf))
+    return light, field(np.where(colour[..., 3] > 0.5, deep, np.inf))
 
 
 def covered(state: State, view: View) -> Box | None:
@@ -141,15 +139,15 @@ def _bundle(state: State, grid_from_camera: Array, rays: Rays) -> tuple[Bundle, 
     """Rays as lines over the nodes of material points, and 1 / their z."""
     x, y, z = turned(grid_from_camera[:3, :3], *rays)
     never = z > GRAZING
-    sink = 1 / np.where(never, np.float32(-1), z)
+    sink = field(1 / np.where(never, np.float32(-1), z))
     origin = grid_from_camera[:3, 3]
     shape = state.scene.shape
     lines = []
     for k, side in enumerate((x, y)):
         per_node = np.float32(1 / (state.factors[k] * shape.step))
-        slope = side * (sink * per_node)
+        slope = field(side * (sink * per_node))
         first = np.float32(origin[k] * per_node + shape.size[k] / 2 / shape.step)
-        start = first - np.float32(origin[2]) * slope
+        start = field(first - np.float32(origin[2]) * slope)
         if never.any():
             start[never], slope[never] = OUTSIDE, 0
         lines.append((start, slope))
@@ -157,13 +155,13 @@ def _bundle(state: State, grid_from_camera: Array, rays: Rays) -> tuple[Bundle, 
 
 
 def _speed(state: State, directions: tuple[Field, Field, Field], u: Field, v: Field, z: Field) -> Field:
-    """Speed (h, w, 2) mm/s at which material points pass the rays that meet node u, v at height z, as the surface moves."""
+    """Speed (h, w, 2) mm/s at which material points pass rays that meet node u, v at height z, as the surface moves."""
     twist = se3.adjoint(se3.inverse(state.scene.shape.surface_from_grid)) @ state.instant.twist
     if not twist.any():
         return np.zeros((*u.shape, 2), np.float32)
     w, t = twist[:3].astype(np.float32), twist[3:].astype(np.float32)
     shape, factors = state.scene.shape, state.factors
-    slopes = cv2.remap(cv2.blur(state.relief.slopes, (9, 9)), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    slopes = looked_up(field(cv2.blur(state.relief.slopes, (9, 9))), u, v)
     sx, sy = slopes[..., 0] / (shape.step * factors[0]), slopes[..., 1] / (shape.step * factors[1])
     x = (u * shape.step - shape.size[0] / 2) * factors[0]
     y = (v * shape.step - shape.size[1] / 2) * factors[1]
@@ -171,17 +169,15 @@ def _speed(state: State, directions: tuple[Field, Field, Field], u: Field, v: Fi
     dx, dy, dz = directions
     towards = np.minimum(dz - sx * dx - sy * dy, -0.1)
     along = (vz - sx * vx - sy * vy) / towards
-    return np.dstack([(along * dx - vx) / factors[0], (along * dy - vy) / factors[1]]).astype(np.float32)
+    return field(np.dstack([(along * dx - vx) / factors[0], (along * dy - vy) / factors[1]]))
 
 
-def _exposed(
-    state: State, view: View, level: int, tu: Field, tv: Field, speed: Field | None
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _exposed(state: State, view: View, level: int, tu: Field, tv: Field, speed: Field | None) -> tuple[Field, Field]:
     """Colour and relief (H, W, 4) at texels tu, tv, each sample at its own part of the exposure; speed: mm/s."""
     layers, exposure = state.scene.layers, state.instant.exposure
     sources = layers.colour[level], layers.relief[level]
     if speed is None or exposure == 0:
-        colour, relief = (_looked_up(source, tu, tv) for source in sources)
+        colour, relief = (painted(source, tu, tv) for source in sources)
         return colour, relief
     fastest = float(np.abs(speed).max()) * exposure / (SAMPLES * view.spacing)  # px
     count = int(np.clip(np.ceil(fastest / SMEAR / TIMES.size), 1, MOST_INSTANTS))
@@ -191,11 +187,6 @@ def _exposed(
     for k in range(count):
         time = times + np.float32(((k + 0.5) / count - 0.5) / TIMES.size)
         u, v = tu + path[..., 0] * time, tv + path[..., 1] * time
-        sums.append([_looked_up(source, u, v) for source in sources])
-    colour, relief = (np.mean(part, axis=0, dtype=np.float32) for part in zip(*sums, strict=True))
+        sums.append([painted(source, u, v) for source in sources])
+    colour, relief = (field(np.mean(part, axis=0, dtype=np.float32)) for part in zip(*sums, strict=True))
     return colour, relief
-
-
-def _looked_up(texture: NDArray[np.float32], u: Field, v: Field) -> NDArray[np.float32]:
-    found = cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0, 0, 0, 0))
-    return np.asarray(found, np.float32)

@@ -9,10 +9,10 @@ import numpy as np
 from estimation import se3
 from estimation.se3 import Array
 from hardware.simulator import nozzle_shape
+from hardware.simulator.field import Field
 from hardware.simulator.hits import Relief
 from hardware.simulator.instant import Instant
 from hardware.simulator.lamps import Lamp, lamps
-from hardware.simulator.noise import Field
 from hardware.simulator.scene import Scene
 
 SHADOW_STEP = 0.5  # mm: a needle's shadow is 0.7 mm wide

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from estimation.rig import Camera
 from estimation.se3 import Array, inverse
-from hardware.simulator.noise import Field
+from hardware.simulator.field import Field
 from hardware.simulator.sensor import Sensor, vignette
 from perception.lens import undistort
 
@@ -86,7 +86,7 @@ class View:
     def coarse(self, step: int) -> Rays:
         """Rays through the middles of squares of `step` px over the whole image."""
         if step not in self._coarse:
-            x, y = (np.arange(0, n, step) + (step - 1) / 2 for n in self.whole[2:])
+            x, y = (np.arange(0.0, n, step) + (step - 1) / 2 for n in self.whole[2:])
             self._coarse[step] = Rays(*_rays(self.camera, x, y))
         return self._coarse[step]
 
