@@ -22,7 +22,8 @@ FRAME = 4.0  # mm between the points that tell which part of an image the shape 
 STRIP = 4  # rows of cells worked on at once: their fields stay in the cache
 SMEAR = 1.5  # px between the instants of one exposure that a pixel holds
 MOST_INSTANTS = 8  # a sample; at more the picture is one smear anyway
-TIMES = np.array([[-3, 1], [3, -1]]) / 8  # of the exposure, for the samples (row, column) of a pixel
+TIMES = np.array([[7, 1], [3, 5]]) / 16  # of the exposure, before and after its middle, for the samples of a pixel
+SHARP = 0.25  # px: a smear too short to be seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +62,8 @@ class _Lattice:
     """What varies slowly, (h, w) at the middles of a box's cells, and the box's rays, (H, W).
 
     start: heights mm. odd: where rays must be searched one by one. mirrors: slopes that mirror the lamps, (h, w, 4).
-    speed: (h, w, 2) mm/s of material points past the rays.
+    speed: (h, w, 2) mm/s of material points past the rays. instants: how often a sample is taken before the middle of
+    the exposure, and as often after it; 0: in the middle only.
     """
 
     grid_from_camera: Array
@@ -70,6 +72,7 @@ class _Lattice:
     odd: Mask
     mirrors: Field
     speed: Field
+    instants: int
 
     def spread(self, cells: Field, first: int, last: int) -> Field:
         """A field of the cells at the samples of the cell rows first to last."""
@@ -91,7 +94,9 @@ def _lattice(state: State, view: View, box: Box) -> _Lattice:
     directions = turned(grid_from_camera[:3, :3], *cells)
     mirrors = shading.half_slopes(directions, state.towards)
     speed = _speed(state, directions, lines.u + start * lines.du, lines.v + start * lines.dv, start)
-    return _Lattice(grid_from_camera, rays, start, odd, mirrors, speed)
+    smear = float(np.abs(speed).max()) * state.instant.exposure / (SAMPLES * view.spacing)  # px
+    instants = int(np.clip(np.ceil(smear / SMEAR / (2 * TIMES.size)), 1, MOST_INSTANTS)) if smear > SHARP else 0
+    return _Lattice(grid_from_camera, rays, start, odd, mirrors, speed, instants)
 
 
 def _strip(state: State, view: View, lattice: _Lattice, first: int, last: int) -> tuple[Field, Field | None]:
@@ -111,8 +116,8 @@ def _strip(state: State, view: View, lattice: _Lattice, first: int, last: int) -
     to_texels = np.float32(scene.shape.step * scale)
     tu = u * to_texels + np.float32(ox - scene.shape.size[0] / 2 * scale)
     tv = v * to_texels + np.float32(oy - scene.shape.size[1] / 2 * scale)
-    speed = lattice.spread(lattice.speed, first, last) if lattice.speed.any() else None
-    colour, relief = _exposed(state, view, level, tu, tv, speed)
+    speed = lattice.spread(lattice.speed, first, last) if lattice.instants else None
+    colour, relief = _exposed(state, level, tu, tv, speed, lattice.instants)
     light = colour
     if scene.look.lit:
         mirrors = lattice.spread(lattice.mirrors, first, last)
@@ -172,21 +177,23 @@ def _speed(state: State, directions: tuple[Field, Field, Field], u: Field, v: Fi
     return field(np.dstack([(along * dx - vx) / factors[0], (along * dy - vy) / factors[1]]))
 
 
-def _exposed(state: State, view: View, level: int, tu: Field, tv: Field, speed: Field | None) -> tuple[Field, Field]:
-    """Colour and relief (H, W, 4) at texels tu, tv, each sample at its own part of the exposure; speed: mm/s."""
+def _exposed(state: State, level: int, tu: Field, tv: Field, speed: Field | None, instants: int) -> tuple[Field, Field]:
+    """Colour and relief (H, W, 4) at texels tu, tv, each sample at its own part of the exposure; speed: mm/s.
+
+    Each sample looks as long before the middle of the exposure as after it, so that a point's picture stays centred.
+    """
     layers, exposure = state.scene.layers, state.instant.exposure
     sources = layers.colour[level], layers.relief[level]
-    if speed is None or exposure == 0:
+    if speed is None:
         colour, relief = (painted(source, tu, tv) for source in sources)
         return colour, relief
-    fastest = float(np.abs(speed).max()) * exposure / (SAMPLES * view.spacing)  # px
-    count = int(np.clip(np.ceil(fastest / SMEAR / TIMES.size), 1, MOST_INSTANTS))
     path = speed * np.float32(exposure * layers.offsets(level)[0])
     times = np.tile(TIMES.astype(np.float32), (tu.shape[0] // 2, tu.shape[1] // 2))
     sums = []
-    for k in range(count):
-        time = times + np.float32(((k + 0.5) / count - 0.5) / TIMES.size)
-        u, v = tu + path[..., 0] * time, tv + path[..., 1] * time
-        sums.append([painted(source, u, v) for source in sources])
+    for k in range(instants):
+        time = times + np.float32(((k + 0.5) / instants - 0.5) / (2 * TIMES.size))
+        du, dv = path[..., 0] * time, path[..., 1] * time
+        for u, v in ((tu - du, tv - dv), (tu + du, tv + dv)):
+            sums.append([painted(source, u, v) for source in sources])
     colour, relief = (field(np.mean(part, axis=0, dtype=np.float32)) for part in zip(*sums, strict=True))
     return colour, relief
