@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from hardware.simulator.field import Field, Mask, field, gradient, looked_up
@@ -12,6 +13,7 @@ STEPS = 56  # of the search downwards
 ROUNDS = 2  # of Newton's method
 FLAT = 0.3  # rays that meet the surface more grazing than this (1: head on) are searched for one by one
 CLOSE = 2e-3  # mm that is left over where Newton's method did not come to rest
+REACH = 7  # rays round a grazing one that are searched too: it may hide the surface from them
 WIDTH = 256  # rays
 
 
@@ -42,17 +44,20 @@ def meet(relief: Relief, rays: Bundle, start: Field, odd: Mask) -> Field:
     """Height z (H, W) mm where each ray first meets the field, which goes on beyond its edge as it is there.
 
     start: (H, W) mm, near it. odd: (H, W) which rays are searched alone, because the surface there grazes them or hides
-    itself; the others, and those that do not come to rest, end within 1e-4 mm by Newton's method.
+    itself; so are those that turn out to graze it or do not come to rest. Newton's method ends within 1e-4 mm of it.
     """
-    z, rest = _newton(relief, rays, start)
-    doubt = odd | ~(np.abs(rest) < CLOSE)
+    z, rest, facing = _newton(relief, rays, start)
+    grazed = facing < FLAT
+    if grazed.any():
+        grazed = np.asarray(cv2.dilate(grazed.astype(np.uint8), np.ones((REACH, REACH), np.uint8)), bool)
+    doubt = odd | grazed | ~(np.abs(rest) < CLOSE)
     if doubt.any():
-        doubt &= near(relief, rays, z)
+        doubt &= near(relief, rays, start)
     place = np.nonzero(doubt)
     if len(place[0]):
         alone = Bundle(*(block(part[place]) for part in rays))
         searched, _ = search(relief, alone)
-        better, left = _newton(relief, alone, searched)
+        better, left, _ = _newton(relief, alone, searched)
         z[place] = np.where(np.abs(left) < 10 * CLOSE, better, searched).reshape(-1)[: len(place[0])]
     return z
 
@@ -76,15 +81,19 @@ def _heights(relief: Relief, rays: Bundle, z: Field) -> Field:
     return looked_up(relief.height, u, v)
 
 
-def _newton(relief: Relief, rays: Bundle, z: Field) -> tuple[Field, Field]:
-    """Heights nearer to the surface than z, and what was left over before the last round, mm; one slope for all."""
+def _newton(relief: Relief, rays: Bundle, z: Field) -> tuple[Field, Field, Field]:
+    """Heights nearer to the surface than z, what was left over before the last round, mm, and how much rays face it.
+
+    The slope at the start serves all rounds.
+    """
     u, v = rays.u + z * rays.du, rays.v + z * rays.dv
     slopes = looked_up(relief.slopes, u, v)
-    step = 1 / np.maximum(1 - slopes[..., 0] * rays.du - slopes[..., 1] * rays.dv, 0.15)
+    facing = 1 - slopes[..., 0] * rays.du - slopes[..., 1] * rays.dv
+    step = 1 / np.maximum(facing, 0.15)
     for _ in range(ROUNDS):
         z = field(z - (z - _heights(relief, rays, z)) * step)
     rest = z - _heights(relief, rays, z)
-    return field(z - rest * step), rest
+    return field(z - rest * step), rest, facing
 
 
 def search(relief: Relief, rays: Bundle) -> tuple[Field, Field]:

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 from hardware.simulator.field import Field, gradient
 from hardware.simulator.layers import Layers, linear
 
-GEL = linear([120, 182, 236])  # linear BGR of a thick layer
-DENSITY = 2.6  # per mm: a bead 0.3 mm high covers half of what is below
+GEL = linear([128, 184, 232])  # linear BGR of a thick layer
+DENSITY = 1.7  # per mm: a bead 0.4 mm high covers half of what is below
 FLATNESS = 0.45  # a bead's height by its width
 GLOSS = 0.95
 

@@ -87,7 +87,7 @@ def _shaded(
     reflected = (*mirrored, gone)
     up = nozzle_from_rest[:3, 2]
     height = _dot(reflected, up)
-    room = np.clip(0.42 + 0.5 * height + 0.10 * np.sin(9 * height), 0.03, 1.0)
+    room = np.clip(0.46 + 0.45 * height + 0.12 * np.sin(9 * height), 0.12, 1.0)
     light = np.float32(state.scene.look.ambient) * (0.6 + 0.4 * _dot(normal, up))
     glint = np.zeros_like(light)
     for lamp in state.lamps:

@@ -11,7 +11,7 @@ from hardware.simulator.field import Field, field
 from hardware.simulator.lamps import AMBIENT, Lamp
 
 WRAP = (0.10, 0.13, 0.30)  # BGR: how far light creeps round into the shade under the skin, a share of the lamp's
-MIRROR = 0.045  # of light that a film of water and serum sends back
+MIRROR = 0.06  # of light that a film of water and serum sends back
 FILM = 0.075  # slope, one sigma: how rough the film is
 SHEEN = 0.32  # slope, one sigma: how rough dry skin is
 DRY_MIRROR = 0.035

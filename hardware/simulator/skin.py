@@ -52,7 +52,7 @@ def skin(shape: Size, texel: float, inside: Field | None, tone: float, hair: flo
     veil = 1 - 0.6 * tone  # blood shows less through dark skin
     exponent = blood[..., None] * (BLOOD * veil) + melanin[..., None] * MELANIN + veins[..., None] * (VENOUS * veil)
     colour = base_colour(tone) * cv2.exp(-exponent)
-    scales = ramp(octaves(shape, 3.0 / texel, 3, rng), 1.5, 2.6) * 0.22
+    scales = ramp(octaves(shape, 3.0 / texel, 3, rng), 1.5, 2.6) * np.float32(0.14 * (1 - 0.5 * tone))
     colour += scales[..., None] * (0.8 * SCALE - colour)
     height = -0.030 * furrow - 0.009 * crease - 0.035 * pores + 0.010 * grain + 0.02 * scales
     if hair > 0:
