@@ -23,6 +23,7 @@ MOST = 20  # key frames: 40 improved the pose by nothing and cost four times as 
 TURN, SHIFT = 0.07, 0.04  # rad, and parts of the distance to the cameras: a view that differs by this is worth keeping
 STEADY = 0.4  # s between key frames of the same view, of which a few average the tracks' noise
 STEADY_MOST = 6
+CLEARER = 0.5  # of the doubt about the cameras' instants: then the same key frames tell more
 LEAST_SIGMA = 0.1  # px
 LEAST_OF_CAMERA = 12  # tracks: fewer may agree by chance, and so may less than half of those found
 
@@ -39,7 +40,8 @@ class Refiner:
         self._due = 0
         self._count = 0
         self._offered: tuple[Fit, Observations, Array] | None = None
-        self._job: tuple[Rig, SurfaceMap, list[KeyFrame]] | None = None
+        self._skew = self._skew_used = np.inf  # s, of the cameras' instants: as known now, and at the last adjustment
+        self._job: tuple[Rig, SurfaceMap, list[KeyFrame], float] | None = None
         self._future: Future[Adjusted | None] | None = None
 
     def begin(
@@ -62,28 +64,29 @@ class Refiner:
         Until then a surface that moved between the cameras' instants looks nearer or farther than it is.
         """
         assert self._map is not None
-        first, pose, drift = self._frames[0], fit.solution.base_from_surface, self.speed(fit) * skew
-        second = KeyFrame(pose, _inliers(self._rig, self._map, pose, observations), drift)
-        self._frames = [KeyFrame(first.base_from_surface, first.observations, drift), second]
+        first, pose, twist = self._frames[0], fit.solution.base_from_surface, self.speed(fit)
+        second = KeyFrame(pose, _inliers(self._rig, self._map, pose, observations), twist)
+        self._frames = [KeyFrame(first.base_from_surface, first.observations, twist), second]
         self._stamps = [self._stamps[0], fit.stamp]
-        refined = adjust(self._rig, self._map, self._frames)
+        self._skew = self._skew_used = skew
+        refined = adjust(self._rig, self._map, self._frames, skew)
         if refined is not None:
             self._map = refined.map
         return refined
 
     def offer(self, fit: Fit, observations: Observations, twist: Array, skew: float) -> None:
         """A measured frame set; `poll` keeps it if it shows the surface anew."""
-        self._offered = fit, observations, twist * skew
+        self._offered, self._skew = (fit, observations, twist), skew
 
     def _choose(self) -> None:
         """Whether the last frame set offered becomes a key frame."""
         if self._offered is None or self._map is None:
             return
-        fit, observations, drift = self._offered
+        fit, observations, twist = self._offered
         self._offered = None
         if self._is_new(fit.stamp, fit.solution.base_from_surface):
             kept = _inliers(self._rig, self._map, fit.solution.base_from_surface, observations)
-            self._keep(fit.stamp, fit.solution.base_from_surface, kept, drift)
+            self._keep(fit.stamp, fit.solution.base_from_surface, kept, twist)
             self._ask = True
 
     def _is_new(self, stamp: float, pose: Array) -> bool:
@@ -97,8 +100,8 @@ class Refiner:
             return True
         return int(alike.sum()) < STEADY_MOST and stamp - self._stamps[-1] > STEADY
 
-    def _keep(self, stamp: float, pose: Array, observations: Observations, drift: Array) -> None:
-        self._frames.append(KeyFrame(pose, observations, drift))
+    def _keep(self, stamp: float, pose: Array, observations: Observations, twist: Array) -> None:
+        self._frames.append(KeyFrame(pose, observations, twist))
         self._stamps.append(stamp)
         if len(self._frames) > MOST:
             worst = self._most_alike()
@@ -119,6 +122,7 @@ class Refiner:
         """
         self._count += 1
         self._choose()
+        self._ask |= self._skew < CLEARER * self._skew_used
         result = None
         if self._job is not None and self._count >= self._due:
             result = self._finish()
@@ -126,7 +130,8 @@ class Refiner:
                 self._map = result.map
         if self._ask and self._job is None and self._map is not None and len(self._frames) >= 3:
             self._ask, self._due = False, self._count + DELAY
-            self._job = self._rig, self._map, list(self._frames)
+            self._job = self._rig, self._map, list(self._frames), self._skew
+            self._skew_used = self._skew
             self._future = None if self._executor is None else self._executor.submit(adjust, *self._job)
         return result
 
