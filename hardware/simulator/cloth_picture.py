@@ -17,6 +17,9 @@ from hardware.simulator.view import Rays, View
 
 LATTICE = 8  # px between the rays that are traced
 STEPS = 20
+SEARCH = 16  # px between the rays that are searched through all depths
+LOCAL_STEPS = 8
+NEARBY = np.float32(8.0)  # mm of depth by which the cloth between rays reaches beyond them
 JUMP = 15.0  # mm by which the depth between two rays differs from the mean of theirs where the cloth hides itself
 STRIP = 48  # rows coloured at once: their fields stay in the cache
 HIGHEST = 40.0  # mm above the rest plane: nothing of the cloth is higher
@@ -69,7 +72,9 @@ def cloth_picture(state: State, view: View) -> ClothPicture:
         se3.inverse(state.scene.base_from_rest) @ view.camera.base_from_camera,
     )
     rays = view.coarse(LATTICE)
-    depth, x, y = _refined(eye, rays, _search(eye, rays))
+    coarse = view.coarse(SEARCH)
+    found = _search(eye, coarse, *_bounds(eye, coarse), STEPS)
+    depth, x, y = _refined(eye, rays, enlarged(found, (rays.x.shape[0], rays.x.shape[1])))
     passed = _passed(eye, rays, depth)
     w, h = view.camera.size
     whole = view.whole
@@ -81,14 +86,18 @@ def cloth_picture(state: State, view: View) -> ClothPicture:
     return ClothPicture(light, depth)
 
 
-def _search(eye: _Eye, rays: Rays) -> Field:
-    """Depth (H, W) mm at which rays first meet the cloth, by equal steps; the last one where they never do."""
+def _bounds(eye: _Eye, rays: Rays) -> tuple[Field, Field]:
+    """Depths (H, W) mm between which the cloth lies."""
     m = eye.rest_from_camera
     sink = np.minimum(m[2, 0] * rays.x + m[2, 1] * rays.y + m[2, 2], -0.15)
-    near, far = ((z - m[2, 3]) / sink for z in (HIGHEST, DEEPEST))
-    near, found, step = field(near), field(far), field((far - near) / STEPS)
-    above, open_way = np.ones_like(near), np.ones(near.shape, bool)
-    for k in range(STEPS + 1):
+    return field((HIGHEST - m[2, 3]) / sink), field((DEEPEST - m[2, 3]) / sink)
+
+
+def _search(eye: _Eye, rays: Rays, near: Field, far: Field, steps: int) -> Field:
+    """Depth (H, W) mm at which rays first meet the cloth, by equal steps from near to far; far where they never do."""
+    step = (far - near) / np.float32(steps)
+    found, above, open_way = far, np.ones_like(near), np.ones(near.shape, bool)
+    for k in range(steps + 1):
         depth = near + step * np.float32(k)
         left, _, _ = eye.left(rays, depth)
         new = (left <= 0) & open_way
@@ -115,14 +124,16 @@ def _edges(eye: _Eye, rays: Rays, depth: Field, fields: Field) -> None:
     """
     bend = np.array([[1.0, -2.0, 1.0]], np.float32)
     bent = np.maximum(*(np.abs(cv2.filter2D(depth, -1, k, borderType=cv2.BORDER_REPLICATE)) for k in (bend, bend.T)))
-    jump = bent > JUMP
+    jump = np.asarray(cv2.dilate((bent > JUMP).astype(np.uint8), np.ones((3, 3), np.uint8)), bool)
     if not jump.any():
         return
     h, w = fields.shape[:2]
     place = np.nonzero(np.repeat(np.repeat(jump, LATTICE, 0), LATTICE, 1)[:h, :w])
     at = [block(((p + 0.5) / LATTICE - 0.5).astype(np.float32)) for p in place]
     alone = Rays(*(looked_up(r, at[1], at[0]) for r in rays))
-    _, x, y = _refined(eye, alone, _search(eye, alone))
+    around = np.ones((5, 5), np.uint8)
+    near, far = (looked_up(field(f(depth, around)), at[1], at[0]) for f in (cv2.erode, cv2.dilate))
+    _, x, y = _refined(eye, alone, _search(eye, alone, near - NEARBY, far + NEARBY, LOCAL_STEPS))
     for k, put in enumerate((x, y)):
         fields[place[0], place[1], k] = put.reshape(-1)[: len(place[0])]
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from hardware.simulator.field import Field, Mask, field, gradient, looked_up
 
-STEPS = 56  # of the search downwards
+STEPS = 56  # of the search downwards through all heights
+LOCAL_STEPS = 24  # of a search between near bounds
 ROUNDS = 2  # of Newton's method
 FLAT = 0.3  # rays that meet the surface more grazing than this (1: head on) are searched for one by one
 CLOSE = 2e-3  # mm that is left over where Newton's method did not come to rest
@@ -40,11 +41,12 @@ def relief_of(height: Field) -> Relief:
     return Relief(height, field(np.dstack(gradient(height, 1.0))), float(height.min()) - 0.1, float(height.max()) + 0.1)
 
 
-def meet(relief: Relief, rays: Bundle, start: Field, odd: Mask) -> Field:
+def meet(relief: Relief, rays: Bundle, start: Field, odd: Mask, bounds: tuple[Field, Field]) -> Field:
     """Height z (H, W) mm where each ray first meets the field, which goes on beyond its edge as it is there.
 
     start: (H, W) mm, near it. odd: (H, W) which rays are searched alone, because the surface there grazes them or hides
     itself; so are those that turn out to graze it or do not come to rest. Newton's method ends within 1e-4 mm of it.
+    bounds: (h, w) mm below and above which the search need not look, of squares of rays.
     """
     z, rest, facing = _newton(relief, rays, start)
     grazed = facing < FLAT
@@ -56,7 +58,9 @@ def meet(relief: Relief, rays: Bundle, start: Field, odd: Mask) -> Field:
     place = np.nonzero(doubt)
     if len(place[0]):
         alone = Bundle(*(block(part[place]) for part in rays))
-        searched, _ = search(relief, alone)
+        times = z.shape[0] // bounds[0].shape[0]
+        low, high = (block(b[place[0] // times, place[1] // times]) for b in bounds)
+        searched, _ = search(relief, alone, low, high, LOCAL_STEPS)
         better, left, _ = _newton(relief, alone, searched)
         z[place] = np.where(np.abs(left) < 10 * CLOSE, better, searched).reshape(-1)[: len(place[0])]
     return z
@@ -96,19 +100,18 @@ def _newton(relief: Relief, rays: Bundle, z: Field) -> tuple[Field, Field, Field
     return field(z - rest * step), rest, facing
 
 
-def search(relief: Relief, rays: Bundle) -> tuple[Field, Field]:
-    """Heights where rays first meet the field, by steps downwards, and how much it faces them there (1: head on)."""
-    step = np.float32((relief.high - relief.low) / (STEPS - 1))
-    z = np.full(rays.u.shape, relief.low, np.float32)
+def search(relief: Relief, rays: Bundle, low: Field, high: Field, steps: int) -> tuple[Field, Field]:
+    """Heights where rays first meet the field, by steps from high to low, and how much it faces them (1: head on)."""
+    step = (high - low) / np.float32(steps - 1)
+    z, above = low, step
     facing = np.ones(z.shape, np.float32)
     open_way = np.ones(z.shape, bool)
-    above = np.full(z.shape, step, np.float32)
-    for height in np.linspace(relief.high, relief.low, STEPS).astype(np.float32):
-        level = np.full_like(z, height)
+    for k in range(steps):
+        level = high - np.float32(k) * step
         left = level - _heights(relief, rays, level)
         new = (left <= 0) & open_way
         fall = np.maximum(above - left, 1e-6)
-        z = field(np.where(new, height - step * left / fall, z))
+        z = field(np.where(new, level - step * left / fall, z))
         facing = field(np.where(new, fall / step, facing))
         open_way &= ~new
         if not open_way.any():

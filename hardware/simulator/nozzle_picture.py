@@ -11,7 +11,7 @@ from estimation.rig import pixels_from_points
 from estimation.se3 import Array
 from hardware.simulator import nozzle_shape
 from hardware.simulator.field import Field
-from hardware.simulator.nozzle_shape import PARTS, Triple
+from hardware.simulator.nozzle_shape import PARTS, Part, Triple
 from hardware.simulator.state import State, turned
 from hardware.simulator.view import SAMPLES, Box, View
 
@@ -19,20 +19,32 @@ NEAR = 30.0  # mm before the lens: nearer, a part is not drawn
 LATTICE = 4  # px between the rays that are looked up; straight between them, off by 1e-3 px
 
 
-def nozzle_box(state: State, view: View) -> Box | None:
-    """The part of the image that the nozzle can touch, None where there is none."""
+def part_boxes(state: State, view: View) -> list[tuple[Part, Box]]:
+    """The parts in view and the part of the image that each can touch."""
     if state.instant.base_from_nozzle is None:
-        return None
-    boxes = [box for part in PARTS if (box := _part_box(state.instant.base_from_nozzle, view, part)) is not None]
-    if not boxes:
-        return None
-    corners = np.array(boxes)
-    return Box(*(int(v) for v in (*corners[:, :2].min(0), *corners[:, 2:].max(0))))
+        return []
+    outlines = np.stack([nozzle_shape.outline(part) for part in PARTS])
+    points = se3.transform_points(state.instant.base_from_nozzle, outlines.reshape(-1, 3))
+    pixels, depth = pixels_from_points(view.camera, points)
+    pixels, depth = pixels.reshape(*outlines.shape[:2], 2), depth.reshape(outlines.shape[:2])
+    boxes = (
+        view.clip(p.min(0) - 2, p.max(0) + 3) if d.min() > NEAR else None for p, d in zip(pixels, depth, strict=True)
+    )
+    return [(part, box) for part, box in zip(PARTS, boxes, strict=True) if box is not None]
 
 
-def nozzle_picture(state: State, view: View, box: Box, behind: Field) -> NDArray[np.float32]:
-    """Light (H, W, 4) of the nozzle over a box: linear BGR times opacity, and opacity. behind: (2H, 2W) depth mm."""
+def whole_box(boxes: list[tuple[Part, Box]]) -> Box:
+    """The box that holds all of them."""
+    corners = np.array([box for _, box in boxes])
+    x0, y0 = (int(v) for v in corners[:, :2].min(0))
+    x1, y1 = (int(v) for v in corners[:, 2:].max(0))
+    return Box(x0, y0, x1, y1)
+
+
+def nozzle_picture(state: State, view: View, boxes: list[tuple[Part, Box]], behind: Field) -> NDArray[np.float32]:
+    """Light (H, W, 4) of parts in their whole box: linear BGR times opacity, and opacity. behind: (2H, 2W) depth mm."""
     assert state.instant.base_from_nozzle is not None
+    box = whole_box(boxes)
     nozzle_from_camera = se3.inverse(state.instant.base_from_nozzle) @ view.camera.base_from_camera
     columns, rows = slice(box.x0 // LATTICE, box.x1 // LATTICE), slice(box.y0 // LATTICE, box.y1 // LATTICE)
     size = (box.size[1] * SAMPLES, box.size[0] * SAMPLES)
@@ -43,17 +55,14 @@ def nozzle_picture(state: State, view: View, box: Box, behind: Field) -> NDArray
     rays = turned(nozzle_from_camera[:3, :3], across, down)
     depth, which = behind.copy(), np.full(behind.shape, -1, np.int8)
     normal = [np.zeros(behind.shape, np.float32) for _ in range(3)]
-    for number, part in enumerate(PARTS):
-        inner = _part_box(state.instant.base_from_nozzle, view, part)
-        if inner is None:
-            continue
+    for part, inner in boxes:
         at = (
             slice((inner.y0 - box.y0) * SAMPLES, (inner.y1 - box.y0) * SAMPLES),
             slice((inner.x0 - box.x0) * SAMPLES, (inner.x1 - box.x0) * SAMPLES),
         )
         met = nozzle_shape.meet(part, nozzle_from_camera[:3, 3], (rays[0][at], rays[1][at], rays[2][at]))
         nearer = met.depth < depth[at]
-        which[at][nearer] = number
+        which[at][nearer] = PARTS.index(part)
         for into, new in zip((depth, *normal), met, strict=True):
             np.copyto(into[at], new, where=nearer)
     light = np.zeros((*behind.shape, 4), np.float32)
@@ -63,14 +72,6 @@ def nozzle_picture(state: State, view: View, box: Box, behind: Field) -> NDArray
     dx, dy, dz = (r[seen] for r in rays)
     light[seen] = _shaded(state, which[seen], (x, y, z), (dx, dy, dz), nozzle_from_rest)
     return np.asarray(cv2.resize(light, box.size[::-1], interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _part_box(base_from_nozzle: Array, view: View, part: nozzle_shape.Part) -> Box | None:
-    points = se3.transform_points(base_from_nozzle, nozzle_shape.outline(part))
-    pixels, depth = pixels_from_points(view.camera, points)
-    if depth.min() < NEAR:
-        return None
-    return view.clip(pixels.min(0) - 2, pixels.max(0) + 3)
 
 
 def _shaded(

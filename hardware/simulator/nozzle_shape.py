@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,8 @@ from hardware.simulator.lamps import Lamp
 from hardware.simulator.layers import linear
 
 
-class Part(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
     """A frustum from height z0 to z1 mm above the tip, of radius r0 to r1 mm. colour: linear BGR. gloss: 0..1, metal
     mirrors the room in its own colour."""
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from estimation.rig import Camera
 from hardware.simulator.cloth_picture import LATTICE, ClothPicture, cloth_picture
 from hardware.simulator.instant import Instant
-from hardware.simulator.nozzle_picture import nozzle_box, nozzle_picture
+from hardware.simulator.nozzle_picture import nozzle_picture, part_boxes, whole_box
 from hardware.simulator.scene import Scene
 from hardware.simulator.sensor import Sensor, expose
 from hardware.simulator.skin_picture import SkinPicture, skin_picture
@@ -51,9 +51,10 @@ def _finished(
     light = cloth.light
     if skin is not None:
         _over(light, skin.box, skin.light)
-    box = nozzle_box(state, view)
-    if box is not None:
-        _over(light, box, nozzle_picture(state, view, box, _behind(box, skin, cloth)))
+    boxes = part_boxes(state, view)
+    if boxes:
+        box = whole_box(boxes)
+        _over(light, box, nozzle_picture(state, view, boxes, _behind(box, skin, cloth)))
     return expose(light, sensor, view.fall(sensor), state.instant.gain, rng)
 
 

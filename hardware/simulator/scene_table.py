@@ -105,7 +105,9 @@ def _shape(where: object, table: Table, folder: Path, wound: Wound | None, seed:
     return shape if wound is None else with_wound(shape, wound, seed)
 
 
-def _deformation(where: object, table: Table) -> Deformation:
+def _deformation(where: object, table: object) -> Deformation:
+    if not isinstance(table, dict):
+        raise InputError(where, "scene.deformation", table, "a table [scene.deformation]")
     keys = ("stretch", "bulge_mm", "radius_mm")
     checks.check_keys(where, "scene.deformation.", table, (), keys)
     default = Deformation()

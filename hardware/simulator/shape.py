@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
@@ -139,7 +140,10 @@ def shape_from_scan(vertices: ArrayLike, triangles: ArrayLike, step: float = STE
 
 
 def _mean_plane(scan: Scan) -> Array:
-    """surface_from_grid (4, 4): z along the mean normal, x as near to the scan's own x (or y) as can be."""
+    """surface_from_grid (4, 4): z along the mean normal, the sides of the least rectangle round the scan along x and y.
+
+    Of the four ways to lay them, x is the one nearest to the scan's own x (its y where that stands upright).
+    """
     areas = face_areas(scan)
     z = areas @ face_normals(scan)
     z /= np.linalg.norm(z)
@@ -147,6 +151,9 @@ def _mean_plane(scan: Scan) -> Array:
     x = x - (x @ z) * z
     x /= np.linalg.norm(x)
     rotation = np.column_stack([x, np.cross(z, x), z])
+    flattened = (scan.vertices @ rotation[:, :2]).astype(np.float32)
+    turn = np.deg2rad((cv2.minAreaRect(flattened)[2] + 45) % 90 - 45)
+    rotation = rotation @ se3.exp_rotation([0.0, 0.0, turn])
     seen = scan.vertices @ rotation  # grid axes, the scan's origin
     middle = (seen.min(0) + seen.max(0)) / 2
     middle[2] = areas @ (scan.corners.mean(1) @ rotation[:, 2]) / areas.sum()

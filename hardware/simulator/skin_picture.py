@@ -18,6 +18,8 @@ from hardware.simulator.view import CELL, SAMPLES, Box, Rays, View
 
 GRAZING = -0.03  # of a ray's z: those that sink less never meet the shape
 OUTSIDE = -1e5  # a node where nothing is painted
+NEARBY = np.float32(1.5)  # mm: a wound's rim or wall between two cells reaches no further
+AROUND = np.ones((3, 3), np.uint8)
 FRAME = 4.0  # mm between the points that tell which part of an image the shape covers
 STRIP = 4  # rows of cells worked on at once: their fields stay in the cache
 SMEAR = 1.5  # px between the instants of one exposure that a pixel holds
@@ -61,7 +63,8 @@ def skin_picture(state: State, view: View) -> SkinPicture | None:
 class _Lattice:
     """What varies slowly, (h, w) at the middles of a box's cells, and the box's rays, (H, W).
 
-    start: heights mm. odd: where rays must be searched one by one. mirrors: slopes that mirror the lamps, (h, w, 4).
+    start: heights mm. bounds: heights mm that hold those of the rays around. odd: where rays must be searched one by
+    one. mirrors: (h, w, 4) slopes that mirror the lamps.
     speed: (h, w, 2) mm/s of material points past the rays. instants: how often a sample is taken before the middle of
     the exposure, and as often after it; 0: in the middle only.
     """
@@ -69,6 +72,7 @@ class _Lattice:
     grid_from_camera: Array
     rays: Rays
     start: Field
+    bounds: tuple[Field, Field]
     odd: Mask
     mirrors: Field
     speed: Field
@@ -88,15 +92,17 @@ def _lattice(state: State, view: View, box: Box) -> _Lattice:
     small = (box.size[0] // CELL, box.size[1] // CELL)
     cells = Rays(*(averaged(r, small) for r in rays))
     lines, _ = _bundle(state, grid_from_camera, cells)
-    start, facing = hits.search(state.relief, lines)
+    low, high = (np.full(small, v, np.float32) for v in (state.relief.low, state.relief.high))
+    start, facing = hits.search(state.relief, lines, low, high, hits.STEPS)
+    bounds = field(cv2.erode(start, AROUND)) - NEARBY, field(cv2.dilate(start, AROUND)) + NEARBY
     hard = (facing < hits.FLAT) & hits.near(state.relief, lines, start, CELL * SAMPLES)
-    odd = np.asarray(cv2.dilate(hard.astype(np.uint8), np.ones((3, 3), np.uint8)), bool)
+    odd = np.asarray(cv2.dilate(hard.astype(np.uint8), AROUND), bool)
     directions = turned(grid_from_camera[:3, :3], *cells)
     mirrors = shading.half_slopes(directions, state.towards)
     speed = _speed(state, directions, lines.u + start * lines.du, lines.v + start * lines.dv, start)
     smear = float(np.abs(speed).max()) * state.instant.exposure / (SAMPLES * view.spacing)  # px
     instants = int(np.clip(np.ceil(smear / SMEAR / (2 * TIMES.size)), 1, MOST_INSTANTS)) if smear > SHARP else 0
-    return _Lattice(grid_from_camera, rays, start, odd, mirrors, speed, instants)
+    return _Lattice(grid_from_camera, rays, start, bounds, odd, mirrors, speed, instants)
 
 
 def _strip(state: State, view: View, lattice: _Lattice, first: int, last: int) -> tuple[Field, Field | None]:
@@ -105,7 +111,8 @@ def _strip(state: State, view: View, lattice: _Lattice, first: int, last: int) -
     rays = Rays(*(r[first * times : last * times] for r in lattice.rays))
     lines, sink = _bundle(state, lattice.grid_from_camera, rays)
     odd = np.repeat(np.repeat(lattice.odd[first:last], times, 0), times, 1)
-    z = hits.meet(state.relief, lines, lattice.spread(lattice.start, first, last), odd)
+    bounds = lattice.bounds[0][first:last], lattice.bounds[1][first:last]
+    z = hits.meet(state.relief, lines, lattice.spread(lattice.start, first, last), odd, bounds)
     u, v = lines.u + z * lines.du, lines.v + z * lines.dv  # nodes of material points
     passed = None
     if state.shadow is not None:
