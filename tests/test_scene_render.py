@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from estimation import se3
 from estimation.rig import Camera, pixels_from_points
 from estimation.se3 import Array
+from hardware.simulator.bodies import Wound, body, with_wound
 from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.deformation import Deformation
 from hardware.simulator.instant import Instant
-from hardware.simulator.look import plain
+from hardware.simulator.look import Look, plain
 from hardware.simulator.render import render
-from hardware.simulator.scene import Scene
+from hardware.simulator.scene import Scene, rois
 from hardware.simulator.sensor import Sensor
-from hardware.simulator.shape import cylinder, flat
+from hardware.simulator.shape import cylinder, flat, shape_from_scan
 from perception.frames import Image
 
 TEXEL = 0.15  # mm
@@ -133,3 +136,170 @@ def spread(image: Image, near: Array) -> Array:
         mx, my = ((window * axis).sum() / window.sum() for axis in (xx, yy))
         found.append((window * ((xx - mx) ** 2 + (yy - my) ** 2)).sum() / window.sum())
     return np.array(found)
+
+
+@cache
+def wounded() -> Scene:
+    """A forearm with a wound, coarsely painted; nothing may be printed on it."""
+    return Scene(body("forearm", Wound(), 2), Look(texel=0.3), seed=2)
+
+
+def taken(scene: Scene, at: Instant, sensor: Sensor = BARE, cameras: Sequence[Camera] = RIG.cameras) -> list[Image]:
+    rngs = [np.random.default_rng(c) for c in range(len(cameras))]
+    return render(scene, cameras, [at] * len(cameras), sensor, rngs)
+
+
+def region(camera: Camera, xy: Array, pose: Array = REST) -> tuple[slice, slice]:
+    """The pixels of the box round material points (N, 2) of `wounded`."""
+    pixels, _ = pixels_from_points(camera, se3.transform_points(pose, wounded().shape.points(xy)))
+    (x0, y0), (x1, y1) = np.rint(pixels.min(0)).astype(int), np.rint(pixels.max(0)).astype(int)
+    return slice(y0, y1 + 1), slice(x0, x1 + 1)
+
+
+def test_pictures_do_not_depend_on_the_number_of_threads() -> None:
+    scene = wounded()
+    at = [instant(MOVED, twist=np.full(6, 0.5 * c), base_from_nozzle=REST) for c in range(3)]
+    rngs = [[np.random.default_rng(c) for c in range(3)] for _ in range(2)]
+    one, four = (render(scene, RIG.cameras, at, Sensor(), r, threads=n) for n, r in zip((1, 4), rngs, strict=True))
+    for a, b in zip(one, four, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_scene_built_again_gives_the_same_picture_and_another_seed_another() -> None:
+    camera = RIG.cameras[1:2]
+    again, other = (Scene(body("forearm", Wound(), s), Look(texel=0.3), seed=s) for s in (2, 3))
+    first = taken(wounded(), instant(), cameras=camera)[0]
+    np.testing.assert_array_equal(first, taken(again, instant(), cameras=camera)[0])
+    assert np.abs(first.astype(int) - taken(other, instant(), cameras=camera)[0]).mean() > 3
+
+
+def test_a_view_does_not_remember_the_pictures_before() -> None:
+    scene = Scene(body("forearm", Wound(), 2), Look(texel=0.3), seed=2)
+    taken(scene, instant(MOVED))
+    for a, b in zip(taken(scene, instant()), taken(wounded(), instant()), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_grain_is_as_strong_as_the_sensor_says_and_differs_from_image_to_image() -> None:
+    clean, noisy = (taken(wounded(), instant(), s)[1].astype(float) for s in (BARE, Sensor(3.0, 0.0, 0.45)))
+    assert (noisy - clean).std() == pytest.approx(3.0, rel=0.02)
+    assert abs((noisy - clean).mean()) < 0.02
+    again = render(wounded(), RIG.cameras[1:2], [instant()], Sensor(3.0, 0.0, 0.45), [np.random.default_rng(9)])[0]
+    assert np.corrcoef((noisy - clean).ravel(), (again - clean).ravel())[0, 1] < 0.01
+
+
+def test_gain_scales_the_light_and_vignetting_darkens_the_corners() -> None:
+    dim, bright = (taken(wounded(), instant(gain=g))[0].astype(float) for g in (0.5, 1.0))
+    lit = (bright > 40) & (bright < 250)
+    np.testing.assert_allclose((dim[lit] / bright[lit]) ** 2, 0.5, atol=0.03)
+    fallen = taken(wounded(), instant(), Sensor(0.0, 1.0, 0.45))[0].astype(float)
+    x, y = (1279 - RIG.cameras[0].matrix[0, 2]) / 1100, (719 - RIG.cameras[0].matrix[1, 2]) / 1100
+    corner = (fallen[-40:, -40:].mean() / bright[-40:, -40:].mean()) ** 2
+    assert corner == pytest.approx((1 + x * x + y * y) ** -2, rel=0.05)
+
+
+def test_the_nozzle_hides_what_is_behind_it_and_casts_a_shadow() -> None:
+    scene, place = wounded(), np.array([[4.0, 3.0]])
+    tip = scene.shape.points(place)[0] + [0, 0, 0.5]
+    nozzle = REST @ se3.make(np.eye(3), tip)
+    plain_images, images = (taken(scene, instant(base_from_nozzle=n)) for n in (None, nozzle))
+    for camera, before, after in zip(RIG.cameras, plain_images, images, strict=True):
+        change = after.astype(int) - before
+        axis = se3.transform_points(nozzle, [[0.0, 0, z] for z in (0.0, 30.0, 55.0)])
+        pixels = np.rint(pixels_from_points(camera, axis)[0]).astype(int)
+        for x, y in pixels:
+            assert np.abs(change[y - 1 : y + 2, x - 1 : x + 2]).mean() > 15
+        assert not change[:150, :300].any()
+    shaded = (images[0].astype(int) - plain_images[0]).mean(2)
+    beside = region(RIG.cameras[0], np.array([[14.0, 5.0], [24.0, 12.0]]))  # away from the key lamp
+    assert shaded[beside].mean() < -4
+
+
+def test_a_nozzle_below_the_skin_is_not_seen() -> None:
+    nozzle = REST @ se3.make(se3.exp_rotation([np.pi, 0, 0]), [0, 0, -6.0])  # inside the arm, pointing up
+    for camera, before, after in zip(
+        RIG.cameras, taken(wounded(), instant()), taken(wounded(), instant(base_from_nozzle=nozzle)), strict=True
+    ):
+        rows, columns = region(camera, np.array([[-8.0, -5.0], [8.0, 5.0]]))
+        assert (np.abs(after[rows, columns].astype(int) - before[rows, columns]).max(2) > 60).mean() < 0.01
+
+
+def test_beads_are_seen_where_they_are_laid_and_nowhere_else() -> None:
+    scene = Scene(body("forearm", Wound(), 2), Look(texel=0.1), seed=2)
+    bare = taken(scene, instant())
+    scene.ink.lay([-8.0, 0.0], [8.0, 0.0], 1.2)
+    printed = taken(scene, instant())
+    for camera, before, after in zip(RIG.cameras, bare, printed, strict=True):
+        change = np.abs(after.astype(int) - before).max(2)
+        rows, columns = region(camera, np.array([[-8.8, -0.8], [8.8, 0.8]]))
+        inner = region(camera, np.array([[-7.5, -0.05], [7.5, 0.05]]))
+        assert np.median(change[inner]) > 15
+        change[rows.start - 3 : rows.stop + 3, columns.start - 3 : columns.stop + 3] = 0
+        assert not change.any()
+
+
+def test_a_bead_in_pieces_is_one_bead_and_laying_it_twice_changes_nothing() -> None:
+    scenes = [Scene(body("chest", Wound(), 1), Look(texel=0.2), seed=1) for _ in range(2)]
+    ends = np.column_stack([np.linspace(-6, 6, 41), np.linspace(2, -3, 41)])
+    scenes[0].ink.lay(ends[0], ends[-1], 0.9)
+    for _ in range(2):
+        for a, b in zip(ends[:-1], ends[1:], strict=True):
+            scenes[1].ink.lay(a, b, 0.9)
+    scenes[1].ink.lay([900.0, 0.0], [901.0, 0.0], 1.0)  # beside the texture
+    for one, other in zip(scenes[0].layers.colour, scenes[1].layers.colour, strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-4)
+    coarse, fine = scenes[1].layers.relief[2], scenes[1].layers.relief[0]
+    np.testing.assert_allclose(coarse, fine.reshape(coarse.shape[0], 4, coarse.shape[1], 4, 4).mean((1, 3)), atol=1e-5)
+
+
+def test_a_wet_wound_glares_and_its_glare_moves_with_the_eye() -> None:
+    wet, dry = (Scene(body("forearm", Wound(), 2), Look(wetness=w), seed=2) for w in (1.0, 0.0))
+    xy = np.array([[-12.0, -8.0], [12.0, 8.0]])
+    here = region(RIG.cameras[1], xy)
+    glare, matt = (taken(s, instant(), cameras=RIG.cameras[1:2])[0][here].min(2) for s in (wet, dry))
+    assert (glare > 150).mean() > 3 * (matt > 150).mean() + 0.002
+
+
+def test_far_cloth_rests_while_cloth_by_the_wound_moves_with_it() -> None:
+    still, moved = (
+        taken(wounded(), instant(p))[1].astype(int) for p in (REST, REST @ se3.exp(np.array([0, 0, 0, 2.0, 1, 1])))
+    )
+    assert np.abs(moved - still)[:60, :60].max() <= 1
+    assert np.abs(moved - still)[300:420, 400:880].mean() > 4
+
+
+def test_regions_hold_the_wound_in_every_camera() -> None:
+    regions = rois(wounded(), RIG, MOVED, 1.5)
+    assert [r.camera for r in regions] == [0, 1, 2]
+    middle = se3.transform_points(MOVED, wounded().shape.points([[0.0, 0.0], [15.0, 8.0]]))
+    for roi in regions:
+        pixels, _ = pixels_from_points(RIG.cameras[roi.camera], middle)
+        for x, y in pixels:
+            assert cv2.pointPolygonTest(roi.polygon.astype(np.float32), (float(x), float(y)), False) > 0
+        assert roi.stamp == 1.5
+
+
+def test_a_scan_is_drawn_in_its_own_frame() -> None:
+    source = wounded().shape
+    surface_from_scanner = se3.make(se3.exp_rotation([0.3, -0.2, 0.1]), [12.0, -7.0, 31.0])
+    vertices, triangles = source.mesh(0.5)
+    shape = with_wound(
+        shape_from_scan(se3.transform_points(surface_from_scanner, vertices), triangles, 0.5), Wound(), 2
+    )
+    pose = REST @ se3.inverse(surface_from_scanner)
+    scene = Scene(shape, Look(texel=0.4), seed=2, base_from_rest=pose)
+    image = taken(scene, instant(pose), cameras=RIG.cameras[1:2])[0].astype(float)
+    point = se3.transform_points(pose, shape.points([[0.0, 0.0]]))
+    x, y = np.rint(pixels_from_points(RIG.cameras[1], point)[0][0]).astype(int)
+    assert image[y - 6 : y + 6, x - 6 : x + 6, 2].mean() > 1.5 * image[y - 6 : y + 6, x - 6 : x + 6, 1].mean()
+
+
+def test_a_surface_out_of_view_leaves_the_cloth() -> None:
+    aside = se3.make(np.eye(3), [5000.0, 0, 0]) @ REST
+    assert all(image.std() < 40 for image in taken(wounded(), instant(aside)))
+
+
+def test_a_patch_is_built_quickly_enough_for_tests() -> None:
+    scene = Scene(flat(PATCH), plain(dots(centres()), TEXEL))
+    assert scene.layers.size == (360, 480)
+    assert scene.opening == PATCH
