@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
+from hardware.ply_file import write_ply
 from hardware.simulator.default_rig import REST
 from hardware.simulator.scene_table import scene_from_table, sensor_from_table
-from tests.synthetic import write_ply
 
 COARSE = {"texel_mm": 0.8}
 
