@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads only spin over matrices this small
     code: int | None = None
     try:
+        _end_in_order()
         code = arguments.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # nobody reads on, as after `| head`; the files are written all the same
@@ -39,6 +42,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"\nstillbed: interrupted; {kept(arguments.out)}", file=sys.stderr)
         return INTERRUPTED
     return code or 0
+
+
+def _end_in_order() -> None:
+    """What asks this process to end, ends it as Ctrl-C does; outside the main thread that is somebody else's part."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def kept(out: Path) -> str:
@@ -109,6 +118,7 @@ def _add_simulate(commands: Commands) -> None:
     )
     command.add_argument("scenario", type=Path, metavar="SCENARIO.toml", help="what is simulated; see data/scenarios")
     command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
+    command.add_argument("--trace", type=Path, metavar="FILE", help="a recorded motion, TUM or CSV, instead of its own")
     command.add_argument("--threads", type=int, default=2, metavar="N", help="threads that render; results do not vary")
     command.add_argument("--pty", action="store_true", help="send the arm's bytes through a pseudo-terminal")
     command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
@@ -201,7 +211,7 @@ def _add_export(commands: Commands) -> None:
 def _simulate(arguments: argparse.Namespace) -> int:
     from hardware.simulator.simulate import Options, run_simulation
 
-    options = Options(arguments.threads, arguments.pty, arguments.force)
+    options = Options(arguments.trace, arguments.threads, arguments.pty, arguments.force)
     outcome = run_simulation(arguments.scenario, arguments.out, options)
     print(outcome.text)
     return 0 if outcome.met else MISSED

@@ -83,7 +83,12 @@ def write_frames(path: Path, rig: Rig, refs: Iterable[FrameRef]) -> None:
     with open(path, "w", encoding="utf-8") as file:
         file.write(",".join(COLUMNS) + "\n")
         for ref in sorted(refs, key=lambda r: (r.camera, r.number)):
-            file.write(f"{rig.cameras[ref.camera].name},{ref.number},{ref.camera_stamp!r}\n")
+            file.write(frame_line(rig, ref))
+
+
+def frame_line(rig: Rig, ref: FrameRef) -> str:
+    """One line of frames.csv."""
+    return f"{rig.cameras[ref.camera].name},{ref.number},{ref.camera_stamp!r}\n"
 
 
 def read_roi(path: Path, rig: Rig, stamps: Sequence[Array]) -> tuple[Roi, ...]:

@@ -53,11 +53,16 @@ LONGEST = 3600.0  # s: an hour of pictures is 300,000 of them
 STRAIN_STREAM = 11  # of random numbers, so that motions and strain do not share theirs
 
 
-def read_scenario(path: str | Path) -> Scenario:
-    """Read and check a scenario; InputError names the key that is wrong."""
+def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
+    """Read and check a scenario; InputError names the key that is wrong.
+
+    trace: a recorded motion, as a [[motion]] of kind "trace" takes it, instead of the scenario's own.
+    """
     path = Path(path)
     table = checks.read_toml(path)
     checks.check_keys(path, "", table, KEYS, OPTIONAL)
+    if trace is not None:
+        table["motion"] = [{"kind": "trace", "file": str(trace.resolve())}]
     parts = {name: _table(path, table, name) for name in TABLES}
     seed = checks.integer(path, "seed", table.get("seed", 1), 0)
     rig = _rig(path, parts["rig"])

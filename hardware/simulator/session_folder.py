@@ -1,4 +1,4 @@
-"""Writes a simulated session as a plain session folder, pictures as they come and the tables at the end."""
+"""Writes a simulated session as a plain session folder, as its pictures come."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from types import TracebackType
 
 from estimation.rig import Rig
 from estimation.trajectory import Trajectory
-from hardware.folder_tables import write_frames, write_roi
+from hardware.folder_tables import frame_line, write_frames, write_roi
 from hardware.rig_file import ImageSource, write_rig
 from hardware.session import FrameRef
 from hardware.tum import write_tum
@@ -18,22 +18,27 @@ SUFFIX = {"png": ".png", "jpeg": ".jpg"}
 
 
 class SessionFolder:
-    """A session folder in the making; a context manager that leaves a readable one however it ends."""
+    """A session folder in the making; readable at every instant, whole once the context ends."""
 
     def __init__(self, folder: Path, rig: Rig, rois: Sequence[Roi]) -> None:
-        self.folder, self._rig, self._rois = folder, rig, tuple(rois)
-        self._refs: list[FrameRef] = []
+        """folder: made if it is not there. rois: where the surface is in the first picture of each camera."""
+        self.folder, self._rig = folder, rig
         self._counts = [0] * len(rig)
         self._truth: Trajectory | None = None
         for camera in rig.cameras:
             (folder / camera.name).mkdir(parents=True, exist_ok=True)
         write_rig(folder / "rig.toml", rig, [ImageSource("images", f"{c.name}/*") for c in rig.cameras])
+        if rois:
+            write_roi(folder / "roi.toml", rig, rois, [0] * len(rois))
+        write_frames(folder / "frames.csv", rig, [])
+        self._frames = (folder / "frames.csv").open("a", encoding="utf-8")
 
     def picture(self, camera: int, stamp: float, kind: str, data: bytes) -> None:
         """An encoded picture ("png" or "jpeg") of a camera at `stamp`, s; stamps of a camera rise."""
         number, name = self._counts[camera], self._rig.cameras[camera].name
         (self.folder / name / f"{number:06d}{SUFFIX[kind]}").write_bytes(data)
-        self._refs.append(FrameRef(camera, number, stamp, stamp))
+        self._frames.write(frame_line(self._rig, FrameRef(camera, number, stamp, stamp)))
+        self._frames.flush()
         self._counts[camera] += 1
 
     def truth(self, trajectory: Trajectory) -> None:
@@ -44,9 +49,6 @@ class SessionFolder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        write_frames(self.folder / "frames.csv", self._rig, self._refs)
-        rois = [roi for roi in self._rois if self._counts[roi.camera]]
-        if rois:
-            write_roi(self.folder / "roi.toml", self._rig, rois, [0] * len(rois))
+        self._frames.close()
         if self._truth is not None:
             write_tum(self.folder / "truth.tum", self._truth)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -56,8 +57,13 @@ FILES = (
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How to run a scenario. threads: that render. pty: whether the arm's bytes pass a pseudo-terminal."""
+    """How to run a scenario.
 
+    trace: a recorded motion instead of the scenario's own. threads: that render. pty: whether the arm's bytes pass a
+    pseudo-terminal. force: whether to write into a folder that is not empty.
+    """
+
+    trace: Path | None = None
     threads: int = 2
     pty: bool = False
     force: bool = False
@@ -80,7 +86,7 @@ def run_simulation(file: Path, out: Path, options: Options | None = None) -> Out
     options = options or Options()
     if options.threads < 1:
         raise InputError("command line", "--threads", options.threads, ">= 1")
-    scenario = read_scenario(file)
+    scenario = read_scenario(file, options.trace)
     path = read_path(scenario.path)
     scene = scene_from_table(scenario.file, scenario.scene, scenario.file.parent, scenario.seed)
     if scenario.clearance is not None:
@@ -96,6 +102,7 @@ def run_simulation(file: Path, out: Path, options: Options | None = None) -> Out
             step = stack.enter_context(_tracking(scenario, truth, regions, scan, exposures))
             line = stack.enter_context(PtyLink()).transfer if options.pty else bytes
             progress = stack.enter_context(Progress("simulate", "s", WallClock().now))
+            print(f"watch: {folder.watch.page.resolve().as_uri()}", file=sys.stderr)
             world = World(scenario, scene, path, truth, step, exposures, folder, WallClock(), options.threads, line)
             world.run(lambda now: progress(int(now), int(scenario.seconds)))
         complete = True

@@ -18,6 +18,8 @@ from perception.frames import FrameSet, Image
 EVERY = 0.5  # s of the run between two pictures
 WIDE, NARROW = (960, 540), (480, 270)  # px: the first camera's picture, and the others'
 QUALITY = 85
+CLOSE = 400  # px of the picture that fill a tile's width once the line's place is known
+LINE = (255, 200, 90)  # BGR
 COLOURS = {  # BGR, as the report's states
     TrackState.INITIALISING: (160, 160, 160),
     TrackState.TRACKING: (90, 190, 70),
@@ -78,22 +80,33 @@ class Watch:
             tile = canvas[y : y + h, x : x + w]
             images = [f.image for f in frames.frames if f.camera == camera]
             if images:
-                tile[:] = cv2.resize(self._drawn(images[0], camera, pose, line), (w, h), interpolation=cv2.INTER_AREA)
+                self._draw(tile, images[0], camera, pose, line)
             self._label(tile, self._rig.cameras[camera].name if images else "no picture")
         cv2.rectangle(canvas, (0, 0), (canvas.shape[1] - 1, height - 1), COLOURS[pose.state], 6)
         return canvas
 
-    def _drawn(self, image: Image, camera: int, pose: SurfacePose, line: Array | None) -> Image:
-        """The picture with the line where the pose says that it lies."""
-        drawn = image.copy() if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
-        if line is not None and pose.state.measured:
-            points = se3.transform_points(pose.base_from_surface, line)
-            pixels, depth = pixels_from_points(self._rig.cameras[camera], points)
-            if (depth > 1).all():
-                corners = [np.rint(pixels * 16).astype(np.int32).reshape(-1, 1, 2)]
-                cv2.polylines(drawn, corners, False, (255, 255, 255), 4, cv2.LINE_AA, 4)
-                cv2.polylines(drawn, corners, False, (190, 120, 20), 2, cv2.LINE_AA, 4)
-        return drawn
+    def _draw(self, tile: Image, image: Image, camera: int, pose: SurfacePose, line: Array | None) -> None:
+        """The picture on its tile, brought close to the line where the pose says that it lies, and the line on it."""
+        width, (h, w) = image.shape[1], tile.shape[:2]
+        pixels = self._pixels(camera, pose, line)
+        zoom, corner = (
+            (w / width, np.zeros(2)) if pixels is None else (w / CLOSE, pixels.mean(0) - [CLOSE / 2, CLOSE * h / w / 2])
+        )
+        move = np.array([[zoom, 0, -zoom * corner[0]], [0, zoom, -zoom * corner[1]]])
+        colour = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+        cv2.warpAffine(colour, move, (w, h), dst=tile, flags=cv2.INTER_LINEAR)
+        if pixels is not None:
+            corners = [np.rint(16 * zoom * (pixels - corner)).astype(np.int32).reshape(-1, 1, 2)]
+            cv2.polylines(tile, corners, False, LINE, 1, cv2.LINE_AA, 4)
+
+    def _pixels(self, camera: int, pose: SurfacePose, line: Array | None) -> Array | None:
+        """Where the camera sees the line (N, 2) px, None where that is not known."""
+        if line is None or not pose.state.measured:
+            return None
+        pixels, depth = pixels_from_points(
+            self._rig.cameras[camera], se3.transform_points(pose.base_from_surface, line)
+        )
+        return pixels if (depth > 1).all() else None
 
     def _label(self, tile: Image, text: str) -> None:
         for colour, width in (((20, 20, 20), 4), ((240, 240, 240), 1)):
