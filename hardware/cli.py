@@ -110,8 +110,8 @@ def _add_simulate(commands: Commands) -> None:
         commands,
         "simulate",
         "print on a simulated wound, and measure the nozzle's error",
-        "Run a scenario in virtual time: the wound moves, cameras see it, tracking and motion are those of a live run,\n"
-        "a virtual arm executes, and every millisecond the nozzle is compared with its true checkpoint.\n"
+        "Run a scenario in virtual time: the wound moves, cameras see it, tracking and motion are a live run's, a\n"
+        "virtual arm executes, and every millisecond the nozzle is compared with its true checkpoint.\n"
         "Writes the session (MCAP and folder), tracking/, commands.csv, frames.bin, nozzle.csv, summary.json and\n"
         "report.html. Exit code 0 where the scenario's own limits are met, 1 where they are not.",
         "stillbed simulate data/scenarios/breathing_calm.toml -o out/calm",
