@@ -304,3 +304,12 @@ def test_a_patch_is_built_quickly_enough_for_tests() -> None:
     scene = Scene(flat(PATCH), plain(dots(centres()), TEXEL))
     assert scene.layers.size == (360, 480)
     assert scene.opening == PATCH
+
+
+@pytest.mark.parametrize("size", [(641, 483), (320, 240)])
+def test_an_image_of_any_size_is_filled(size: tuple[int, int]) -> None:
+    small = arc_rig(size=size, focal=500.0).cameras
+    nozzle = REST @ se3.make(np.eye(3), [0.0, 0.0, 1.0])
+    for image in taken(wounded(), instant(base_from_nozzle=nozzle), cameras=small):
+        assert image.shape == (size[1], size[0], 3)
+        assert image.reshape(-1, 3).max(1).min() > 5

@@ -77,13 +77,20 @@ def cloth_picture(state: State, view: View) -> ClothPicture:
     depth, x, y = _refined(eye, rays, enlarged(found, (rays.x.shape[0], rays.x.shape[1])))
     passed = _passed(eye, rays, depth)
     w, h = view.camera.size
-    whole = view.whole
-    fields = enlarged(field(np.dstack([x, y, *passed])), (whole.y1, whole.x1))[:h, :w]
-    _edges(eye, rays, depth, fields)
+    planes = [enlarged(plane, (view.whole.y1, view.whole.x1))[:h, :w] for plane in (*_texels(state, x, y), *passed)]
+    _edges(eye, rays, depth, planes[0], planes[1])
     light = np.empty((h, w, 3), np.float32)
     for first in range(0, h, STRIP):
-        _coloured(state, fields[first : first + STRIP], light[first : first + STRIP])
+        rows = slice(first, first + STRIP)
+        _coloured(state, [plane[rows] for plane in planes], light[rows])
     return ClothPicture(light, depth)
+
+
+def _texels(state: State, x: Field, y: Field) -> tuple[Field, Field]:
+    """Columns and rows (H, W) in the cloth's picture, at material x, y mm."""
+    rows, columns = state.scene.sheet.picture.shape[:2]
+    scale = np.float32(1 / sheet.TEXEL)
+    return x * scale + np.float32((columns - 1) / 2), y * scale + np.float32((rows - 1) / 2)
 
 
 def _bounds(eye: _Eye, rays: Rays) -> tuple[Field, Field]:
@@ -117,29 +124,29 @@ def _refined(eye: _Eye, rays: Rays, depth: Field) -> tuple[Field, Field, Field]:
     return depth, x, y
 
 
-def _edges(eye: _Eye, rays: Rays, depth: Field, fields: Field) -> None:
+def _edges(eye: _Eye, rays: Rays, depth: Field, u: Field, v: Field) -> None:
     """Trace again, one by one, the pixels where the cloth hides itself and the lattice would draw steps.
 
-    fields: (H, W, 2 or more), x and y of which are put right.
+    u, v: (H, W) columns and rows in the cloth's picture, which are put right.
     """
     bend = np.array([[1.0, -2.0, 1.0]], np.float32)
     bent = np.maximum(*(np.abs(cv2.filter2D(depth, -1, k, borderType=cv2.BORDER_REPLICATE)) for k in (bend, bend.T)))
     jump = np.asarray(cv2.dilate((bent > JUMP).astype(np.uint8), np.ones((3, 3), np.uint8)), bool)
     if not jump.any():
         return
-    h, w = fields.shape[:2]
+    h, w = u.shape
     place = np.nonzero(np.repeat(np.repeat(jump, LATTICE, 0), LATTICE, 1)[:h, :w])
     at = [block(((p + 0.5) / LATTICE - 0.5).astype(np.float32)) for p in place]
     alone = Rays(*(looked_up(r, at[1], at[0]) for r in rays))
     around = np.ones((5, 5), np.uint8)
     near, far = (looked_up(field(f(depth, around)), at[1], at[0]) for f in (cv2.erode, cv2.dilate))
     _, x, y = _refined(eye, alone, _search(eye, alone, near - NEARBY, far + NEARBY, LOCAL_STEPS))
-    for k, put in enumerate((x, y)):
-        fields[place[0], place[1], k] = put.reshape(-1)[: len(place[0])]
+    for into, right in zip((u, v), _texels(eye.state, x, y), strict=True):
+        into[place] = right.reshape(-1)[: len(place[0])]
 
 
 def _passed(eye: _Eye, rays: Rays, depth: Field) -> list[Field]:
-    """Per lamp the light (H, W) that passes the nozzle on its way to the cloth."""
+    """The share (H, W) of the key lamp's light that passes the nozzle; none where there is no nozzle."""
     state = eye.state
     if state.instant.base_from_nozzle is None:
         return []
@@ -150,12 +157,12 @@ def _passed(eye: _Eye, rays: Rays, depth: Field) -> list[Field]:
     return [nozzle_shape.lit(points, nozzle_from_rest, state.lamps[0])]
 
 
-def _coloured(state: State, fields: Field, light: Field) -> None:
-    """Fill in linear BGR (H, W, 3) of the cloth at material x, y, where a share of the key lamp's light falls."""
-    picture = state.scene.sheet.picture
-    u = fields[..., 0] * np.float32(1 / sheet.TEXEL) + np.float32((picture.shape[1] - 1) / 2)
-    v = fields[..., 1] * np.float32(1 / sheet.TEXEL) + np.float32((picture.shape[0] - 1) / 2)
-    found = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-    key = found[..., 3] * fields[..., 2] if fields.shape[2] > 2 else found[..., 3]
+def _coloured(state: State, planes: list[Field], light: Field) -> None:
+    """Fill in linear BGR (H, W, 3) of the cloth; planes: columns, rows, and the share of the key lamp's light there."""
+    u, v, *passed = planes
+    border = cv2.BORDER_REFLECT_101
+    found = field(cv2.remap(state.scene.sheet.picture, u, v, cv2.INTER_LINEAR, borderMode=border))
+    if passed:
+        found[..., 3] *= passed[0]
     tint = cloth.TEAL * np.array(state.lamps[0].colour, np.float32)
-    cv2.merge([found[..., c] + key * tint[c] for c in range(3)], light)
+    cv2.transform(found, np.column_stack([np.eye(3, dtype=np.float32), tint]), light)

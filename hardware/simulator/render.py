@@ -62,8 +62,10 @@ def _over(light: NDArray[np.float32], box: Box, layer: NDArray[np.float32]) -> N
     """Lay a layer (H, W, 4) of a box, BGR times opacity and opacity, over the light."""
     below = light[box.y0 : box.y1, box.x0 : box.x1]
     layer = layer[: below.shape[0], : below.shape[1]]
-    below *= (1 - layer[..., 3])[..., None]
-    below += layer[..., :3]
+    b, g, r, opacity = cv2.split(layer)
+    through = 1 - opacity
+    np.multiply(below, cv2.merge([through, through, through]), out=below)
+    np.add(below, cv2.merge([b, g, r]), out=below)
 
 
 def _behind(box: Box, skin: SkinPicture | None, cloth: ClothPicture) -> NDArray[np.float32]:

@@ -52,14 +52,17 @@ def expose(light: Field, sensor: Sensor, fall: Field, gain: float, rng: np.rando
     The grain is a cut at random from one large field (drawing anew is ten times slower).
     """
     h, w = light.shape[:2]
-    if sensor.blur:
-        light = blurred(light, sensor.blur)
     y, x = rng.integers(0, ROOM, 2)
     grain = _grain(h, w)[y : y + h, x : x + w]
     image = np.empty((h, w, 3), np.uint8)
+    halo = int(np.ceil(6 * sensor.blur))  # rows that the blur reads beyond its own
     for first in range(0, h, STRIP):
-        rows = slice(first, first + STRIP)
-        display = cv2.sqrt(cv2.multiply(light[rows], fall[rows], scale=gain * 255.0**2))
+        rows, low = slice(first, first + STRIP), max(first - halo, 0)
+        part = light[low : first + STRIP + halo]
+        if sensor.blur:
+            part = blurred(part, sensor.blur)
+        part = part[first - low : first - low + len(image[rows])]
+        display = cv2.sqrt(cv2.multiply(part, fall[rows], scale=gain * 255.0**2))
         image[rows] = cv2.addWeighted(display, 1.0, grain[rows], sensor.noise, 0.0, dtype=cv2.CV_8U)
     return image
 

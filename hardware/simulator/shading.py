@@ -43,7 +43,9 @@ def shade(
     towards: (2, 3) the lamps in the grid frame. ambient: irradiance of the room.
     """
     across, along, gloss, open_sky = cv2.split(relief)
-    opacity = colour[..., 3]
+    *bgr, opacity = cv2.split(colour)
+    mirror = cv2.split(mirrors)
+    shares = None if passed is None else cv2.split(passed)
     facing = 1 / cv2.sqrt(across * across + along * along + 1)
     room = open_sky * (0.45 + 0.55 * facing) * np.float32(ambient)
     wet, dry = gloss * gloss, np.float32(0.3) + gloss
@@ -54,16 +56,16 @@ def shade(
             continue
         direction = towards[k].astype(np.float32)
         cosine = (direction[2] - direction[0] * across - direction[1] * along) * facing
-        arrives = open_sky if passed is None else open_sky * passed[..., k]
+        arrives = open_sky if shares is None else open_sky * shares[k]
         for c in range(3):
             creep = np.float32(WRAP[c])
             strength = np.float32(lamp.strength * lamp.colour[c] / (1 + WRAP[c]))
             lights[c] += np.maximum(cosine + creep, 0) * (arrives * strength)
-        du, dv = across - mirrors[..., 2 * k], along - mirrors[..., 2 * k + 1]
-        square = du * du + dv * dv
+        du, dv = across - mirror[2 * k], along - mirror[2 * k + 1]
+        square = field(du * du + dv * dv)
         glint += arrives * (_lobe(square, FILM, MIRROR, lamp) * wet + _lobe(square, SHEEN, DRY_MIRROR, lamp) * dry)
     glint *= opacity
-    return np.asarray(cv2.merge([*(colour[..., c] * lights[c] + glint for c in range(3)), opacity]), np.float32)
+    return np.asarray(cv2.merge([*(bgr[c] * lights[c] + glint for c in range(3)), opacity]), np.float32)
 
 
 def _lobe(square: Field, rough: float, mirror: float, lamp: Lamp) -> Field:
