@@ -47,7 +47,7 @@ from planning.path import Path
 from planning.planner import Progress as Print
 
 BLOCK = 0.2  # s of rows given out at once
-REST = 1.0  # s that the run goes on after the path is finished
+REST = 0.3  # s that the run goes on after the path is finished
 NO_IMAGE = np.zeros((0, 0), np.uint8)  # of a frame that nobody looks at
 BEAD_STEP = 0.01  # s between the ends of the pieces in which a bead is drawn
 
