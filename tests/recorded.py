@@ -1,0 +1,50 @@
+"""Recordings and records that tests of the recorder share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from session_files import image, rig, stamps, trajectory
+
+from estimation.pose import SurfacePose, TrackState
+from hardware.recording import Recorder
+from perception.frames import Frame
+
+
+def write_frames(recorder: Recorder, count: int, cameras: int = 2, start: float = -0.1) -> None:
+    for number, stamp in enumerate(stamps(count, start)):
+        for camera in range(cameras):
+            recorder.write(Frame(camera, stamp, image(camera, number)))
+
+
+def pose(stamp: float, seed: int = 0) -> SurfacePose:
+    draw = np.random.default_rng(seed)
+    root = draw.normal(size=(6, 6))
+    placed = trajectory(1, True).base_from_surface[0]
+    return SurfacePose(
+        stamp,
+        placed,
+        root @ root.T,
+        draw.normal(size=6),
+        TrackState.DEGRADED,
+        np.eye(6) / 3,
+        draw.random(6),
+        'why "so"',
+    )
+
+
+LOST = SurfacePose(0.0, np.full((4, 4), np.nan), np.full((6, 6), np.inf), np.zeros(6), TrackState.LOST)
+
+
+def whole_recording(folder: Path) -> Path:
+    """A closed recording x.mcap of 2.4 s with a scan in it."""
+    (folder / "scan.ply").write_bytes(b"ply\n" * 500)
+    with Recorder(folder / "x.mcap", rig(2)) as recorder:
+        for number, stamp in enumerate(stamps(24, 0.0)):
+            for camera in range(2):
+                recorder.write(Frame(camera, 3 * stamp, image(camera, number)))
+            recorder.write(pose(3 * stamp, number))
+            if number == 12:
+                recorder.surface(folder / "scan.ply")
+    return folder / "x.mcap"

@@ -1,0 +1,155 @@
+"""Damaged recordings: what was cut, killed, flipped or left no room keeps its whole chunks."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import SeekingReader
+from session_files import image, rig, stamps
+
+from estimation.errors import InputError, StillbedError
+from hardware import channels
+from hardware.mcap_walk import ChunkOf, walk
+from hardware.recording import CHUNK_SECONDS, Recorder
+from hardware.session import open_session
+from tests.recorded import whole_recording, write_frames
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return whole_recording(tmp_path_factory.mktemp("whole"))
+
+
+@cache
+def chunk_ends(path: Path) -> list[tuple[int, int]]:
+    """End of each chunk, bytes, and the frames that can be read up to there."""
+    with open(path, "rb") as file:
+        summary = SeekingReader(file).get_summary()
+    assert summary is not None
+    ends = []
+    frames = 0
+    chunks = {p.offset: p for p in walk(path) if isinstance(p, ChunkOf)}
+    for index in sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
+        frames += sum(m.topic == "/frames" for m in chunks[index.chunk_start_offset].messages)
+        ends.append((index.chunk_start_offset + index.chunk_length, frames))
+    return ends
+
+
+@settings(max_examples=120)
+@given(where=st.floats(0, 1), near=st.integers(-12, 12) | st.none(), pick=st.integers(0, 1000))
+def test_a_file_cut_at_any_byte_is_readable_up_to_its_last_whole_chunk(
+    whole: Path, where: float, near: int | None, pick: int
+) -> None:
+    data, ends = whole.read_bytes(), chunk_ends(whole)
+    cut = int(where * (len(data) - 1)) if near is None else ends[pick % len(ends)][0] + near
+    part = whole.parent / "cut.mcap"
+    part.write_bytes(data[:cut])
+    expected = max([frames for end, frames in ends if end <= cut], default=0)
+    if cut < ends[0][0]:
+        with pytest.raises(InputError):
+            open_session(part)
+        return
+    session = open_session(part)
+    assert sum(map(len, session.sets)) == expected
+    assert len(list(session.frame_sets())) == len(session)
+    assert session.damage != ""
+    assert sum(1 for _ in channels.read_poses(part)) >= expected // 2 - 1
+
+
+def test_a_chunk_that_an_interrupted_run_wrote_twice_counts_once(whole: Path) -> None:
+    data, ends = whole.read_bytes(), [end for end, _ in chunk_ends(whole)]
+    starts = [p.offset for p in walk(whole) if isinstance(p, ChunkOf)]
+    again = whole.parent / "again.mcap"
+    again.write_bytes(data[: ends[1]] + data[starts[1] : ends[1]] + data[ends[1] :])
+    session = open_session(again)
+    assert sum(map(len, session.sets)) == 48 == sum(len(s.frames) for s in session.frame_sets())
+
+
+@settings(max_examples=60)
+@given(where=st.floats(0.01, 0.999), bit=st.integers(0, 7))
+def test_a_flipped_bit_never_gives_a_wrong_image(whole: Path, where: float, bit: int) -> None:
+    data = bytearray(whole.read_bytes())
+    data[int(where * len(data))] ^= 1 << bit
+    part = whole.parent / "flip.mcap"
+    part.write_bytes(data)
+    try:
+        session = open_session(part)
+    except InputError:
+        return  # the first chunk, with the rig, is broken
+    frames = {(f.camera, f.stamp): f.image for s in session.frame_sets() for f in s.frames}
+    original = {3 * stamp: number for number, stamp in enumerate(stamps(24, 0.0))}
+    assert all(np.array_equal(i, image(c, original[s])) for (c, s), i in frames.items())
+    assert len(frames) == 48 or session.damage
+
+
+KILLED = """
+import sys, time
+sys.path.insert(0, "tests")
+from session_files import image, rig
+from hardware.recording import Recorder
+from perception.frames import Frame
+recorder = Recorder(sys.argv[1], rig(2))
+for k in range(10**6):
+    for camera in range(2):
+        recorder.write(Frame(camera, k / 30, image(camera, k % 50)))
+    print(k, flush=True)
+"""
+
+
+def test_a_killed_run_is_readable_to_the_last_second(tmp_path: Path) -> None:
+    root = Path(__file__).parent.parent
+    command = [sys.executable, "-c", KILLED, str(tmp_path / "x.mcap")]
+    child = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    while int(child.stdout.readline()) < 100:
+        pass
+    child.send_signal(signal.SIGKILL)
+    last = max([100, *(int(line) for line in child.stdout.read().split())])
+    child.wait()
+    session = open_session(tmp_path / "x.mcap")
+    assert "not closed" in session.damage or "cut" in session.damage
+    frames = list(session.frame_sets())
+    assert last / 30 - frames[-1].stamp <= CHUNK_SECONDS + 2 / 30
+
+
+@contextmanager
+def disk_of(size: int) -> Iterator[None]:
+    """No file may grow beyond `size` bytes: the system itself refuses the write."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_is_one_error_and_what_was_written_stays_readable(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    recorder = Recorder(path, rig(2))
+    with disk_of(400_000), pytest.raises(StillbedError, match="recording stopped") as caught:
+        write_frames(recorder, 10_000)
+    with pytest.raises(StillbedError, match="recording stopped"):
+        recorder.event(1.0, "still there?")
+    recorder.close()
+    recorder.close()
+    assert not isinstance(caught.value, InputError)
+    session = open_session(path)
+    assert len(session) > 10 and len(list(session.frame_sets())) == len(session)
+
+
+def test_an_error_inside_the_block_is_not_hidden_and_the_file_is_closed(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
+        write_frames(recorder, 3)
+        raise KeyboardInterrupt
+    assert open_session(tmp_path / "x.mcap").damage == ""

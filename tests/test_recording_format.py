@@ -1,0 +1,208 @@
+"""What is written is a sound MCAP that viewers read, and what others wrote is read or refused in one line."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import jsonschema  # type: ignore[import-untyped]
+import numpy as np
+import pytest
+from mcap.reader import SeekingReader
+from mcap.records import ChunkIndex
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+from session_files import NAMES, image, rig, stamps, trajectory
+
+from estimation.errors import InputError
+from estimation.observations import Observations
+from hardware.images import encode
+from hardware.mcap_walk import ChunkOf, Damage, walk
+from hardware.messages import message_from_image, message_from_rig
+from hardware.recording import CHUNK_SECONDS, EPOCH, Recorder
+from hardware.schemas import CALIBRATION, IMAGE, TOPICS
+from hardware.session import open_session
+from perception.frames import Roi
+from planning.command import Hold, Move
+from tests.recorded import LOST, pose, whole_recording, write_frames
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return whole_recording(tmp_path_factory.mktemp("whole"))
+
+
+def records(path: Path) -> list[object]:
+    with open(path, "rb") as file:
+        return list(StreamReader(file, validate_crcs=True, emit_chunks=False).records)
+
+
+def test_the_file_is_sound_for_the_library_with_every_checksum(whole: Path) -> None:
+    kinds = [type(r).__name__ for r in records(whole)]
+    assert kinds[0] == "Header" and kinds[-1] == "Footer" and "DataEnd" in kinds
+    assert not any(isinstance(p, Damage) for p in walk(whole))
+    known: set[int] = {0}
+    channels_seen: set[int] = set()
+    last = 0
+    for record in records(whole):
+        name = type(record).__name__
+        if name == "Schema":
+            known.add(record.id)  # type: ignore[attr-defined]
+        elif name == "Channel":
+            assert record.schema_id in known  # type: ignore[attr-defined]
+            channels_seen.add(record.id)  # type: ignore[attr-defined]
+        elif name == "Message":
+            assert record.channel_id in channels_seen  # type: ignore[attr-defined]
+            assert record.log_time >= last  # type: ignore[attr-defined]
+            last = record.log_time  # type: ignore[attr-defined]
+
+
+def test_the_summary_points_at_what_is_there(whole: Path) -> None:
+    data = whole.read_bytes()
+    with open(whole, "rb") as file:
+        reader = SeekingReader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        counted = sum(1 for _ in reader.iter_messages())
+        (attachment,) = reader.iter_attachments()
+        (metadata,) = reader.iter_metadata()
+    assert counted == summary.statistics.message_count
+    assert attachment.name == "surface.ply" and attachment.data == b"ply\n" * 500
+    assert metadata.metadata["epoch_s"] == str(EPOCH)
+    for index in summary.chunk_indexes:
+        assert isinstance(index, ChunkIndex)
+        opcode, length = struct.unpack_from("<BQ", data, index.chunk_start_offset)
+        assert (opcode, length + 9) == (0x06, index.chunk_length)
+        assert index.message_end_time - index.message_start_time <= CHUNK_SECONDS * 1e9
+        for offset in index.message_index_offsets.values():
+            assert data[offset] == 0x07
+    assert len(summary.chunk_indexes) == summary.statistics.chunk_count >= 4
+
+
+def test_every_message_fits_its_published_schema(tmp_path: Path) -> None:
+    (tmp_path / "scan.obj").write_bytes(b"v 0 0 0\n")
+    with Recorder(tmp_path / "x.mcap", rig()) as recorder:
+        write_frames(recorder, 2, 3)
+        recorder.surface(tmp_path / "scan.obj")
+        recorder.truth(trajectory(2, True))
+        pixels = np.array([[1.0, 2.0], [3.0, 0.0]])
+        recorder.write(Observations(0.0, np.array([0, 1]), np.array([5, -1]), pixels, np.ones(2)))
+        recorder.write(pose(0.0))
+        recorder.write(LOST)
+        recorder.write(Move(0.0, np.zeros(6), 1.0, 0, False))
+        recorder.write(Hold(0.0, 0.1, "why"))
+        recorder.write(Roi(0, 0.0, np.eye(3)[:, :2]))
+        recorder.sent(0.0, b"1")
+        recorder.received(0.0, b"2")
+        recorder.event(0.0, "words")
+    seen = set()
+    with open(tmp_path / "x.mcap", "rb") as file:
+        for schema, channel, message in SeekingReader(file, validate_crcs=True).iter_messages():
+            assert schema is not None and schema.encoding == "jsonschema" and channel.message_encoding == "json"
+            parsed = json.loads(schema.data)
+            assert parsed["type"] == "object" and parsed["title"] == schema.name
+            if schema.name not in seen:
+                jsonschema.Draft202012Validator.check_schema(parsed)
+            jsonschema.validate(json.loads(message.data), parsed, cls=jsonschema.Draft202012Validator)
+            seen.add(schema.name)
+    assert {"foxglove.CompressedImage", "foxglove.CameraCalibration", "foxglove.FrameTransform", "foxglove.Log"} <= seen
+    assert len(seen) == 13
+
+
+def plain(schema: dict[str, object]) -> bool:
+    """Whether Foxglove can read it: each field has one type, and arrays hold no arrays."""
+    fields = schema.get("properties", {})
+    assert isinstance(fields, dict)
+    for field in fields.values():
+        inner = field["items"] if field["type"] == "array" else field
+        allowed = {"boolean", "string", "number", "integer", "object"}
+        if not isinstance(inner["type"], str) or inner["type"] not in allowed or not plain(inner):
+            return False
+    return True
+
+
+def test_every_schema_is_one_that_foxglove_reads() -> None:
+    every = [*TOPICS.values(), IMAGE, CALIBRATION]
+    assert all(plain(schema) for schema in every)
+    assert not plain({"type": "object", "properties": {"m": {"type": "array", "items": {"type": "array"}}}})
+
+
+def test_images_are_given_to_viewers_at_their_stamp(whole: Path) -> None:
+    with open(whole, "rb") as file:
+        found = list(SeekingReader(file).iter_messages(topics=[f"/camera/{NAMES[0]}/image"]))
+    for (_, _, message), stamp in zip(found, stamps(24, 0.0), strict=True):
+        assert message.log_time == round(3 * stamp * 1e9) + EPOCH * 10**9
+        told = json.loads(message.data)["timestamp"]
+        assert told["sec"] * 10**9 + told["nsec"] == message.log_time
+
+
+def test_an_attachment_cannot_choose_where_it_is_unpacked(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
+        write_frames(recorder, 2)
+    with open(tmp_path / "y.mcap", "wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_attachment(0, 0, "../surface.ply", "model/ply", b"ply")
+        for part in walk(tmp_path / "x.mcap"):
+            for stored in part.messages if isinstance(part, ChunkOf) else ():
+                channel = writer.register_channel(stored.topic, "json", 0)
+                writer.add_message(channel, 0, stored.data, 0, stored.sequence)
+        writer.finish()  # type: ignore[no-untyped-call]
+    session = open_session(tmp_path / "y.mcap")
+    assert len(session) == 2 and session.surface is None
+
+
+def foreign(path: Path, messages: list[tuple[str, object]]) -> None:
+    """A sound MCAP file, written by someone else."""
+    with open(path, "wb") as file:
+        writer = Writer(file, compression=CompressionType.LZ4)
+        writer.start()
+        for topic, message in messages:
+            channel = writer.register_channel(topic, "json", 0)
+            writer.add_message(channel, 0, json.dumps(message).encode(), 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+FRAME = {"stamp": 0.0, "camera_stamp": 0.0, "camera": 0, "number": 0}
+RIG = message_from_rig(rig(2))
+ONE_FRAME = [
+    ("/rig", RIG),
+    ("/camera/left/image", message_from_image(*encode(image(0, 0)), "left", 0)),
+    ("/frames", FRAME),
+]
+
+
+@pytest.mark.parametrize(
+    ("messages", "words"),
+    [
+        ([("/other", {})], "/rig"),
+        ([("/rig", [])], "/rig"),
+        ([("/rig", {"camera": [{"name": "a"}]})], "camera[0].size = 'missing'"),
+        ([("/rig", RIG)], "/frames"),
+        ([("/rig", RIG), ("/frames", FRAME)], "/camera/left/image: image = 'no number 0'"),
+        ([("/rig", RIG), ("/frames", {**FRAME, "camera": 2})], "allowed a camera of /rig, 0..1"),
+        ([("/rig", RIG), ("/frames", {**FRAME, "stamp": float("nan")})], "finite"),
+        ([("/rig", RIG), ("/frames", {"camera": 0})], "message of its schema"),
+        ([*ONE_FRAME, ("/roi", {"stamp": 0.0, "camera": 2, "polygon": [0, 0, 9, 0, 9, 9]})], "a camera of /rig, 0..1"),
+        ([*ONE_FRAME, ("/roi", {"stamp": 0.0, "camera": 0, "polygon": [0, 0, 9, 0, 9, float("nan")]})], "finite"),
+        ([*ONE_FRAME, ("/roi", {"stamp": 0.0, "camera": 0, "polygon": [0, 0, 9, 0]})], "3 points"),
+        ([*ONE_FRAME, ("/truth", {"stamp": 0, "position": [1, 2, 3], "quaternion": [0] * 4, "exact": True})], "unit"),
+        ([("/rig", RIG), ("/camera/left/image", {"data": "", "format": "png"}), ("/frames", FRAME)], "undecodable"),
+        ([("/rig", RIG), ("/camera/left/image", {"data": 3}), ("/frames", FRAME)], "CompressedImage"),
+    ],
+)
+def test_a_sound_file_with_the_wrong_content_is_one_error(
+    tmp_path: Path, messages: list[tuple[str, object]], words: str
+) -> None:
+    foreign(tmp_path / "x.mcap", messages)
+    with pytest.raises(InputError) as caught:
+        open_session(tmp_path / "x.mcap")
+    assert words in str(caught.value) and "x.mcap" in caught.value.where
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\n", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + bytes(100)])
+def test_what_is_no_recording_is_one_error(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "x.mcap").write_bytes(content)
+    with pytest.raises(InputError, match=r"x\.mcap"):
+        open_session(tmp_path / "x.mcap")
