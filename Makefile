@@ -10,9 +10,7 @@ APT    := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
-	@$(BIN)/python -m tests.synthetic $(DEMO)/session
-	@$(BIN)/stillbed replay $(DEMO)/session --path data/paths/square_10mm.csv -o $(DEMO)/replay --force
-	@$(BIN)/stillbed track $(DEMO)/session -o $(DEMO)/track --force
+	@$(BIN)/stillbed simulate data/scenarios/breathing_calm.toml -o $(DEMO) --pty --force
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
