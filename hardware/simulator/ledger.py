@@ -68,7 +68,7 @@ class Ledger:
         nozzle = nozzle_from_axes(self._arm, executed(times))
         place = np.interp(fraction, np.arange(len(self._places)), self._places)
         filled = np.where(there, fraction, 0.0)
-        reasons = [self._reason[i] if ok else "nothing commanded" for i, ok in zip(index, known, strict=True)]
+        reasons = [self._reason[i] if ok else "no surface is followed yet" for i, ok in zip(index, known, strict=True)]
         return NozzleLog(
             stamps=times,
             base_from_surface=self._truth.base_from_surface(times),
@@ -110,4 +110,4 @@ class Ledger:
 def executed_rows(start: float, end: float) -> Array:
     """Instants (N,) of the rows after `start` up to `end`, s, on whole milliseconds."""
     first, last = np.floor(start / ROW + 1e-6) + 1, np.floor(end / ROW + 1e-6)
-    return np.asarray(np.arange(first, last + 1) * ROW)
+    return np.minimum(np.arange(first, last + 1) * ROW, end)  # a product may be rounded to just beyond it

@@ -101,10 +101,10 @@ def run_simulation(file: Path, out: Path, options: Options | None = None) -> Out
             exposures: Exposures = {}
             step = stack.enter_context(_tracking(scenario, truth, regions, scan, exposures))
             line = stack.enter_context(PtyLink()).transfer if options.pty else bytes
-            progress = stack.enter_context(Progress("simulate", "s", WallClock().now))
+            progress = stack.enter_context(Progress("simulate", "frame sets", WallClock().now))
             print(f"watch: {folder.watch.page.resolve().as_uri()}", file=sys.stderr)
             world = World(scenario, scene, path, truth, step, exposures, folder, WallClock(), options.threads, line)
-            world.run(lambda now: progress(int(now), int(scenario.seconds)))
+            world.run(progress)
         complete = True
     finally:
         outcome = _finish(scenario, path, truth, folder, regions, complete)

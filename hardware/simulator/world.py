@@ -23,6 +23,7 @@ from estimation.se3 import Array
 from hardware.clock import Clock
 from hardware.images import decode
 from hardware.motion import MotionStep
+from hardware.progress import Report, silent
 from hardware.recording import WARNING
 from hardware.simulator.agenda import ARRIVAL, EXPOSURE, KNOWN, TICK, Agenda
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras
@@ -59,7 +60,7 @@ class Sink(Protocol):
     """What is told of everything that passes."""
 
     def picture(self, shot: Shot, kind: str, data: bytes) -> None:
-        """A picture has arrived, as encoded by its camera."""
+        """A picture that can be decoded has arrived, as encoded by its camera."""
         ...
 
     def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
@@ -122,22 +123,25 @@ class World:
         self._agenda = Agenda()
         self._busy = False  # the tracker
         self._waiting: FrameSet | None = None  # the newest that came meanwhile
-        self.skipped = 0  # frame sets that the tracker had no time for
+        self.tracked, self.skipped = 0, 0  # frame sets, and those that the tracker had no time for
         self._pose: SurfacePose | None = None
         self._motion: MotionStep | None = None
         self._ticks, self._given, self._laid = 0, 0.0, 0.0
         self._bead: Array | None = None  # (2,) where the last piece of bead ended
         self._end = scenario.seconds
 
-    def run(self, progress: Callable[[float], None] = lambda now: None) -> None:
-        """Let the scenario's time pass; progress is told the instant, s. What was given out stays so if this raises."""
+    def run(self, progress: Report = silent) -> None:
+        """Let the scenario's time pass; progress is told of each frame set tracked. What was given out stays given."""
+        total = int(self.scenario.seconds / self.scenario.cameras.period)
         for camera in range(len(self.scenario.rig)):
             self._next_shot(self._cameras.shots(camera, self.scenario.seconds))
         self._agenda.at(0.0, TICK, self._tick)
-        now = 0.0
+        now, told = 0.0, 0
         try:
             for now in self._agenda.run(np.inf):
-                progress(now)
+                if self.tracked > told:
+                    told = self.tracked
+                    progress(told, total)
                 if now >= self._end:
                     break
         finally:
@@ -185,12 +189,12 @@ class World:
         frame = Frame(shot.camera, shot.stamp, NO_IMAGE)
         if self._pictures is not None:
             kind, data = self._pictures.take(shot)
-            self._sink.picture(shot, kind, data)
             try:
                 image = decode(data, f"camera {self.scenario.rig.cameras[shot.camera].name}", f"picture {shot.number}")
-            except InputError as error:
+            except InputError as error:  # as a driver drops what it cannot decode
                 self._sink.event(now, str(error))
                 return
+            self._sink.picture(shot, kind, data)
             frame = replace(frame, image=image)
         self._formed(self._pairer.add(frame, now), now)
         self._agenda.at(now + self._pairer.patience, ARRIVAL, self._overdue)
@@ -215,6 +219,7 @@ class World:
         start = self._clock.now()
         pose = self._step(frames)
         spent = self._clock.now() - start
+        self.tracked += 1
         self._sink.pose(frames, pose, self._step.last, spent)
         took = spent if self.scenario.tracking.processing is None else self.scenario.tracking.processing
         self._agenda.at(now + took, KNOWN, partial(self._know, pose, frames, self._step.last.observations))
@@ -232,7 +237,7 @@ class World:
         """Tell the motion where its path lies on the surface that the tracker follows."""
         scenario, change = self.scenario, np.eye(4)
         if scenario.tracking.pictures and not scenario.tracking.scan:
-            exposed = np.full(len(scenario.rig), np.nan)
+            exposed = np.full(len(scenario.rig), pose.stamp)
             for frame in frames.frames:
                 exposed[frame.camera] = self._exposed[frame.camera, frame.stamp]
             rigs = scenario.rig, scenario.told_rig
