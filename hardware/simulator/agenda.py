@@ -22,9 +22,9 @@ class Agenda:
         heapq.heappush(self._heap, (instant, rank, self._count, action))
         self._count += 1
 
-    def run(self, until: float) -> Iterator[float]:
-        """Do everything due before `until`, s, in order; gives each instant after what happened at it."""
-        while self._heap and self._heap[0][0] < until:
+    def run(self, until: Callable[[], float]) -> Iterator[float]:
+        """Do everything due before `until()`, s, in order; gives each instant after what happened at it."""
+        while self._heap and self._heap[0][0] < until():
             instant, _, _, action = heapq.heappop(self._heap)
             action(instant)
             yield instant

@@ -138,14 +138,13 @@ class World:
         self._agenda.at(0.0, TICK, self._tick)
         now, told = 0.0, 0
         try:
-            for now in self._agenda.run(np.inf):
+            for now in self._agenda.run(lambda: self._end):
                 if self.tracked > told:
                     told = self.tracked
                     progress(told, total)
-                if now >= self._end:
-                    break
+            now = self._end
         finally:
-            self._give_rows(min(now, self._end))
+            self._give_rows(max(now, self.arm.now))  # cut short, the arm may be ahead of the last thing that was done
 
     # -- cameras
 
