@@ -1,17 +1,15 @@
-"""A synthetic session with exactly known truth: a patch of skin with a wound that moves before three cameras.
+"""What tests of estimation and perception look at: the simulator's pictures of a small patch, and tracks without any.
 
-`frame_sets(Scene(), rig(), breathing, stamps, rng)` gives pictures, `tracks(seed=1)` gives observations, and
-`write_session(folder)` a session folder; `python -m tests.synthetic FOLDER --seconds 4` does the last from a shell.
+`frame_sets(patch(), arc_rig(), breathing, stamps, rng)` gives pictures, `tracks(seed=1)` observations, and
+`write_session(folder)` a session folder, all with exactly known truth.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,43 +18,46 @@ from estimation.observations import Observations
 from estimation.rig import Camera, Rig, ideal_pixels, pixels_from_points
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
-from hardware.folder_tables import write_frames, write_roi
 from hardware.images import encode
 from hardware.ply_file import write_ply
-from hardware.progress import Progress, Report, silent
-from hardware.rig_file import ImageSource, write_rig
-from hardware.session import FrameRef
-from hardware.tum import write_tum
-from perception.frames import Frame, FrameSet, Image, Roi
-from tests.scene import TARGET, Scene, patch_points, render_one
+from hardware.simulator.bodies import Wound, with_wound
+from hardware.simulator.default_rig import REST, arc_rig
+from hardware.simulator.instant import Instant
+from hardware.simulator.look import Look
+from hardware.simulator.render import render
+from hardware.simulator.scene import Scene, rois
+from hardware.simulator.sensor import Sensor
+from hardware.simulator.session_folder import SessionFolder
+from hardware.simulator.shape import cylinder, flat
+from perception.frames import Frame, FrameSet, Image
 
 Motion = Callable[[float], Array]  # stamp, s -> base_from_surface (4, 4), mm
 
-ANGLES = (0.0, 36.0, 84.0)  # degrees about the patch, thesis Fig. 4.3
-TILT = np.deg2rad(-38.0)  # of the patch, so that its normal stands amid the cameras and none of them grazes it
-REST = se3.make(se3.exp_rotation([TILT, 0.0, 0.0]), TARGET)  # base_from_surface
+RADIUS = 70.0  # mm, of a bent patch
+LOOK = Look(texel=0.2, wetness=0.3, drape=False)  # a finer texture only costs time: a pixel is 0.36 mm or more
+WOUND, WIDE = Wound((26.0, 18.0)), Wound((70.0, 54.0))  # the second fills a patch: all of it has strong texture
+NOISY = Sensor()
+CLEAN = Sensor(noise=0.0, blur=0.0)
+AWAY = REST @ se3.make(np.eye(3), [5000.0, 0.0, 0.0])  # base_from_surface, out of every camera's view
 SCAN_FROM_SURFACE = se3.make(se3.exp_rotation([0.3, -0.2, 0.6]), [12.0, -7.0, 31.0])  # a scanner has its own frame
 
 
-def rig(
-    angles: Sequence[float] = ANGLES,
-    distance: float = 400.0,
-    focal: float = 1100.0,
-    size: tuple[int, int] = (1280, 720),
-    distortion: Sequence[float] = (-0.12, 0.06, 6e-4, -4e-4, 0.0),
-) -> Rig:
-    """Cameras on an arc about TARGET, `angles` in degrees from straight above, `distance` mm away, focal in px."""
-    cameras = []
-    for i, angle in enumerate(np.deg2rad(angles)):
-        out = np.array([0.0, np.sin(angle), np.cos(angle)])  # from the patch to the camera
-        right = np.array([1.0, 0.0, 0.0])
-        rotation = np.stack([right, np.cross(-out, right), -out], axis=1)
-        centre = np.array(
-            [[focal * (1 + 0.01 * i), 0, size[0] / 2 - 3 + 5 * i], [0, focal, size[1] / 2 + 4 - 3 * i], [0, 0, 1]]
-        )
-        pose = se3.make(rotation, TARGET + distance * out)
-        cameras.append(Camera(f"cam_{i}", size, centre, np.array(distortion, float), pose))
-    return Rig(tuple(cameras))
+def patch(
+    seed: int = 0,
+    size: tuple[float, float] = (80.0, 60.0),
+    radius: float = RADIUS,
+    wound: Wound = WOUND,
+    look: Look = LOOK,
+) -> Scene:
+    """A patch of skin with a wound drawn on it, bent about its x axis to `radius` mm (inf: flat)."""
+    shape = flat(size) if np.isinf(radius) else cylinder(size, radius)
+    return Scene(with_wound(shape, wound, seed), look, seed=seed)
+
+
+def points_on_patch(count: int, rng: np.random.Generator) -> Array:
+    """Points (N, 3) mm, surface frame, at random on a bent patch of 60 x 45 mm."""
+    size = (60.0, 45.0)
+    return cylinder(size, RADIUS).points(rng.uniform(-0.5, 0.5, (count, 2)) * size)
 
 
 def still(stamp: float) -> Array:
@@ -75,9 +76,16 @@ def breathing(
     return REST @ se3.make(se3.exp_rotation(w), v)
 
 
-def render(scene: Scene, rig: Rig, base_from_surface: Array, rng: np.random.Generator) -> list[Image]:
-    """The cameras' images of one instant, in the rig's order."""
-    return [scene.add_grain(render_one(scene, camera, base_from_surface), rng) for camera in rig.cameras]
+def pictures(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    base_from_surface: Array,
+    rng: np.random.Generator,
+    sensor: Sensor = NOISY,
+) -> list[Image]:
+    """The cameras' sharp images of one instant, in their order."""
+    instant = Instant(0.0, 0.0, base_from_surface, np.zeros(6))
+    return render(scene, cameras, [instant] * len(cameras), sensor, rng.spawn(len(cameras)))
 
 
 def frame_sets(
@@ -85,24 +93,8 @@ def frame_sets(
 ) -> Iterator[FrameSet]:
     """Frame sets of all cameras at `stamps`, s, each rendered when it is asked for."""
     for stamp in stamps:
-        images = render(scene, rig, motion(float(stamp)), rng)
+        images = pictures(scene, rig.cameras, motion(float(stamp)), rng)
         yield FrameSet(float(stamp), tuple(Frame(c, float(stamp), image) for c, image in enumerate(images)))
-
-
-def rois(scene: Scene, rig: Rig, base_from_surface: Array, stamp: float, part: float = 0.75) -> tuple[Roi, ...]:
-    """Polygons around what each camera sees of the ellipse that fills the central `part` of the patch."""
-    flat = scene.grid(2.0, part)
-    flat = flat[np.linalg.norm(flat / (part * np.array(scene.size) / 2), axis=1) <= 1]
-    points = se3.transform_points(base_from_surface, scene.points(flat))
-    normals = scene.normals(flat) @ base_from_surface[:3, :3].T
-    found = []
-    for number, camera in enumerate(rig.cameras):
-        facing = np.einsum("ni,ni->n", normals, camera.base_from_camera[:3, 3] - points) > 0
-        pixels, depth = pixels_from_points(camera, points)
-        seen = pixels[facing & (depth > 1)].astype(np.float32)
-        if len(seen) >= 3:
-            found.append(Roi(number, stamp, cv2.convexHull(seen).reshape(-1, 2).astype(float)))
-    return tuple(found)
 
 
 def trajectory(motion: Motion, stamps: Iterable[float]) -> Trajectory:
@@ -161,122 +153,50 @@ def tracks(
     sigma: float = 0.3,
     outliers: float = 0.0,
     seed: int = 0,
-    size: tuple[float, float] = (60.0, 45.0),
-    radius: float = 70.0,
 ) -> Tracks:
     """Trajectory, rig, landmarks, pixels and noise in one line: `count` landmarks at random on a patch."""
     rng = np.random.default_rng([seed, 11])
-    flat = rng.uniform(-0.5, 0.5, (count, 2)) * size
-    landmarks = patch_points(flat, radius)
+    landmarks = points_on_patch(count, rng)
     truth = trajectory(motion, np.arange(round(seconds * rate)) / rate)
-    cameras = rig()
+    cameras = arc_rig()
     poses = zip(truth.stamps, truth.base_from_surface, strict=True)
     seen = tuple(observations(cameras, landmarks, pose, float(t), rng, sigma, outliers) for t, pose in poses)
     return Tracks(cameras, landmarks, truth, seen)
 
 
 def write_session(
-    folder: str | Path,
+    folder: Path,
     seconds: float = 4.0,
     rate: float = 30.0,
     seed: int = 0,
     motion: Motion = breathing,
-    video: bool = True,
-    scene: Scene | None = None,
+    quality: int | None = 95,
     cameras: Rig | None = None,
     scan: bool = False,
-    lossless: bool = False,
-    progress: Report = silent,
 ) -> Trajectory:
-    """Render a session into `folder`, in the plain container that a person could make by hand; returns its truth.
+    """Render a session of patch(seed) into `folder`; returns its truth.
 
-    video: one file per camera, Motion JPEG at quality 95 or FFV1 where `lossless`; else one PNG folder per camera.
+    quality: of JPEG, 0-100; None: PNG, which keeps every pixel.
     scan: also write surface.ply, in the scanner's own frame, which then is the surface frame of truth.tum.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    scene, cameras = scene or Scene(seed), cameras or rig()
+    scene, cameras = patch(seed), cameras or arc_rig()
     stamps = np.arange(max(1, round(seconds * rate))) / rate
     truth = trajectory(motion, stamps)
-    sources = [
-        ImageSource("video", f"{c.name}.avi") if video else ImageSource("images", f"{c.name}/*.png")
-        for c in cameras.cameras
-    ]
-    write_rig(folder / "rig.toml", cameras, sources)
-    refs = [FrameRef(c, i, float(t), float(t)) for c in range(len(cameras)) for i, t in enumerate(stamps)]
-    write_frames(folder / "frames.csv", cameras, refs)
+    sets = frame_sets(scene, cameras, motion, stamps, np.random.default_rng([seed, 3]))
     polygons = rois(scene, cameras, truth.base_from_surface[0], 0.0)
-    write_roi(folder / "roi.toml", cameras, polygons, [0] * len(polygons))
+    if scan:
+        truth = Trajectory(truth.stamps, truth.base_from_surface @ se3.inverse(SCAN_FROM_SURFACE), exact=True)
+    with SessionFolder(folder, cameras, polygons) as session:
+        session.truth(truth)
+        for frames in sets:
+            for frame in frames.frames:
+                session.picture(frame.camera, frame.stamp, *encode(frame.image, quality))
     if scan:
         write_ply(folder / "surface.ply", *scan_of(scene))
-        truth = Trajectory(truth.stamps, truth.base_from_surface @ se3.inverse(SCAN_FROM_SURFACE), exact=True)
-    write_tum(folder / "truth.tum", truth)
-    sinks = [_sink(folder, camera, rate, video, lossless) for camera in cameras.cameras]
-    try:
-        for done, frames in enumerate(frame_sets(scene, cameras, motion, stamps, np.random.default_rng([seed, 3]))):
-            for sink, frame in zip(sinks, frames.frames, strict=True):
-                sink.write(frame.image)
-            progress(done + 1, len(stamps))
-    finally:
-        for sink in sinks:
-            sink.release()
     return truth
 
 
 def scan_of(scene: Scene, step: float = 1.0) -> tuple[Array, NDArray[np.int64]]:
     """Vertices (V, 3) mm in the scanner's frame and triangles (T, 3), seen anticlockwise from outside, of the patch."""
-    flat = scene.grid(step)
-    columns = int(np.flatnonzero(np.diff(flat[:, 1]))[0]) + 1
-    corner = np.arange(len(flat)).reshape(-1, columns)
-    a, b, c, d = (m.ravel() for m in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
-    triangles = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-    return se3.transform_points(SCAN_FROM_SURFACE, scene.points(flat)), triangles
-
-
-class _PngFolder:
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(exist_ok=True)
-        self._folder, self._count = folder, 0
-
-    def write(self, image: Image) -> None:
-        (self._folder / f"{self._count:05d}.png").write_bytes(encode(image)[1])
-        self._count += 1
-
-    def release(self) -> None:
-        """Nothing is open."""
-
-
-def _sink(folder: Path, camera: Camera, rate: float, video: bool, lossless: bool) -> _PngFolder | cv2.VideoWriter:
-    if not video:
-        return _PngFolder(folder / camera.name)
-    path = str(folder / f"{camera.name}.avi")
-    if lossless:
-        writer = cv2.VideoWriter(path, cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"FFV1"), rate, camera.size)
-    else:
-        quality = [cv2.VIDEOWRITER_PROP_QUALITY, 95]  # only OpenCV's own writer heeds it
-        writer = cv2.VideoWriter(
-            path, cv2.CAP_OPENCV_MJPEG, cv2.VideoWriter.fourcc(*"MJPG"), rate, camera.size, quality
-        )
-    assert writer.isOpened(), path
-    return writer
-
-
-def main() -> None:
-    """Write a session into the folder named on the command line."""
-    from hardware.clock import WallClock
-
-    parser = argparse.ArgumentParser(description="Render a synthetic session with exactly known truth.")
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--seconds", type=float, default=4.0)
-    parser.add_argument("--rate", type=float, default=30.0, help="frames per second")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--scan", action="store_true", help="also write surface.ply")
-    parser.add_argument("--png", action="store_true", help="pictures instead of videos")
-    a = parser.parse_args()
-    progress = Progress("render", "frame sets", WallClock().now)
-    write_session(a.folder, a.seconds, a.rate, a.seed, video=not a.png, scan=a.scan, progress=progress)
-    progress.close()
-
-
-if __name__ == "__main__":
-    main()
+    vertices, triangles = scene.shape.mesh(step)
+    return se3.transform_points(SCAN_FROM_SURFACE, vertices), triangles

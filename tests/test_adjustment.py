@@ -13,10 +13,10 @@ from estimation.observations import Observations
 from estimation.pose_solver import solve_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from tests.scene import patch_points
-from tests.synthetic import REST, observations, rig
+from hardware.simulator.default_rig import REST, arc_rig
+from tests.synthetic import observations, points_on_patch
 
-RIG = rig()
+RIG = arc_rig()
 
 
 def swaying(stamp: float) -> Array:
@@ -26,7 +26,7 @@ def swaying(stamp: float) -> Array:
 
 
 def landmarks(seed: int = 0, count: int = 40) -> Array:
-    return patch_points(np.random.default_rng([seed, 3]).uniform(-0.5, 0.5, (count, 2)) * [60, 45], 70.0)
+    return points_on_patch(count, np.random.default_rng([seed, 3]))
 
 
 def as_map(points: Array, sigma: float = 0.5) -> SurfaceMap:

@@ -13,11 +13,11 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from tests.scene import patch_points
-from tests.synthetic import REST, Motion, breathing, observations, rig
+from hardware.simulator.default_rig import REST, arc_rig
+from tests.synthetic import Motion, breathing, observations, points_on_patch
 
-RIG = rig()
-LANDMARKS = patch_points(np.random.default_rng(3).uniform(-0.5, 0.5, (60, 2)) * [60, 45], 70.0)
+RIG = arc_rig()
+LANDMARKS = points_on_patch(60, np.random.default_rng(3))
 RATE = 30.0
 
 

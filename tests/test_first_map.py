@@ -9,27 +9,28 @@ import pytest
 from estimation import se3
 from estimation.rig import Rig
 from estimation.se3 import Array
+from hardware.simulator.default_rig import REST, arc_rig
+from hardware.simulator.scene import Scene, rois
 from perception.features import grey, polygon_mask
 from perception.first_map import FirstMap, build_first_map, in_frame
 from perception.frames import Image
 from perception.lens import Lenses
 from perception.patches import pyramid
-from tests.scene import Scene
-from tests.synthetic import REST, SCAN_FROM_SURFACE, render, rig, rois
+from tests.synthetic import RADIUS, SCAN_FROM_SURFACE, patch, pictures
 
 Pyramids = dict[int, tuple[Image, Image]]
-RIG = rig(size=(640, 480), focal=560.0)
-SCENE = Scene(1)
+RIG = arc_rig(size=(640, 480), focal=560.0)
+SCENE = patch(1)
 
 
 def look(
     scene: Scene = SCENE, cameras: Rig = RIG, pose: Array = REST, seed: int = 0
 ) -> tuple[Pyramids, dict[int, Array]]:
     """Images and polygons by camera."""
-    images = render(scene, cameras, pose, np.random.default_rng(seed))
+    images = pictures(scene, cameras.cameras, pose, np.random.default_rng(seed))
     return (
         {c: pyramid(grey(image)) for c, image in enumerate(images)},
-        {roi.camera: roi.polygon for roi in rois(scene, cameras, pose, 0.0)},
+        {roi.camera: roi.polygon for roi in rois(scene, cameras, pose, 0.0, 0.75)},
     )
 
 
@@ -50,17 +51,17 @@ def on_patch(first: FirstMap, pose: Array = REST) -> Array:
     return se3.transform_points(se3.inverse(pose) @ first.base_from_surface, first.map.points)
 
 
-def off_surface(first: FirstMap, radius: float = 70.0) -> Array:
+def off_surface(first: FirstMap) -> Array:
     """Distances (N,) mm of the landmarks from the true cylinder."""
     points = on_patch(first)
-    return np.abs(np.hypot(points[:, 1], points[:, 2] + radius) - radius)
+    return np.abs(np.hypot(points[:, 1], points[:, 2] + RADIUS) - RADIUS)
 
 
 def test_the_landmarks_lie_on_the_true_surface(first: FirstMap) -> None:
-    """A pixel is 0.7 mm here; 0.1 px of it is 0.07 mm, and the depth's share of that a little more."""
+    """A pixel is 0.7 mm here; 0.1 px of it is 0.07 mm. Patches are taken as flat: where they bend they lie too low."""
     off = off_surface(first)
     assert len(off) > 100
-    assert np.median(off) < 0.08 and np.percentile(off, 95) < 0.3 and off.max() < 1.0
+    assert np.median(off) < 0.09 and np.percentile(off, 95) < 0.3 and off.max() < 1.0
 
 
 @pytest.mark.parametrize("pair", [(0, 1), (1, 2), (0, 2)])
@@ -71,7 +72,7 @@ def test_two_cameras_are_enough(pair: tuple[int, int]) -> None:
 
 def test_the_claimed_covariance_is_of_the_errors_size(first: FirstMap) -> None:
     points = on_patch(first)
-    out = np.column_stack([np.zeros(len(points)), points[:, 1], points[:, 2] + 70.0])
+    out = np.column_stack([np.zeros(len(points)), points[:, 1], points[:, 2] + RADIUS])
     out = out / np.linalg.norm(out, axis=1, keepdims=True) @ (se3.inverse(first.base_from_surface) @ REST)[:3, :3].T
     n = len(points)
     blocks = np.einsum("ninj->nij", first.map.covariance.reshape(n, 3, n, 3))
@@ -83,7 +84,7 @@ def test_the_claimed_covariance_is_of_the_errors_size(first: FirstMap) -> None:
 def test_normals_stand_on_the_surface(first: FirstMap) -> None:
     points = on_patch(first)
     normals = first.map.normals @ (se3.inverse(REST) @ first.base_from_surface)[:3, :3].T
-    true = np.column_stack([np.zeros(len(points)), points[:, 1] / 70.0, points[:, 2] / 70.0 + 1])
+    true = np.column_stack([np.zeros(len(points)), points[:, 1] / RADIUS, points[:, 2] / RADIUS + 1])
     cosine = np.einsum("ni,ni->n", normals, true / np.linalg.norm(true, axis=1, keepdims=True))
     assert np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))) < 6
     assert np.percentile(cosine, 5) > np.cos(np.deg2rad(25))
@@ -118,7 +119,7 @@ def test_a_smaller_region_gives_a_smaller_map(first: FirstMap) -> None:
     small = build_first_map(Lenses(RIG), pyramids, polygons)
     assert not isinstance(small, str)
     assert np.ptp(on_patch(small), axis=0)[0] < 0.8 * np.ptp(on_patch(first), axis=0)[0]
-    assert (np.abs(on_patch(small)[:, 0]) < 0.25 * SCENE.size[0] + 1).all()
+    assert (np.abs(on_patch(small)[:, 0]) < 0.25 * SCENE.shape.size[0] + 1).all()
 
 
 def test_a_map_is_the_same_map_in_another_frame(first: FirstMap) -> None:
@@ -144,8 +145,7 @@ def test_two_runs_give_the_same_bits(first: FirstMap) -> None:
 
 
 def test_a_flat_surface_is_mapped_flat() -> None:
-    flat = Scene(3, radius=np.inf)
-    pyramids, polygons = look(flat)
+    pyramids, polygons = look(patch(3, radius=np.inf))
     found = build_first_map(Lenses(RIG), pyramids, polygons)
     assert not isinstance(found, str)
     off = np.abs(on_patch(found)[:, 2])
@@ -174,7 +174,7 @@ def test_noise_gives_a_reason() -> None:
 
 
 def test_different_surfaces_in_each_camera_give_a_reason() -> None:
-    pyramids = {c: look(Scene(10 + c))[0][c] for c in range(3)}
+    pyramids = {c: look(patch(10 + c))[0][c] for c in range(3)}
     assert isinstance(build_first_map(Lenses(RIG), pyramids, look()[1]), str)
 
 

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.rig import Camera, Rig, distort, ideal_pixels, pixels_from_points
 from estimation.se3 import Array
+from hardware.simulator.default_rig import REST, arc_rig
 from perception.lens import Lenses, imaged_radius, undistort
-from tests.synthetic import REST, rig
 
 LENSES = [(0.0,) * 5, (-0.12, 0.06, 6e-4, -4e-4, 0.0), (-0.3, 0.12, 1e-3, -1e-3, -0.02), (0.15, -0.05, 0.0, 0.0, 0.01)]
 
 
 def camera(distortion: tuple[float, ...]) -> Camera:
-    return replace(rig().cameras[0], distortion=np.array(distortion))
+    return replace(arc_rig().cameras[0], distortion=np.array(distortion))
 
 
 def spots(lens: Camera, seed: int, count: int = 50) -> Array:
@@ -92,7 +92,7 @@ def test_what_folds_back_into_the_image_is_not_seen() -> None:
 @given(st.integers(0, 10_000))
 @settings(max_examples=20)
 def test_lenses_image_points_as_the_rig_does(seed: int) -> None:
-    cameras = rig()
+    cameras = arc_rig()
     lenses = Lenses(cameras)
     points = se3.transform_points(REST, np.random.default_rng(seed).uniform(-30, 30, (40, 3)))
     for number, lens in enumerate(cameras.cameras):
@@ -101,7 +101,7 @@ def test_lenses_image_points_as_the_rig_does(seed: int) -> None:
 
 
 def test_points_behind_the_camera_are_not_seen() -> None:
-    cameras = rig()
+    cameras = arc_rig()
     behind = cameras.cameras[0].base_from_camera @ np.array([0.0, 0.0, -300.0, 1.0])
     ideal, depth = ideal_pixels(cameras.cameras[0], behind[None, :3])
     assert np.allclose(ideal, cameras.cameras[0].matrix[:2, 2])  # dead centre, but behind

@@ -15,8 +15,7 @@ from estimation.scan import Scan
 from hardware.mesh_file import APT_LINE, read_mesh
 from hardware.ply_file import write_ply
 from tests import scans
-from tests.scene import Scene
-from tests.synthetic import SCAN_FROM_SURFACE, scan_of
+from tests.synthetic import RADIUS, SCAN_FROM_SURFACE, patch, scan_of
 
 try:
     import open3d  # noqa: F401
@@ -68,11 +67,10 @@ def test_every_format_gives_the_same_scan(tmp_path: Path, suffix: str) -> None:
 
 @needs_open3d
 def test_the_synthetic_scan_comes_back_in_its_own_frame(tmp_path: Path) -> None:
-    scene = Scene()
-    write_ply(tmp_path / "surface.ply", *scan_of(scene, 4.0))
+    write_ply(tmp_path / "surface.ply", *scan_of(patch(), 4.0))
     mesh = read_mesh(tmp_path / "surface.ply")
     on_patch = se3.transform_points(se3.inverse(SCAN_FROM_SURFACE), mesh.scan.vertices)
-    np.testing.assert_allclose(np.hypot(on_patch[:, 1], on_patch[:, 2] + scene.radius), scene.radius, atol=1e-9)
+    np.testing.assert_allclose(np.hypot(on_patch[:, 1], on_patch[:, 2] + RADIUS), RADIUS, atol=1e-9)
     assert (mesh.scan.normals @ SCAN_FROM_SURFACE[:3, 2]).min() > 0.8
     assert mesh.open_edges == 2 * (20 + 15)
 

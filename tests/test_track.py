@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from time import monotonic, sleep
 
+import cv2
 import numpy as np
 import pytest
 
@@ -24,6 +25,7 @@ from hardware.rig_file import ImageSource, write_rig
 from hardware.session import FrameRef, open_session
 from hardware.track_recorder import TrackRecorder
 from tests.runs import Replayed
+from tests.session_files import change
 from tests.synthetic import still, write_session
 
 ROOT = Path(__file__).parents[1]
@@ -31,10 +33,25 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten frame sets at 10 Hz of the synthetic surface, breathing."""
+    """Ten frame sets at 10 Hz of a simulated surface, breathing, in videos."""
     folder = tmp_path_factory.mktemp("session") / "breathing"
     write_session(folder, seconds=1.0, rate=10.0, seed=2)
+    for name in ("cam_0", "cam_1", "cam_2"):
+        film(folder, name)
     return folder
+
+
+def film(folder: Path, name: str) -> None:
+    """Make one video of a camera's pictures."""
+    images = [cv2.imread(str(path)) for path in sorted((folder / name).iterdir())]
+    quality = [cv2.VIDEOWRITER_PROP_QUALITY, 95]
+    path, code = str(folder / f"{name}.avi"), cv2.VideoWriter.fourcc(*"MJPG")
+    writer = cv2.VideoWriter(path, cv2.CAP_OPENCV_MJPEG, code, 10.0, images[0].shape[1::-1], quality)
+    for image in images:
+        writer.write(image)
+    writer.release()
+    shutil.rmtree(folder / name)
+    change(folder / "rig.toml", f'images = "{name}/*"', f'video = "{name}.avi"')
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +91,7 @@ def test_a_run_leaves_its_files_and_they_agree(tracked: Path) -> None:
     assert (table.seconds[:, -1] >= table.seconds[:, :-1].sum(axis=1) - 1e-4).all()
 
 
-def test_the_synthetic_surface_is_followed(tracked: Path) -> None:
+def test_the_simulated_surface_is_followed(tracked: Path) -> None:
     summary = json.loads((tracked / "summary.json").read_text())
     assert summary["measured_share"] >= 0.8
     assert summary["errors"]["against"] == "truth"
@@ -103,7 +120,7 @@ def test_a_video_that_ends_early_costs_only_what_comes_after(
 
 def endless(folder: Path) -> Path:
     """A session of 2000 frame sets, all the same three pictures."""
-    write_session(folder, seconds=0.1, rate=10.0, motion=still, video=False)
+    write_session(folder, seconds=0.1, rate=10.0, motion=still, quality=None)
     rig = open_session(folder).rig
     for camera in rig.cameras:
         first = next((folder / camera.name).glob("*.png"))

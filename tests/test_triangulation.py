@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.triangulation import epipolar_distance, rays, triangulate
-from tests.scene import TARGET
-from tests.synthetic import rig
+from hardware.simulator.default_rig import TARGET, arc_rig
 
-RIG = rig()
+RIG = arc_rig()
 seeds = st.integers(0, 10_000)
 
 
