@@ -1,0 +1,167 @@
+"""Small simulated worlds: scenario files with one thing changed, runs of them, and a sink that remembers all of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import se3
+from estimation.pose import SurfacePose
+from estimation.se3 import Array
+from hardware.clock import SimClock
+from hardware.path_file import read_path
+from hardware.recording import WARNING
+from hardware.simulator.cameras import Shot
+from hardware.simulator.deformation import Deformation
+from hardware.simulator.look import Look
+from hardware.simulator.nozzle_error import NozzleErrors, nozzle_errors
+from hardware.simulator.nozzle_log import NozzleLog, joined
+from hardware.simulator.perfect import PerfectTracker
+from hardware.simulator.planned_line import planned_line
+from hardware.simulator.scenario import Scenario
+from hardware.simulator.scenario_file import read_scenario
+from hardware.simulator.scene import STILL, Scene
+from hardware.simulator.shape import flat
+from hardware.simulator.truth import Truth
+from hardware.simulator.world import Exposures, World
+from perception.frames import FrameSet
+from perception.tracking import StepReport
+from planning.command import Command, Hold
+from planning.planner import Progress
+
+HEADER = "x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,speed_mm_s,material,temperature_c,layer,extrude"
+IDEAL = {  # nothing takes time
+    "cameras": {"fps": 50.0, "exposure_s": 0.0, "transport_s": 0.0},
+    "tracking": {"by": "truth", "processing_s": 0},
+    "arm": {"file": "arm.toml", "servo_lag_s": 0, "wire_baud": float("inf"), "assumed_lag_s": 0},
+}
+SMALL = {  # pictures of a ninth of the usual size, half as often
+    "scene": {"body": "forearm", "texel_mm": 0.3, "hair": 0},
+    "rig": {"size": [480, 270], "focal_px": 420},
+    "cameras": {"fps": 15.0},
+    "arm": {"file": "arm.toml"},
+}
+
+
+class Heard:
+    """A sink that remembers everything it is told."""
+
+    def __init__(self) -> None:
+        self.pictures: list[tuple[Shot, str, bytes]] = []
+        self.frames: list[FrameSet] = []
+        self.poses: list[SurfacePose] = []
+        self.commands: list[Command] = []
+        self.progress: list[Progress] = []
+        self.sent, self.received = b"", b""
+        self.logs: list[NozzleLog] = []
+        self.changes: list[Array] = []
+        self.events: list[tuple[float, str]] = []
+
+    def picture(self, shot: Shot, kind: str, data: bytes) -> None:
+        self.pictures.append((shot, kind, data))
+
+    def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
+        self.frames.append(frames)
+        self.poses.append(pose)
+
+    def command(self, command: Command, progress: Progress, frame: bytes, received: bytes) -> None:
+        self.commands.append(command)
+        self.progress.append(progress)
+        self.sent += frame
+        self.received += received
+
+    def rows(self, log: NozzleLog) -> None:
+        self.logs.append(log)
+
+    def registered(self, truth_from_estimate: Array) -> None:
+        self.changes.append(truth_from_estimate)
+
+    def event(self, stamp: float, text: str, level: int = WARNING) -> None:
+        self.events.append((stamp, text))
+
+    @property
+    def log(self) -> NozzleLog:
+        """All rows so far."""
+        return joined(self.logs)
+
+    @property
+    def reasons(self) -> set[str]:
+        """Why the motion held."""
+        return {command.reason for command in self.commands if isinstance(command, Hold)}
+
+
+def write_path(file: Path, points: Sequence[Sequence[float]], speed: float = 5.0) -> Path:
+    """An upright path through points (N, 3), mm, as a file; all but the way to the first is printed."""
+    rows = [f"{x},{y},{z},0,0,0,{speed},1,20,0,{int(i > 0)}" for i, (x, y, z) in enumerate(points)]
+    file.write_text("\n".join([HEADER, *rows]) + "\n")
+    return file
+
+
+def write_scenario(folder: Path, *tables: Mapping[str, object], name: str = "scenario.toml", **top: object) -> Path:
+    """A scenario of an 8 mm line in `folder`, tables put over each other in order, keys of the top level over those.
+
+    The arm's home is 1 mm above the start of the line, so that printing begins at once.
+    """
+    if not (folder / "path.csv").exists():
+        write_path(folder / "path.csv", [[-4, 0, 0], [4, 0, 0]])
+    x, y, z = read_path(folder / "path.csv").surface_from_nozzle[0, :3, 3]
+    (folder / "arm.toml").write_text(f"home_mm_deg = [{202.5 + x}, {225.0 + y}, {51.0 + z}, 0, 0, 0]\n")
+    whole: dict[str, object] = {"title": "A test", "seconds": 2.0, "path": "path.csv"}
+    for table in [*tables, top]:
+        for key, value in table.items():
+            old = whole.get(key)
+            whole[key] = {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value
+    (folder / name).write_text("\n".join(f"{key} = {_toml(value)}" for key, value in whole.items()) + "\n")
+    return folder / name
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_toml(part)}" for key, part in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return repr(value) if isinstance(value, float) else json.dumps(value)
+
+
+@cache
+def patch(deformation: Deformation = STILL) -> Scene:
+    """A flat scene that costs next to nothing, for runs that take no pictures."""
+    return Scene(flat((40.0, 30.0)), Look(texel=1.0, drape=False), deformation)
+
+
+def world_of(
+    scenario: Scenario, sink: Heard, line: Callable[[bytes], bytes] = bytes, deformation: Deformation = STILL
+) -> World:
+    """A world without pictures whose tracker knows the truth, as `stillbed simulate` builds it, on a flat surface."""
+    assert not scenario.tracking.pictures
+    exposures: Exposures = {}
+    scene = patch(deformation)
+    truth = Truth(scenario.rest, scenario.motion, deformation, scenario.strain, scene.shape.surface_from_grid)
+    offset = scenario.told_rig.cameras[0].base_from_camera @ se3.inverse(scenario.rig.cameras[0].base_from_camera)
+    step = PerfectTracker(truth, offset, lambda camera, stamp: exposures[camera, stamp], len(scenario.rig))
+    path = read_path(scenario.path)
+    return World(scenario, scene, path, truth, step, exposures, sink, SimClock(), line=line)
+
+
+def heard(file: Path) -> Heard:
+    """All that passes in the scenario in `file`, poses being true."""
+    sink = Heard()
+    world_of(read_scenario(file), sink).run()
+    return sink
+
+
+def errors(file: Path, log: NozzleLog) -> NozzleErrors:
+    """The errors of a run of the scenario in `file`."""
+    return nozzle_errors(log, planned_line(read_path(read_scenario(file).path)))
+
+
+def inner(log: NozzleLog, before: float = 0.3, after: float = 0.2) -> NDArray[np.bool_]:
+    """(N,) rows that extrude, the first `before` and the last `after` s of that left out: there the path speeds up."""
+    rows = np.flatnonzero(log.extrude)
+    start, end = log.stamps[rows[0]] + before, log.stamps[rows[-1]] - after
+    return np.asarray(log.extrude & (log.stamps > start) & (log.stamps < end))
