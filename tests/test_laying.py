@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation import se3
+from estimation.errors import InputError
 from hardware.simulator.laying import divided, laid
 from hardware.simulator.shape import Shape, cylinder, flat
 from planning.path import check_path, lengths
@@ -57,6 +58,25 @@ def test_a_laid_path_stands_at_its_clearance_above_the_surface(shape: Shape) -> 
     places = path.surface_from_nozzle[:, :3, 3]
     assert places[:, 2] - shape.heights_at(places[:, :2]) == pytest.approx(0.4)
     assert np.array_equal(path.surface_from_nozzle[:, :3, :3], np.broadcast_to(np.eye(3), (len(path), 3, 3)))
+
+
+def test_on_a_scan_whose_frame_is_tilted_the_clearance_is_along_the_frames_own_z() -> None:
+    bent = cylinder((60, 60), 45.0)
+    tilted = replace(bent, surface_from_grid=se3.make(se3.exp_rotation([0.3, -0.4, 0.2]), [3.0, -2.0, 40.0]))
+    path = raster(10.0)
+    places = laid(path, tilted, 0.4).surface_from_nozzle[:, :3, 3]
+    below = places - [0, 0, 0.4]
+    assert tilted.points(tilted.material(below)) == pytest.approx(below, abs=1e-4)
+    assert np.array_equal(places[:, :2], divided(path, 1.0).surface_from_nozzle[:, :2, 3])
+
+
+@pytest.mark.parametrize("side", [10.1, -10.1])
+def test_a_path_that_leaves_the_surface_is_refused(side: float) -> None:
+    shape = flat((40, 20))
+    path = path_through(np.array([[0.0, 0, 0], [0, np.sign(side) * 10, 0]]))
+    laid(path, shape, 0.4)
+    with pytest.raises(InputError, match=r"x\.csv: a place on the path.*40 x 20 mm"):
+        laid(path_through(np.array([[0.0, 0, 0], [0, side, 0]])), shape, 0.4, "x.csv")
 
 
 def test_the_layers_of_a_path_stay_above_each_other() -> None:

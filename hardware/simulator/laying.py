@@ -7,23 +7,43 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.simulator.shape import Shape
 from planning.path import Path
 
 PIECE = 1.0  # mm: beds of wounds are uneven over a few
+STEPS = 12  # towards the surface along z; only where a scan's own frame is tilted against its mean plane one is not all
+MISSED = 1e-3  # mm from the surface
 
 
-def laid(path: Path, shape: Shape, clearance: float) -> Path:
+def laid(path: Path, shape: Shape, clearance: float, where: object = "path") -> Path:
     """The path with its checkpoints `clearance` mm above the surface, stretches divided into pieces of about 1 mm.
 
     Tools keep the direction that the path gives them; a path's own height (z) is kept on top of the surface's.
+    InputError with `where` for a checkpoint that lies beyond the surface's edge.
     """
     fine = divided(path, PIECE)
     places = fine.surface_from_nozzle.copy()
-    heights = shape.points(shape.material(places[:, :3, 3]))[:, 2]
-    places[:, 2, 3] += heights + clearance
+    points, there = surface_along_z(shape, places[:, :2, 3])
+    if not there.all():
+        x, y = places[~there][0, :2, 3]
+        allowed = "on the surface, {:g} x {:g} mm about its middle".format(*shape.size)
+        raise InputError(where, "a place on the path", f"x = {x:.2f}, y = {y:.2f} mm", allowed)
+    places[:, 2, 3] += points[:, 2] + clearance
     return replace(fine, surface_from_nozzle=places)
+
+
+def surface_along_z(shape: Shape, xy: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Points (N, 3) mm of the surface at x and y (N, 2) mm, surface frame, and whether (N,) there is one."""
+    points, outwards = np.column_stack([xy, np.zeros(len(xy))]), shape.surface_from_grid[:3, 2]
+    for _ in range(STEPS):
+        off = shape.points(shape.material(points)) - points  # along the grid's own z
+        points[:, 2] += (off @ outwards) / outwards[2]
+    material = shape.material(points)
+    inside = (np.abs(material) <= np.array(shape.size) / 2 + MISSED).all(axis=1)
+    met = np.linalg.norm(shape.points(material) - points, axis=1) < MISSED
+    return points, inside & met
 
 
 def divided(path: Path, piece: float) -> Path:

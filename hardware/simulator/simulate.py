@@ -90,7 +90,7 @@ def run_simulation(file: Path, out: Path, options: Options | None = None) -> Out
     path = read_path(scenario.path)
     scene = scene_from_table(scenario.file, scenario.scene, scenario.file.parent, scenario.seed)
     if scenario.clearance is not None:
-        path = laid(path, scene.shape, scenario.clearance)
+        path = laid(path, scene.shape, scenario.clearance, scenario.path)
     prepare_out(out, options.force)
     truth = Truth(scenario.rest, scenario.motion, scene.deformation, scenario.strain, scene.shape.surface_from_grid)
     regions, scan = _regions(scenario, scene, truth), _scan(scenario, scene, out)
