@@ -136,15 +136,15 @@ class World:
         for camera in range(len(self.scenario.rig)):
             self._next_shot(self._cameras.shots(camera, self.scenario.seconds))
         self._agenda.at(0.0, TICK, self._tick)
-        now, told = 0.0, 0
+        told, complete = 0, False
         try:
-            for now in self._agenda.run(lambda: self._end):
+            for _ in self._agenda.run(lambda: self._end):
                 if self.tracked > told:
                     told = self.tracked
                     progress(told, total)
-            now = self._end
+            complete = True
         finally:
-            self._give_rows(max(now, self.arm.now))  # cut short, the arm may be ahead of the last thing that was done
+            self._give_rows(self._end if complete else self.arm.now)
 
     # -- cameras
 
