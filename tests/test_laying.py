@@ -79,6 +79,16 @@ def test_a_path_that_leaves_the_surface_is_refused(side: float) -> None:
         laid(path_through(np.array([[0.0, 0, 0], [0, side, 0]])), shape, 0.4, "x.csv")
 
 
+def test_a_path_over_a_hole_of_a_scan_is_refused() -> None:
+    shape = flat((40, 20))
+    valid = np.ones(shape.heights.shape, bool)
+    valid[10, 20] = False  # the node in the middle
+    holed = replace(shape, valid=valid)
+    laid(path_through(np.array([[-5.0, 1, 0], [5, 1, 0]])), holed, 0.4)
+    with pytest.raises(InputError, match=r"x = 0\.00, y = 0\.00 mm"):
+        laid(path_through(np.array([[-5.0, 0, 0], [5, 0, 0]])), holed, 0.4)
+
+
 def test_the_layers_of_a_path_stay_above_each_other() -> None:
     low = raster(20.0).surface_from_nozzle[:, :3, 3]
     both = path_through(np.concatenate([low, low[::-1] + [0, 0, 0.7]]))

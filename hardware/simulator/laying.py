@@ -41,9 +41,7 @@ def surface_along_z(shape: Shape, xy: Array) -> tuple[Array, NDArray[np.bool_]]:
         off = shape.points(shape.material(points)) - points  # along the grid's own z
         points[:, 2] += (off @ outwards) / outwards[2]
     material = shape.material(points)
-    inside = (np.abs(material) <= np.array(shape.size) / 2 + MISSED).all(axis=1)
-    met = np.linalg.norm(shape.points(material) - points, axis=1) < MISSED
-    return points, inside & met
+    return points, shape.covers(material) & (np.linalg.norm(shape.points(material) - points, axis=1) < MISSED)
 
 
 def divided(path: Path, piece: float) -> Path:

@@ -23,7 +23,7 @@ from hardware.simulator.truth import Truth
 
 STEPS = 12  # Newton steps from the mean plane onto the surface; wounds are met in four
 NUDGE = 1e-3  # mm, for the slope along the surface
-MISSED = 1e-3  # mm between ray and surface: such a track hangs over an edge
+MISSED = 1e-3  # mm between ray and surface: such a track does not lie on it
 LEAST = 12  # tracks for a registration
 
 
@@ -90,4 +90,4 @@ def surface_points(
         now = off(xy)
         slope = np.stack([(off(xy + NUDGE * axis) - now) / NUDGE for axis in np.eye(2)], -1)  # (N, 3, 2)
         xy = xy - (np.linalg.pinv(slope) @ now[..., None])[..., 0]
-    return shape.points(xy), np.linalg.norm(off(xy), axis=1) < MISSED
+    return shape.points(xy), shape.covers(xy) & (np.linalg.norm(off(xy), axis=1) < MISSED)

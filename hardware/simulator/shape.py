@@ -60,6 +60,15 @@ class Shape:
         """Material points (N, 2) mm straight above or below points (N, 3), surface frame."""
         return np.asarray(se3.transform_points(se3.inverse(self.surface_from_grid), points_surface)[:, :2])
 
+    def covers(self, xy: ArrayLike) -> NDArray[np.bool_]:
+        """Whether (N,) there is a surface at material points (N, 2) mm: on the rectangle, and in no hole."""
+        xy = np.asarray(xy, float).reshape(-1, 2)
+        on = (np.abs(xy) <= np.array(self.size) / 2 + 1e-6).all(axis=1)
+        if self.valid is None:
+            return np.asarray(on)
+        x, y = np.rint(self._nodes(xy)).astype(int).T
+        return np.asarray(on & self.valid[y, x])
+
     def grid(self, step: float, part: float = 1.0) -> Array:
         """Material points (N, 2) mm, row by row, over the central `part` of the rectangle, about `step` mm apart."""
         x, y = (np.linspace(-0.5, 0.5, max(1, round(part * s / step)) + 1) * part * s for s in self.size)
