@@ -302,7 +302,6 @@ def test_a_camera_that_runs_late_makes_the_claim_wider_not_wrong() -> None:
     assert np.mean(errors(poses, swinging)[8:] < 3 * np.array(sigma)) > 0.9
 
 
-@pytest.mark.xfail(strict=True, reason="optical flow takes brightness as constant and fails from 25 % between two sets")
 def test_brightness_may_change_from_set_to_set(sets: list[FrameSet]) -> None:
     draw = np.random.default_rng(3)
 
