@@ -33,7 +33,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware import checks
 from hardware.arm_file import read_arm
-from hardware.arm_profile import BITS_PER_BYTE, ArmProfile, placed
+from hardware.arm_profile import BITS_PER_BYTE, LONGEST_LAG, ArmProfile, placed
 from hardware.checks import Table
 from hardware.protocol import LENGTH
 from hardware.rig_file import read_rig
@@ -49,6 +49,8 @@ from hardware.simulator.scene_table import sensor_from_table
 KEYS = ("title", "seconds", "path")
 TABLES = ("scene", "strain", "rig", "cameras", "sensor", "tracking", "arm", "planted", "limits")
 OPTIONAL = ("seed", "clearance_mm", "bead_mm", "faults", "motion", *TABLES)
+MOST_CAMERAS = 8
+SIDES = 64, 4096  # px of a picture
 LONGEST = 3600.0  # s: an hour of pictures is 300,000 of them
 STRAIN_STREAM = 11  # of random numbers, so that motions and strain do not share theirs
 
@@ -69,6 +71,8 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
     arm, profile, baud = _arm(path, parts["arm"])
     rig_offset, arm_offset = _planted(path, parts["planted"])
     quality = checks.integer(path, "sensor.jpeg_quality", parts["sensor"].pop("jpeg_quality", 90), 0)
+    if quality > 100:
+        raise InputError(path, "sensor.jpeg_quality", quality, "1 to 100, or 0 for lossless pictures")
     known = replace(profile.arm, arm_from_base=profile.arm.arm_from_base @ se3.make(np.eye(3), arm_offset))
     return Scenario(
         file=path,
@@ -92,7 +96,7 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
         told_rig=_shifted(rig, rig_offset),
         cameras=camera_settings_from_table(path, parts["cameras"], [camera.name for camera in rig.cameras]),
         sensor=sensor_from_table(path, parts["sensor"]),
-        jpeg_quality=min(quality, 100) or None,
+        jpeg_quality=quality or None,
         tracking=_tracking(path, parts["tracking"]),
         arm=arm,
         faults=_faults(path, table.get("faults", [])),
@@ -124,14 +128,19 @@ def _rig(path: Path, table: Table) -> Rig:
     checks.check_keys(path, "rig.", table, (), ("angles_deg", "distance_mm", "focal_px", "size", "distortion"))
     given: dict[str, object] = {}
     if "angles_deg" in table:
-        given["angles_deg"] = tuple(checks.numbers(path, "rig.angles_deg", table["angles_deg"], (None,), "degrees"))
+        angles = checks.numbers(path, "rig.angles_deg", table["angles_deg"], (None,), "degrees")
+        if not 1 <= len(angles) <= MOST_CAMERAS:
+            raise InputError(path, "rig.angles_deg", table["angles_deg"], f"1 to {MOST_CAMERAS} angles")
+        given["angles_deg"] = tuple(angles)
     if "distance_mm" in table:
         given["distance"] = _within(path, "rig.distance_mm", table["distance_mm"], 100, 2000, "mm")
     if "focal_px" in table:
         given["focal"] = _within(path, "rig.focal_px", table["focal_px"], 100, 10_000, "px")
     if "size" in table:
-        width, height = checks.numbers(path, "rig.size", table["size"], (2,), "[width, height] in px")
-        given["size"] = (int(width), int(height))
+        size = checks.numbers(path, "rig.size", table["size"], (2,), "[width, height] in px")
+        if (size != np.rint(size)).any() or size.min() < SIDES[0] or size.max() > SIDES[1]:
+            raise InputError(path, "rig.size", table["size"], f"whole px, {SIDES[0]} to {SIDES[1]}")
+        given["size"] = (int(size[0]), int(size[1]))
     if "distortion" in table:
         given["distortion"] = tuple(checks.numbers(path, "rig.distortion", table["distortion"], (5,), "k1 k2 p1 p2 k3"))
     return arc_rig(**given)  # type: ignore[arg-type]
@@ -164,11 +173,8 @@ def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:
             path, "arm.wire_baud", baud, f"{profile.baud} bits/s, the arm's own, or more; inf for no delay"
         )
     lag = settings.dead_time + settings.servo_lag + LENGTH * BITS_PER_BYTE / baud
-    return (
-        settings,
-        replace(profile, lag=lag if assumed is None else checks.number(path, "arm.assumed_lag_s", assumed)),
-        float(baud),
-    )
+    lag = _within(path, "arm.assumed_lag_s", lag if assumed is None else assumed, 0, LONGEST_LAG, "s")
+    return settings, replace(profile, lag=lag), float(baud)
 
 
 def _tracking(path: Path, table: Table) -> Tracking:
