@@ -9,7 +9,10 @@ from estimation.se3 import Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
-    """Go to the machine axes [X Y Z A B C] (6,), mm and rad, at `feed` mm/s; on the way to `checkpoint`. stamp: s."""
+    """Go to the machine axes [X Y Z A B C] (6,), mm and rad, at `feed` mm/s; on the way to `checkpoint`. stamp: s.
+
+    Of a move that only turns `feed` is in degrees/s, as controllers of arms read it.
+    """
 
     stamp: float
     axes: Array

@@ -30,7 +30,8 @@ STALL = 3.0  # ticks without a call after which the arm has come to rest by itse
 MARGIN = np.array([5.0, 5, 5, *np.deg2rad([2, 2, 2])])  # that targets keep from the bounds: braking needs room
 SHARE = 0.98  # of what the guard tolerates of a pose: the planner brakes before the guard would cut
 PATH_SPEED, PATH_ACCELERATION = 0.5, 0.2  # of the axes' limits, for the path alone; the rest carries the surface
-SLOWEST = 1.0  # mm/s, feed of a move that only turns
+SLOWEST = 1.0  # mm/s, or degrees/s, of any move
+TURNING = 1e-3  # mm: a move shorter than this only turns, and its feed counts degrees/s, as controllers of arms read it
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,8 +224,9 @@ class Planner:
         return Hold(now, self._limits.pause, reason)
 
     def _move(self, now: float, start: Array, axes: Array, extrude: bool) -> Move:
-        feed = max(float(np.linalg.norm(axes[:3] - start[:3])) / self._tick, SLOWEST)
-        return Move(now, axes, feed, self._checkpoint(), extrude)
+        length, turn_deg = float(np.linalg.norm(axes[:3] - start[:3])), np.rad2deg(np.linalg.norm(axes[3:] - start[3:]))
+        speed = (length if length > TURNING else float(turn_deg)) / self._tick
+        return Move(now, axes, min(max(speed, SLOWEST), self._limits.feed), self._checkpoint(), extrude)
 
     def _checkpoint(self) -> int:
         """The checkpoint that the place on the path leads to."""

@@ -16,7 +16,7 @@ from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.scenario_file import read_scenario
 from hardware.simulator.world import REST
 from planning.legs import Phase
-from tests.worlds import IDEAL, Heard, errors, heard, inner, world_of, write_path, write_scenario
+from tests.worlds import HEADER, IDEAL, Heard, errors, heard, inner, world_of, write_path, write_scenario
 
 VELOCITY = np.array([3.0, -2.0, 4.0])  # mm/s of the surface, in the rest frame
 SPEED = 5.0  # mm/s along the path, which is x
@@ -322,3 +322,16 @@ def test_cut_short_within_a_tick_the_rows_until_then_are_given_out(tmp_path: Pat
     with pytest.raises(KeyboardInterrupt):
         world.run()
     assert sink.log.stamps[-1] == pytest.approx(sink.commands[-1].stamp + 0.02, abs=1.1e-3)
+
+
+def test_an_arm_that_only_turns_keeps_pace(tmp_path: Path) -> None:
+    """Its controller reads F of such a move as degrees a minute."""
+    rows = ["0,0,0,0,0,0,5,1,20,0,0", "0,0,0,20,0,0,2,1,20,0,1", "3,0,0,20,0,0,2,1,20,0,1"]
+    (tmp_path / "path.csv").write_text("\n".join([HEADER, *rows]) + "\n")
+    file = write_scenario(tmp_path, IDEAL, seconds=5.0)
+    world = world_of(read_scenario(file), sink := Heard())
+    world.run()
+    assert world.arm.in_flight <= 0.021
+    log = sink.log
+    assert np.rad2deg(errors(file, log).angle[inner(log)].max()) < 0.5
+    assert errors(file, log).distance[inner(log)].max() < 0.06
