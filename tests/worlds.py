@@ -36,12 +36,13 @@ from planning.planner import Progress
 
 HEADER = "x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,speed_mm_s,material,temperature_c,layer,extrude"
 IDEAL = {  # nothing takes time
+    "scene": {"wound": False, "texel_mm": 1.0},
     "cameras": {"fps": 50.0, "exposure_s": 0.0, "transport_s": 0.0},
     "tracking": {"by": "truth", "processing_s": 0},
     "arm": {"file": "arm.toml", "servo_lag_s": 0, "wire_baud": float("inf"), "assumed_lag_s": 0},
 }
 SMALL = {  # pictures of a ninth of the usual size, half as often
-    "scene": {"body": "forearm", "texel_mm": 0.3, "hair": 0},
+    "scene": {"wound": False, "texel_mm": 0.3},
     "rig": {"size": [480, 270], "focal_px": 420},
     "cameras": {"fps": 15.0},
     "arm": {"file": "arm.toml"},

@@ -279,6 +279,7 @@ class World:
         if not self.scenario.beads or not len(ends):
             return
         self._laid = float(ends[-1])
+        self.arm.advance(max(until, self.arm.now))
         extruding = self._ledger.extruding(ends)
         nozzle = nozzle_from_axes(self.scenario.true_arm, self.arm.axes_at(ends))
         places = self._scene.shape.material(self._truth.material(ends, nozzle[:, :3, 3]))

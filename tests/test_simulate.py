@@ -1,0 +1,231 @@
+"""`stillbed simulate` as a whole: the same bytes each time, files that others read, and limits that decide."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.errors import InputError
+from hardware.path_file import read_path
+from hardware.pose_file import PoseTable, read_poses
+from hardware.session import open_session
+from hardware.simulator.default_rig import REST
+from hardware.simulator.nozzle_file import read_nozzle
+from hardware.simulator.scenario_file import read_scenario
+from hardware.simulator.simulate import Options, run_simulation
+from hardware.track import run_track
+from hardware.tum import read_tum
+from tests.worlds import IDEAL, SMALL, write_path, write_scenario
+
+BREATHING = {"kind": "breathing", "amplitude_mm": 2.0, "rate_hz": 0.4}
+FAULTY = {  # whatever chance may bring
+    "cameras": {"drop": 0.03, "duplicate": 0.03, "garble": 0.05, "jitter_s": 0.0005, "exposure_s": 0.004},
+    "arm": {"replies": "stray"},
+}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with pictures and faults, rendered by one thread."""
+    folder = tmp_path_factory.mktemp("recorded")
+    file = write_scenario(folder, SMALL, FAULTY, motion=[BREATHING], seconds=1.4, seed=8, clearance_mm=0.4)
+    run_simulation(file, folder / "one", Options(threads=1))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A finished run without pictures."""
+    folder = tmp_path_factory.mktemp("quick")
+    file = write_scenario(folder, IDEAL, seconds=4.0, limits={"p95_mm": 0.06, "duty": 0.9})
+    outcome = run_simulation(file, folder / "out")
+    assert outcome.met
+    yield folder
+
+
+def same_columns(one: Path, other: Path) -> bool:
+    """Whether two poses.csv agree in all but the milliseconds."""
+    rows = [list(csv.DictReader(file.read_text().splitlines())) for file in (one, other)]
+    kept = [[{k: v for k, v in row.items() if not k.startswith("ms_")} for row in table] for table in rows]
+    return kept[0] == kept[1]
+
+
+# -- the same bytes
+
+
+def test_two_runs_and_any_number_of_threads_give_the_same_bytes(recorded: Path) -> None:
+    run_simulation(recorded / "scenario.toml", recorded / "two", Options(threads=2))
+    one, two = recorded / "one", recorded / "two"
+    names = sorted(str(file.relative_to(one)) for file in one.rglob("*") if file.is_file())
+    assert names == sorted(str(file.relative_to(two)) for file in two.rglob("*") if file.is_file())
+    timed = {"report.html", *(f"tracking/{name}" for name in ("poses.csv", "report.html", "summary.json"))}
+    differing = {name for name in names if (one / name).read_bytes() != (two / name).read_bytes()}
+    assert differing <= timed  # these tell how long it took
+    assert same_columns(one / "tracking" / "poses.csv", two / "tracking" / "poses.csv")
+    assert sum(name.endswith(".jpg") for name in names) > 40
+
+
+def test_another_seed_gives_other_pictures_and_other_errors(recorded: Path) -> None:
+    tremor = [BREATHING, {"kind": "tremor", "rms_mm": [0.1, 0.1, 0.1]}]
+    file = write_scenario(recorded, SMALL, motion=tremor, seconds=0.3, seed=6, clearance_mm=0.4, name="other.toml")
+    run_simulation(file, recorded / "other", Options(threads=1))
+    for name in ("session/cam_0/000001.jpg", "nozzle.csv", "session/truth.tum"):
+        assert (recorded / "one" / name).read_bytes() != (recorded / "other" / name).read_bytes()
+
+
+# -- what is measured
+
+
+def test_with_pictures_too_an_offset_planted_in_the_rig_comes_out_as_that_offset(tmp_path: Path) -> None:
+    offset = [0.2, -0.1, 0.3]
+    change = {"scene": {"nozzle": False}, "planted": {"rig_offset_mm": offset}}
+    run_simulation(write_scenario(tmp_path, SMALL, change, seconds=1.8, clearance_mm=0.4), tmp_path / "out")
+    table = read_nozzle(tmp_path / "out" / "nozzle.csv")
+    off = (table.nozzle - table.target)[table.extrude]
+    assert len(off) > 300
+    assert off[-300:].mean(axis=0) == pytest.approx(offset, abs=0.05)
+
+
+# -- what others read
+
+
+def test_the_session_tracks_to_the_very_poses_of_the_run(recorded: Path, tmp_path: Path) -> None:
+    for kind in ("session", "session.mcap"):
+        run_track(recorded / "one" / kind, tmp_path / kind)
+        assert same_columns(tmp_path / kind / "poses.csv", recorded / "one" / "tracking" / "poses.csv")
+
+
+def test_the_truth_holds_every_exposure_and_each_pose_is_near_it(recorded: Path) -> None:
+    out = recorded / "one"
+    scenario = read_scenario(recorded / "scenario.toml")
+    truth = read_tum(out / "session" / "truth.tum", exact=True)
+    assert (np.diff(truth.stamps) > 0).all()
+    exact = scenario.rest @ scenario.motion(truth.stamps)
+    assert truth.base_from_surface == pytest.approx(exact, abs=1e-6)
+    exposed = 0.1 + np.arange(int(1.3 * 15)) / 15  # no clock offsets: a set's mid-exposure
+    assert np.abs(truth.stamps[:, None] - exposed).min(axis=0).max() < 1e-8
+    session = open_session(out / "session")
+    assert session.truth is not None
+    assert len(session.truth.stamps) == len(truth.stamps)
+
+
+def test_folder_and_mcap_hold_the_same_session(recorded: Path) -> None:
+    folder, mcap = (open_session(recorded / "one" / name) for name in ("session", "session.mcap"))
+    assert len(folder) == len(mcap)
+    for one, other in zip(folder.frame_sets(), mcap.frame_sets(), strict=True):
+        assert [f.camera for f in one.frames] == [f.camera for f in other.frames]
+        assert one.stamp == pytest.approx(other.stamp, abs=1e-8)
+        assert all(np.array_equal(a.image, b.image) for a, b in zip(one.frames, other.frames, strict=True))
+    assert len(folder.roi) == len(mcap.roi) == 3
+
+
+def test_poses_are_those_of_the_told_surface_and_tracked(recorded: Path) -> None:
+    poses: PoseTable = read_poses(recorded / "one" / "tracking" / "poses.csv")
+    assert poses.measured.mean() > 0.8
+    summary = json.loads((recorded / "one" / "summary.json").read_text())
+    assert summary["tracking_mm"]["max"] < 0.3
+    assert summary["complete"]
+
+
+def test_the_frames_that_were_sent_are_those_of_the_commands(recorded: Path) -> None:
+    out = recorded / "one"
+    commands = out.joinpath("commands.csv").read_text().splitlines()[1:]
+    assert out.joinpath("frames.bin").stat().st_size == 48 * len(commands)
+    table = read_nozzle(out / "nozzle.csv")
+    assert np.allclose(table.stamps, np.arange(1, 1401) / 1000, atol=1e-9)
+    assert table.extrude.any()
+
+
+def test_what_arrives_damaged_beyond_decoding_is_told_and_left_out(tmp_path: Path) -> None:
+    change = {"cameras": {"fps": 15.0, "garble": 1.0}, "scene": {"wound": False, "texel_mm": 1.0}}
+    file = write_scenario(tmp_path, SMALL, change, seconds=0.8, rig={"size": [160, 90], "focal_px": 150})
+    run_simulation(file, tmp_path / "out", Options(threads=1))
+    session = open_session(tmp_path / "out" / "session")
+    assert 0 < sum(len(refs) for refs in session.sets) < 3 * 11
+    assert all(frame.image.shape == (90, 160, 3) for frames in session.frame_sets() for frame in frames.frames)
+    assert len(read_nozzle(tmp_path / "out" / "nozzle.csv")) == 800
+
+
+def test_a_perfect_loop_meets_its_limits_and_says_so(quick: Path) -> None:
+    out = quick / "out"
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["met"] and summary["finished"] and summary["complete"]
+    assert summary["errors"]["position_mm"]["p95"] < 0.06
+    assert "All 2 limits were met" in " ".join(summary["verdict"])
+    for name in ("report.html", "arm.toml", "scenario.toml", "tracking/report.html", "commands.csv", "watch.html"):
+        assert (out / name).stat().st_size > 100
+    assert not (out / "session").exists()  # there are no pictures
+    assert (out / "scenario.toml").read_text() == (quick / "scenario.toml").read_text()
+
+
+def test_a_limit_that_is_missed_is_told(quick: Path) -> None:
+    file = write_scenario(quick, IDEAL, seconds=2.0, limits={"p95_mm": 1e-6, "duty": 0.1}, name="strict.toml")
+    outcome = run_simulation(file, quick / "strict")
+    assert not outcome.met
+    assert "1 of 2 limits missed: position error, 95 %" in outcome.text
+    assert "MISSED  p95_mm" in outcome.text
+    assert "met     duty" in outcome.text
+
+
+def test_the_pty_carries_the_same_bytes(quick: Path) -> None:
+    run_simulation(quick / "scenario.toml", quick / "pty", Options(pty=True))
+    for name in ("frames.bin", "nozzle.csv", "commands.csv"):
+        assert (quick / "pty" / name).read_bytes() == (quick / "out" / name).read_bytes()
+
+
+def test_a_trace_is_simulated_instead_of_the_scenarios_own_motion(quick: Path) -> None:
+    trace = quick / "moved.tum"
+    trace.write_text("".join(f"{t / 10} 0 {2 * np.sin(t / 10)} 0 0 0 0 1\n" for t in range(60)))
+    run_simulation(quick / "scenario.toml", quick / "traced", Options(trace=trace))
+    moved, still = (read_nozzle(quick / name / "nozzle.csv") for name in ("traced", "out"))
+    along = REST[:3, 1]
+    assert np.nanmax(moved.target @ along) > np.nanmax(still.target @ along) + 1.0
+
+
+# -- what is refused
+
+
+def refused(file: Path, out: Path, words: str, options: Options | None = None) -> None:
+    with pytest.raises(InputError, match=words):
+        run_simulation(file, out, options)
+    assert not out.exists()  # nothing is made for what makes no sense
+
+
+def test_what_makes_no_sense_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    file, out = write_scenario(tmp_path, IDEAL), tmp_path / "out"
+    refused(tmp_path / "none.toml", out, r"none\.toml")
+    refused(file, out, "--threads = 0", Options(threads=0))
+    refused(file, out, r"gone\.tum", Options(trace=tmp_path / "gone.tum"))
+    refused(write_scenario(tmp_path, IDEAL, path="gone.csv"), out, r"gone\.csv")
+    refused(write_scenario(tmp_path, IDEAL, scene={"body": "whale"}), out, r"scenario\.toml: scene\.body = 'whale'")
+    refused(write_scenario(tmp_path, IDEAL, scene={"tone": 2}), out, r"scenario\.toml: scene\.tone")
+    refused(write_scenario(tmp_path, IDEAL, scene={"scan": "gone.ply"}), out, r"gone\.ply")
+
+
+def test_a_path_outside_of_the_surface_is_refused(tmp_path: Path) -> None:
+    write_path(tmp_path / "path.csv", [[0, 0, 0], [0, 90, 0]])
+    refused(write_scenario(tmp_path, IDEAL, clearance_mm=0.4), tmp_path / "out", r"path\.csv: a place on the path")
+
+
+def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path) -> None:
+    file = write_scenario(tmp_path, IDEAL, seconds=0.2)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="--force"):
+        run_simulation(file, tmp_path / "out")
+    assert [f.name for f in (tmp_path / "out").iterdir()] == ["mine.txt"]
+    run_simulation(file, tmp_path / "out", Options(force=True))
+    assert (tmp_path / "out" / "mine.txt").exists()
+
+
+def test_a_run_in_which_nothing_could_be_printed_has_a_report(tmp_path: Path) -> None:
+    outcome = run_simulation(write_scenario(tmp_path, IDEAL, seconds=0.15), tmp_path / "out")
+    assert "Nothing was printed" in outcome.text
+    assert (tmp_path / "out" / "report.html").exists()
+    path = read_path(tmp_path / "path.csv")
+    assert len(path) == 2
