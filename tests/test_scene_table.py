@@ -47,6 +47,15 @@ def test_a_scan_is_read_beside_the_file_and_keeps_its_frame(tmp_path: Path) -> N
     assert scene.shape.inside is not None
 
 
+def test_a_scan_that_is_closed_has_no_outside_and_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("open3d")
+    corners = np.array([[0.0, 0, 0], [40, 0, 0], [0, 40, 0], [0, 0, 40]])
+    write_ply(tmp_path / "scan.ply", corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+    with pytest.raises(InputError, match="mean normal") as caught:
+        scene_from_table("a.toml", {**COARSE, "scan": "scan.ply"}, tmp_path, 0)
+    assert caught.value.where == str(tmp_path / "scan.ply")
+
+
 @pytest.mark.parametrize(
     ("table", "what"),
     [
@@ -64,9 +73,9 @@ def test_a_scan_is_read_beside_the_file_and_keeps_its_frame(tmp_path: Path) -> N
         ({"wound_size_mm": [30, 4.99]}, "scene.wound_size_mm"),
         ({"wound_depth_mm": 8.01}, "scene.wound_depth_mm"),
         ({"deformation": {"bulge": 1.0}}, "scene.deformation.bulge"),
-        ({"deformation": {"bulge_mm": 30.01}}, "deformation.bulge"),
-        ({"deformation": {"stretch": [0.51, 0]}}, "deformation.stretch"),
-        ({"deformation": {"radius_mm": 4.99}}, "deformation.radius"),
+        ({"deformation": {"bulge_mm": 30.01}}, "scene.deformation.bulge_mm"),
+        ({"deformation": {"stretch": [0.51, 0]}}, "scene.deformation.stretch"),
+        ({"deformation": {"radius_mm": 4.99}}, "scene.deformation.radius_mm"),
         ({"deformation": 3}, "scene.deformation"),
         ({"scan": "missing.ply"}, "scan"),
     ],
@@ -83,14 +92,15 @@ def test_wrong_values_are_named(table: dict[str, Any], what: str) -> None:
     [
         ({"noise": 50.01}, "noise"),
         ({"vignetting": -0.01}, "vignetting"),
-        ({"blur_px": 10.01}, "blur"),
+        ({"blur_px": 10.01}, "blur_px"),
+        ({"blur_px": float("nan")}, "blur_px"),
         ({"iso": 1}, "iso"),
     ],
 )
 def test_wrong_sensors_are_named(table: dict[str, Any], what: str) -> None:
     with pytest.raises(InputError) as caught:
         sensor_from_table("a.toml", table)
-    assert what in caught.value.what
+    assert caught.value.what == f"sensor.{what}"
     assert caught.value.where == "a.toml"
 
 

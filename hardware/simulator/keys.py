@@ -19,6 +19,7 @@ class Keys:
     """Takes values out of a table. where: the file. prefix: in front of each key in an error ("motion[0].").
 
     A key without a default must be there. `done` is called last: it refuses every key that was not asked for.
+    asked: so far, and whatever else may be there.
     """
 
     where: object
@@ -68,12 +69,21 @@ class Keys:
 
     def band(self, key: str, default: tuple[float, float]) -> tuple[float, float]:
         """Two numbers, 0 < low < high."""
-        if not self._take(key, False):
-            return default
-        low, high = checks.numbers(self.where, self.prefix + key, self.table[key], (2,))
+        low, high = self.pair(key, default)
         if not 0 < low < high:
             raise self.wrong(key, "[low, high], 0 < low < high")
-        return float(low), float(high)
+        return low, high
+
+    def pair(
+        self, key: str, default: tuple[float, float], low: float = -math.inf, high: float = math.inf
+    ) -> tuple[float, float]:
+        """Two finite numbers from low to high."""
+        if not self._take(key, False):
+            return default
+        first, second = checks.numbers(self.where, self.prefix + key, self.table[key], (2,))
+        if not (low <= min(first, second) and max(first, second) <= high):
+            raise self.wrong(key, f"2 numbers, each {_range(low, high, False)}")
+        return float(first), float(second)
 
     def list_of_numbers(self, key: str, default: Sequence[float]) -> Array:
         """One finite number or more (N,)."""

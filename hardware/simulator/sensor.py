@@ -14,6 +14,7 @@ from hardware.simulator.field import Field, blurred
 from perception.frames import Image
 
 ROOM = 256  # px by which the stored grain is larger than an image, so that each image takes another cut of it
+NOISE, VIGNETTING, BLUR = 50.0, 2.0, 10.0  # the most of each; more is no camera
 STRIP = 48  # rows developed at once: they stay in the cache
 
 
@@ -31,11 +32,9 @@ class Sensor:
     blur: float = 0.45
 
     def __post_init__(self) -> None:
-        for name, value, high in (("noise", self.noise, 50.0), ("vignetting", self.vignetting, 2.0)):
-            if not 0 <= value <= high:
-                raise InputError("sensor", name, value, f"0 to {high:g}")
-        if not 0 <= self.blur <= 10:
-            raise InputError("sensor", "blur", self.blur, "0 to 10 px")
+        for name, most in (("noise", NOISE), ("vignetting", VIGNETTING), ("blur", BLUR)):
+            if not 0 <= getattr(self, name) <= most:
+                raise InputError("sensor", name, getattr(self, name), f"0 to {most:g}")
 
 
 def vignette(camera: Camera, sensor: Sensor) -> Field:

@@ -11,11 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
 from estimation import se3
+from estimation.errors import InputError
 from estimation.ray_cast import cast
 from estimation.scan import Scan, face_areas, face_normals, scan_from_triangles
 from estimation.se3 import Array
 
 STEP = 0.25  # mm between nodes: a wound's rim rises over 2 mm
+LEAST_FACING = 0.1  # mean of a scan's normals by area: a closed body's is 0, and no plane is its mean plane
 FAR = 1e7  # mm: rays from there are parallel to 1e-5 rad over a body, 0.1 um across a scan
 
 
@@ -128,7 +130,7 @@ def shape_from_scan(vertices: ArrayLike, triangles: ArrayLike, step: float = STE
 
     The grid lies in the mean plane of the triangles (their normals' mean, weighted by area), its origin at their mean.
     Each node takes the outermost height above it, so that what an overhang hides is left out; nodes over holes and
-    beyond the rim are not `valid` and are not drawn.
+    beyond the rim are not `valid` and are not drawn. InputError for a body that is closed: it faces no way.
     """
     scan = scan_from_triangles(vertices, triangles)
     surface_from_grid = _mean_plane(scan)
@@ -154,8 +156,12 @@ def _mean_plane(scan: Scan) -> Array:
     Of the four ways to lay them, x is the one nearest to the scan's own x (its y where that stands upright).
     """
     areas = face_areas(scan)
-    z = areas @ face_normals(scan)
-    z /= np.linalg.norm(z)
+    z = areas @ face_normals(scan) / areas.sum()
+    facing = float(np.linalg.norm(z))
+    if facing < LEAST_FACING:
+        allowed = f"{LEAST_FACING:g} or more: a surface seen from one side, no closed body"
+        raise InputError("scan", "length of its mean normal", f"{facing:.2g}", allowed)
+    z /= facing
     x = np.eye(3)[0 if abs(z[0]) < 0.9 else 1]
     x = x - (x @ z) * z
     x /= np.linalg.norm(x)
