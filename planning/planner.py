@@ -15,7 +15,7 @@ import numpy as np
 from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from planning.command import Command, Hold, Move
+from planning.command import TURNING, Command, Hold, Move
 from planning.curve import Curve, curve_through
 from planning.follow import LEAD, Follower
 from planning.kinematics import SimpleArm, axes_from_nozzle, nozzle_from_axes
@@ -31,7 +31,6 @@ MARGIN = np.array([5.0, 5, 5, *np.deg2rad([2, 2, 2])])  # that targets keep from
 SHARE = 0.98  # of what the guard tolerates of a pose: the planner brakes before the guard would cut
 PATH_SPEED, PATH_ACCELERATION = 0.5, 0.2  # of the axes' limits, for the path alone; the rest carries the surface
 SLOWEST = 1.0  # mm/s, or degrees/s, of any move
-TURNING = 1e-3  # mm: a move shorter than this only turns, and its feed counts degrees/s, as controllers of arms read it
 
 
 @dataclass(frozen=True, slots=True)

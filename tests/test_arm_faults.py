@@ -14,7 +14,7 @@ from estimation.errors import InputError
 from hardware.protocol import G4, Pause, encode
 from hardware.simulator.arm_faults import ArmFault, FaultKind, FaultyLine, Rates, fault_from_text
 from hardware.simulator.arm_settings import ArmSettings, Replies
-from tests.virtual_arm import IDEAL, axes_at, move, virtual_arm
+from tests.virtual_arm import IDEAL, axes_at, motion, move, virtual_arm
 
 
 def fault(text: str) -> ArmFault:
@@ -223,6 +223,6 @@ def test_faults_are_the_same_for_a_seed() -> None:
         arm = virtual_arm(ArmSettings(seed=seed), fault("garble for 2s"))
         for now in np.arange(0, 3, 0.02):
             arm.receive(move(10.0, x=202.5 + now), now)
-        return arm.log()[1].tobytes()
+        return motion(arm)[1].tobytes()
 
     assert garbled(3) == garbled(3) != garbled(4)

@@ -14,7 +14,8 @@ from hardware.protocol import G1, G4, G54, THESIS, ControllerReset, Dialect, Mod
 from hardware.replies import ReplyKind, reply_stream
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.controller import VirtualArm
-from tests.virtual_arm import HOME, IDEAL, axes_at, move, virtual_arm
+from planning.command import TURNING
+from tests.virtual_arm import HOME, IDEAL, axes_at, motion, move, virtual_arm
 
 step = st.integers(-160, 160).map(lambda eighths: eighths / 8)  # exact in binary32
 targets = st.lists(step, min_size=6, max_size=6).map(lambda s: HOME + np.array([*s[:3], *np.deg2rad(s[3:])]))
@@ -78,8 +79,15 @@ def test_neither_the_split_of_bytes_nor_who_looks_when_changes_the_motion(
         arm.advance(now + 1)
     sent, got = plain.transmit(now + 1), got + watched.transmit(now + 1)
     assert sent == got
-    assert plain.log()[1].tobytes() == watched.log()[1].tobytes()
+    assert motion(plain)[1].tobytes() == motion(watched)[1].tobytes()
     assert (plain.frames, plain.ignored, plain.underruns) == (watched.frames, watched.ignored, watched.underruns)
+
+
+@pytest.mark.parametrize("length", [0.0, 0.5 * TURNING])
+def test_a_turn_with_next_to_no_way_takes_the_time_that_its_feed_in_degrees_says(length: float) -> None:
+    arm = virtual_arm()
+    arm.receive(move(25.0, x=HOME[0] + length, c=0.5), 0.0)  # 0.5 degrees at 25 degrees/s
+    assert arm.in_flight == pytest.approx(0.02)
 
 
 @settings(max_examples=60)
@@ -104,7 +112,7 @@ def test_the_setpoint_has_no_jump_and_keeps_the_top_speeds(script: list[tuple[fl
         now += wait
         arm.receive(encode(command), now)
     arm.advance(now + 5)
-    stamps, axes = arm.log()
+    stamps, axes = motion(arm)
     change = np.diff(axes, axis=0) / np.diff(stamps)[:, None]
     assert np.linalg.norm(change[:, :3], axis=1).max() <= 250 * (1 + 1e-6)
     assert np.abs(change[:, 3:]).max() <= np.pi * (1 + 1e-6)
@@ -121,7 +129,7 @@ def test_noise_between_frames_changes_no_motion(script: list[tuple[float, G1]], 
         noisy.receive(noise + encode(command), now)
     for arm in plain, noisy:
         arm.advance(now + 1)
-    assert plain.log()[1].tobytes() == noisy.log()[1].tobytes()
+    assert motion(plain)[1].tobytes() == motion(noisy)[1].tobytes()
     assert b"".join(data for _, data in noisy.garbage) == noise * len(script)
 
 

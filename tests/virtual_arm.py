@@ -30,3 +30,9 @@ def axes_at(arm: VirtualArm, *instants: float) -> Array:
     """Executed axes (N, 6), X Y Z in mm and A B C in degrees; time passes as far as needed."""
     arm.advance(max(arm.now, *instants))
     return arm.axes_at(np.array(instants)) * np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
+
+
+def motion(arm: VirtualArm) -> tuple[Array, Array]:
+    """Every millisecond so far: stamps (N,), s, and executed axes (N, 6), mm and rad."""
+    stamps = np.minimum(np.arange(int(arm.now / 0.001 + 1e-6) + 1) * 0.001, arm.now)
+    return stamps, arm.axes_at(stamps)

@@ -38,10 +38,9 @@ from hardware.simulator.arm_faults import ArmFault, FaultyLine, Rates
 from hardware.simulator.arm_settings import ArmSettings
 from hardware.simulator.polyline import AXES, Polyline
 from hardware.simulator.servo import Servo
+from planning.command import TURNING
 
-LOG_STEP = 0.001  # s
 NEXT = 1e-5  # s: a move that comes this late after the last one still follows it without a stop
-STILL = 1e-4  # mm: a shorter way is none; binary32 resolves 6e-5 mm at 1 m
 
 
 class VirtualArm:
@@ -108,17 +107,6 @@ class VirtualArm:
         """Executed axes (N, 6), mm and rad, at instants (N,), s, that are not in the future."""
         assert (instants <= self.now).all()
         return self._servo.at(instants, self.now)
-
-    def setpoint_at(self, instants: Array) -> Array:
-        """Axes (N, 6) that the interpolation gives to the servos, likewise."""
-        assert (instants <= self.now).all()
-        return self._setpoint.at(instants)
-
-    def log(self) -> tuple[Array, Array]:
-        """Every millisecond up to now: stamps (N,), s, and executed axes (N, 6), mm and rad."""
-        stamps = np.arange(int(self.now / LOG_STEP + 1e-6) + 1, dtype=np.float64) * LOG_STEP
-        stamps[-1] = min(stamps[-1], self.now)
-        return stamps, self.axes_at(stamps)
 
     @property
     def queued(self) -> int:
@@ -199,9 +187,9 @@ class VirtualArm:
 
 
 def _duration(way: Array, feed: float, settings: ArmSettings) -> float:
-    """Seconds that a move along `way` (6,), mm and rad, takes at `feed` mm/s, or degrees/s where nothing but angles."""
+    """Seconds that a move along `way` (6,), mm and rad, takes at `feed` mm/s, or degrees/s if it only turns."""
     length, turns = float(np.linalg.norm(way[:3])), np.abs(way[3:])
-    if length > STILL or not turns.any():
+    if length > TURNING or not turns.any():
         asked = length / min(feed, settings.top_speed)
     else:
         asked = max(float(np.linalg.norm(turns)) / float(np.deg2rad(feed)), length / settings.top_speed)

@@ -16,11 +16,12 @@ from hardware.arm_profile import BITS_PER_BYTE, ArmProfile
 from hardware.clock import Clock, WallClock
 from hardware.simulator.arm_faults import ArmFault
 from hardware.simulator.arm_settings import ArmSettings
-from hardware.simulator.controller import LOG_STEP, VirtualArm
+from hardware.simulator.controller import VirtualArm
 from hardware.simulator.pty_link import open_pty
 
 HEADER = "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg"
 PERIOD = 0.002  # s between looks at the line; a frame takes 4 ms
+LOG_STEP = 0.001  # s
 _ROWS = 10_000  # of the log at once
 
 
@@ -64,7 +65,7 @@ def run_virtual_arm(
 def write_motion(path: Path, arm: VirtualArm) -> None:
     """Write the executed axes, a line each millisecond, as CSV."""
     units = np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
-    size = int(arm.now / LOG_STEP) + 1
+    size = int(arm.now / LOG_STEP + 1e-6) + 1  # a whole number of steps may come out just below it
     with path.open("w", encoding="utf-8") as file:
         file.write(HEADER + "\n")
         for start in range(0, size, _ROWS):
