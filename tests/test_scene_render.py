@@ -19,10 +19,12 @@ from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.deformation import Deformation
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look, plain
+from hardware.simulator.motions import Motion
 from hardware.simulator.render import render
 from hardware.simulator.scene import Scene, rois
 from hardware.simulator.sensor import Sensor
 from hardware.simulator.shape import cylinder, flat, shape_from_scan
+from hardware.simulator.truth import Truth
 from perception.frames import Image
 
 TEXEL = 0.15  # mm
@@ -80,7 +82,9 @@ def projected(scene: Scene, camera: Camera, at: Instant) -> Array:
     step = SIGMA / 4
     spread = np.stack(np.meshgrid(*[np.arange(-16, 17) * step] * 2), -1)  # (33, 33, 2)
     points = (centres()[:, None, None] + spread).reshape(-1, 2)
-    surface = scene.displaced(scene.shape.points(points), at.strain)
+    surface = scene.shape.points(points)
+    truth = Truth(REST, Motion(()), scene.deformation, None, scene.shape.surface_from_grid)
+    surface = surface + truth.displacement(surface, np.full(len(surface), at.strain))
     pixels, _ = pixels_from_points(camera, se3.transform_points(at.base_from_surface, surface))
     pixels = pixels.reshape(-1, *spread.shape)
     across, down = np.gradient(pixels, axis=2), np.gradient(pixels, axis=1)

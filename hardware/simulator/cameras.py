@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -68,9 +67,6 @@ class SimulatedCameras:
         rng = np.random.default_rng([seed, GAIN_STREAM])
         self._gain_phases = rng.uniform(0, 2 * math.pi, len(settings.phases)).tolist()
 
-    def __len__(self) -> int:
-        return len(self.settings.phases)
-
     def shots(self, camera: int, until: float = math.inf) -> Iterator[Shot]:
         """A camera's frames in order, those that are due before `until`, s, true time; without it they never end.
 
@@ -83,12 +79,6 @@ class SimulatedCameras:
                 arrival = shot.arrival
             yield shot
             number += 1
-
-    def arrivals(self, until: float = math.inf) -> Iterator[Shot]:
-        """What arrives of all cameras, in order of arrival; `until` as in `shots`."""
-        streams = [self.shots(camera, until) for camera in range(len(self))]
-        merged = heapq.merge(*(_delivered(s) for s in streams), key=lambda shot: (shot.arrival, shot.camera))
-        yield from merged
 
     def due(self, camera: int, number: int) -> float:
         """True middle, s, of a camera's exposure."""
@@ -130,10 +120,6 @@ class SimulatedCameras:
         drift = math.sin(2 * math.pi * exposed / settings.gain_period + self._gain_phases[camera])
         light = math.sin(2 * math.pi * settings.flicker_hz * exposed) * np.sinc(settings.flicker_hz * settings.exposure)
         return float((1 + settings.gain_drift * drift) * (1 + settings.flicker * light))
-
-
-def _delivered(shots: Iterator[Shot]) -> Iterator[Shot]:
-    return (shot for shot in shots if shot.fate is not Fate.DROPPED)
 
 
 def garble(data: bytes, rng: np.random.Generator) -> bytes:

@@ -6,7 +6,6 @@ import threading
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
 
 from estimation import se3
 from estimation.rig import Camera, Rig, pixels_from_points
@@ -65,16 +64,6 @@ class Scene:
             return self.shape.size
         half = paint.half_opening(self.shape)
         return 2 * half[0], 2 * half[1]
-
-    def displaced(self, points_surface: ArrayLike, amount: float) -> Array:
-        """Where points (N, 3) mm of the surface at rest are under `amount` of the deformation; both surface frame."""
-        grid = se3.transform_points(se3.inverse(self.shape.surface_from_grid), points_surface)
-        return se3.transform_points(self.shape.surface_from_grid, grid + self.deformation.displacement(grid, amount))
-
-    def at_rest(self, points_surface: ArrayLike, amount: float) -> Array:
-        """The inverse of `displaced`."""
-        grid = se3.transform_points(se3.inverse(self.shape.surface_from_grid), points_surface)
-        return se3.transform_points(self.shape.surface_from_grid, self.deformation.undo(grid, amount))
 
     def view(self, camera: Camera) -> View:
         """What stays the same between the pictures of one camera."""
