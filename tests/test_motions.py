@@ -206,7 +206,7 @@ def test_a_waveform_alone_has_unit_height() -> None:
         ({"kind": "ramp", "speed_mm_s": [1, 0, 0], "back": True}, "motion[0].end_s", "back = true"),
         ({"kind": "ramp", "speed_mm_s": [1, 0, 0], "back": 1}, "motion[0].back", "true or false"),
         ({"kind": "turn", "angles_deg": []}, "motion[0].angles_deg", "one number or more"),
-        ({"kind": "constant", "travel_s": 0}, "motion[0].travel_s", "> 0"),
+        ({"kind": "constant", "travel_s": 0}, "motion[0].travel_s", ">= 0.001"),
         ({"kind": "trace"}, "motion[0].file", "this key"),
     ],
 )

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
 from estimation.se3 import Array
-from hardware.simulator.nozzle_error import row_step
-from hardware.simulator.nozzle_log import NozzleLog
+from hardware.simulator.nozzle_log import NozzleLog, row_step
 from hardware.simulator.planned_line import PlannedLine
 
 CELL = 0.1  # mm

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from estimation.se3 import Array
 from hardware.chart import stretches
-from hardware.simulator.nozzle_log import NozzleLog
+from hardware.simulator.nozzle_log import NozzleLog, row_step
 
 SEARCH = 0.25  # s, the largest shift tried; a loop later than this follows nothing that breathes
 COARSE = 0.01  # s between the shifts first tried
@@ -39,7 +39,7 @@ def lag_of(log: NozzleLog) -> Lag:
     """
     if len(log) < 3:
         return _nothing()
-    step = float(np.median(np.diff(log.stamps)))
+    step = row_step(log)
     most, stride = round(SEARCH / step), max(1, round(COARSE / step))
     rows = _rows(log, step, most)
     nozzle, target = log.base_from_nozzle[:, :3, 3], log.base_from_target[:, :3, 3]

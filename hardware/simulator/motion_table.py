@@ -117,7 +117,7 @@ def _sine(keys: Keys, rng: Random) -> Waveform:
 
 
 def _steps(keys: Keys, rng: Random) -> Waveform:
-    every = keys.number("every_s", 2.0, 0, open=True)
+    every = keys.number("every_s", 2.0, 1e-3)
     rise = keys.number("rise_s", min(0.05, every), 1e-3, every)
     first = keys.number("start_s", every, 0)
     return Steps(first, every, rise, keys.word("pattern", ["turns", "stairs"], "turns") == "stairs")
@@ -184,7 +184,7 @@ def _constant(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
     unit, speed = keys.number("unit_mm", UNIT_MM, 0, open=True), keys.number("speed_units_s", 0.3)
     turn = math.radians(keys.number("turn_deg_s", math.degrees(0.3)))
     along, about = (keys.vector(name, (1.0, 1.0, 1.0)) for name in ("direction", "axis"))
-    travel = keys.number("travel_s", 1.0, 0, open=True)
+    travel = keys.number("travel_s", 1.0, 1e-3)
     rounding = keys.number("round_s", min(0.2, travel), 1e-3, 2 * travel)
     return Driven((Zigzag(travel, rounding),), np.concatenate([turn * about, unit * speed * along])[None], pivot)
 

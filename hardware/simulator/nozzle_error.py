@@ -14,7 +14,7 @@ from estimation.se3 import Array
 from hardware.evaluation import Spread, spread
 from hardware.simulator.hold_reasons import Holds, HoldSpan, hold_spans, holds_of
 from hardware.simulator.lag import Lag, lag_of
-from hardware.simulator.nozzle_log import NozzleLog
+from hardware.simulator.nozzle_log import NozzleLog, row_step
 from hardware.simulator.planned_line import PlannedLine
 
 NEAR = 0.5  # mm: what a thin bead forgives
@@ -26,9 +26,10 @@ class NozzleErrors:
     """The error in each of N rows of a log; NaN where no target was due.
 
     vector: (N, 3) mm, nozzle less target, in the surface frame. split: (N, 3) mm, the same along the path (ahead is
-    positive), across it (to the left) and along the target's normal (away from the surface). angle: (N,) rad between
-    the nozzle's axis and the target's. path: (N,) mm from the tip to the nearest place that is printed, whenever that
-    is due, and known without a target too; NaN where the path prints nothing.
+    positive), across it (to the left) and along the target's axis (back into the tool), which is the surface's normal
+    as far as the path says so. angle: (N,) rad between the nozzle's axis and the target's. path: (N,) mm from the tip
+    to the nearest place that is printed, whenever that is due, and known without a target too; NaN where the path
+    prints nothing.
     """
 
     vector: Array
@@ -133,11 +134,6 @@ def nozzle_figures(log: NozzleLog, line: PlannedLine, errors: NozzleErrors) -> N
         holds=holds_of(spans),
         spans=tuple(spans),
     )
-
-
-def row_step(log: NozzleLog) -> float:
-    """How long a row lasts, s."""
-    return float(np.median(np.diff(log.stamps))) if len(log) > 1 else 0.0
 
 
 def _duty(extruded: int, printing: int, rows: int, line: PlannedLine) -> float:

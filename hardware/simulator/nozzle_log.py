@@ -36,6 +36,11 @@ class NozzleLog:
         return len(self.stamps)
 
 
+def row_step(log: NozzleLog) -> float:
+    """How long a row lasts, s; 0 where there are not two."""
+    return float(np.median(np.diff(log.stamps))) if len(log) > 1 else 0.0
+
+
 def joined(logs: Sequence[NozzleLog]) -> NozzleLog:
     """One log of several that follow each other."""
     columns = (np.concatenate([getattr(log, f.name) for log in logs]) for f in fields(NozzleLog))

@@ -13,7 +13,8 @@ from hardware.chart import Plot, stretches, thinned
 from hardware.page import area_key, document, figures_table, legend, line_key, row_of_tiles, section, tile
 from hardware.report import HALF, WIDTH, sections
 from hardware.simulator.lag import Lag
-from hardware.simulator.nozzle_error import NEAR, row_step
+from hardware.simulator.nozzle_error import NEAR
+from hardware.simulator.nozzle_log import row_step
 from hardware.simulator.nozzle_run import NozzleResult
 from hardware.simulator.nozzle_summary import (
     HEADS,
@@ -180,7 +181,7 @@ def _parts(result: NozzleResult) -> str:
         plot = Plot(WIDTH, 156 if i == 3 else 140, _span(log.stamps), y, label=name, x_ticks=i == 3)
         _line(plot, log.stamps, value, f"series c{i}")
         plots.append(plot.svg())
-    text = "Ahead, to the left and away from the surface are positive; the angle is between the nozzle and the normal."
+    text = "Ahead, to the left and out of the surface are positive; the angle is that to the axis of the target."
     return section("Parts of the error", text, "".join(plots))
 
 

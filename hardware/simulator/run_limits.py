@@ -1,11 +1,18 @@
 """What a run must reach: the [limits] of a scenario, each a figure and a bound, and whether it was met.
 
     [limits]
-    p95_mm = 0.5        # of the position error while extruding; rms_mm, p99_mm, max_mm likewise
-    duty = 0.8          # at least; as are coverage and near
-    lag_ms = 20         # whether late or early
+    p95_mm = 0.5            # of the position error while extruding; median_mm, rms_mm, p99_mm, max_mm likewise
+    normal_p95_mm = 0.3     # of its part along the target's axis
+    path_p95_mm = 0.3       # of the distance from the printed line, whenever; path_max_mm likewise
+    angle_p95_deg = 2       # between the nozzle's axis and the target's; angle_max_deg likewise
+    near = 0.9              # at least; share of the extruding time with an error under 0.5 mm
+    duty = 0.8              # at least
+    hold_s = 1.0            # the longest
+    lag_ms = 20             # whether late or early
+    coverage = 0.9          # at least; gaps, overlap and outside at most
+    tracking_p95_mm = 0.3   # of the estimated surface, from the start; tracking_rms_mm, tracking_max_mm likewise
 
-All are optional. Duty, near (time within 0.5 mm), coverage, gaps, overlap and outside are shares from 0 to 1.
+All are optional. Those without a unit are shares from 0 to 1.
 """
 
 from __future__ import annotations
