@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,16 +18,21 @@ import pytest
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from hardware.cli import kept, main
+from hardware.clock import WallClock
 from hardware.out_folder import prepare_out
 from hardware.pose_file import PoseWriter, read_poses
 from hardware.progress import Progress, duration
+from hardware.session import open_session
+from hardware.simulator.nozzle_file import read_nozzle
 from hardware.track import follow
 from perception.frames import FrameSet
 from perception.tracking import STAGES, StepReport
 from tests.runs import Replayed
+from tests.worlds import IDEAL, SMALL, write_scenario
 
 ROOT = Path(__file__).parents[1]
-COMMANDS = ([], ["track"], ["replay"], ["import"], ["export"])
+CLOCK = WallClock()
+COMMANDS = ([], ["simulate"], ["track"], ["replay"], ["arm"], ["import"], ["export"])
 
 
 def stillbed(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -70,11 +77,15 @@ def test_version() -> None:
         ["export", "{missing}", "-o", "{out}"],
         ["track", "{empty}", "-o", "{out}"],
         ["export", "{empty}", "-o", "{out}"],
+        ["simulate", "{missing}", "-o", "{out}"],
+        ["simulate", "{scenario}", "-o", "{out}", "--threads", "0"],
+        ["arm", "--virtual", "--fault", "dance at 5s"],
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(arguments: list[str], tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     names = {name: str(tmp_path / name) for name in ("missing", "empty", "out")}
+    names["scenario"] = str(ROOT / "data" / "scenarios" / "still.toml")
     done = stillbed(*(argument.format(**names) for argument in arguments))
     assert done.returncode == 2
     assert done.stdout == ""
@@ -85,11 +96,57 @@ def test_wrong_input_is_one_line_and_exit_code_2(arguments: list[str], tmp_path:
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("arguments", [[], ["dance"], ["track"], ["track", "x"], ["track", "x", "-o", "y", "--speed"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        *([], ["dance"], ["track"], ["track", "x"], ["track", "x", "-o", "y", "--speed"]),
+        *(["simulate", "x"], ["simulate", "x", "-o", "y", "--threads", "many"], ["arm"]),
+        ["arm", "--virtual", "--replies", "loud"],
+    ],
+)
 def test_a_wrong_command_line_is_exit_code_2(arguments: list[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 2
+
+
+def test_the_exit_code_of_a_simulation_says_whether_its_limits_were_met(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    limits = {"p95_mm": 0.1, "duty": 0.9}
+    met = write_scenario(tmp_path, IDEAL, seconds=2.5, limits=limits, name="met.toml")
+    missed = write_scenario(tmp_path, IDEAL, seconds=2.5, limits={**limits, "max_mm": 0.001}, name="missed.toml")
+    assert main(["simulate", str(met), "-o", str(tmp_path / "met")]) == 0
+    assert "met     p95_mm" in capsys.readouterr().out
+    assert main(["simulate", str(missed), "-o", str(tmp_path / "missed"), "--pty", "--threads", "1"]) == 1
+    assert "MISSED  max_mm" in capsys.readouterr().out
+
+
+def test_a_simulation_ended_by_ctrl_c_keeps_what_there_was(tmp_path: Path) -> None:
+    small = {"rig": {"size": [96, 64], "focal_px": 140}, "scene": {"texel_mm": 1.0}}
+    file, out = write_scenario(tmp_path, SMALL, small, seconds=600.0), tmp_path / "out"
+    command = [sys.executable, "-m", "hardware.cli", "simulate", str(file), "-o", str(out), "--threads", "1"]
+    running = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        for _ in range(600):
+            if (out / "nozzle.csv").exists() and (out / "nozzle.csv").stat().st_size > 30_000:
+                break
+            CLOCK.wait_until(CLOCK.now() + 0.05)
+        running.send_signal(signal.SIGINT)
+        _, errors = running.communicate(timeout=60)
+    finally:
+        running.kill()
+    assert running.returncode == 130
+    assert "interrupted; kept in" in errors
+    assert "Traceback" not in errors
+    rows = read_nozzle(out / "nozzle.csv")
+    assert len(rows) > 300 and np.allclose(np.diff(rows.stamps), 0.001)
+    assert len(read_poses(out / "tracking" / "poses.csv")) >= 1
+    sessions = [open_session(out / name) for name in ("session", "session.mcap")]
+    assert len(sessions[0]) == len(sessions[1]) > 3
+    assert all(session.truth is not None and session.damage == "" for session in sessions)
+    assert not json.loads((out / "summary.json").read_text())["complete"]
+    assert "cut short" in (out / "report.html").read_text()
 
 
 def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path) -> None:

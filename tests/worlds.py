@@ -106,12 +106,12 @@ def write_path(file: Path, points: Sequence[Sequence[float]], speed: float = 5.0
 def write_scenario(folder: Path, *tables: Mapping[str, object], name: str = "scenario.toml", **top: object) -> Path:
     """A scenario of an 8 mm line in `folder`, tables put over each other in order, keys of the top level over those.
 
-    The arm's home is 1 mm above the start of the line, so that printing begins at once.
+    The arm's home is just above the start of the line, so that printing begins at once.
     """
     if not (folder / "path.csv").exists():
         write_path(folder / "path.csv", [[-4, 0, 0], [4, 0, 0]])
     x, y, z = read_path(folder / "path.csv").surface_from_nozzle[0, :3, 3]
-    (folder / "arm.toml").write_text(f"home_mm_deg = [{202.5 + x}, {225.0 + y}, {51.0 + z}, 0, 0, 0]\n")
+    (folder / "arm.toml").write_text(f"home_mm_deg = [{202.5 + x}, {225.0 + y}, {50.3 + z}, 0, 0, 0]\n")
     whole: dict[str, object] = {"title": "A test", "seconds": 2.0, "path": "path.csv"}
     for table in [*tables, top]:
         for key, value in table.items():

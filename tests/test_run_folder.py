@@ -1,0 +1,201 @@
+"""The folder of a run: all that passes is in it as it comes, readable however the run ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.observations import no_observations
+from estimation.pose import SurfacePose, TrackState
+from estimation.rig import Rig
+from estimation.se3 import Array
+from hardware.arm_file import read_arm
+from hardware.images import encode
+from hardware.path_file import read_path
+from hardware.pose_file import read_poses
+from hardware.session import open_session
+from hardware.simulator.cameras import Fate, Shot
+from hardware.simulator.default_rig import REST
+from hardware.simulator.nozzle_file import read_nozzle
+from hardware.simulator.planned_line import planned_line
+from hardware.simulator.run_folder import LATEST, RunFolder
+from hardware.simulator.scenario import Scenario
+from hardware.simulator.scenario_file import read_scenario
+from hardware.simulator.session_folder import SessionFolder
+from hardware.tum import read_tum
+from perception.frames import Frame, FrameSet, Roi
+from perception.tracking import STAGES, StepReport
+from planning.command import Command, Hold, Move
+from planning.legs import Phase
+from planning.planner import Progress
+from tests.nozzle_logs import nozzle_log, part, straight
+from tests.worlds import IDEAL, SMALL, write_scenario
+
+ROIS = tuple(Roi(c, 0.1, np.array([[10.0, 5], [80, 5], [50, 60]])) for c in range(3))
+
+
+def scenario(folder: Path, *tables: dict[str, object]) -> Scenario:
+    return read_scenario(write_scenario(folder, SMALL, {"rig": {"size": [96, 64], "focal_px": 140}}, *tables))
+
+
+def moving(times: Array) -> Array:
+    """base_from_surface (N, 4, 4): 3 mm/s upwards."""
+    poses = np.broadcast_to(REST, (len(times), 4, 4)).copy()
+    poses[:, 2, 3] += 3.0 * times
+    return poses
+
+
+def opened(folder: Path, asked: Scenario) -> RunFolder:
+    (folder / "out").mkdir()
+    return RunFolder(folder / "out", asked, planned_line(read_path(asked.path)), ROIS, moving, None)
+
+
+def picture(camera: int, number: int) -> tuple[str, bytes]:
+    return encode(np.full((64, 96, 3), 7 * number + 60 * camera, np.uint8), 95)
+
+
+def shot(camera: int, number: int, offset: float = 0.0) -> Shot:
+    """One that exposes `offset` s after its stamp."""
+    stamp = 0.1 + number / 10
+    return Shot(camera, number, number, stamp + offset, stamp, stamp + 0.03, 0.008, 1.0, Fate.DELIVERED)
+
+
+def feed(folder: RunFolder, count: int, offset: float = 0.0) -> None:
+    """Pictures at 10 Hz of all cameras with a pose each, and a log row each millisecond, ends told every 0.2 s."""
+    log = nozzle_log(straight(8.0), seconds=count / 10)
+    for number in range(count):
+        for camera in range(3):
+            folder.picture(shot(camera, number, offset), *picture(camera, number))
+        stamp = 0.1 + number / 10
+        folder.pose(frames(stamp), pose(stamp), report(stamp), 0.01)
+        folder.command(move(stamp, number > 3), progress(), bytes(48), b"")
+        folder.rows(part(log, slice(100 * number + 1, 100 * number + 101)))
+
+
+def frames(stamp: float) -> FrameSet:
+    return FrameSet(stamp, tuple(Frame(c, stamp, np.full((64, 96, 3), 90, np.uint8)) for c in range(3)))
+
+
+def pose(stamp: float, state: TrackState = TrackState.TRACKING) -> SurfacePose:
+    return SurfacePose(stamp, moving(np.array([stamp]))[0], np.eye(6), np.zeros(6), state)
+
+
+def report(stamp: float) -> StepReport:
+    return StepReport(no_observations(stamp), np.zeros(3, np.int64), np.zeros(len(STAGES)))
+
+
+def move(stamp: float, extrude: bool) -> Move:
+    return Move(stamp, np.zeros(6), 5.0, 1, extrude)
+
+
+def progress() -> Progress:
+    return Progress(Phase.PRINTING, 1, 2, 3.0, 8.0, 0.4)
+
+
+@pytest.mark.parametrize("ending", [None, KeyboardInterrupt(), OSError("disk")], ids=["whole", "Ctrl-C", "failed"])
+def test_however_a_run_ends_everything_until_then_can_be_read(ending: BaseException | None, tmp_path: Path) -> None:
+    folder = opened(tmp_path, scenario(tmp_path))
+    out = tmp_path / "out"
+    if ending is None:
+        with folder:
+            feed(folder, 9)
+    else:
+        with pytest.raises(type(ending)), folder:
+            feed(folder, 9)
+            raise ending
+    for name in ("session", "session.mcap"):
+        session = open_session(out / name)
+        assert len(session) == 9
+        assert [set(f.camera for f in s.frames) for s in session.frame_sets()] == [{0, 1, 2}] * 9
+        assert len(session.roi) == 3
+        assert session.damage == ""
+        assert session.truth is not None and session.truth.exact
+        assert session.truth.base_from_surface == pytest.approx(moving(session.truth.stamps), abs=1e-6)
+    assert len(read_poses(out / "tracking" / "poses.csv")) == 9
+    assert len(read_nozzle(out / "nozzle.csv")) == 900
+    assert out.joinpath("frames.bin").read_bytes() == bytes(48 * 9)
+
+
+def test_before_it_is_closed_the_folder_holds_all_but_the_truth(tmp_path: Path) -> None:
+    folder = opened(tmp_path, scenario(tmp_path))
+    with folder:
+        feed(folder, 4)
+        session = open_session(tmp_path / "out" / "session")
+        assert (len(session), session.truth) == (4, None)
+        assert len(read_nozzle(tmp_path / "out" / "nozzle.csv")) == 400
+
+
+def test_the_truth_holds_every_row_and_every_exposure_once_in_order(tmp_path: Path) -> None:
+    folder = opened(tmp_path, scenario(tmp_path))
+    with folder:
+        feed(folder, 12, offset=0.01234567)  # hidden clocks: exposures fall between the rows
+    assert LATEST < 1.2  # so that some of it was written while the run went on
+    truth = read_tum(tmp_path / "out" / "session" / "truth.tum", exact=True)
+    wanted = np.unique(np.concatenate([np.arange(1, 1201) / 1000, 0.11234567 + np.arange(12) / 10]).round(9))
+    assert truth.stamps == pytest.approx(wanted, abs=1e-9)
+
+
+def test_the_pictures_to_show_are_of_the_printing_where_there_is_one(tmp_path: Path) -> None:
+    folder = opened(tmp_path, scenario(tmp_path))
+    with folder:
+        feed(folder, 3)
+        assert folder.pictures == {c: picture(c, 2)[1] for c in range(3)}
+        folder.command(move(0.4, True), progress(), bytes(48), b"")
+        folder.picture(shot(0, 3), *picture(0, 3))
+        folder.command(Hold(0.5, 0.001, "blind"), progress(), bytes(48), b"")
+        folder.picture(shot(0, 4), *picture(0, 4))
+        assert folder.pictures[0] == picture(0, 3)[1]
+
+
+def test_a_run_without_pictures_has_no_session(tmp_path: Path) -> None:
+    folder = opened(tmp_path, read_scenario(write_scenario(tmp_path, IDEAL)))
+    log = nozzle_log(straight(8.0), seconds=0.3)
+    with folder:
+        folder.pose(FrameSet(0.1, ()), pose(0.1), report(0.1), 0.0)
+        folder.rows(part(log, slice(1, None)))
+        folder.event(0.1, "nobody hears it")
+    names = {file.name for file in (tmp_path / "out").iterdir()}
+    assert names == {"tracking", "commands.csv", "frames.bin", "nozzle.csv", "arm.toml", "scenario.toml"}
+
+
+def test_changes_of_state_and_holds_are_told_once_each(tmp_path: Path) -> None:
+    told = list[str]()
+
+    class Told(RunFolder):
+        def event(self, stamp: float, text: str, level: int = 0) -> None:
+            told.append(text)
+
+    asked = scenario(tmp_path)
+    (tmp_path / "out").mkdir()
+    with Told(tmp_path / "out", asked, planned_line(read_path(asked.path)), ROIS, moving, None) as folder:
+        states = [TrackState.TRACKING, TrackState.TRACKING, TrackState.LOST, TrackState.TRACKING]
+        for i, state in enumerate(states):
+            folder.pose(frames(0.1 + i), pose(0.1 + i, state), report(0.1 + i), 0.0)
+        commands: list[Command] = [move(0.1, True), *(Hold(0.2 + i, 0.001, "blind") for i in range(3)), move(4.0, True)]
+        for command in [*commands, Hold(5.0, 0.001, "blind")]:
+            folder.command(command, progress(), bytes(48), b"")
+    state_words = [text.split(":")[0] for text in told if not text.startswith("hold")]
+    assert state_words == [s.value for s in (TrackState.TRACKING, TrackState.LOST, TrackState.TRACKING)]
+    assert [text for text in told if text.startswith("hold")] == ["hold: blind"] * 2
+
+
+def test_what_the_arm_was_taken_for_and_what_was_simulated_are_kept(tmp_path: Path) -> None:
+    asked = scenario(tmp_path, {"planted": {"arm_offset_mm": [1, 2, 3]}})
+    with opened(tmp_path, asked):
+        pass
+    profile = read_arm(tmp_path / "out" / "arm.toml")
+    assert profile.arm.arm_from_base == pytest.approx(asked.profile.arm.arm_from_base)  # what it was told
+    assert (tmp_path / "out" / "scenario.toml").read_bytes() == asked.file.read_bytes()
+
+
+def test_a_session_folder_numbers_its_frames_and_names_them_by_kind(tmp_path: Path) -> None:
+    rig: Rig = scenario(tmp_path).rig
+    with SessionFolder(tmp_path / "session", rig, ()) as session:
+        session.picture(1, 0.1, *picture(1, 0))
+        session.picture(1, 0.2, "png", encode(np.zeros((64, 96, 3), np.uint8), None)[1])
+    assert sorted(f.name for f in (tmp_path / "session" / "cam_1").iterdir()) == ["000000.jpg", "000001.png"]
+    assert (tmp_path / "session" / "frames.csv").read_text().splitlines()[1:] == ["cam_1,0,0.1", "cam_1,1,0.2"]
+    assert not (tmp_path / "session" / "roi.toml").exists()
+    assert not (tmp_path / "session" / "truth.tum").exists()
