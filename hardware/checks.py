@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import difflib
 import json
 import tomllib
@@ -37,6 +38,19 @@ def read_bytes(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise InputError(path, "file", error, "a readable file") from error
+
+
+def read_csv(path: Path, allowed: str = "a readable CSV file") -> list[tuple[int, list[str]]]:
+    """The rows of a CSV file, each with its line number; blanks before a word do not count, empty lines do.
+
+    InputError, with `allowed`, where it is missing, not text or not CSV.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.reader(stream, skipinitialspace=True)
+            return [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(path, "file", error, allowed) from error
 
 
 def check_keys(where: object, prefix: str, table: Table, required: Iterable[str], optional: Iterable[str] = ()) -> None:

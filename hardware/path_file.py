@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
-from hardware.checks import meant
+from hardware import checks
 from planning.path import Path, check_path
 
 POSE = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
@@ -64,12 +64,7 @@ def write_path(file: str | File, path: Path) -> None:
 
 def _columns(file: File) -> tuple[list[int], Words]:
     """Line numbers of the checkpoints, and the words of each column."""
-    try:
-        with file.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.reader(stream, skipinitialspace=True)
-            rows = [(reader.line_num, [word.strip() for word in row]) for row in reader if any(map(str.strip, row))]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(file, "file", error, "a readable CSV file") from error
+    rows = [(n, [word.strip() for word in row]) for n, row in checks.read_csv(file) if any(map(str.strip, row))]
     if not rows:
         raise InputError(file, "file", "empty", f"a header {','.join(HEADER)} and 2 checkpoints or more")
     (_, header), body = rows[0], rows[1:]
@@ -91,7 +86,7 @@ def _check_header(file: File, header: Sequence[str]) -> None:
         if (stem := name.split("_")[0]) in STEMS:
             raise InputError(file, f"header, column {i + 1}", name, f"{STEMS[stem]}, in this unit")
         if difflib.get_close_matches(name, HEADER, 1):
-            raise InputError(file, f"header, column {i + 1}", name, meant(name, HEADER))
+            raise InputError(file, f"header, column {i + 1}", name, checks.meant(name, HEADER))
     for name in (*POSE, *REST):
         if name not in header:
             raise InputError(file, "header", f"no {name}", ",".join(HEADER))

@@ -20,6 +20,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
+from hardware import checks
 
 TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 _UPPER = np.triu_indices(6)
@@ -111,11 +112,7 @@ def read_poses(path: Path) -> PoseTable:
 
     Raises InputError naming file, line and column for anything else that PoseWriter would not have written.
     """
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "file", str(error), "a poses.csv of stillbed track") from None
+    rows = [row for _, row in checks.read_csv(path, "a poses.csv of stillbed track")]
     head = rows[0] if rows else []
     if tuple(head[: len(_HEAD)]) != _HEAD or head[-1:] != ["reason"]:
         raise InputError(path, "header", ",".join(head[:4]), f"{','.join(_HEAD[:4])}, ...")

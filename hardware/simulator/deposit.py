@@ -91,8 +91,7 @@ def deposit_figures(found: DepositMap) -> DepositFigures:
     area, cells = float(wanted.sum()) * square, int((planned >= HALF).sum())
     if not cells:
         return DepositFigures(area, *[float("nan")] * 5)
-    lacking = (planned >= HALF) & (deposited <= wanted - HALF)
-    double = (planned >= HALF) & (deposited > np.maximum(1.5 * planned, planned + HALF))
+    lacking, double = gaps_and_overlaps(planned, deposited)
     return DepositFigures(
         area=area,
         coverage=float(np.minimum(wanted, got).sum()) * square / area,
@@ -101,6 +100,13 @@ def deposit_figures(found: DepositMap) -> DepositFigures:
         outside=float(np.maximum(got - wanted, 0.0).sum()) * square / area,
         material=float(deposited.sum() / planned.sum()),
     )
+
+
+def gaps_and_overlaps(planned: Array, deposited: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which cells (...) are gaps and which overlap, as DepositFigures counts them, of thicknesses (...)."""
+    there = planned >= HALF
+    gaps = there & (deposited <= np.minimum(planned, 1.0) - HALF)
+    return gaps, there & (deposited > np.maximum(1.5 * planned, planned + HALF))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

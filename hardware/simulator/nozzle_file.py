@@ -7,7 +7,6 @@ so a killed run leaves whole lines.
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path as File
 from types import TracebackType
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from hardware import checks
 from hardware.simulator.nozzle_error import NozzleErrors, nozzle_errors
 from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.planned_line import PlannedLine
@@ -98,11 +98,7 @@ def read_nozzle(file: File) -> NozzleTable:
 
     Raises InputError naming file, line and column for anything else that NozzleWriter would not have written.
     """
-    try:
-        with file.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.reader(stream))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(file, "file", str(error), "a nozzle.csv of stillbed simulate") from None
+    rows = [row for _, row in checks.read_csv(file, "a nozzle.csv of stillbed simulate")]
     if not rows or tuple(rows[0]) != HEADER:
         raise InputError(file, "header", ",".join(rows[0][:4]) if rows else "", ",".join(HEADER))
     body = rows[1:]

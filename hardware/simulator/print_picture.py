@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from estimation.se3 import Array
 from hardware.chart import round_step, stretches
-from hardware.simulator.deposit import HALF, DepositMap
+from hardware.simulator.deposit import HALF, DepositMap, gaps_and_overlaps
 from hardware.simulator.nozzle_run import NozzleResult
 
 KINDS = ("as planned", "missing", "double", "outside")  # of cells, in this order; report.css has them as classes
@@ -83,11 +83,10 @@ def bead_picture(result: NozzleResult, layer: int, width: float) -> str:
 
 def kinds(planned: Array, laid: Array) -> NDArray[np.uint8]:
     """Index in KINDS (H, W) of what became of each cell, by the bounds of DepositFigures; empty cells count as 0."""
-    there = planned >= HALF
     kind = np.zeros(planned.shape, np.uint8)
-    kind[there & (laid <= np.minimum(planned, 1.0) - HALF)] = 1
-    kind[there & (laid > np.maximum(1.5 * planned, planned + HALF))] = 2
-    kind[~there & (laid >= HALF)] = 3
+    for number, cells in enumerate(gaps_and_overlaps(planned, laid), 1):
+        kind[cells] = number
+    kind[(planned < HALF) & (laid >= HALF)] = 3
     return kind
 
 

@@ -7,7 +7,6 @@ Further columns are left alone, unless they are one of these in a unit that is n
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.checks import meant
+from hardware import checks
 from hardware.tum import read_rows
 
 MM = {"mm": 1.0, "m": 1000.0}
@@ -112,7 +111,7 @@ def _check_units(path: Path, columns: dict[str, Array]) -> None:
     for name in columns:
         if name not in KNOWN and (stem := name.rsplit("_", 1)[0].lower()) in STEMS:
             raise InputError(
-                path, "header", name, f"{STEMS[stem]}, or that column in another unit: {meant(name, KNOWN)}"
+                path, "header", name, f"{STEMS[stem]}, or that column in another unit: {checks.meant(name, KNOWN)}"
             )
 
 
@@ -141,11 +140,7 @@ def _rotations(path: Path, columns: dict[str, Array], count: int) -> Array:
 
 def _columns(path: Path) -> dict[str, Array]:
     """The columns by name; those that this file knows are checked, the others may hold anything and are left out."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = [(n, row) for n, row in enumerate(csv.reader(stream, skipinitialspace=True), 1) if any(row)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "file", error, "a readable CSV file") from error
+    rows = [(n, row) for n, row in checks.read_csv(path) if any(row)]
     if not rows:
         raise InputError(path, "file", "empty", "a header and 8 rows or more")
     header = [name.strip() for name in rows[0][1]]
