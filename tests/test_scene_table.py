@@ -12,6 +12,7 @@ from estimation.errors import InputError
 from hardware.ply_file import write_ply
 from hardware.simulator.default_rig import REST
 from hardware.simulator.scene_table import scene_from_table, sensor_from_table
+from hardware.simulator.shape import flat
 
 COARSE = {"texel_mm": 0.8}
 
@@ -54,6 +55,16 @@ def test_a_scan_that_is_closed_has_no_outside_and_is_refused(tmp_path: Path) -> 
     with pytest.raises(InputError, match="mean normal") as caught:
         scene_from_table("a.toml", {**COARSE, "scan": "scan.ply"}, tmp_path, 0)
     assert caught.value.where == str(tmp_path / "scan.ply")
+
+
+def test_a_scan_too_small_for_a_drape_is_taken_without_one(tmp_path: Path) -> None:
+    pytest.importorskip("open3d")
+    write_ply(tmp_path / "scan.ply", *flat((30.0, 60.0)).mesh(5.0))
+    table = {**COARSE, "scan": "scan.ply", "wound": False}
+    with pytest.raises(InputError, match=r"30\.0 x 60\.0 mm") as caught:
+        scene_from_table("a.toml", table, tmp_path, 0)
+    assert caught.value.what == "scene.drape"
+    assert scene_from_table("a.toml", {**table, "drape": False}, tmp_path, 0).opening == pytest.approx((30.0, 60.0))
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.checks import Table
-from hardware.simulator.bodies import BODIES, Wound, body, with_wound
+from hardware.simulator.bodies import BODIES, MARGIN, Wound, body, with_wound
 from hardware.simulator.default_rig import REST
 from hardware.simulator.deformation import BULGE, RADIUS, STRETCH, Deformation
 from hardware.simulator.keys import Keys
@@ -44,6 +44,7 @@ from hardware.simulator.shape import Shape, shape_from_scan
 TEXEL = (0.05, 1.0)  # mm
 WOUND = (5.0, 80.0)  # mm across
 DEPTH = (0.0, 8.0)  # mm
+OPENING = 20.0  # mm, the least that a drape leaves open
 LARGEST_SCAN = 400.0  # mm: a texture of 0.1 mm and rays for nodes 0.25 mm apart end there
 SCENARIO_KEYS = {"scene": ("nozzle", "beads"), "sensor": ("jpeg_quality",)}  # taken out by whoever reads the scenario
 
@@ -61,6 +62,11 @@ def scene_from_table(where: object, table: Table, folder: Path, seed: int, base_
         raise InputError(where, "scene", "body and scan", "one of the two")
     else:
         shape = _scanned(folder / scan, wound, seed)
+        if look.drape and min(shape.size) < 2 * MARGIN + OPENING:
+            allowed = (
+                f"false for a scan of {shape.size[0]:.1f} x {shape.size[1]:.1f} mm: a drape needs {MARGIN:g} a side"
+            )
+            raise InputError(where, "scene.drape", True, allowed)
     return Scene(shape, look, deformation, seed, base_from_rest)
 
 
