@@ -180,7 +180,7 @@ WRONG = [
     ("arm.assumed_lag_s", {"arm": {"assumed_lag_s": -0.01}}),
     ("arm.assumed_lag_s", {"arm": {"assumed_lag_s": 1.01}}),
     ("arm.assumed_lag_s", {"arm": {"assumed_lag_s": "none"}}),
-    ("arm.assumed_lag_s", {"arm": {"dead_time_s": 0.9, "servo_lag_s": 0.9}}),
+    ("arm.dead_time_s + servo_lag_s", {"arm": {"dead_time_s": 0.9, "servo_lag_s": 0.9}}),
     ("arm.wire_baud", {"arm": {"wire_baud": 9600}}),
     ("arm.wire_baud", {"arm": {"wire_baud": "fast"}}),
     ("arm.wire_baud", {"arm": {"wire_baud": True}}),

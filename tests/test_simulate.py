@@ -229,3 +229,37 @@ def test_a_run_in_which_nothing_could_be_printed_has_a_report(tmp_path: Path) ->
     assert (tmp_path / "out" / "report.html").exists()
     path = read_path(tmp_path / "path.csv")
     assert len(path) == 2
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ({"strain": {"kind": "sine", "rate_hz": 0.5}}, "strain, scene.deformation"),
+        ({"scene": {"deformation": {"bulge_mm": 1.0}}}, "strain, scene.deformation"),
+        ({"tracking": {"by": "truth", "register": "scan"}}, "tracking.register"),
+    ],
+)
+def test_what_would_have_no_effect_is_refused(tmp_path: Path, tables: dict[str, object], words: str) -> None:
+    refused(write_scenario(tmp_path, IDEAL, tables), tmp_path / "out", words)
+
+
+def test_a_scenario_is_not_run_over_itself(tmp_path: Path) -> None:
+    file = write_scenario(tmp_path, IDEAL)
+    with pytest.raises(InputError, match="the folder that holds the scenario"):
+        run_simulation(file, tmp_path, Options(force=True))
+    assert file.exists()
+
+
+def test_nothing_of_an_earlier_run_is_left_to_be_mistaken_for_this_one(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for seconds, quality in ((0.9, 90), (0.5, 0)):
+        tables = {"sensor": {"jpeg_quality": quality}}
+        run_simulation(write_scenario(tmp_path, SMALL, tables, seconds=seconds), out, Options(force=True))
+    (out / "mine.txt").write_text("kept")
+    session = open_session(out / "session")
+    pictures = sum(len(list(folder.iterdir())) for folder in (out / "session").iterdir() if folder.is_dir())
+    assert pictures == sum(map(len, session.sets)) and len(list(session.frame_sets())) == len(session)
+
+
+def test_a_run_that_printed_nothing_met_nothing(tmp_path: Path) -> None:
+    assert not run_simulation(write_scenario(tmp_path, IDEAL, seconds=0.1, limits={}), tmp_path / "out").met

@@ -40,19 +40,19 @@ class Deformation:
         """By how much lengths along x and y grow."""
         return 1 + amount * self.stretch[0], 1 + amount * self.stretch[1]
 
-    def lift(self, xy: ArrayLike, amount: float) -> Array:
-        """How far out (N,) mm material points (N, 2) mm bulge."""
+    def lift(self, xy: ArrayLike, amount: float | Array) -> Array:
+        """How far out (N,) mm material points (N, 2) mm bulge; amount: one, or (N,)."""
         square = np.einsum("...i,...i->...", np.asarray(xy, float), np.asarray(xy, float))
         return np.asarray(amount * self.bulge * np.exp(-square / (2 * self.radius**2)))
 
-    def displacement(self, points: ArrayLike, amount: float) -> Array:
-        """How far (N, 3) mm points (N, 3) mm of the shape at rest are moved; both in the grid frame."""
+    def displacement(self, points: ArrayLike, amount: float | Array) -> Array:
+        """How far (N, 3) mm points (N, 3) mm of the shape at rest are moved, in the grid frame; amount: or (N,)."""
         points = np.asarray(points, float)
-        along = amount * points[..., :2] * np.array(self.stretch)
+        along = np.asarray(amount)[..., None] * points[..., :2] * np.array(self.stretch)
         return np.concatenate([along, self.lift(points[..., :2], amount)[..., None]], -1)
 
-    def undo(self, points: ArrayLike, amount: float) -> Array:
-        """Where points (N, 3) mm of the deformed shape lie at rest, (N, 3) mm; both in the grid frame."""
+    def undo(self, points: ArrayLike, amount: float | Array) -> Array:
+        """Where points (N, 3) mm of the deformed shape lie at rest, (N, 3) mm, in the grid frame; amount: or (N,)."""
         points = np.asarray(points, float)
-        flat = points[..., :2] / np.array(self.factors(amount))
+        flat = points[..., :2] / (1 + np.asarray(amount)[..., None] * np.array(self.stretch))
         return np.concatenate([flat, (points[..., 2] - self.lift(flat, amount))[..., None]], -1)

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.se3 import Array
 from hardware.simulator.nozzle_log import NozzleLog
+from hardware.simulator.planned_line import planned_line
 from hardware.simulator.truth import Truth
 from planning.command import Command, Hold, Move
 from planning.kinematics import SimpleArm, nozzle_from_axes
 from planning.legs import Phase
-from planning.path import Path, lengths
+from planning.path import Path
 from planning.planner import Progress
 
 Index = NDArray[np.int64]
@@ -33,8 +34,7 @@ class Ledger:
     def __init__(self, path: Path, arm: SimpleArm, truth: Truth, tick: float, lag: float) -> None:
         """path: in the true surface frame. arm: where it truly stands. tick, lag: s, as the motion knows them."""
         self._path, self._arm, self._truth, self._tick, self._lag = path, arm, truth, tick, lag
-        places = np.concatenate([[0.0], np.cumsum(lengths(path.surface_from_nozzle))])
-        self._places = places  # (N,) mm along the path of each checkpoint
+        self._places = planned_line(path).knots  # (N,) mm along the path of each checkpoint
         self._due: list[float] = []  # s, rising: when each command is to be fulfilled
         self._fraction: list[float] = []  # checkpoints, at `due`; NaN before printing began
         self._extrude: list[bool] = []
@@ -76,7 +76,7 @@ class Ledger:
             base_from_target=target,
             place=np.where(there, place, np.nan),
             checkpoint=np.where(there, np.minimum(np.ceil(filled), len(self._places) - 1), -1).astype(np.int64),
-            extrude=self.extruding(times) & there,
+            extrude=self.extruding(times),
             reason=np.array(reasons, dtype=np.str_),
             surface_from_tip=self._truth.material(times, nozzle[:, :3, 3]),
         )

@@ -45,8 +45,9 @@ class NozzleResult:
 
     @property
     def met(self) -> bool:
-        """Whether the run was complete and met all of its limits."""
-        return self.run.complete and all(verdict.met for verdict in self.verdicts)
+        """Whether the run was complete, printed something, and that only where a target was, and met all its limits."""
+        printed = self.figures.nozzle.extruding > 0 and self.figures.nozzle.untold == 0
+        return self.run.complete and printed and all(verdict.met for verdict in self.verdicts)
 
 
 def judge(run: NozzleRun) -> NozzleResult:

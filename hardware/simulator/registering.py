@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.pose_solver import solve_pose
@@ -34,16 +33,15 @@ def truth_from_estimate(
     truth: Truth,
     shape: Shape,
     exposed: Array,
-) -> Array:
-    """truth_surface_from_estimated_surface (4, 4) from the tracks of one frame set.
+) -> Array | None:
+    """truth_surface_from_estimated_surface (4, 4) from one frame set; None where too few tracks lie on the surface.
 
     rigs: the true one and the one the tracker was told. exposed: (C,) s, when each camera truly took its picture.
-    InputError where too few tracks lie on the surface.
     """
     true, told = rigs
     points, met = surface_points(observations, true, truth, shape, exposed)
     if met.sum() < LEAST:
-        raise InputError("simulation", "tracks on the true surface", int(met.sum()), f"{LEAST} or more to register")
+        return None
     start = truth.base_from_surface(np.array([pose.stamp]))[0]
     seen = solve_pose(
         told,

@@ -26,7 +26,7 @@ from hardware.arm_file import write_arm
 from hardware.pose_file import PoseWriter
 from hardware.recording import INFO, WARNING, Recorder
 from hardware.replay import CommandWriter
-from hardware.simulator.cameras import Shot
+from hardware.simulator.cameras import JITTER_LIMIT, Shot
 from hardware.simulator.nozzle_file import NozzleWriter
 from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.planned_line import PlannedLine
@@ -40,9 +40,22 @@ from planning.command import Command, Hold, Move
 from planning.planner import Progress
 
 DIGITS = 9  # of a stamp: a row and an exposure of one instant are one
-LATEST = 0.5  # s after its exposure until a picture has arrived; truth is written in order of stamp
+PATIENCE = 0.5  # s beyond the transport until a picture has surely arrived; truth is written in order of stamp
+
+FILES = (
+    *("session.mcap", "commands.csv", "frames.bin", "nozzle.csv", "arm.toml", "scenario.toml"),
+    *("watch.html", "watch.jpg", "report.html", "summary.json"),
+)
 
 TruthAt = Callable[[Array], Array]  # times (N,), s -> base_from_surface (N, 4, 4)
+
+
+def clear(out: Path) -> None:
+    """Remove from the folder `out` what an earlier run left there: of two runs no session could be made."""
+    for name in ("session", "tracking"):
+        shutil.rmtree(out / name, ignore_errors=True)
+    for name in FILES:
+        (out / name).unlink(missing_ok=True)
 
 
 class RunFolder:
@@ -63,6 +76,8 @@ class RunFolder:
         self._pending: list[Array] = []  # s, instants whose truth is still to be written
         self._written: list[Array] = []  # s, rising
         self._until = -np.inf  # s, the last of them
+        cameras = scenario.cameras
+        self._latest = cameras.transport + JITTER_LIMIT * cameras.transport_jitter + PATIENCE
         shutil.copyfile(scenario.file, out / "scenario.toml")
         write_arm(out / "arm.toml", scenario.profile, "what the motion knew of the arm")
         (out / "tracking").mkdir(exist_ok=True)
@@ -137,7 +152,7 @@ class RunFolder:
         self.logs.append(log)
         self._nozzle.write(log)
         self._pending.append(log.stamps)
-        self._write_truth(float(log.stamps[-1]) - LATEST)
+        self._write_truth(float(log.stamps[-1]) - self._latest)
 
     def event(self, stamp: float, text: str, level: int = WARNING) -> None:
         """Something that a person should know."""

@@ -173,7 +173,10 @@ def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:
             path, "arm.wire_baud", baud, f"{profile.baud} bits/s, the arm's own, or more; inf for no delay"
         )
     lag = settings.dead_time + settings.servo_lag + LENGTH * BITS_PER_BYTE / baud
-    lag = _within(path, "arm.assumed_lag_s", lag if assumed is None else assumed, 0, LONGEST_LAG, "s")
+    if assumed is not None:
+        lag = _within(path, "arm.assumed_lag_s", assumed, 0, LONGEST_LAG, "s")
+    elif lag > LONGEST_LAG:
+        raise InputError(path, "arm.dead_time_s + servo_lag_s", lag, f"at most {LONGEST_LAG:g} s, or assumed_lag_s")
     return settings, replace(profile, lag=lag), float(baud)
 
 

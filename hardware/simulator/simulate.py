@@ -31,10 +31,10 @@ from hardware.simulator.nozzle_summary import nozzle_dict, nozzle_text
 from hardware.simulator.perfect import PerfectTracker
 from hardware.simulator.planned_line import planned_line
 from hardware.simulator.pty_link import PtyLink
-from hardware.simulator.run_folder import RunFolder
+from hardware.simulator.run_folder import RunFolder, clear
 from hardware.simulator.scenario import Scenario
 from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.scene import Scene, rois
+from hardware.simulator.scene import STILL, Scene, rois
 from hardware.simulator.scene_table import scene_from_table
 from hardware.simulator.truth import Truth
 from hardware.simulator.world import Exposures, World
@@ -89,13 +89,17 @@ def run_simulation(file: Path, out: Path, options: Options | None = None) -> Out
     scenario = read_scenario(file, options.trace)
     path = read_path(scenario.path)
     scene = scene_from_table(scenario.file, scenario.scene, scenario.file.parent, scenario.seed)
+    _check_pairs(scenario, scene)
     if scenario.clearance is not None:
         path = laid(path, scene.shape, scenario.clearance, scenario.path)
+    if file.resolve().parent == out.resolve():
+        raise InputError(out, "--out", "the folder that holds the scenario", "another one: files there are replaced")
     prepare_out(out, options.force)
+    clear(out)
     truth = Truth(scenario.rest, scenario.motion, scene.deformation, scenario.strain, scene.shape.surface_from_grid)
     regions, scan = _regions(scenario, scene, truth), _scan(scenario, scene, out)
     folder = RunFolder(out, scenario, planned_line(path), regions, truth.base_from_surface, scan)
-    complete = False
+    complete, skipped = False, 0
     try:
         with folder, ExitStack() as stack:
             exposures: Exposures = {}
@@ -104,17 +108,36 @@ def run_simulation(file: Path, out: Path, options: Options | None = None) -> Out
             progress = stack.enter_context(Progress("simulate", "frame sets", WallClock().now))
             print(f"watch: {folder.watch.page.resolve().as_uri()}", file=sys.stderr)
             world = World(scenario, scene, path, truth, step, exposures, folder, WallClock(), options.threads, line)
-            world.run(progress)
+            try:
+                world.run(progress)
+            finally:
+                skipped = world.skipped
         complete = True
     finally:
-        outcome = _finish(scenario, path, truth, folder, regions, complete)
+        outcome = _finish(scenario, path, truth, folder, regions, complete, skipped)
     return outcome
 
 
+def _check_pairs(scenario: Scenario, scene: Scene) -> None:
+    """InputError for what was read and would have no effect."""
+    if (scenario.strain is None) != (scene.deformation == STILL):
+        allowed = "both (how much over time, and of what) or neither"
+        raise InputError(scenario.file, "strain, scene.deformation", "one of the two", allowed)
+    if scenario.tracking.scan and not scenario.tracking.pictures:
+        allowed = 'with by = "pictures": the truth needs no registration'
+        raise InputError(scenario.file, "tracking.register", "scan", allowed)
+
+
 def _finish(
-    scenario: Scenario, path: Checkpoints, truth: Truth, folder: RunFolder, regions: Sequence[Roi], complete: bool
+    scenario: Scenario,
+    path: Checkpoints,
+    truth: Truth,
+    folder: RunFolder,
+    regions: Sequence[Roi],
+    complete: bool,
+    skipped: int,
 ) -> Outcome:
-    """Judge what was simulated; writes both reports and summaries."""
+    """Judge what was simulated; writes both reports and summaries. skipped: frame sets that found the tracker busy."""
     out = folder.out
     if not folder.logs:
         return Outcome("nothing was simulated", False)
@@ -131,11 +154,12 @@ def _finish(
         files=FILES if scenario.tracking.pictures else tuple(f for f in FILES if f[0] != "session"),
     )
     result = judge(run)
-    summary = nozzle_dict(result)
+    summary = nozzle_dict(result) | {"frame_sets_skipped": skipped}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     write_nozzle_report(out / "report.html", result)
     folder.watch.finish(summary["verdict"][0])
-    return Outcome(f"{nozzle_text(summary)}\nreport: {out / 'report.html'}", result.met)
+    busy = f"{skipped} frame sets found the tracker busy and were left out\n" if skipped else ""
+    return Outcome(f"{nozzle_text(summary)}\n{busy}report: {out / 'report.html'}", result.met)
 
 
 def _tracking_report(

@@ -13,7 +13,6 @@ from estimation.se3 import Array
 from hardware.simulator.deformation import Deformation
 
 STEP = 0.01  # mm over which the deformation's gradient is taken: it is smooth over centimetres
-UNDOINGS = 8  # fixed-point steps; a strain of 5 % leaves less than 1e-9 mm
 
 
 class MotionOf(Protocol):
@@ -71,15 +70,15 @@ class Truth:
         there = se3.inverse(self.base_from_surface(times))
         points = (there[:, :3, :3] @ points_base[..., None])[..., 0] + there[:, :3, 3]
         amount = self.amount(times)
-        material = points
-        for _ in range(UNDOINGS if amount.any() else 0):
-            material = points - self.displacement(material, amount)
-        return np.asarray(material)
+        if not amount.any():
+            return np.asarray(points)
+        grid = se3.transform_points(se3.inverse(self.surface_from_grid), points)
+        return se3.transform_points(self.surface_from_grid, self.deformation.undo(grid, amount))
 
     def displacement(self, points: Array, amount: Array) -> Array:
         """How far (N, 3) mm points (N, 3) of the undeformed surface are moved by amounts (N,); both surface frame."""
         grid = se3.transform_points(se3.inverse(self.surface_from_grid), points)
-        moved = amount[:, None] * self.deformation.displacement(grid, 1.0)  # it is linear in its amount
+        moved = self.deformation.displacement(grid, amount)
         return np.asarray(moved @ self.surface_from_grid[:3, :3].T)
 
     def _turn(self, points: Array, amount: Array) -> Array:

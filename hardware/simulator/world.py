@@ -155,7 +155,7 @@ class World:
             self._agenda.at(due, EXPOSURE, partial(self._expose, shot, shots))
 
     def _expose(self, shot: Shot, shots: Iterator[Shot], now: float) -> None:
-        """A camera's shutter is half open: from here on the world may change, the picture may not."""
+        """Half of a camera's exposure is over: from here on the world may change, the picture may not."""
         self._next_shot(shots)
         if shot.fate is Fate.DROPPED:
             return
@@ -233,14 +233,17 @@ class World:
             self._track(now)
 
     def _register(self, pose: SurfacePose, frames: FrameSet, seen: Observations) -> None:
-        """Tell the motion where its path lies on the surface that the tracker follows."""
-        scenario, change = self.scenario, np.eye(4)
+        """Tell the motion where its path lies on the surface that the tracker follows, if that can be told yet."""
+        scenario = self.scenario
+        change: Array | None = np.eye(4)
         if scenario.tracking.pictures and not scenario.tracking.scan:
             exposed = np.full(len(scenario.rig), pose.stamp)
             for frame in frames.frames:
                 exposed[frame.camera] = self._exposed[frame.camera, frame.stamp]
             rigs = scenario.rig, scenario.told_rig
             change = truth_from_estimate(pose, seen, rigs, self._truth, self._scene.shape, exposed)
+        if change is None:
+            return
         moved = se3.inverse(change) @ self._path.surface_from_nozzle
         self._motion = MotionStep(replace(self._path, surface_from_nozzle=moved), scenario.profile)
         self._sink.registered(change)
