@@ -10,7 +10,7 @@ APT    := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
-	@$(BIN)/stillbed simulate data/scenarios/breathing_calm.toml -o $(DEMO) --pty --force
+	@$(BIN)/stillbed simulate data/scenarios/demo.toml -o $(DEMO) --pty --force
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
