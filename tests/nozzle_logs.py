@@ -13,7 +13,7 @@ from estimation.se3 import Array
 from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.planned_line import planned_line
 from planning.path import Path
-from tests.moving import REST
+from tests.moving import REST, path_through
 
 Motion = Callable[[Array], Array]  # stamps (N,) s -> base_from_surface (N, 4, 4)
 
@@ -114,25 +114,15 @@ def straight(length: float = 20.0, speed: float = 5.0) -> Path:
 
 def through(points: Array, speed: float = 5.0, extrude: Array | None = None, layer: Array | None = None) -> Path:
     """An upright path through points (N, 3), mm."""
-    count = len(points)
-    return Path(
-        se3.make(np.eye(3), points),
-        np.full(count, speed),
-        np.ones(count, np.int64),
-        np.full(count, 20.0),
-        np.zeros(count, np.int64) if layer is None else layer,
-        np.ones(count, bool) if extrude is None else extrude,
+    path = path_through(points, speed)
+    return replace(
+        path, layer=path.layer if layer is None else layer, extrude=path.extrude if extrude is None else extrude
     )
 
 
 def part(log: NozzleLog, rows: slice) -> NozzleLog:
     """Some rows of a log."""
     return NozzleLog(**{name: getattr(log, name)[rows] for name in NozzleLog.__slots__})
-
-
-def joined(logs: list[NozzleLog]) -> NozzleLog:
-    """Logs one after the other."""
-    return NozzleLog(**{name: np.concatenate([getattr(log, name) for log in logs]) for name in NozzleLog.__slots__})
 
 
 def without_target(log: NozzleLog, rows: slice) -> NozzleLog:

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from hardware.simulator.deposit import FAR, DepositFigures, DepositMap, deposit_figures, deposit_map
-from hardware.simulator.nozzle_log import NozzleLog
+from hardware.simulator.nozzle_log import NozzleLog, joined
 from hardware.simulator.planned_line import planned_line
 from planning.path import Path
 from tests.moving import raster
-from tests.nozzle_logs import breathing, held, joined, nozzle_log, part, straight, through
+from tests.nozzle_logs import breathing, held, nozzle_log, part, straight, through
 
 FEW = settings(max_examples=10, deadline=None)
 BEAD = 0.8

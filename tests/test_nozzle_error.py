@@ -14,11 +14,11 @@ from estimation.se3 import Array
 from hardware.simulator.hold_reasons import hold_spans, holds_of
 from hardware.simulator.lag import SEARCH, lag_of
 from hardware.simulator.nozzle_error import NozzleErrors, NozzleFigures, nozzle_errors, nozzle_figures
-from hardware.simulator.nozzle_log import NozzleLog
+from hardware.simulator.nozzle_log import NozzleLog, joined
 from hardware.simulator.planned_line import planned_line
 from planning.path import Path
 from tests.moving import raster
-from tests.nozzle_logs import breathing, held, joined, nozzle_log, part, sliding, straight, through, without_target
+from tests.nozzle_logs import breathing, held, nozzle_log, part, sliding, straight, through, without_target
 
 FEW = settings(max_examples=10, deadline=None)
 vectors = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
