@@ -1,4 +1,4 @@
-"""The command line: stillbed simulate, track, replay, arm, import, export. Imports lazily, so that help is instant."""
+"""The command line: stillbed simulate, track, replay, arm, import, export, bench. Lazy imports, so that help is instant."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from estimation.errors import StillbedError
+from hardware.bench.command import add_bench
 
 if TYPE_CHECKING:
     from hardware.progress import Progress
@@ -39,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"stillbed: {error}", file=sys.stderr)
         return WRONG_INPUT
     except KeyboardInterrupt:
-        print(f"\nstillbed: interrupted; {kept(arguments.out)}", file=sys.stderr)
+        print(f"\nstillbed: interrupted; {kept(getattr(arguments, 'out', None))}", file=sys.stderr)
         return INTERRUPTED
     return code or 0
 
@@ -50,8 +51,10 @@ def _end_in_order() -> None:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
-def kept(out: Path) -> str:
-    """What an interrupted command left behind, in words."""
+def kept(out: Path | None) -> str:
+    """What an interrupted command left behind, in words; None where it was to write nothing."""
+    if out is None:
+        return "nothing was to be written"
     if out.is_dir():
         names = sorted(file.name for file in out.iterdir())
         return f"kept in {out}: {', '.join(names)}" if names else f"nothing was written to {out}"
@@ -75,6 +78,7 @@ def parser() -> argparse.ArgumentParser:
     _add_arm(commands)
     _add_import(commands)
     _add_export(commands)
+    add_bench(commands)
     return top
 
 

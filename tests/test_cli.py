@@ -32,7 +32,7 @@ from tests.worlds import IDEAL, SMALL, write_scenario
 
 ROOT = Path(__file__).parents[1]
 CLOCK = WallClock()
-COMMANDS = ([], ["simulate"], ["track"], ["replay"], ["arm"], ["import"], ["export"])
+COMMANDS = ([], ["simulate"], ["track"], ["replay"], ["arm"], ["import"], ["export"], ["bench"])
 
 
 def stillbed(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -80,6 +80,7 @@ def test_version() -> None:
         ["simulate", "{missing}", "-o", "{out}"],
         ["simulate", "{scenario}", "-o", "{out}", "--threads", "0"],
         ["arm", "--virtual", "--fault", "dance at 5s"],
+        ["bench", "dance", "-o", "{out}"],
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(arguments: list[str], tmp_path: Path) -> None:
@@ -163,6 +164,7 @@ def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path) -> None:
 
 def test_what_was_kept_is_said(tmp_path: Path) -> None:
     assert kept(tmp_path / "nothing") == "nothing was written"
+    assert kept(None) == "nothing was to be written"
     (tmp_path / "poses.csv").write_text("x")
     assert kept(tmp_path) == f"kept in {tmp_path}: poses.csv"
     assert "readable" in kept(tmp_path / "poses.csv")

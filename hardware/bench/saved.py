@@ -1,0 +1,41 @@
+"""Figures as files: figures.json with the machine, figures.csv with a line each."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from hardware.bench.figure import Figure
+from hardware.bench.machine import Machine
+from hardware.summary import finite
+
+COLUMNS = ("what", "value", "unit", "low", "high", "verdict", "reference", "note")
+
+
+def save(
+    folder: Path, subject: str, options: Mapping[str, object], figures: Sequence[Figure], machine: Machine
+) -> None:
+    """Write figures.json and figures.csv into an existing folder; a number that does not exist is null, or empty."""
+    rows = [_row(figure) for figure in figures]
+    whole = {
+        "subject": subject,
+        "options": {
+            name: value if isinstance(value, (int, float, bool)) else str(value) for name, value in options.items()
+        },
+        "machine": asdict(machine),
+        "figures": rows,
+    }
+    (folder / "figures.json").write_text(json.dumps(finite(whole), indent=2) + "\n", encoding="utf-8")
+    with (folder / "figures.csv").open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, COLUMNS)
+        writer.writeheader()
+        writer.writerows(finite(rows))
+
+
+def _row(figure: Figure) -> dict[str, object]:
+    low, high = (None, None) if figure.target is None else (figure.target.low, figure.target.high)
+    values = (figure.what, figure.value, figure.unit, low, high, figure.verdict, figure.reference, figure.note)
+    return dict(zip(COLUMNS, values, strict=True))

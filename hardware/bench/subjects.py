@@ -1,0 +1,39 @@
+"""What can be measured: one module each, imported when it is asked for."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+
+from hardware.bench.figure import Figure
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """One thing to measure.
+
+    module: has `add_options(parser)`, which adds its own options, and `run(options) -> list[Figure]`.
+    summary: a line for the list of subjects.
+    """
+
+    module: str
+    summary: str
+
+    @property
+    def add_options(self) -> Callable[[argparse.ArgumentParser], None]:
+        """The module's `add_options`."""
+        found: Callable[[argparse.ArgumentParser], None] = import_module(self.module).add_options
+        return found
+
+    @property
+    def run(self) -> Callable[[argparse.Namespace], list[Figure]]:
+        """The module's `run`."""
+        found: Callable[[argparse.Namespace], list[Figure]] = import_module(self.module).run
+        return found
+
+
+Subjects = Mapping[str, Subject]
+
+SUBJECTS: Subjects = {}

@@ -1,0 +1,95 @@
+"""The bench: every figure stands beside its target, on the screen and in the files, with what it was measured on."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from estimation.errors import InputError
+from hardware.bench.command import add_bench, run_bench, subject_parser
+from hardware.bench.figure import Figure, Target, at_least, at_most
+from hardware.bench.machine import this_machine
+from hardware.bench.subjects import SUBJECTS, Subject
+from hardware.bench.table import table_text
+
+SUBJECT = {"toy": Subject("tests.bench_subject", "one figure of each kind")}
+
+
+def bench(*words: str) -> None:
+    parser = argparse.ArgumentParser()
+    add_bench(parser.add_subparsers())
+    run_bench(parser.parse_args(["bench", *words]), SUBJECT)
+
+
+@pytest.mark.parametrize("target", [at_most(2.0), at_least(-1.0), Target(-1.0, 2.0)])
+def test_a_target_holds_its_ends_and_not_a_hair_more(target: Target) -> None:
+    for value in (-1.0, 2.0):
+        assert target.met(value)
+    assert target.met(math.nextafter(2.0, 3.0)) == math.isinf(target.high)
+    assert target.met(math.nextafter(-1.0, -2.0)) == math.isinf(target.low)
+    assert not target.met(math.nan)
+
+
+def test_targets_say_their_direction() -> None:
+    assert [str(t) for t in (at_most(0.03), at_least(0.93), Target(0.8, 1.25))] == ["<= 0.03", ">= 0.93", "0.8 to 1.25"]
+
+
+def test_the_table_marks_what_is_met_and_what_is_missed() -> None:
+    text = table_text(
+        [Figure("a", 1.0, "mm", at_most(1.0)), Figure("longer", 20.0, "", at_least(30.0)), Figure("c", 3)]
+    )
+    lines = text.splitlines()
+    assert [("met" in line.split(), "MISSED" in line) for line in lines[1:4]] == [
+        (True, False),
+        (False, True),
+        (False, False),
+    ]
+    assert lines[-1] == "1 of 2 targets met"
+    ends = {line.index(value) + len(value) for line, value in zip(lines[1:4], ("1.00", "20.0", "3.00"), strict=True)}
+    assert len(ends) == 1  # numbers stand under each other
+
+
+def test_a_run_prints_its_table_and_saves_the_same_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bench("toy", "-o", str(tmp_path / "out"), "--error", "0.05")
+    printed = capsys.readouterr().out
+    assert this_machine().cpu in printed and "2 of 4 targets met" not in printed and "1 of 4 targets met" in printed
+    saved = json.loads((tmp_path / "out" / "figures.json").read_text())
+    assert saved["subject"] == "toy" and saved["options"]["error"] == 0.05
+    assert saved["machine"]["cores"] >= 1 and saved["machine"]["versions"]["numpy"]
+    error, *_, missing = saved["figures"]
+    assert (error["value"], error["high"], error["low"], error["verdict"]) == (0.05, 0.03, None, "MISSED")
+    assert missing["value"] is None and missing["note"] == "not here"
+    with (tmp_path / "out" / "figures.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["what"] for row in rows] == [row["what"] for row in saved["figures"]]
+    assert [row["value"] for row in rows] == ["0.05", "1.0", "0.9", "300.0", ""]
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="--force"):
+        bench("toy", "-o", str(tmp_path))
+    bench("toy", "-o", str(tmp_path), "--force")
+    assert (tmp_path / "figures.json").exists()
+
+
+def test_without_a_subject_the_subjects_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in ([], ["--list"]):
+        bench(*words)
+        assert capsys.readouterr().out == "toy  one figure of each kind\n"
+
+
+def test_an_unknown_subject_is_told_the_near_one() -> None:
+    with pytest.raises(InputError, match="did you mean 'toy'"):
+        bench("toi")
+
+
+@pytest.mark.parametrize("name", SUBJECTS)
+def test_every_subject_has_its_options_and_its_run(name: str) -> None:
+    assert subject_parser(name, SUBJECTS[name]).parse_args([]).out is None
+    assert callable(SUBJECTS[name].run)
