@@ -1,4 +1,4 @@
-"""The command line: stillbed simulate, track, replay, arm, import, export, bench. Lazy imports, so that help is instant."""
+"""The command line: stillbed simulate, track, replay, arm, import, export, bench. Imports lazily: help is instant."""
 
 from __future__ import annotations
 
