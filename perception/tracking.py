@@ -15,29 +15,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation import se3
-from estimation.adjustment import Adjusted, single_fit
 from estimation.errors import InputError
 from estimation.estimator import Estimator, Fit, identity_pose
 from estimation.observations import Observations, no_observations
 from estimation.pose import SurfacePose, TrackState
-from estimation.refiner import Refiner
-from estimation.registration import register
 from estimation.rig import Rig
 from estimation.scan import Scan
 from estimation.se3 import Array
 from perception.features import grey
-from perception.first_map import FirstMap, build_first_map, in_frame
 from perception.frames import FrameSet, Roi
 from perception.lens import Lenses
+from perception.mapping import Mapping
 from perception.matcher import Matcher
 from perception.patches import Pyramid, pyramid
 from perception.relocalise import Relocaliser
 
 STAGES = ("prepare", "flow", "align", "pose", "search")
-LEAST_SCAN_SIGMA = 0.1  # mm: no handheld scan is better
-EAGER = 5  # tries for a first map, 0.5 s and more each, before only every tenth frame set is tried
-PATIENCE = 2.0  # s: a first map that nobody confirms is dropped, and the next images are tried
 FULL_SEARCH = 10  # frame sets of an absent surface between searches at full size, off the frame's path
 
 
@@ -72,15 +65,12 @@ class TrackingStep:
         centroid, z out of the surface).
         """
         self.rig, self.roi, self._clock = rig, tuple(roi), clock
-        self._refiner = Refiner(rig, executor)
-        self._scan = scan
         self._lenses = Lenses(rig)
         self._estimator = Estimator(rig)
         self._search = Relocaliser(self._lenses)
+        self._mapping = Mapping(self._lenses, self.roi, self._search, executor, scan)
         self._matcher: Matcher | None = None
         self._lost: dict[int, Pyramid] = {}  # images of cameras that are to be searched once the pose is handed over
-        self._tries, self._why = 0, ""  # to make a first map, and why the last one failed
-        self._mapped = 0.0  # s, stamp of the first map
         self._absent = 0  # frame sets since the surface was last measured
         self._spent = np.zeros(len(STAGES))
         self._lap = 0.0
@@ -105,9 +95,8 @@ class TrackingStep:
 
     def idle(self) -> None:
         """Work that no pose waits for; the caller's loop calls it once a pose is handed over."""
-        refined = self._refiner.poll()
-        if refined is not None:
-            self._take(refined)
+        if self._matcher is not None:
+            self._mapping.keep(self._matcher, self._estimator)
         self._recover()
 
     def _check(self, frames: FrameSet) -> None:
@@ -127,53 +116,14 @@ class TrackingStep:
         self, frames: FrameSet, pyramids: dict[int, Pyramid]
     ) -> tuple[SurfacePose, Observations, NDArray[np.int64]]:
         none = np.zeros(len(self.rig), np.int64)
-        polygons = self._polygons(frames)
-        if isinstance(polygons, str):
-            return identity_pose(frames.stamp, polygons), no_observations(frames.stamp), none
-        self._tries += 1
-        if self._tries > EAGER and self._tries % FULL_SEARCH:
-            return identity_pose(frames.stamp, self._why), no_observations(frames.stamp), none
-        first = build_first_map(self._lenses, pyramids, polygons)
+        first = self._mapping.first_map(frames, pyramids)
         self._took("search")
         if isinstance(first, str):
-            self._why = first
             return identity_pose(frames.stamp, first), no_observations(frames.stamp), none
-        caveat = ""
-        if self._scan is not None:
-            first, caveat = self._on_scan(first, self._scan)
         matcher = self._matcher = Matcher(self._lenses, first.map, first.templates)
-        self._mapped = frames.stamp
-        pose = self._estimator.begin(frames.stamp, first.base_from_surface, first.map, caveat)
-        starts = dict.fromkeys(polygons, first.base_from_surface)
-        observations = matcher.align(frames.stamp, pyramids, starts, coarse=True)
-        fit = self._estimator.fit(observations, first.base_from_surface)
-        self._refiner.begin(first.map, frames.stamp, first.base_from_surface, observations)
-        matcher.remember(pyramids, observations, fit.inlier, first.base_from_surface)
-        for camera in polygons:
-            self._search.learn(camera, pyramids[camera][0], first.base_from_surface, first.map)
+        pose, observations, fit = self._mapping.begin(frames.stamp, first, matcher, self._estimator, pyramids)
         self._took("search")
         return pose, observations, fit.used
-
-    def _on_scan(self, first: FirstMap, scan: Scan) -> tuple[FirstMap, str]:
-        """The first map in the scan's frame, and what the scan's shape leaves open, or ''."""
-        points = se3.transform_points(first.base_from_surface, first.map.points)
-        blocks = first.map.covariance.reshape(len(points), 3, len(points), 3)
-        sigma = float(np.sqrt(np.median(np.einsum("nini->n", blocks))))
-        found = register(points, max(sigma, LEAST_SCAN_SIGMA), scan, first.base_from_surface[:3, 2])
-        caveat = "" if found.sure else f"the scan's place is open: {found.verdict}"
-        return in_frame(first, found.base_from_surface), caveat
-
-    def _polygons(self, frames: FrameSet) -> dict[int, Array] | str:
-        """Where the surface is in these images, by camera, or why that is not known yet."""
-        if not self.roi:
-            return {
-                f.camera: np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float) * self.rig.cameras[f.camera].size
-                for f in frames.frames
-            }
-        start = max(r.stamp for r in self.roi)
-        if frames.stamp < start - 0.1:
-            return f"waiting for the region of interest at {start:.3f} s"
-        return {r.camera: r.polygon for r in self.roi if any(f.camera == r.camera for f in frames.frames)}
 
     # -- every frame after it
 
@@ -194,16 +144,16 @@ class TrackingStep:
             self._took("search")
         if estimator.pose.state is TrackState.INITIALISING:
             if len(self._carried(fit, pyramids)) < 2:
-                if stamp - self._mapped > PATIENCE:
+                if self._mapping.expired(stamp):
                     self._matcher = None
                 reason = f"the first map waits for a second look by two cameras ({fit.reason or 'one sees it'})"
                 return estimator.wait(stamp, reason), observations, fit.used
-            fit, observations = self._confirm(matcher, pyramids, fit, observations)
+            fit, observations = self._mapping.confirm(matcher, estimator, pyramids, fit, observations)
         if fit.measured:
             self._lost = {c: pyramids[c] for c in self._missing(fit, pyramids)}
             self._absent = 0
             pose = estimator.accept(fit, observations)
-            self._refiner.offer(fit, observations, pose.twist, estimator.skew.sigma)
+            self._mapping.offer(fit, observations, pose.twist, estimator)
             matcher.remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)
         else:
             pose = estimator.coast(stamp, fit.reason)
@@ -211,31 +161,6 @@ class TrackingStep:
             self._lost = pyramids if self._absent % FULL_SEARCH == 0 else {}
         self._took("pose")
         return pose, observations, fit.used
-
-    def _confirm(
-        self, matcher: Matcher, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations
-    ) -> tuple[Fit, Observations]:
-        """The first measured frame set after the first map: correct the map by it, look and fit again, twice."""
-        for _ in range(2):
-            refined = self._refiner.confirm(fit, observations, self._estimator.skew.sigma)
-            if refined is None:
-                break
-            self._take(refined)
-            self._estimator.moving(self._refiner.speed(fit))
-            pose, points = fit.solution.base_from_surface, refined.map.points
-            fits = {c: single_fit(self.rig, points, observations, c, pose) for c in pyramids}
-            starts = {c: own.base_from_surface for c, own in fits.items()}
-            again = matcher.align(fit.stamp, pyramids, starts, coarse=True)
-            refit = self._estimator.fit(again, pose)
-            if not refit.measured:
-                break
-            fit, observations = refit, again
-        return fit, observations
-
-    def _take(self, refined: Adjusted) -> None:
-        assert self._matcher is not None
-        self._estimator.replace_map(refined.map)
-        self._matcher.take(refined.map, refined.agrees)
 
     def _missing(self, fit: Fit, pyramids: dict[int, Pyramid]) -> list[int]:
         """Cameras that carried the last pose and now hardly see the surface."""
