@@ -1,4 +1,4 @@
-# make demo | test | check | format: each makes .venv and installs what it needs; the second time that costs nothing.
+# make demo | test | check | format | outages: each makes .venv and installs what it needs; a second time costs nothing.
 
 PYTHON ?= python3
 BIN    := .venv/bin
@@ -6,7 +6,7 @@ STAMP  := .venv/.installed
 DEMO   := demo
 APT    := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0
 
-.PHONY: demo test check format install
+.PHONY: demo test check format install outages
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
@@ -14,6 +14,9 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
+
+outages: $(STAMP)
+	$(BIN)/stillbed bench outages --count 1000 --seed 1 -o out/outages --force
 
 check: $(STAMP)
 	$(BIN)/ruff check .

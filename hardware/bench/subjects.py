@@ -36,4 +36,6 @@ class Subject:
 
 Subjects = Mapping[str, Subject]
 
-SUBJECTS: Subjects = {}
+SUBJECTS: Subjects = {
+    "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: never lost in silence"),
+}

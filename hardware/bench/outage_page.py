@@ -1,0 +1,48 @@
+"""A page of outages: error and claim over time, and what the state was."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hardware.bench.outage_judge import Verdict
+from hardware.bench.outage_run import Watched
+from hardware.chart import Plot, ribbon
+from hardware.page import document, legend, line_key, section
+from hardware.simulator.outage import Kind
+
+WIDTH, LEAST = 900, 1e-3  # px; mm, where the logarithmic axis begins
+WORST = 12  # outages that went worst are shown after one of each kind
+
+
+def outage_page(judged: Sequence[tuple[Watched, Verdict]]) -> str:
+    """One outage of each kind and the worst ones, as a page."""
+    first = [next((p for p in judged if p[0].outage.kind is kind), None) for kind in Kind]
+    rank = sorted(judged, key=lambda pair: (-pair[1].silent, -pair[1].beyond, -pair[1].worst))
+    silent = sum(v.silent for _, v in judged)
+    lead = f"{silent} of {len(judged)} outages were lost in silence."
+    body = [_one(*pair) for pair in first if pair is not None]
+    body += [_one(*pair) for pair in rank[:WORST] if all(pair is not p for p in first)]
+    return document("bench", "outages", lead, body, "Error: the largest of five points of the wound.")
+
+
+def _one(watched: Watched, verdict: Verdict) -> str:
+    outage, stamps = watched.outage, watched.stamps - watched.outage.start
+    span = (float(stamps[0]), float(stamps[-1]))
+    top = max(1.0, float(np.nanmax(watched.error)) * 1.5, min(100.0, float(np.nanmax(watched.radius)) * 1.2))
+    plot = Plot(WIDTH, 170, span, (LEAST, top), log_y=True, label="mm")
+    plot.shade(np.array([0.0]), np.array([outage.end - outage.start]), "holding")
+    plot.line(stamps, np.maximum(watched.radius, LEAST), "truth")
+    plot.line(stamps, np.maximum(watched.error, LEAST), "estimate")
+    edges = np.append(stamps, stamps[-1] + (stamps[-1] - stamps[-2]))
+    titles = [f"{s.value} {r}" for s, r in zip(watched.states, watched.reasons, strict=True)]
+    strip = ribbon(edges, [s.value for s in watched.states], titles, span, WIDTH)
+    keys = legend([line_key("estimate", "error, mm"), line_key("truth", "claimed for 95 %, mm")])
+    cameras = ", ".join(f"cam_{c}" for c in outage.cameras)
+    text = (
+        f"{cameras}, {outage.end - outage.start:.2f} s; flagged after {1000 * verdict.flagged:.0f} ms, back after "
+        f"{1000 * verdict.back:.0f} ms at {verdict.after:.3f} mm; time in s from its beginning"
+    )
+    reasons = list(dict.fromkeys(r for r in watched.reasons if r))[:3]
+    return section(outage.kind.value, f"{text}. {'; '.join(reasons)}", keys + strip + plot.svg())
