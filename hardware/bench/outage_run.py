@@ -62,7 +62,8 @@ class Watched:
     """Frame sets of one outage, from the calm before it to the rest after it.
 
     stamps: (K,) s. error: (K,) mm, the largest of the judged points. radius: (K,) mm, within which 95 % of the errors
-    there are claimed to lie. states, reasons: K each. used: (K, C) tracks that carry the pose.
+    there are claimed to lie. states, reasons: K each. used: (K, C) tracks that carry the pose. jumped: whether the
+    surface came back elsewhere.
     """
 
     outage: Outage
@@ -111,7 +112,7 @@ class Stretch:
             self._frame(None)
         outage = draw_outage(kind, self._pictures.rig, self._count / FPS, self._rng)
         hidden = len(outage.cameras) == len(self._pictures.rig) and kind in (Kind.OCCLUDED, Kind.DEAD, Kind.BLACK)
-        jumps = hidden and outage.end - outage.start > 1.0 and self._rng.random() < JUMPS
+        before, jumps = self._loop, hidden and outage.end - outage.start > 1.0 and self._rng.random() < JUMPS
         while self._count / FPS < outage.end - 1e-9:
             if jumps and self._count / FPS > outage.start + 0.5:
                 jumps, self._loop = False, self._other()
@@ -127,7 +128,7 @@ class Stretch:
             states,
             reasons,
             np.stack(used),
-            hidden and jumps,
+            self._loop is not before,
         )
 
     def _other(self) -> PictureLoop:

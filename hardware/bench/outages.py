@@ -83,7 +83,7 @@ HEADER = (
 
 def kinds_text(judged: Sequence[tuple[Kind, Verdict]]) -> str:
     """A line for each kind and one for all; times are median and largest, `worst` the largest error while measured."""
-    rows = [HEADER]
+    rows: list[tuple[str, ...]] = [HEADER]
     for kind in Kind:
         mine = [v for k, v in judged if k is kind]
         if mine:

@@ -37,5 +37,5 @@ class Subject:
 Subjects = Mapping[str, Subject]
 
 SUBJECTS: Subjects = {
-    "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: never lost in silence"),
+    "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?"),
 }

@@ -10,6 +10,7 @@ from enum import Enum
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.rig import Camera, Rig, pixels_from_points
@@ -17,6 +18,8 @@ from estimation.se3 import Array
 from hardware.simulator.cover import covered, glared
 from perception.frames import Image
 from perception.lens import undistort
+
+Map = NDArray[np.float32]  # (H, W)
 
 LONGEST, SHORTEST = 5.0, 0.2  # s, of an occlusion; other faults are over within 2 s
 FLASH = (0.03, 0.2)  # s
@@ -90,12 +93,12 @@ class Spoiler:
     def __init__(self, rig: Rig, extent: Array) -> None:
         """extent: (N, 3) mm, surface frame, points around what is to be covered."""
         self.rig, self._extent = rig, extent
-        self._maps: tuple[Outage, tuple[Image, Image]] | None = None
+        self._maps: tuple[Outage, tuple[Map, Map]] | None = None
 
     def __call__(
         self, outage: Outage, stamp: float, images: list[Image], last: list[Image], base_from_surface: Array
     ) -> list[Image | None]:
-        """What the cameras deliver at `stamp` instead of `images` (grey); last: what they delivered before the outage."""
+        """What the cameras deliver at `stamp` instead of `images` (grey); last: what they did before the outage."""
         spoilt: list[Image | None] = list(images)
         for c in outage.cameras:
             spoilt[c] = self._one(outage, stamp, c, images, last, base_from_surface)
@@ -148,7 +151,7 @@ def _relit(image: Image, gain: float, offset: float) -> Image:
     return np.asarray(cv2.convertScaleAbs(image, alpha=gain, beta=offset), np.uint8)
 
 
-def _bump_maps(camera: Camera, camera_from_bumped: Array, base_from_surface: Array) -> tuple[Image, Image]:
+def _bump_maps(camera: Camera, camera_from_bumped: Array, base_from_surface: Array) -> tuple[Map, Map]:
     """Where each pixel of the bumped camera lies in the camera's own image, x and y (H, W)."""
     w, h = camera.size
     across, down = (np.arange(-LATTICE, n + 2 * LATTICE, LATTICE, dtype=float) for n in (w, h))
@@ -161,8 +164,7 @@ def _bump_maps(camera: Camera, camera_from_bumped: Array, base_from_surface: Arr
     reach = (base_from_surface[:3, 3] - centre) @ plane / (rays @ plane)
     source = pixels_from_points(camera, centre + reach[:, None] * rays)[0].reshape(grid.shape)
     x, y = np.meshgrid((np.arange(w) / LATTICE + 1), (np.arange(h) / LATTICE + 1))
-    fine = cv2.remap(source.astype(np.float32), x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
-    first, second = cv2.convertMaps(
-        np.ascontiguousarray(fine[..., 0]), np.ascontiguousarray(fine[..., 1]), cv2.CV_32FC1
+    fine: Map = np.asarray(
+        cv2.remap(source.astype(np.float32), x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR), np.float32
     )
-    return first, second
+    return np.ascontiguousarray(fine[..., 0]), np.ascontiguousarray(fine[..., 1])
