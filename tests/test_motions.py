@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
-from hardware.simulator.draws import WIDEST
+from estimation.synthetic.draws import WIDEST
+from estimation.synthetic.motions import Motion, shaking_amplitude
 from hardware.simulator.motion_table import motion_from_tables, waveform_from_table
-from hardware.simulator.motions import Motion, shaking_amplitude
 
 H = 1e-4  # s, half the step of a difference quotient
 Spec = dict[str, Any]

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
+from estimation.synthetic.motions import Motion
 from hardware.simulator.motion_table import motion_from_tables
-from hardware.simulator.motions import Motion
 from hardware.simulator.trace_file import read_trace
 from hardware.simulator.traces import Traced
 from hardware.tum import write_rows

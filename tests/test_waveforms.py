@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.se3 import Array
-from hardware.simulator.draws import WIDEST, BreathingSpec, draw_breathing, draw_noise, draw_pulse, draw_walk
-from hardware.simulator.waveforms import Corners, Levels, Sine, Steps, Waveform, Zigzag
+from estimation.synthetic.draws import WIDEST, BreathingSpec, draw_breathing, draw_noise, draw_pulse, draw_walk
+from estimation.synthetic.waveforms import Corners, Levels, Sine, Steps, Waveform, Zigzag
 
 H = 1e-4  # s, half the step of a difference quotient
 

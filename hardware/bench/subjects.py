@@ -37,5 +37,6 @@ class Subject:
 Subjects = Mapping[str, Subject]
 
 SUBJECTS: Subjects = {
+    "estimator": Subject("hardware.bench.estimator", "the estimator on synthetic tracks: accuracy, honesty, time"),
     "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?"),
 }

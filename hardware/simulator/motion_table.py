@@ -26,13 +26,13 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from estimation.synthetic.draws import WIDEST, BreathingSpec, draw_breathing, draw_noise, draw_pulse, draw_walk
+from estimation.synthetic.motions import FRAMES_PER_S, Driven, Motion, Part, shaking_amplitude
+from estimation.synthetic.waveforms import Corners, Levels, Sine, Steps, Waveform, Zigzag
 from hardware.checks import Table
-from hardware.simulator.draws import WIDEST, BreathingSpec, draw_breathing, draw_noise, draw_pulse, draw_walk
 from hardware.simulator.keys import Keys
-from hardware.simulator.motions import FRAMES_PER_S, Driven, Motion, Part, shaking_amplitude
 from hardware.simulator.trace_file import read_trace
 from hardware.simulator.traces import traced
-from hardware.simulator.waveforms import Corners, Levels, Sine, Steps, Waveform, Zigzag
 
 MOTION_STREAM = 21  # of the scenario's seed: no other draw of the simulator shares it
 OUTWARD = (0.0, 0.0, 1.0)  # the surface's normal

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from estimation.rig import Rig
 from estimation.se3 import Array
+from estimation.synthetic.motions import Motion
 from hardware.arm_profile import ArmProfile
 from hardware.checks import Table
 from hardware.simulator.arm_faults import ArmFault
 from hardware.simulator.arm_settings import ArmSettings
 from hardware.simulator.camera_settings import CameraSettings
-from hardware.simulator.motions import Motion
 from hardware.simulator.run_limits import RunLimits
 from hardware.simulator.sensor import Sensor
 from planning.kinematics import SimpleArm

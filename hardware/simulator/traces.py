@@ -12,8 +12,8 @@ from scipy.signal import butter, filtfilt
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
+from estimation.synthetic.waveforms import corner, corner_rate, folded, folded_rate
 from hardware.simulator.trace_file import Trace
-from hardware.simulator.waveforms import corner, corner_rate, folded, folded_rate
 
 SMOOTH_STEPS = 5  # of the trace's own: periods below are taken away, on the 10 Hz chests 0.03-0.1 mm, their noise
 WIDEST_TURN = math.radians(150)  # from the first pose: rotation vectors are interpolated, which end at 180

@@ -16,7 +16,7 @@ STEP = 0.01  # mm over which the deformation's gradient is taken: it is smooth o
 
 
 class MotionOf(Protocol):
-    """A motion about the rest pose: hardware.simulator.motions.Motion, or anything that answers like it."""
+    """A motion about the rest pose: estimation.synthetic.motions.Motion, or anything that answers like it."""
 
     def __call__(self, times: Array) -> Array:
         """rest_from_surface (N, 4, 4) at times (N,), s."""

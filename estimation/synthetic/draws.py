@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from estimation.se3 import Array
-from hardware.simulator.waveforms import PULSE_BUMPS, WALK_SECONDS, Cycles, Noise, Walk, breath_bumps
+from estimation.synthetic.waveforms import PULSE_BUMPS, WALK_SECONDS, Cycles, Noise, Walk, breath_bumps
 
 DRAWN_SECONDS = 600.0  # breaths and beats for so long; then they repeat, at rest as they began
 WIDEST = 2.5  # standard deviations at which a draw is cut, so that every amplitude has a bound

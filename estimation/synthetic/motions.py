@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from estimation import se3
 from estimation.se3 import Array
-from hardware.simulator.waveforms import Waveform
+from estimation.synthetic.waveforms import Waveform
 
 FRAMES_PER_S = 29.91  # of the camera over the thesis's shaking table (thesis 4.6)
 
