@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.motion_detector import MotionDetector
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import PoseFit, own_residuals, project, solve_pose
@@ -140,6 +141,7 @@ class Estimator:
         self.map: SurfaceMap | None = None
         self.skew = Skew()
         self._smoother = Smoother()
+        self._detector = MotionDetector(np.zeros(3))
         self._pose: SurfacePose | None = None
         self._measured_stamp = -np.inf
         self._tracking = False
@@ -233,6 +235,7 @@ class Estimator:
         """
         self.map, self._caveat = surface_map, caveat
         self._smoother.reset()
+        self._detector = MotionDetector(surface_map.points.mean(0))
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
         return self._enter(
             stamp, base_from_surface, covariance, TrackState.INITIALISING, "a first map, to be confirmed"
@@ -272,6 +275,8 @@ class Estimator:
                 sigma[keep],
             )
         state, reason = self._grade(fit)
+        noise = np.linalg.pinv(fit.solution.information, hermitian=True)  # what map and clocks add is the same at rest
+        self._detector(fit.stamp, fit.solution.base_from_surface, noise)
         return self._enter(fit.stamp, fit.solution.base_from_surface, fit.covariance, state, reason)
 
     def _grade(self, fit: Fit) -> tuple[TrackState, str]:
@@ -301,6 +306,7 @@ class Estimator:
             window.twist_covariance,
             window.acceleration_psd,
             reason,
+            self._detector.motion,
         )
         return self._pose
 

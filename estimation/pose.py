@@ -26,6 +26,21 @@ class TrackState(Enum):
         return self in (TrackState.TRACKING, TrackState.DEGRADED)
 
 
+@dataclass(frozen=True, slots=True)
+class SurfaceMotion:
+    """Whether the surface moves: a movement of 300 um or 0.1 degree away from where it was at rest (thesis 1.3).
+
+    moving: also before it has been seen at rest. onset: s, stamp of the first pose of the last movement, NaN where that
+    was before the first pose. moved: mm, of the middle of the mapped surface, and turned: rad, since it was last at
+    rest, or since the first pose before it ever was.
+    """
+
+    moving: bool = True
+    onset: float = float("nan")
+    moved: float = 0.0
+    turned: float = 0.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfacePose:
     """Pose of the surface at one instant.
@@ -33,7 +48,7 @@ class SurfacePose:
     stamp: s, middle of the exposure. base_from_surface: (4, 4) mm. covariance: (6, 6) of the right perturbation
     [rx ry rz tx ty tz], rad and mm, in the surface frame. twist: (6,) body velocity, rad/s and mm/s. twist_covariance:
     (6, 6). acceleration_psd: (6,) spectral density of the white-noise acceleration between poses, rad^2/s^3 and
-    mm^2/s^3. reason: why the state is what it is, in words for the operator.
+    mm^2/s^3. reason: why the state is what it is, in words for the operator. motion: as last detected.
     """
 
     stamp: float
@@ -44,6 +59,7 @@ class SurfacePose:
     twist_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     acceleration_psd: Array = field(default_factory=lambda: np.zeros(6))
     reason: str = ""
+    motion: SurfaceMotion = SurfaceMotion()
 
     def predict(self, stamp: float) -> SurfacePose:
         """The pose at `stamp` (s) under constant body velocity, with the covariance grown to match.

@@ -12,7 +12,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.pose import SurfacePose, TrackState
+from estimation.pose import SurfaceMotion, SurfacePose, TrackState
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from hardware.rig_file import rig_from_table, table_from_rig
@@ -114,13 +114,30 @@ def message_from_pose(pose: SurfacePose) -> Message:
         "twist_covariance": _flat(pose.twist_covariance),
         "acceleration_psd": _flat(pose.acceleration_psd),
         "reason": pose.reason,
+        "motion": _message_from_motion(pose.motion),
     }
 
 
 def pose_from_message(message: Message) -> SurfacePose:
     """An estimated pose from its message."""
     arrays = {key: _array(message[key], shape) for key, shape in _POSE_SHAPES.items()}
-    return SurfacePose(stamp=message["stamp"], state=TrackState(message["state"]), reason=message["reason"], **arrays)
+    return SurfacePose(
+        stamp=message["stamp"],
+        state=TrackState(message["state"]),
+        reason=message["reason"],
+        motion=_motion_from_message(message["motion"]) if "motion" in message else SurfaceMotion(),
+        **arrays,
+    )
+
+
+def _message_from_motion(motion: SurfaceMotion) -> Message:
+    onset = _flat(np.array([motion.onset]))
+    return {"moving": motion.moving, "onset": onset, "moved": motion.moved, "turned": motion.turned}
+
+
+def _motion_from_message(message: Message) -> SurfaceMotion:
+    onset = float(_array(message["onset"], (1,))[0])
+    return SurfaceMotion(message["moving"], onset, message["moved"], message["turned"])
 
 
 def message_from_move(move: Move) -> Message:

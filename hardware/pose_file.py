@@ -1,8 +1,8 @@
 """poses.tum and poses.csv: what a tracking run leaves behind, written line by line and read back.
 
 `poses.tum` holds the measured poses only, as evo reads them: `stamp x y z qx qy qz qw`, s and mm. `poses.csv` holds one
-line per frame set: stamp, frames given, pose, upper triangle of the covariance, twist, state, tracks per camera,
-milliseconds per stage, reason. Every line is flushed, so a killed run leaves whole lines.
+line per frame set: stamp, frames given, pose, upper triangle of the covariance, twist, whether it moves, state, tracks
+per camera, milliseconds per stage, reason. Every line is flushed, so a killed run leaves whole lines.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ _UPPER = np.triu_indices(6)
 _POSE = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 _COVARIANCE = tuple(f"cov_{TANGENT[i]}_{TANGENT[j]}" for i, j in zip(*_UPPER, strict=True))
 _TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_mm_s", "vy_mm_s", "vz_mm_s")
-_HEAD = ("stamp_s", "frames", *_POSE, *_COVARIANCE, *_TWIST, "state", "cameras")
+_MOTION = ("moving", "onset_s", "moved_mm", "turned_deg")
+_HEAD = ("stamp_s", "frames", *_POSE, *_COVARIANCE, *_TWIST, *_MOTION, "state", "cameras")
 _STATES = tuple(state.value for state in TrackState)
 
 
@@ -36,7 +37,8 @@ class PoseTable:
     """A run as parallel arrays, one row per frame set.
 
     stamps: (N,) s. frames: (N,) images given. base_from_surface: (N, 4, 4) mm. covariance: (N, 6, 6) and twist:
-    (N, 6) as in SurfacePose. states: N of TrackState. used: (N, C) tracks that carry the pose, per camera. seconds:
+    (N, 6) as in SurfacePose. moving: (N,), onset: (N,) s, NaN before the first, moved: (N,) mm and turned: (N,) rad, as
+    in SurfaceMotion. states: N of TrackState. used: (N, C) tracks that carry the pose, per camera. seconds:
     (N, S + 1) per stage and in all. reasons: N sentences. cameras: C names. stages: S + 1 names, the last "total".
     """
 
@@ -45,6 +47,10 @@ class PoseTable:
     base_from_surface: Array
     covariance: Array
     twist: Array
+    moving: NDArray[np.bool_]
+    onset: Array
+    moved: Array
+    turned: Array
     states: tuple[TrackState, ...]
     used: NDArray[np.int64]
     seconds: Array
@@ -81,8 +87,10 @@ class PoseWriter:
         numbers = _pose_numbers(pose.base_from_surface)
         upper = pose.covariance[_UPPER]
         milliseconds = [f"{1000 * s:.4f}" for s in (*seconds, total)]
+        motion = pose.motion
+        moved = [int(motion.moving), f"{motion.onset:.6f}", f"{motion.moved:.6f}", f"{np.rad2deg(motion.turned):.6f}"]
         self._csv.writerow(
-            [f"{pose.stamp:.6f}", frames, *numbers, *(f"{v:.9g}" for v in (*upper, *pose.twist))]
+            [f"{pose.stamp:.6f}", frames, *numbers, *(f"{v:.9g}" for v in (*upper, *pose.twist)), *moved]
             + [pose.state.value, int(np.count_nonzero(used)), *(int(n) for n in used), *milliseconds, pose.reason]
         )
         self._csv_file.flush()
@@ -132,8 +140,8 @@ def _table(path: Path, head: list[str], body: list[list[str]]) -> PoseTable:
         if row[state_column] not in _STATES:
             raise InputError(path, f"line {number}: state", row[state_column], ", ".join(_STATES))
     numbers = _numbers(path, head, [row[:state_column] + row[state_column + 1 : -1] for row in body])
-    stamps, frames, positions, quaternions, upper, twist, cameras_used, used, milliseconds = np.split(
-        numbers, np.cumsum([1, 1, 3, 4, 21, 6, 1, len(cameras)]), axis=1
+    stamps, frames, positions, quaternions, upper, twist, motion, cameras_used, used, milliseconds = np.split(
+        numbers, np.cumsum([1, 1, 3, 4, 21, 6, len(_MOTION), 1, len(cameras)]), axis=1
     )
     del cameras_used  # it is np.count_nonzero(used, 1)
     covariance = np.zeros((len(body), 6, 6))
@@ -144,6 +152,10 @@ def _table(path: Path, head: list[str], body: list[list[str]]) -> PoseTable:
         base_from_surface=se3.make(se3.rotation_from_quaternion(quaternions), positions),
         covariance=covariance,
         twist=twist,
+        moving=motion[:, 0] != 0,
+        onset=motion[:, 1],
+        moved=motion[:, 2],
+        turned=np.deg2rad(motion[:, 3]),
         states=tuple(TrackState(row[state_column]) for row in body),
         used=used.astype(np.int64),
         seconds=milliseconds / 1000,

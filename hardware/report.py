@@ -16,6 +16,7 @@ from estimation.pose import TrackState
 from estimation.se3 import Array
 from hardware.chart import Plot, ribbon, spanning
 from hardware.evaluation import NEES_BOUND, OFF_MM, Comparison, Evaluation, spread
+from hardware.motion_section import motion_section
 from hardware.page import area_key, document, figures_table, legend, line_key, row_of_tiles, section, tile
 from hardware.summary import figure, measured_share, percent, text_of, verdict
 
@@ -38,7 +39,9 @@ def page(result: Evaluation) -> str:
 
 def sections(result: Evaluation) -> list[str]:
     """The parts of the page that follow its tiles, as HTML."""
-    parts = [_states(result), _trajectory(result), _errors(result), _tracks(result), _latency(result)]
+    span = _followed(result)
+    parts = [_states(result), _trajectory(result), motion_section(result.table, span, WIDTH), _errors(result)]
+    parts += [_tracks(result), _latency(result)]
     return [part for part in parts if part]
 
 

@@ -148,6 +148,17 @@ OBSERVATIONS = _object(
     pixels=_perhaps("x y of each track, undistorted px"),
     sigma=_perhaps("px, one standard deviation per axis"),
 )
+MOTION: Schema = {
+    "type": "object",
+    "description": "Whether the surface moves",
+    "properties": {
+        "moving": FLAG,
+        "onset": _array(NUMBER, None, "s, start of the last movement; empty: before the first pose"),
+        "moved": _about(NUMBER, "mm since it was last at rest"),
+        "turned": _about(NUMBER, "rad since it was last at rest"),
+    },
+    "required": ["moving", "onset", "moved", "turned"],
+}
 POSE = _object(
     "stillbed.SurfacePose",
     "Estimated pose of the surface; mm, rad, s; tangent order rx ry rz tx ty tz, right perturbation",
@@ -159,6 +170,7 @@ POSE = _object(
     twist_covariance=_perhaps("6x6, rad/s, mm/s"),
     acceleration_psd=_perhaps("6, rad^2/s^3, mm^2/s^3"),
     reason=TEXT,
+    motion=MOTION,
 )
 MOVE = _object(
     "stillbed.Move",

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from session_files import image, rig, stamps, trajectory
 
-from estimation.pose import SurfacePose, TrackState
+from estimation.pose import SurfaceMotion, SurfacePose, TrackState
 from hardware.recording import Recorder
 from perception.frames import Frame
 
@@ -31,6 +31,7 @@ def pose(stamp: float, seed: int = 0) -> SurfacePose:
         np.eye(6) / 3,
         draw.random(6),
         'why "so"',
+        SurfaceMotion(True, stamp - 0.1 if seed else float("nan"), 0.31, 0.002),
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from estimation.pose import SurfacePose, TrackState
+from estimation.pose import SurfaceMotion, SurfacePose, TrackState
 from hardware.pose_file import PoseTable, PoseWriter, read_poses
 from tests.runs import run
 
@@ -23,6 +23,7 @@ def pose(table: PoseTable, i: int) -> SurfacePose:
         table.twist[i],
         table.states[i],
         reason=table.reasons[i],
+        motion=SurfaceMotion(bool(table.moving[i]), table.onset[i], table.moved[i], table.turned[i]),
     )
 
 
@@ -49,6 +50,9 @@ def test_csv_round_trip(tmp_path: Path) -> None:
     assert np.abs(back.base_from_surface - table.base_from_surface).max() < 1e-6
     assert np.allclose(back.covariance, table.covariance, rtol=1e-8)
     assert np.allclose(back.twist, table.twist, rtol=1e-8)
+    assert np.array_equal(back.moving, table.moving)
+    for name in ("onset", "moved", "turned"):
+        assert np.allclose(getattr(back, name), getattr(table, name), atol=1e-6, equal_nan=True)
     assert np.abs(back.seconds - table.seconds).max() < 1e-7
 
 

@@ -80,6 +80,7 @@ def test_every_record_comes_back_bit_by_bit(
     for name in ("base_from_surface", "covariance", "twist", "twist_covariance", "acceleration_psd"):
         assert getattr(estimate, name).tobytes() == getattr(pose(stamp, seed), name).tobytes()
     assert (estimate.stamp, estimate.state, estimate.reason) == (stamp, TrackState.DEGRADED, 'why "so"')
+    assert repr(estimate.motion) == repr(pose(stamp, seed).motion)  # NaN equals nothing, but is written like itself
     first, second, third = channels.read_commands(path)
     assert isinstance(first, Move) and isinstance(third, Move) and second == hold
     assert first.axes.tobytes() == move.axes.tobytes()
