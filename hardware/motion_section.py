@@ -9,7 +9,7 @@ from hardware.page import legend, line_key, section
 from hardware.pose_file import PoseTable
 
 
-def motion_section(table: PoseTable, span: tuple[float, float], width: float) -> str:
+def motion_section(table: PoseTable, span: tuple[float, float], width: int) -> str:
     """How far the surface was from its last place of rest, and where its movements began; HTML, "" without poses.
 
     span: s, of the time axis. width: px.
