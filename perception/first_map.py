@@ -18,9 +18,10 @@ from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals, surface_frame
 from estimation.triangulation import epipolar_distance, rays, triangulate
+from perception.alignment import align, coarse_score
 from perception.features import corners, match, polygon_mask, sift
 from perception.lens import Lenses, undistort
-from perception.patches import FLAT, Pyramid, Templates, align, coarse_score, join, project_squares, take_templates
+from perception.patches import FLAT, Pyramid, Templates, join, project_squares, take_templates
 
 EPIPOLAR_REACH = 40.0  # px: 0.3 m/s at 60 ms between exposures, f 700 px, 400 mm away
 LEAST_SEEDS, LEAST_LANDMARKS = 10, 20

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.rig import Camera, Rig, distort
+from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 
 _EXACT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)  # the default 5 rounds leave 0.1 px at wide angles
@@ -39,15 +39,38 @@ def imaged_radius(camera: Camera) -> float:
 
 
 class Lenses:
-    """The rig's lenses, with what each needs worked out once."""
+    """The rig's lenses, with what each needs worked out once. sizes: (C, 2) px, width and height."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
         self.radius = np.array([imaged_radius(c) for c in rig.cameras])
+        self.sizes = np.array([c.size for c in rig.cameras], float)
+        self._focal, self._centre = rig.matrices[:, [0, 1], [0, 1]], rig.matrices[:, :2, 2]
+        self._bends = np.array([c.distortion for c in rig.cameras], float)
 
-    def image(self, camera: int, ideal: Array, depth: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Imaged pixels (..., 2) of ideal ones and whether each is in front of and inside the lens's field (...)."""
-        lens = self.rig.cameras[camera]
-        tangent = (ideal - lens.matrix[:2, 2]) / lens.matrix[[0, 1], [0, 1]]
-        seen = (depth > 1.0) & (np.einsum("...i,...i->...", tangent, tangent) < self.radius[camera] ** 2)
-        return distort(lens, np.where(seen[..., None], ideal, lens.matrix[:2, 2])), seen
+    def image(self, camera: int | NDArray[np.int64], ideal: Array, depth: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Imaged pixels (..., 2) of ideal ones and whether each is in front of and inside the lens's field (...).
+
+        camera: of all of them, or of each (...).
+        """
+        tangent = (ideal - self._centre[camera]) / self._focal[camera]
+        imaged, seen = self.bend(camera, tangent[..., 0], tangent[..., 1], depth)
+        return np.moveaxis(imaged, 0, -1), seen
+
+    def bend(
+        self, camera: int | NDArray[np.int64], x: Array, y: Array, depth: Array
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """As `image`, of tangents x, y (...) of the angles to the axis; pixels (2, ...). camera: broadcast to them."""
+        r2 = x * x + y * y
+        seen = (depth > 1.0) & (r2 < self.radius[camera] ** 2)
+        if not seen.all():
+            x, y, r2 = x * seen, y * seen, r2 * seen
+        k1, k2, p1, p2, k3 = np.moveaxis(self._bends[camera], -1, 0)
+        radial, xy = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * x * y
+        imaged = np.empty((2, *r2.shape))
+        imaged[0] = x * radial + p1 * xy + p2 * (r2 + 2 * x * x)
+        imaged[1] = y * radial + p1 * (r2 + 2 * y * y) + p2 * xy
+        for axis in (0, 1):
+            imaged[axis] *= self._focal[camera, axis]
+            imaged[axis] += self._centre[camera, axis]
+        return imaged, seen

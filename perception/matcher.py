@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,18 +10,20 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations, no_observations
-from estimation.pose_solver import solve_pose
+from estimation.pose_solver import project, solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
+from perception.alignment import align_in
 from perception.flow import flow as optical_flow
 from perception.frames import Image
 from perception.lens import Lenses, undistort
-from perception.patches import Alignment, Pyramid, Templates, project_squares
-from perception.patches import align as align_patches
+from perception.patches import Pyramid, Templates, project_into
 
 LOOSE = np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3)  # how far one camera's own pose may stray from the joint one
 FLOW_TRACKS = 80  # a camera: enough for a start, and flow is only that
+DOUBTED = 8  # landmarks of a camera that tell how uncertain all of them are
+MOST = 0.8  # of a camera's landmarks: fewer found may be the fault of where they were sought
 ROUGH = 1e-3  # rad, mm: a start for the alignment need not be better
 
 
@@ -43,6 +46,7 @@ class Matcher:
         self.map = surface_map
         self.agrees = np.ones(len(surface_map), bool)  # landmarks worth looking for
         self._views: dict[int, View] = {}
+        self._gathered: tuple[NDArray[np.int64], Templates] | None = None
 
     def take(self, surface_map: SurfaceMap, agrees: NDArray[np.bool_]) -> None:
         """A refined map, same rows, and which of them (N,) are worth looking for."""
@@ -51,6 +55,26 @@ class Matcher:
     def seen(self, camera: int) -> int:
         """How many landmarks a camera last saw."""
         return len(self._views[camera].rows) if camera in self._views else 0
+
+    def doubt(self, base_from_surface: Array, covariance: Array) -> float:
+        """How far off, px, one standard deviation, a pose with a covariance (6, 6) puts the landmarks in the images.
+
+        The worst of a few landmarks, a camera each in turn; infinite where no camera knows the surface.
+        """
+        ready = sorted(c for c in self._views if self.seen(c) >= 6)
+        if not ready:
+            return np.inf
+        rows = np.concatenate([self._views[c].rows[:: 1 + len(self._views[c].rows) // DOUBTED] for c in ready])
+        camera = np.concatenate(
+            [np.full(len(self._views[c].rows[:: 1 + len(self._views[c].rows) // DOUBTED]), c) for c in ready]
+        )
+        jacobian = project(self.rig, camera, base_from_surface, self.map.points[rows])[2]
+        return float(np.sqrt(((jacobian @ covariance) * jacobian).sum(2).max()))
+
+    def complete(self, observations: Observations, cameras: Iterable[int]) -> bool:
+        """Whether each camera found most of what it last saw."""
+        found = np.bincount(observations.camera, minlength=len(self.rig))
+        return all(found[c] >= MOST * self.seen(c) for c in cameras)
 
     def flow(self, pyramids: dict[int, Pyramid], guess: Array) -> tuple[Array, dict[int, Array]]:
         """The joint pose by optical flow, and each camera's own: cameras are seldom exposed at the same instant."""
@@ -105,27 +129,37 @@ class Matcher:
         self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array], coarse: bool = False
     ) -> Observations:
         """Measure the landmarks in every camera, begun where the camera's own pose puts them; coarse: from afar."""
-        rows = np.nonzero(self.agrees)[0]
         cameras = [c for c in pyramids if c in poses]
         if not cameras:
             return no_observations(stamp)
-        results = [self._align_one(c, pyramids[c], poses[c], rows, coarse) for c in cameras]
-        found = [rows[r.found] for r in results]
-        pixels = [undistort(self.rig.cameras[c], r.pixels[r.found]) for c, r in zip(cameras, results, strict=True)]
-        return Observations(
-            stamp,
-            np.concatenate([np.full(len(f), c, np.int64) for c, f in zip(cameras, found, strict=True)]),
-            np.concatenate(found),
-            np.concatenate(pixels),
-            np.concatenate([r.sigma[r.found] for r in results]),
-        )
+        rows = np.nonzero(self.agrees)[0]
+        surface_map, axes = self.map, self.templates.axes[rows]
+        starts = np.stack([poses[c] for c in cameras])
+        where = project_into(self.lenses, cameras, starts, surface_map.points[rows], surface_map.normals[rows], axes)
+        seen = np.nonzero(where.visible)[0]
+        position, row = np.divmod(seen, len(rows))
+        where, row = where.take(seen), rows[row]
+        counts = np.bincount(position, minlength=len(cameras))
+        images = [pyramids[c] for c in cameras]
+        result = align_in(self._pictures(row), images, counts.tolist(), where, where.centre, coarse=coarse)
+        kept = result.found
+        camera = np.array(cameras, np.int64)[position[kept]]
+        pixels = self._ideal(camera, result.pixels[kept])
+        return Observations(stamp, camera, row[kept], pixels, result.sigma[kept])
 
-    def _align_one(self, camera: int, images: Pyramid, pose: Array, rows: NDArray[np.int64], coarse: bool) -> Alignment:
-        surface_map, templates = self.map, self.templates
-        where = project_squares(
-            self.lenses, camera, pose, surface_map.points[rows], surface_map.normals[rows], templates.axes[rows]
-        )
-        return align_patches(templates.take(rows), images, where, where.centre, coarse=coarse)
+    def _ideal(self, camera: NDArray[np.int64], pixels: Array) -> Array:
+        """Undistorted pixels (N, 2) of imaged ones, by camera (N,), in ascending blocks."""
+        ideal = np.empty((len(pixels), 2))
+        for c in np.unique(camera):
+            mine = camera == c
+            ideal[mine] = undistort(self.rig.cameras[c], pixels[mine])
+        return ideal
+
+    def _pictures(self, rows: NDArray[np.int64]) -> Templates:
+        """The templates of rows (N,): megabytes to gather, and mostly those of the last frame set."""
+        if self._gathered is None or not np.array_equal(self._gathered[0], rows):
+            self._gathered = rows, self.templates.take(rows)
+        return self._gathered[1]
 
     def remember(
         self, pyramids: dict[int, Pyramid], observations: Observations, inlier: NDArray[np.bool_], pose: Array

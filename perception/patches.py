@@ -1,13 +1,12 @@
-"""Small textured tiles of the surface, found again in later images by warping and sub-pixel alignment.
+"""Small textured tiles of the surface: what each looks like, and where it falls in a camera.
 
 Each landmark keeps the picture of a small square of the surface's tangent plane, taken once from its reference image.
-In a later image the square is projected with the predicted pose and shifted until the picture fits (inverse
-compositional Lucas-Kanade, Baker and Matthews 2004, on patches freed of brightness and contrast), so a track never
-creeps: it is compared with the reference, never with the frame before.
+In a later image the square is projected with the predicted pose; perception.alignment shifts it until the picture fits.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -33,6 +32,7 @@ def _grid() -> Array:
 
 
 GRID = _grid()  # (SIDE * SIDE, 2)
+GRID_SIZE = len(GRID)
 _SPAN = np.ascontiguousarray(GRID.T, np.float32)  # (2, S)
 
 
@@ -79,13 +79,23 @@ def sample(image: Image, centre: Array, per_sample: Array, spacing: float = 1.0,
     spacing: steps from sample to sample. half: the image is the half-size one of `pyramid`. Bilinear; outside the image
     the border's value.
     """
+    return look_up(image, grid_offsets(per_sample, spacing, half), centre, half).astype(np.float32)
+
+
+def grid_offsets(per_sample: Array, spacing: float = 1.0, half: bool = False) -> Float32:
+    """Where the grid's samples lie about its centre: (N, 2, S) px of the image that is sampled."""
+    scale = (0.5 if half else 1.0) * spacing
+    flat = (per_sample * scale).astype(np.float32).reshape(-1, 2) @ _SPAN
+    return np.asarray(flat.reshape(-1, 2, GRID_SIZE), np.float32)
+
+
+def look_up(image: Image, offsets: Float32, centre: Array, half: bool) -> Image:
+    """Grey levels (N, S) of an image at `grid_offsets` (N, 2, S) about centres (N, 2) px."""
     # A quarter pixel beside the half-size grid bilinear sampling blurs the image, which widens the reach: on the grid
     # tests/test_patches.py finds fewer from 5 px away. Templates are cut alike, so what is compared is not shifted.
-    scale, shift = (0.5, -0.25) if half else (1.0, 0.0)
-    offsets = np.matmul((per_sample * (spacing * scale)).astype(np.float32), _SPAN)  # (N, 2, S)
-    start = (centre * scale + shift).astype(np.float32)
+    start = (centre * 0.5 - 0.25 if half else centre).astype(np.float32)
     x, y = offsets[:, 0] + start[:, :1], offsets[:, 1] + start[:, 1:]
-    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 def normalise(pictures: Float32) -> tuple[Float32, Float32]:
@@ -97,7 +107,7 @@ def normalise(pictures: Float32) -> tuple[Float32, Float32]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """Where squares fall in one camera.
+    """Where squares fall in one camera, or in several one after the other.
 
     centre: (N, 2) px as imaged. per_sample: (N, 2, 2) px. visible: (N,). facing: (N,) cosine of the viewing angle.
     """
@@ -107,27 +117,47 @@ class Projection:
     visible: NDArray[np.bool_]
     facing: Array
 
+    def take(self, index: NDArray[np.int64]) -> Projection:
+        """The chosen ones."""
+        return Projection(self.centre[index], self.per_sample[index], self.visible[index], self.facing[index])
+
 
 def project_squares(
     lenses: Lenses, camera: int, base_from_surface: Array, points: Array, normals: Array, axes: Array
 ) -> Projection:
     """Project tangent squares at points (N, 3) with sides axes (N, 3, 2), surface frame, mm, into one camera."""
-    lens = lenses.rig.cameras[camera]
-    camera_from_surface = lenses.rig.camera_from_base[camera] @ base_from_surface
-    step = 2.0  # samples: wide enough that the difference is the patch's own scale, not rounding
-    corners = np.stack([points, points + step * axes[:, :, 0], points + step * axes[:, :, 1]], 1)  # (N, 3, 3)
-    in_camera = se3.transform_points(camera_from_surface, corners.reshape(-1, 3)).reshape(-1, 3, 3)
-    depth = in_camera[..., 2]
-    ideal = in_camera[..., :2] / np.where(np.abs(depth) < 1e-6, 1e-6, depth)[..., None]
-    ideal = ideal * lens.matrix[[0, 1], [0, 1]] + lens.matrix[:2, 2]
-    imaged, seen = lenses.image(camera, ideal, depth)
-    per_sample = np.swapaxes(imaged[:, 1:] - imaged[:, :1], 1, 2) / step
-    view = in_camera[:, 0] / np.maximum(np.linalg.norm(in_camera[:, 0], axis=1, keepdims=True), 1e-9)
-    facing = -np.einsum("ni,ni->n", normals @ camera_from_surface[:3, :3].T, view)
+    return project_into(lenses, [camera], base_from_surface[None], points, normals, axes)
+
+
+def project_into(
+    lenses: Lenses, cameras: Sequence[int], base_from_surface: Array, points: Array, normals: Array, axes: Array
+) -> Projection:
+    """Project the squares into several cameras, each with its own base_from_surface (C, 4, 4).
+
+    Row c N + i of the answer is square i in cameras[c].
+    """
+    which = np.asarray(cameras, np.int64)
+    camera_from_surface = lenses.rig.camera_from_base[which] @ base_from_surface
+    count, step = len(which), 2.0  # samples: wide enough that the difference is the patch's own scale, not rounding
+    corners = np.stack([points, points + step * axes[:, :, 0], points + step * axes[:, :, 1]]).reshape(-1, 3)
+    in_camera = camera_from_surface[:, :3, :3] @ corners.T + camera_from_surface[:, :3, 3:]  # (C, 3, 3N)
+    x, y, depth = in_camera.reshape(count, 3, 3, -1).swapaxes(0, 1)  # each (C, 3, N)
+    inverse_depth = 1 / np.where(np.abs(depth) < 1e-6, 1e-6, depth)
+    imaged, seen = lenses.bend(which[:, None, None], x * inverse_depth, y * inverse_depth, depth)  # (2, C, 3, N)
+    per_sample = (imaged[:, :, 1:] - imaged[:, :, :1]) / step  # (2, C, 2, N)
+    turned = camera_from_surface[:, :3, :3] @ normals.T  # (C, 3, N)
+    from_eye = in_camera[:, :, : len(points)]
+    facing = -(turned * from_eye).sum(1) / np.maximum(np.sqrt((from_eye * from_eye).sum(1)), 1e-9)
     reach = RADIUS * np.abs(per_sample).sum(2) + 2
-    centre = imaged[:, 0]
-    inside = ((centre >= reach) & (centre < np.array(lens.size) - 1 - reach)).all(1)
-    return Projection(centre, per_sample, seen.all(1) & inside & (facing > 0.15), facing)
+    centre = imaged[:, :, 0]
+    limit = lenses.sizes[which].T[..., None] - 1 - reach
+    visible = seen.all(1) & ((centre >= reach) & (centre < limit)).all(0) & (facing > 0.15)
+    return Projection(
+        np.ascontiguousarray(centre.reshape(2, -1).T),
+        np.ascontiguousarray(per_sample.transpose(1, 3, 0, 2).reshape(-1, 2, 2)),
+        visible.ravel(),
+        facing.ravel(),
+    )
 
 
 def square_axes(lenses: Lenses, camera: int, base_from_surface: Array, points: Array, normals: Array) -> Array:
@@ -162,81 +192,3 @@ def take_templates(
     fine = _describe(sample(images[0], where.centre, where.per_sample))
     coarse = _describe(sample(images[1], where.centre, where.per_sample, 2.0, half=True))
     return Templates(np.full(len(points), camera), axes, fine[0], fine[1], fine[2], *coarse[:3], fine[3].astype(float))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Alignment:
-    """Where landmarks were found in one image: pixels (N, 2) as imaged, sigma (N,) px, score (N,) correlation in
-    [-1, 1], found (N,)."""
-
-    pixels: Array
-    sigma: Array
-    score: Array
-    found: NDArray[np.bool_]
-
-
-def align(
-    templates: Templates,
-    images: Pyramid,
-    where: Projection,
-    start: Array,
-    least: float = 0.75,
-    coarse: bool = True,
-) -> Alignment:
-    """Shift each template until it fits.
-
-    start: (N, 2) px as imaged, where to begin. least: the correlation below which a landmark is not found. coarse:
-    begin on the half-size image, which reaches twice as far (5 px surely, 8 mostly) and costs as much again.
-    """
-    shift = np.zeros((len(templates), 2))  # in samples of the template
-    if coarse:
-        pieces = templates.coarse_picture, templates.coarse_steepest, templates.coarse_inverse_hessian
-        _descend(pieces, images[1], where, start, shift, 2.0, 4)
-    _descend((templates.picture, templates.steepest, templates.inverse_hessian), images[0], where, start, shift, 1.0, 6)
-    return _judge(templates, images[0], where, start, shift, least)
-
-
-def _descend(
-    pieces: tuple[Float32, Float32, Array],
-    image: Image,
-    where: Projection,
-    start: Array,
-    shift: Array,
-    spacing: float,
-    rounds: int,
-) -> None:
-    """Gauss-Newton on the shifts (N, 2), in place, of those in view; who has arrived is left alone."""
-    picture, steepest, inverse = pieces
-    busy = np.nonzero(where.visible)[0]
-    for _ in range(rounds):
-        if not len(busy):
-            return
-        per_sample = where.per_sample[busy]
-        centre = start[busy] + (per_sample @ shift[busy, :, None])[..., 0]
-        current, _ = normalise(sample(image, centre, per_sample, spacing, half=spacing > 1))
-        gradient = np.matmul(steepest[busy], (current - picture[busy])[..., None])
-        step = -(inverse[busy] @ gradient)[..., 0]
-        length = np.sqrt((step * step).sum(1))
-        shift[busy] += step * (spacing * np.minimum(1.0, 3.0 / np.maximum(length, 1e-9)))[:, None]
-        busy = busy[length > 0.03]
-
-
-def coarse_score(templates: Templates, images: Pyramid, where: Projection, centre: Array) -> Array:
-    """Correlation (N,) in [-1, 1] of each template with the half-size image at centres (N, 2) px, without alignment."""
-    current, _ = normalise(sample(images[1], centre, where.per_sample, 2.0, half=True))
-    return np.asarray((current * templates.coarse_picture).mean(1), float)
-
-
-def _judge(
-    templates: Templates, image: Image, where: Projection, start: Array, shift: Array, least: float
-) -> Alignment:
-    moved = (where.per_sample @ shift[..., None])[..., 0]
-    pixels = start + moved
-    current, contrast = normalise(sample(image, pixels, where.per_sample))
-    score = (current * templates.picture).mean(1).astype(float)
-    noise = 2 * (1 - np.clip(score, -1, 1)) * 2.0  # variance per sample; neighbours share noise, hence the two
-    per_pixel = where.per_sample @ templates.inverse_hessian @ np.swapaxes(where.per_sample, 1, 2)
-    sigma = np.sqrt(np.maximum(noise * np.trace(per_pixel, axis1=1, axis2=2) / 2, 0.05**2))
-    reach = np.linalg.norm(moved, axis=1)
-    found = where.visible & (score > least) & (contrast > FLAT) & (reach < 3 * SIDE) & np.isfinite(pixels).all(1)
-    return Alignment(pixels, sigma, score, found)

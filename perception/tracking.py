@@ -1,9 +1,9 @@
 """TrackingStep: one frame set in, one surface pose out; no I/O and no clock of its own.
 
-Flow from the last images predicts where each landmark is, alignment with the landmark's reference picture measures it,
-the estimator fits the pose. When too little is found the surface is searched by its SIFT features. Cameras take turns:
-a thread for each was measured to gain nothing (13.3 ms against 13.9, p99 16.6 against 30, three cameras, two cores),
-since most of the work is short numpy calls that hold the interpreter.
+The motion model, or where that is not sure enough flow from the last images, predicts where each landmark is, alignment
+with the landmark's reference picture measures it, the estimator fits the pose. When too little is found the surface is
+searched by its SIFT features. All cameras are aligned in one go: most of the time is the number of calls, and a thread
+for each camera was measured to gain nothing, as short numpy calls hold the interpreter.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from perception.patches import Pyramid, pyramid
 from perception.relocalise import Relocaliser
 
 STAGES = ("prepare", "flow", "align", "pose", "search")
+NEAR = 0.8  # px, one sigma: three of it are what alignment reaches on the full image
 FULL_SEARCH = 10  # frame sets of an absent surface between searches at full size, off the frame's path
 
 
@@ -132,11 +133,7 @@ class TrackingStep:
     ) -> tuple[SurfacePose, Observations, NDArray[np.int64]]:
         estimator = self._estimator
         assert estimator.map is not None and estimator.pose is not None
-        guess = estimator.predict(stamp)
-        joint, single = matcher.flow(pyramids, guess)
-        self._took("flow")
-        observations = matcher.align(stamp, pyramids, single)
-        self._took("align")
+        joint, observations = self._measure(matcher, estimator.pose.predict(stamp), pyramids)
         fit = estimator.fit(observations, joint)
         self._took("pose")
         if not fit.measured or self._missing(fit, pyramids):
@@ -161,6 +158,29 @@ class TrackingStep:
             self._lost = pyramids if self._absent % FULL_SEARCH == 0 else {}
         self._took("pose")
         return pose, observations, fit.used
+
+    def _measure(
+        self, matcher: Matcher, expected: SurfacePose, pyramids: dict[int, Pyramid]
+    ) -> tuple[Array, Observations]:
+        """A rough joint pose and the landmarks found in the images.
+
+        Alignment begins where the motion puts the surface, if that is known to a pixel or so. Flow is asked where it is
+        not, and where alignment then finds fewer landmarks than the last images had.
+        """
+        stamp, guess, observations = expected.stamp, expected.base_from_surface, None
+        late = self._estimator.skew.sigma * expected.twist
+        if matcher.doubt(guess, expected.covariance + np.outer(late, late)) < NEAR:
+            observations = matcher.align(stamp, pyramids, dict.fromkeys(pyramids, guess))
+            self._took("align")
+            if matcher.complete(observations, pyramids):
+                return guess, observations
+        joint, single = matcher.flow(pyramids, guess)
+        self._took("flow")
+        again = matcher.align(stamp, pyramids, single)
+        self._took("align")
+        if observations is not None and len(observations) > len(again):
+            return guess, observations
+        return joint, again
 
     def _missing(self, fit: Fit, pyramids: dict[int, Pyramid]) -> list[int]:
         """Cameras that carried the last pose and now hardly see the surface."""

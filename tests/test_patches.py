@@ -11,15 +11,13 @@ from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
 from hardware.simulator.default_rig import REST, arc_rig
+from perception.alignment import Alignment, align, coarse_score
 from perception.features import grey
 from perception.frames import Image
 from perception.lens import Lenses
 from perception.patches import (
-    Alignment,
     Projection,
     Templates,
-    align,
-    coarse_score,
     join,
     normalise,
     project_squares,
