@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from estimation.errors import StillbedError
 from hardware.bench.command import add_bench
+from hardware.methods import MAP, METHODS
 
 if TYPE_CHECKING:
     from hardware.progress import Progress
@@ -158,6 +159,9 @@ def _add_track(commands: Commands) -> None:
     )
     command.add_argument("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
     command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
+    command.add_argument(
+        "--method", choices=METHODS, default=MAP, help="; ".join(f"{name}: {what}" for name, what in METHODS.items())
+    )
     command.add_argument("--record", type=Path, metavar="X.mcap", help="also record images, tracks and poses as MCAP")
     command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     command.set_defaults(run=_track)
@@ -236,7 +240,7 @@ def _arm(arguments: argparse.Namespace) -> None:
 def _track(arguments: argparse.Namespace) -> None:
     from hardware.track import run_track
 
-    print(run_track(arguments.session, arguments.out, arguments.record, arguments.force))
+    print(run_track(arguments.session, arguments.out, arguments.record, arguments.force, arguments.method))
 
 
 def _replay(arguments: argparse.Namespace) -> None:

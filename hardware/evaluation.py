@@ -198,6 +198,7 @@ class Evaluation:
 
     title: the session's name. comparison: None without truth or reference. shares: per state, of the frame sets from
     `since` (s) on. complete: whether the session was run to its end. damage: what was lost of its file, "" if nothing.
+    method: how it was tracked, a key of hardware.methods.METHODS or "truth", "" where that is not known.
     """
 
     title: str
@@ -208,6 +209,7 @@ class Evaluation:
     since: float
     complete: bool
     damage: str
+    method: str = ""
 
 
 def evaluate(
@@ -217,7 +219,9 @@ def evaluate(
     since: float = -np.inf,
     complete: bool = True,
     damage: str = "",
+    method: str = "",
 ) -> Evaluation:
     """Everything about one run; `since` (s) is the instant from which its states count."""
     comparison = None if truth is None else compare(table, truth)
-    return Evaluation(title, table, comparison, latency(table), state_shares(table, since), since, complete, damage)
+    shares = state_shares(table, since)
+    return Evaluation(title, table, comparison, latency(table), shares, since, complete, damage, method)

@@ -34,7 +34,8 @@ def page(result: Evaluation) -> str:
     """The page as HTML text."""
     body = [_tiles(result), *sections(result)]
     footer = "Lengths in mm, time in s from the session's own clock; poses are base_from_surface."
-    return document("stillbed track", result.title or "a session", " ".join(verdict(result)), body, footer)
+    kind = f"stillbed track, method {result.method}" if result.method else "stillbed track"
+    return document(kind, result.title or "a session", " ".join(verdict(result)), body, footer)
 
 
 def sections(result: Evaluation) -> list[str]:

@@ -63,6 +63,7 @@ def as_dict(result: Evaluation) -> dict[str, Any]:
     percentiles = zip(late.stages, late.p50, late.p95, late.p99, late.max, strict=True)
     summary = {
         "session": result.title,
+        "method": result.method,
         "complete": result.complete,
         "verdict": verdict(result),
         "frame_sets": len(result.table),

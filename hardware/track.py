@@ -12,6 +12,7 @@ import numpy as np
 from estimation.pose import SurfacePose
 from hardware.clock import WallClock
 from hardware.evaluation import evaluate
+from hardware.methods import MAP, step_by
 from hardware.out_folder import prepare_out
 from hardware.pose_file import PoseWriter, read_poses
 from hardware.progress import Progress, Report
@@ -19,7 +20,6 @@ from hardware.report import write_report
 from hardware.session import Session, open_session
 from hardware.summary import summary_text, write_summary
 from hardware.track_recorder import TrackRecorder
-from hardware.tracker import tracker
 from perception.frames import FrameSet
 from perception.tracking import STAGES, StepReport
 
@@ -68,23 +68,24 @@ def follow(
     return done
 
 
-def finish(out: Path, session: Session, complete: bool) -> str:
+def finish(out: Path, session: Session, complete: bool, method: str = MAP) -> str:
     """Judge what poses.csv in `out` holds; writes report.html and summary.json there and returns the summary as text.
 
-    complete: whether the session was run to its end.
+    complete: whether the session was run to its end. method: by which it was tracked.
     """
     since = min((roi.stamp for roi in session.roi), default=-np.inf)
     table = read_poses(out / "poses.csv")
-    result = evaluate(table, session.truth, session.path.name, since, complete, session.damage)
+    result = evaluate(table, session.truth, session.path.name, since, complete, session.damage, method)
     write_summary(out / "summary.json", result)
     write_report(out / "report.html", result)
     return summary_text(result)
 
 
-def run_track(path: Path, out: Path, record: Path | None = None, force: bool = False) -> str:
+def run_track(path: Path, out: Path, record: Path | None = None, force: bool = False, method: str = MAP) -> str:
     """Track the session at `path` into the folder `out`; returns the summary as text.
 
-    Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of all frame sets until then.
+    method: a key of METHODS. Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of
+    all frame sets until then.
     """
     session = open_session(path)
     prepare_out(out, force)
@@ -92,7 +93,7 @@ def run_track(path: Path, out: Path, record: Path | None = None, force: bool = F
     cameras = [camera.name for camera in session.rig.cameras]
     complete = False
     with ExitStack() as stack:
-        step = stack.enter_context(tracker(session.rig, session.roi, session.surface, clock.now))
+        step = stack.enter_context(step_by(method, session.rig, session.roi, session.surface, clock.now))
         sinks = [] if record is None else [stack.enter_context(TrackRecorder(record, session, force)).write]
         writer = stack.enter_context(PoseWriter(out, cameras, STAGES))
         progress = stack.enter_context(Progress("track", "frame sets", clock.now))
@@ -100,5 +101,5 @@ def run_track(path: Path, out: Path, record: Path | None = None, force: bool = F
             follow(session.frame_sets(), step, writer, clock.now, progress, len(session), sinks)
             complete = True
         finally:
-            text = finish(out, session, complete)
+            text = finish(out, session, complete, method)
     return f"{text}\nreport: {out / 'report.html'}"

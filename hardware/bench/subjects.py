@@ -39,4 +39,5 @@ Subjects = Mapping[str, Subject]
 SUBJECTS: Subjects = {
     "estimator": Subject("hardware.bench.estimator", "the estimator on synthetic tracks: accuracy, honesty, time"),
     "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?"),
+    "thesis": Subject("hardware.bench.thesis", "the thesis's estimator beside ours, on the same frame sets"),
 }

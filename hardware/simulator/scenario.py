@@ -11,6 +11,7 @@ from estimation.se3 import Array
 from estimation.synthetic.motions import Motion
 from hardware.arm_profile import ArmProfile
 from hardware.checks import Table
+from hardware.methods import MAP
 from hardware.simulator.arm_faults import ArmFault
 from hardware.simulator.arm_settings import ArmSettings
 from hardware.simulator.camera_settings import CameraSettings
@@ -21,15 +22,17 @@ from planning.kinematics import SimpleArm
 
 @dataclass(frozen=True, slots=True)
 class Tracking:
-    """How poses are made. pictures: by TrackingStep from rendered pictures, else exact ones at their instants.
+    """How poses are made. pictures: by a tracking step from rendered pictures, else exact ones at their instants.
 
     processing: s that a frame set takes, None for the time that was measured (then no two runs are alike).
     scan: whether the tracker has the scan and registers to it; else the path is registered by the skin's texture.
+    method: of the tracking step, a key of METHODS.
     """
 
     pictures: bool = True
     processing: float | None = 0.02  # 15 ms of tracking and 5 ms of decoding, measured on two cores
     scan: bool = False
+    method: str = MAP
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,8 +13,8 @@ faults = ["stall 600ms at 5s"]   # of the arm
 [rig]                            # file, or angles_deg, distance_mm, focal_px, size, distortion
 [cameras]                        # rate, exposure, way to the computer, clock offsets, lost and damaged frames
 [sensor]                         # noise, vignetting, jpeg_quality (0 for lossless pictures)
-[tracking]                       # by = "pictures" or "truth"; processing_s = 0.02 or "measured"; register = "texture"
-                                 # or "scan"
+[tracking]                       # by = "pictures", "thesis", "thesis-flow" or "truth"; processing_s = 0.02 or
+                                 # "measured"; register = "texture" or "scan"
 [arm]                            # file, assumed_lag_s, wire_baud, and the virtual controller: servo, dead time, replies
 [planted]                        # rig_offset_mm, arm_offset_mm: errors of calibration that nothing in the loop knows of
 [limits]                         # what the run must reach, for the exit code
@@ -35,6 +35,7 @@ from hardware import checks
 from hardware.arm_file import read_arm
 from hardware.arm_profile import BITS_PER_BYTE, LONGEST_LAG, ArmProfile, placed
 from hardware.checks import Table
+from hardware.methods import MAP, THESIS, THESIS_FLOW
 from hardware.protocol import LENGTH
 from hardware.rig_file import read_rig
 from hardware.simulator.arm_faults import ArmFault, fault_from_text
@@ -182,12 +183,12 @@ def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:
 
 def _tracking(path: Path, table: Table) -> Tracking:
     checks.check_keys(path, "tracking.", table, (), ("by", "processing_s", "register"))
-    by = _one_of(path, "tracking.by", table.get("by", "pictures"), ("pictures", "truth"))
+    by = _one_of(path, "tracking.by", table.get("by", "pictures"), ("pictures", THESIS, THESIS_FLOW, "truth"))
     register = _one_of(path, "tracking.register", table.get("register", "texture"), ("texture", "scan"))
     spent = table.get("processing_s", Tracking().processing)
     measured = spent == "measured"
     processing = None if measured else _within(path, "tracking.processing_s", spent, 0, 10, 's, or "measured"')
-    return Tracking(by == "pictures", processing, register == "scan")
+    return Tracking(by != "truth", processing, register == "scan", MAP if by in ("pictures", "truth") else by)
 
 
 def _switch(path: Path, key: str, value: object) -> bool:

@@ -16,6 +16,7 @@ from estimation.errors import InputError
 from estimation.trajectory import Trajectory
 from hardware.clock import WallClock
 from hardware.evaluation import Evaluation, evaluate
+from hardware.methods import MAP, step_by
 from hardware.out_folder import prepare_out
 from hardware.path_file import read_path
 from hardware.ply_file import write_ply
@@ -40,7 +41,6 @@ from hardware.simulator.truth import Truth
 from hardware.simulator.world import Exposures, World
 from hardware.summary import write_summary
 from hardware.track import Step
-from hardware.tracker import tracker
 from perception.frames import Roi
 from planning.path import Path as Checkpoints
 
@@ -123,8 +123,8 @@ def _check_pairs(scenario: Scenario, scene: Scene) -> None:
     if (scenario.strain is None) != (scene.deformation == STILL):
         allowed = "both (how much over time, and of what) or neither"
         raise InputError(scenario.file, "strain, scene.deformation", "one of the two", allowed)
-    if scenario.tracking.scan and not scenario.tracking.pictures:
-        allowed = 'with by = "pictures": the truth needs no registration'
+    if scenario.tracking.scan and not (scenario.tracking.pictures and scenario.tracking.method == MAP):
+        allowed = 'with by = "pictures": nothing else registers to a scan'
         raise InputError(scenario.file, "tracking.register", "scan", allowed)
 
 
@@ -169,7 +169,8 @@ def _tracking_report(
     table = read_poses(folder / "poses.csv")
     exact = Trajectory(table.stamps, truth.base_from_surface(table.stamps), exact=True) if len(table) else None
     since = min((roi.stamp for roi in regions), default=-np.inf)
-    result = evaluate(table, exact, scenario.title, since, complete)
+    method = scenario.tracking.method if scenario.tracking.pictures else "truth"
+    result = evaluate(table, exact, scenario.title, since, complete, method=method)
     write_summary(folder / "summary.json", result)
     write_report(folder / "report.html", result)
     return result
@@ -202,7 +203,7 @@ def _tracking(
 ) -> Iterator[Step]:
     """The tracking step of the scenario: that of a live run, or one that knows the truth."""
     if scenario.tracking.pictures:
-        with tracker(scenario.told_rig, regions, scan, WallClock().now) as step:
+        with step_by(scenario.tracking.method, scenario.told_rig, regions, scan, WallClock().now) as step:
             yield step
         return
     told, true = scenario.told_rig.cameras[0], scenario.rig.cameras[0]
