@@ -37,21 +37,48 @@ def freedom(points: Array, normals: Array, sigma: float, index: ScanIndex) -> Fr
     size = float(np.ptp(index.samples, axis=0).max())
     if not len(points):
         return Freedom(np.eye(6), ("everything",), np.diag([np.pi**2] * 3 + [size**2] * 3), np.inf)
-    centre = points.mean(0)
-    radius = max(float(np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1)))), 1e-6)
-    jacobian = np.concatenate([np.cross(points - centre, normals) / radius, normals], axis=1)
-    values, vectors = np.linalg.eigh(jacobian.T @ jacobian / len(points))
-    slope = np.sqrt(np.maximum(values, 0))
+    centre, radius = _middle(points)
+    slope, vectors = _slopes(points, normals)
     std = sigma / np.maximum(slope * np.sqrt(len(points)), 1e-12)
     free = (slope < FREE_SLOPE) | (std > FREE_STD)
-    perturbation = np.zeros((6, 6))  # of a motion counted as above
-    perturbation[:3, :3], perturbation[3:, 3:] = np.eye(3) / radius, np.eye(3)
-    perturbation[3:, :3] = se3.hat(centre) / radius
+    perturbation = _perturbation(centre, radius)
     spread = perturbation @ vectors @ np.diag(np.where(free, size, np.minimum(std, size)))
     motions = _slides_and_turns(vectors[:, free].T)
     names = tuple(_name(m, centre, radius) for m in motions)
     weakest = float(std[~free].max(initial=0.0))
     return Freedom(motions @ perturbation.T, names, spread @ spread.T, weakest)
+
+
+def without_free(points: Array, normals: Array, step: Array) -> Array:
+    """A right perturbation (6,) without its parts along which distances at points (N, 3), normals (N, 3) hardly change.
+
+    Both in the surface frame.
+    """
+    slope, vectors = _slopes(points, normals)
+    held = vectors[:, slope >= FREE_SLOPE]
+    perturbation = _perturbation(*_middle(points))
+    return np.asarray(perturbation @ held @ held.T @ np.linalg.solve(perturbation, step))
+
+
+def _middle(points: Array) -> tuple[Array, float]:
+    centre = points.mean(0)
+    return centre, max(float(np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1)))), 1e-6)
+
+
+def _slopes(points: Array, normals: Array) -> tuple[Array, Array]:
+    """Change of distance per mm of motion (6,), least first, along six motions (6, 6), in columns."""
+    centre, radius = _middle(points)
+    jacobian = np.concatenate([np.cross(points - centre, normals) / radius, normals], axis=1)
+    values, vectors = np.linalg.eigh(jacobian.T @ jacobian / len(points))
+    return np.sqrt(np.maximum(values, 0)), vectors
+
+
+def _perturbation(centre: Array, radius: float) -> Array:
+    """Right perturbation, rad and mm, of a motion whose turns count about `centre` in mm at `radius`: (6, 6)."""
+    out = np.zeros((6, 6))
+    out[:3, :3], out[3:, 3:] = np.eye(3) / radius, np.eye(3)
+    out[3:, :3] = se3.hat(centre) / radius
+    return out
 
 
 def _slides_and_turns(motions: Array) -> Array:

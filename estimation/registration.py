@@ -7,14 +7,14 @@ is read from the eigenvalues of the information matrix (Gelfand et al., Geometri
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from estimation import se3
 from estimation.closest import ScanIndex
-from estimation.freedom import Freedom, freedom
+from estimation.freedom import Freedom, freedom, without_free
 from estimation.scan import Index, Scan
 from estimation.se3 import Array
 
@@ -22,6 +22,7 @@ FEWEST = 12  # points: six unknowns, and as many again to see that they fit
 YAWS = 24  # starts per place: 15 degrees apart, half of it is within reach of the refinement
 PLACES = 150  # at most
 FIRST_POINTS, COARSE_POINTS = 24, 60  # spread over all, while there are many poses to be tried
+FIRST_STEPS = 3  # of all starts: ranked as they are laid down, those near the truth on a steep surface are lost
 KEPT = 80  # starts that are refined roughly
 FINE = 6  # and of these, those refined with exact nearest points
 FINAL = 3  # and of these, those refined with all points: more than one, to see whether the best is alone
@@ -34,7 +35,8 @@ class Registration:
 
     base_from_surface: (4, 4) mm. rms: mm, of the points that fit, across the surface. covariance: (6, 6) of the right
     perturbation, rad and mm; as wide as the scan along what is free. free: (K, 6) directions of that perturbation that
-    the shape does not hold. sure: whether the pose is fixed, unique and fits. verdict: the same in words.
+    the shape does not hold. sure: whether the pose is fixed, unique and fits. verdict: the same in words. rival: (4, 4)
+    another pose that fits as well, or None.
     """
 
     base_from_surface: Array
@@ -43,6 +45,7 @@ class Registration:
     free: Array
     sure: bool
     verdict: str
+    rival: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +71,8 @@ def register(points_base: Array, sigma: float, scan: Scan, outward: Array) -> Re
     few = points_base[_spread_out(points_base, min(COARSE_POINTS, len(points_base)))]  # the first ones furthest apart
     reach = 0.1 * _radius(points_base) + 3 * sigma  # mm: further off counts no more
     poses = _starts(points_base, outward, index)
+    for _ in range(FIRST_STEPS):
+        poses = _rough_step(index, poses, few[:FIRST_POINTS], reach)
     poses = poses[np.argsort(_costs(index, poses, few[:FIRST_POINTS], reach), kind="stable")[:KEPT]]
     for step in range(8):
         poses = _rough_step(index, poses, few, reach * 0.75**step)
@@ -78,6 +83,19 @@ def register(points_base: Array, sigma: float, scan: Scan, outward: Array) -> Re
     finest = [_refine(index, pose, points_base, sigma, gate, 40) for _, (pose, gate) in best]
     fits = [_measure(index, pose, gate, points_base, sigma) for pose, gate in finest]
     return _judge(sorted(fits, key=lambda f: f.cost), points_base, sigma)
+
+
+def settle(points_base: Array, sigma: float, shared: float, index: ScanIndex, near: Array) -> Registration:
+    """Refine a pose `near` (4, 4) that is right to a millimetre or two, from points (N, 3), mm, base frame.
+
+    sigma: mm, of a point across the surface; shared: how much wider that is for what they tell together, where the
+    errors of neighbours are alike. Along what the shape leaves open the pose stays where it was.
+    """
+    if len(points_base) < FEWEST:
+        return replace(_nothing(index, len(points_base)), base_from_surface=near)
+    pose, gate = _refine(index, near, points_base, sigma, 10 * sigma, 20, held=True)
+    fit = _measure(index, pose, gate, points_base, sigma, shared)
+    return _judge([fit], points_base, max(sigma, fit.rms))
 
 
 def _judge(fits: list[_Fit], points: Array, sigma: float) -> Registration:
@@ -97,7 +115,8 @@ def _judge(fits: list[_Fit], points: Array, sigma: float) -> Registration:
     if len(free.directions):
         words.append("free: " + "; ".join(free.names))
     verdict = ". ".join(words) or f"found: {best.rms:.3g} mm rms, weakest direction good to {free.weakest:.2g} mm"
-    return Registration(best.pose, best.rms, free.covariance, free.directions, not words, verdict)
+    other = None if rival is None else rival.pose
+    return Registration(best.pose, best.rms, free.covariance, free.directions, not words, verdict, other)
 
 
 def _nothing(index: ScanIndex, count: int) -> Registration:
@@ -114,10 +133,13 @@ def _rival(fits: list[_Fit], points: Array, sigma: float) -> _Fit | None:
     return others[0] if others else None
 
 
-def _refine(index: ScanIndex, pose: Array, points: Array, sigma: float, gate: float, steps: int) -> tuple[Array, float]:
+def _refine(
+    index: ScanIndex, pose: Array, points: Array, sigma: float, gate: float, steps: int, held: bool = False
+) -> tuple[Array, float]:
     """Robust point-to-plane steps (Geman-McClure) with exact nearest points: the pose, and the gate, mm.
 
-    The gate is narrowed to three of the residuals' own standard deviations as they settle.
+    The gate is narrowed to three of the residuals' own standard deviations as they settle. held: no steps along what
+    the shape does not hold.
     """
     for _ in range(steps):
         pull, offset, inner = _pull(index, pose, points)
@@ -128,6 +150,7 @@ def _refine(index: ScanIndex, pose: Array, points: Array, sigma: float, gate: fl
         step = np.linalg.solve(
             information + 1e-6 * np.diag(np.diag(information)) + 1e-9 * np.eye(6), weighted.T @ offset
         )
+        step = without_free(inner, pull, step) if held else step
         pose = pose @ se3.exp(step)
         spread = 1.4826 * float(np.median(np.abs(offset)))
         narrowed = max(3 * max(spread, sigma), 0.5 * gate)
@@ -138,14 +161,14 @@ def _refine(index: ScanIndex, pose: Array, points: Array, sigma: float, gate: fl
     return pose, gate
 
 
-def _measure(index: ScanIndex, pose: Array, gate: float, points: Array, sigma: float) -> _Fit:
-    """How well points (N, 3), base frame, fit at a pose; those within two gates count."""
+def _measure(index: ScanIndex, pose: Array, gate: float, points: Array, sigma: float, shared: float = 1.0) -> _Fit:
+    """How well points (N, 3), base frame, fit at a pose; those within two gates count. shared: see `settle`."""
     inner = se3.transform_points(se3.inverse(pose), points)
     near = index.closest(inner)
     distance = np.linalg.norm(inner - near.points, axis=1)
     counts = (distance < 2 * gate) & ~near.rim
     rms = float(np.sqrt(np.mean(distance[counts] ** 2))) if counts.any() else np.inf
-    held = freedom(inner[counts], near.normals[counts], max(sigma, min(rms, gate)), index)
+    held = freedom(inner[counts], near.normals[counts], shared * max(sigma, min(rms, gate)), index)
     return _Fit(pose, float(np.mean(np.minimum(distance, 2 * gate) ** 2)), rms, float(counts.mean()), held)
 
 
