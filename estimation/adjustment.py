@@ -19,7 +19,7 @@ from estimation.observations import Observations
 from estimation.pose_solver import PoseFit, project, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.surface_map import SurfaceMap, local_normals
+from estimation.surface_map import SurfaceMap, local_normals, motion_of
 
 LEAST_SIGHTINGS = 3
 LEAST_JUDGES = 6  # key frames: fewer cannot tell a stray landmark from a bent map, and a stray one is not asked again
@@ -44,6 +44,20 @@ class KeyFrame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Anchors:
+    """What a scan says of the landmarks, surface frame: the nearer to its surface, the likelier.
+
+    points, normals: (N, 3), the plane each lies on. sigma: (N,) mm across it; FREE for one that is not on the scan.
+    frame: (6, 6) covariance of the scan's own place, a right perturbation, rad and mm.
+    """
+
+    points: Array
+    normals: Array
+    sigma: Array
+    frame: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
     """The refined map, same rows, same surface frame. agrees: (N,) which landmarks move with the rest."""
 
@@ -51,10 +65,12 @@ class Adjusted:
     agrees: NDArray[np.bool_]
 
 
-def adjust(rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], skew: float) -> Adjusted | None:
+def adjust(
+    rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], skew: float, anchors: Anchors | None = None
+) -> Adjusted | None:
     """The map that fits all key frames best, or None if they do not determine one.
 
-    skew: s, one standard deviation of the cameras' instants.
+    skew: s, one standard deviation of the cameras' instants. anchors: of the map's first rows, where there is a scan.
 
     Base and surface swap roles (X = surface_from_base), so that GTSAM's stock projection factor with
     body_P_sensor = base_from_camera is the measurement.
@@ -65,7 +81,7 @@ def adjust(rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], skew: f
     rows = np.nonzero(sightings >= LEAST_SIGHTINGS)[0]
     if len(rows) < 12 or len(keyframes) < 2:
         return None
-    graph, values = _graph(rig, surface_map, keyframes, set(rows.tolist()), skew)
+    graph, values = _graph(rig, surface_map, keyframes, set(rows.tolist()), skew, anchors)
     try:
         solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
         covariance = _joint_covariance(graph.linearize(solved), rows)
@@ -79,6 +95,8 @@ def adjust(rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], skew: f
     covariance = without_frame(covariance, points[rows])
     place = (3 * rows[:, None] + np.arange(3)).ravel()
     whole[place] = whole[:, place] = 0.0
+    if anchors is not None:
+        covariance = covariance + of_frame(points[rows], anchors.frame)
     whole[np.ix_(place, place)] = covariance
     agrees = _agreement(rig, points, keyframes, solved)
     if agrees.sum() < 12:
@@ -96,13 +114,18 @@ def without_frame(covariance: Array, points: Array) -> Array:
     Each point holds the frame by what it is worth itself. Counted alike, one that a single camera sees, unknown by
     centimetres along its ray, was measured to lend a tenth of a millimetre to each of two hundred others.
     """
-    motion = np.concatenate([-se3.hat(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], -1).reshape(-1, 6)
-    motion = motion * [0.01, 0.01, 0.01, 1, 1, 1]  # of about one size
+    motion = motion_of(points) * [0.01, 0.01, 0.01, 1, 1, 1]  # of about one size
     worth = 1 / np.maximum(np.repeat(np.diag(covariance).reshape(-1, 3).sum(1), 3), LEAST_DRIFT[3] ** 2)
     held = motion.T * worth
     of_frame = motion @ np.linalg.solve(held @ motion, held)
     left = covariance - of_frame @ covariance
     return np.asarray(left - left @ of_frame.T)
+
+
+def of_frame(points: Array, covariance: Array) -> Array:
+    """Covariance (3N, 3N) of points (N, 3) by that of their frame's place alone, (6, 6)."""
+    motion = motion_of(points)
+    return np.asarray(motion @ covariance @ motion.T)
 
 
 def frame_change(keyframes: list[KeyFrame], refined: Array, skew: float) -> Array:
@@ -148,7 +171,12 @@ def _camera_key(camera: int, frame: int) -> int:
 
 
 def _graph(
-    rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], rows: set[int], skew: float
+    rig: Rig,
+    surface_map: SurfaceMap,
+    keyframes: list[KeyFrame],
+    rows: set[int],
+    skew: float,
+    anchors: Anchors | None,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     lenses = [gtsam.Cal3_S2(m[0, 0], m[1, 1], 0.0, m[0, 2], m[1, 2]) for m in rig.matrices]
@@ -182,7 +210,12 @@ def _graph(
     for row in sorted(rows):
         key = gtsam.symbol("l", row)
         values.insert(key, surface_map.points[row])
-        graph.add(gtsam.PriorFactorPoint3(key, surface_map.points[row], far))
+        if anchors is None or row >= len(anchors.sigma):
+            graph.add(gtsam.PriorFactorPoint3(key, surface_map.points[row], far))
+            continue
+        across = np.outer(anchors.normals[row], anchors.normals[row])
+        loose = FREE**2 * (np.eye(3) - across) + anchors.sigma[row] ** 2 * across
+        graph.add(gtsam.PriorFactorPoint3(key, anchors.points[row], gtsam.noiseModel.Gaussian.Covariance(loose)))
     return graph, values
 
 

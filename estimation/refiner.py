@@ -11,7 +11,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future
 import numpy as np
 
 from estimation import se3
-from estimation.adjustment import Adjusted, KeyFrame, adjust, single_fit
+from estimation.adjustment import Adjusted, Anchors, KeyFrame, adjust, single_fit
 from estimation.estimator import Fit
 from estimation.observations import Observations
 from estimation.rig import Rig
@@ -36,19 +36,20 @@ class Refiner:
         self._frames: list[KeyFrame] = []
         self._stamps: list[float] = []
         self._map: SurfaceMap | None = None
+        self._anchors: Anchors | None = None
         self._ask = False
         self._due = 0
         self._count = 0
         self._offered: tuple[Fit, Observations, Array] | None = None
         self._skew = self._skew_used = np.inf  # s, of the cameras' instants: as known now, and at the last adjustment
-        self._job: tuple[Rig, SurfaceMap, list[KeyFrame], float] | None = None
+        self._job: tuple[Rig, SurfaceMap, list[KeyFrame], float, Anchors | None] | None = None
         self._future: Future[Adjusted | None] | None = None
 
     def begin(
         self, surface_map: SurfaceMap, stamp: float, base_from_surface: Array, observations: Observations
     ) -> None:
         """The first map and the frame set that it was made from, whose pose defines the surface frame."""
-        self._map, self._frames, self._stamps = surface_map, [], []
+        self._map, self._frames, self._stamps, self._anchors = surface_map, [], [], None
         self._job, self._future, self._ask = None, None, False
         kept = _inliers(self._rig, surface_map, base_from_surface, observations)
         self._keep(stamp, base_from_surface, kept, np.zeros(6))
@@ -73,6 +74,15 @@ class Refiner:
         if refined is not None:
             self._map = refined.map
         return refined
+
+    def reframe(self, surface_map: SurfaceMap, new_from_old: Array, anchors: Anchors) -> None:
+        """The surface frame is another from now on: new_from_old (4, 4). surface_map: in the new one, same rows."""
+        turned = se3.adjoint(new_from_old)
+        old_from_new = se3.inverse(new_from_old)
+        self._map, self._anchors = surface_map, anchors
+        self._frames = [
+            KeyFrame(f.base_from_surface @ old_from_new, f.observations, turned @ f.twist) for f in self._frames
+        ]
 
     def offer(self, fit: Fit, observations: Observations, twist: Array, skew: float) -> None:
         """A measured frame set; `poll` keeps it if it shows the surface anew."""
@@ -130,7 +140,7 @@ class Refiner:
                 self._map = result.map
         if self._ask and self._job is None and self._map is not None and len(self._frames) >= 3:
             self._ask, self._due = False, self._count + DELAY
-            self._job = self._rig, self._map, list(self._frames), self._skew
+            self._job = self._rig, self._map, list(self._frames), self._skew, self._anchors
             self._skew_used = self._skew
             self._future = None if self._executor is None else self._executor.submit(adjust, *self._job)
         return result

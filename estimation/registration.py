@@ -115,7 +115,7 @@ def _judge(fits: list[_Fit], points: Array, sigma: float) -> Registration:
     if len(free.directions):
         words.append("free: " + "; ".join(free.names))
     verdict = ". ".join(words) or f"found: {best.rms:.3g} mm rms, weakest direction good to {free.weakest:.2g} mm"
-    other = None if rival is None else rival.pose
+    other = None if rival is None or len(free.directions) else rival.pose
     return Registration(best.pose, best.rms, free.covariance, free.directions, not words, verdict, other)
 
 

@@ -27,6 +27,21 @@ class SurfaceMap:
         return len(self.points)
 
 
+def moved_map(surface_map: SurfaceMap, new_from_old: Array) -> SurfaceMap:
+    """The same map in another surface frame: new_from_old (4, 4)."""
+    turn, count = new_from_old[:3, :3], len(surface_map)
+    covariance = surface_map.covariance.reshape(count, 3, count, 3)
+    turned = np.einsum("ai,minj,bj->manb", turn, covariance, turn, optimize=True).reshape(3 * count, 3 * count)
+    points = se3.transform_points(new_from_old, surface_map.points)
+    return SurfaceMap(points, surface_map.normals @ turn.T, turned)
+
+
+def motion_of(points: Array) -> Array:
+    """How points (N, 3) move, (3N, 6), with a right perturbation of their frame's pose, per rad and mm."""
+    each = np.concatenate([-se3.hat(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], -1)
+    return np.asarray(each.reshape(-1, 6))
+
+
 def local_normals(points: Array, outward: Array, neighbours: int = 12) -> Array:
     """Unit normals (N, 3) of points (N, 3) by a plane through each one's nearest neighbours, on the side of `outward`.
 

@@ -22,6 +22,7 @@ from perception.lens import Lenses
 PIXELS = 1.1  # of the cameras, a node: a finer lattice shows nothing more
 PATCH, STRIDE, ROUNDS = 12, 3, 25  # nodes, nodes and steps of the flow
 CONTRAST = 6.0  # nodes over which brightness and contrast are evened out, since glare and light differ by camera
+EVEN, FAINT = 40.0, 100.0  # grey levels of contrast once evened out; their square below which it tells nothing
 ALIKE = 0.6  # correlation below which a match is not believed
 ASIDE = 0.5  # px off the epipolar line, or three times the median, beyond which it is not
 FACING = 0.2  # cosine of the viewing angle below which a camera sees too little of a node
@@ -56,10 +57,11 @@ def node_size(lenses: Lenses, cameras: list[int], centre: Array) -> float:
     return min(sizes)
 
 
-def match_on(lenses: Lenses, images: dict[int, Image], nodes: Array, reference: int) -> Matched | None:
+def match_on(lenses: Lenses, images: dict[int, Image], nodes: Array, reference: int, every: int = 1) -> Matched | None:
     """Where the surface near `nodes` (H, W, 3), base frame, really is; None where no two cameras see any of it.
 
     Each node's ray in the reference camera is met with those of the other cameras at the places that look like it.
+    every: only each so manieth row and column of nodes is given, (H', W', 3).
     """
     towards = _normals(nodes)
     first = _laid(lenses, reference, images[reference], nodes, towards)
@@ -71,8 +73,12 @@ def match_on(lenses: Lenses, images: dict[int, Image], nodes: Array, reference: 
         pixels.append(found)
         camera.append(c)
         used.append(first.seen & other.seen & (alike > ALIKE))
-    both = np.logical_or.reduce(used[1:]) if len(used) > 1 else np.zeros(first.seen.shape, bool)
-    return _met(lenses, nodes, np.stack(pixels), np.array(camera), np.stack(used) & both, both) if both.any() else None
+    if len(used) < 2:
+        return None
+    chosen = (slice(None), slice(None, None, every), slice(None, None, every))
+    seen, where = np.stack(used)[chosen], np.stack(pixels)[chosen]
+    both = np.asarray(seen[1:].any(axis=0), bool)
+    return _met(lenses, nodes[chosen[1:]], where, np.array(camera), seen & both, both) if both.any() else None
 
 
 def middle_camera(lenses: Lenses, cameras: list[int], centre: Array) -> int:
@@ -128,7 +134,7 @@ def _evened(image: Image) -> Image:
     grey = image.astype(np.float32)
     centred = grey - cv2.GaussianBlur(grey, (0, 0), CONTRAST)
     spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), CONTRAST))
-    return np.asarray(np.clip(128 + 40 * centred / (spread + 2.0), 0, 255), np.uint8)
+    return np.asarray(np.clip(np.rint(128 + EVEN * centred / (spread + 2.0)), 0, 255), np.uint8)
 
 
 def _flow() -> cv2.DISOpticalFlow:
@@ -146,7 +152,8 @@ def _flow() -> cv2.DISOpticalFlow:
 
 def _moved(flow: cv2.DISOpticalFlow, first: _Laid, other: _Laid) -> tuple[Array, Float32]:
     """Ideal pixels (H, W, 2) in the other camera of what the first sees at each node, and how alike they look."""
-    shift = np.asarray(flow.calc(first.even, other.even, None))
+    still = np.zeros((*first.even.shape, 2), np.float32)
+    shift = np.asarray(flow.calc(first.even, other.even, still))
     y, x = np.mgrid[: shift.shape[0], : shift.shape[1]].astype(np.float32)
     x, y = x + shift[..., 0], y + shift[..., 1]
     found = cv2.remap(other.pixels.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -161,4 +168,4 @@ def _likeness(a: Image, b: Image) -> Float32:
     def mean(product: Float32) -> Float32:
         return np.asarray(cv2.GaussianBlur(product, (0, 0), CONTRAST / 2), np.float32)
 
-    return np.asarray(mean(here * there) / np.sqrt(mean(here * here) * mean(there * there) + 1), np.float32)
+    return np.asarray(mean(here * there) / (np.sqrt(mean(here * here) * mean(there * there)) + FAINT), np.float32)

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from estimation import se3
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
-from estimation.surface_map import SurfaceMap, local_normals, surface_frame
+from estimation.surface_map import SurfaceMap, local_normals, moved_map, surface_frame
 from estimation.triangulation import epipolar_distance, rays, triangulate
 from perception.alignment import align, coarse_score
 from perception.features import corners, match, polygon_mask, sift
@@ -41,13 +41,8 @@ class FirstMap:
 def in_frame(first: FirstMap, base_from_new: Array) -> FirstMap:
     """The same map in another surface frame, as a scan's: base_from_new (4, 4)."""
     new_from_old = se3.inverse(base_from_new) @ first.base_from_surface
-    turn = new_from_old[:3, :3]
-    count = len(first.map)
-    covariance = first.map.covariance.reshape(count, 3, count, 3)
-    turned = np.einsum("ai,minj,bj->manb", turn, covariance, turn, optimize=True).reshape(3 * count, 3 * count)
-    points = se3.transform_points(new_from_old, first.map.points)
-    templates = replace(first.templates, axes=turn @ first.templates.axes)
-    return FirstMap(base_from_new, SurfaceMap(points, first.map.normals @ turn.T, turned), templates)
+    templates = replace(first.templates, axes=new_from_old[:3, :3] @ first.templates.axes)
+    return FirstMap(base_from_new, moved_map(first.map, new_from_old), templates)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,17 +14,19 @@ from estimation.estimator import Estimator, Fit
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.refiner import Refiner
-from estimation.registration import register
+from estimation.registration import Registration
 from estimation.scan import Scan
 from estimation.se3 import Array
+from estimation.surface_map import moved_map
 from perception.first_map import FirstMap, build_first_map, in_frame
 from perception.frames import FrameSet, Roi
 from perception.lens import Lenses
 from perception.matcher import Matcher
 from perception.patches import Pyramid
 from perception.relocalise import Relocaliser
+from perception.scan_place import ScanPlacing, as_at_one_instant
+from perception.scanned_map import scanned
 
-LEAST_SCAN_SIGMA = 0.1  # mm: no handheld scan is better
 EAGER = 5  # tries for a first map, 0.5 s and more each, before only every tenth frame set is tried
 RELAXED = 10  # frame sets from one try to the next after those
 PATIENCE = 2.0  # s: a first map that nobody confirms is dropped, and the next images are tried
@@ -44,7 +47,9 @@ class Mapping:
 
         executor: where the map is refined. scan: its frame is the surface frame.
         """
-        self._lenses, self._roi, self._search, self._scan = lenses, tuple(roi), search, scan
+        self._lenses, self._roi, self._search = lenses, tuple(roi), search
+        self._placing = None if scan is None else ScanPlacing(scan)
+        self._place: Registration | None = None  # of the scan at the first instant
         self._refiner = Refiner(lenses.rig, executor)
         self._tries, self._why = 0, ""  # to make a first map, and why the last one failed
         self._mapped = 0.0  # s, stamp of the first map
@@ -63,7 +68,10 @@ class Mapping:
             self._why = first
             return first
         self._caveat = ""
-        return first if self._scan is None else self._on_scan(first, self._scan)
+        if self._placing is None:
+            return first
+        images = {c: pyramids[c][0] for c in polygons}
+        return self._on_scan(first, self._placing.search(self._lenses, images, first, polygons))
 
     def begin(
         self, stamp: float, first: FirstMap, matcher: Matcher, estimator: Estimator, pyramids: dict[int, Pyramid]
@@ -101,6 +109,8 @@ class Mapping:
             if not refit.measured:
                 break
             fit, observations = refit, again
+        if self._placing is not None:
+            fit = self._lay_scan(self._placing, matcher, estimator, pyramids, fit, observations)
         return fit, observations
 
     def offer(self, fit: Fit, observations: Observations, twist: Array, estimator: Estimator) -> None:
@@ -113,14 +123,40 @@ class Mapping:
         if refined is not None:
             _take(refined, matcher, estimator)
 
-    def _on_scan(self, first: FirstMap, scan: Scan) -> FirstMap:
+    def _on_scan(self, first: FirstMap, place: Registration) -> FirstMap:
         """The first map in the scan's frame; notes what the scan's shape leaves open."""
-        points = se3.transform_points(first.base_from_surface, first.map.points)
-        blocks = first.map.covariance.reshape(len(points), 3, len(points), 3)
-        sigma = float(np.sqrt(np.median(np.einsum("nini->n", blocks))))
-        found = register(points, max(sigma, LEAST_SCAN_SIGMA), scan, first.base_from_surface[:3, 2])
-        self._caveat = "" if found.sure else f"the scan's place is open: {found.verdict}"
-        return in_frame(first, found.base_from_surface)
+        self._place = place
+        self._caveat = "" if place.sure else f"the scan's place is open: {place.verdict}"
+        return in_frame(first, place.base_from_surface)
+
+    def _lay_scan(
+        self,
+        placing: ScanPlacing,
+        matcher: Matcher,
+        estimator: Estimator,
+        pyramids: dict[int, Pyramid],
+        fit: Fit,
+        observations: Observations,
+    ) -> Fit:
+        """Place the scan anew now that each camera's own instant is known, and put the landmarks onto it."""
+        assert self._place is not None and estimator.pose is not None and estimator.map is not None
+        rig, pose = self._lenses.rig, fit.solution.base_from_surface
+        single = {c: single_fit(rig, matcher.map.points, observations, c, pose).base_from_surface for c in pyramids}
+        lenses = Lenses(as_at_one_instant(rig, pose, single))
+        images = {c: p[0] for c, p in pyramids.items()}
+        place = placing.refine(lenses, images, replace(self._place, base_from_surface=pose))
+        self._caveat = "" if place.sure else f"the scan's place is open: {place.verdict}"
+        new_from_old = se3.inverse(place.base_from_surface) @ pose
+        there = moved_map(estimator.map, new_from_old)
+        laid, anchors = scanned(there, matcher.templates.camera, lenses, placing.scan, place)
+        first = estimator.pose.base_from_surface @ se3.inverse(new_from_old)
+        self._refiner.reframe(laid, new_from_old, anchors)
+        matcher.reframe(laid, new_from_old)
+        self._search.reframe(new_from_old)
+        estimator.begin(estimator.pose.stamp, first, laid, self._caveat)
+        fit = estimator.fit(observations, place.base_from_surface)
+        estimator.moving(self._refiner.speed(fit))
+        return estimator.fit(observations, place.base_from_surface)
 
     def _polygons(self, frames: FrameSet) -> dict[int, Array] | str:
         """Where the surface is in these images, by camera, or why that is not known yet."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,15 @@ class Matcher:
     def take(self, surface_map: SurfaceMap, agrees: NDArray[np.bool_]) -> None:
         """A refined map, same rows, and which of them (N,) are worth looking for."""
         self.map, self.agrees = surface_map, agrees
+
+    def reframe(self, surface_map: SurfaceMap, new_from_old: Array) -> None:
+        """The surface frame is another from now on: new_from_old (4, 4). surface_map: in the new one, same rows."""
+        self.map, self._gathered = surface_map, None
+        self.templates = replace(self.templates, axes=new_from_old[:3, :3] @ self.templates.axes)
+        old_from_new = se3.inverse(new_from_old)
+        self._views = {
+            c: replace(view, base_from_surface=view.base_from_surface @ old_from_new) for c, view in self._views.items()
+        }
 
     def seen(self, camera: int) -> int:
         """How many landmarks a camera last saw."""

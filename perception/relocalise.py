@@ -72,6 +72,10 @@ class Relocaliser:
         self._points = np.concatenate([self._points, points[near]])[-CAPACITY:]
         self._descriptors = np.concatenate([self._descriptors, descriptors[near]])[-CAPACITY:]
 
+    def reframe(self, new_from_old: Array) -> None:
+        """The surface frame is another from now on: new_from_old (4, 4)."""
+        self._points = se3.transform_points(new_from_old, self._points)
+
     def _on_surface(
         self,
         camera: int,

@@ -39,7 +39,7 @@ class ScanPlacing:
     """Finds one scan in pictures."""
 
     def __init__(self, scan: Scan) -> None:
-        self._scan, self._index = scan, ScanIndex(scan)
+        self.scan, self._index = scan, ScanIndex(scan)
         self._nodes = np.zeros((0, 0, 3))
 
     def search(
@@ -53,7 +53,7 @@ class ScanPlacing:
         if not len(points):
             points = se3.transform_points(first.base_from_surface, first.map.points)
         outward = first.base_from_surface[:3, 2]
-        found = register(points[:: max(1, len(points) // ENOUGH)], RELIEF_SIGMA, self._scan, outward)
+        found = register(points[:: max(1, len(points) // ENOUGH)], RELIEF_SIGMA, self.scan, outward)
         self._nodes = self._lattice(lenses, sorted(images), points, outward, found.base_from_surface)
         return self.refine(lenses, images, found)
 
@@ -76,11 +76,11 @@ class ScanPlacing:
             on_scan = np.isfinite(self._nodes[..., 0])
             nodes = se3.transform_points(pose, np.nan_to_num(self._nodes).reshape(-1, 3)).reshape(self._nodes.shape)
             reference = middle_camera(lenses, sorted(images), nodes[on_scan].mean(0)) if on_scan.any() else 0
-            matched = match_on(lenses, images, nodes, reference) if on_scan.any() else None
+            matched = match_on(lenses, images, nodes, reference, SPREAD) if on_scan.any() else None
             if matched is None:
                 return replace(near, sure=False, verdict=f"{near.verdict}; no two cameras see the scan there")
-            sure = (matched.sure & on_scan)[::SPREAD, ::SPREAD]
-            found = settle(matched.points[::SPREAD, ::SPREAD][sure], MATCH_SIGMA, SHARED, self._index, pose)
+            sure = matched.sure & on_scan[::SPREAD, ::SPREAD]
+            found = settle(matched.points[sure], MATCH_SIGMA, SHARED, self._index, pose)
         return found
 
     def _lattice(self, lenses: Lenses, cameras: list[int], points: Array, outward: Array, pose: Array) -> Array:
@@ -99,7 +99,7 @@ class ScanPlacing:
         lattice = np.stack(np.meshgrid(*lines), -1)
         down = np.concatenate([lattice / FAR, -np.ones((*lattice.shape[:2], 1))], -1).reshape(-1, 3)
         apex = surface_from_plane @ se3.make(np.eye(3), [0.0, 0.0, FAR])
-        return cast(self._scan, apex, down).points.reshape(*lattice.shape[:2], 3)
+        return cast(self.scan, apex, down).points.reshape(*lattice.shape[:2], 3)
 
 
 def as_at_one_instant(rig: Rig, pose: Array, single: dict[int, Array]) -> Rig:
