@@ -27,8 +27,8 @@ from perception.relief import relief
 RELIEF_SIGMA = 0.1  # mm: of matched relief across the surface; no handheld scan is better
 ENOUGH = 400  # points for the search: more take longer and find the same
 MATCH_SIGMA = 0.03  # mm, of points matched on the scan itself
-SPREAD = 6  # nodes between points taken: half a matched patch,
-SHARED = 2.0  # so each is worth a quarter of an independent one
+SPREAD = 6  # nodes between points taken: half a matched patch, so neighbours share half their error,
+SHARED = 2.5  # and their errors another part, as measured: each is worth a sixth of an independent one
 ROUNDS = 4  # of matching and settling: the third was measured to move by 0.01 mm, the fourth by 0.002
 FAR = 1e5  # mm: rays from there are parallel to 1e-3 rad over a body
 MARGIN = 2.0  # mm around the part that was seen
