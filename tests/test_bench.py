@@ -16,14 +16,19 @@ from hardware.bench.figure import Figure, Target, at_least, at_most
 from hardware.bench.machine import this_machine
 from hardware.bench.subjects import SUBJECTS, Subject
 from hardware.bench.table import table_text
+from hardware.cli import main
 
 SUBJECT = {"toy": Subject("tests.bench_subject", "one figure of each kind")}
 
 
-def bench(*words: str) -> None:
+def _arguments(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     add_bench(parser.add_subparsers())
-    run_bench(parser.parse_args(["bench", *words]), SUBJECT)
+    return parser.parse_args(["bench", *words])
+
+
+def bench(*words: str) -> None:
+    run_bench(_arguments(*words), SUBJECT)
 
 
 @pytest.mark.parametrize("target", [at_most(2.0), at_least(-1.0), Target(-1.0, 2.0)])
@@ -93,3 +98,22 @@ def test_an_unknown_subject_is_told_the_near_one() -> None:
 def test_every_subject_has_its_options_and_its_run(name: str) -> None:
     assert subject_parser(name, SUBJECTS[name]).parse_args([]).out is None
     assert callable(SUBJECTS[name].run)
+
+
+def test_the_estimator_is_measured_beside_its_bound(capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["bench", "estimator", "--only", "still, clean", "--seeds", "1", "--seconds", "0.5", "--maps", "told"]
+    assert main(command) == 0
+    text = capsys.readouterr().out
+    for words in ("still, clean, exact map: error by bound", "NEES/6", "time, exact map: p99", "differ run twice"):
+        assert words in text
+
+
+def test_a_pattern_that_meets_no_scene_is_told_the_scenes() -> None:
+    with pytest.raises(InputError, match="breathing, clean"):
+        run_bench(_arguments("estimator", "--only", "dancing"))
+
+
+def test_a_soak_compares_its_end_with_its_start(capsys: pytest.CaptureFixture[str]) -> None:
+    run_bench(_arguments("estimator", "--soak", "0.001", "--maps", "told"))
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(line.startswith("soak 0.001 h, exact map") for line in lines) == 4

@@ -41,7 +41,7 @@ TROUBLED = tuple(
         ("coherent 20 %", {"coherent": 0.2}, 0.0, False),
         ("correlated 0.6 px", {"correlated": 0.6}, 0.0, False),
         ("offsets 16 ms", {"offsets": (0.0, APART, -APART)}, 0.1, False),
-        ("offsets 16, 9 ms", {"offsets": (0.0, APART, 0.009)}, 0.1, False),
+        ("offsets 16, 4, 12 ms", {"offsets": (APART, -0.004, -0.012)}, 0.1, False),
         ("offsets 16 ms, lens 0.3 px", {"offsets": (0.0, APART, -APART), "calibration": 0.3}, 0.1, False),
         ("jitter 5 ms", {"jitter": 0.005}, 0.1, False),
     )
