@@ -275,7 +275,7 @@ class Estimator:
                 sigma[keep],
             )
         state, reason = self._grade(fit)
-        noise: Array = np.linalg.pinv(fit.solution.information, hermitian=True)  # map and clocks: the same at rest
+        noise = np.asarray(np.linalg.pinv(fit.solution.information, hermitian=True))  # map and clocks: the same at rest
         self._detector(fit.stamp, fit.solution.base_from_surface, noise)
         return self._enter(fit.stamp, fit.solution.base_from_surface, fit.covariance, state, reason)
 
