@@ -1,21 +1,19 @@
-"""What tests of estimation and perception look at: the simulator's pictures of a small patch, and tracks without any.
+"""What tests of perception look at: the simulator's pictures of a small patch, with exactly known truth.
 
-`frame_sets(patch(), arc_rig(), breathing, stamps, rng)` gives pictures, `tracks(seed=1)` observations, and
-`write_session(folder)` a session folder, all with exactly known truth.
+`frame_sets(patch(), arc_rig(), breathing, stamps, rng)` gives pictures, `write_session(folder)` a session folder.
+Tracks without pictures are those of `estimation.synthetic`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.observations import Observations
-from estimation.rig import Camera, Rig, ideal_pixels, pixels_from_points
+from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
 from hardware.images import encode
@@ -52,12 +50,6 @@ def patch(
     """A patch of skin with a wound drawn on it, bent about its x axis to `radius` mm (inf: flat)."""
     shape = flat(size) if np.isinf(radius) else cylinder(size, radius)
     return Scene(with_wound(shape, wound, seed), look, seed=seed)
-
-
-def points_on_patch(count: int, rng: np.random.Generator) -> Array:
-    """Points (N, 3) mm, surface frame, at random on a bent patch of 60 x 45 mm."""
-    size = (60.0, 45.0)
-    return cylinder(size, RADIUS).points(rng.uniform(-0.5, 0.5, (count, 2)) * size)
 
 
 def still(stamp: float) -> Array:
@@ -101,67 +93,6 @@ def trajectory(motion: Motion, stamps: Iterable[float]) -> Trajectory:
     """The motion at `stamps`, s."""
     times = np.array(list(stamps), float)
     return Trajectory(times, np.stack([motion(float(t)) for t in times]), exact=True)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tracks:
-    """Observations of known landmarks. landmarks: (N, 3) mm, surface frame; a track's id is its landmark's number."""
-
-    rig: Rig
-    landmarks: Array
-    truth: Trajectory
-    observations: tuple[Observations, ...]
-
-
-def observations(
-    rig: Rig,
-    landmarks: Array,
-    base_from_surface: Array,
-    stamp: float,
-    rng: np.random.Generator,
-    sigma: float = 0.3,
-    outliers: float = 0.0,
-    visible: NDArray[np.bool_] | None = None,
-) -> Observations:
-    """Where the cameras see landmarks (N, 3), surface frame: undistorted pixels with white noise of `sigma` px.
-
-    outliers: the share of observations that stand up to 40 px anywhere else instead. visible: (C, N); by default
-    whatever falls into a camera's image.
-    """
-    points = se3.transform_points(base_from_surface, landmarks)
-    cameras, ids, pixels = [], [], []
-    for number, camera in enumerate(rig.cameras):
-        ideal, depth = ideal_pixels(camera, points)
-        imaged, _ = pixels_from_points(camera, points)
-        seen = (depth > 1) & (imaged > 0).all(1) & (imaged < np.array(camera.size) - 1).all(1)
-        track = np.flatnonzero(seen if visible is None else seen & visible[number])
-        noise = sigma * rng.standard_normal((len(track), 2))
-        wrong = rng.random(len(track)) < outliers
-        noise[wrong] = rng.uniform(-40, 40, (int(wrong.sum()), 2))
-        cameras.append(np.full(len(track), number))
-        ids.append(track)
-        pixels.append(ideal[track] + noise)
-    camera_of = np.concatenate(cameras)
-    return Observations(stamp, camera_of, np.concatenate(ids), np.concatenate(pixels), np.full(len(camera_of), sigma))
-
-
-def tracks(
-    seconds: float = 4.0,
-    rate: float = 30.0,
-    count: int = 100,
-    motion: Motion = breathing,
-    sigma: float = 0.3,
-    outliers: float = 0.0,
-    seed: int = 0,
-) -> Tracks:
-    """Trajectory, rig, landmarks, pixels and noise in one line: `count` landmarks at random on a patch."""
-    rng = np.random.default_rng([seed, 11])
-    landmarks = points_on_patch(count, rng)
-    truth = trajectory(motion, np.arange(round(seconds * rate)) / rate)
-    cameras = arc_rig()
-    poses = zip(truth.stamps, truth.base_from_surface, strict=True)
-    seen = tuple(observations(cameras, landmarks, pose, float(t), rng, sigma, outliers) for t, pose in poses)
-    return Tracks(cameras, landmarks, truth, seen)
 
 
 def write_session(

@@ -13,8 +13,9 @@ from estimation.observations import Observations
 from estimation.pose_solver import solve_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
+from estimation.synthetic.look import observations
+from estimation.synthetic.surfaces import patch
 from hardware.simulator.default_rig import REST, arc_rig
-from tests.synthetic import observations, points_on_patch
 
 RIG = arc_rig()
 
@@ -26,7 +27,7 @@ def swaying(stamp: float) -> Array:
 
 
 def landmarks(seed: int = 0, count: int = 40) -> Array:
-    return points_on_patch(count, np.random.default_rng([seed, 3]))
+    return patch(count, np.random.default_rng([seed, 3])).points
 
 
 def as_map(points: Array, sigma: float = 0.5) -> SurfaceMap:

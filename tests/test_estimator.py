@@ -13,11 +13,13 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
+from estimation.synthetic.look import observations
+from estimation.synthetic.surfaces import patch
 from hardware.simulator.default_rig import REST, arc_rig
-from tests.synthetic import Motion, breathing, observations, points_on_patch
+from tests.synthetic import Motion, breathing
 
 RIG = arc_rig()
-LANDMARKS = points_on_patch(60, np.random.default_rng(3))
+LANDMARKS = patch(60, np.random.default_rng(3)).points
 RATE = 30.0
 
 

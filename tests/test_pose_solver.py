@@ -13,11 +13,12 @@ from estimation.observations import Observations
 from estimation.pose_solver import PoseFit, project, solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
+from estimation.synthetic.look import observations
+from estimation.synthetic.surfaces import patch
 from hardware.simulator.default_rig import REST, arc_rig
-from tests.synthetic import observations, points_on_patch
 
 RIG = arc_rig()
-LANDMARKS = points_on_patch(60, np.random.default_rng(3))
+LANDMARKS = patch(60, np.random.default_rng(3)).points
 seeds = st.integers(0, 10_000)
 
 

@@ -18,8 +18,10 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from estimation.observations import Observations
+from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
+from estimation.synthetic.look import observations
 from estimation.synthetic.movements import MOVEMENTS
 from estimation.synthetic.surfaces import SURFACES
 from estimation.synthetic.world import World
@@ -37,7 +39,7 @@ def off(world: World, late: Array | None = None) -> list[tuple[Observations, Arr
     instants = np.zeros(len(world.rig)) if late is None else late
     found = []
     for seen in world:
-        right, _ = world._imaged(seen.stamp + instants)
+        right, _ = world.imaged(seen.stamp + instants)
         found.append((seen, seen.pixels - right[seen.camera, seen.track]))
     return found
 
@@ -163,7 +165,7 @@ def test_so_many_observations_are_outliers(share: float) -> None:
 
 def test_coherent_tracks_stay_where_they_were_in_the_image() -> None:
     world = made("lively", seconds=2.0, coherent=0.3, noise=0.0)
-    first, _ = world._imaged(np.zeros(3))
+    first, _ = world.imaged(np.zeros(3))
     moved = [(np.abs(away).max(1) > 1e-9, seen) for seen, away in off(world)][30]
     stuck, seen = moved
     assert stuck.mean() == pytest.approx(0.3, abs=0.06)
@@ -209,8 +211,8 @@ def test_jitter_moves_each_camera_anew() -> None:
 @pytest.mark.parametrize("rms", [0.1, 0.3, 1.0])
 def test_the_rig_that_is_told_misses_by_as_much_as_asked(rms: float) -> None:
     world = made("still", calibration=rms, noise=0.0, seconds=0.1)
-    for camera, told in enumerate(made("still", noise=0.0, seconds=0.1)._imaged(np.zeros(3))[0]):
-        away = world._imaged(np.zeros(3))[0][camera] - told
+    for camera, told in enumerate(made("still", noise=0.0, seconds=0.1).imaged(np.zeros(3))[0]):
+        away = world.imaged(np.zeros(3))[0][camera] - told
         assert np.sqrt((away**2).mean()) == pytest.approx(rms, rel=0.01)
     assert [c.name for c in world.rig.cameras] == [c.name for c in world.true_rig.cameras]
 
@@ -270,3 +272,20 @@ def test_wrong_input_is_named(wrong: dict[str, Any]) -> None:
 def test_another_rig_may_watch() -> None:
     world = made("still", seconds=0.1, rig=arc_rig(angles_deg=(10.0, 50.0)))
     assert set(next(iter(world)).camera.tolist()) == {0, 1}
+
+
+def test_one_look_has_the_noise_the_outliers_and_the_gaps_that_are_asked_for() -> None:
+    rig, points, draw = arc_rig(), SURFACES["patch"](400, np.random.default_rng(1)).points, np.random.default_rng(2)
+    visible = np.ones((3, 400), bool)
+    visible[1, 5:] = False
+    clean = observations(rig, points, REST, 0.5, draw, sigma=0.0, visible=visible)
+    seen = observations(rig, points, REST, 0.5, draw, sigma=0.3, outliers=0.1, visible=visible)
+    assert seen.stamp == 0.5 and (seen.sigma == 0.3).all()
+    assert np.bincount(seen.camera).tolist() == [400, 5, 400] and set(seen.track[seen.camera == 1]) == set(range(5))
+    for number, camera in enumerate(rig.cameras):
+        ideal, _ = ideal_pixels(camera, se3.transform_points(REST, points))
+        mine = clean.camera == number
+        np.testing.assert_allclose(clean.pixels[mine], ideal[clean.track[mine]], atol=1e-9)
+    error = seen.pixels - clean.pixels
+    wrong = np.abs(error).max(1) > 1.8
+    assert wrong.mean() == pytest.approx(0.1, abs=0.03) and error[~wrong].std() == pytest.approx(0.3, rel=0.06)

@@ -11,12 +11,13 @@ import numpy as np
 from estimation import se3
 from estimation.errors import InputError
 from estimation.observations import Observations
-from estimation.rig import Rig, pixels_from_points
+from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.synthetic.calibration import miscalibrated, undistorting
 from estimation.synthetic.conditions import WHERE, Conditions
+from estimation.synthetic.look import gathered, imaged
 from estimation.synthetic.movements import MOVEMENTS
 from estimation.synthetic.surfaces import SURFACES, Landmarks, Surface
 from estimation.synthetic.tracks import Errors, Found, Seen, lives
@@ -24,7 +25,6 @@ from estimation.trajectory import Trajectory
 
 Displacement = Callable[[Array], Array]  # times (...), s -> rest_from_surface (..., 4, 4), mm
 
-LEAST_FACING = 0.17  # cosine: at 80 degrees a patch of skin is a line
 LEAST_SIGMA = 0.02  # px: no track is sharper, and none may claim to be exact
 MOVING, LANDMARKS, CALIBRATION, MAPPING, TRACKS = range(5)  # each draws by itself, so that none shifts another
 
@@ -77,29 +77,19 @@ class World:
         finding, erring, timing, sticking = np.random.default_rng([self.seed, TRACKS]).spawn(4)
         errors, found = Errors(self.conditions, shape, erring), Found(self.conditions, shape, finding)
         stuck = sticking.random(shape) < self.conditions.coherent
-        first, _ = self._imaged(np.zeros(shape[0]))
+        first, _ = self.imaged(np.zeros(shape[0]))
         offsets = np.array(self.conditions.offsets or np.zeros(shape[0]))
         step = float(self.stamps[1] - self.stamps[0]) if len(self) > 1 else 0.0
         for stamp in self.stamps:
             instants = stamp + offsets + self.conditions.jitter * timing.standard_normal(shape[0])
-            pixels, seen = self._imaged(instants)
+            pixels, seen = self.imaged(instants)
             pixels = np.where(stuck[..., None], first, pixels) + errors(step)
-            yield self._gathered(float(stamp), pixels, seen & found(float(stamp), step) & self._there(float(stamp)))
+            seen = seen & found(float(stamp), step) & self._there(float(stamp))
+            yield gathered(float(stamp), pixels, seen, max(self.conditions.noise, LEAST_SIGMA))
 
-    def _imaged(self, instants: Array) -> tuple[Array, Seen]:
-        """Undistorted pixels (C, N, 2) at each camera's instant (C,), s, and which landmarks it has in view."""
-        poses = self.base_from_surface(instants)
-        pixels, seen = [], []
-        for camera, pose in zip(self.true_rig.cameras, poses, strict=True):
-            points = se3.transform_points(pose, self.landmarks.points)
-            at, depth = pixels_from_points(camera, points)
-            to_camera = camera.base_from_camera[:3, 3] - points
-            normals = self.landmarks.normals @ pose[:3, :3].T
-            facing = (normals * to_camera).sum(1) > LEAST_FACING * np.linalg.norm(to_camera, axis=1)
-            inside = (at > 0).all(1) & (at < np.array(camera.size) - 1).all(1)
-            pixels.append(at)
-            seen.append(facing & inside & (depth > 1))
-        return np.stack(pixels), np.stack(seen)
+    def imaged(self, instants: Array) -> tuple[Array, Seen]:
+        """True pixels (C, N, 2) at each camera's own instant (C,), s, and which landmarks (C, N) it has in view."""
+        return imaged(self.true_rig, self.landmarks.points, self.base_from_surface(instants), self.landmarks.normals)
 
     def _there(self, stamp: float) -> Seen:
         """Which landmarks (N,) are alive and uncovered at `stamp`, s."""
@@ -110,11 +100,6 @@ class World:
         x = self.landmarks.points[:, 0]
         shown = np.clip((stamp - start) / max(end - start, 1e-9), 0.0, 1.0)
         return np.asarray(alive & (x <= shown * x.max()))
-
-    def _gathered(self, stamp: float, pixels: Array, seen: Seen) -> Observations:
-        camera, track = np.nonzero(seen)
-        sigma = np.full(len(camera), max(self.conditions.noise, LEAST_SIGMA))
-        return Observations(stamp, camera, track, pixels[camera, track], sigma)
 
 
 def synthetic_world(
