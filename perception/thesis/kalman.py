@@ -9,7 +9,7 @@ import numpy as np
 from estimation.se3 import Array
 
 ACCELERATION = np.array([500.0, 500.0, 2.5])  # px/s^2 and rad/s^2: 50 px/s, or 15 deg/s, within a tenth of a second
-MOVE = np.array([0.1, 0.1, 1e-3])  # px and rad, of one measured move: some fifty matches of half a px over 100 px
+MOVE = np.array([0.15, 0.15, 5e-3])  # px and rad, of one measured move: some twenty matches, each to half a px
 UNKNOWN = np.array([300.0, 300.0, 1.5])  # px/s and rad/s, of a surface just found: any that could be printed on
 
 

@@ -29,8 +29,8 @@ PIXEL = 1.0  # px, told of each feature's place: the thesis states none
 class ThesisStep:
     """Follows one surface through frame sets; deterministic, causal.
 
-    The pose's covariance is what the filter of thesis 4.4 has of the measured axes; what no camera measures is taken
-    for still, as the thesis does, and adds nothing to it.
+    Covariances are what the thesis claims, next to nothing: the filter of 4.4 knows how sure it is of a velocity and of
+    a prediction, but the sum of the measured moves is taken for exact, and what no camera measures for still.
     """
 
     last: StepReport
