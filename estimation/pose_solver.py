@@ -38,24 +38,21 @@ class PoseFit:
 def project(rig: Rig, camera: Index, base_from_surface: Array, points: Array) -> tuple[Array, Array, Array]:
     """Ideal pixels (N, 2), depths (N,) mm and Jacobians (N, 2, 6) of surface points (N, 3), each in its camera (N,)."""
     extrinsics = rig.camera_from_base @ base_from_surface  # (C, 4, 4) camera_from_surface
-    rotation = extrinsics[camera, :3, :3]
-    in_camera = (rotation @ points[..., None])[..., 0] + extrinsics[camera, :3, 3]
-    matrices = rig.matrices[camera]
-    fx, fy = matrices[:, 0, 0], matrices[:, 1, 1]
-    depth = in_camera[:, 2]
+    count, place = len(points), np.ascontiguousarray(points.T)
+    # tracks last: rows of N numbers are what numpy is quick at
+    parts = extrinsics[:, :3].reshape(-1, 12).T.take(camera, axis=1).reshape(3, 4, count)
+    lens = rig.matrices[:, :2].reshape(-1, 6).T.take(camera, axis=1).reshape(2, 3, count)
+    rotation, focal, centre = parts[:, :3], lens[[0, 1], [0, 1]], lens[:, 2]
+    x, y, depth = np.einsum("ijn,jn->in", rotation, place) + parts[:, 3]
     inverse_depth = 1.0 / np.where(np.abs(depth) < 1e-6, 1e-6, depth)
-    x, y = in_camera[:, 0] * inverse_depth, in_camera[:, 1] * inverse_depth
-    pixels = np.stack([fx * x + matrices[:, 0, 2], fy * y + matrices[:, 1, 2]], -1)
-    u = (fx * inverse_depth)[:, None] * (rotation[:, 0] - x[:, None] * rotation[:, 2])
-    v = (fy * inverse_depth)[:, None] * (rotation[:, 1] - y[:, None] * rotation[:, 2])
-    by_point = np.stack([u, v], 1)  # (N, 2, 3)
-    jacobian = np.empty((len(points), 2, 6))
-    jacobian[:, :, 3:] = by_point
-    px, py, pz = points[:, :1], points[:, 1:2], points[:, 2:]
-    jacobian[:, :, 0] = py * by_point[:, :, 2] - pz * by_point[:, :, 1]  # row @ -hat(p) = cross(p, row)
-    jacobian[:, :, 1] = pz * by_point[:, :, 0] - px * by_point[:, :, 2]
-    jacobian[:, :, 2] = px * by_point[:, :, 1] - py * by_point[:, :, 0]
-    return pixels, depth, jacobian
+    tangent = np.stack([x, y]) * inverse_depth
+    by_point = (rotation[:2] - tangent[:, None] * rotation[2]) * (focal * inverse_depth)[:, None]  # (2, 3, N)
+    jacobian = np.empty((2, 6, count))
+    jacobian[:, 3:] = by_point
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):  # row @ -hat(p) = cross(p, row)
+        jacobian[:, i] = place[j] * by_point[:, k] - place[k] * by_point[:, j]
+    pixels = focal * tangent + centre
+    return np.ascontiguousarray(pixels.T), depth, np.ascontiguousarray(jacobian.transpose(2, 0, 1))
 
 
 def solve_pose(

@@ -92,6 +92,8 @@ def _exp_one(xi: Array) -> Array:
 def log(transform: ArrayLike) -> Array:
     """Tangent vectors (..., 6) of transforms (..., 4, 4): inverse of `exp` for rotations below pi."""
     transform = np.asarray(transform, float)
+    if transform.ndim == 2:
+        return _log_one(transform)
     w = log_rotation(transform[..., :3, :3])
     angle = np.linalg.norm(w, axis=-1)
     s, c, _ = _coefficients(angle)
@@ -102,6 +104,41 @@ def log(transform: ArrayLike) -> Array:
     h = hat(w)
     inverse_left = np.eye(3) - 0.5 * h + e[..., None, None] * (h @ h)
     return np.concatenate([w, (inverse_left @ transform[..., :3, 3:])[..., 0]], axis=-1)
+
+
+def _log_one(transform: Array) -> Array:
+    """`log` of one transform in plain floats, as `_exp_one`."""
+    (a, b, c, tx), (d, e, f, ty), (g, h, i, tz), _ = transform.tolist()
+    qx, qy, qz, qw = _quaternion_one(a, b, c, d, e, f, g, h, i)
+    n = math.sqrt(qx * qx + qy * qy + qz * qz)
+    angle = 2 * math.atan2(n, qw)
+    scale = 2.0 if n < 1e-8 else angle / n
+    x, y, z = scale * qx, scale * qy, scale * qz
+    a2 = x * x + y * y + z * z
+    if angle < 0.05:
+        k = 1 / 12 + a2 / 720 + a2 * a2 / 30240
+    else:
+        half = 0.5 * angle
+        k = (1 - half * math.cos(half) / math.sin(half)) / a2
+    ux, uy, uz = y * tz - z * ty, z * tx - x * tz, x * ty - y * tx  # hat(w) @ t
+    vx, vy, vz = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
+    return np.array([x, y, z, tx - 0.5 * ux + k * vx, ty - 0.5 * uy + k * vy, tz - 0.5 * uz + k * vz])
+
+
+def _quaternion_one(
+    xx: float, xy: float, xz: float, yx: float, yy: float, yz: float, zx: float, zy: float, zz: float
+) -> tuple[float, float, float, float]:
+    """Unit quaternion x y z w, w >= 0, of one rotation's entries row by row."""
+    if xx + yy + zz > 0:
+        q = zy - yz, xz - zx, yx - xy, 1 + xx + yy + zz
+    elif xx >= yy and xx >= zz:
+        q = 1 + xx - yy - zz, xy + yx, xz + zx, zy - yz
+    elif yy >= zz:
+        q = xy + yx, 1 + yy - xx - zz, yz + zy, xz - zx
+    else:
+        q = xz + zx, yz + zy, 1 + zz - xx - yy, yx - xy
+    length = math.copysign(math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2), q[3])
+    return q[0] / length, q[1] / length, q[2] / length, q[3] / length
 
 
 def make(rotation: ArrayLike, translation: ArrayLike) -> Array:
@@ -117,7 +154,9 @@ def inverse(transform: ArrayLike) -> Array:
     """b_from_a (..., 4, 4) of a_from_b."""
     transform = np.asarray(transform, float)
     r = np.swapaxes(transform[..., :3, :3], -1, -2)
-    return make(r, -(r @ transform[..., :3, 3:])[..., 0])
+    out = np.zeros(transform.shape)
+    out[..., :3, :3], out[..., :3, 3:], out[..., 3, 3] = r, -(r @ transform[..., :3, 3:]), 1.0
+    return out
 
 
 def adjoint(transform: ArrayLike) -> Array:

@@ -31,6 +31,8 @@ from perception.patches import (
 MEAN = np.full(GRID_SIZE, 1 / GRID_SIZE, np.float32)
 FAINT = 1e-6  # grey levels squared: no contrast at all
 ARRIVED = 0.03  # samples: a last step; what is left after it is a tenth of that
+UNSEEN = 0.3  # samples: the longest step taken without a look at where it leads
+HURRIED = 4  # looks at the full image from a near start; a tenth of the tracks, the worst, would like more
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,8 +81,8 @@ def align_in(
         _descend(pieces, halves, where, start, shift, 2.0, 4)
     full = _Sampler([i[0] for i in images], ends, where.per_sample)
     pieces = templates.picture, templates.steepest, templates.inverse_hessian
-    score, contrast = _descend(pieces, full, where, start, shift, 1.0, 6)
-    return _judge(templates, where, start, shift, score, contrast, least)
+    ended = _descend(pieces, full, where, start, shift, 1.0, 6 if coarse else HURRIED)
+    return _judge(templates, where, start, shift, ended, least)
 
 
 class _Sampler:
@@ -109,6 +111,16 @@ class _Sampler:
         return out
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ended:
+    """How each descent ended: score (N,) and contrast (N,), grey levels, at the place looked at last, and rest (N,),
+    samples, what it would still have moved."""
+
+    score: Array
+    contrast: Array
+    rest: Array
+
+
 def _descend(
     pieces: tuple[Float32, Float32, Array],
     grey_levels: _Sampler,
@@ -117,14 +129,13 @@ def _descend(
     shift: Array,
     spacing: float,
     rounds: int,
-) -> tuple[Array, Array]:
+) -> _Ended:
     """Gauss-Newton on the shifts (N, 2), in place, of those in view; who has arrived is left alone.
 
-    Answers with score (N,) and contrast (N,), grey levels, at the place looked at last, from which the shift is at most
-    ARRIVED away. The steepest descent pictures are free of brightness and contrast, so the images need not be.
+    The steepest descent pictures are free of brightness and contrast, so the images need not be.
     """
     picture, steepest, inverse = pieces
-    score, contrast = np.zeros(len(shift)), np.zeros(len(shift))
+    score, contrast, rest = np.zeros((3, len(shift)))
     busy = np.nonzero(where.visible)[0]
     for last in range(rounds - 1, -1, -1):
         if not len(busy):
@@ -138,12 +149,13 @@ def _descend(
         gradient = np.vecdot(steepest[some], seen[:, None]) / spread[:, None]
         step = -(inverse[some] @ gradient[..., None])[..., 0]
         length = np.sqrt((step * step).sum(1))
-        arrived = length < ARRIVED
-        if spacing == 1 and not last:  # a step that nobody can check any more is not taken
-            step[~arrived] = 0.0
+        if spacing == 1 and not last:
+            step[length > UNSEEN] = 0.0
         shift[some] += step * (spacing * np.minimum(1.0, 3.0 / np.maximum(length, 1e-9)))[:, None]
+        arrived = length < ARRIVED
+        rest[some] = np.where(arrived, 0.0, length)
         busy = busy[~arrived]
-    return score, contrast
+    return _Ended(score, contrast, rest)
 
 
 def coarse_score(templates: Templates, images: Pyramid, where: Projection, centre: Array) -> Array:
@@ -153,13 +165,14 @@ def coarse_score(templates: Templates, images: Pyramid, where: Projection, centr
 
 
 def _judge(
-    templates: Templates, where: Projection, start: Array, shift: Array, score: Array, contrast: Array, least: float
+    templates: Templates, where: Projection, start: Array, shift: Array, ended: _Ended, least: float
 ) -> Alignment:
     moved = (where.per_sample @ shift[..., None])[..., 0]
     pixels = start + moved
-    noise = 2 * (1 - np.clip(score, -1, 1)) * 2.0  # variance per sample; neighbours share noise, hence the two
+    noise = 2 * (1 - np.clip(ended.score, -1, 1)) * 2.0  # variance per sample; neighbours share noise, hence the two
     per_pixel = where.per_sample @ templates.inverse_hessian @ np.swapaxes(where.per_sample, 1, 2)
-    sigma = np.sqrt(np.maximum(noise * (per_pixel[:, 0, 0] + per_pixel[:, 1, 1]) / 2, 0.05**2))
+    sigma = np.sqrt(np.maximum(noise * (per_pixel[:, 0, 0] + per_pixel[:, 1, 1]) / 2, 0.05**2) + ended.rest**2)
     reach = np.sqrt((moved * moved).sum(1))
-    found = where.visible & (score > least) & (contrast > FLAT) & (reach < 3 * SIDE) & np.isfinite(pixels).all(1)
-    return Alignment(pixels, sigma, score, found)
+    fits = (ended.score > least) & (ended.contrast > FLAT)
+    found = where.visible & fits & (reach < 3 * SIDE) & np.isfinite(pixels).all(1)
+    return Alignment(pixels, sigma, ended.score, found)

@@ -29,7 +29,7 @@ ROUGH = 1e-3  # rad, mm: a start for the alignment need not be better
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What one camera last saw: its image, where landmarks (rows) stood in it, and the pose then."""
+    """What one camera last saw: its image, where landmarks (rows) stood in it, ideal pixels, and the pose then."""
 
     image: Image
     rows: NDArray[np.int64]
@@ -73,11 +73,9 @@ class Matcher:
         ready = sorted(c for c in self._views if self.seen(c) >= 6)
         if not ready:
             return np.inf
-        rows = np.concatenate([self._views[c].rows[:: 1 + len(self._views[c].rows) // DOUBTED] for c in ready])
-        camera = np.concatenate(
-            [np.full(len(self._views[c].rows[:: 1 + len(self._views[c].rows) // DOUBTED]), c) for c in ready]
-        )
-        jacobian = project(self.rig, camera, base_from_surface, self.map.points[rows])[2]
+        some = [self._views[c].rows[:: 1 + self.seen(c) // DOUBTED] for c in ready]
+        camera = np.repeat(ready, [len(rows) for rows in some])
+        jacobian = project(self.rig, camera, base_from_surface, self.map.points[np.concatenate(some)])[2]
         return float(np.sqrt(((jacobian @ covariance) * jacobian).sum(2).max()))
 
     def complete(self, observations: Observations, cameras: Iterable[int]) -> bool:
@@ -123,7 +121,8 @@ class Matcher:
     def _flow_one(self, camera: int, image: Image, guess: Array) -> tuple[NDArray[np.int64], Array]:
         view = self._views[camera]
         some = slice(None, None, 1 + len(view.rows) // FLOW_TRACKS)
-        rows, pixels = view.rows[some], view.pixels[some]
+        rows, ideal = view.rows[some], view.pixels[some]
+        pixels, _ = self.lenses.image(camera, ideal, np.full(len(rows), np.inf))
         before = self._imaged(camera, view.base_from_surface, rows)
         after = self._imaged(camera, guess, rows)
         found, ok = optical_flow(view.image, image, pixels, pixels + after - before)
@@ -176,5 +175,4 @@ class Matcher:
         """Keep what the cameras saw: images, the tracks that agreed (inlier, (N,)), the surface's pose (4, 4)."""
         for c, images in pyramids.items():
             mine = inlier & (observations.camera == c)
-            from_lens, _ = self.lenses.image(c, observations.pixels[mine], np.full(int(mine.sum()), 1e3))
-            self._views[c] = View(images[0], observations.track[mine], from_lens, pose)
+            self._views[c] = View(images[0], observations.track[mine], observations.pixels[mine], pose)

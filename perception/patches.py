@@ -23,7 +23,6 @@ SIDE = 2 * RADIUS + 1
 FLAT = 3.0  # grey levels: a patch with less contrast is not worth a track
 
 Float32 = NDArray[np.float32]
-Pyramid = tuple[Image, Image]  # an image and its half-size version
 
 
 def _grid() -> Array:
@@ -34,6 +33,28 @@ def _grid() -> Array:
 GRID = _grid()  # (SIDE * SIDE, 2)
 GRID_SIZE = len(GRID)
 _SPAN = np.ascontiguousarray(GRID.T, np.float32)  # (2, S)
+
+
+class Pyramid:
+    """An image, level 0, and its half-size version, level 1, made when it is first asked for: most frames need none."""
+
+    __slots__ = ("_half", "_image")
+
+    def __init__(self, image: Image) -> None:
+        self._image = image
+        self._half: Image | None = None
+
+    def __getitem__(self, level: int) -> Image:
+        if level == 0:
+            return self._image
+        if self._half is None:
+            self._half = np.asarray(cv2.pyrDown(self._image), np.uint8)
+        return self._half
+
+
+def pyramid(image: Image) -> Pyramid:
+    """The image and its half-size version, as alignment takes them."""
+    return Pyramid(image)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,11 +87,6 @@ class Templates:
 def join(parts: list[Templates]) -> Templates:
     """Several sets of templates one after the other."""
     return Templates(*(np.concatenate([getattr(p, name) for p in parts]) for name in Templates.__slots__))
-
-
-def pyramid(image: Image) -> Pyramid:
-    """The image and its half-size version, as alignment takes them."""
-    return image, np.asarray(cv2.pyrDown(image), np.uint8)
 
 
 def sample(image: Image, centre: Array, per_sample: Array, spacing: float = 1.0, half: bool = False) -> Float32:

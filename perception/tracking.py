@@ -31,6 +31,7 @@ from perception.patches import Pyramid, pyramid
 from perception.relocalise import Relocaliser
 
 STAGES = ("prepare", "flow", "align", "pose", "search")
+FAR = 4.0, 1.0  # scales of a fit whose start may be pixels off
 NEAR = 0.8  # px, one sigma: three of it are what alignment reaches on the full image
 FULL_SEARCH = 10  # frame sets of an absent surface between searches at full size, off the frame's path
 
@@ -133,8 +134,8 @@ class TrackingStep:
     ) -> tuple[SurfacePose, Observations, NDArray[np.int64]]:
         estimator = self._estimator
         assert estimator.map is not None and estimator.pose is not None
-        joint, observations = self._measure(matcher, estimator.pose.predict(stamp), pyramids)
-        fit = estimator.fit(observations, joint)
+        joint, observations, scales = self._measure(matcher, estimator.pose.predict(stamp), pyramids)
+        fit = estimator.fit(observations, joint, scales)
         self._took("pose")
         if not fit.measured or self._missing(fit, pyramids):
             fit, observations = self._second_try(matcher, pyramids, fit, observations)
@@ -161,8 +162,8 @@ class TrackingStep:
 
     def _measure(
         self, matcher: Matcher, expected: SurfacePose, pyramids: dict[int, Pyramid]
-    ) -> tuple[Array, Observations]:
-        """A rough joint pose and the landmarks found in the images.
+    ) -> tuple[Array, Observations, tuple[float, ...]]:
+        """A rough joint pose, the landmarks found in the images, and the scales at which a fit should begin and end.
 
         Alignment begins where the motion puts the surface, if that is known to a pixel or so. Flow is asked where it is
         not, and where alignment then finds fewer landmarks than the last images had.
@@ -173,14 +174,14 @@ class TrackingStep:
             observations = matcher.align(stamp, pyramids, dict.fromkeys(pyramids, guess))
             self._took("align")
             if matcher.complete(observations, pyramids):
-                return guess, observations
+                return guess, observations, (1.0,)
         joint, single = matcher.flow(pyramids, guess)
         self._took("flow")
         again = matcher.align(stamp, pyramids, single)
         self._took("align")
         if observations is not None and len(observations) > len(again):
-            return guess, observations
-        return joint, again
+            return guess, observations, FAR
+        return joint, again, FAR
 
     def _missing(self, fit: Fit, pyramids: dict[int, Pyramid]) -> list[int]:
         """Cameras that carried the last pose and now hardly see the surface."""

@@ -13,12 +13,11 @@ from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.scene import Scene, rois
 from perception.features import grey, polygon_mask
 from perception.first_map import FirstMap, build_first_map, in_frame
-from perception.frames import Image
 from perception.lens import Lenses
-from perception.patches import pyramid
+from perception.patches import Pyramid, pyramid
 from tests.synthetic import RADIUS, SCAN_FROM_SURFACE, patch, pictures
 
-Pyramids = dict[int, tuple[Image, Image]]
+Pyramids = dict[int, Pyramid]
 RIG = arc_rig(size=(640, 480), focal=560.0)
 SCENE = patch(1)
 

@@ -11,7 +11,7 @@ from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
 from hardware.simulator.default_rig import REST, arc_rig
-from perception.alignment import Alignment, align, coarse_score
+from perception.alignment import Alignment, align, align_in, coarse_score
 from perception.features import grey
 from perception.frames import Image
 from perception.lens import Lenses
@@ -20,6 +20,7 @@ from perception.patches import (
     Templates,
     join,
     normalise,
+    project_into,
     project_squares,
     pyramid,
     take_templates,
@@ -109,6 +110,32 @@ def test_the_claimed_error_is_of_the_true_ones_size(templates: Templates) -> Non
         found, _ = find(templates, picture(pose, seed=seed + 3), pose)
         ratios.append(errors(found, pose) / (np.sqrt(2) * found.sigma[found.found]))
     assert 0.3 < np.sqrt(np.mean(np.concatenate(ratios) ** 2)) < 1.5
+
+
+@pytest.mark.parametrize("coarse", [True, False])
+def test_cameras_aligned_together_are_each_as_alone(templates: Templates, coarse: bool) -> None:
+    pose = REST @ se3.exp(np.array([0.004, 0, 0.004, 0.3, -0.2, 0]))
+    images = [pyramid(picture(REST, camera=c)) for c in range(3)]
+    whole = project_into(LENSES, range(3), np.stack([pose] * 3), POINTS, NORMALS, templates.axes)
+    count = [len(POINTS)] * 3
+    together = align_in(join([templates] * 3), images, count, whole, whole.centre, coarse=coarse)
+    for c in range(3):
+        where = project_squares(LENSES, c, pose, POINTS, NORMALS, templates.axes)
+        alone = align(templates, images[c], where, where.centre, coarse=coarse)
+        part = slice(c * len(POINTS), (c + 1) * len(POINTS))
+        assert np.allclose(whole.centre[part], where.centre, atol=1e-9)
+        assert np.array_equal(together.found[part], alone.found) and alone.found.sum() > 15
+        assert np.allclose(together.pixels[part][alone.found], alone.pixels[alone.found], atol=1e-3)
+        assert np.allclose(together.sigma[part][alone.found], alone.sigma[alone.found], atol=1e-3)
+
+
+def test_a_patch_that_had_not_arrived_says_how_far_it_had_to_go(templates: Templates) -> None:
+    begin = true_pixels(REST) + [2.0, 1.8]
+    found, _ = find(templates, picture(REST, seed=4), REST, begin=begin, coarse=False)
+    away = np.linalg.norm(found.pixels - true_pixels(REST), axis=1)
+    short = found.found & (away > 0.3)
+    assert found.found.sum() > 30 and short.sum() > 5
+    assert 0.5 < np.median(away[short] / found.sigma[short]) < 2
 
 
 def test_the_coarse_image_reaches_five_pixels_from_any_side(templates: Templates) -> None:

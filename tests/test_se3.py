@@ -94,6 +94,12 @@ def test_exp_log_adjoint_and_inverse_are_gtsams(xi: Array) -> None:
     assert close(se3.inverse(pose.matrix()), pose.inverse().matrix())
 
 
+@given(tangents())
+def test_log_of_one_is_log_of_a_stack_of_one(xi: Array) -> None:
+    t = se3.exp(xi)
+    assert close(se3.log(t), se3.log(t[None])[0])
+
+
 @given(transforms, tangents(angle=3.0), st.floats(0, 1))
 def test_interpolation_is_gtsams(a: Array, xi: Array, u: float) -> None:
     one, other = gtsam.Pose3(a), gtsam.Pose3(a @ se3.exp(xi))

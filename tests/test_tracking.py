@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
+from itertools import count
 
 import cv2
 import numpy as np
@@ -18,7 +20,7 @@ from hardware.simulator.scene import Scene, rois
 from perception.features import grey
 from perception.frames import Frame, FrameSet, Image, Roi
 from perception.tracking import STAGES, TrackingStep
-from tests.synthetic import AWAY, CLEAN, Motion, breathing, frame_sets, patch, pictures
+from tests.synthetic import AWAY, CLEAN, Motion, breathing, frame_sets, patch, pictures, still
 
 RIG = arc_rig(size=(640, 480), focal=560.0)
 SCENE = patch(0)
@@ -196,6 +198,29 @@ def test_a_hidden_surface_is_never_called_tracked(sets: list[FrameSet], hidden: 
     widths = [np.linalg.eigvalsh(p.covariance[3:, 3:])[-1] for p in poses[5:16]]
     assert (np.diff(widths) > 0).all()
     assert states(poses[18:]) == {TrackState.TRACKING} and errors(poses)[18:].max() < 0.15
+
+
+def test_a_jolt_that_no_motion_model_expects_is_followed() -> None:
+    """At rest alignment begins where the model says; 5 mm and 2 degrees between two sets are beyond its reach."""
+    away = se3.exp(np.array([0.02, 0.02, 0.02, 4.0, 3.0, 1.0]))
+
+    def jolted(stamp: float) -> Array:
+        return REST @ away if stamp > 1.25 else REST
+
+    poses = run(shot(jolted, np.arange(16) / 10))
+    assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses, jolted)[1:].max() < 0.1
+
+
+def test_flow_is_asked_only_where_the_motion_model_is_unsure(sets: list[FrameSet]) -> None:
+    ticks = count()
+    step = TrackingStep(RIG, ROIS, lambda: float(next(ticks)))  # every lap counts one
+    calm = shot(still, np.arange(14) / 10)
+    asked = []
+    for frames in [*calm, replace(sets[5], stamp=3.0)]:
+        step(frames)
+        asked.append(step.last.seconds[STAGES.index("flow")] > 0)
+        step.idle()
+    assert not any(asked[-6:-1]) and asked[-1]
 
 
 def test_a_surface_that_comes_back_elsewhere_is_found(sets: list[FrameSet]) -> None:
