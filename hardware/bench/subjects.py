@@ -38,6 +38,7 @@ Subjects = Mapping[str, Subject]
 
 SUBJECTS: Subjects = {
     "estimator": Subject("hardware.bench.estimator", "the estimator on synthetic tracks: accuracy, honesty, time"),
+    "latency": Subject("hardware.bench.latency", "from three decoded frames to the pose, by wall clock and processor"),
     "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?"),
     "thesis": Subject("hardware.bench.thesis", "the thesis's estimator beside ours, on the same frame sets"),
 }
