@@ -71,3 +71,20 @@ def test_pooled_figures_are_those_of_all_poses_together() -> None:
     assert both.bound_mm**2 == pytest.approx((one.bound_mm**2 + two.bound_mm**2) / 2)
     assert both.nees == pytest.approx((one.nees + two.nees) / 2)
     assert 0.5 < both.error_mm / both.bound_mm < 1.5 and both.measured == 1.0
+
+
+def test_the_bound_of_an_estimated_frame_holds_the_error_of_the_look_that_laid_it() -> None:
+    """Over many starts, since that error is one draw for a whole run."""
+    worlds = [synthetic_world("still", seconds=0.2, count=40, seed=seed) for seed in range(30)]
+    for mapping in ("told", "seen"):
+        runs = [follow(world, mapping) for world in worlds]
+        found = pooled(runs)
+        assert 0.85 < found.error_mm / found.bound_mm < 1.3
+        assert found.filtered_mm <= found.bound_mm and found.filtered_deg <= found.bound_deg
+        assert all(np.isfinite(run.bounds).all() for run in runs)
+
+
+def test_where_nothing_is_seen_nothing_is_known() -> None:
+    run = follow(synthetic_world("still", seconds=0.5, outages=((0.2, 0.3),)))
+    assert np.array_equal(np.isinf(run.bounds).all(axis=(1, 2)), ~run.measured)
+    assert np.isfinite(run.filtered_bounds()).all()

@@ -17,7 +17,7 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.refiner import Refiner
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.synthetic.bound import pose_information
+from estimation.synthetic.bound import filtered_bound, pose_bound, pose_information
 from estimation.synthetic.first_map import Triangulated, triangulated
 from estimation.synthetic.world import World
 
@@ -84,7 +84,8 @@ class Followed:
 
     poses: K of them. seconds: (K,) by the clock. Of the estimated surface frame, into which the truth is carried at the
     start, and never fitted: expected: (K, 4, 4) true base_from_surface. twists: (K, 6) true ones. informations:
-    (K, 6, 6), Fisher's, of each true pose from its own tracks, were all of them right.
+    (K, 6, 6), Fisher's, of each true pose from its own tracks, were all of them right. frame: (6, 6), the least
+    covariance with which the first look could lay the surface frame; 0 where it was told.
     """
 
     poses: tuple[SurfacePose, ...]
@@ -92,6 +93,25 @@ class Followed:
     expected: Array
     twists: Array
     informations: Array
+    frame: Array
+
+    @property
+    def bounds(self) -> Array:
+        """(K, 6, 6), the least covariance of each error, one frame set by itself; inf where nothing was seen.
+
+        An estimated frame was laid by a pose that is no better than the others, and its error is in all of them.
+        """
+        bounds = np.full_like(self.informations, np.inf)
+        seen = self.informations.any(axis=(1, 2))
+        bounds[seen] = pose_bound(self.informations[seen]) + self.frame
+        return bounds
+
+    def filtered_bounds(self) -> Array:
+        """(K, 6, 6), the same with all frame sets before, for a motion as lively as this one was on the whole."""
+        dt = self.poses[1].stamp - self.poses[0].stamp
+        drive = (np.diff(self.twists, axis=0) ** 2).mean(0) / dt
+        psd = np.repeat([drive[:3].mean(), drive[3:].mean()], 3)
+        return filtered_bound(self.informations, dt, psd) + self.frame
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -165,11 +185,13 @@ def follow(world: World, mapping: Mapping = "told", clock: Callable[[], float] =
     true_from_estimated = se3.inverse(true_start) @ begun.pose.base_from_surface
     expected = world.base_from_surface(stamps) @ true_from_estimated
     points = se3.transform_points(se3.inverse(true_from_estimated), world.landmarks.points)
-    pairs = zip(expected, rest, strict=True)
+    poses = zip([true_start @ true_from_estimated, *expected], [begun, *rest], strict=True)
+    first, *informations = (pose_information(world.true_rig, pose, points, step.seen) for pose, step in poses)
     return Followed(
         poses=tuple(step.pose for step in rest),
         seconds=np.array([step.seconds for step in rest]),
         expected=expected,
         twists=world.twists(stamps) @ se3.adjoint(se3.inverse(true_from_estimated)).T,
-        informations=np.stack([pose_information(world.true_rig, pose, points, step.seen) for pose, step in pairs]),
+        informations=np.stack(informations),
+        frame=pose_bound(first) if mapping == "seen" else np.zeros((6, 6)),
     )

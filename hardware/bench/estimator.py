@@ -28,7 +28,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", default="*", metavar="PATTERN", help="scenes by name, e.g. 'breathing, c*'")
     parser.add_argument("--maps", nargs="+", choices=get_args(Mapping), default=get_args(Mapping), help="whose map")
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="worlds of each scene")
-    parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="length of each world")
+    parser.add_argument("--seconds", type=float, metavar="S", help="length of each world; 10 s or more without")
     parser.add_argument("--count", type=int, default=100, metavar="N", help="landmarks")
     parser.add_argument("--noise", type=float, default=0.25, metavar="PX", help="white, where a scene has no own")
     parser.add_argument("--soak", type=float, metavar="HOURS", help="instead: one long run of breathing")
@@ -61,9 +61,8 @@ def _asked(pattern: str) -> list[Scene]:
 def world_of(scene: Scene, seed: int, options: argparse.Namespace) -> World:
     """One world of a scene."""
     conditions = {"noise": options.noise, **scene.conditions}
-    return synthetic_world(
-        scene.movement, options.seconds, count=options.count, surface=scene.surface, seed=seed, **conditions
-    )
+    seconds = scene.seconds if options.seconds is None else options.seconds
+    return synthetic_world(scene.movement, seconds, count=options.count, surface=scene.surface, seed=seed, **conditions)
 
 
 def scene_figures(scene: Scene, of_map: str, found: Pooled) -> list[Figure]:
@@ -71,10 +70,11 @@ def scene_figures(scene: Scene, of_map: str, found: Pooled) -> list[Figure]:
     name = f"{scene.name}, {of_map}"
     rigid = scene.rigid and scene.error is not None
     near = at_most(1.3) if scene.rigid else None
-    bound = f"bound {found.bound_mm:.4f} mm, {found.bound_deg:.4f} deg"
+    moved = f"bound {found.bound_mm:.4f}, filtered {found.filtered_mm:.4f}"
+    turned = f"bound {found.bound_deg:.4f}, filtered {found.filtered_deg:.4f}"
     return [
-        Figure(f"{name}: error", found.error_mm, "mm", scene.error, bound),
-        Figure(f"{name}: turn", found.error_deg, "deg", at_most(0.05) if rigid else None, bound),
+        Figure(f"{name}: error", found.error_mm, "mm", scene.error, moved),
+        Figure(f"{name}: turn", found.error_deg, "deg", at_most(0.05) if rigid else None, turned),
         Figure(f"{name}: error by bound", found.error_mm / found.bound_mm, "", near),
         Figure(f"{name}: turn by bound", found.error_deg / found.bound_deg, "", near),
         Figure(f"{name}: NEES/6", found.nees, "", CONSISTENT),

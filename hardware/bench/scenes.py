@@ -24,6 +24,11 @@ class Scene:
     rigid: bool = False
     surface: str = "patch"
 
+    @property
+    def seconds(self) -> float:
+        """How long it lasts: offsets are asked to be known after 20 s."""
+        return 24.0 if "offsets" in self.conditions else 10.0
+
 
 CLEAN = tuple(
     Scene(f"{movement}, clean", movement, error=at_most(0.03), rigid=True)
