@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
+from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.trajectory import Trajectory
 from hardware.images import encode
 from hardware.ply_file import write_ply
 from hardware.simulator.bodies import Wound, with_wound
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look
 from hardware.simulator.render import render

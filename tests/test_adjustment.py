@@ -13,9 +13,9 @@ from estimation.observations import Observations
 from estimation.pose_solver import solve_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
+from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.synthetic.look import observations
 from estimation.synthetic.surfaces import patch
-from hardware.simulator.default_rig import REST, arc_rig
 
 RIG = arc_rig()
 

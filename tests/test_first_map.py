@@ -9,7 +9,7 @@ import pytest
 from estimation import se3
 from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware.simulator.default_rig import REST, arc_rig
+from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.simulator.scene import Scene, rois
 from perception.features import grey, polygon_mask
 from perception.first_map import FirstMap, build_first_map, in_frame

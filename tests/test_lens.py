@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.rig import Camera, Rig, distort, ideal_pixels, pixels_from_points
 from estimation.se3 import Array
-from hardware.simulator.default_rig import REST, arc_rig
+from estimation.synthetic.arc_rig import REST, arc_rig
 from perception.lens import Lenses, imaged_radius, undistort
 
 LENSES = [(0.0,) * 5, (-0.12, 0.06, 6e-4, -4e-4, 0.0), (-0.3, 0.12, 1e-3, -1e-3, -0.02), (0.15, -0.05, 0.0, 0.0, 0.01)]

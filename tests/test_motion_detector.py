@@ -11,7 +11,7 @@ from estimation import se3
 from estimation.motion_detector import MotionDetector
 from estimation.pose import SurfaceMotion
 from estimation.se3 import Array
-from hardware.simulator.default_rig import REST
+from estimation.synthetic.arc_rig import REST
 from tests.synthetic import breathing
 
 RATE = 30.0

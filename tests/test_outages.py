@@ -9,10 +9,10 @@ import pytest
 
 from estimation import se3
 from estimation.pose import TrackState
+from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.bench.outage_judge import judge
 from hardware.bench.outage_run import FPS, Watched
 from hardware.bench.outages import figures, kinds_text, shares
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.outage import Kind, Outage, Spoiler, draw_outage
 from perception.frames import Image
 

@@ -10,7 +10,7 @@ import pytest
 from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
-from hardware.simulator.default_rig import REST, arc_rig
+from estimation.synthetic.arc_rig import REST, arc_rig
 from perception.alignment import Alignment, align, align_in, coarse_score
 from perception.features import grey
 from perception.frames import Image

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from estimation import se3
+from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.images import decode
 from hardware.simulator.cameras import Fate, Shot
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look
 from hardware.simulator.pictures import Pictures

@@ -13,9 +13,9 @@ from estimation.observations import Observations
 from estimation.pose_solver import PoseFit, project, solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
+from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.synthetic.look import observations
 from estimation.synthetic.surfaces import patch
-from hardware.simulator.default_rig import REST, arc_rig
 
 RIG = arc_rig()
 LANDMARKS = patch(60, np.random.default_rng(3)).points

@@ -14,8 +14,8 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
+from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.simulator.bodies import Wound, body
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.deformation import Deformation
 from hardware.simulator.motion_table import motion_from_tables
 from hardware.simulator.registering import LEAST, surface_points, truth_from_estimate

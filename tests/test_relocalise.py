@@ -9,7 +9,7 @@ from estimation import se3
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from hardware.simulator.default_rig import REST, arc_rig
+from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.simulator.scene import Scene
 from perception.features import grey
 from perception.frames import Image

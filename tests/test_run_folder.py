@@ -11,13 +11,13 @@ from estimation.observations import no_observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
+from estimation.synthetic.arc_rig import REST
 from hardware.arm_file import read_arm
 from hardware.images import encode
 from hardware.path_file import read_path
 from hardware.pose_file import read_poses
 from hardware.session import open_session
 from hardware.simulator.cameras import Fate, Shot
-from hardware.simulator.default_rig import REST
 from hardware.simulator.nozzle_file import read_nozzle
 from hardware.simulator.planned_line import planned_line
 from hardware.simulator.run_folder import RunFolder

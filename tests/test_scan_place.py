@@ -13,8 +13,8 @@ from estimation.rig import ideal_pixels
 from estimation.scan import Scan, scan_from_triangles
 from estimation.se3 import Array
 from estimation.surface_map import moved_map
+from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.simulator.bodies import Wound, body, with_wound
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.scene import Scene, rois
 from hardware.simulator.shape import Shape, cylinder, flat
 from perception.dense import Matched, match_on

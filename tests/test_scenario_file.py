@@ -10,10 +10,10 @@ import pytest
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.arm_profile import ArmProfile
 from hardware.rig_file import ImageSource, write_rig
 from hardware.simulator.arm_faults import FaultKind
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.scenario_file import read_scenario
 from tests.worlds import write_path, write_scenario
 

@@ -14,9 +14,9 @@ import pytest
 from estimation import se3
 from estimation.rig import Camera, pixels_from_points
 from estimation.se3 import Array
+from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.synthetic.motions import Motion
 from hardware.simulator.bodies import Wound, body, with_wound
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.deformation import Deformation
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look, plain

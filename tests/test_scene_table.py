@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
+from estimation.synthetic.arc_rig import REST
 from hardware.ply_file import write_ply
-from hardware.simulator.default_rig import REST
 from hardware.simulator.scene_table import scene_from_table, sensor_from_table
 from hardware.simulator.shape import flat
 

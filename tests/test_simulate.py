@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
+from estimation.synthetic.arc_rig import REST
 from hardware.path_file import read_path
 from hardware.pose_file import PoseTable, read_poses
 from hardware.session import open_session
-from hardware.simulator.default_rig import REST
 from hardware.simulator.nozzle_file import read_nozzle
 from hardware.simulator.scenario_file import read_scenario
 from hardware.simulator.simulate import Options, run_simulation

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.se3 import Array
 from estimation.smoother import LAG, QUIET_PSD, Measured, Smoother, Window
-from hardware.simulator.default_rig import REST
+from estimation.synthetic.arc_rig import REST
 from tests.synthetic import Motion, breathing
 
 NOISE = np.array([2e-3] * 3 + [0.03] * 3)  # rad, mm: what one frame set is worth

@@ -12,7 +12,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import Camera, ideal_pixels, pixels_from_points
 from estimation.se3 import Array
-from hardware.simulator.default_rig import TARGET, arc_rig
+from estimation.synthetic.arc_rig import TARGET, arc_rig
 from perception.frames import Image
 from perception.thesis.axes import assign_axes, unmeasured
 from perception.thesis.displacement import displacement, turn

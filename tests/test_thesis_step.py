@@ -16,10 +16,10 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
+from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.bench import thesis, thesis_scenes
 from hardware.cli import main
 from hardware.methods import METHODS
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.scenario_file import read_scenario
 from hardware.simulator.scene import rois
 from perception.frames import Frame, FrameSet, Roi

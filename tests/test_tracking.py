@@ -15,7 +15,7 @@ import pytest
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.simulator.default_rig import REST, TARGET, arc_rig
+from estimation.synthetic.arc_rig import REST, TARGET, arc_rig
 from hardware.simulator.scene import Scene, rois
 from perception.features import grey
 from perception.frames import Frame, FrameSet, Image, Roi

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
+from estimation.synthetic.arc_rig import TARGET, arc_rig
 from estimation.triangulation import epipolar_distance, rays, triangulate
-from hardware.simulator.default_rig import TARGET, arc_rig
 
 RIG = arc_rig()
 seeds = st.integers(0, 10_000)

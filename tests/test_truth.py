@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.se3 import Array
-from hardware.simulator.default_rig import REST
+from estimation.synthetic.arc_rig import REST
 from hardware.simulator.deformation import Deformation
 from hardware.simulator.motion_table import motion_from_tables
 from hardware.simulator.truth import Truth

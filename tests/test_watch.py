@@ -10,7 +10,7 @@ import numpy as np
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import pixels_from_points
-from hardware.simulator.default_rig import REST, arc_rig
+from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.simulator.watch import EVERY, NARROW, WIDE, Watch
 from perception.frames import Frame, FrameSet, Image
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from estimation.se3 import Array
-from hardware.simulator.default_rig import REST as BASE_FROM_REST
+from estimation.synthetic.arc_rig import REST as BASE_FROM_REST
 from hardware.simulator.deformation import Deformation
 from hardware.simulator.lag import lag_of
 from hardware.simulator.nozzle_log import NozzleLog

@@ -12,8 +12,8 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
+from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.simulator.bodies import Wound, with_wound
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.look import Look
 from hardware.simulator.outage import Kind, Outage, Spoiler, draw_outage
 from hardware.simulator.picture_loop import PictureLoop, closed_motion

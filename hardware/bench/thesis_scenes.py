@@ -10,11 +10,11 @@ import numpy as np
 
 from estimation.rig import Rig
 from estimation.se3 import Array
+from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.trajectory import Trajectory
 from hardware.checks import Table
 from hardware.session import Session, open_session
 from hardware.simulator.bodies import Wound, with_wound
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look
 from hardware.simulator.motion_table import motion_from_tables

@@ -31,6 +31,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
+from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware import checks
 from hardware.arm_file import read_arm
 from hardware.arm_profile import BITS_PER_BYTE, LONGEST_LAG, ArmProfile, placed
@@ -41,7 +42,6 @@ from hardware.rig_file import read_rig
 from hardware.simulator.arm_faults import ArmFault, fault_from_text
 from hardware.simulator.arm_settings import ArmSettings, arm_settings_from_table
 from hardware.simulator.camera_settings import camera_settings_from_table
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.motion_table import motion_from_tables, waveform_from_table
 from hardware.simulator.run_limits import limits_from_table
 from hardware.simulator.scenario import Scenario, Tracking

@@ -10,8 +10,8 @@ import numpy as np
 from estimation import se3
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
+from estimation.synthetic.arc_rig import REST
 from hardware.simulator import paint, sheet
-from hardware.simulator.default_rig import REST
 from hardware.simulator.deformation import Deformation
 from hardware.simulator.hits import Relief, relief_of
 from hardware.simulator.ink import Ink

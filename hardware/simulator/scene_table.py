@@ -31,9 +31,9 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from estimation.synthetic.arc_rig import REST
 from hardware.checks import Table
 from hardware.simulator.bodies import BODIES, MARGIN, Wound, body, with_wound
-from hardware.simulator.default_rig import REST
 from hardware.simulator.deformation import BULGE, RADIUS, STRETCH, Deformation
 from hardware.simulator.keys import Keys
 from hardware.simulator.look import Look
