@@ -146,6 +146,7 @@ class Estimator:
         self._measured_stamp = -np.inf
         self._tracking = False
         self._caveat = ""
+        self._view = 0  # landmarks of the first view: what is added later is not all seen at once
 
     @property
     def pose(self) -> SurfacePose | None:
@@ -233,7 +234,7 @@ class Estimator:
 
         caveat: what is not known of that frame's place on the tissue; as long as it stands no pose is TRACKING.
         """
-        self.map, self._caveat = surface_map, caveat
+        self.map, self._caveat, self._view = surface_map, caveat, len(surface_map)
         self._smoother.reset()
         self._detector = MotionDetector(surface_map.points.mean(0))
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
@@ -247,7 +248,7 @@ class Estimator:
 
     def _camera_least(self) -> float:
         assert self.map is not None
-        return max(self.settings.camera_tracks, self.settings.camera_share * len(self.map))
+        return max(self.settings.camera_tracks, self.settings.camera_share * self._view)
 
     def moving(self, twist: Array) -> None:
         """What is known of the velocity (6,) before the window can tell: the first pose's covariance needs it."""
@@ -326,8 +327,8 @@ class Estimator:
         return self._pose
 
     def replace_map(self, surface_map: SurfaceMap) -> None:
-        """Take a refined map of the same surface frame; rows keep their meaning."""
-        assert self.map is not None and len(surface_map) == len(self.map)
+        """Take a refined or longer map of the same surface frame; rows keep their meaning."""
+        assert self.map is not None and len(surface_map) >= len(self.map)
         self.map = surface_map
 
 

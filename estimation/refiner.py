@@ -6,19 +6,20 @@ poses do not depend on how fast that process was.
 
 from __future__ import annotations
 
-from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures import Executor
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.adjustment import Adjusted, Anchors, KeyFrame, adjust, single_fit
+from estimation.deferred import Deferred
 from estimation.estimator import Fit
 from estimation.observations import Observations
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 
-DELAY = 3  # frame sets between the asking and the taking over
 MOST = 20  # key frames: 40 improved the pose by nothing and cost four times as much
 TURN, SHIFT = 0.07, 0.04  # rad, and parts of the distance to the cameras: a view that differs by this is worth keeping
 STEADY = 0.4  # s between key frames of the same view, of which a few average the tracks' noise
@@ -32,25 +33,23 @@ class Refiner:
     """Keeps the key frames of one surface and asks for a new map when a new one is worth it."""
 
     def __init__(self, rig: Rig, executor: Executor | None = None) -> None:
-        self._rig, self._executor = rig, executor
+        self._rig = rig
+        self._work: Deferred[Adjusted] = Deferred(executor)
         self._frames: list[KeyFrame] = []
         self._stamps: list[float] = []
         self._map: SurfaceMap | None = None
         self._anchors: Anchors | None = None
-        self._ask = False
-        self._due = 0
-        self._count = 0
+        self._ask = self._kept = False
         self._offered: tuple[Fit, Observations, Array] | None = None
         self._skew = self._skew_used = np.inf  # s, of the cameras' instants: as known now, and at the last adjustment
-        self._job: tuple[Rig, SurfaceMap, list[KeyFrame], float, Anchors | None] | None = None
-        self._future: Future[Adjusted | None] | None = None
 
     def begin(
         self, surface_map: SurfaceMap, stamp: float, base_from_surface: Array, observations: Observations
     ) -> None:
         """The first map and the frame set that it was made from, whose pose defines the surface frame."""
         self._map, self._frames, self._stamps, self._anchors = surface_map, [], [], None
-        self._job, self._future, self._ask = None, None, False
+        self._work.forget()
+        self._ask = False
         kept = _inliers(self._rig, surface_map, base_from_surface, observations)
         self._keep(stamp, base_from_surface, kept, np.zeros(6))
 
@@ -90,25 +89,29 @@ class Refiner:
 
     def _choose(self) -> None:
         """Whether the last frame set offered becomes a key frame."""
+        self._kept = False
         if self._offered is None or self._map is None:
             return
         fit, observations, twist = self._offered
         self._offered = None
-        if self._is_new(fit.stamp, fit.solution.base_from_surface):
-            kept = _inliers(self._rig, self._map, fit.solution.base_from_surface, observations)
-            self._keep(fit.stamp, fit.solution.base_from_surface, kept, twist)
+        pose = fit.solution.base_from_surface
+        self._kept = not self._alike(pose).any() or self._is_steady(fit.stamp, pose)
+        if self._kept:
+            self._keep(fit.stamp, pose, _inliers(self._rig, self._map, pose, observations), twist)
             self._ask = True
 
-    def _is_new(self, stamp: float, pose: Array) -> bool:
+    def _is_steady(self, stamp: float, pose: Array) -> bool:
+        """Whether another look at a known view is due."""
+        return int(self._alike(pose).sum()) < STEADY_MOST and stamp - self._stamps[-1] > STEADY
+
+    def _alike(self, pose: Array) -> NDArray[np.bool_]:
+        """Which key frames (K,) show about what is seen at `pose`."""
         poses = np.stack([f.base_from_surface for f in self._frames])
         turn = se3.angle_of(se3.inverse(poses) @ pose)
         shift = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
         centre = np.mean([c.base_from_camera[:3, 3] for c in self._rig.cameras], axis=0)
         far = SHIFT * np.linalg.norm(pose[:3, 3] - centre)
-        alike = (turn < TURN) & (shift < far)
-        if not alike.any():
-            return True
-        return int(alike.sum()) < STEADY_MOST and stamp - self._stamps[-1] > STEADY
+        return np.asarray((turn < TURN) & (shift < far))
 
     def _keep(self, stamp: float, pose: Array, observations: Observations, twist: Array) -> None:
         self._frames.append(KeyFrame(pose, observations, twist))
@@ -125,36 +128,44 @@ class Refiner:
         size[np.diag_indices(len(poses))] = np.inf
         return 1 + int(np.argmin(np.sort(size[1:], axis=1)[:, :2].sum(1)))
 
+    def extend(self, surface_map: SurfaceMap) -> None:
+        """The map has got more rows at its end; the others are as they were."""
+        self._map = surface_map
+
+    @property
+    def kept(self) -> bool:
+        """Whether the last frame set offered became a key frame."""
+        return self._kept
+
+    def with_new_rows(self, adjusted: Adjusted) -> Adjusted:
+        """What was adjusted, and the rows that the map has got since."""
+        assert self._map is not None
+        current, count = self._map, len(adjusted.map)
+        if count == len(current):
+            return adjusted
+        covariance = current.covariance.copy()
+        covariance[: 3 * count, : 3 * count] = adjusted.map.covariance
+        points = np.concatenate([adjusted.map.points, current.points[count:]])
+        normals = np.concatenate([adjusted.map.normals, current.normals[count:]])
+        agrees = np.concatenate([adjusted.agrees, np.ones(len(current) - count, bool)])
+        return Adjusted(SurfaceMap(points, normals, covariance), agrees)
+
     def poll(self) -> Adjusted | None:
         """A refined map whose frame set has come, or None; asks for the next one when key frames call for it.
 
         To be called once a frame set, when its pose is handed over.
         """
-        self._count += 1
         self._choose()
         self._ask |= self._skew < CLEARER * self._skew_used
-        result = None
-        if self._job is not None and self._count >= self._due:
-            result = self._finish()
-            if result is not None:
-                self._map = result.map
-        if self._ask and self._job is None and self._map is not None and len(self._frames) >= 3:
-            self._ask, self._due = False, self._count + DELAY
-            self._job = self._rig, self._map, list(self._frames), self._skew, self._anchors
+        result = self._work.poll()
+        if result is not None:
+            result = self.with_new_rows(result)
+            self._map = result.map
+        if self._ask and not self._work.busy and self._map is not None and len(self._frames) >= 3:
+            self._ask = False
             self._skew_used = self._skew
-            self._future = None if self._executor is None else self._executor.submit(adjust, *self._job)
+            self._work.ask(adjust, self._rig, self._map, list(self._frames), self._skew, self._anchors)
         return result
-
-    def _finish(self) -> Adjusted | None:
-        """The result that is due; without a process, or with one that died, it is made here, slower but the same."""
-        assert self._job is not None
-        job, future = self._job, self._future
-        self._job = self._future = None
-        try:
-            return adjust(*job) if future is None else future.result()
-        except BrokenExecutor:
-            self._executor = None
-            return adjust(*job)
 
 
 def _inliers(rig: Rig, surface_map: SurfaceMap, near: Array, observations: Observations) -> Observations:

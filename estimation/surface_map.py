@@ -36,6 +36,15 @@ def moved_map(surface_map: SurfaceMap, new_from_old: Array) -> SurfaceMap:
     return SurfaceMap(points, surface_map.normals @ turn.T, turned)
 
 
+def joined_map(first: SurfaceMap, second: SurfaceMap) -> SurfaceMap:
+    """Both maps, of one surface frame, as one; their errors are taken as independent."""
+    n, m = 3 * len(first), 3 * len(second)
+    covariance = np.zeros((n + m, n + m))
+    covariance[:n, :n], covariance[n:, n:] = first.covariance, second.covariance
+    points = np.concatenate([first.points, second.points])
+    return SurfaceMap(points, np.concatenate([first.normals, second.normals]), covariance)
+
+
 def motion_of(points: Array) -> Array:
     """How points (N, 3) move, (3N, 6), with a right perturbation of their frame's pose, per rad and mm."""
     each = np.concatenate([-se3.hat(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], -1)

@@ -171,7 +171,7 @@ class Landmarks:
     normals: Array
 
 
-def _find_landmarks(
+def find_landmarks(
     lenses: Lenses, pyramids: dict[int, Pyramid], mask: NDArray[np.uint8], seeds: Seeds, camera: int, count: int
 ) -> Landmarks | None:
     """Corners of one camera, found in the other: first on the seeds' surface, then by a sweep along their rays."""
@@ -297,23 +297,28 @@ def build_first_map(lenses: Lenses, pyramids: dict[int, Pyramid], polygons: dict
             if seeds is None:
                 continue
             for c in (a, b):
-                part = _find_landmarks(lenses, pyramids, masks[c], seeds, c, LANDMARKS // len(cameras))
+                part = find_landmarks(lenses, pyramids, masks[c], seeds, c, LANDMARKS // len(cameras))
                 if part is not None and (c not in best or len(part.points) > len(best[c].points)):
                     best[c] = part
     parts = [best[c] for c in sorted(best)]
     if sum(len(p.points) for p in parts) < LEAST_LANDMARKS:
         return f"fewer than {LEAST_LANDMARKS} spots could be matched between two cameras"
-    return _assemble(lenses, pyramids, parts)
+    points = np.concatenate([p.points for p in parts])
+    centre = np.mean([rig.cameras[p.camera].base_from_camera[:3, 3] for p in parts], axis=0)
+    frame = surface_frame(points, centre, rig.cameras[parts[0].camera].base_from_camera[:3, 0])
+    return assemble(lenses, pyramids, parts, frame)
 
 
-def _assemble(lenses: Lenses, pyramids: dict[int, Pyramid], parts: list[Landmarks]) -> FirstMap:
+def assemble(
+    lenses: Lenses, pyramids: dict[int, Pyramid], parts: list[Landmarks], base_from_surface: Array
+) -> FirstMap:
+    """Landmarks of several cameras as one map in the frame `base_from_surface` (4, 4), and their reference pictures."""
     rig = lenses.rig
     points_base = np.concatenate([p.points for p in parts])
-    centre = np.mean([rig.cameras[p.camera].base_from_camera[:3, 3] for p in parts], axis=0)
-    base_from_surface = surface_frame(points_base, centre, rig.cameras[parts[0].camera].base_from_camera[:3, 0])
     surface_from_base = se3.inverse(base_from_surface)
     points = se3.transform_points(surface_from_base, points_base)
-    normals = local_normals(points, np.array([0.0, 0.0, 1.0]))
+    outward = np.mean([rig.cameras[p.camera].base_from_camera[:3, 3] for p in parts], axis=0) - points_base.mean(0)
+    normals = local_normals(points, surface_from_base[:3, :3] @ outward)
     first = np.cumsum([0] + [len(p.points) for p in parts])
     templates = join(
         [

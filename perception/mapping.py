@@ -7,9 +7,11 @@ from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.adjustment import Adjusted, single_fit
+from estimation.deferred import Deferred
 from estimation.estimator import Estimator, Fit
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
@@ -17,9 +19,10 @@ from estimation.refiner import Refiner
 from estimation.registration import Registration
 from estimation.scan import Scan
 from estimation.se3 import Array
-from estimation.surface_map import moved_map
+from estimation.surface_map import SurfaceMap, joined_map, moved_map
 from perception.first_map import FirstMap, build_first_map, in_frame
 from perception.frames import FrameSet, Roi
+from perception.growth import LEAST, SHARE, WANTED, Found, Look, Probation, amid, look_for_more
 from perception.lens import Lenses
 from perception.matcher import Matcher
 from perception.patches import Pyramid
@@ -29,6 +32,7 @@ from perception.scanned_map import scanned
 
 EAGER = 5  # tries for a first map, 0.5 s and more each, before only every tenth frame set is tried
 RELAXED = 10  # frame sets from one try to the next after those
+MOST = 600  # landmarks; those out of view are kept, and cost little
 PATIENCE = 2.0  # s: a first map that nobody confirms is dropped, and the next images are tried
 
 
@@ -51,9 +55,14 @@ class Mapping:
         self._placing = None if scan is None else ScanPlacing(scan)
         self._place: Registration | None = None  # of the scan at the first instant
         self._refiner = Refiner(lenses.rig, executor)
+        self._cameras = np.mean([c.base_from_camera[:3, 3] for c in lenses.rig.cameras], axis=0)
         self._tries, self._why = 0, ""  # to make a first map, and why the last one failed
         self._mapped = 0.0  # s, stamp of the first map
         self._caveat = ""
+        self._growth: Deferred[Found] = Deferred(executor)
+        self._probation: Probation | None = None
+        self._wanted: dict[int, int] = {}  # landmarks, by camera
+        self._last: tuple[Fit, Observations, dict[int, Pyramid]] | None = None
 
     def first_map(self, frames: FrameSet, pyramids: dict[int, Pyramid]) -> FirstMap | str:
         """A first map of what these images (by camera) show, or the reason why there is none yet."""
@@ -82,6 +91,8 @@ class Mapping:
         observations = matcher.align(stamp, pyramids, dict.fromkeys(pyramids, start), coarse=True)
         fit = estimator.fit(observations, start)
         self._refiner.begin(first.map, stamp, start, observations)
+        self._growth.forget()
+        self._probation = self._last = None
         matcher.remember(pyramids, observations, fit.inlier, start)
         for camera, images in pyramids.items():
             self._search.learn(camera, images[0], start, first.map)
@@ -109,19 +120,86 @@ class Mapping:
             if not refit.measured:
                 break
             fit, observations = refit, again
+        self._wanted = {c: max(WANTED, int(fit.used[c])) for c in range(len(self._lenses.rig))}
         if self._placing is not None:
             fit = self._lay_scan(self._placing, matcher, estimator, pyramids, fit, observations)
         return fit, observations
 
-    def offer(self, fit: Fit, observations: Observations, twist: Array, estimator: Estimator) -> None:
-        """A measured frame set, from which the map may be refined. twist: (6,), the surface's."""
+    def offer(
+        self,
+        fit: Fit,
+        observations: Observations,
+        twist: Array,
+        estimator: Estimator,
+        pyramids: dict[int, Pyramid],
+    ) -> None:
+        """A measured frame set, from which the map may be refined or grow. twist: (6,), the surface's."""
         self._refiner.offer(fit, observations, twist, estimator.skew.sigma)
+        self._last = fit, observations, pyramids
 
     def keep(self, matcher: Matcher, estimator: Estimator) -> None:
         """Once a frame set, when no pose waits: put what is due into force, ask for what comes next."""
         refined = self._refiner.poll()
         if refined is not None:
             _take(refined, matcher, estimator)
+        found = self._growth.poll()
+        if found is not None:
+            distance = float(np.linalg.norm(found.look.base_from_surface[:3, 3] - self._cameras))
+            self._probation = Probation(found, amid(found, matcher.map, distance))
+        if self._last is None:
+            return
+        (fit, observations, pyramids), self._last = self._last, None
+        lacking = len(pyramids) >= 2 and any(fit.used[c] < SHARE * self._wanted[c] for c in pyramids)
+        if self._probation is not None and self._refiner.kept:
+            self._prove(self._probation, matcher, estimator, fit, observations, pyramids)
+        elif self._refiner.kept and lacking and not self._growth.busy and len(matcher.map) < MOST:
+            look = self._look(matcher, fit, observations, pyramids)
+            self._growth.ask(look_for_more, self._lenses.rig, look, matcher.map)
+
+    def _look(self, matcher: Matcher, fit: Fit, observations: Observations, pyramids: dict[int, Pyramid]) -> Look:
+        seen, kept = observations, fit.inlier
+        inliers = Observations(seen.stamp, seen.camera[kept], seen.track[kept], seen.pixels[kept], seen.sigma[kept])
+        single = self._single(matcher, fit, observations, pyramids)
+        images = {c: p[0] for c, p in pyramids.items()}
+        return Look(images, fit.solution.base_from_surface, single, fit.covariance, inliers, self._wanted)
+
+    def _single(
+        self, matcher: Matcher, fit: Fit, observations: Observations, pyramids: dict[int, Pyramid]
+    ) -> dict[int, Array]:
+        """Where the surface was at each camera's own instant."""
+        pose, points, rig = fit.solution.base_from_surface, matcher.map.points, self._lenses.rig
+        return {c: single_fit(rig, points, observations, c, pose).base_from_surface for c in pyramids}
+
+    def _prove(
+        self,
+        waiting: Probation,
+        matcher: Matcher,
+        estimator: Estimator,
+        fit: Fit,
+        observations: Observations,
+        pyramids: dict[int, Pyramid],
+    ) -> None:
+        """Look for the new landmarks again; those that move with the surface join the map."""
+        waiting.look(self._lenses, fit.stamp, pyramids, self._single(matcher, fit, observations, pyramids))
+        proven = waiting.proven
+        if proven.sum() >= LEAST:
+            self._join(waiting.found, proven, matcher, estimator)
+        if proven.sum() >= LEAST or waiting.over:
+            self._probation = None
+
+    def _join(self, found: Found, proven: NDArray[np.bool_], matcher: Matcher, estimator: Estimator) -> None:
+        chosen = np.flatnonzero(proven)[: MOST - len(matcher.map)]
+        rows = (3 * chosen[:, None] + np.arange(3)).ravel()
+        longer = joined_map(
+            matcher.map,
+            SurfaceMap(found.map.points[chosen], found.map.normals[chosen], found.map.covariance[np.ix_(rows, rows)]),
+        )
+        matcher.extend(longer, found.templates.take(chosen))
+        estimator.replace_map(longer)
+        self._refiner.extend(longer)
+        for c, features in found.features.items():
+            pose = found.look.single.get(c, found.look.base_from_surface)
+            self._search.add(c, features, pose, longer)
 
     def _on_scan(self, first: FirstMap, place: Registration) -> FirstMap:
         """The first map in the scan's frame; notes what the scan's shape leaves open."""

@@ -18,7 +18,7 @@ from perception.alignment import align_in
 from perception.flow import flow as optical_flow
 from perception.frames import Image
 from perception.lens import Lenses, undistort
-from perception.patches import Pyramid, Templates, project_into
+from perception.patches import Pyramid, Templates, join, project_into
 
 LOOSE = np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3)  # how far one camera's own pose may stray from the joint one
 FLOW_TRACKS = 80  # a camera: enough for a start, and flow is only that
@@ -51,6 +51,13 @@ class Matcher:
     def take(self, surface_map: SurfaceMap, agrees: NDArray[np.bool_]) -> None:
         """A refined map, same rows, and which of them (N,) are worth looking for."""
         self.map, self.agrees = surface_map, agrees
+
+    def extend(self, surface_map: SurfaceMap, templates: Templates) -> None:
+        """The map with more rows at its end, and the reference pictures of those."""
+        new = len(surface_map) - len(self.map)
+        self.map, self._gathered = surface_map, None
+        self.templates = join([self.templates, templates])
+        self.agrees = np.concatenate([self.agrees, np.ones(new, bool)])
 
     def reframe(self, surface_map: SurfaceMap, new_from_old: Array) -> None:
         """The surface frame is another from now on: new_from_old (4, 4). surface_map: in the new one, same rows."""

@@ -50,6 +50,7 @@ class Relocaliser:
         self.lenses = lenses
         self._descriptors = np.zeros((0, 128), np.float32)
         self._points = np.zeros((0, 3))
+        self._view = np.zeros(0, np.int64)  # (N,) which view each is from
 
     def learn(self, camera: int, image: Image, base_from_surface: Array, surface_map: SurfaceMap) -> None:
         """Add the features of one image in which the surface's pose is known: each is put on the landmarks' surface."""
@@ -64,13 +65,47 @@ class Relocaliser:
         hull = cv2.convexHull(imaged[seen].astype(np.float32)).reshape(-1, 2)
         cv2.fillConvexPoly(mask, np.round(hull).astype(np.int32), 255)
         mask = np.asarray(cv2.dilate(mask, np.ones((9, 9), np.uint8)), np.uint8)
-        keypoints, descriptors = sift(image, mask, 500, tilted=True)
-        if not len(keypoints):
+        self.add(camera, sift(image, mask, 500, tilted=True), base_from_surface, surface_map)
+
+    def add(
+        self,
+        camera: int,
+        features: tuple[Array, NDArray[np.float32]],
+        base_from_surface: Array,
+        surface_map: SurfaceMap,
+    ) -> None:
+        """Take the features of one image, (N, 2) px as imaged and (N, 128), best first, in which the pose is known.
+
+        Each view keeps its best: an equal share of what there is room for, so that no new one drives out an old one.
+        """
+        lens = self.lenses.rig.cameras[camera]
+        ideal, depth = ideal_pixels(lens, se3.transform_points(base_from_surface, surface_map.points))
+        imaged, seen = self.lenses.image(camera, ideal, depth)
+        seen = seen & ((imaged >= 0) & (imaged < lens.size)).all(1)
+        keypoints, descriptors = features
+        if not len(keypoints) or seen.sum() < 8:
             return
         points = self._on_surface(camera, undistort(lens, keypoints), base_from_surface, surface_map, ideal, seen)
         near = np.isfinite(points).all(1)
-        self._points = np.concatenate([self._points, points[near]])[-CAPACITY:]
-        self._descriptors = np.concatenate([self._descriptors, descriptors[near]])[-CAPACITY:]
+        view = np.full(int(near.sum()), self._view.max(initial=-1) + 1)
+        self._points = np.concatenate([self._points, points[near]])
+        self._descriptors = np.concatenate([self._descriptors, descriptors[near]])
+        self._view = np.concatenate([self._view, view])
+        self._make_room()
+
+    def _make_room(self) -> None:
+        counts = np.bincount(self._view)
+        most = int(counts.max(initial=0))
+        while np.minimum(counts, most).sum() > CAPACITY:
+            most -= 1 + most // 100
+        rank = np.concatenate([np.arange(n) for n in counts]) if len(counts) else np.zeros(0, int)
+        kept = rank < most
+        self._points, self._descriptors, self._view = self._points[kept], self._descriptors[kept], self._view[kept]
+
+    @property
+    def descriptors(self) -> NDArray[np.float32]:
+        """Descriptors (N, 128) of what would be found again."""
+        return self._descriptors
 
     def reframe(self, new_from_old: Array) -> None:
         """The surface frame is another from now on: new_from_old (4, 4)."""

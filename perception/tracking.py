@@ -22,6 +22,7 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.scan import Scan
 from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap
 from perception.features import grey
 from perception.frames import FrameSet, Roi
 from perception.lens import Lenses
@@ -95,6 +96,11 @@ class TrackingStep:
         self.last = StepReport(observations, used, self._spent)
         return pose
 
+    @property
+    def map(self) -> SurfaceMap | None:
+        """The map as it is now, in the surface frame; None before there is one."""
+        return self._estimator.map
+
     def idle(self) -> None:
         """Work that no pose waits for; the caller's loop calls it once a pose is handed over."""
         if self._matcher is not None:
@@ -151,7 +157,7 @@ class TrackingStep:
             self._lost = {c: pyramids[c] for c in self._missing(fit, pyramids)}
             self._absent = 0
             pose = estimator.accept(fit, observations)
-            self._mapping.offer(fit, observations, pose.twist, estimator)
+            self._mapping.offer(fit, observations, pose.twist, estimator, pyramids)
             matcher.remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)
         else:
             pose = estimator.coast(stamp, fit.reason)

@@ -1,0 +1,192 @@
+"""New landmarks where the surface has come into view and the map knows little of it.
+
+Found as the first map was, between two cameras, begun at the landmarks that both see; kept on probation until a later
+frame set has shown that they move with the surface. A drape beside a wound looks as good, but stays where it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import se3
+from estimation.adjustment import of_frame
+from estimation.observations import Observations
+from estimation.pose_solver import project
+from estimation.rig import Rig
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap
+from perception.features import Mask, sift
+from perception.first_map import Landmarks, Seeds, assemble, find_landmarks, find_seeds
+from perception.frames import Image
+from perception.lens import Lenses
+from perception.matcher import Matcher
+from perception.patches import Pyramid, Templates, pyramid
+from perception.scan_place import as_at_one_instant
+
+WANTED = 120  # landmarks that a camera should see at least
+SHARE = 0.7  # of it, and of what the camera saw at first, below which more are looked for
+BEYOND = 0.35  # of the known part's size in an image: how far beyond it new ones are sought
+LEAST = 8  # new landmarks: fewer are not worth a change of the map
+FEATURES = 300  # a camera, for the first matches on what nobody knows yet
+AGREES = 2.0  # px between a new landmark and where the surface's motion puts it
+TELLS = 4.0  # px by which the surface's motion must have moved it: then what stands still is told apart
+AMID = 0.04  # of the distance to the cameras: what lies so near to known landmarks,
+LEVEL = 0.004  # and so near to their surface, is part of it without such proof
+GIVEN_UP = 4  # looks in which a new landmark was in view and not found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """One frame set in which the surface is known: where it stood, jointly and at each camera's own instant, and what
+    agreed. images: grey, by camera. single: (4, 4) by camera. seen: the inliers. wanted: landmarks, by camera."""
+
+    images: dict[int, Image]
+    base_from_surface: Array
+    single: dict[int, Array]
+    covariance: Array
+    seen: Observations
+    wanted: dict[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """New landmarks, and the features (N, 2) px and (N, 128) of the part that they are in, by camera."""
+
+    look: Look
+    map: SurfaceMap
+    templates: Templates
+    features: dict[int, tuple[Array, NDArray[np.float32]]]
+
+
+def look_for_more(rig: Rig, look: Look, surface_map: SurfaceMap) -> Found | None:
+    """Landmarks beside those seen, as far as two cameras tell their depth; None if hardly any."""
+    lenses = Lenses(as_at_one_instant(rig, look.base_from_surface, look.single))
+    pyramids = {c: pyramid(image) for c, image in look.images.items()}
+    lacking = {c: look.wanted[c] - int((look.seen.camera == c).sum()) for c in sorted(pyramids)}
+    masks = {c: _unknown(lenses, c, look, surface_map) for c in lacking}
+    features = {c: sift(pyramids[c][0], masks[c], FEATURES, tilted=True) for c in lacking}
+    best: dict[int, Landmarks] = {}
+    cameras = sorted(lacking)
+    for i, a in enumerate(cameras):
+        for b in cameras[i + 1 :]:
+            seeds = _seeds(lenses, a, b, look, surface_map, features)
+            for c in (a, b):
+                if seeds is None or lacking[c] < LEAST:
+                    continue
+                part = find_landmarks(lenses, pyramids, masks[c], seeds, c, lacking[c])
+                if part is not None and (c not in best or len(part.points) > len(best[c].points)):
+                    best[c] = part
+    parts = [best[c] for c in sorted(best)]
+    if sum(len(p.points) for p in parts) < LEAST:
+        return None
+    grown = assemble(lenses, pyramids, parts, look.base_from_surface)
+    if len(grown.map) < LEAST:
+        return None
+    joint = grown.map.covariance + of_frame(grown.map.points, look.covariance)  # all share the pose they hang on
+    return Found(look, SurfaceMap(grown.map.points, grown.map.normals, joint), grown.templates, features)
+
+
+def _unknown(lenses: Lenses, camera: int, look: Look, surface_map: SurfaceMap) -> Mask:
+    """Where in an image the surface may go on without landmarks: around and between those seen."""
+    size = lenses.rig.cameras[camera].size
+    mask = np.zeros((size[1], size[0]), np.uint8)
+    mine = look.seen.camera == camera
+    if mine.sum() < 6:
+        return mask
+    imaged, _ = lenses.image(camera, look.seen.pixels[mine], np.full(int(mine.sum()), 1e3))
+    spots = np.round(imaged).astype(np.int32)
+    cv2.fillConvexPoly(mask, cv2.convexHull(spots), 255)
+    across = float(np.sqrt(cv2.countNonZero(mask)))
+    reach = 2 * int(BEYOND * across) + 1
+    mask = np.asarray(cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))), np.uint8)
+    for spot in spots:
+        cv2.circle(mask, spot.tolist(), max(6, int(0.6 * across / np.sqrt(WANTED))), 0, -1)
+    return mask
+
+
+def _seeds(
+    lenses: Lenses,
+    a: int,
+    b: int,
+    look: Look,
+    surface_map: SurfaceMap,
+    features: dict[int, tuple[Array, NDArray[np.float32]]],
+) -> Seeds | None:
+    """What is known of the surface between two cameras: landmarks that both see, and matches in the unknown part."""
+    fresh = find_seeds(lenses, a, b, features, np.random.default_rng(0))
+    in_a, in_b = look.seen.camera == a, look.seen.camera == b
+    rows, at_a, at_b = np.intersect1d(look.seen.track[in_a], look.seen.track[in_b], return_indices=True)
+    known = Seeds(
+        a,
+        b,
+        look.seen.pixels[in_a][at_a],
+        look.seen.pixels[in_b][at_b],
+        se3.transform_points(look.base_from_surface, surface_map.points[rows]),
+    )
+    if fresh is None:
+        return known if len(rows) >= 6 else None
+    return Seeds(
+        a,
+        b,
+        np.concatenate([known.pixels_a, fresh.pixels_a]),
+        np.concatenate([known.pixels_b, fresh.pixels_b]),
+        np.concatenate([known.points, fresh.points]),
+    )
+
+
+@dataclass(slots=True, eq=False)
+class Probation:
+    """New landmarks that wait for proof. moved, missed: (N,) looks in which each was found where the surface's motion
+    puts it, far from where it would be at rest; and in which it was not found."""
+
+    found: Found
+    amid: NDArray[np.bool_]
+    moved: NDArray[np.int64] = field(init=False)
+    stayed: NDArray[np.int64] = field(init=False)
+    missed: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.moved, self.stayed, self.missed = np.zeros((3, len(self.found.map)), np.int64)
+
+    def look(self, lenses: Lenses, stamp: float, pyramids: dict[int, Pyramid], single: dict[int, Array]) -> None:
+        """Look for them again at each camera's own pose of the surface."""
+        matcher = Matcher(lenses, self.found.map, self.found.templates)
+        seen = matcher.align(stamp, pyramids, single)
+        where, rest = np.zeros((2, len(seen), 2))
+        for c in np.unique(seen.camera):
+            mine = seen.camera == c
+            points = self.found.map.points[seen.track[mine]]
+            before = self.found.look.single.get(int(c), self.found.look.base_from_surface)
+            where[mine] = project(lenses.rig, seen.camera[mine], single[int(c)], points)[0]
+            rest[mine] = project(lenses.rig, seen.camera[mine], before, points)[0]
+        good = np.linalg.norm(seen.pixels - where, axis=1) < AGREES
+        told = np.linalg.norm(rest - where, axis=1) > TELLS
+        np.add.at(self.moved, seen.track[good & told], 1)
+        np.add.at(self.stayed, seen.track[good & ~told], 1)
+        lacking = np.setdiff1d(np.arange(len(self.missed)), seen.track[good])
+        self.missed[lacking] += 1
+
+    @property
+    def proven(self) -> NDArray[np.bool_]:
+        """Which (N,) belong to the surface."""
+        enough = (self.moved >= 1) | (self.amid & (self.stayed >= 1))
+        return np.asarray(enough & (self.moved + self.stayed > self.missed))
+
+    @property
+    def over(self) -> bool:
+        """Whether no more is to be learned of them by waiting."""
+        return bool((self.proven | (self.missed >= GIVEN_UP)).all())
+
+
+def amid(found: Found, surface_map: SurfaceMap, distance: float) -> NDArray[np.bool_]:
+    """Which new landmarks (N,) lie between known ones and on their surface. distance: mm to the cameras."""
+    away = found.map.points[:, None] - surface_map.points
+    gap = np.linalg.norm(away, axis=2)
+    near = np.argsort(gap, axis=1)[:, :4]
+    rows = np.arange(len(near))[:, None]
+    height = np.abs(np.einsum("nki,nki->nk", away[rows, near], surface_map.normals[near])).min(1)
+    return np.asarray((gap[rows, near].max(1) < AMID * distance) & (height < LEVEL * distance))

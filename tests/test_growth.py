@@ -1,0 +1,234 @@
+"""The map grows where new parts of the surface come into view, by what is proven to move with it; the rest is kept."""
+
+from __future__ import annotations
+
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from estimation import se3
+from estimation.adjustment import Adjusted
+from estimation.deferred import DELAY, Deferred
+from estimation.observations import no_observations
+from estimation.pose import SurfacePose, TrackState
+from estimation.refiner import Refiner
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap, joined_map
+from hardware.simulator.bodies import Wound
+from hardware.simulator.default_rig import REST, arc_rig
+from hardware.simulator.scene import rois
+from perception.features import grey
+from perception.first_map import FirstMap, build_first_map
+from perception.frames import FrameSet
+from perception.growth import Found, Look, Probation, amid
+from perception.lens import Lenses
+from perception.patches import Pyramid, pyramid
+from perception.relocalise import CAPACITY, Relocaliser
+from perception.tracking import TrackingStep
+from tests.synthetic import frame_sets, patch, pictures
+
+RIG = arc_rig(size=(320, 240), focal=560.0)  # 0.7 mm a pixel, 228 mm wide
+LONG = patch(1, (320.0, 60.0), np.inf, Wound((310.0, 56.0)))
+STAMPS = np.arange(46) / 10
+SMALL = patch(2, (80.0, 60.0), np.inf, Wound((70.0, 54.0)))
+
+
+def passing(stamp: float) -> Array:
+    """A long patch passes by: of what is in view at first, nothing is in the end."""
+    return REST @ se3.exp([0.02 * np.sin(stamp), 0, 0, 85 - 45 * stamp, 0, 1.5 * np.sin(2 * stamp)])
+
+
+@cache
+def passing_sets() -> tuple[FrameSet, ...]:
+    return tuple(frame_sets(LONG, RIG, passing, STAMPS, np.random.default_rng(0)))
+
+
+def followed(executor: Executor | None = None) -> tuple[list[SurfacePose], list[SurfaceMap], TrackingStep]:
+    """Poses and the map after each frame set."""
+    step = TrackingStep(RIG, rois(LONG, RIG, passing(0.0), 0.0), executor=executor)
+    poses, maps = [], []
+    for frames in passing_sets():
+        poses.append(step(frames))
+        step.idle()
+        maps.append(step.map)
+    return poses, [m for m in maps if m is not None], step
+
+
+@cache
+def passed() -> tuple[list[SurfacePose], list[SurfaceMap], TrackingStep]:
+    return followed()
+
+
+def test_a_surface_of_which_all_that_was_known_has_gone_is_still_followed() -> None:
+    poses, maps, _ = passed()
+    assert all(p.state is TrackState.TRACKING for p in poses[1:])
+    estimated_from_true = se3.inverse(poses[1].base_from_surface) @ passing(poses[1].stamp)
+    off = [se3.inverse(passing(p.stamp)) @ p.base_from_surface @ estimated_from_true for p in poses[1:]]
+    assert max(np.linalg.norm(o[:3, 3]) for o in off) < 0.15
+    ideal = se3.transform_points(poses[-1].base_from_surface, maps[0].points)[:, 0] - REST[0, 3]
+    assert np.median(ideal) < -60  # the first map is mostly out of view
+
+
+def test_rows_are_only_added_and_keep_their_meaning() -> None:
+    _, maps, _ = passed()
+    counts = [len(m) for m in maps]
+    assert counts == sorted(counts) and counts[-1] > counts[0] + 50
+    for before, after in pairwise(maps):
+        assert np.linalg.norm(after.points[: len(before)] - before.points, axis=1).max() < 2.0
+    hidden = maps[-1].points[: counts[0]]  # kept, and hardly moved by what was learned since
+    assert np.median(np.linalg.norm(hidden - maps[3].points[: counts[0]], axis=1)) < 0.2
+
+
+def test_what_was_added_lies_on_the_true_surface_as_claimed() -> None:
+    poses, maps, _ = passed()
+    last, new = maps[-1], slice(len(maps[0]), None)
+    true_from_estimated = se3.inverse(passing(poses[1].stamp)) @ poses[1].base_from_surface
+    points = se3.transform_points(true_from_estimated, last.points[new])
+    blocks = np.einsum("ninj->nij", last.covariance.reshape(len(last), 3, len(last), 3))[new]
+    claimed = np.sqrt(np.einsum("i,nij,j->n", true_from_estimated[2, :3], blocks, true_from_estimated[2, :3]))
+    assert np.median(np.abs(points[:, 2])) < 0.2
+    assert np.median(np.abs(points[:, 2])) < 3 * np.median(claimed)
+    assert np.linalg.eigvalsh(last.covariance).min() > -1e-9
+
+
+def test_an_executor_changes_no_bit() -> None:
+    with ThreadPoolExecutor(1) as executor:
+        poses, maps, _ = followed(executor)
+    assert all(
+        a.base_from_surface.tobytes() == b.base_from_surface.tobytes()
+        and a.covariance.tobytes() == b.covariance.tobytes()
+        for a, b in zip(poses, passed()[0], strict=True)
+    )
+    assert maps[-1].points.tobytes() == passed()[1][-1].points.tobytes()
+
+
+# -- probation
+
+WIDE_RIG = arc_rig(size=(640, 480), focal=560.0)
+LENSES = Lenses(WIDE_RIG)
+MOVED = REST @ se3.exp([0.02, 0.01, 0.0, 8.0, 3.0, 2.0])
+
+
+@cache
+def images(moved: bool) -> dict[int, Pyramid]:
+    taken = pictures(SMALL, WIDE_RIG.cameras, MOVED if moved else REST, np.random.default_rng(int(moved)))
+    return {c: pyramid(grey(i)) for c, i in enumerate(taken)}
+
+
+@cache
+def first() -> FirstMap:
+    found = build_first_map(LENSES, images(False), {r.camera: r.polygon for r in rois(SMALL, WIDE_RIG, REST, 0.0)})
+    assert not isinstance(found, str)
+    return found
+
+
+def waiting(amid_others: bool = False) -> Probation:
+    start = first().base_from_surface
+    look = Look({}, start, dict.fromkeys(range(3), start), np.zeros((6, 6)), no_observations(0.0), {})
+    count = len(first().map)
+    return Probation(Found(look, first().map, first().templates, {}), np.full(count, amid_others))
+
+
+def at(pose: Array) -> dict[int, Array]:
+    """Where the surface is said to be when it is at `pose` in the scene's own terms, by camera."""
+    return dict.fromkeys(range(3), pose @ se3.inverse(REST) @ first().base_from_surface)
+
+
+def test_what_moves_with_the_surface_is_proven_at_once() -> None:
+    new = waiting()
+    new.look(LENSES, 1.0, images(True), at(MOVED))
+    assert new.proven.mean() > 0.8
+
+
+def test_what_stands_still_while_the_surface_moves_is_never_proven() -> None:
+    new = waiting()
+    for _ in range(4):
+        new.look(LENSES, 1.0, images(False), at(MOVED))
+    assert new.proven.mean() < 0.05 and new.over
+
+
+@pytest.mark.parametrize("amid_others", [False, True])
+def test_where_nothing_moves_only_what_lies_amid_known_landmarks_is_taken(amid_others: bool) -> None:
+    new = waiting(amid_others)
+    new.look(LENSES, 1.0, images(False), at(REST))
+    assert new.proven.mean() > 0.9 if amid_others else not new.proven.any()
+
+
+def test_amid_others_means_between_them_and_level_with_them() -> None:
+    flat = np.stack(np.meshgrid(np.arange(-30, 30, 5.0), np.arange(-30, 30, 5.0)), -1).reshape(-1, 2)
+    known = SurfaceMap(np.c_[flat, np.zeros(len(flat))], np.tile([0.0, 0, 1], (len(flat), 1)), np.zeros((0, 0)))
+    points = np.array([[2.0, 3, 0.3], [2, 3, 8], [70, 0, 0], [-28, 14, -0.5]])
+    new = SurfaceMap(points, np.tile([0.0, 0, 1], (4, 1)), np.zeros((12, 12)))
+    found = Found(waiting().found.look, new, first().templates, {})
+    assert amid(found, known, 400.0).tolist() == [True, False, False, True]
+
+
+# -- the parts
+
+
+def square(x: int) -> int | None:
+    return x * x
+
+
+class Dead(Executor):
+    """An executor whose process has died."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_exception(BrokenExecutor())
+        return future
+
+
+@pytest.mark.parametrize("kind", ["here", "thread", "dead"])
+def test_a_result_comes_into_force_a_fixed_number_of_frame_sets_later(kind: str) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        work: Deferred[int] = Deferred({"here": None, "thread": pool, "dead": Dead()}[kind])
+        assert work.poll() is None and not work.busy
+        work.ask(square, 7)
+        assert [work.poll() for _ in range(DELAY + 1)] == [None] * (DELAY - 1) + [49, None]
+        work.ask(square, 3)
+        assert work.busy
+        work.forget()
+        assert [work.poll() for _ in range(DELAY)] == [None] * DELAY and not work.busy
+
+
+def small_map(count: int, seed: int) -> SurfaceMap:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(3 * count, 3 * count))
+    return SurfaceMap(rng.normal(size=(count, 3)), np.tile([0.0, 0, 1], (count, 1)), root @ root.T)
+
+
+def test_maps_are_joined_one_after_the_other_with_errors_of_their_own() -> None:
+    a, b = small_map(4, 1), small_map(3, 2)
+    both = joined_map(a, b)
+    assert len(both) == 7 and np.array_equal(both.points[4:], b.points) and np.array_equal(both.points[:4], a.points)
+    assert np.array_equal(both.covariance[:12, :12], a.covariance) and np.array_equal(
+        both.covariance[12:, 12:], b.covariance
+    )
+    assert not both.covariance[:12, 12:].any()
+
+
+def test_a_map_that_grew_while_it_was_refined_keeps_its_new_rows() -> None:
+    a, b = small_map(4, 1), small_map(3, 2)
+    refiner = Refiner(RIG)
+    refiner.extend(joined_map(a, b))
+    better = SurfaceMap(a.points + 0.1, a.normals, 2 * a.covariance)
+    whole = refiner.with_new_rows(Adjusted(better, np.array([True, False, True, True])))
+    assert np.array_equal(whole.map.points, np.concatenate([better.points, b.points]))
+    assert whole.agrees.tolist() == [True, False, True, True, True, True, True]
+    assert np.array_equal(whole.map.covariance[:12, :12], better.covariance)
+    assert np.array_equal(whole.map.covariance[12:, 12:], b.covariance)
+
+
+def test_no_new_view_drives_an_old_one_out_of_the_search() -> None:
+    rng = np.random.default_rng(5)
+    search = Relocaliser(LENSES)
+    for view in range(4):
+        features = rng.uniform(200, 400, (4000, 2)), np.full((4000, 128), float(view), np.float32)
+        search.add(1, features, first().base_from_surface, first().map)
+    held = np.unique(search.descriptors[:, 0], return_counts=True)
+    assert held[0].tolist() == [0, 1, 2, 3] and held[1].sum() <= CAPACITY and np.ptp(held[1]) <= 1
