@@ -18,8 +18,8 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.refiner import Refiner
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, joined_map
+from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.simulator.bodies import Wound
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.scene import rois
 from perception.features import grey
 from perception.first_map import FirstMap, build_first_map
