@@ -117,3 +117,9 @@ def test_a_soak_compares_its_end_with_its_start(capsys: pytest.CaptureFixture[st
     run_bench(_arguments("estimator", "--soak", "0.001", "--maps", "told"))
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.startswith("soak 0.001 h, exact map") for line in lines) == 4
+
+
+def test_where_clocks_differ_the_bench_asks_what_is_known_of_them(capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["estimator", "--only", "breathing, offsets 16 ms", "--seeds", "1", "--seconds", "0.3", "--maps", "told"]
+    run_bench(_arguments(*command))
+    assert "offsets 16 ms, exact map: offsets off by" in capsys.readouterr().out

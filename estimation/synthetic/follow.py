@@ -65,6 +65,11 @@ class Follower:
         if refined is not None:
             self._take(refined)
 
+    @property
+    def offsets(self) -> Array | None:
+        """How much later than stamped each camera exposes (C,), s, as estimated; None where it is not."""
+        return None
+
     def of_map(self, seen: Observations) -> Observations:
         """The observations of landmarks that are in the map and agree with it, numbered by its rows."""
         known = seen.track < len(self._row)
@@ -85,7 +90,8 @@ class Followed:
     poses: K of them. seconds: (K,) by the clock. Of the estimated surface frame, into which the truth is carried at the
     start, and never fitted: expected: (K, 4, 4) true base_from_surface. twists: (K, 6) true ones. informations:
     (K, 6, 6), Fisher's, of each true pose from its own tracks, were all of them right. frame: (6, 6), the least
-    covariance with which the first look could lay the surface frame; 0 where it was told.
+    covariance with which the first look could lay the surface frame; 0 where it was told. offsets: (C,) s, of the
+    cameras' instants from their stamps, as estimated at the end; None where they are not.
     """
 
     poses: tuple[SurfacePose, ...]
@@ -94,6 +100,7 @@ class Followed:
     twists: Array
     informations: Array
     frame: Array
+    offsets: Array | None
 
     @property
     def bounds(self) -> Array:
@@ -156,11 +163,15 @@ def beginning(world: World, first: Observations, mapping: Mapping) -> Triangulat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """One frame set: the pose, what was seen, and the s by a clock that the pose took; refinement is not counted."""
+    """One frame set: the pose, what was seen, the s by a clock that the pose took, and the offsets then known.
+
+    Refinement is not counted.
+    """
 
     pose: SurfacePose
     seen: Observations
     seconds: float
+    offsets: Array | None
 
 
 def steps(world: World, mapping: Mapping = "told", clock: Callable[[], float] = lambda: 0.0) -> Iterator[Step]:
@@ -169,12 +180,12 @@ def steps(world: World, mapping: Mapping = "told", clock: Callable[[], float] = 
     first = next(seen)
     follower = Follower(world.rig, first, beginning(world, first, mapping), refine=mapping == "seen")
     assert follower.estimator.pose is not None
-    yield Step(follower.estimator.pose, first, 0.0)
+    yield Step(follower.estimator.pose, first, 0.0, follower.offsets)
     for observations in seen:
         follower.idle()
         start = clock()
         pose = follower(observations)
-        yield Step(pose, observations, clock() - start)
+        yield Step(pose, observations, clock() - start, follower.offsets)
 
 
 def follow(world: World, mapping: Mapping = "told", clock: Callable[[], float] = lambda: 0.0) -> Followed:
@@ -194,4 +205,5 @@ def follow(world: World, mapping: Mapping = "told", clock: Callable[[], float] =
         twists=world.twists(stamps) @ se3.adjoint(se3.inverse(true_from_estimated)).T,
         informations=np.stack(informations),
         frame=pose_bound(first) if mapping == "seen" else np.zeros((6, 6)),
+        offsets=rest[-1].offsets if rest else begun.offsets,
     )
