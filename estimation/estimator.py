@@ -21,6 +21,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.smoother import Measured, Smoother
 from estimation.surface_map import SurfaceMap
+from estimation.warp_filter import WarpFilter
 
 ORDERLY = 1.5  # px of residual, at which nobody asks how much of it a camera's own motion explains
 
@@ -39,6 +40,8 @@ class EstimatorSettings:
     camera_tracks: int = 6  # fewer say nothing of that camera,
     camera_share: float = 0.1  # nor does a smaller part of the map's landmarks: so many agree by chance
     disorder: float = 3.0  # px, median, within a camera whatever its own pose: matches by chance, not a surface
+    enter_deformation: float = 0.3  # mm, RMS over the landmarks: a rigid pose alone is off by half a bead in places
+    leave_deformation: float = 0.2
     sigma_tracking: float = 2.0  # mm: a pose less certain than this is DEGRADED
     sigma_measured: float = 50.0  # mm: a pose less certain than this is no measurement
     coast: float = 0.5  # s without a measurement until LOST
@@ -142,9 +145,10 @@ class Estimator:
         self.skew = Skew()
         self._smoother = Smoother()
         self._detector = MotionDetector(np.zeros(3))
+        self._warp: WarpFilter | None = None
         self._pose: SurfacePose | None = None
         self._measured_stamp = -np.inf
-        self._tracking = False
+        self._tracking = self._bent = False
         self._caveat = ""
         self._view = 0  # landmarks of the first view: what is added later is not all seen at once
 
@@ -175,7 +179,8 @@ class Estimator:
             reason = f"{len(observations)} tracks found, {settings.least_tracks} needed"
             none = np.zeros(len(observations), bool)
             return Fit(observations.stamp, nothing, np.full((6, 6), np.inf), none, used, reason)
-        points = self.map.points[observations.track]
+        warped = self.map.points if self._warp is None else self._warp.points(self.map)
+        points = warped[observations.track]
         sigma = np.hypot(np.maximum(observations.sigma, settings.floor_sigma), self._smear(observations, points, start))
         solution = solve_pose(self.rig, observations.camera, points, observations.pixels, sigma, start, scales=scales)
         inlier = solution.weights > 0.2
@@ -227,6 +232,9 @@ class Estimator:
         np.add.at(pull, observations.camera, np.einsum("nki,nk->ni", weighted, velocity))
         late = noise @ pull.T
         total = total + self.skew.sigma**2 * late @ late.T
+        if self._warp is not None:
+            bent = self._warp.pull(observations.track, weighted, solution.jacobians[:, :, 3:])
+            total = total + noise @ bent @ noise
         return np.asarray((total + total.T) / 2)
 
     def begin(self, stamp: float, base_from_surface: Array, surface_map: SurfaceMap, caveat: str = "") -> SurfacePose:
@@ -236,7 +244,7 @@ class Estimator:
         """
         self.map, self._caveat, self._view = surface_map, caveat, len(surface_map)
         self._smoother.reset()
-        self._detector = MotionDetector(surface_map.points.mean(0))
+        self._detector, self._warp = MotionDetector(surface_map.points.mean(0)), WarpFilter(surface_map)
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
         return self._enter(
             stamp, base_from_surface, covariance, TrackState.INITIALISING, "a first map, to be confirmed"
@@ -275,6 +283,8 @@ class Estimator:
                 twist,
                 sigma[keep],
             )
+            if self._warp is not None:
+                self._warp.learn(observations, fit.solution, sigma, twist, self.skew.sigma)
         state, reason = self._grade(fit)
         noise = np.asarray(np.linalg.pinv(fit.solution.information, hermitian=True))  # map and clocks: the same at rest
         self._detector(fit.stamp, fit.solution.base_from_surface, noise)
@@ -282,6 +292,9 @@ class Estimator:
 
     def _grade(self, fit: Fit) -> tuple[TrackState, str]:
         s = self.settings
+        warp = None if self._warp is None else self._warp.warp
+        deformation = 0.0 if warp is None else warp.deformation
+        self._bent = deformation > (s.leave_deformation if self._bent else s.enter_deformation)
         cameras = len(self.carriers(fit))
         spread = _position_sigma(fit.covariance)
         if cameras < 2:
@@ -290,6 +303,8 @@ class Estimator:
             return TrackState.DEGRADED, f"the pose is uncertain to {spread:.1f} mm"
         if fit.used.sum() < (s.leave_tracks if self._tracking else s.enter_tracks):
             return TrackState.DEGRADED, f"{fit.used.sum()} tracks carry the pose, {s.enter_tracks} wanted"
+        if self._bent:
+            return TrackState.DEGRADED, f"the surface is deformed by {deformation:.2f} mm"
         if self._caveat:
             return TrackState.DEGRADED, self._caveat
         return TrackState.TRACKING, ""
@@ -308,6 +323,7 @@ class Estimator:
             window.acceleration_psd,
             reason,
             self._detector.motion,
+            None if self._warp is None else self._warp.warp,
         )
         return self._pose
 
@@ -329,6 +345,8 @@ class Estimator:
     def replace_map(self, surface_map: SurfaceMap) -> None:
         """Take a refined or longer map of the same surface frame; rows keep their meaning."""
         assert self.map is not None and len(surface_map) >= len(self.map)
+        if self._warp is not None:
+            self._warp.replace_map(surface_map)
         self.map = surface_map
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.se3 import Array
+from estimation.warp import Warp
 
 
 class TrackState(Enum):
@@ -48,7 +49,8 @@ class SurfacePose:
     stamp: s, middle of the exposure. base_from_surface: (4, 4) mm. covariance: (6, 6) of the right perturbation
     [rx ry rz tx ty tz], rad and mm, in the surface frame. twist: (6,) body velocity, rad/s and mm/s. twist_covariance:
     (6, 6). acceleration_psd: (6,) spectral density of the white-noise acceleration between poses, rad^2/s^3 and
-    mm^2/s^3. reason: why the state is what it is, in words for the operator. motion: as last detected.
+    mm^2/s^3. reason: why the state is what it is, in words for the operator. motion: as last detected. warp: how
+    the surface departs from the rigid body that the pose describes; None while it does not.
     """
 
     stamp: float
@@ -60,6 +62,12 @@ class SurfacePose:
     acceleration_psd: Array = field(default_factory=lambda: np.zeros(6))
     reason: str = ""
     motion: SurfaceMotion = SurfaceMotion()
+    warp: Warp | None = None
+
+    @property
+    def deformation(self) -> float:
+        """Root mean square displacement of the landmarks, mm, that no rigid motion explains."""
+        return 0.0 if self.warp is None else self.warp.deformation
 
     def predict(self, stamp: float) -> SurfacePose:
         """The pose at `stamp` (s) under constant body velocity, with the covariance grown to match.
@@ -82,12 +90,15 @@ class SurfacePose:
             base_from_surface=self.base_from_surface @ step,
             covariance=(grown + grown.T) / 2,
             twist_covariance=twist_grown,
+            warp=None if self.warp is None else self.warp.later(dt),
         )
 
     def error_at(self, points_surface: Array) -> Array:
-        """Standard deviation (N,), mm, of the position of points (N, 3) given in the surface frame."""
+        """Standard deviation (N,), mm, of the position of points (N, 3), surface frame, along its worst direction."""
         jacobian = np.concatenate(
             [-se3.hat(points_surface), np.broadcast_to(np.eye(3), (len(points_surface), 3, 3))], -1
         )
         spread = jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2)  # (N, 3, 3)
+        if self.warp is not None:
+            spread = spread + self.warp.spread(points_surface)
         return np.asarray(np.sqrt(np.linalg.eigvalsh(spread)[:, -1]))

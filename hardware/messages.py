@@ -15,6 +15,7 @@ from estimation.observations import Observations
 from estimation.pose import SurfaceMotion, SurfacePose, TrackState
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
+from estimation.warp import Warp
 from hardware.rig_file import rig_from_table, table_from_rig
 from hardware.schemas import camera_frame
 from perception.frames import Roi
@@ -31,6 +32,7 @@ _POSE_SHAPES = {
     "twist_covariance": (6, 6),
     "acceleration_psd": (6,),
 }
+_WARP = {"control": 1, "coefficients": 1, "covariance": 2, "growth": 2}  # of 3 x as many numbers as control points
 _MM = 1e-3  # viewers count in metres
 
 
@@ -115,6 +117,7 @@ def message_from_pose(pose: SurfacePose) -> Message:
         "acceleration_psd": _flat(pose.acceleration_psd),
         "reason": pose.reason,
         "motion": _message_from_motion(pose.motion),
+        "warp": _message_from_warp(pose.warp),
     }
 
 
@@ -126,6 +129,7 @@ def pose_from_message(message: Message) -> SurfacePose:
         state=TrackState(message["state"]),
         reason=message["reason"],
         motion=_motion_from_message(message["motion"]) if "motion" in message else SurfaceMotion(),
+        warp=_warp_from_message(message["warp"]) if "warp" in message else None,
         **arrays,
     )
 
@@ -138,6 +142,35 @@ def _message_from_motion(motion: SurfaceMotion) -> Message:
 def _motion_from_message(message: Message) -> SurfaceMotion:
     onset = float(_array(message["onset"], (1,))[0])
     return SurfaceMotion(message["moving"], onset, message["moved"], message["turned"])
+
+
+def _message_from_warp(warp: Warp | None) -> Message:
+    if warp is None:
+        return {**{name: [] for name in _WARP}, "reach": 0.0, "deformation": 0.0, "deformation_sigma": 0.0}
+    return {
+        **{name: _flat(getattr(warp, name)) for name in _WARP},
+        "reach": warp.reach,
+        "deformation": warp.deformation,
+        "deformation_sigma": warp.deformation_sigma,
+    }
+
+
+def _warp_from_message(message: Message) -> Warp | None:
+    size = len(message["control"])
+    if not size:
+        return None
+    control, coefficients, covariance, growth = (
+        _array(message[name], (size // 3, 3) if shape == 1 else (size, size)) for name, shape in _WARP.items()
+    )
+    return Warp(
+        control,
+        coefficients,
+        covariance,
+        growth,
+        message["reach"],
+        message["deformation"],
+        message["deformation_sigma"],
+    )
 
 
 def message_from_move(move: Move) -> Message:

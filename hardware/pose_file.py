@@ -28,7 +28,8 @@ _POSE = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 _COVARIANCE = tuple(f"cov_{TANGENT[i]}_{TANGENT[j]}" for i, j in zip(*_UPPER, strict=True))
 _TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_mm_s", "vy_mm_s", "vz_mm_s")
 _MOTION = ("moving", "onset_s", "moved_mm", "turned_deg")
-_HEAD = ("stamp_s", "frames", *_POSE, *_COVARIANCE, *_TWIST, *_MOTION, "state", "cameras")
+_DEFORMATION = ("deformation_mm", "deformation_sigma_mm")
+_HEAD = ("stamp_s", "frames", *_POSE, *_COVARIANCE, *_TWIST, *_MOTION, *_DEFORMATION, "state", "cameras")
 _STATES = tuple(state.value for state in TrackState)
 
 
@@ -38,8 +39,9 @@ class PoseTable:
 
     stamps: (N,) s. frames: (N,) images given. base_from_surface: (N, 4, 4) mm. covariance: (N, 6, 6) and twist:
     (N, 6) as in SurfacePose. moving: (N,), onset: (N,) s, NaN before the first, moved: (N,) mm and turned: (N,) rad, as
-    in SurfaceMotion. states: N of TrackState. used: (N, C) tracks that carry the pose, per camera. seconds:
-    (N, S + 1) per stage and in all. reasons: N sentences. cameras: C names. stages: S + 1 names, the last "total".
+    in SurfaceMotion. deformation, deformation_sigma: (N,) mm, 0 where there is no warp. states: N of TrackState. used:
+    (N, C) tracks that carry the pose, per camera. seconds: (N, S + 1) per stage and in all. reasons: N sentences.
+    cameras: C names. stages: S + 1 names, the last "total".
     """
 
     stamps: Array
@@ -51,6 +53,8 @@ class PoseTable:
     onset: Array
     moved: Array
     turned: Array
+    deformation: Array
+    deformation_sigma: Array
     states: tuple[TrackState, ...]
     used: NDArray[np.int64]
     seconds: Array
@@ -89,8 +93,16 @@ class PoseWriter:
         milliseconds = [f"{1000 * s:.4f}" for s in (*seconds, total)]
         motion = pose.motion
         moved = [int(motion.moving), f"{motion.onset:.6f}", f"{motion.moved:.6f}", f"{np.rad2deg(motion.turned):.6f}"]
+        bent = [0.0, 0.0] if pose.warp is None else [pose.warp.deformation, pose.warp.deformation_sigma]
         self._csv.writerow(
-            [f"{pose.stamp:.6f}", frames, *numbers, *(f"{v:.9g}" for v in (*upper, *pose.twist)), *moved]
+            [
+                f"{pose.stamp:.6f}",
+                frames,
+                *numbers,
+                *(f"{v:.9g}" for v in (*upper, *pose.twist)),
+                *moved,
+                *(f"{v:.6f}" for v in bent),
+            ]
             + [pose.state.value, int(np.count_nonzero(used)), *(int(n) for n in used), *milliseconds, pose.reason]
         )
         self._csv_file.flush()
@@ -140,8 +152,8 @@ def _table(path: Path, head: list[str], body: list[list[str]]) -> PoseTable:
         if row[state_column] not in _STATES:
             raise InputError(path, f"line {number}: state", row[state_column], ", ".join(_STATES))
     numbers = _numbers(path, head, [row[:state_column] + row[state_column + 1 : -1] for row in body])
-    stamps, frames, positions, quaternions, upper, twist, motion, cameras_used, used, milliseconds = np.split(
-        numbers, np.cumsum([1, 1, 3, 4, 21, 6, len(_MOTION), 1, len(cameras)]), axis=1
+    stamps, frames, positions, quaternions, upper, twist, motion, deformation, cameras_used, used, milliseconds = (
+        np.split(numbers, np.cumsum([1, 1, 3, 4, 21, 6, len(_MOTION), len(_DEFORMATION), 1, len(cameras)]), axis=1)
     )
     del cameras_used  # it is np.count_nonzero(used, 1)
     covariance = np.zeros((len(body), 6, 6))
@@ -156,6 +168,8 @@ def _table(path: Path, head: list[str], body: list[list[str]]) -> PoseTable:
         onset=motion[:, 1],
         moved=motion[:, 2],
         turned=np.deg2rad(motion[:, 3]),
+        deformation=deformation[:, 0],
+        deformation_sigma=deformation[:, 1],
         states=tuple(TrackState(row[state_column]) for row in body),
         used=used.astype(np.int64),
         seconds=milliseconds / 1000,

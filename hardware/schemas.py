@@ -159,6 +159,19 @@ MOTION: Schema = {
     },
     "required": ["moving", "onset", "moved", "turned"],
 }
+WARP: Schema = {
+    "type": "object",
+    "description": "Departure from a rigid body: Gaussian bells about K points, surface frame; K = 0: none",
+    "properties": {
+        "control": _perhaps("K x 3, mm"),
+        "coefficients": _perhaps("K x 3, mm"),
+        "covariance": _perhaps("3K x 3K, mm^2, of the coefficients"),
+        "growth": _perhaps("3K x 3K, mm^2/s"),
+        "reach": _about(NUMBER, "mm, one sigma of a bell"),
+        "deformation": _about(NUMBER, "mm, root mean square over the landmarks"),
+        "deformation_sigma": _about(NUMBER, "mm"),
+    },
+}
 POSE = _object(
     "stillbed.SurfacePose",
     "Estimated pose of the surface; mm, rad, s; tangent order rx ry rz tx ty tz, right perturbation",
@@ -171,6 +184,7 @@ POSE = _object(
     acceleration_psd=_perhaps("6, rad^2/s^3, mm^2/s^3"),
     reason=TEXT,
     motion=MOTION,
+    warp=WARP,
 )
 MOVE = _object(
     "stillbed.Move",

@@ -125,7 +125,8 @@ class Guard:
 
 def _numbers(pose: SurfacePose) -> tuple[Array | float, ...]:
     drift = (pose.twist_covariance, pose.acceleration_psd)
-    return pose.stamp, pose.base_from_surface, pose.covariance, pose.twist, *drift
+    warp = () if pose.warp is None else (pose.warp.coefficients, pose.warp.covariance, pose.warp.growth)
+    return pose.stamp, pose.base_from_surface, pose.covariance, pose.twist, *drift, *warp
 
 
 def _error(pose: SurfacePose, place: Array, ahead: float) -> float:
@@ -133,7 +134,10 @@ def _error(pose: SurfacePose, place: Array, ahead: float) -> float:
     drift = np.diag(pose.acceleration_psd) * ahead**3 / 3
     covariance = pose.covariance + ahead**2 * pose.twist_covariance + drift
     jacobian = np.hstack([-se3.hat(place), np.eye(3)])
-    worst = float(np.linalg.eigvalsh(jacobian @ covariance @ jacobian.T)[-1])
+    spread = jacobian @ covariance @ jacobian.T
+    if pose.warp is not None:
+        spread = spread + pose.warp.later(ahead).spread(place[None])[0]
+    worst = float(np.linalg.eigvalsh(spread)[-1])
     return math.sqrt(worst) if worst >= 0 else math.nan
 
 

@@ -4,6 +4,9 @@ The target of the nozzle is base_from_surface(t) @ surface_from_nozzle(s(t)): th
 place s on the path as TOPP-RA times it. Whatever stands in the way (no pose, a pose that is not worth following, a
 target out of reach, a failed solve) brakes the arm within its limits and then holds it; when it is gone the nozzle goes
 back to the very place where it stopped: nothing is left out and nothing printed twice.
+
+A pose whose state is DEGRADED may be printed on: how well the place under the nozzle is known decides, the warp's own
+doubt included. A surface that deforms, but whose warp is known, carries the checkpoints with its tissue.
 """
 
 from __future__ import annotations
@@ -141,6 +144,8 @@ class Planner:
         self._leg = None
         base_from_nozzle = nozzle_from_axes(self._arm, self._follower.position)
         nozzle = se3.inverse(pose.predict(now).base_from_surface) @ base_from_nozzle
+        if pose.warp is not None:
+            nozzle = pose.warp.uncarry(nozzle[None])[0]
         if self._place >= self._curve.length:
             return self._start(pose, Phase.LEAVING, exit_from(nozzle), 0.0, now)
         goal = self._curve.poses(np.array([self._place]))[0]
@@ -204,7 +209,10 @@ class Planner:
     def _targets(self, pose: SurfacePose, leg: Leg, times: Array) -> Array:
         """Machine axes (T, 6) that the leg asks for at times (T,), s."""
         base_from_surface = pose.base_from_surface @ se3.exp(pose.twist * (times - pose.stamp)[:, None])
-        return axes_from_nozzle(self._arm, base_from_surface @ leg.curve.poses(leg.timing.at(times)))
+        surface_from_nozzle = leg.curve.poses(leg.timing.at(times))
+        if pose.warp is not None:
+            surface_from_nozzle = pose.warp.carry(surface_from_nozzle)
+        return axes_from_nozzle(self._arm, base_from_surface @ surface_from_nozzle)
 
     def _error(self, pose: SurfacePose, leg: Leg, now: float) -> float:
         """Distance, mm, of the nozzle from where the leg wants it at `now`."""
@@ -244,5 +252,7 @@ def _late(pose: SurfacePose, lag: float) -> SurfacePose:
 
 
 def _finite(pose: SurfacePose) -> bool:
-    arrays = (pose.base_from_surface, pose.covariance, pose.twist, pose.twist_covariance, pose.acceleration_psd)
+    arrays = [pose.base_from_surface, pose.covariance, pose.twist, pose.twist_covariance, pose.acceleration_psd]
+    if pose.warp is not None:
+        arrays += [pose.warp.control, pose.warp.coefficients, pose.warp.covariance, pose.warp.growth]
     return bool(np.isfinite(pose.stamp) and all(np.isfinite(a).all() for a in arrays))

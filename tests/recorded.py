@@ -8,6 +8,7 @@ import numpy as np
 from session_files import image, rig, stamps, trajectory
 
 from estimation.pose import SurfaceMotion, SurfacePose, TrackState
+from estimation.warp import Warp
 from hardware.recording import Recorder
 from perception.frames import Frame
 
@@ -32,6 +33,7 @@ def pose(stamp: float, seed: int = 0) -> SurfacePose:
         draw.random(6),
         'why "so"',
         SurfaceMotion(True, stamp - 0.1 if seed else float("nan"), 0.31, 0.002),
+        Warp(draw.normal(size=(4, 3)), draw.normal(size=(4, 3)), np.eye(12) / 7, np.eye(12) / 9, 25.0, 0.3, 0.02),
     )
 
 

@@ -56,6 +56,8 @@ def run(
         onset=np.where(np.arange(count) < 4, np.nan, stamps - stamps % 0.2),
         moved=np.arange(count) / 8,
         turned=np.arange(count) / 1024,
+        deformation=np.zeros(count),
+        deformation_sigma=np.zeros(count),
         states=tuple(named.get(i, TrackState.TRACKING) for i in range(count)),
         used=draw.integers(30, 60, size=(count, 3)),
         seconds=np.concatenate([seconds, seconds.sum(axis=1, keepdims=True)], axis=1),

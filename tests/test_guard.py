@@ -14,6 +14,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
+from estimation.warp import Warp
 from planning.command import Command, Hold, Move
 from planning.guard import Guard
 from planning.kinematics import SimpleArm
@@ -274,3 +275,14 @@ def test_the_arm_is_checked() -> None:
         SimpleArm(arm_from_upright=se3.exp_rotation([0, 0, 0.1]) * 2)
     with pytest.raises(InputError, match="home"):
         SimpleArm(home=np.full(6, np.nan))
+
+
+def test_a_warp_adds_its_own_doubt_and_what_grows_of_it() -> None:
+    def warped(variance: float, growth: float) -> SurfacePose:
+        bell = np.zeros((1, 3)), np.zeros((1, 3)), variance * np.eye(3), growth * np.eye(3), 1e4, 0.4, 0.1
+        return pose(1.0, covariance=np.zeros((6, 6)), warp=Warp(*bell))
+
+    assert not refused(judged(move(axes(0.5)), warped(0.2499, 0.0)))
+    assert refused(judged(move(axes(0.5)), warped(0.2501, 0.0)), "is known to 0.500")
+    assert refused(judged(move(axes(0.5)), warped(0.2499, 0.02)), "is known to 0.500")  # one tick ahead
+    assert refused(judged(move(axes(0.5)), warped(np.nan, 0.0)), "not finite")

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
+from estimation.warp import Warp
 from planning.command import Command, Hold, Move
 from planning.guard import Guard
 from planning.kinematics import SimpleArm, axes_from_nozzle, nozzle_from_axes
@@ -326,3 +327,22 @@ def test_in_the_simple_mode_the_angles_are_the_surfaces_own_turn() -> None:
     tilted = axes_from_nozzle(ARM, REST @ se3.make(turn, np.zeros(3)))
     assert np.allclose(upright, [202.5, 225, 50, 0, 0, 0])
     assert np.allclose(tilted, [202.5, 225, 50, 0.1, -0.2, 0.3])
+
+
+def test_a_surface_that_deforms_carries_the_checkpoints_with_it() -> None:
+    bump = Warp(np.zeros((1, 3)), np.array([[0.3, -0.2, 1.0]]), 1e-4 * np.eye(3), np.zeros((3, 3)), 8.0, 0.4, 0.01)
+    path, seconds = raster(size=6.0), 14.0
+    seen = [(now, replace(p, warp=bump, state=TrackState.DEGRADED)) for now, p in exact(still, seconds)]
+    result = run(path, seen, arm=CLOSE)
+    printed = np.array([isinstance(c, Move) and c.extrude for c in result.commands])
+    at = se3.inverse(REST) @ nozzle_from_axes(CLOSE, result.axes[1:][printed])
+    off = bump.undo(at[:, :3, 3])
+    assert printed.any() and np.abs(off[:, 2]).max() < 0.02  # the path lies in the plane of the undeformed surface
+    assert at[:, 2, 3].max() > 0.9
+
+
+def test_a_warp_that_is_not_known_well_enough_stops_the_print() -> None:
+    vague = Warp(np.zeros((1, 3)), np.zeros((1, 3)), np.eye(3), np.zeros((3, 3)), 8.0, 0.4, 1.0)
+    result = run(raster(), [(now, replace(p, warp=vague)) for now, p in exact(still, 0.2)], arm=CLOSE)
+    assert any("the place under the nozzle is known to" in reason for reason in result.reasons)
+    assert not any(isinstance(c, Move) for c in result.commands)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +81,10 @@ def test_every_record_comes_back_bit_by_bit(
     for name in ("base_from_surface", "covariance", "twist", "twist_covariance", "acceleration_psd"):
         assert getattr(estimate, name).tobytes() == getattr(pose(stamp, seed), name).tobytes()
     assert (estimate.stamp, estimate.state, estimate.reason) == (stamp, TrackState.DEGRADED, 'why "so"')
+    warp = pose(stamp, seed).warp
+    assert warp is not None and estimate.warp is not None
+    for field in fields(warp):
+        assert np.array_equal(getattr(estimate.warp, field.name), getattr(warp, field.name))
     assert repr(estimate.motion) == repr(pose(stamp, seed).motion)  # NaN equals nothing, but is written like itself
     first, second, third = channels.read_commands(path)
     assert isinstance(first, Move) and isinstance(third, Move) and second == hold
