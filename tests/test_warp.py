@@ -15,16 +15,18 @@ from estimation.estimator import Estimator
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
+from estimation.synthetic.look import observations
+from estimation.synthetic.surfaces import patch
 from estimation.warp import Warp
 from estimation.warp_modes import WarpModes, modes_from_map
 from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.deformation import Deformation
-from tests.synthetic import Motion, breathing, observations, points_on_patch, still
+from tests.synthetic import Motion, breathing, still
 
 RIG = arc_rig()
-LANDMARKS = points_on_patch(100, np.random.default_rng(3))
+LANDMARKS = patch(100, np.random.default_rng(3)).points
 MAP = SurfaceMap(LANDMARKS, np.tile([0.0, 0.0, 1.0], (len(LANDMARKS), 1)), np.zeros((300, 300)))
-CHECKPOINTS = 0.6 * points_on_patch(30, np.random.default_rng(4))
+CHECKPOINTS = 0.6 * patch(30, np.random.default_rng(4)).points
 CHECKPOINTS[:, 2] = np.sqrt(70.0**2 - CHECKPOINTS[:, 1] ** 2) - 70.0  # back onto the cylinder
 MODES = modes_from_map(MAP)
 BULGE = Deformation((0.03, 0.01), 1.5, 25.0)
