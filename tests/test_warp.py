@@ -15,11 +15,11 @@ from estimation.estimator import Estimator
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
+from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.synthetic.look import observations
 from estimation.synthetic.surfaces import patch
 from estimation.warp import Warp
 from estimation.warp_modes import WarpModes, modes_from_map
-from hardware.simulator.default_rig import REST, arc_rig
 from hardware.simulator.deformation import Deformation
 from tests.synthetic import Motion, breathing, still
 
