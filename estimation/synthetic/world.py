@@ -121,8 +121,7 @@ def synthetic_world(
     """
     asked = Conditions(**conditions)
     rig = arc_rig() if rig is None else rig
-    if asked.offsets and len(asked.offsets) != len(rig):
-        raise InputError(WHERE, "offsets", asked.offsets, f"one for each of {len(rig)} cameras")
+    _check(asked, rig, seconds, rate, count)
     stamps = np.arange(max(1, round(seconds * rate))) / rate
     drawn = [np.random.default_rng([seed, stream]) for stream in range(TRACKS)]
     motion = _named(movement, MOVEMENTS, "movement")(drawn[MOVING]) if isinstance(movement, str) else movement
@@ -134,6 +133,17 @@ def synthetic_world(
         true_rig = miscalibrated(true_rig, points, asked.calibration, drawn[CALIBRATION])
     known = _known(landmarks, asked.map_error, drawn[MAPPING])
     return World(rig, true_rig, landmarks, spans, known, motion, rest, stamps, asked, seed)
+
+
+def _check(asked: Conditions, rig: Rig, seconds: float, rate: float, count: int) -> None:
+    if asked.offsets and len(asked.offsets) != len(rig):
+        raise InputError(WHERE, "offsets", asked.offsets, f"one for each of {len(rig)} cameras")
+    for spell in asked.outages:
+        if len(spell) == 3 and not 0 <= spell[2] < len(rig):
+            raise InputError(WHERE, "outages", spell, f"a camera, 0 to {len(rig) - 1}")
+    for name, value in (("seconds", seconds), ("rate", rate), ("count", count)):
+        if not 0 < value < np.inf:
+            raise InputError(WHERE, name, value, "a finite number > 0")
 
 
 def _named(name: Any, table: dict[str, Any], what: str) -> Any:
