@@ -39,6 +39,8 @@ Subjects = Mapping[str, Subject]
 SUBJECTS: Subjects = {
     "estimator": Subject("hardware.bench.estimator", "the estimator on synthetic tracks: accuracy, honesty, time"),
     "latency": Subject("hardware.bench.latency", "from three decoded frames to the pose, by wall clock and processor"),
+    "map": Subject("hardware.bench.mapping", "landmarks off the true surface beside their claim, and the map's growth"),
     "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?"),
+    "registration": Subject("hardware.bench.registration", "a scan laid into the first pictures: error and verdict"),
     "thesis": Subject("hardware.bench.thesis", "the thesis's estimator beside ours, on the same frame sets"),
 }
