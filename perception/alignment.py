@@ -31,6 +31,11 @@ from perception.patches import (
 MEAN = np.full(GRID_SIZE, 1 / GRID_SIZE, np.float32)
 FAINT = 1e-6  # grey levels squared: no contrast at all
 ARRIVED = 0.03  # samples: a last step; what is left after it is a tenth of that
+LEAST_SIGMA = 0.05  # px
+# Height of the surface over a patch's plane, px: seen from the side it shifts all that shows it, by the angle's tangent,
+# and does so in every image, so no residual tells. Measured on simulated skin with a wound of 2.4 mm and on a roof's
+# edge: 0.06 px seen squarely, 0.1 at 60 degrees, 0.2-0.3 at 70 and 0.4-0.5 at 75, of which alignment alone claimed half.
+RELIEF, SQUINT = 0.1, 0.1  # px; cosine beyond which nothing is visible anyway
 UNSEEN = 0.3  # samples: the longest step taken without a look at where it leads
 HURRIED = 4  # looks at the full image from a near start; a tenth of the tracks, the worst, would like more
 
@@ -171,7 +176,10 @@ def _judge(
     pixels = start + moved
     noise = 2 * (1 - np.clip(ended.score, -1, 1)) * 2.0  # variance per sample; neighbours share noise, hence the two
     per_pixel = where.per_sample @ templates.inverse_hessian @ np.swapaxes(where.per_sample, 1, 2)
-    sigma = np.sqrt(np.maximum(noise * (per_pixel[:, 0, 0] + per_pixel[:, 1, 1]) / 2, 0.05**2) + ended.rest**2)
+    sidelong = np.clip(where.facing, SQUINT, 1.0)
+    bent = RELIEF**2 * (1 / sidelong**2 - 1)  # the tangent's square
+    white = np.maximum(noise * (per_pixel[:, 0, 0] + per_pixel[:, 1, 1]) / 2, LEAST_SIGMA**2)
+    sigma = np.sqrt(white + ended.rest**2 + bent)
     reach = np.sqrt((moved * moved).sum(1))
     fits = (ended.score > least) & (ended.contrast > FLAT)
     found = where.visible & fits & (reach < 3 * SIDE) & np.isfinite(pixels).all(1)

@@ -11,7 +11,7 @@ from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
-from perception.alignment import Alignment, align, align_in, coarse_score
+from perception.alignment import RELIEF, Alignment, align, align_in, coarse_score
 from perception.features import grey
 from perception.frames import Image
 from perception.lens import Lenses
@@ -127,6 +127,17 @@ def test_cameras_aligned_together_are_each_as_alone(templates: Templates, coarse
         assert np.array_equal(together.found[part], alone.found) and alone.found.sum() > 15
         assert np.allclose(together.pixels[part][alone.found], alone.pixels[alone.found], atol=1e-3)
         assert np.allclose(together.sigma[part][alone.found], alone.sigma[alone.found], atol=1e-3)
+
+
+def test_what_is_seen_from_the_side_claims_less(templates: Templates) -> None:
+    claims = []
+    for tilt in (0.3, 0.0, -0.5):  # ever further from facing the camera
+        pose = REST @ se3.exp(np.array([tilt, 0, 0, 0, 0, 0]))
+        found, where = find(templates, picture(pose, seed=6), pose)
+        slope = np.sqrt(1 / where.facing[found.found] ** 2 - 1)
+        assert (found.sigma[found.found] >= 0.999 * RELIEF * slope).all() and found.found.sum() > 40
+        claims.append(float(np.median(found.sigma[found.found])))
+    assert claims[0] < claims[1] < claims[2]
 
 
 def test_a_patch_that_had_not_arrived_says_how_far_it_had_to_go(templates: Templates) -> None:
