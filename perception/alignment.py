@@ -25,6 +25,7 @@ from perception.patches import (
     grid_offsets,
     look_up,
     normalise,
+    on_level,
     sample,
 )
 
@@ -32,11 +33,12 @@ MEAN = np.full(GRID_SIZE, 1 / GRID_SIZE, np.float32)
 FAINT = 1e-6  # grey levels squared: no contrast at all
 ARRIVED = 0.03  # samples: a last step; what is left after it is a tenth of that
 LEAST_SIGMA = 0.05  # px
-# Height of the surface over a patch's plane, px: seen from the side it shifts all that shows it, by the angle's tangent,
-# and does so in every image, so no residual tells. Measured on simulated skin with a wound of 2.4 mm and on a roof's
-# edge: 0.06 px seen squarely, 0.1 at 60 degrees, 0.2-0.3 at 70 and 0.4-0.5 at 75, of which alignment alone claimed half.
+# Height of the surface over a patch's plane, px: seen from the side it shifts all that shows it, by the angle's
+# tangent, and does so in every image, so no residual tells. Measured on simulated skin with a wound of 2.4 mm and on a
+# roof's edge: 0.06 px seen squarely, 0.1 at 60 degrees, 0.2-0.3 at 70, 0.4-0.5 at 75; alignment alone claimed half.
 RELIEF, SQUINT = 0.1, 0.1  # px; cosine beyond which nothing is visible anyway
 UNSEEN = 0.3  # samples: the longest step taken without a look at where it leads
+MOSTLY = 0.6  # of the tracks still under way
 HURRIED = 4  # looks at the full image from a near start; a tenth of the tracks, the worst, would like more
 
 
@@ -91,7 +93,7 @@ def align_in(
 
 
 class _Sampler:
-    """Grey levels on the templates' grids in several images."""
+    """Grey levels on the templates' grids in several images; its arrays are megabytes, so they are made once."""
 
     def __init__(
         self,
@@ -103,17 +105,20 @@ class _Sampler:
     ) -> None:
         self._images, self._ends, self._half = images, ends, half
         self._offsets = grid_offsets(per_sample, spacing, half)
+        self._places = np.empty((2, len(per_sample), GRID_SIZE), np.float32)
+        self._seen = np.empty((len(per_sample), GRID_SIZE), np.float32)
 
     def __call__(self, rows: NDArray[np.int64], centre: Array) -> Float32:
-        """Grey levels (M, S) of some rows (M,), ascending, with their centres (M, 2) px."""
-        whole = len(rows) == len(self._offsets)
+        """Grey levels (M, S) of some rows (M,), ascending, with their centres (M, 2) px; good until the next call."""
+        whole, count = len(rows) == len(self._offsets), len(rows)
         offsets = self._offsets if whole else self._offsets[rows]
         ends = self._ends if whole else np.searchsorted(rows, self._ends)
-        out = np.empty((len(rows), SIDE * SIDE), np.float32)
+        start = on_level(centre, self._half)
+        x, y = (np.add(offsets[:, k], start[:, k : k + 1], out=self._places[k, :count]) for k in (0, 1))
         for image, first, last in zip(self._images, ends[:-1], ends[1:], strict=True):
             if last > first:
-                out[first:last] = look_up(image, offsets[first:last], centre[first:last], self._half)
-        return out
+                self._seen[first:last] = look_up(image, x[first:last], y[first:last])
+        return self._seen[:count]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,10 +146,12 @@ def _descend(
     """
     picture, steepest, inverse = pieces
     score, contrast, rest = np.zeros((3, len(shift)))
-    busy = np.nonzero(where.visible)[0]
+    busy, everyone, all_in_view = np.nonzero(where.visible)[0], np.arange(len(shift)), bool(where.visible.all())
     for last in range(rounds - 1, -1, -1):
         if not len(busy):
             break
+        if len(busy) > MOSTLY * len(shift) and all_in_view:  # to leave a few out costs more than another look at them
+            busy = everyone
         some = slice(None) if len(busy) == len(shift) else busy
         per_sample = where.per_sample[some]
         seen = grey_levels(busy, start[some] + (per_sample @ shift[some, :, None])[..., 0])

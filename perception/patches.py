@@ -95,7 +95,8 @@ def sample(image: Image, centre: Array, per_sample: Array, spacing: float = 1.0,
     spacing: steps from sample to sample. half: the image is the half-size one of `pyramid`. Bilinear; outside the image
     the border's value.
     """
-    return look_up(image, grid_offsets(per_sample, spacing, half), centre, half).astype(np.float32)
+    offsets, start = grid_offsets(per_sample, spacing, half), on_level(centre, half)
+    return look_up(image, offsets[:, 0] + start[:, :1], offsets[:, 1] + start[:, 1:]).astype(np.float32)
 
 
 def grid_offsets(per_sample: Array, spacing: float = 1.0, half: bool = False) -> Float32:
@@ -105,12 +106,15 @@ def grid_offsets(per_sample: Array, spacing: float = 1.0, half: bool = False) ->
     return np.asarray(flat.reshape(-1, 2, GRID_SIZE), np.float32)
 
 
-def look_up(image: Image, offsets: Float32, centre: Array, half: bool) -> Image:
-    """Grey levels (N, S) of an image at `grid_offsets` (N, 2, S) about centres (N, 2) px."""
+def on_level(centre: Array, half: bool) -> Float32:
+    """Centres (N, 2) px of an image in the pixels of the image or of its half-size version."""
     # A quarter pixel beside the half-size grid bilinear sampling blurs the image, which widens the reach: on the grid
     # tests/test_patches.py finds fewer from 5 px away. Templates are cut alike, so what is compared is not shifted.
-    start = (centre * 0.5 - 0.25 if half else centre).astype(np.float32)
-    x, y = offsets[:, 0] + start[:, :1], offsets[:, 1] + start[:, 1:]
+    return np.asarray(centre * 0.5 - 0.25 if half else centre, np.float32)
+
+
+def look_up(image: Image, x: Float32, y: Float32) -> Image:
+    """Grey levels (N, S) of an image at x, y (N, S) px, bilinear; outside it the border's."""
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 

@@ -11,7 +11,7 @@ from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
-from perception.alignment import RELIEF, Alignment, align, align_in, coarse_score
+from perception.alignment import ARRIVED, RELIEF, Alignment, align, align_in, coarse_score
 from perception.features import grey
 from perception.frames import Image
 from perception.lens import Lenses
@@ -113,7 +113,7 @@ def test_the_claimed_error_is_of_the_true_ones_size(templates: Templates) -> Non
 
 
 @pytest.mark.parametrize("coarse", [True, False])
-def test_cameras_aligned_together_are_each_as_alone(templates: Templates, coarse: bool) -> None:
+def test_cameras_aligned_together_stand_where_each_does_alone(templates: Templates, coarse: bool) -> None:
     pose = REST @ se3.exp(np.array([0.004, 0, 0.004, 0.3, -0.2, 0]))
     images = [pyramid(picture(REST, camera=c)) for c in range(3)]
     whole = project_into(LENSES, range(3), np.stack([pose] * 3), POINTS, NORMALS, templates.axes)
@@ -124,9 +124,10 @@ def test_cameras_aligned_together_are_each_as_alone(templates: Templates, coarse
         alone = align(templates, images[c], where, where.centre, coarse=coarse)
         part = slice(c * len(POINTS), (c + 1) * len(POINTS))
         assert np.allclose(whole.centre[part], where.centre, atol=1e-9)
-        assert np.array_equal(together.found[part], alone.found) and alone.found.sum() > 15
-        assert np.allclose(together.pixels[part][alone.found], alone.pixels[alone.found], atol=1e-3)
-        assert np.allclose(together.sigma[part][alone.found], alone.sigma[alone.found], atol=1e-3)
+        both = together.found[part] & alone.found
+        assert both.sum() >= max(15, 0.95 * alone.found.sum())
+        change = np.linalg.norm(together.pixels[part] - alone.pixels, axis=1)[both]
+        assert change.max() < ARRIVED
 
 
 def test_what_is_seen_from_the_side_claims_less(templates: Templates) -> None:
