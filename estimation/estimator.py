@@ -7,19 +7,22 @@ tracks; its size (`skew`) is learned from how far the cameras disagree while the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.camera_health import CameraHealth, HealthSettings
 from estimation.motion_detector import MotionDetector
 from estimation.observations import Observations
+from estimation.odd_camera import odd_ones, solve_with, standing_off
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import PoseFit, own_residuals, project, solve_pose
+from estimation.pose_solver import PoseFit, own_residuals, project
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.smoother import Measured, Smoother
+from estimation.state_machine import Measurement, StateMachine, StateSettings
 from estimation.surface_map import SurfaceMap
 from estimation.warp_filter import WarpFilter
 
@@ -28,29 +31,26 @@ ORDERLY = 1.5  # px of residual, at which nobody asks how much of it a camera's 
 
 @dataclass(frozen=True, slots=True)
 class EstimatorSettings:
-    """When a fit counts as a measurement, and what it is called.
-
-    Two thresholds keep the state from flickering: `enter` to become TRACKING, `leave` to stop being it.
-    """
+    """When a fit counts as a measurement. states: what it is then called. health: which cameras are trusted."""
 
     least_tracks: int = 10  # six unknowns need three tracks; ten leave room to see an outlier
     least_share: float = 0.4  # of the tracks found: with fewer in agreement the surface is not what is seen
-    enter_tracks: int = 30
-    leave_tracks: int = 20
     camera_tracks: int = 6  # fewer say nothing of that camera,
     camera_share: float = 0.1  # nor does a smaller part of the map's landmarks: so many agree by chance
     disorder: float = 3.0  # px, median, within a camera whatever its own pose: matches by chance, not a surface
-    enter_deformation: float = 0.3  # mm, RMS over the landmarks: a rigid pose alone is off by half a bead in places
-    leave_deformation: float = 0.2
-    sigma_tracking: float = 2.0  # mm: a pose less certain than this is DEGRADED
     sigma_measured: float = 50.0  # mm: a pose less certain than this is no measurement
-    coast: float = 0.5  # s without a measurement until LOST
     floor_sigma: float = 0.1  # px: alignment claims less on clean images, interpolation and lens model do not allow it
+    states: StateSettings = field(default_factory=StateSettings)
+    health: HealthSettings = field(default_factory=HealthSettings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A fit to one frame set, judged. used: (C,) inliers per camera. reason: why it is no measurement, or ''."""
+    """A fit to one frame set, judged.
+
+    used: (C,) inliers per camera. reason: why it is no measurement, or ''. off: (C,) px by which each camera stands off
+    the pose, nan where it does not see the surface; allowed: (C,) px, one sigma. odd: cameras that were left out.
+    """
 
     stamp: float
     solution: PoseFit
@@ -58,6 +58,9 @@ class Fit:
     inlier: NDArray[np.bool_]
     used: NDArray[np.int64]
     reason: str
+    off: Array
+    allowed: Array
+    odd: frozenset[int] = frozenset()
 
     @property
     def measured(self) -> bool:
@@ -143,12 +146,13 @@ class Estimator:
         self.settings = settings or EstimatorSettings()
         self.map: SurfaceMap | None = None
         self.skew = Skew()
+        self.health = CameraHealth([camera.name for camera in rig.cameras], self.settings.health)
+        self._states = StateMachine(self.settings.states)
         self._smoother = Smoother()
         self._detector = MotionDetector(np.zeros(3))
         self._warp: WarpFilter | None = None
         self._pose: SurfacePose | None = None
-        self._measured_stamp = -np.inf
-        self._tracking = self._bent = False
+        self._measured: SurfacePose | None = None  # the last one that was
         self._caveat = ""
         self._view = 0  # landmarks of the first view: what is added later is not all seen at once
 
@@ -174,21 +178,49 @@ class Estimator:
         assert self.map is not None
         count, settings = len(self.rig), self.settings
         used = np.zeros(count, np.int64)
+        off = np.full(count, np.nan)
         if len(observations) < settings.least_tracks:
             nothing = PoseFit(start, np.zeros((6, 6)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 6)), 1.0)
             reason = f"{len(observations)} tracks found, {settings.least_tracks} needed"
-            none = np.zeros(len(observations), bool)
-            return Fit(observations.stamp, nothing, np.full((6, 6), np.inf), none, used, reason)
+            none, odd = np.zeros(len(observations), bool), self.health.left_out
+            return Fit(observations.stamp, nothing, np.full((6, 6), np.inf), none, used, reason, off, off, odd)
         warped = self.map.points if self._warp is None else self._warp.points(self.map)
         points = warped[observations.track]
-        sigma = np.hypot(np.maximum(observations.sigma, settings.floor_sigma), self._smear(observations, points, start))
-        solution = solve_pose(self.rig, observations.camera, points, observations.pixels, sigma, start, scales=scales)
+        smear = self._smear(observations, points, start)
+        sigma = np.hypot(np.maximum(observations.sigma, settings.floor_sigma), smear)
+        allowed = self.health.allowed(np.full(count, smear))
+        solution, odd = self._solve(observations, points, sigma, start, scales, allowed)
         inlier = solution.weights > 0.2
         used = np.bincount(observations.camera[inlier], minlength=count)
         covariance = self._covariance(observations, solution, sigma)
         disorder = _disorder(observations, solution, inlier)
-        reason = self._judge(len(observations), used, covariance, disorder)
-        return Fit(observations.stamp, solution, covariance, inlier, used, reason)
+        found = int((~np.isin(observations.camera, list(odd))).sum())
+        reason = self._judge(found, used, covariance, disorder)
+        off = standing_off(observations, solution, count, self._camera_least())
+        return Fit(observations.stamp, solution, covariance, inlier, used, reason, off, allowed, odd)
+
+    def _solve(
+        self,
+        observations: Observations,
+        points: Array,
+        sigma: Array,
+        start: Array,
+        scales: tuple[float, ...],
+        allowed: Array,
+    ) -> tuple[PoseFit, frozenset[int]]:
+        """The pose of all cameras that agree with each other, and those that are left out of it."""
+        odd, least = self.health.left_out, self._camera_least()
+        solution = solve_with(self.rig, observations, points, sigma, start, scales, odd)
+        if self._pose is None or self._pose.state is TrackState.INITIALISING:  # a bent first map sets cameras apart
+            return solution, odd
+        most = self.settings.health.out * allowed
+        off = standing_off(observations, solution, len(self.rig), least)
+        if any(off[c] > most[c] for c in range(len(self.rig)) if c not in odd):
+            expected = self._pose.predict(observations.stamp)
+            found = odd_ones(self.rig, observations, points, sigma, odd, most, least, expected)
+            if found is not None:
+                return found[1], found[0]
+        return solution, odd
 
     def _smear(self, observations: Observations, points: Array, start: Array) -> float:
         """How far, px, the surface moves between the cameras' instants: beside that, sharper tracks count no more."""
@@ -245,10 +277,9 @@ class Estimator:
         self.map, self._caveat, self._view = surface_map, caveat, len(surface_map)
         self._smoother.reset()
         self._detector, self._warp = MotionDetector(surface_map.points.mean(0)), WarpFilter(surface_map)
+        self.health.begin()
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
-        return self._enter(
-            stamp, base_from_surface, covariance, TrackState.INITIALISING, "a first map, to be confirmed"
-        )
+        return self._enter(stamp, base_from_surface, covariance, *self._states.begin(stamp))
 
     def carriers(self, fit: Fit) -> NDArray[np.int64]:
         """The cameras that carry a fit, by number."""
@@ -285,35 +316,27 @@ class Estimator:
             )
             if self._warp is not None:
                 self._warp.learn(observations, fit.solution, sigma, twist, self.skew.sigma)
-        state, reason = self._grade(fit)
         noise = np.asarray(np.linalg.pinv(fit.solution.information, hermitian=True))  # map and clocks: the same at rest
         self._detector(fit.stamp, fit.solution.base_from_surface, noise)
+        self._heed(fit)
+        seen = Measurement(
+            tuple(self.rig.cameras[c].name for c in self.carriers(fit)),
+            int(fit.used.sum()),
+            _position_sigma(fit.covariance),
+            self.health.trouble(fit.stamp),
+            self._caveat,
+            0.0 if self._warp is None or self._warp.warp is None else self._warp.warp.deformation,
+        )
+        state, reason = self._states.measured(fit.stamp, seen)
         return self._enter(fit.stamp, fit.solution.base_from_surface, fit.covariance, state, reason)
 
-    def _grade(self, fit: Fit) -> tuple[TrackState, str]:
-        s = self.settings
-        warp = None if self._warp is None else self._warp.warp
-        deformation = 0.0 if warp is None else warp.deformation
-        self._bent = deformation > (s.leave_deformation if self._bent else s.enter_deformation)
-        cameras = len(self.carriers(fit))
-        spread = _position_sigma(fit.covariance)
-        if cameras < 2:
-            return TrackState.DEGRADED, "one camera alone carries the pose"
-        if spread > s.sigma_tracking * (1.25 if self._tracking else 1.0):
-            return TrackState.DEGRADED, f"the pose is uncertain to {spread:.1f} mm"
-        if fit.used.sum() < (s.leave_tracks if self._tracking else s.enter_tracks):
-            return TrackState.DEGRADED, f"{fit.used.sum()} tracks carry the pose, {s.enter_tracks} wanted"
-        if self._bent:
-            return TrackState.DEGRADED, f"the surface is deformed by {deformation:.2f} mm"
-        if self._caveat:
-            return TrackState.DEGRADED, self._caveat
-        return TrackState.TRACKING, ""
+    def _heed(self, fit: Fit) -> None:
+        used = fit.used if fit.measured else np.zeros_like(fit.used)
+        self.health.update(fit.stamp, used, self._camera_least(), fit.off, fit.allowed, fit.odd)
 
     def _enter(self, stamp: float, pose: Array, covariance: Array, state: TrackState, reason: str) -> SurfacePose:
         window = self._smoother.add(Measured(stamp, pose, covariance))
-        self._tracking = state is TrackState.TRACKING
-        self._measured_stamp = stamp
-        self._pose = SurfacePose(
+        self._pose = self._measured = SurfacePose(
             stamp,
             window.pose,
             window.covariance,
@@ -327,19 +350,17 @@ class Estimator:
         )
         return self._pose
 
-    def coast(self, stamp: float, reason: str) -> SurfacePose:
-        """No measurement at `stamp`: predict, and say for how long already."""
-        assert self._pose is not None
-        away = stamp - self._measured_stamp
-        lost = away > self.settings.coast
-        self._tracking = False
-        predicted = self._pose.predict(stamp)
-        self._pose = replace(
-            predicted,
-            twist=np.zeros(6) if lost else predicted.twist,  # a velocity that old would carry the pose away
-            state=TrackState.LOST if lost else TrackState.COASTING,
-            reason=f"{reason}; {away:.2f} s since the last measurement",
-        )
+    def coast(self, fit: Fit) -> SurfacePose:
+        """No measurement at `fit.stamp`: predict from the last one, and say for how long already and why."""
+        assert self._measured is not None
+        self._heed(fit)
+        trouble = self.health.trouble(fit.stamp, at_once=True)
+        state, reason = self._states.missed(fit.stamp, f"{fit.reason}; {trouble}" if trouble else fit.reason)
+        predicted, lost = self._measured.predict(fit.stamp), state is TrackState.LOST
+        if lost:  # a velocity that old would carry the pose away
+            stays = self._measured.predict(self._measured.stamp + self.settings.states.coast)
+            predicted = replace(predicted, base_from_surface=stays.base_from_surface, twist=np.zeros(6))
+        self._pose = replace(predicted, state=state, reason=reason)
         return self._pose
 
     def replace_map(self, surface_map: SurfaceMap) -> None:

@@ -25,6 +25,7 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.features import grey
 from perception.frames import FrameSet, Roi
+from perception.freshness import Freshness
 from perception.lens import Lenses
 from perception.mapping import Mapping
 from perception.matcher import Matcher
@@ -70,6 +71,7 @@ class TrackingStep:
         self.rig, self.roi, self._clock = rig, tuple(roi), clock
         self._lenses = Lenses(rig)
         self._estimator = Estimator(rig)
+        self._fresh = Freshness()
         self._search = Relocaliser(self._lenses)
         self._mapping = Mapping(self._lenses, self.roi, self._search, executor, scan)
         self._matcher: Matcher | None = None
@@ -87,7 +89,7 @@ class TrackingStep:
             self.last = StepReport(no_observations(frames.stamp), np.zeros(len(self.rig), np.int64), self._spent)
             return last
         self._check(frames)
-        pyramids = {f.camera: pyramid(grey(f.image)) for f in frames.frames}
+        pyramids = self._pyramids(frames)
         self._took("prepare")
         if self._matcher is None:
             pose, observations, used = self._initialise(frames, pyramids)
@@ -112,6 +114,13 @@ class TrackingStep:
             camera, (h, w) = self.rig.cameras[frame.camera], frame.image.shape[:2]
             if (w, h) != camera.size:
                 raise InputError(f"camera {camera.name}", "image size", f"{w} x {h}", "{} x {} px".format(*camera.size))
+
+    def _pyramids(self, frames: FrameSet) -> dict[int, Pyramid]:
+        """The new pictures, by camera; one that was there before would say that the surface stands still."""
+        images = {f.camera: grey(f.image) for f in frames.frames}
+        fresh = {c: pyramid(image) for c, image in images.items() if self._fresh(c, image)}
+        self._estimator.health.pictures(fresh, images.keys() - fresh.keys())
+        return fresh
 
     def _took(self, stage: str) -> None:
         now = self._clock()
@@ -157,10 +166,11 @@ class TrackingStep:
             self._lost = {c: pyramids[c] for c in self._missing(fit, pyramids)}
             self._absent = 0
             pose = estimator.accept(fit, observations)
-            self._mapping.offer(fit, observations, pose.twist, estimator, pyramids)
+            if not fit.odd:  # else the map would be bent to a camera that was bumped
+                self._mapping.offer(fit, observations, pose.twist, estimator, pyramids)
             matcher.remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)
         else:
-            pose = estimator.coast(stamp, fit.reason)
+            pose = estimator.coast(fit)
             self._absent += 1
             self._lost = pyramids if self._absent % FULL_SEARCH == 0 else {}
         self._took("pose")

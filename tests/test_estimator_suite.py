@@ -42,12 +42,12 @@ CASES = {
     "clean": Case(),
     "noise": Case({"noise": 1.0}),
     "dropouts": Case({"dropouts": 0.3}),
-    "outage": Case({"outages": ((0.8, 1.1),)}, states=(TRACKING, COASTING, TRACKING)),
-    "outage of a camera": Case({"outages": ((0.8, 1.3, 1),)}),
+    "outage": Case({"outages": ((0.8, 1.1),)}, states=(TRACKING, COASTING, DEGRADED, TRACKING)),
+    "outage of a camera": Case({"outages": ((0.8, 1.3, 1),)}, states=(TRACKING, DEGRADED, TRACKING)),
     "outage of two cameras": Case({"outages": ((0.8, 1.3, 1), (0.8, 1.3, 2))}, states=(TRACKING, DEGRADED, TRACKING)),
     "outliers": Case({"outliers": 0.2}, beyond=1.5),  # a fifth of the tracks is worth nothing, and some stand near
     "churn": Case({"churn": 1.0}),
-    "restart": Case({"outages": ((0.6, 1.5),)}, states=(TRACKING, COASTING, LOST, TRACKING)),
+    "restart": Case({"outages": ((0.6, 1.5),)}, states=(TRACKING, COASTING, LOST, DEGRADED, TRACKING)),
 }
 
 

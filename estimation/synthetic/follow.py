@@ -53,7 +53,7 @@ class Follower:
                 refit = estimator.fit(seen, fit.solution.base_from_surface)
                 fit = refit if refit.measured else fit
         if not fit.measured:
-            return estimator.coast(seen.stamp, fit.reason)
+            return estimator.coast(fit)
         pose = estimator.accept(fit, seen)
         if self.refiner is not None:
             self.refiner.offer(fit, seen, pose.twist, estimator.skew.sigma)

@@ -129,7 +129,7 @@ def figures(verdicts: Sequence[Verdict]) -> list[Figure]:
     slow = int((back > 0.2 + 1e-9).sum())
     return [
         Figure("silent losses", sum(v.silent for v in verdicts), "", at_most(0), REFERENCE, note),
-        Figure("errors beyond the claim", sum(v.beyond for v in verdicts), "", at_most(0), "", "in any state"),
+        Figure("errors beyond the claim", sum(v.beyond for v in verdicts), "", at_most(0), "", "in any state but LOST"),
         Figure("flagged after more than 100 ms", late, "", at_most(0), "", f"of {len(needed)} that had to be"),
         Figure("time to the flag, median", 1000 * float(np.median(needed)) if len(needed) else np.nan, "ms"),
         Figure("time to the flag, largest", 1000 * float(needed.max(initial=0.0)), "ms", at_most(100)),

@@ -1,0 +1,95 @@
+"""Fitting a pose while one camera may be wrong as a whole: the odd one out is found by the others and by the motion.
+
+Single wrong tracks are rejected one by one; a camera that was bumped or swapped is wrong in all of its tracks at once,
+and they agree with each other. Left out one at a time, the camera without which the others agree, and agree with the
+motion until now, is the odd one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from itertools import combinations
+
+import numpy as np
+
+from estimation import se3
+from estimation.observations import Observations
+from estimation.pose import SurfacePose
+from estimation.pose_solver import PoseFit, project, solve_pose
+from estimation.rig import Rig
+from estimation.se3 import Array
+
+MOST = 2  # cameras that may be wrong at once: exchanged cables
+SURER = 3.0  # times likelier, in sigmas of the motion, than the next: which of two that disagree is then told
+
+
+def solve_with(
+    rig: Rig,
+    observations: Observations,
+    points: Array,
+    sigma: Array,
+    start: Array,
+    scales: tuple[float, ...],
+    left_out: Collection[int],
+) -> PoseFit:
+    """The pose of all cameras but `left_out`, whose tracks have residuals too, and no weight; points (N, 3) mm."""
+    camera, pixels = observations.camera, observations.pixels
+    if not left_out:
+        return solve_pose(rig, camera, points, pixels, sigma, start, scales=scales)
+    kept = ~np.isin(camera, list(left_out))
+    fit = solve_pose(rig, camera[kept], points[kept], pixels[kept], sigma[kept], start, scales=scales)
+    predicted, _, jacobians = project(rig, camera, fit.base_from_surface, points)
+    weights = np.zeros(len(camera))
+    weights[kept] = fit.weights
+    return PoseFit(fit.base_from_surface, fit.information, predicted - pixels, weights, jacobians, fit.scale)
+
+
+def standing_off(observations: Observations, fit: PoseFit, count: int, least: float) -> Array:
+    """How far, px, half of each camera's tracks stand off a pose at least: (C,), nan with fewer than `least`."""
+    away = np.linalg.norm(fit.residuals, axis=1)
+    off = np.full(count, np.nan)
+    for c in np.unique(observations.camera):
+        mine = away[observations.camera == c]
+        if len(mine) >= least:
+            off[c] = np.median(mine)
+    return off
+
+
+def odd_ones(
+    rig: Rig,
+    observations: Observations,
+    points: Array,
+    sigma: Array,
+    left_out: Collection[int],
+    allowed: Array,
+    least: float,
+    expected: SurfacePose,
+) -> tuple[frozenset[int], PoseFit] | None:
+    """The cameras, one or else two, without which the others agree, and the fit without them; None where unclear.
+
+    left_out: cameras that are so already. allowed: (C,) px by which each may stand off. expected: by the motion, at
+    this stamp.
+    """
+    kept = [int(c) for c in np.unique(observations.camera) if c not in left_out]
+    for size in range(1, min(MOST, len(kept) - 1) + 1):
+        found: list[tuple[float, frozenset[int], PoseFit]] = []
+        for odd in combinations(kept, size):
+            without = frozenset(left_out) | set(odd)
+            fit = solve_with(rig, observations, points, sigma, expected.base_from_surface, (4.0, 1.0), without)
+            apart = standing_off(observations, fit, len(rig), least) / allowed
+            others = [apart[c] for c in kept if c not in odd and np.isfinite(apart[c])]
+            if others and max(others) <= 1.0 and all(apart[c] > 1.0 for c in odd):
+                found.append((_surprise(fit, expected), without, fit))
+        found.sort(key=lambda one: one[0])
+        if found:
+            sure = len(found) == 1 or found[1][0] > SURER * found[0][0]
+            return found[0][1:] if sure else None
+    return None
+
+
+def _surprise(fit: PoseFit, expected: SurfacePose) -> float:
+    """By how many sigmas a pose differs from the motion's, at least one."""
+    off = se3.log(se3.inverse(expected.base_from_surface) @ fit.base_from_surface)
+    damped = fit.information + 1e-9 * np.trace(fit.information) * np.eye(6)
+    spread = expected.covariance + np.linalg.inv(damped)
+    return max(1.0, float(np.sqrt(off @ np.linalg.solve(spread, off) / 6)))
