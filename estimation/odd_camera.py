@@ -20,6 +20,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 
 MOST = 2  # cameras that may be wrong at once: exchanged cables
+RAYLEIGH = 1.18  # median length of a vector whose two entries are normal, in their sigmas
 SURER = 3.0  # times likelier, in sigmas of the motion, than the next: which of two that disagree is then told
 
 
@@ -45,13 +46,17 @@ def solve_with(
 
 
 def standing_off(observations: Observations, fit: PoseFit, count: int, least: float) -> Array:
-    """How far, px, half of each camera's tracks stand off a pose at least: (C,), nan with fewer than `least`."""
+    """How far, px, each camera stands off a pose: (C,), nan with fewer tracks than `least`.
+
+    That is the median of its tracks' residuals, less what their noise alone makes of it.
+    """
     away = np.linalg.norm(fit.residuals, axis=1)
     off = np.full(count, np.nan)
     for c in np.unique(observations.camera):
-        mine = away[observations.camera == c]
-        if len(mine) >= least:
-            off[c] = np.median(mine)
+        mine = observations.camera == c
+        if np.count_nonzero(mine) >= least:
+            noise = RAYLEIGH * np.median(observations.sigma[mine])
+            off[c] = np.sqrt(max(np.median(away[mine]) ** 2 - noise**2, 0.0))
     return off
 
 
