@@ -152,13 +152,14 @@ def test_the_error_that_is_left_is_the_one_predicted(bulging: Follow) -> None:
 
 
 def test_a_deformed_surface_is_degraded_between_two_thresholds(bulging: Follow) -> None:
-    settings = bulging.estimator.settings
+    settings = bulging.estimator.settings.states
     sizes = np.array([pose.deformation for pose in bulging.poses])
-    degraded = np.array([pose.state is TrackState.DEGRADED for pose in bulging.poses])
+    degraded = np.array(["deformed" in pose.reason for pose in bulging.poses])
+    assert all(pose.state is TrackState.DEGRADED for pose in bulging.poses if pose.reason)
     assert sizes.max() > 0.45 and sizes.min() == 0.0
-    assert degraded[sizes > settings.enter_deformation].all()
-    assert not degraded[sizes <= settings.leave_deformation].any()
-    between = (sizes > settings.leave_deformation) & (sizes <= settings.enter_deformation)
+    assert degraded[sizes > settings.leave_deformation].all()
+    assert not degraded[sizes <= settings.enter_deformation].any()
+    between = (sizes > settings.enter_deformation) & (sizes <= settings.leave_deformation)
     assert between[1:].any() and (degraded[1:] == degraded[:-1])[between[1:]].all()
     assert "deformed by" in bulging.poses[int(np.argmax(sizes))].reason
 
