@@ -38,7 +38,7 @@ class MotionSettings:
     turned: float = float(np.deg2rad(0.1))  # rad, thesis 1.3
     flagged: float = 0.5  # of both
     settled: float = 0.125  # of both
-    chance: float = 34.0  # chi-square of three degrees of freedom: 2e-7 a look, one look in 5 million
+    chance: float = 31.0  # chi-square of three degrees of freedom: 8e-7 a look, half a look an hour
     agree: float = 0.4  # of their mean: so far both halves of the poses must have gone, or it was a glitch
     memory: float = 1800.0  # poses, a minute, over which the noise is learned
     steady: float = 300.0  # poses, ten seconds: what is slower is no noise, but drift
