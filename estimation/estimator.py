@@ -19,6 +19,7 @@ from estimation.observations import Observations
 from estimation.odd_camera import odd_ones, solve_with, standing_off
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import PoseFit, own_residuals, project
+from estimation.predictor import Predictor
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.smoother import Measured, Smoother
@@ -151,6 +152,7 @@ class Estimator:
         self._smoother = Smoother()
         self._detector = MotionDetector(np.zeros(3))
         self._warp: WarpFilter | None = None
+        self._predictor = Predictor()
         self._pose: SurfacePose | None = None
         self._measured: SurfacePose | None = None  # the last one that was
         self._caveat = ""
@@ -278,6 +280,7 @@ class Estimator:
         self._smoother.reset()
         self._detector, self._warp = MotionDetector(surface_map.points.mean(0)), WarpFilter(surface_map)
         self.health.begin()
+        self._predictor = Predictor(surface_map.points)
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
         return self._enter(stamp, base_from_surface, covariance, *self._states.begin(stamp))
 
@@ -336,7 +339,7 @@ class Estimator:
 
     def _enter(self, stamp: float, pose: Array, covariance: Array, state: TrackState, reason: str) -> SurfacePose:
         window = self._smoother.add(Measured(stamp, pose, covariance))
-        self._pose = self._measured = SurfacePose(
+        entered = SurfacePose(
             stamp,
             window.pose,
             window.covariance,
@@ -348,6 +351,7 @@ class Estimator:
             self._detector.motion,
             None if self._warp is None else self._warp.warp,
         )
+        self._pose = self._measured = replace(entered, forecast=self._predictor.add(entered))
         return self._pose
 
     def coast(self, fit: Fit) -> SurfacePose:
@@ -359,7 +363,7 @@ class Estimator:
         predicted, lost = self._measured.predict(fit.stamp), state is TrackState.LOST
         if lost:  # a velocity that old would carry the pose away
             stays = self._measured.predict(self._measured.stamp + self.settings.states.coast)
-            predicted = replace(predicted, base_from_surface=stays.base_from_surface, twist=np.zeros(6))
+            predicted = replace(predicted, base_from_surface=stays.base_from_surface, twist=np.zeros(6), forecast=None)
         self._pose = replace(predicted, state=state, reason=reason)
         return self._pose
 

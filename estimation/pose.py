@@ -8,6 +8,7 @@ from enum import Enum
 import numpy as np
 
 from estimation import se3
+from estimation.forecast import Forecast, body_rate, point_covariance, radius
 from estimation.se3 import Array
 from estimation.warp import Warp
 
@@ -51,6 +52,7 @@ class SurfacePose:
     (6, 6). acceleration_psd: (6,) spectral density of the white-noise acceleration between poses, rad^2/s^3 and
     mm^2/s^3. reason: why the state is what it is, in words for the operator. motion: as last detected. warp: how
     the surface departs from the rigid body that the pose describes; None while it does not.
+    forecast: where the surface is expected from the stamp on, if that is known better than by the twist.
     """
 
     stamp: float
@@ -63,6 +65,7 @@ class SurfacePose:
     reason: str = ""
     motion: SurfaceMotion = SurfaceMotion()
     warp: Warp | None = None
+    forecast: Forecast | None = None
 
     @property
     def deformation(self) -> float:
@@ -70,11 +73,46 @@ class SurfacePose:
         return 0.0 if self.warp is None else self.warp.deformation
 
     def predict(self, stamp: float) -> SurfacePose:
-        """The pose at `stamp` (s) under constant body velocity, with the covariance grown to match.
+        """The pose at `stamp` (s): along the forecast as far as it reaches, under constant body velocity from there on.
 
-        White noise on acceleration (Barfoot 2017, 11.1): P + dt^2 P_twist + q dt^3 / 3, carried along the geodesic.
-        A stamp before the pose's own runs the same model backwards.
+        The covariance is the forecast's, whose 90 % radii are calibrated, or that of white noise on acceleration
+        (Barfoot 2017, 11.1): P + dt^2 P_twist + q dt^3 / 3, carried along the geodesic. A stamp before the pose's own
+        runs the constant velocity backwards.
         """
+        dt = stamp - self.stamp
+        if self.forecast is None or dt <= 0:
+            return self._drift(stamp)
+        if dt > self.forecast.end:
+            return self._foreseen(self.stamp + self.forecast.end, self.forecast)._drift(stamp)
+        return self._foreseen(stamp, self.forecast)
+
+    def base_at(self, stamps: Array) -> Array:
+        """base_from_surface (T, 4, 4) at stamps (T,), s: the poses of `predict`, for many stamps at once."""
+        ahead = stamps - self.stamp
+        if self.forecast is None:
+            return np.asarray(self.base_from_surface @ se3.exp(self.twist * ahead[:, None]))
+        within = np.clip(ahead, 0.0, self.forecast.end)
+        increments, rates = self.forecast.at(within)
+        speed = np.where((ahead < 0)[:, None], self.twist, body_rate(increments, rates))
+        return np.asarray(self.base_from_surface @ se3.exp(increments) @ se3.exp(speed * (ahead - within)[:, None]))
+
+    def _foreseen(self, stamp: float, forecast: Forecast) -> SurfacePose:
+        """The pose at `stamp`, s, within its forecast."""
+        ahead = min(stamp - self.stamp, forecast.end)
+        increments, rates = forecast.at(np.array([ahead]))
+        return replace(
+            self,
+            stamp=stamp,
+            base_from_surface=self.base_from_surface @ se3.exp(increments[0]),
+            covariance=forecast.covariance(self.covariance, ahead),
+            twist=body_rate(increments[0], rates[0]),
+            twist_covariance=self.twist_covariance + np.diag(self.acceleration_psd) * ahead,
+            warp=None if self.warp is None else self.warp.later(ahead),
+            forecast=forecast.after(ahead),
+        )
+
+    def _drift(self, stamp: float) -> SurfacePose:
+        """The pose at `stamp`, s, under constant body velocity."""
         dt = stamp - self.stamp
         step = se3.exp(self.twist * dt)
         carry = se3.adjoint(se3.inverse(step))
@@ -91,14 +129,19 @@ class SurfacePose:
             covariance=(grown + grown.T) / 2,
             twist_covariance=twist_grown,
             warp=None if self.warp is None else self.warp.later(dt),
+            forecast=None if dt else self.forecast,
         )
 
     def error_at(self, points_surface: Array) -> Array:
         """Standard deviation (N,), mm, of the position of points (N, 3), surface frame, along its worst direction."""
-        jacobian = np.concatenate(
-            [-se3.hat(points_surface), np.broadcast_to(np.eye(3), (len(points_surface), 3, 3))], -1
-        )
-        spread = jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2)  # (N, 3, 3)
-        if self.warp is not None:
-            spread = spread + self.warp.spread(points_surface)
+        spread = self._spread(points_surface)
         return np.asarray(np.sqrt(np.linalg.eigvalsh(spread)[:, -1]))
+
+    def radius_at(self, points_surface: Array, share: float = 0.9) -> Array:
+        """Radius (N,), mm, about points (N, 3), surface frame, that holds their true places in `share` of cases."""
+        return radius(self._spread(points_surface), share)
+
+    def _spread(self, points_surface: Array) -> Array:
+        """Covariances (N, 3, 3), mm^2, of the positions of points (N, 3)."""
+        spread = point_covariance(self.covariance, points_surface)
+        return spread if self.warp is None else np.asarray(spread + self.warp.spread(points_surface))

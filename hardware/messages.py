@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from estimation import se3
+from estimation.forecast import Forecast
 from estimation.observations import Observations
 from estimation.pose import SurfaceMotion, SurfacePose, TrackState
 from estimation.rig import Camera, Rig
@@ -32,6 +33,7 @@ _POSE_SHAPES = {
     "twist_covariance": (6, 6),
     "acceleration_psd": (6,),
 }
+_FORECAST: dict[str, tuple[int, ...]] = {"horizons": (), "increments": (6,), "covariances": (6, 6)}  # of each horizon
 _WARP = {"control": 1, "coefficients": 1, "covariance": 2, "growth": 2}  # of 3 x as many numbers as control points
 _MM = 1e-3  # viewers count in metres
 
@@ -118,18 +120,20 @@ def message_from_pose(pose: SurfacePose) -> Message:
         "reason": pose.reason,
         "motion": _message_from_motion(pose.motion),
         "warp": _message_from_warp(pose.warp),
+        "forecast": _message_from_forecast(pose.forecast),
     }
 
 
 def pose_from_message(message: Message) -> SurfacePose:
     """An estimated pose from its message."""
-    arrays = {key: _array(message[key], shape) for key, shape in _POSE_SHAPES.items()}
+    arrays: dict[str, Any] = {key: _array(message[key], shape) for key, shape in _POSE_SHAPES.items()}
     return SurfacePose(
         stamp=message["stamp"],
         state=TrackState(message["state"]),
         reason=message["reason"],
         motion=_motion_from_message(message["motion"]) if "motion" in message else SurfaceMotion(),
         warp=_warp_from_message(message["warp"]) if "warp" in message else None,
+        forecast=_forecast_from_message(message["forecast"]) if "forecast" in message else None,
         **arrays,
     )
 
@@ -142,6 +146,18 @@ def _message_from_motion(motion: SurfaceMotion) -> Message:
 def _motion_from_message(message: Message) -> SurfaceMotion:
     onset = float(_array(message["onset"], (1,))[0])
     return SurfaceMotion(message["moving"], onset, message["moved"], message["turned"])
+
+
+def _message_from_forecast(forecast: Forecast | None) -> Message:
+    if forecast is None:
+        return {name: [] for name in _FORECAST}
+    return {name: _flat(getattr(forecast, name)) for name in _FORECAST}
+
+
+def _forecast_from_message(message: Message) -> Forecast | None:
+    count = len(message["horizons"])
+    arrays = (_array(message[name], (count, *shape)) for name, shape in _FORECAST.items())
+    return Forecast(*arrays) if count else None
 
 
 def _message_from_warp(warp: Warp | None) -> Message:

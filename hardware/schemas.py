@@ -159,6 +159,16 @@ MOTION: Schema = {
     },
     "required": ["moving", "onset", "moved", "turned"],
 }
+FORECAST: Schema = {
+    "type": "object",
+    "description": "where the surface is expected after the stamp; empty: by its twist",
+    "properties": {
+        "horizons": _perhaps("s after the stamp, H of them"),
+        "increments": _perhaps("Hx6, tangent at the pose"),
+        "covariances": _perhaps("Hx6x6, rad, mm"),
+    },
+    "required": ["horizons", "increments", "covariances"],
+}
 WARP: Schema = {
     "type": "object",
     "description": "Departure from a rigid body: Gaussian bells about K points, surface frame; K = 0: none",
@@ -185,6 +195,7 @@ POSE = _object(
     reason=TEXT,
     motion=MOTION,
     warp=WARP,
+    forecast=FORECAST,
 )
 MOVE = _object(
     "stillbed.Move",

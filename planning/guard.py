@@ -126,13 +126,18 @@ class Guard:
 def _numbers(pose: SurfacePose) -> tuple[Array | float, ...]:
     drift = (pose.twist_covariance, pose.acceleration_psd)
     warp = () if pose.warp is None else (pose.warp.coefficients, pose.warp.covariance, pose.warp.growth)
-    return pose.stamp, pose.base_from_surface, pose.covariance, pose.twist, *drift, *warp
+    ahead = () if (f := pose.forecast) is None else (f.horizons, f.increments, f.covariances)
+    return pose.stamp, pose.base_from_surface, pose.covariance, pose.twist, *drift, *warp, *ahead
 
 
 def _error(pose: SurfacePose, place: Array, ahead: float) -> float:
     """Standard deviation, mm, of a point (3,) on the surface `ahead` s after the pose, along its worst direction."""
-    drift = np.diag(pose.acceleration_psd) * ahead**3 / 3
-    covariance = pose.covariance + ahead**2 * pose.twist_covariance + drift
+    known, covariance = 0.0, pose.covariance
+    if pose.forecast is not None:
+        known = min(ahead, pose.forecast.end)
+        covariance = pose.forecast.covariance(covariance, known)
+    beyond = ahead - known
+    covariance = covariance + beyond**2 * pose.twist_covariance + np.diag(pose.acceleration_psd) * beyond**3 / 3
     jacobian = np.hstack([-se3.hat(place), np.eye(3)])
     spread = jacobian @ covariance @ jacobian.T
     if pose.warp is not None:

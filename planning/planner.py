@@ -208,11 +208,10 @@ class Planner:
 
     def _targets(self, pose: SurfacePose, leg: Leg, times: Array) -> Array:
         """Machine axes (T, 6) that the leg asks for at times (T,), s."""
-        base_from_surface = pose.base_from_surface @ se3.exp(pose.twist * (times - pose.stamp)[:, None])
         surface_from_nozzle = leg.curve.poses(leg.timing.at(times))
         if pose.warp is not None:
             surface_from_nozzle = pose.warp.carry(surface_from_nozzle)
-        return axes_from_nozzle(self._arm, base_from_surface @ surface_from_nozzle)
+        return axes_from_nozzle(self._arm, pose.base_at(times) @ surface_from_nozzle)
 
     def _error(self, pose: SurfacePose, leg: Leg, now: float) -> float:
         """Distance, mm, of the nozzle from where the leg wants it at `now`."""
@@ -255,4 +254,6 @@ def _finite(pose: SurfacePose) -> bool:
     arrays = [pose.base_from_surface, pose.covariance, pose.twist, pose.twist_covariance, pose.acceleration_psd]
     if pose.warp is not None:
         arrays += [pose.warp.control, pose.warp.coefficients, pose.warp.covariance, pose.warp.growth]
+    if pose.forecast is not None:
+        arrays += [pose.forecast.horizons, pose.forecast.increments, pose.forecast.covariances]
     return bool(np.isfinite(pose.stamp) and all(np.isfinite(a).all() for a in arrays))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from session_files import image, rig, stamps, trajectory
 
+from estimation.forecast import Forecast
 from estimation.pose import SurfaceMotion, SurfacePose, TrackState
 from estimation.warp import Warp
 from hardware.recording import Recorder
@@ -34,6 +35,7 @@ def pose(stamp: float, seed: int = 0) -> SurfacePose:
         'why "so"',
         SurfaceMotion(True, stamp - 0.1 if seed else float("nan"), 0.31, 0.002),
         Warp(draw.normal(size=(4, 3)), draw.normal(size=(4, 3)), np.eye(12) / 7, np.eye(12) / 9, 25.0, 0.3, 0.02),
+        Forecast(np.array([0.1, 0.3]), draw.normal(size=(2, 6)), np.stack([np.eye(6) / 3, np.eye(6) / 7])),
     )
 
 

@@ -85,6 +85,10 @@ def test_every_record_comes_back_bit_by_bit(
     assert warp is not None and estimate.warp is not None
     for field in fields(warp):
         assert np.array_equal(getattr(estimate.warp, field.name), getattr(warp, field.name))
+    forecast = pose(stamp, seed).forecast
+    assert forecast is not None and estimate.forecast is not None
+    for field in fields(forecast):
+        assert np.array_equal(getattr(estimate.forecast, field.name), getattr(forecast, field.name))
     assert repr(estimate.motion) == repr(pose(stamp, seed).motion)  # NaN equals nothing, but is written like itself
     first, second, third = channels.read_commands(path)
     assert isinstance(first, Move) and isinstance(third, Move) and second == hold

@@ -42,6 +42,7 @@ SUBJECTS: Subjects = {
     "map": Subject("hardware.bench.mapping", "landmarks off the true surface beside their claim, and the map's growth"),
     "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?"),
     "registration": Subject("hardware.bench.registration", "a scan laid into the first pictures: error and verdict"),
+    "prediction": Subject("hardware.bench.prediction", "where a breathing chest will be, 100 to 500 ms ahead"),
     "steps": Subject("hardware.bench.steps", "movements of 300 um and 0.1 degree: how soon flagged, how often falsely"),
     "thesis": Subject("hardware.bench.thesis", "the thesis's estimator beside ours, on the same frame sets"),
 }

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from estimation.observations import no_observations
 from estimation.pose import SurfacePose, TrackState
+from estimation.predictor import Predictor
 from estimation.se3 import Array
 from hardware.simulator.truth import Truth
 from perception.frames import FrameSet
@@ -26,6 +28,7 @@ class PerfectTracker:
 
         exposed: the true instant, s, of a camera's frame with a stamp, s: clocks that are wrong stay wrong.
         """
+        self._predictor = Predictor()
         self._truth, self._offset, self._exposed, self._cameras = truth, offset, exposed, cameras
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
@@ -33,7 +36,8 @@ class PerfectTracker:
         instant = np.array([np.mean([self._exposed(f.camera, f.stamp) for f in frames.frames])])
         pose, twist = self._truth.base_from_surface(instant)[0], self._truth.twist(instant)[0]
         self.last = StepReport(no_observations(frames.stamp), np.zeros(self._cameras, np.int64), np.zeros(len(STAGES)))
-        return SurfacePose(frames.stamp, self._offset @ pose, SURE, twist, TrackState.TRACKING)
+        seen = SurfacePose(frames.stamp, self._offset @ pose, SURE, twist, TrackState.TRACKING)
+        return replace(seen, forecast=self._predictor.add(seen))
 
     def idle(self) -> None:
         """There is nothing else to do."""

@@ -1,0 +1,129 @@
+"""Where the surface will be in the next half second, learned from its own motion while it is followed.
+
+Experts (hold, constant velocity and the `Members`) each say where it will be; the `Stack` weighs them by their delayed
+errors, and the `Intervals` say how far off that was. All are trained directly for each horizon, at samples STEP s apart
+that are interpolated from the poses as they come: the camera's rate and its jitter do not matter.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from estimation.calibration import Intervals
+from estimation.forecast import Forecast
+from estimation.history import History
+from estimation.members import LAGS, LEVER, Members
+from estimation.pose import SurfacePose
+from estimation.se3 import Array
+from estimation.stacking import Stack
+
+HORIZONS = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # s
+STEP = 0.1  # s between samples learned from; a camera that is faster only predicts in between
+GAP = 0.5  # s without a pose, after which the surface may be anywhere
+SETTLE = 50  # samples judged before the first forecast
+SCALE = np.array([LEVER] * 3 + [1.0] * 3)  # rad to mm at the lever
+PROBES = 10  # points at most, at which the intervals are judged
+EARLY = 1e-3  # s: stamps that are equal but for rounding
+
+
+@dataclass(slots=True)
+class _Sample:
+    """A past instant, and what was expected of it. known: horizons whose truth has come."""
+
+    stamp: float
+    pose: Array
+    inputs: list[Array]
+    experts: Array  # (H, E, 6)
+    expected: Array  # (H, 6)
+    claimed: Array  # (H, N)
+    known: int = 0
+    moved: Array = field(default_factory=lambda: np.zeros((len(HORIZONS), 6)))
+
+
+class Predictor:
+    """Takes the poses of one surface as they come and gives each a forecast, once it has seen enough."""
+
+    def __init__(self, points: Array | None = None) -> None:
+        """points: (N, 3) mm of the surface, for which the intervals shall hold."""
+        if points is None:
+            points = LEVER * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+        probes = points[:: -(-len(points) // PROBES)]
+        self._members = Members(len(HORIZONS))
+        count = self._members.count
+        self._history = History(LAGS[-1] + STEP)
+        self._stack = Stack(len(HORIZONS), np.concatenate([np.zeros(2), np.full(count, 1 / count)]))
+        self._intervals = Intervals(len(HORIZONS), probes / LEVER)
+        self._samples: deque[_Sample] = deque()
+        self._judged = 0
+        self._before = -np.inf
+
+    def add(self, pose: SurfacePose) -> Forecast | None:
+        """Learn from a measured pose, newer than those before, and forecast from it; None while too little is known."""
+        if not (np.isfinite(pose.base_from_surface).all() and np.isfinite(pose.twist).all()):
+            return None
+        if not 0 < pose.stamp - self._before <= GAP:
+            self._history.clear()
+            self._samples.clear()
+        self._before = pose.stamp
+        self._history.add(pose.stamp, pose.base_from_surface)
+        if self._history.reach < STEP / 2:
+            return None
+        due = self._due(pose.stamp)
+        ends, now = [s.stamp + HORIZONS[k] for s, k in due], np.broadcast_to(pose.base_from_surface, (len(LAGS), 4, 4))
+        starts = np.concatenate([np.array([s.pose for s, _ in due]).reshape(-1, 4, 4), now])
+        moved = self._history.increments(starts, np.concatenate([ends, pose.stamp - LAGS])) * SCALE
+        self._learn(due, moved[: len(due)])
+        if self._history.reach < LAGS[-1] - EARLY:
+            return None
+        return self._forecast(pose, moved[len(due) :])
+
+    def _due(self, now: float) -> list[tuple[_Sample, int]]:
+        """The samples and horizons whose time has come."""
+        waiting = ((s, k) for s in self._samples for k in range(s.known, len(HORIZONS)))
+        return [(s, k) for s, k in waiting if s.stamp + HORIZONS[k] <= now + EARLY]
+
+    def _forecast(self, pose: SurfacePose, past: Array) -> Forecast | None:
+        twist = pose.twist * SCALE
+        inputs = self._members.inputs(past, twist)
+        ahead = (HORIZONS[:, None] * twist)[:, None]  # (H, 1, 6)
+        experts = np.concatenate([np.zeros_like(ahead), ahead, self._members(inputs) + ahead], axis=1)
+        expected = self._stack(experts)
+        spread, claimed = self._intervals()
+        if not self._samples or pose.stamp - self._samples[-1].stamp > STEP - EARLY:
+            self._members.watch(past)
+            self._samples.append(_Sample(pose.stamp, pose.base_from_surface, inputs, experts, expected, claimed))
+        if self._judged < SETTLE:
+            return None
+        return Forecast(HORIZONS, expected / SCALE, spread / np.outer(SCALE, SCALE))
+
+    def _learn(self, due: list[tuple[_Sample, int]], moved: Array) -> None:
+        """Compare what was expected with what came, (K, 6), horizon by horizon as its time comes."""
+        for batch in _once_each(due):
+            samples, k = [due[i][0] for i in batch], np.array([due[i][1] for i in batch])
+            truth = moved[batch]
+            each = range(len(batch))
+            self._stack.learn(k, np.stack([samples[i].experts[k[i]] for i in each]), truth)
+            error = truth - np.stack([samples[i].expected[k[i]] for i in each])
+            self._intervals.learn(k, error, np.stack([samples[i].claimed[k[i]] for i in each]))
+        for (sample, j), vector in zip(due, moved, strict=True):
+            sample.moved[j], sample.known = vector, j + 1
+        while self._samples and self._samples[0].known == len(HORIZONS):
+            sample = self._samples.popleft()
+            self._members.learn(sample.inputs, sample.experts[:, 1:], sample.moved)
+            self._judged += 1
+
+
+def _once_each(due: list[tuple[_Sample, int]]) -> Iterator[list[int]]:
+    """The places in `due` in batches, of which each has a horizon once at most, older samples first."""
+    batches: list[list[int]] = []
+    for i, (_, k) in enumerate(due):
+        free = [b for b in batches if all(due[j][1] != k for j in b)]
+        if free:
+            free[0].append(i)
+        else:
+            batches.append([i])
+    yield from batches

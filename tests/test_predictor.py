@@ -1,0 +1,230 @@
+"""Prediction: laws of the forecast, what gaps and bad poses do to it, and intervals that keep what they claim."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimation import se3
+from estimation.forecast import Forecast, body_rate, radius
+from estimation.history import History
+from estimation.pose import SurfacePose, TrackState
+from estimation.predictor import HORIZONS, Predictor
+from estimation.se3 import Array
+
+MOVED = se3.exp(np.array([0.7, -1.1, 0.4, 300.0, -200.0, 500.0]))
+
+
+def breathing(stamps: Array, noise: float = 0.05, seed: int = 0) -> Array:
+    """Poses (T, 4, 4) of a rise and fall of 8 mm with a little turn, every third breath deeper, and noise, mm."""
+    draw = np.random.default_rng(seed)
+    phase = 2 * np.pi * 0.27 * stamps
+    lift = 4 * np.cos(phase) ** 4 * (1 + 0.2 * np.cos(phase / 3)) + 0.3 * np.sin(0.05 * stamps)
+    steps = np.outer(lift, [0.01, 0.002, 0, 0.1, 0.2, 1.0])
+    return se3.exp(steps + noise * draw.normal(size=steps.shape) / [60, 60, 60, 1, 1, 1])
+
+
+def seen(stamps: Array, poses: Array) -> list[SurfacePose]:
+    """Tracked poses with the velocity since the one before."""
+    twists = np.zeros((len(stamps), 6))
+    twists[1:] = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / np.diff(stamps)[:, None]
+    sure = 1e-6 * np.eye(6)
+    rows = zip(stamps.tolist(), poses, twists, strict=True)
+    return [SurfacePose(stamp, pose, sure, twist, TrackState.TRACKING) for stamp, pose, twist in rows]
+
+
+def forecasts(poses: list[SurfacePose]) -> list[Forecast | None]:
+    predictor = Predictor()
+    return [predictor.add(pose) for pose in poses]
+
+
+@pytest.fixture(scope="module")
+def stamps() -> Array:
+    return np.arange(0, 40, 0.1)
+
+
+def test_constant_velocity_is_predicted_exactly(stamps: Array) -> None:
+    twist = np.array([0.01, -0.02, 0.005, 3.0, 1.0, -2.0])
+    last = forecasts(seen(stamps[:200], se3.exp(stamps[:200, None] * twist)))[-1]
+    assert last is not None
+    assert np.abs(last.increments - HORIZONS[:, None] * twist).max() < 1e-6
+
+
+def test_the_base_frame_does_not_matter(stamps: Array) -> None:
+    poses = breathing(stamps)
+    here, there = (forecasts(seen(stamps, way @ poses))[-1] for way in (np.eye(4), MOVED))
+    assert here is not None and there is not None
+    assert np.allclose(here.increments, there.increments, atol=1e-6)
+    assert np.allclose(here.covariances, there.covariances, rtol=1e-4, atol=1e-9)
+
+
+def test_the_same_poses_give_the_same_bytes(stamps: Array) -> None:
+    one, other = (forecasts(seen(stamps, breathing(stamps)))[-1] for _ in range(2))
+    assert one is not None and other is not None
+    assert (
+        one.increments.tobytes() + one.covariances.tobytes() == other.increments.tobytes() + other.covariances.tobytes()
+    )
+
+
+@pytest.mark.parametrize("period", [0.1, 1 / 30, 1 / 60, 0.137])
+def test_breathing_is_predicted_far_better_than_by_its_velocity(period: float) -> None:
+    stamps = np.arange(0, 40, period)
+    poses, truth = seen(stamps, breathing(stamps)), breathing(stamps, noise=0.0)
+    errors = []
+    for pose, forecast in zip(poses, forecasts(poses), strict=True):
+        later = min(int(np.searchsorted(stamps, pose.stamp + 0.3 - 1e-9)), len(stamps) - 1)
+        if forecast is not None and stamps[later] - pose.stamp < 0.5:
+            guesses = [p.base_at(stamps[later : later + 1])[0, :3, 3] for p in (pose, replace(pose, forecast=forecast))]
+            errors.append([np.linalg.norm(guess - truth[later, :3, 3]) for guess in guesses])
+    steady, ours = np.sqrt((np.array(errors)[100:] ** 2).mean(0))
+    assert ours < 0.5 * steady
+
+
+def test_a_step_of_a_still_surface_does_not_overshoot(stamps: Array) -> None:
+    noise = 0.02 * np.random.default_rng(3).normal(size=(len(stamps), 6)) / [60, 60, 60, 1, 1, 1]
+    at = 0.3 * (np.floor(stamps / 7) % 2)
+    poses = se3.exp(noise + np.outer(at, [0, 0, 0, 0, 0, 1.0]))
+    furthest = max(np.abs(f.increments[:, 5]).max() for f in forecasts(seen(stamps, poses)) if f is not None)
+    assert furthest < 0.5  # by its velocity alone the surface would be 1.5 mm away
+
+
+def test_nothing_is_forecast_before_enough_is_known_nor_after_a_gap(stamps: Array) -> None:
+    poses = breathing(stamps)
+    gone = (stamps < 20) | (stamps > 20.8)
+    given = [f is not None for f in forecasts(seen(stamps[gone], poses[gone]))]
+    times = stamps[gone]
+    assert not any(np.array(given)[times < 8])
+    assert all(np.array(given)[(times > 10) & (times < 20)])
+    assert not any(np.array(given)[(times > 20.8) & (times < 23.7)])
+    assert all(np.array(given)[times > 24.1])
+
+
+def test_a_pose_that_is_not_finite_changes_nothing(stamps: Array) -> None:
+    poses = seen(stamps[:150], breathing(stamps[:150]))
+    bad = [
+        replace(poses[100], base_from_surface=np.full((4, 4), np.nan)),
+        replace(poses[100], twist=np.full(6, np.inf)),
+    ]
+    plain, mixed = forecasts(poses)[-1], forecasts([*poses[:100], *bad, *poses[100:]])[-1]
+    assert plain is not None and mixed is not None
+    assert plain.increments.tobytes() == mixed.increments.tobytes()
+
+
+def test_a_short_outage_or_a_wild_jump_leaves_forecasts_finite(stamps: Array) -> None:
+    poses = breathing(stamps)
+    poses[200:] = se3.exp(np.array([2.0, 1.0, 0.5, 80.0, 0, 0])) @ poses[200:]
+    kept = np.ones(len(stamps), bool)
+    kept[250:254] = False
+    for forecast in forecasts(seen(stamps[kept], poses[kept])):
+        if forecast is not None:
+            assert np.isfinite(forecast.increments).all()
+            assert np.linalg.eigvalsh(forecast.covariances).min() > 0
+
+
+@pytest.mark.parametrize("memory", [0.5, 0.9])
+def test_ninety_percent_intervals_hold_ninety_percent(memory: float) -> None:
+    draw = np.random.default_rng(5)
+    count = 1500
+    shocks = draw.standard_t(4, size=(count, 6)) * 0.2 / [60, 60, 60, 1, 1, 1]
+    values = np.zeros((count, 6))
+    for t in range(1, count):
+        values[t] = memory * values[t - 1] + shocks[t]
+    stamps, poses = 0.1 * np.arange(count), se3.exp(values)
+    points = 60 * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    tracked = seen(stamps, poses)
+    for k in (1, 3, 5):
+        inside = []
+        for i, forecast in enumerate(forecasts(tracked)[:-k]):
+            if i > 300:
+                later = replace(tracked[i], forecast=forecast).predict(float(stamps[i + k]))
+                places = (se3.transform_points(pose, points) for pose in (later.base_from_surface, poses[i + k]))
+                inside.append(np.linalg.norm(np.subtract(*places), axis=1) <= later.radius_at(points))
+        assert 0.88 <= np.mean(inside) <= 0.92
+
+
+def test_an_irregular_time_widens_the_intervals(stamps: Array) -> None:
+    quiet, wild = breathing(stamps), breathing(stamps)
+    wild[370:] = wild[370:] @ se3.exp(np.random.default_rng(2).normal(size=(30, 6)) * [0, 0, 0, 1, 1, 1])
+    usual, irregular = (forecasts(seen(stamps, poses))[-1] for poses in (quiet, wild))
+    assert usual is not None and irregular is not None
+    assert np.trace(irregular.covariances[0]) > 4 * np.trace(usual.covariances[0])
+
+
+def test_memory_stays_what_it_is() -> None:
+    stamps = np.arange(0, 60, 1 / 60)
+    predictor = Predictor()
+    sizes = []
+    for i, pose in enumerate(seen(stamps, breathing(stamps))):
+        predictor.add(pose)
+        if i in (900, 3500):
+            sizes.append(len(pickle.dumps(predictor)))
+    assert sizes[1] < 1.02 * sizes[0]
+
+
+# -- the record
+
+
+def some_forecast() -> Forecast:
+    steps = np.outer(HORIZONS, [0.02, 0.01, -0.01, 1.0, 2.0, 3.0]) + np.outer(HORIZONS**2, [0.1, 0, 0, 0, -3.0, 5.0])
+    return Forecast(HORIZONS, steps, np.stack([h * np.diag([1e-4] * 3 + [0.1] * 3) for h in HORIZONS]))
+
+
+def pose_with(forecast: Forecast | None) -> SurfacePose:
+    return SurfacePose(2.0, MOVED, 1e-6 * np.eye(6), np.ones(6), TrackState.TRACKING, forecast=forecast)
+
+
+def test_a_forecast_begins_at_the_pose_and_passes_its_horizons() -> None:
+    forecast = some_forecast()
+    pose = pose_with(forecast)
+    assert pose.predict(2.0).base_from_surface.tobytes() == pose.base_from_surface.tobytes()
+    assert np.allclose(pose.predict(2.0 + 1e-9).covariance, pose.covariance, atol=1e-8)
+    for k, ahead in enumerate(HORIZONS):
+        later = pose.predict(2.0 + float(ahead))
+        assert np.allclose(later.base_from_surface, MOVED @ se3.exp(forecast.increments[k]), atol=1e-9)
+        assert np.allclose(later.covariance, forecast.covariances[k])
+
+
+@pytest.mark.parametrize("ahead", [-0.2, 0.0, 0.05, 0.33, 0.5, 0.7])
+def test_many_instants_at_once_are_where_each_alone_is(ahead: float) -> None:
+    pose = pose_with(some_forecast())
+    assert np.allclose(pose.base_at(np.array([2.0 + ahead]))[0], pose.predict(2.0 + ahead).base_from_surface, atol=1e-6)
+
+
+def test_two_steps_of_a_forecast_end_where_one_does() -> None:
+    pose = pose_with(some_forecast())
+    once, twice = pose.predict(2.4), pose.predict(2.13).predict(2.4)
+    assert np.allclose(once.base_from_surface, twice.base_from_surface, atol=1e-3)
+    assert np.allclose(once.twist, twice.twist, atol=2e-2)
+
+
+def test_the_predicted_twist_is_the_rate_of_the_predicted_pose() -> None:
+    pose = pose_with(some_forecast())
+    before, after = pose.base_at(np.array([2.249, 2.251]))
+    assert np.allclose(se3.log(se3.inverse(before) @ after) / 0.002, pose.predict(2.25).twist, atol=1e-3)
+    assert np.allclose(body_rate(np.zeros(6), np.arange(6.0)), np.arange(6.0))
+
+
+def test_a_forecast_crosses_to_another_process() -> None:
+    copy = pickle.loads(pickle.dumps(some_forecast()))
+    assert copy.increments.tobytes() == some_forecast().increments.tobytes()
+
+
+@pytest.mark.parametrize("sigmas", [(1.0, 1.0, 1.0), (1.0, 0.1, 0.1), (1.0, 0.5, 0.0), (2.0, 0.0, 0.0)])
+def test_the_radius_holds_nine_tenths_of_normal_errors(sigmas: tuple[float, float, float]) -> None:
+    drawn = np.random.default_rng(0).normal(size=(200_000, 3)) * sigmas
+    inside = np.linalg.norm(drawn, axis=1) < radius(np.diag(np.square(sigmas)))
+    assert abs(inside.mean() - 0.9) < 0.01
+
+
+def test_increments_of_the_past_are_those_of_the_group() -> None:
+    draw = np.random.default_rng(4)
+    poses, stamps = se3.exp(draw.normal(size=(30, 6)) * [0.8, 0.8, 0.8, 50, 50, 50]), 0.1 * np.arange(30)
+    history = History(2.0)
+    for stamp, pose in zip(stamps.tolist(), poses, strict=True):
+        history.add(stamp, pose)
+    expected = se3.log(se3.inverse(poses[-1]) @ poses[15:])
+    assert np.allclose(history.increments(np.tile(poses[-1], (15, 1, 1)), stamps[15:]), expected, atol=1e-9)
+    assert history.reach == pytest.approx(2.0, abs=0.11)
