@@ -367,10 +367,15 @@ class Estimator:
         self._pose = replace(predicted, state=state, reason=reason)
         return self._pose
 
-    def replace_map(self, surface_map: SurfaceMap) -> None:
-        """Take a refined or longer map of the same surface frame; rows keep their meaning."""
+    def replace_map(self, surface_map: SurfaceMap, crooked: bool = False) -> None:
+        """Take a refined or longer map of the same surface frame; rows keep their meaning.
+
+        crooked: whether the one before was a first map, whose own error looked like a deformation.
+        """
         assert self.map is not None and len(surface_map) >= len(self.map)
-        if self._warp is not None:
+        if crooked:
+            self._warp = WarpFilter(surface_map)
+        elif self._warp is not None:
             self._warp.replace_map(surface_map)
         self.map = surface_map
 

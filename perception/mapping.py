@@ -33,6 +33,7 @@ from perception.scanned_map import scanned
 EAGER = 5  # tries for a first map, 0.5 s and more each, before only every tenth frame set is tried
 RELAXED = 10  # frame sets from one try to the next after those
 MOST = 600  # landmarks; those out of view are kept, and cost little
+CROOKED = 6  # refinements, two of them the confirmation, until what looks bent is not the first map itself
 PATIENCE = 2.0  # s: a first map that nobody confirms is dropped, and the next images are tried
 
 
@@ -59,6 +60,7 @@ class Mapping:
         self._tries, self._why = 0, ""  # to make a first map, and why the last one failed
         self._mapped = 0.0  # s, stamp of the first map
         self._caveat = ""
+        self._taken = 0  # refinements of this map
         self._growth: Deferred[Found] = Deferred(executor)
         self._probation: Probation | None = None
         self._wanted: dict[int, int] = {}  # landmarks, by camera
@@ -93,6 +95,7 @@ class Mapping:
         self._refiner.begin(first.map, stamp, start, observations)
         self._growth.forget()
         self._probation = self._last = None
+        self._taken = 0
         matcher.remember(pyramids, observations, fit.inlier, start)
         for camera, images in pyramids.items():
             self._search.learn(camera, images[0], start, first.map)
@@ -110,7 +113,7 @@ class Mapping:
             refined = self._refiner.confirm(fit, observations, estimator.skew.sigma)
             if refined is None:
                 break
-            _take(refined, matcher, estimator)
+            self._take(refined, matcher, estimator)
             estimator.moving(self._refiner.speed(fit))
             pose, points = fit.solution.base_from_surface, refined.map.points
             fits = {c: single_fit(self._lenses.rig, points, observations, c, pose) for c in pyramids}
@@ -141,7 +144,7 @@ class Mapping:
         """Once a frame set, when no pose waits: put what is due into force, ask for what comes next."""
         refined = self._refiner.poll()
         if refined is not None:
-            _take(refined, matcher, estimator)
+            self._take(refined, matcher, estimator)
         found = self._growth.poll()
         if found is not None:
             distance = float(np.linalg.norm(found.look.base_from_surface[:3, 3] - self._cameras))
@@ -236,6 +239,11 @@ class Mapping:
         estimator.moving(self._refiner.speed(fit))
         return estimator.fit(observations, place.base_from_surface)
 
+    def _take(self, refined: Adjusted, matcher: Matcher, estimator: Estimator) -> None:
+        self._taken += 1
+        estimator.replace_map(refined.map, crooked=self._taken <= CROOKED)
+        matcher.take(refined.map, refined.agrees)
+
     def _polygons(self, frames: FrameSet) -> dict[int, Array] | str:
         """Where the surface is in these images, by camera, or why that is not known yet."""
         if not self._roi:
@@ -247,8 +255,3 @@ class Mapping:
         if frames.stamp < start - 0.1:
             return f"waiting for the region of interest at {start:.3f} s"
         return {r.camera: r.polygon for r in self._roi if any(f.camera == r.camera for f in frames.frames)}
-
-
-def _take(refined: Adjusted, matcher: Matcher, estimator: Estimator) -> None:
-    estimator.replace_map(refined.map)
-    matcher.take(refined.map, refined.agrees)
