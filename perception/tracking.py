@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ from perception.relocalise import Relocaliser
 STAGES = ("prepare", "flow", "align", "pose", "search")
 FAR = 4.0, 1.0  # scales of a fit whose start may be pixels off
 NEAR = 0.8  # px, one sigma: three of it are what alignment reaches on the full image
-FULL_SEARCH = 10  # frame sets of an absent surface between searches at full size, off the frame's path
+FULL_SEARCH = 10  # frame sets of an absent surface between searches at full size: a far one needs it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +76,7 @@ class TrackingStep:
         self._mapping = Mapping(self._lenses, self.roi, self._search, executor, scan)
         self._matcher: Matcher | None = None
         self._lost: dict[int, Pyramid] = {}  # images of cameras that are to be searched once the pose is handed over
+        self._found: Array | None = None  # (4, 4), where the last search saw the surface
         self._absent = 0  # frame sets since the surface was last measured
         self._spent = np.zeros(len(STAGES))
         self._lap = 0.0
@@ -149,11 +150,14 @@ class TrackingStep:
     ) -> tuple[SurfacePose, Observations, NDArray[np.int64]]:
         estimator = self._estimator
         assert estimator.map is not None and estimator.pose is not None
-        joint, observations, scales = self._measure(matcher, estimator.pose.predict(stamp), pyramids)
+        expected = estimator.pose.predict(stamp)
+        if self._found is not None:
+            expected, self._found = replace(expected, base_from_surface=self._found), None
+        joint, observations, scales = self._measure(matcher, expected, pyramids)
         fit = estimator.fit(observations, joint, scales)
         self._took("pose")
         if not fit.measured or self._missing(fit, pyramids):
-            fit, observations = self._second_try(matcher, pyramids, fit, observations)
+            fit, observations = self._second_try(matcher, pyramids, fit, observations, expected.base_from_surface)
             self._took("search")
         if estimator.pose.state is TrackState.INITIALISING:
             if len(self._carried(fit, pyramids)) < 2:
@@ -172,7 +176,7 @@ class TrackingStep:
         else:
             pose = estimator.coast(fit)
             self._absent += 1
-            self._lost = pyramids if self._absent % FULL_SEARCH == 0 else {}
+            self._lost = pyramids
         self._took("pose")
         return pose, observations, fit.used
 
@@ -206,15 +210,18 @@ class TrackingStep:
         return [c for c, n in before.items() if n >= 20 and fit.used[c] < 0.3 * n]
 
     def _second_try(
-        self, matcher: Matcher, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations
+        self, matcher: Matcher, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations, expected: Array
     ) -> tuple[Fit, Observations]:
-        """What a missing camera, or all of them, show from a better start: the other cameras' pose, or one by SIFT.
+        """What a missing camera, or all of them, show from a better start: the other cameras' pose, or the motion's.
 
-        The search takes 50-200 ms and holds the pose up, so it is made here only where two agreeing cameras lack.
+        expected: (4, 4), by the motion. The search by SIFT takes 50 ms a camera and would hold the pose up: it is made
+        in `idle`, but for a first map, which is not worth much until two cameras have seen it again.
         """
-        if fit.measured:
-            fit, observations = self._realign(matcher, pyramids, fit, observations, fit.solution.base_from_surface, {})
-        if len(self._carried(fit, pyramids)) < min(2, len(pyramids)):
+        start = fit.solution.base_from_surface if fit.measured else expected
+        fit, observations = self._realign(matcher, pyramids, fit, observations, start, {})
+        assert self._estimator.pose is not None
+        first = self._estimator.pose.state is TrackState.INITIALISING
+        if first and len(self._carried(fit, pyramids)) < min(2, len(pyramids)):
             found = self._search.find(pyramids)
             if found is not None:
                 joint, single = found.base_from_surface, found.single
@@ -245,7 +252,8 @@ class TrackingStep:
         pyramids, self._lost = self._lost, {}
         if not pyramids or self._matcher is None:
             return
-        found = self._search.find(pyramids, half=self._absent % FULL_SEARCH != 0)
+        turn = sorted(pyramids)[self._absent % len(pyramids)]  # one camera a frame set: the next is soon there
+        found = self._search.find({turn: pyramids[turn]}, half=self._absent % FULL_SEARCH != 0)
         if found is None:
             return
         pose = found.base_from_surface
@@ -254,3 +262,4 @@ class TrackingStep:
         fit = self._estimator.fit(again, pose)
         if fit.measured:
             self._matcher.remember(pyramids, again, fit.inlier, fit.solution.base_from_surface)
+            self._found = fit.solution.base_from_surface if self._absent else None
