@@ -26,6 +26,7 @@ class HealthSettings:
     looks: int = 2  # in so many frame sets one after the other
     away: float = 0.08  # s, and also two frame sets, that a camera may miss: drivers drop frames every day
     leave_share: float = 0.3  # of the tracks a camera usually has: with fewer it is missed
+    least_share: float = 0.15  # where no camera has as many, the few may be what covers the rest: no measurement
     enter_share: float = 1.5  # times what is asked of a camera that counts is asked of one that is to count again
 
 
@@ -57,6 +58,10 @@ class CameraHealth:
     def allowed(self, moved: Array) -> Array:
         """How far each camera may stand off, px, one sigma (C,). moved: (C,) px between the cameras' instants."""
         return np.asarray(np.hypot(np.maximum(self._usual, self.settings.shift), moved))
+
+    def hidden(self, used: NDArray[np.int64]) -> bool:
+        """Whether every camera shows so much less than usual that these (C,) tracks prove nothing."""
+        return bool((used < self.settings.least_share * self._tracks)[self._tracks > 0].all() and self._tracks.any())
 
     def update(
         self, stamp: float, used: NDArray[np.int64], least: float, off: Array, allowed: Array, odd: Collection[int]

@@ -237,7 +237,7 @@ class Estimator:
             return f"{agreed} tracks agree, {s.least_tracks} needed"
         if agreed < s.least_share * found:
             return f"only {agreed} of {found} tracks agree"
-        if used.max() < self._camera_least():
+        if used.max() < self._camera_least() or self.health.hidden(used):
             return f"no camera sees more than {used.max()} of {len(self.map or ())} landmarks"
         bent = (
             self._pose is not None and self._pose.state is TrackState.INITIALISING

@@ -11,7 +11,7 @@ from estimation import se3
 from estimation.pose import TrackState
 from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.bench.outage_judge import judge
-from hardware.bench.outage_run import FPS, Watched
+from hardware.bench.outage_run import FPS, Stretch, Watched, make_pictures
 from hardware.bench.outages import figures, kinds_text, shares
 from hardware.simulator.outage import Kind, Outage, Spoiler, draw_outage
 from perception.frames import Image
@@ -161,3 +161,25 @@ def test_draws_are_the_same_again_and_within_their_limits() -> None:
             a, b = (draw_outage(kind, RIG, 1.0, np.random.default_rng(seed)) for _ in range(2))
             assert (a.cameras, a.end, a.strength, a.seed) == (b.cameras, b.end, b.strength, b.seed)
             assert 0 < a.end - a.start <= 5 and 1 <= len(a.cameras) <= 3 and set(a.cameras) <= {0, 1, 2}
+
+
+# -- the tracker
+
+
+@pytest.fixture(scope="module")
+def stretch() -> Stretch:
+    begun = Stretch(make_pictures(3, period=24, size=(480, 270), focal=420.0), 3)
+    assert begun.begin()
+    return begun
+
+
+@pytest.mark.parametrize("kind", list(Kind))
+def test_the_tracker_is_never_lost_in_silence_and_comes_back(stretch: Stretch, kind: Kind) -> None:
+    seen = stretch.outage(kind, longest=0.6)
+    verdict = judge(seen)
+    assert not verdict.silent and not verdict.beyond
+    assert np.isnan(verdict.flagged) or verdict.flagged <= 0.1
+    assert verdict.back <= 0.2 and verdict.after < 0.2
+    if kind.blinds:
+        named = " ".join(seen.reasons)
+        assert any(f"cam_{c}" in named for c in seen.outage.cameras)

@@ -15,7 +15,7 @@ from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.simulator.bodies import Wound, with_wound
 from hardware.simulator.look import Look
-from hardware.simulator.outage import Kind, Outage, Spoiler, draw_outage
+from hardware.simulator.outage import LONGEST, Kind, Outage, Spoiler, draw_outage
 from hardware.simulator.picture_loop import PictureLoop, closed_motion
 from hardware.simulator.scene import Scene, rois
 from hardware.simulator.shape import cylinder
@@ -51,7 +51,7 @@ def make_pictures(
     rig = arc_rig(size=size, focal=focal)
     shape = with_wound(cylinder((80.0, 60.0), float(rng.uniform(50, 120))), WOUND, seed)
     scene = Scene(shape, Look(texel=0.2, wetness=0.3, drape=False), seed=seed)
-    poses = closed_motion(period, REST, rng)
+    poses = closed_motion(period, REST, rng, lively=period / PERIOD)  # at one speed, however short the loop
     return Pictures(
         rig, scene, PictureLoop(scene, rig, poses, seed), PictureLoop(scene, rig, poses @ ELSEWHERE, seed + 1)
     )
@@ -105,12 +105,12 @@ class Stretch:
         self._rows.clear()
         return True
 
-    def outage(self, kind: Kind) -> Watched:
-        """Calm, one outage, and the rest after it."""
+    def outage(self, kind: Kind, longest: float = LONGEST) -> Watched:
+        """Calm, one outage of `longest` s at most, and the rest after it."""
         self._rows.clear()
         for _ in range(round(CALM * FPS)):
             self._frame(None)
-        outage = draw_outage(kind, self._pictures.rig, self._count / FPS, self._rng)
+        outage = draw_outage(kind, self._pictures.rig, self._count / FPS, self._rng, longest)
         hidden = len(outage.cameras) == len(self._pictures.rig) and kind in (Kind.OCCLUDED, Kind.DEAD, Kind.BLACK)
         before, jumps = self._loop, hidden and outage.end - outage.start > 1.0 and self._rng.random() < JUMPS
         while self._count / FPS < outage.end - 1e-9:

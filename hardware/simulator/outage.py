@@ -63,14 +63,14 @@ class Outage:
     seed: int
 
 
-def draw_outage(kind: Kind, rig: Rig, start: float, rng: np.random.Generator) -> Outage:
-    """An outage of a kind that begins at `start`, s. Durations are uniform in their logarithm."""
+def draw_outage(kind: Kind, rig: Rig, start: float, rng: np.random.Generator, longest: float = LONGEST) -> Outage:
+    """An outage of a kind that begins at `start`, s, and lasts `longest` s at most; uniform in the logarithm."""
     low, high = {
         Kind.OCCLUDED: (SHORTEST, LONGEST),
         Kind.HAND: (SHORTEST + 2 * SLIDE, LONGEST),
         Kind.FLASH: FLASH,
     }.get(kind, (SHORTEST, 2.0))
-    length = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    length = min(float(np.exp(rng.uniform(np.log(low), np.log(high)))), longest)
     most = {Kind.SWAPPED: (2,), Kind.BUMPED: (1,)}.get(kind, (1, 1, 2, 3))
     count = min(int(rng.choice(most)), len(rig))
     cameras = tuple(sorted(rng.choice(len(rig), count, replace=False).tolist()))
