@@ -16,9 +16,9 @@ from estimation import se3
 from estimation.camera_health import CameraHealth, HealthSettings
 from estimation.motion_detector import MotionDetector
 from estimation.observations import Observations
-from estimation.odd_camera import odd_ones, solve_with, standing_off
+from estimation.odd_camera import disorder, odd_ones, solve_with, standing_off
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import PoseFit, own_residuals, project
+from estimation.pose_solver import PoseFit, project
 from estimation.predictor import Predictor
 from estimation.rig import Rig
 from estimation.se3 import Array
@@ -26,8 +26,6 @@ from estimation.smoother import Measured, Smoother
 from estimation.state_machine import Measurement, StateMachine, StateSettings
 from estimation.surface_map import SurfaceMap
 from estimation.warp_filter import WarpFilter
-
-ORDERLY = 1.5  # px of residual, at which nobody asks how much of it a camera's own motion explains
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,9 +193,9 @@ class Estimator:
         inlier = solution.weights > 0.2
         used = np.bincount(observations.camera[inlier], minlength=count)
         covariance = self._covariance(observations, solution, sigma)
-        disorder = _disorder(observations, solution, inlier)
+        among = disorder(observations, solution, inlier)
         found = int((~np.isin(observations.camera, list(odd))).sum())
-        reason = self._judge(found, used, covariance, disorder)
+        reason = self._judge(found, used, covariance, among)
         off = standing_off(observations, solution, count, self._camera_least())
         return Fit(observations.stamp, solution, covariance, inlier, used, reason, off, allowed, odd)
 
@@ -231,7 +229,7 @@ class Estimator:
         velocity = project(self.rig, observations.camera, start, points)[2] @ self._pose.twist
         return self.skew.sigma * float(np.median(np.linalg.norm(velocity, axis=1)))
 
-    def _judge(self, found: int, used: NDArray[np.int64], covariance: Array, disorder: float) -> str:
+    def _judge(self, found: int, used: NDArray[np.int64], covariance: Array, among: float) -> str:
         s, agreed = self.settings, int(used.sum())
         if agreed < s.least_tracks:
             return f"{agreed} tracks agree, {s.least_tracks} needed"
@@ -242,8 +240,8 @@ class Estimator:
         bent = (
             self._pose is not None and self._pose.state is TrackState.INITIALISING
         )  # first maps of a moving surface are
-        if disorder > s.disorder * (3.0 if bent else 1.0):
-            return f"the tracks of a camera disagree among themselves by {disorder:.1f} px"
+        if among > s.disorder * (3.0 if bent else 1.0):
+            return f"the tracks of a camera disagree among themselves by {among:.1f} px"
         spread = _position_sigma(covariance)
         if not spread <= s.sigma_measured:
             return f"the pose is uncertain to {spread:.1f} mm"
@@ -378,15 +376,6 @@ class Estimator:
         elif self._warp is not None:
             self._warp.replace_map(surface_map)
         self.map = surface_map
-
-
-def _disorder(observations: Observations, solution: PoseFit, inlier: NDArray[np.bool_]) -> float:
-    """Median residual, px, of the inliers when each camera may move for itself: what no pose of a surface explains."""
-    whole = np.linalg.norm(solution.residuals[inlier], axis=1)
-    if not len(whole) or np.median(whole) < ORDERLY:
-        return 0.0  # what is left of so little need not be asked for
-    left = own_residuals(observations.camera, solution, inlier.astype(float))[inlier]
-    return float(np.median(np.linalg.norm(left, axis=1)))
 
 
 def _position_sigma(covariance: Array) -> float:

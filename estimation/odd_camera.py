@@ -11,15 +11,17 @@ from collections.abc import Collection
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
-from estimation.pose_solver import PoseFit, project, solve_pose
+from estimation.pose_solver import PoseFit, own_residuals, project, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
 
 MOST = 2  # cameras that may be wrong at once: exchanged cables
+ORDERLY = 1.5  # px of residual, at which nobody asks how much of it a camera's own motion explains
 RAYLEIGH = 1.18  # median length of a vector whose two entries are normal, in their sigmas
 SURER = 3.0  # times likelier, in sigmas of the motion, than the next: which of two that disagree is then told
 
@@ -98,3 +100,12 @@ def _surprise(fit: PoseFit, expected: SurfacePose) -> float:
     damped = fit.information + 1e-9 * np.trace(fit.information) * np.eye(6)
     spread = expected.covariance + np.linalg.inv(damped)
     return max(1.0, float(np.sqrt(off @ np.linalg.solve(spread, off) / 6)))
+
+
+def disorder(observations: Observations, solution: PoseFit, inlier: NDArray[np.bool_]) -> float:
+    """Median residual, px, of the inliers when each camera may move for itself: what no pose of a surface explains."""
+    whole = np.linalg.norm(solution.residuals[inlier], axis=1)
+    if not len(whole) or np.median(whole) < ORDERLY:
+        return 0.0  # what is left of so little need not be asked for
+    left = own_residuals(observations.camera, solution, inlier.astype(float))[inlier]
+    return float(np.median(np.linalg.norm(left, axis=1)))
