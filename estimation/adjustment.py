@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.camera_errors import Delays
 from estimation.observations import Observations
 from estimation.pose_solver import PoseFit, project, solve_pose
 from estimation.rig import Rig
@@ -66,11 +67,12 @@ class Adjusted:
 
 
 def adjust(
-    rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], skew: float, anchors: Anchors | None = None
+    rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], delays: Delays, anchors: Anchors | None = None
 ) -> Adjusted | None:
     """The map that fits all key frames best, or None if they do not determine one.
 
-    skew: s, one standard deviation of the cameras' instants. anchors: of the map's first rows, where there is a scan.
+    delays: how much later than stamped the cameras expose, as is known now. anchors: of the map's first rows, where
+    there is a scan.
 
     Base and surface swap roles (X = surface_from_base), so that GTSAM's stock projection factor with
     body_P_sensor = base_from_camera is the measurement.
@@ -81,7 +83,7 @@ def adjust(
     rows = np.nonzero(sightings >= LEAST_SIGHTINGS)[0]
     if len(rows) < 12 or len(keyframes) < 2:
         return None
-    graph, values = _graph(rig, surface_map, keyframes, set(rows.tolist()), skew, anchors)
+    graph, values = _graph(rig, surface_map, keyframes, set(rows.tolist()), delays, anchors)
     try:
         solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
         covariance = _joint_covariance(graph.linearize(solved), rows)
@@ -102,7 +104,7 @@ def adjust(
     if agrees.sum() < 12:
         return None
     refined = np.stack([_fit(rig, points, frame) for frame in keyframes])
-    points = se3.transform_points(frame_change(keyframes, refined, skew), points)
+    points = se3.transform_points(frame_change(keyframes, refined, delays.sigma), points)
     normals = surface_map.normals.copy()
     normals[agrees] = local_normals(points[agrees], surface_map.normals[agrees].mean(0))
     return Adjusted(SurfaceMap(points, normals, whole), agrees)
@@ -175,7 +177,7 @@ def _graph(
     surface_map: SurfaceMap,
     keyframes: list[KeyFrame],
     rows: set[int],
-    skew: float,
+    delays: Delays,
     anchors: Anchors | None,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -188,14 +190,15 @@ def _graph(
         values.insert(body, start)
         # T exp(d) has the inverse X exp(-Ad(T) d): the same drift, seen from the base
         carry = se3.adjoint(frame.base_from_surface)
-        drift = frame.twist * skew
+        drift = frame.twist * delays.sigma
         along = np.outer(drift, drift) + np.diag((0.3 * np.abs(drift) + LEAST_DRIFT) ** 2)
         loose = gtsam.noiseModel.Gaussian.Covariance(carry @ along @ carry.T)
         seen = frame.observations
         for c in np.unique(seen.camera):
             own = single_fit(rig, surface_map.points, seen, int(c), frame.base_from_surface).base_from_surface
             values.insert(_camera_key(int(c), i), gtsam.Pose3(se3.inverse(own)))
-            graph.add(gtsam.BetweenFactorPose3(body, _camera_key(int(c), i), gtsam.Pose3(), loose))
+            late = se3.exp(-carry @ frame.twist * delays.mean[c])
+            graph.add(gtsam.BetweenFactorPose3(body, _camera_key(int(c), i), gtsam.Pose3(late), loose))
         for c, row, pixel, sigma in zip(seen.camera, seen.track, seen.pixels, seen.sigma, strict=True):
             if int(row) in rows:
                 noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(2, float(sigma)))

@@ -1,8 +1,9 @@
 """From observations to surface poses: robust fit to the map, honest covariance, sliding window, state.
 
-The covariance of one fit has three parts: the tracks' noise, the map's joint error, and the cameras' capture instants.
-The last is a common shift of all tracks of one camera along their image velocity, so it does not average out over
-tracks; its size (`skew`) is learned from how far the cameras disagree while the surface moves.
+The covariance of one fit has two parts. What is new in every frame set, the tracks' noise and what the tracks of a
+camera share (late exposures, shifted images), goes into the window and is averaged there. What stays from frame to
+frame, the map's joint error and the calibration's, is not averaged by anything and is added to what the window says;
+so is the error of the first pose that is given out, since the path is placed in it.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.camera_errors import CameraErrors
 from estimation.camera_health import CameraHealth, HealthSettings
 from estimation.motion_detector import MotionDetector
 from estimation.observations import Observations
 from estimation.odd_camera import disorder, odd_ones, solve_with, standing_off
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import PoseFit, project
+from estimation.pose_solver import EFFICIENCY, PoseFit, Shared, project
 from estimation.predictor import Predictor
 from estimation.rig import Rig
 from estimation.se3 import Array
@@ -47,13 +49,20 @@ class EstimatorSettings:
 class Fit:
     """A fit to one frame set, judged.
 
-    used: (C,) inliers per camera. reason: why it is no measurement, or ''. off: (C,) px by which each camera stands off
-    the pose, nan where it does not see the surface; allowed: (C,) px, one sigma. odd: cameras that were left out.
+    covariance: (6, 6), of what is new in this frame set; lasting: (6, 6), of what the map adds to it. twist: (6,) the
+    velocity by which the cameras' instants were brought together, twist_doubt: (6,) its variance. bias: (6, 2C), what
+    shifts of the cameras' images do to the pose. used: (C,) inliers per camera. reason: why it is no measurement, or
+    ''. off: (C,) px by which each camera stands off the pose, nan where it does not see the surface; allowed: (C,) px,
+    one sigma. odd: cameras that were left out.
     """
 
     stamp: float
     solution: PoseFit
     covariance: Array
+    lasting: Array
+    twist: Array
+    twist_doubt: Array
+    bias: Array
     inlier: NDArray[np.bool_]
     used: NDArray[np.int64]
     reason: str
@@ -67,76 +76,6 @@ class Fit:
         return not self.reason
 
 
-class Skew:
-    """How far apart the cameras' capture instants lie, s, learned from their disagreement along the motion.
-
-    One delay per camera and frame set is solved for beside the pose, and taken apart into independent combinations: a
-    delay d known to a variance e is a draw from sigma^2 + e, so sigma^2 is the mean of d^2 - e under the weights
-    (sigma^2 + e)^-2. That is Fisher scoring; expectation maximisation was measured to need ten times the frames where
-    single delays are uncertain. Lens and map shift whole cameras too: how much is learned across the motion, where a
-    delay shows nothing. Frames in which nothing moves teach nothing of delays, and nothing is forgotten over them.
-    """
-
-    PRIOR, TRUST = 0.02, 3.0  # s, webcams stand 10 to 60 ms apart; delays that this belief is worth
-    RECENT = 100  # delays, known better than sigma, over which the rest is forgotten
-    CLEAREST = 2e-3  # s: what sigma is never known better than, so that a clock that begins to slip is noticed
-    LEAST, MOST = 5e-4, 0.1  # s: no camera's stamp is better; a longer delay is a wrong pose
-    SHARED, LEAST_SHARED = 0.2, 0.02  # px: what lens and map may shift all tracks of a camera by, at first and at least
-    SEEN, SETTLE = 3.0, 30.0  # of such a shift the pose takes most up; frame sets until it is known
-
-    def __init__(self) -> None:
-        self._weight = self.TRUST  # of all delays taken, one known exactly against a sigma of PRIOR weighing 1
-        self._shared = self.SHARED**2  # px^2
-        self._sum = self.TRUST * (1 - (2 / self.TRUST) ** 0.5) * self.PRIOR**2  # weighted, of d^2 - e, s^2
-
-    @property
-    def sigma(self) -> float:
-        """One standard deviation, s: the mean square and one standard error of it.
-
-        A mean below zero says that delays are known better than is claimed, and by how much it can be trusted.
-        """
-        square = abs(self._sum / self._weight) + (2 / self._weight) ** 0.5 * self.PRIOR**2
-        return float(np.sqrt(np.clip(square, self.LEAST**2, self.MOST**2)))
-
-    def learn(self, camera: NDArray[np.int64], residual: Array, jacobian: Array, twist: Array, sigma: Array) -> None:
-        """Take a joint fit's inliers: residuals (N, 2) px, jacobians (N, 2, 6), twist (6,) per s, sigma (N,) px."""
-        cameras, index, count = np.unique(camera, return_inverse=True, return_counts=True)
-        if len(cameras) < 2 or count.min() < 6:
-            return
-        velocity = jacobian @ twist
-        self._settle(index, count, residual, velocity)
-        weight = 1 / (sigma**2 + count[index] * max(self._shared, self.LEAST_SHARED**2))
-        information = np.einsum("nki,n,nkj->ij", jacobian, weight, jacobian)
-        pull, own, right = np.zeros((len(cameras), 6)), np.zeros(len(cameras)), np.zeros(len(cameras))
-        np.add.at(pull, index, np.einsum("nki,n,nk->ni", jacobian, weight, velocity))
-        np.add.at(own, index, weight * (velocity**2).sum(1))
-        np.add.at(right, index, weight * (velocity * residual).sum(1))
-        gradient = np.einsum("nki,n,nk->i", jacobian, weight, residual)
-        solved = np.linalg.solve(information + 1e-9 * np.trace(information) * np.eye(6), np.c_[pull.T, gradient])
-        told, apart = np.linalg.eigh(np.diag(own) - pull @ solved[:, :-1])
-        right = apart.T @ (right - pull @ solved[:, -1])
-        for known, product in zip(told, right, strict=True):
-            if known > 1 / self.MOST**2:
-                self._take(min(abs(product / known), self.MOST), 1 / known)
-
-    def _settle(self, index: NDArray[np.int64], count: NDArray[np.int64], residual: Array, velocity: Array) -> None:
-        """Follow the shift of whole cameras by its part across the motion."""
-        shift, moved = np.zeros((len(count), 2)), np.zeros((len(count), 2))
-        np.add.at(shift, index, residual / count[index, None])
-        np.add.at(moved, index, velocity)
-        across = (shift[:, 0] * moved[:, 1] - shift[:, 1] * moved[:, 0]) / np.maximum(np.hypot(*moved.T), 1e-12)
-        self._shared += (self.SEEN * float((across**2).mean()) - self._shared) / self.SETTLE
-
-    def _take(self, delay: float, variance: float) -> None:
-        """One delay, s, known to a variance, s^2."""
-        square = self.sigma**2
-        share = (self.PRIOR**2 / (square + variance)) ** 2
-        most = 2 * (self.PRIOR / self.CLEAREST) ** 4
-        keep = min(1 - (square / (square + variance)) ** 2 / self.RECENT, most / (self._weight + share))
-        self._weight = keep * self._weight + share
-        self._sum = keep * self._sum + share * (delay**2 - variance)
-
-
 class Estimator:
     """Owns the map, the window and the state of one surface."""
 
@@ -144,7 +83,7 @@ class Estimator:
         self.rig = rig
         self.settings = settings or EstimatorSettings()
         self.map: SurfaceMap | None = None
-        self.skew = Skew()
+        self.cameras = CameraErrors(len(rig))
         self.health = CameraHealth([camera.name for camera in rig.cameras], self.settings.health)
         self._states = StateMachine(self.settings.states)
         self._smoother = Smoother()
@@ -155,11 +94,19 @@ class Estimator:
         self._measured: SurfacePose | None = None  # the last one that was
         self._caveat = ""
         self._view = 0  # landmarks of the first view: what is added later is not all seen at once
+        self._accepted = 0  # poses measured since the first map
+        self._first: Array | None = None  # (6, 6) covariance of the first pose given out, in which the path is placed
+        self._first_bias: Array | None = None
 
     @property
     def pose(self) -> SurfacePose | None:
         """The last pose given, or None before there is a map."""
         return self._pose
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether a frame set after the one of the first map has been measured."""
+        return self._accepted > 0
 
     def predict(self, stamp: float) -> Array:
         """Where the surface is expected at `stamp`: (4, 4). Only after the first map."""
@@ -176,58 +123,84 @@ class Estimator:
         observations.track counts rows of the map.
         """
         assert self.map is not None
-        count, settings = len(self.rig), self.settings
-        used = np.zeros(count, np.int64)
-        off = np.full(count, np.nan)
-        if len(observations) < settings.least_tracks:
-            nothing = PoseFit(start, np.zeros((6, 6)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 6)), 1.0)
-            reason = f"{len(observations)} tracks found, {settings.least_tracks} needed"
-            none, odd = np.zeros(len(observations), bool), self.health.left_out
-            return Fit(observations.stamp, nothing, np.full((6, 6), np.inf), none, used, reason, off, off, odd)
+        if len(observations) < self.settings.least_tracks:
+            return self._no_fit(observations, start)
         warped = self.map.points if self._warp is None else self._warp.points(self.map)
-        points = warped[observations.track]
-        smear = self._smear(observations, points, start)
-        sigma = np.hypot(np.maximum(observations.sigma, settings.floor_sigma), smear)
-        allowed = self.health.allowed(np.full(count, smear))
-        solution, odd = self._solve(observations, points, sigma, start, scales, allowed)
+        points, (twist, doubt) = warped[observations.track], self._twist(observations.stamp, start)
+        seen = self._together(observations, points, start, twist)
+        allowed = self.health.allowed(np.full(len(self.rig), self._smear(seen, points, start, twist)))
+        solution, odd = self._solve(seen, points, start, scales, self.cameras.shared(twist), allowed)
         inlier = solution.weights > 0.2
-        used = np.bincount(observations.camera[inlier], minlength=count)
-        covariance = self._covariance(observations, solution, sigma)
-        among = disorder(observations, solution, inlier)
-        found = int((~np.isin(observations.camera, list(odd))).sum())
-        reason = self._judge(found, used, covariance, among)
-        off = standing_off(observations, solution, count, self._camera_least())
-        return Fit(observations.stamp, solution, covariance, inlier, used, reason, off, allowed, odd)
+        used = np.bincount(seen.camera[inlier], minlength=len(self.rig))
+        noise, lasting, bias = self._covariance(seen, solution)
+        found = int((~np.isin(seen.camera, list(odd))).sum())
+        reason = self._judge(found, used, noise + lasting, disorder(seen, solution, inlier))
+        off = standing_off(seen, solution, len(self.rig), self._camera_least())
+        knowledge = solution, noise, lasting, twist, doubt, bias
+        return Fit(seen.stamp, *knowledge, inlier, used, reason, off, allowed, odd)
+
+    def _no_fit(self, observations: Observations, start: Array) -> Fit:
+        count, cameras = len(observations), len(self.rig)
+        nothing = PoseFit(start, np.zeros((6, 6)), np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2, 6)), 1.0)
+        unknown, off = np.full((6, 6), np.inf), np.full(cameras, np.nan)
+        zeros = np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros((6, 2 * cameras))
+        none, used = np.zeros(count, bool), np.zeros(cameras, np.int64)
+        reason = f"{count} tracks found, {self.settings.least_tracks} needed"
+        odd = self.health.left_out
+        return Fit(observations.stamp, nothing, unknown, *zeros, none, used, reason, off, off, odd)
 
     def _solve(
         self,
-        observations: Observations,
+        seen: Observations,
         points: Array,
-        sigma: Array,
         start: Array,
         scales: tuple[float, ...],
+        shared: Shared,
         allowed: Array,
     ) -> tuple[PoseFit, frozenset[int]]:
         """The pose of all cameras that agree with each other, and those that are left out of it."""
         odd, least = self.health.left_out, self._camera_least()
-        solution = solve_with(self.rig, observations, points, sigma, start, scales, odd)
-        if self._pose is None or self._pose.state is TrackState.INITIALISING:  # a bent first map sets cameras apart
+        solution = solve_with(self.rig, seen, points, start, scales, odd, shared)
+        if self._pose is None or not self.confirmed:  # a bent first map sets cameras apart
             return solution, odd
         most = self.settings.health.out * allowed
-        off = standing_off(observations, solution, len(self.rig), least)
+        off = standing_off(seen, solution, len(self.rig), least)
         if any(off[c] > most[c] for c in range(len(self.rig)) if c not in odd):
-            expected = self._pose.predict(observations.stamp)
-            found = odd_ones(self.rig, observations, points, sigma, odd, most, least, expected)
+            expected = self._pose.predict(seen.stamp)
+            found = odd_ones(self.rig, seen, points, odd, most, least, expected, shared)
             if found is not None:
                 return found[1], found[0]
         return solution, odd
 
-    def _smear(self, observations: Observations, points: Array, start: Array) -> float:
-        """How far, px, the surface moves between the cameras' instants: beside that, sharper tracks count no more."""
-        if self._pose is None or not self._pose.twist.any():
-            return 0.0
-        velocity = project(self.rig, observations.camera, start, points)[2] @ self._pose.twist
-        return self.skew.sigma * float(np.median(np.linalg.norm(velocity, axis=1)))
+    def _twist(self, stamp: float, start: Array) -> tuple[Array, Array]:
+        """Velocity (6,) at `stamp` and its variance (6,): the window's and the chord's to `start`, as each is known."""
+        last = self._pose
+        if last is None or stamp <= last.stamp:
+            return np.zeros(6), np.zeros(6)
+        dt = stamp - last.stamp
+        chord = se3.log(se3.inverse(last.base_from_surface) @ start) / dt
+        ahead = np.diag(last.twist_covariance) + last.acceleration_psd * dt
+        behind = 2 * np.diag(last.covariance) / dt**2 + last.acceleration_psd * dt / 3
+        trust = np.repeat([group.mean() for group in (behind / (ahead + behind + 1e-30)).reshape(2, 3)], 3)
+        return trust * last.twist + (1 - trust) * chord, trust**2 * ahead + (1 - trust) ** 2 * behind
+
+    def _together(self, observations: Observations, points: Array, start: Array, twist: Array) -> Observations:
+        """The observations as cameras without offsets would have made them, with sigmas that can be believed."""
+        sigma, pixels = np.maximum(observations.sigma, self.settings.floor_sigma), observations.pixels
+        if twist.any():
+            camera, late = observations.camera, self.as_exposed(start, twist)
+            moved = project(self.rig, camera, late, points)[0] - project(self.rig, camera, start, points)[0]
+            pixels = pixels - moved
+        return replace(observations, pixels=pixels, sigma=sigma)
+
+    def as_exposed(self, base_from_surface: Array, twist: Array) -> Array:
+        """Where the surface is (C, 4, 4) when each camera exposes, from its pose (4, 4) and twist (6,)."""
+        return np.asarray(base_from_surface @ se3.exp(twist * self.cameras.offset[:, None]))
+
+    def _smear(self, seen: Observations, points: Array, start: Array, twist: Array) -> float:
+        """How far, px, the surface moves in the time by which a camera's exposure is unknown."""
+        velocity = project(self.rig, seen.camera, start, points)[2] @ twist
+        return self.cameras.delays.sigma * float(np.median(np.linalg.norm(velocity, axis=1)))
 
     def _judge(self, found: int, used: NDArray[np.int64], covariance: Array, among: float) -> str:
         s, agreed = self.settings, int(used.sum())
@@ -237,9 +210,7 @@ class Estimator:
             return f"only {agreed} of {found} tracks agree"
         if used.max() < self._camera_least() or self.health.hidden(used):
             return f"no camera sees more than {used.max()} of {len(self.map or ())} landmarks"
-        bent = (
-            self._pose is not None and self._pose.state is TrackState.INITIALISING
-        )  # first maps of a moving surface are
+        bent = not self.confirmed  # first maps of a moving surface are
         if among > s.disorder * (3.0 if bent else 1.0):
             return f"the tracks of a camera disagree among themselves by {among:.1f} px"
         spread = _position_sigma(covariance)
@@ -247,27 +218,22 @@ class Estimator:
             return f"the pose is uncertain to {spread:.1f} mm"
         return ""
 
-    def _covariance(self, observations: Observations, solution: PoseFit, sigma: Array) -> Array:
-        assert self.map is not None
+    def _covariance(self, seen: Observations, solution: PoseFit) -> tuple[Array, Array, Array]:
+        """Of what is new (6, 6), of what map and deformation add (6, 6), and the effect (6, 2C) of shifted images."""
+        assert self.map is not None and solution.shared is not None
         information = solution.information + 1e-9 * np.eye(6) * np.trace(solution.information)
         noise = np.linalg.pinv(information, hermitian=True)
-        weight = solution.weights / (sigma * solution.scale) ** 2
-        weighted = solution.jacobians * weight[:, None, None]
-        by_point = np.einsum("nki,nkj->nij", weighted, solution.jacobians[:, :, 3:])  # (N, 6, 3)
+        weight = EFFICIENCY * solution.weights / (seen.sigma * solution.scale) ** 2
+        weighted, by_point = solution.shared.slopes * weight[:, None, None], solution.jacobians[:, :, 3:]
+        pulled = noise @ weighted.transpose(0, 2, 1)  # (N, 6, 2)
         spread = np.zeros((len(self.map), 6, 3))
-        np.add.at(spread, observations.track, by_point)
+        np.add.at(spread, seen.track, pulled @ by_point)
         shift = spread.transpose(1, 0, 2).reshape(6, -1)
-        total = noise + noise @ (shift @ self.map.covariance @ shift.T) @ noise
-        twist = self._pose.twist if self._pose is not None else np.zeros(6)
-        velocity = solution.jacobians @ twist  # (N, 2)
-        pull = np.zeros((len(self.rig), 6))
-        np.add.at(pull, observations.camera, np.einsum("nki,nk->ni", weighted, velocity))
-        late = noise @ pull.T
-        total = total + self.skew.sigma**2 * late @ late.T
+        lasting = shift @ self.map.covariance @ shift.T
         if self._warp is not None:
-            bent = self._warp.pull(observations.track, weighted, solution.jacobians[:, :, 3:])
-            total = total + noise @ bent @ noise
-        return np.asarray((total + total.T) / 2)
+            lasting = lasting + noise @ self._warp.pull(seen.track, weighted, by_point) @ noise
+        bias = np.stack([pulled[seen.camera == c].sum(0) for c in range(len(self.rig))], 1)  # (6, C, 2)
+        return noise, lasting, bias.reshape(6, -1)
 
     def begin(self, stamp: float, base_from_surface: Array, surface_map: SurfaceMap, caveat: str = "") -> SurfacePose:
         """Take the first map, which defines the surface frame at `stamp`.
@@ -275,12 +241,13 @@ class Estimator:
         caveat: what is not known of that frame's place on the tissue; as long as it stands no pose is TRACKING.
         """
         self.map, self._caveat, self._view = surface_map, caveat, len(surface_map)
+        self._accepted, self._first, self._first_bias = 0, None, None
         self._smoother.reset()
         self._detector, self._warp = MotionDetector(surface_map.points.mean(0)), WarpFilter(surface_map)
         self.health.begin()
         self._predictor = Predictor(surface_map.points)
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
-        return self._enter(stamp, base_from_surface, covariance, *self._states.begin(stamp))
+        return self._enter(stamp, base_from_surface, covariance, np.zeros((6, 6)), *self._states.begin(stamp))
 
     def carriers(self, fit: Fit) -> NDArray[np.int64]:
         """The cameras that carry a fit, by number."""
@@ -303,44 +270,54 @@ class Estimator:
 
     def accept(self, fit: Fit, observations: Observations) -> SurfacePose:
         """Take a measured fit into the window and give the pose."""
-        assert fit.measured
+        assert fit.measured and fit.solution.shared is not None
         if self._pose is not None:
-            moved = se3.log(se3.inverse(self._pose.base_from_surface) @ fit.solution.base_from_surface)
-            twist, keep = moved / (fit.stamp - self._pose.stamp), fit.inlier
-            sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
-            self.skew.learn(
-                observations.camera[keep],
-                fit.solution.residuals[keep],
-                fit.solution.jacobians[keep],
-                twist,
-                sigma[keep],
-            )
+            self.cameras.learn(fit.solution.shared, fit.stamp - self._pose.stamp, _clear(fit))
             if self._warp is not None:
-                self._warp.learn(observations, fit.solution, sigma, twist, self.skew.sigma)
-        noise = np.asarray(np.linalg.pinv(fit.solution.information, hermitian=True))  # map and clocks: the same at rest
-        self._detector(fit.stamp, fit.solution.base_from_surface, noise)
+                sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
+                self._warp.learn(observations, fit.solution, sigma, fit.twist, self.cameras.delays.sigma)
+        self._accepted += 1
+        self._detector(fit.stamp, fit.solution.base_from_surface, fit.covariance)
         self._heed(fit)
+        lasting = fit.lasting + self._calibration(fit)
         seen = Measurement(
             tuple(self.rig.cameras[c].name for c in self.carriers(fit)),
             int(fit.used.sum()),
-            _position_sigma(fit.covariance),
+            _position_sigma(fit.covariance + lasting),
             self.health.trouble(fit.stamp),
             self._caveat,
             0.0 if self._warp is None or self._warp.warp is None else self._warp.warp.deformation,
         )
         state, reason = self._states.measured(fit.stamp, seen)
-        return self._enter(fit.stamp, fit.solution.base_from_surface, fit.covariance, state, reason)
+        return self._enter(fit.stamp, fit.solution.base_from_surface, fit.covariance, lasting, state, reason)
+
+    def _calibration(self, fit: Fit) -> Array:
+        """Covariance (6, 6) of what imperfect lenses do to the pose.
+
+        The map was made through the same lenses, so at the start they do nothing: what counts is the change since then.
+        """
+        if self._first_bias is None:
+            self._first_bias = fit.bias
+        change = fit.bias - self._first_bias
+        size = 2 * np.mean(self.cameras.shift**2)  # px^2: of six shifts of three cameras the pose takes up about half
+        return np.asarray(size * change @ change.T)
 
     def _heed(self, fit: Fit) -> None:
         used = fit.used if fit.measured else np.zeros_like(fit.used)
         self.health.update(fit.stamp, used, self._camera_least(), fit.off, fit.allowed, fit.odd)
 
-    def _enter(self, stamp: float, pose: Array, covariance: Array, state: TrackState, reason: str) -> SurfacePose:
+    def _enter(
+        self, stamp: float, pose: Array, covariance: Array, lasting: Array, state: TrackState, reason: str
+    ) -> SurfacePose:
         window = self._smoother.add(Measured(stamp, pose, covariance))
+        if self._first is not None:
+            lasting = lasting + self._first
+        elif state.measured:
+            self._first = window.covariance
         entered = SurfacePose(
             stamp,
             window.pose,
-            window.covariance,
+            window.covariance + (lasting + lasting.T) / 2,
             window.twist,
             state,
             window.twist_covariance,
@@ -376,6 +353,14 @@ class Estimator:
         elif self._warp is not None:
             self._warp.replace_map(surface_map)
         self.map = surface_map
+
+
+def _clear(fit: Fit) -> float:
+    """The part, 0 to 1, of a fit's squared velocity in the images that is not the velocity's own noise."""
+    weighted = fit.solution.jacobians * np.sqrt(fit.solution.weights)[:, None, None]
+    noise = float((weighted**2).sum((0, 1)) @ fit.twist_doubt)
+    whole = float(((weighted @ fit.twist) ** 2).sum())
+    return max(0.0, 1 - noise / whole) if whole > 0 else 0.0
 
 
 def _position_sigma(covariance: Array) -> float:

@@ -8,6 +8,7 @@ motion until now, is the odd one.
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
-from estimation.pose_solver import PoseFit, own_residuals, project, solve_pose
+from estimation.pose_solver import PoseFit, Shared, own_residuals, project, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
 
@@ -30,21 +31,25 @@ def solve_with(
     rig: Rig,
     observations: Observations,
     points: Array,
-    sigma: Array,
     start: Array,
     scales: tuple[float, ...],
     left_out: Collection[int],
+    shared: Shared,
 ) -> PoseFit:
     """The pose of all cameras but `left_out`, whose tracks have residuals too, and no weight; points (N, 3) mm."""
-    camera, pixels = observations.camera, observations.pixels
+    o = observations
     if not left_out:
-        return solve_pose(rig, camera, points, pixels, sigma, start, scales=scales)
-    kept = ~np.isin(camera, list(left_out))
-    fit = solve_pose(rig, camera[kept], points[kept], pixels[kept], sigma[kept], start, scales=scales)
-    predicted, _, jacobians = project(rig, camera, fit.base_from_surface, points)
-    weights = np.zeros(len(camera))
-    weights[kept] = fit.weights
-    return PoseFit(fit.base_from_surface, fit.information, predicted - pixels, weights, jacobians, fit.scale)
+        return solve_pose(rig, o.camera, points, o.pixels, o.sigma, start, scales=scales, shared=shared)
+    kept = ~np.isin(o.camera, list(left_out))
+    fit = solve_pose(
+        rig, o.camera[kept], points[kept], o.pixels[kept], o.sigma[kept], start, scales=scales, shared=shared
+    )
+    assert fit.shared is not None
+    predicted, _, jacobians = project(rig, o.camera, fit.base_from_surface, points)
+    residuals, weights, slopes = predicted - o.pixels, np.zeros(len(o)), jacobians.copy()
+    residuals[kept], weights[kept], slopes[kept] = fit.residuals, fit.weights, fit.shared.slopes
+    whole = replace(fit.shared, slopes=slopes)
+    return PoseFit(fit.base_from_surface, fit.information, residuals, weights, jacobians, fit.scale, whole)
 
 
 def standing_off(observations: Observations, fit: PoseFit, count: int, least: float) -> Array:
@@ -66,11 +71,11 @@ def odd_ones(
     rig: Rig,
     observations: Observations,
     points: Array,
-    sigma: Array,
     left_out: Collection[int],
     allowed: Array,
     least: float,
     expected: SurfacePose,
+    shared: Shared,
 ) -> tuple[frozenset[int], PoseFit] | None:
     """The cameras, one or else two, without which the others agree, and the fit without them; None where unclear.
 
@@ -82,7 +87,7 @@ def odd_ones(
         found: list[tuple[float, frozenset[int], PoseFit]] = []
         for odd in combinations(kept, size):
             without = frozenset(left_out) | set(odd)
-            fit = solve_with(rig, observations, points, sigma, expected.base_from_surface, (4.0, 1.0), without)
+            fit = solve_with(rig, observations, points, expected.base_from_surface, (4.0, 1.0), without, shared)
             apart = standing_off(observations, fit, len(rig), least) / allowed
             others = [apart[c] for c in kept if c not in odd and np.isfinite(apart[c])]
             if others and max(others) <= 1.0 and all(apart[c] > 1.0 for c in odd):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.adjustment import Adjusted, Anchors, KeyFrame, adjust, single_fit
+from estimation.camera_errors import Delays
 from estimation.deferred import Deferred
 from estimation.estimator import Fit
 from estimation.observations import Observations
@@ -41,7 +42,8 @@ class Refiner:
         self._anchors: Anchors | None = None
         self._ask = self._kept = False
         self._offered: tuple[Fit, Observations, Array] | None = None
-        self._skew = self._skew_used = np.inf  # s, of the cameras' instants: as known now, and at the last adjustment
+        self._delays = Delays(np.zeros(len(rig)), np.zeros((len(rig),) * 2))  # as known now
+        self._doubt = np.inf  # s, of them at the last adjustment
 
     def begin(
         self, surface_map: SurfaceMap, stamp: float, base_from_surface: Array, observations: Observations
@@ -58,7 +60,7 @@ class Refiner:
         moved = se3.log(se3.inverse(self._frames[0].base_from_surface) @ fit.solution.base_from_surface)
         return np.asarray(moved / (fit.stamp - self._stamps[0]))
 
-    def confirm(self, fit: Fit, observations: Observations, skew: float) -> Adjusted | None:
+    def confirm(self, fit: Fit, observations: Observations, delays: Delays) -> Adjusted | None:
         """The second frame set: what it shows of the motion corrects the first map, on the spot.
 
         Until then a surface that moved between the cameras' instants looks nearer or farther than it is.
@@ -68,8 +70,8 @@ class Refiner:
         second = KeyFrame(pose, _inliers(self._rig, self._map, pose, observations), twist)
         self._frames = [KeyFrame(first.base_from_surface, first.observations, twist), second]
         self._stamps = [self._stamps[0], fit.stamp]
-        self._skew = self._skew_used = skew
-        refined = adjust(self._rig, self._map, self._frames, skew)
+        self._delays, self._doubt = delays, delays.sigma
+        refined = adjust(self._rig, self._map, self._frames, delays)
         if refined is not None:
             self._map = refined.map
         return refined
@@ -83,9 +85,9 @@ class Refiner:
             KeyFrame(f.base_from_surface @ old_from_new, f.observations, turned @ f.twist) for f in self._frames
         ]
 
-    def offer(self, fit: Fit, observations: Observations, twist: Array, skew: float) -> None:
+    def offer(self, fit: Fit, observations: Observations, twist: Array, delays: Delays) -> None:
         """A measured frame set; `poll` keeps it if it shows the surface anew."""
-        self._offered, self._skew = (fit, observations, twist), skew
+        self._offered, self._delays = (fit, observations, twist), delays
 
     def _choose(self) -> None:
         """Whether the last frame set offered becomes a key frame."""
@@ -156,15 +158,15 @@ class Refiner:
         To be called once a frame set, when its pose is handed over.
         """
         self._choose()
-        self._ask |= self._skew < CLEARER * self._skew_used
+        self._ask |= self._delays.sigma < CLEARER * self._doubt
         result = self._work.poll()
         if result is not None:
             result = self.with_new_rows(result)
             self._map = result.map
         if self._ask and not self._work.busy and self._map is not None and len(self._frames) >= 3:
             self._ask = False
-            self._skew_used = self._skew
-            self._work.ask(adjust, self._rig, self._map, list(self._frames), self._skew, self._anchors)
+            self._doubt = self._delays.sigma
+            self._work.ask(adjust, self._rig, self._map, list(self._frames), self._delays, self._anchors)
         return result
 
 

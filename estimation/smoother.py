@@ -9,18 +9,17 @@ far-away base.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from estimation import se3
+from estimation.liveliness import Liveliness
 from estimation.se3 import Array
 
 LAG = 0.6  # s: longer changed the newest pose by nothing (0.5, 1 s and windows of 5 to 20 agree to 1e-4 mm)
-QUIET_PSD = np.array([1e-3] * 3 + [30.0] * 3)  # rad^2/s^3, mm^2/s^3: calm breathing, the least the prior allows
-MEMORY = 1.0  # s: over which the liveliness of the motion is measured
+SURPRISE = 9.0  # squared sigmas of an axis, mean: beyond that the prior gives way to the measurement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,8 +47,8 @@ class Smoother:
     """Fixed-lag smoothing of measured poses; flat in time and memory, and never destroyed for good."""
 
     def __init__(self) -> None:
-        self._recent: deque[Measured] = deque(maxlen=8)
-        self._excess = self._psd = QUIET_PSD * 10
+        self._last: Measured | None = None
+        self._liveliness = Liveliness()
         self.restarts = 0
         self._clear()
 
@@ -67,7 +66,8 @@ class Smoother:
 
     def reset(self) -> None:
         """Forget everything, as after an outage longer than the window."""
-        self._recent.clear()
+        self._last = None
+        self._liveliness.restart()
         self._clear()
 
     def add(self, measured: Measured) -> Window:
@@ -77,42 +77,30 @@ class Smoother:
         before = self._newest
         if before is not None and measured.stamp - before.stamp > LAG:
             self.reset()
-        self._learn(measured)
-        self._recent.append(measured)
+        if self._last is not None:
+            moved = se3.log(se3.inverse(self._last.pose) @ measured.pose)
+            self._liveliness.add(moved, measured.stamp - self._last.stamp, np.diag(measured.covariance))
+        self._last = measured
         try:
             self._newest = self._extend(measured)
         except (RuntimeError, IndexError, ValueError):
-            self._newest = self._rebuild()
+            self._newest = self._rebuild(measured)
         return self._newest
 
-    def _learn(self, measured: Measured) -> None:
-        """Follow the spectral density of the acceleration: squared change of the finite-difference twist over dt.
+    def _density(self, measured: Measured) -> Array:
+        """Of the acceleration since the last pose, (6,): what the motion was, or more where it now surprises.
 
-        A hand waves a thousand times livelier than a chest; a density tuned to one drags or shakes on the other.
-        """
-        if len(self._recent) < 2:
-            return
-        a, b, c = self._recent[-2], self._recent[-1], measured
-        first, second = b.stamp - a.stamp, c.stamp - b.stamp
-        change = _twist(b, c) - _twist(a, b)
-        noise = np.diag(a.covariance) / first**2 + np.diag(c.covariance) / second**2
-        noise = noise + np.diag(b.covariance) * (1 / first + 1 / second) ** 2
-        seen = (change**2 - noise) / (0.5 * (first + second))  # signed, else noise alone would pass for liveliness
-        share = min(1.0, second / MEMORY)
-        grouped = np.repeat([seen[:3].mean(), seen[3:].mean()], 3)
-        self._excess = (1 - share) * self._excess + share * grouped
-        self._psd = np.maximum(self._excess, QUIET_PSD)
-
-    def _surprise(self, measured: Measured) -> Array:
-        """The density that makes this measurement a third of a sigma: a jerk of the hand loosens the prior at once.
-
-        The prior is there to bridge gaps and to give the twist; where motion is not smooth it must not drag the pose.
+        A jerk of the hand loosens the prior at once: where motion is not smooth it must not drag the pose.
         """
         assert self._newest is not None
-        dt = measured.stamp - self._newest.stamp
-        expected = self._newest.pose @ se3.exp(self._newest.twist * dt)
-        off = se3.log(se3.inverse(expected) @ measured.pose)
-        return np.asarray(np.repeat([(off[:3] ** 2).mean(), (off[3:] ** 2).mean()], 3) * 30 / dt**3)
+        psd, dt = self._liveliness.psd, measured.stamp - self._newest.stamp
+        off = se3.log(se3.inverse(self._newest.pose @ se3.exp(self._newest.twist * dt)) @ measured.pose)
+        expected = self._newest.covariance + measured.covariance + dt**2 * self._newest.twist_covariance
+        variance = np.diag(expected) + psd * dt**3 / 3
+        for group in (slice(0, 3), slice(3, 6)):
+            if np.mean(off[group] ** 2 / variance[group]) > SURPRISE:
+                psd[group] = np.maximum(psd[group], np.mean(off[group] ** 2) * 3 / dt**3)
+        return psd
 
     def _extend(self, measured: Measured) -> Window:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -128,7 +116,7 @@ class Smoother:
                 gtsam.WnoaMotionFactorPose3(
                     gtsam.StateData(old_pose, old_twist, self._newest.stamp),
                     gtsam.StateData(pose, twist, measured.stamp),
-                    np.maximum(self._psd, self._surprise(measured)),
+                    self._density(measured),
                 )
             )
         noise = gtsam.noiseModel.Gaussian.Covariance(_symmetric(measured.covariance))
@@ -144,7 +132,7 @@ class Smoother:
             _symmetric(self._window.marginalCovariance(pose)),
             np.asarray(estimate.atVector(twist)),
             _symmetric(self._window.marginalCovariance(twist)),
-            self._psd.copy(),
+            self._liveliness.psd,
         )
         if not all(
             np.isfinite(a).all() for a in (window.pose, window.covariance, window.twist, window.twist_covariance)
@@ -152,16 +140,11 @@ class Smoother:
             raise ValueError("the window's estimate is not finite")
         return window
 
-    def _rebuild(self) -> Window:
+    def _rebuild(self, newest: Measured) -> Window:
         """Start a fresh window from the newest measurement alone: GTSAM's smoother is of no use after it has thrown."""
         self.restarts += 1
-        newest = self._recent[-1]
         self._clear()
         return self._extend(newest)
-
-
-def _twist(a: Measured, b: Measured) -> Array:
-    return se3.log(se3.inverse(a.pose) @ b.pose) / (b.stamp - a.stamp)
 
 
 def _proper(covariance: Array) -> Array:

@@ -21,6 +21,7 @@ class StateSettings:
     leave_sigma: float = 2.5
     enter_deformation: float = 0.2  # mm, RMS over the landmarks
     leave_deformation: float = 0.3  # a rigid pose alone is then off by half a bead in places
+    first: int = 4  # poses that are averaged before one is given out: what that is off by, all later ones are
     settle: float = 0.06  # s without a fault until TRACKING again: the second frame set of 30 a second
     coast: float = 0.5  # s without a measurement until LOST
 
@@ -49,10 +50,12 @@ class StateMachine:
         self.state = TrackState.INITIALISING
         self._bad_stamp = float("-inf")  # s, of the last pose with a fault
         self._measured_stamp = float("-inf")
+        self._poses = 0  # measured since the first map
 
     def begin(self, stamp: float) -> tuple[TrackState, str]:
         """A first map, made at `stamp`."""
         self.state, self._bad_stamp, self._measured_stamp = TrackState.INITIALISING, float("-inf"), stamp
+        self._poses = 0
         return self.state, "a first map, to be confirmed"
 
     def measured(self, stamp: float, seen: Measurement) -> tuple[TrackState, str]:
@@ -63,6 +66,10 @@ class StateMachine:
         elif stamp - self._bad_stamp < self.settings.settle:
             fault = f"seen well again for {stamp - self._bad_stamp:.2f} s, {self.settings.settle:.2f} s wanted"
         self._measured_stamp = stamp
+        self._poses += 1
+        if self._poses < self.settings.first:
+            self.state = TrackState.INITIALISING
+            return self.state, f"pose {self._poses} of {self.settings.first} that are averaged into the first"
         self.state = TrackState.DEGRADED if fault else TrackState.TRACKING
         return self.state, fault
 

@@ -110,7 +110,7 @@ class Mapping:
     ) -> tuple[Fit, Observations]:
         """The first measured frame set after the first map: correct the map by it, look and fit again, twice."""
         for _ in range(2):
-            refined = self._refiner.confirm(fit, observations, estimator.skew.sigma)
+            refined = self._refiner.confirm(fit, observations, estimator.cameras.delays)
             if refined is None:
                 break
             self._take(refined, matcher, estimator)
@@ -137,7 +137,7 @@ class Mapping:
         pyramids: dict[int, Pyramid],
     ) -> None:
         """A measured frame set, from which the map may be refined or grow. twist: (6,), the surface's."""
-        self._refiner.offer(fit, observations, twist, estimator.skew.sigma)
+        self._refiner.offer(fit, observations, twist, estimator.cameras.delays)
         self._last = fit, observations, pyramids
 
     def keep(self, matcher: Matcher, estimator: Estimator) -> None:

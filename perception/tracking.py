@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from estimation.errors import InputError
 from estimation.estimator import Estimator, Fit, identity_pose
 from estimation.observations import Observations, no_observations
-from estimation.pose import SurfacePose, TrackState
+from estimation.pose import SurfacePose
 from estimation.rig import Rig
 from estimation.scan import Scan
 from estimation.se3 import Array
@@ -159,7 +159,7 @@ class TrackingStep:
         if not fit.measured or self._missing(fit, pyramids):
             fit, observations = self._second_try(matcher, pyramids, fit, observations, expected.base_from_surface)
             self._took("search")
-        if estimator.pose.state is TrackState.INITIALISING:
+        if not estimator.confirmed:
             if len(self._carried(fit, pyramids)) < 2:
                 if self._mapping.expired(stamp):
                     self._matcher = None
@@ -189,9 +189,10 @@ class TrackingStep:
         not, and where alignment then finds fewer landmarks than the last images had.
         """
         stamp, guess, observations = expected.stamp, expected.base_from_surface, None
-        late = self._estimator.skew.sigma * expected.twist
+        late = self._estimator.cameras.delays.sigma * expected.twist
+        seen = self._estimator.as_exposed(guess, expected.twist)
         if matcher.doubt(guess, expected.covariance + np.outer(late, late)) < NEAR:
-            observations = matcher.align(stamp, pyramids, dict.fromkeys(pyramids, guess))
+            observations = matcher.align(stamp, pyramids, {c: seen[c] for c in pyramids})
             self._took("align")
             if matcher.complete(observations, pyramids):
                 return guess, observations, (1.0,)

@@ -9,6 +9,7 @@ import pytest
 
 from estimation import se3
 from estimation.adjustment import Adjusted, KeyFrame, adjust, frame_change, without_frame
+from estimation.camera_errors import Delays
 from estimation.observations import Observations
 from estimation.pose_solver import solve_pose
 from estimation.se3 import Array
@@ -80,11 +81,16 @@ def size(points: Array) -> float:
 STAMPS = np.arange(8) * 0.4
 
 
+def unsure(skew: float) -> Delays:
+    """Nothing known of the delays but their standard deviation, s."""
+    return Delays(np.zeros(3), skew**2 * np.eye(3))
+
+
 def refine(
     true: Array, wrong: Array, seed: int = 1, noise: float = 0.3, delays: Sequence[float] = (0, 0, 0), skew: float = 0.0
 ) -> tuple[Adjusted, list[KeyFrame]]:
     frames = key_frames([look(true, float(t), seed, noise, delays) for t in STAMPS], wrong)
-    adjusted = adjust(RIG, as_map(wrong), frames, skew)
+    adjusted = adjust(RIG, as_map(wrong), frames, unsure(skew))
     assert adjusted is not None
     return adjusted, frames
 
@@ -130,7 +136,7 @@ def test_a_landmark_that_stays_while_the_rest_moves_is_found() -> None:
                 moving.sigma,
             )
         )
-    adjusted = adjust(RIG, as_map(true), key_frames(seen, true), 0.0)
+    adjusted = adjust(RIG, as_map(true), key_frames(seen, true), unsure(0.0))
     assert adjusted is not None
     assert np.flatnonzero(~adjusted.agrees).tolist() == still.tolist()
     rest = np.setdiff1d(np.arange(len(true)), still)
@@ -210,7 +216,7 @@ def test_a_landmark_seen_too_seldom_stays_where_it_was() -> None:
         seen.append(Observations(o.stamp, o.camera[keep], o.track[keep], o.pixels[keep], o.sigma[keep]))
     wrong = true.copy()
     wrong[0] += [0.0, 0.0, 5.0]
-    adjusted = adjust(RIG, as_map(wrong), key_frames(seen, wrong), 0.0)
+    adjusted = adjust(RIG, as_map(wrong), key_frames(seen, wrong), unsure(0.0))
     assert adjusted is not None
     assert np.linalg.norm(adjusted.map.points[0] - wrong[0]) < 0.05 and adjusted.agrees[0]
     assert np.allclose(adjusted.map.covariance[:3, :3], 0.25 * np.eye(3))
@@ -220,7 +226,7 @@ def test_a_landmark_seen_too_seldom_stays_where_it_was() -> None:
 def test_too_little_to_go_by_gives_no_map(frames: int, count: int) -> None:
     true = landmarks(9, count)
     seen = [look(true, float(t), 5) for t in STAMPS[:frames]]
-    assert adjust(RIG, as_map(true), key_frames(seen, true), 0.0) is None
+    assert adjust(RIG, as_map(true), key_frames(seen, true), unsure(0.0)) is None
 
 
 def test_two_runs_give_the_same_bits() -> None:

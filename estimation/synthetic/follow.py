@@ -42,11 +42,10 @@ class Follower:
         """The pose at `seen.stamp` from this frame set and the ones before."""
         estimator, seen = self.estimator, self.of_map(seen)
         fit = estimator.fit(seen, estimator.predict(seen.stamp))
-        assert estimator.pose is not None
-        if estimator.pose.state is TrackState.INITIALISING:
+        if not estimator.confirmed:
             if len(estimator.carriers(fit)) < 2:
                 return estimator.wait(seen.stamp, fit.reason or "one camera sees the surface")
-            refined = None if self.refiner is None else self.refiner.confirm(fit, seen, estimator.skew.sigma)
+            refined = None if self.refiner is None else self.refiner.confirm(fit, seen, estimator.cameras.delays)
             if self.refiner is not None and refined is not None:
                 self._take(refined)
                 estimator.moving(self.refiner.speed(fit))
@@ -56,7 +55,7 @@ class Follower:
             return estimator.coast(fit)
         pose = estimator.accept(fit, seen)
         if self.refiner is not None:
-            self.refiner.offer(fit, seen, pose.twist, estimator.skew.sigma)
+            self.refiner.offer(fit, seen, pose.twist, estimator.cameras.delays)
         return pose
 
     def idle(self) -> None:
@@ -66,9 +65,9 @@ class Follower:
             self._take(refined)
 
     @property
-    def offsets(self) -> Array | None:
-        """How much later than stamped each camera exposes (C,), s, as estimated; None where it is not."""
-        return None
+    def offsets(self) -> Array:
+        """How much later than stamped each camera exposes (C,), s, as estimated."""
+        return self.estimator.cameras.offset
 
     def of_map(self, seen: Observations) -> Observations:
         """The observations of landmarks that are in the map and agree with it, numbered by its rows."""
@@ -85,7 +84,7 @@ class Follower:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Followed:
-    """A run over a world beside its truth, from the second frame set on; the first one defines the surface frame.
+    """A run over a world beside its truth, after the first pose that is given out, which places the surface frame.
 
     poses: K of them. seconds: (K,) by the clock. Of the estimated surface frame, into which the truth is carried at the
     start, and never fitted: expected: (K, 4, 4) true base_from_surface. twists: (K, 6) true ones. informations:
@@ -100,7 +99,7 @@ class Followed:
     twists: Array
     informations: Array
     frame: Array
-    offsets: Array | None
+    offsets: Array
 
     @property
     def bounds(self) -> Array:
@@ -171,7 +170,7 @@ class Step:
     pose: SurfacePose
     seen: Observations
     seconds: float
-    offsets: Array | None
+    offsets: Array
 
 
 def steps(world: World, mapping: Mapping = "told", clock: Callable[[], float] = lambda: 0.0) -> Iterator[Step]:
@@ -190,7 +189,9 @@ def steps(world: World, mapping: Mapping = "told", clock: Callable[[], float] = 
 
 def follow(world: World, mapping: Mapping = "told", clock: Callable[[], float] = lambda: 0.0) -> Followed:
     """Run the estimator over the whole world."""
-    begun, *rest = steps(world, mapping, clock)
+    every = list(steps(world, mapping, clock))
+    given = next((i for i, step in enumerate(every) if step.pose.state.measured), 0)
+    begun, rest = every[given], every[given + 1 :]
     stamps = np.array([step.pose.stamp for step in rest])
     true_start = world.base_from_surface(np.array(begun.pose.stamp))
     true_from_estimated = se3.inverse(true_start) @ begun.pose.base_from_surface

@@ -89,7 +89,7 @@ def _offset_figures(scene: Scene, of_map: str, runs: Sequence[Followed]) -> list
     if "offsets" not in scene.conditions:
         return []
     true = np.array(scene.conditions["offsets"])
-    known = [run.offsets - run.offsets.mean() for run in runs if run.offsets is not None]
+    known = [run.offsets - run.offsets.mean() for run in runs]
     off = 1000 * float(np.sqrt(np.mean((np.array(known) - true + true.mean()) ** 2))) if known else float("nan")
     note = "" if known else "not estimated"
     return [Figure(f"{scene.name}, {of_map}: offsets off by", off, "ms", at_most(2.0), "thesis under 1 s", note)]
