@@ -67,7 +67,8 @@ class Variance:
 class CameraErrors:
     """Offsets and shifts of all cameras, with their joint covariance."""
 
-    OFFSET, SHIFT = 0.025, 0.5  # s and px, one standard deviation at first: webcams, and a usual calibration
+    OFFSET, SHIFT = 0.02, 0.5  # s and px, one standard deviation at first: webcams, and a usual calibration
+    PLAIN, SURE = 2.0, 8.0  # mean squared sigmas: at that, chance explains the offsets, or does not
     # s and px per root second: quartz differs by 50 ppm at most; lenses warm up
     WANDER = 2e-5, 5e-3
     CAREFUL = 3.0  # what is not modelled is alike in frame after frame, so that each tells less of what stays
@@ -86,8 +87,15 @@ class CameraErrors:
 
     @property
     def offset(self) -> Array:
-        """How much later than stamped each camera exposes (C,), s."""
-        return self._mean[: self._count].copy()
+        """How much later than stamped each camera exposes (C,), s.
+
+        Many cameras are triggered together, and a correction by what chance made up would only carry the pose about; so
+        nothing is corrected until offsets are clearly there.
+        """
+        n = self._count
+        mean, known = self._mean[:n], np.linalg.pinv(self._covariance[:n, :n], hermitian=True)
+        apart = float(mean @ known @ mean) / max(1, n - 1)
+        return mean * min(1.0, max(0.0, (apart - self.PLAIN) / (self.SURE - self.PLAIN)))
 
     @property
     def offset_sigma(self) -> Array:
@@ -135,7 +143,7 @@ class CameraErrors:
     def _beyond_mean(self, found: SharedFit, clear: float) -> SharedFit:
         """What a fit found beyond the shifts known, and of delays only what a clear velocity shows."""
         n, information, pull = self._count, found.information.copy(), found.pull.copy()
-        pull -= information[:, n:] @ self._mean[n:]
+        pull -= information[:, n:] @ self._mean[n:] + information[:, :n] @ (self._mean[:n] - self.offset)
         if clear < self.CLEAR:
             information[:n] = information[:, :n] = pull[:n] = 0.0
         return replace(found, information=information, pull=pull)

@@ -15,7 +15,7 @@ STEP = 10**0.5  # between densities of the grid: closer ones cannot be told apar
 ROTATION = 1e-7 * STEP ** np.arange(18)  # rad^2/s^3, from a surface at rest to a shaken one
 TRANSLATION = 1e-2 * STEP ** np.arange(18)  # mm^2/s^3
 MEMORY = 1.0  # s: over which a density is judged
-WORST = 16.0  # squared sigmas that one measurement can count: a single jerk is not a lively motion
+TAILS = 4.0  # degrees of freedom of Student's t: a single jerk is not a lively motion, ten in a second are
 UNKNOWN = 100.0  # rad/s and mm/s, standard deviation of a velocity before anything is known of it
 
 
@@ -35,11 +35,10 @@ class Liveliness:
 
     @property
     def psd(self) -> Array:
-        """(6,) rad^2/s^3 and mm^2/s^3: the mean of the densities' logarithms under their likelihoods."""
+        """(6,) rad^2/s^3 and mm^2/s^3: the mean of the densities under their likelihoods."""
         weight = np.exp(self._score - self._score.max(1, keepdims=True))
         weight = weight / weight.sum(1, keepdims=True)
-        grouped = np.exp([weight[0] @ np.log(ROTATION), weight[1] @ np.log(TRANSLATION)])
-        return np.asarray(np.repeat(grouped, 3))
+        return np.repeat([weight[0] @ ROTATION, weight[1] @ TRANSLATION], 3)
 
     def add(self, moved: Array, seconds: float, variance: Array) -> None:
         """Take a measured pose: moved (6,) from the measured pose before it, variance (6,) of the new one."""
@@ -51,7 +50,7 @@ class Liveliness:
         cross = self._cross + dt * self._rate_var + q * dt**2 / 2
         rate_var = self._rate_var + q * dt
         total = var + r
-        one = -0.5 * (np.log(total) + np.minimum(ahead**2 / total, WORST))
+        one = -0.5 * (np.log(total) + (TAILS + 1) * np.log1p(ahead**2 / (TAILS * total)))
         keep = np.exp(-dt / MEMORY)
         self._score = keep * self._score + np.stack([one[:3].sum(0), one[3:].sum(0)])
         gain, gain_rate = var / total, cross / total

@@ -104,9 +104,6 @@ EFFICIENCY = 1.235
 ARRIVED = 1e-4  # squared sigmas of the pose: a step as small as that changes nothing that is known
 
 
-NEAR = 1.5  # sigmas, median: tracks that agree so well need no wider gate first
-
-
 def solve_pose(
     rig: Rig,
     camera: Index,
@@ -161,8 +158,6 @@ def solve_pose(
             if common is not None:
                 residual = np.asarray(residual + common.explained(np.asarray(step), jacobian))
             if np.abs(step).max() < tolerance or -step @ gradient < ARRIVED:
-                break
-            if widening != scales[-1] and unit < NEAR:
                 break
     if common is None:
         return PoseFit(pose, EFFICIENCY / unit**2 * information, residual, weight, jacobian, unit)

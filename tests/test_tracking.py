@@ -15,6 +15,7 @@ import pytest
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
+from estimation.state_machine import StateSettings
 from estimation.synthetic.arc_rig import REST, TARGET, arc_rig
 from hardware.simulator.scene import Scene, rois
 from perception.features import grey
@@ -70,14 +71,17 @@ def same(a: SurfacePose, b: SurfacePose) -> bool:
     )
 
 
+FIRST = StateSettings().first  # frame sets until a pose is given out
+
+
 def states(poses: Sequence[SurfacePose]) -> set[TrackState]:
     return {p.state for p in poses}
 
 
 def test_a_breathing_surface_is_followed_to_hundredths_of_a_millimetre(plain: list[SurfacePose]) -> None:
-    assert plain[0].state is TrackState.INITIALISING and states(plain[1:]) == {TrackState.TRACKING}
+    assert states(plain[:FIRST]) == {TrackState.INITIALISING} and states(plain[FIRST:]) == {TrackState.TRACKING}
     away = errors(plain)
-    assert np.median(away[1:]) < 0.03 and away[1:].max() < 0.08
+    assert np.median(away[FIRST:]) < 0.03 and away[FIRST:].max() < 0.08
     for p in plain[1:]:
         assert p.reason == "" and se3.is_transform(p.base_from_surface)
         assert np.linalg.eigvalsh(p.covariance).min() > 0
@@ -145,7 +149,7 @@ def test_the_report_counts_what_carries_the_pose(sets: list[FrameSet]) -> None:
 def test_a_camera_that_misses_frames_costs_little(sets: list[FrameSet], lost: int) -> None:
     holes = [change(s, lambda c, i: None if c == lost else i) if k % 3 == 2 else s for k, s in enumerate(sets)]
     poses = run(holes)
-    assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses)[1:].max() < 0.15
+    assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.15
 
 
 def test_a_camera_that_goes_black_is_done_without(sets: list[FrameSet]) -> None:
@@ -157,7 +161,7 @@ def test_a_camera_that_goes_black_is_done_without(sets: list[FrameSet]) -> None:
         step.idle()
         if len(poses) > 6:
             assert step.last.used[1] == 0 and (step.last.used[[0, 2]] > 50).all()
-    assert states(poses[1:7]) == {TrackState.TRACKING} and errors(poses)[1:].max() < 0.15
+    assert states(poses[1:7]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.15
     assert states(poses[7:]) == {TrackState.DEGRADED} and all("cam_1" in p.reason for p in poses[7:])
 
 
@@ -209,7 +213,7 @@ def test_a_jolt_that_no_motion_model_expects_is_followed() -> None:
         return REST @ away if stamp > 1.25 else REST
 
     poses = run(shot(jolted, np.arange(16) / 10))
-    assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses, jolted)[1:].max() < 0.1
+    assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses, jolted)[FIRST:].max() < 0.1
 
 
 def test_flow_is_asked_only_where_the_motion_model_is_unsure(sets: list[FrameSet]) -> None:
@@ -238,7 +242,7 @@ def test_repeated_pictures_are_no_measurement(sets: list[FrameSet]) -> None:
     twice = [*sets[:8], FrameSet(sets[7].stamp + 0.05, sets[7].frames), *sets[8:]]
     poses = run(twice)
     assert poses[8].state is TrackState.COASTING and "cam_2 shows the same picture again" in poses[8].reason
-    assert states(poses[1:8] + poses[10:]) == {TrackState.TRACKING} and errors(poses)[1:].max() < 0.1
+    assert states(poses[1:8] + poses[10:]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.1
 
 
 def beside(pose: Array) -> Array:
@@ -264,12 +268,12 @@ def test_what_moves_outside_the_region_is_not_followed() -> None:
         return breathing(0.0) @ se3.exp(np.array([0, 0, 0, 4.0 * stamp, 8.0 * np.sin(3 * stamp), 0]))
 
     poses = run(two_patches(still, moving, STAMPS[:14]))
-    assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses, still)[1:].max() < 0.1
+    assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses, still)[FIRST:].max() < 0.1
 
 
 def test_what_stands_outside_the_region_does_not_hold_it_back() -> None:
     poses = run(two_patches(breathing, lambda stamp: breathing(0.0), STAMPS[:14]))
-    assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses)[1:].max() < 0.1
+    assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.1
 
 
 def test_without_a_region_whatever_two_cameras_see_is_the_surface(sets: list[FrameSet]) -> None:
@@ -280,12 +284,12 @@ def test_without_a_region_whatever_two_cameras_see_is_the_surface(sets: list[Fra
         only = [cv2.morphologyEx(o.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0 for o in other]
         plain.append(change(frames, lambda c, i, only=only: np.where(only[c][..., None], i, 90).astype(np.uint8)))
     poses = run(plain, roi=())
-    assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses)[1:].max() < 0.1
+    assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.1
 
 
 def test_a_surface_at_rest_stays_at_rest() -> None:
     poses = run(shot(lambda stamp: REST, STAMPS[:20], 5))
-    assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses, lambda stamp: REST)[1:].max() < 0.03
+    assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses, lambda stamp: REST)[FIRST:].max() < 0.03
     assert max(np.linalg.norm(p.twist[3:]) for p in poses[5:]) < 0.3
 
 
@@ -310,7 +314,7 @@ def test_a_first_map_that_is_never_seen_again_is_never_tracked(sets: list[FrameS
 @pytest.mark.parametrize("cameras", [(0, 1), (1, 2), (0, 2)])
 def test_two_cameras_do_the_whole_job(sets: list[FrameSet], cameras: tuple[int, int]) -> None:
     poses = run([change(s, lambda c, i: i if c in cameras else None) for s in sets[:14]])
-    assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses)[1:].max() < 0.25
+    assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.25
 
 
 def test_a_camera_that_runs_late_makes_the_claim_wider_not_wrong() -> None:
@@ -322,7 +326,7 @@ def test_a_camera_that_runs_late_makes_the_claim_wider_not_wrong() -> None:
     on_time, late = shot(swinging, STAMPS, 2), shot(lambda t: swinging(t + 0.02), STAMPS, 2)
     mixed = [FrameSet(a.stamp, (*a.frames[:2], b.frames[2])) for a, b in zip(on_time, late, strict=True)]
     poses = run(mixed)
-    assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses, swinging)[1:].max() < 1.0
+    assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses, swinging)[FIRST:].max() < 1.0
     sigma = [np.sqrt(np.linalg.eigvalsh(p.covariance[3:, 3:])[-1]) for p in poses[8:]]
     assert np.mean(errors(poses, swinging)[8:] < 3 * np.array(sigma)) > 0.9
 
@@ -335,7 +339,7 @@ def test_brightness_may_change_from_set_to_set(sets: list[FrameSet]) -> None:
         return change(frames, lambda _, i: np.clip(gain * i + offset, 0, 255).astype(np.uint8))
 
     poses = run([sets[0], *[relit(s) for s in sets[1:14]]])
-    assert states(poses[1:]) == {TrackState.TRACKING} and errors(poses)[1:].max() < 0.1
+    assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.1
 
 
 def test_a_hand_over_half_the_surface_does_not_pull_at_it(sets: list[FrameSet]) -> None:
@@ -348,7 +352,7 @@ def test_a_hand_over_half_the_surface_does_not_pull_at_it(sets: list[FrameSet]) 
         return np.where((np.arange(image.shape[1]) > middle)[None, :, None], big, image)
 
     poses = run([change(s, covered) if k >= 5 else s for k, s in enumerate(sets[:18])])
-    assert all(p.state.measured for p in poses[1:]) and errors(poses)[1:].max() < 0.25
+    assert all(p.state.measured for p in poses[FIRST:]) and errors(poses)[FIRST:].max() < 0.25
 
 
 def _view(camera: int) -> tuple[Array, Array, Array, Array]:

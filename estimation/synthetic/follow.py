@@ -205,6 +205,6 @@ def follow(world: World, mapping: Mapping = "told", clock: Callable[[], float] =
         expected=expected,
         twists=world.twists(stamps) @ se3.adjoint(se3.inverse(true_from_estimated)).T,
         informations=np.stack(informations),
-        frame=pose_bound(first) if mapping == "seen" else np.zeros((6, 6)),
+        frame=pose_bound(first),
         offsets=rest[-1].offsets if rest else begun.offsets,
     )
