@@ -67,7 +67,7 @@ class Variance:
 class CameraErrors:
     """Offsets and shifts of all cameras, with their joint covariance."""
 
-    OFFSET, SHIFT = 0.02, 0.5  # s and px, one standard deviation at first: webcams, and a usual calibration
+    OFFSET, SHIFT = 0.01, 0.5  # s and px, one standard deviation at first: webcams, and a usual calibration
     PLAIN, SURE = 2.0, 8.0  # mean squared sigmas: at that, chance explains the offsets, or does not
     # s and px per root second: quartz differs by 50 ppm at most; lenses warm up
     WANDER = 2e-5, 5e-3

@@ -29,6 +29,9 @@ from estimation.state_machine import Measurement, StateMachine, StateSettings
 from estimation.surface_map import SurfaceMap
 from estimation.warp_filter import WarpFilter
 
+BEGINS = np.array([1e-4] * 3 + [1.0] * 3)  # rad^2/s^3, mm^2/s^3: what lies still may begin to breathe
+PERSISTS = 0.2  # s: what breathes is accelerated alike for so long, which adds up to more than white noise does
+
 
 @dataclass(frozen=True, slots=True)
 class EstimatorSettings:
@@ -94,6 +97,7 @@ class Estimator:
         self._measured: SurfacePose | None = None  # the last one that was
         self._caveat = ""
         self._view = 0  # landmarks of the first view: what is added later is not all seen at once
+        self._psd, self._step = np.zeros(6), 1.0  # of the acceleration from pose to pose; s, between them
         self._accepted = 0  # poses measured since the first map
         self._first: Array | None = None  # (6, 6) covariance of the first pose given out, in which the path is placed
         self._first_bias: Array | None = None
@@ -179,8 +183,8 @@ class Estimator:
             return np.zeros(6), np.zeros(6)
         dt = stamp - last.stamp
         chord = se3.log(se3.inverse(last.base_from_surface) @ start) / dt
-        ahead = np.diag(last.twist_covariance) + last.acceleration_psd * dt
-        behind = 2 * np.diag(last.covariance) / dt**2 + last.acceleration_psd * dt / 3
+        ahead = np.diag(last.twist_covariance) + self._psd * dt
+        behind = 2 * np.diag(last.covariance) / dt**2 + self._psd * dt / 3
         trust = np.repeat([group.mean() for group in (behind / (ahead + behind + 1e-30)).reshape(2, 3)], 3)
         return trust * last.twist + (1 - trust) * chord, trust**2 * ahead + (1 - trust) ** 2 * behind
 
@@ -309,7 +313,9 @@ class Estimator:
     def _enter(
         self, stamp: float, pose: Array, covariance: Array, lasting: Array, state: TrackState, reason: str
     ) -> SurfacePose:
+        self._step = 1.0 if self._measured is None else max(1e-3, stamp - self._measured.stamp)
         window = self._smoother.add(Measured(stamp, pose, covariance))
+        self._psd = window.acceleration_psd
         if self._first is not None:
             lasting = lasting + self._first
         elif state.measured:
@@ -321,12 +327,12 @@ class Estimator:
             window.twist,
             state,
             window.twist_covariance,
-            window.acceleration_psd,
+            np.maximum(self._psd * max(1.0, PERSISTS / self._step), BEGINS),
             reason,
             self._detector.motion,
             None if self._warp is None else self._warp.warp,
         )
-        self._pose = self._measured = replace(entered, forecast=self._predictor.add(entered))
+        self._pose = self._measured = replace(entered, forecast=self._predictor.add(entered, lasting))
         return self._pose
 
     def coast(self, fit: Fit) -> SurfacePose:

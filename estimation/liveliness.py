@@ -20,11 +20,11 @@ UNKNOWN = 100.0  # rad/s and mm/s, standard deviation of a velocity before anyth
 
 
 class Liveliness:
-    """Follows the spectral density of the acceleration, separately for turning and for shifting."""
+    """Follows the spectral density of the acceleration, axis by axis: a chest is lively along its normal only."""
 
     def __init__(self) -> None:
         self._grid = np.stack([ROTATION] * 3 + [TRANSLATION] * 3)  # (6, K)
-        self._score = np.zeros((2, self._grid.shape[1]))  # log likelihoods of turning and shifting
+        self._score = np.zeros_like(self._grid)  # log likelihoods
         self.restart()
 
     def restart(self) -> None:
@@ -38,7 +38,7 @@ class Liveliness:
         """(6,) rad^2/s^3 and mm^2/s^3: the mean of the densities under their likelihoods."""
         weight = np.exp(self._score - self._score.max(1, keepdims=True))
         weight = weight / weight.sum(1, keepdims=True)
-        return np.repeat([weight[0] @ ROTATION, weight[1] @ TRANSLATION], 3)
+        return np.asarray((weight * self._grid).sum(1))
 
     def add(self, moved: Array, seconds: float, variance: Array) -> None:
         """Take a measured pose: moved (6,) from the measured pose before it, variance (6,) of the new one."""
@@ -52,7 +52,7 @@ class Liveliness:
         total = var + r
         one = -0.5 * (np.log(total) + (TAILS + 1) * np.log1p(ahead**2 / (TAILS * total)))
         keep = np.exp(-dt / MEMORY)
-        self._score = keep * self._score + np.stack([one[:3].sum(0), one[3:].sum(0)])
+        self._score = keep * self._score + one
         gain, gain_rate = var / total, cross / total
         self._off, self._rate = ahead * (1 - gain), self._rate - gain_rate * ahead
         self._var, self._cross, self._rate_var = var * (1 - gain), cross * (1 - gain), rate_var - gain_rate * cross

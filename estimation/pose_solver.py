@@ -215,7 +215,7 @@ class _Common:
 
     def found(self, jacobian: Array) -> SharedFit:
         """Of the last `reduce` and `explained`."""
-        information = self._whole[:, :6] + 1e-9 * np.trace(self._whole[:, :6]) * np.eye(6)
+        information = self._whole[:, :6] + (1e-9 * np.trace(self._whole[:, :6]) + 1e-12) * np.eye(6)
         solved = np.linalg.solve(information, np.c_[self._cross, self._whole[:, 6]])
         own, right = self._own - self._cross.T @ solved[:, :-1], -(self._right - self._cross.T @ solved[:, -1])
         slopes, given = jacobian.copy(), (self._cross @ self._gain).T  # (3C, 6)

@@ -24,6 +24,7 @@ from estimation.stacking import Stack
 HORIZONS = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # s
 STEP = 0.1  # s between samples learned from; a camera that is faster only predicts in between
 GAP = 0.5  # s without a pose, after which the surface may be anywhere
+YOUNG = 8.0  # s of judged forecasts, two breaths: until then errors still to come are not known by those seen
 SETTLE = 50  # samples judged before the first forecast
 SCALE = np.array([LEVER] * 3 + [1.0] * 3)  # rad to mm at the lever
 PROBES = 10  # points at most, at which the intervals are judged
@@ -61,8 +62,11 @@ class Predictor:
         self._judged = 0
         self._before = -np.inf
 
-    def add(self, pose: SurfacePose) -> Forecast | None:
-        """Learn from a measured pose, newer than those before, and forecast from it; None while too little is known."""
+    def add(self, pose: SurfacePose, lasting: Array | None = None) -> Forecast | None:
+        """Learn from a measured pose, newer than those before, and forecast from it; None while too little is known.
+
+        lasting: (6, 6), the part of the pose's covariance that is the same error in every pose: no later pose shows it.
+        """
         if not (np.isfinite(pose.base_from_surface).all() and np.isfinite(pose.twist).all()):
             return None
         if not 0 < pose.stamp - self._before <= GAP:
@@ -79,14 +83,14 @@ class Predictor:
         self._learn(due, moved[: len(due)])
         if self._history.reach < LAGS[-1] - EARLY:
             return None
-        return self._forecast(pose, moved[len(due) :])
+        return self._forecast(pose, moved[len(due) :], np.zeros((6, 6)) if lasting is None else lasting)
 
     def _due(self, now: float) -> list[tuple[_Sample, int]]:
         """The samples and horizons whose time has come."""
         waiting = ((s, k) for s in self._samples for k in range(s.known, len(HORIZONS)))
         return [(s, k) for s, k in waiting if s.stamp + HORIZONS[k] <= now + EARLY]
 
-    def _forecast(self, pose: SurfacePose, past: Array) -> Forecast | None:
+    def _forecast(self, pose: SurfacePose, past: Array, lasting: Array) -> Forecast | None:
         twist = pose.twist * SCALE
         inputs = self._members.inputs(past, twist)
         ahead = (HORIZONS[:, None] * twist)[:, None]  # (H, 1, 6)
@@ -98,7 +102,17 @@ class Predictor:
             self._samples.append(_Sample(pose.stamp, pose.base_from_surface, inputs, experts, expected, claimed))
         if self._judged < SETTLE:
             return None
-        return Forecast(HORIZONS, expected / SCALE, spread / np.outer(SCALE, SCALE))
+        covariances = spread / np.outer(SCALE, SCALE) + lasting + self._unseen(pose)
+        return Forecast(HORIZONS, expected / SCALE, covariances)
+
+    def _unseen(self, pose: SurfacePose) -> Array:
+        """Covariances (H, 6, 6) of what errors seen so far do not tell, fading as the first breaths are seen.
+
+        It is what white noise on acceleration makes of the twist: errors of one phase of a breath say little of others.
+        """
+        young = max(0.0, 1 - self._judged * STEP / YOUNG)
+        ahead = HORIZONS[:, None, None]
+        return young**2 * (ahead**2 * pose.twist_covariance + ahead**3 / 3 * np.diag(pose.acceleration_psd))
 
     def _learn(self, due: list[tuple[_Sample, int]], moved: Array) -> None:
         """Compare what was expected with what came, (K, 6), horizon by horizon as its time comes."""

@@ -220,9 +220,7 @@ class TrackingStep:
         """
         start = fit.solution.base_from_surface if fit.measured else expected
         fit, observations = self._realign(matcher, pyramids, fit, observations, start, {})
-        assert self._estimator.pose is not None
-        first = self._estimator.pose.state is TrackState.INITIALISING
-        if first and len(self._carried(fit, pyramids)) < min(2, len(pyramids)):
+        if not self._estimator.confirmed and len(self._carried(fit, pyramids)) < min(2, len(pyramids)):
             found = self._search.find(pyramids)
             if found is not None:
                 joint, single = found.base_from_surface, found.single

@@ -23,10 +23,10 @@ def learned(offsets: tuple[float, float, float], seconds: float) -> CameraErrors
 
 
 @pytest.mark.parametrize("offsets", [(0.0, 0.0, 0.0), (0.016, 0.0, -0.016), (0.002, -0.009, 0.013)])
-def test_offsets_are_found_to_a_millisecond_in_two_seconds(offsets: tuple[float, float, float]) -> None:
+def test_offsets_are_found_to_two_milliseconds_in_two_seconds(offsets: tuple[float, float, float]) -> None:
     cameras = learned(offsets, 2.0)
     apart = cameras.offset - (np.array(offsets) - np.mean(offsets))
-    assert (np.abs(apart) < 1e-3).all() and (np.abs(apart) < 4 * cameras.offset_sigma).all()
+    assert (np.abs(apart) < 2e-3).all() and (np.abs(apart) < 4 * cameras.offset_sigma).all()
 
 
 def test_cameras_in_step_with_a_steady_clock_are_known_to_be() -> None:

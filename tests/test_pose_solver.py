@@ -88,7 +88,7 @@ def test_the_information_of_perfect_tracks_is_the_sum_over_them() -> None:
     o = Observations(o.stamp, o.camera, o.track, o.pixels, np.random.default_rng(4).uniform(0.1, 1.0, len(o)))
     j = project(RIG, o.camera, REST, LANDMARKS[o.track])[2]
     expected = np.einsum("nki,n,nkj->ij", j, 1 / o.sigma**2, j)
-    assert np.allclose(fit(o, REST).information, expected, rtol=1e-9)
+    assert np.allclose(fit(o, REST).information, EFFICIENCY * expected, rtol=1e-9)
 
 
 def test_a_track_twice_as_sure_counts_four_times() -> None:

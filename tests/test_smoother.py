@@ -85,9 +85,9 @@ def test_a_waving_hand_is_not_dragged() -> None:
     windows = run(measure(waving, np.arange(60) / 6, 3))
     off = [se3.log(se3.inverse(w.pose) @ waving(w.stamp)) / NOISE for w in windows]
     assert np.sqrt(np.mean(np.square(off))) < 1.3
-    assert (
-        windows[-1].acceleration_psd > 10 * run(measure(breathing, np.arange(60) / 6, 3))[-1].acceleration_psd
-    ).all()
+    calm = run(measure(breathing, np.arange(60) / 6, 3))[-1].acceleration_psd
+    livelier = windows[-1].acceleration_psd > 10 * calm
+    assert livelier[:3].any() and livelier[3:].any()
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])

