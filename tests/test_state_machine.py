@@ -15,7 +15,7 @@ from estimation.pose import TrackState
 from estimation.state_machine import Measurement, StateMachine, StateSettings
 
 GOOD = Measurement(("left", "right"), 100, 0.1)
-LIMITS = StateSettings()
+LIMITS = StateSettings(first=1)
 STEP = 1 / 30
 
 measurements = st.builds(
@@ -32,7 +32,7 @@ measurements = st.builds(
 @settings(deadline=None, max_examples=200)
 @given(st.lists(st.one_of(st.none(), measurements, st.just(GOOD)), max_size=40), st.floats(0.005, 0.2))
 def test_whatever_comes_the_state_says_no_more_than_what_was_seen(seen: list[Measurement | None], step: float) -> None:
-    machine, faulty, measured = StateMachine(), float("-inf"), 0.0
+    machine, faulty, measured = StateMachine(LIMITS), float("-inf"), 0.0
     machine.begin(0.0)
     for k, one in enumerate(seen, 1):
         stamp = k * step
@@ -55,7 +55,7 @@ def test_whatever_comes_the_state_says_no_more_than_what_was_seen(seen: list[Mea
 @settings(deadline=None)
 @given(st.lists(st.booleans(), min_size=1, max_size=60))
 def test_tracking_never_comes_and_goes_faster_than_it_settles(good: list[bool]) -> None:
-    machine, entered = StateMachine(), []
+    machine, entered = StateMachine(LIMITS), []
     machine.measured(0.0, replace(GOOD, tracks=0))
     before = machine.state
     for k, one in enumerate(good, 1):
@@ -70,7 +70,7 @@ def test_tracking_never_comes_and_goes_faster_than_it_settles(good: list[bool]) 
     ("name", "between"), [("tracks", 25), ("sigma", 2.2), ("deformation", 0.25)], ids=["tracks", "sigma", "deformation"]
 )
 def test_between_two_thresholds_the_state_stays_what_it_was(name: str, between: float) -> None:
-    inside, outside = StateMachine(), StateMachine()
+    inside, outside = StateMachine(LIMITS), StateMachine(LIMITS)
     inside.measured(0.0, GOOD)
     outside.measured(0.0, replace(GOOD, cameras=("left",)))
     for k in range(1, 10):
@@ -78,8 +78,18 @@ def test_between_two_thresholds_the_state_stays_what_it_was(name: str, between: 
         assert outside.measured(k * STEP, replace(GOOD, **{name: between}))[0] is TrackState.DEGRADED
 
 
+def test_the_first_poses_are_averaged_before_one_is_given_out() -> None:
+    machine = StateMachine(StateSettings(first=3))
+    machine.begin(0.0)
+    said = [machine.measured(k * STEP, GOOD) for k in (1, 2, 3)]
+    assert [state for state, _ in said] == [TrackState.INITIALISING] * 2 + [TrackState.TRACKING]
+    assert all(reason for _, reason in said[:2]) and not said[2][1]
+
+
 def test_one_camera_is_named_with_those_that_are_missed() -> None:
-    _, reason = StateMachine().measured(1.0, replace(GOOD, cameras=("left",), trouble="right delivers no picture"))
+    _, reason = StateMachine(LIMITS).measured(
+        1.0, replace(GOOD, cameras=("left",), trouble="right delivers no picture")
+    )
     assert reason == "one camera alone carries the pose: left; right delivers no picture"
 
 
