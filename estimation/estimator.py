@@ -136,7 +136,7 @@ class Estimator:
         solution, odd = self._solve(seen, points, start, scales, self.cameras.shared(twist), allowed)
         inlier = solution.weights > 0.2
         used = np.bincount(seen.camera[inlier], minlength=len(self.rig))
-        noise, lasting, bias = self._covariance(seen, solution)
+        noise, lasting, bias = self._covariance(seen, solution, twist)
         found = int((~np.isin(seen.camera, list(odd))).sum())
         reason = self._judge(found, used, noise + lasting, disorder(seen, solution, inlier))
         off = standing_off(seen, solution, len(self.rig), self._camera_least())
@@ -222,13 +222,13 @@ class Estimator:
             return f"the pose is uncertain to {spread:.1f} mm"
         return ""
 
-    def _covariance(self, seen: Observations, solution: PoseFit) -> tuple[Array, Array, Array]:
+    def _covariance(self, seen: Observations, solution: PoseFit, twist: Array) -> tuple[Array, Array, Array]:
         """Of what is new (6, 6), of what map and deformation add (6, 6), and the effect (6, 2C) of shifted images."""
-        assert self.map is not None and solution.shared is not None
+        assert self.map is not None
         information = solution.information + 1e-9 * np.eye(6) * np.trace(solution.information)
         noise = np.linalg.pinv(information, hermitian=True)
         weight = EFFICIENCY * solution.weights / (seen.sigma * solution.scale) ** 2
-        weighted, by_point = solution.shared.slopes * weight[:, None, None], solution.jacobians[:, :, 3:]
+        weighted, by_point = solution.jacobians * weight[:, None, None], solution.jacobians[:, :, 3:]
         pulled = noise @ weighted.transpose(0, 2, 1)  # (N, 6, 2)
         spread = np.zeros((len(self.map), 6, 3))
         np.add.at(spread, seen.track, pulled @ by_point)
@@ -236,8 +236,13 @@ class Estimator:
         lasting = shift @ self.map.covariance @ shift.T
         if self._warp is not None:
             lasting = lasting + noise @ self._warp.pull(seen.track, weighted, by_point) @ noise
-        bias = np.stack([pulled[seen.camera == c].sum(0) for c in range(len(self.rig))], 1)  # (6, C, 2)
-        return noise, lasting, bias.reshape(6, -1)
+        of_camera = (seen.camera == np.arange(len(self.rig))[:, None]).astype(float)  # (C, N)
+        bias = np.einsum("cn,nik->ick", of_camera, pulled)  # (6, C, 2)
+        late = np.einsum("cn,nik,nk->ic", of_camera, pulled, solution.jacobians @ twist)  # (6, C), mm per s of delay
+        shared = self.cameras.shared(twist)
+        bias = bias.reshape(6, -1)
+        new = noise + late @ shared.delay @ late.T + (bias * np.repeat(shared.shift, 2)) @ bias.T
+        return new, lasting, bias
 
     def begin(self, stamp: float, base_from_surface: Array, surface_map: SurfaceMap, caveat: str = "") -> SurfacePose:
         """Take the first map, which defines the surface frame at `stamp`.

@@ -8,7 +8,6 @@ motion until now, is the odd one.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -44,12 +43,10 @@ def solve_with(
     fit = solve_pose(
         rig, o.camera[kept], points[kept], o.pixels[kept], o.sigma[kept], start, scales=scales, shared=shared
     )
-    assert fit.shared is not None
     predicted, _, jacobians = project(rig, o.camera, fit.base_from_surface, points)
-    residuals, weights, slopes = predicted - o.pixels, np.zeros(len(o)), jacobians.copy()
-    residuals[kept], weights[kept], slopes[kept] = fit.residuals, fit.weights, fit.shared.slopes
-    whole = replace(fit.shared, slopes=slopes)
-    return PoseFit(fit.base_from_surface, fit.information, residuals, weights, jacobians, fit.scale, whole)
+    residuals, weights = predicted - o.pixels, np.zeros(len(o))
+    residuals[kept], weights[kept] = fit.residuals, fit.weights
+    return PoseFit(fit.base_from_surface, fit.information, residuals, weights, jacobians, fit.scale, fit.shared)
 
 
 def standing_off(observations: Observations, fit: PoseFit, count: int, least: float) -> Array:
