@@ -2,7 +2,8 @@
 
 `poses.tum` holds the measured poses only, as evo reads them: `stamp x y z qx qy qz qw`, s and mm. `poses.csv` holds one
 line per frame set: stamp, frames given, pose, upper triangle of the covariance, twist, whether it moves, state, tracks
-per camera, milliseconds per stage, reason. Every line is flushed, so a killed run leaves whole lines.
+per camera, the cameras' clocks, milliseconds per stage, reason. Every line is flushed, so a killed run leaves whole
+lines.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware import checks
+from perception.tracking import StepReport
 
 TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 _UPPER = np.triu_indices(6)
@@ -40,8 +42,9 @@ class PoseTable:
     stamps: (N,) s. frames: (N,) images given. base_from_surface: (N, 4, 4) mm. covariance: (N, 6, 6) and twist:
     (N, 6) as in SurfacePose. moving: (N,), onset: (N,) s, NaN before the first, moved: (N,) mm and turned: (N,) rad, as
     in SurfaceMotion. deformation, deformation_sigma: (N,) mm, 0 where there is no warp. states: N of TrackState. used:
-    (N, C) tracks that carry the pose, per camera. seconds: (N, S + 1) per stage and in all. reasons: N sentences.
-    cameras: C names. stages: S + 1 names, the last "total".
+    (N, C) tracks that carry the pose, per camera. offsets, offset_sigmas: (N, C) s, as in StepReport.
+    seconds: (N, S + 1) per stage and in all. reasons: N sentences. cameras: C names. stages: S + 1 names, the last
+    "total".
     """
 
     stamps: Array
@@ -57,6 +60,8 @@ class PoseTable:
     deformation_sigma: Array
     states: tuple[TrackState, ...]
     used: NDArray[np.int64]
+    offsets: Array
+    offset_sigmas: Array
     seconds: Array
     reasons: tuple[str, ...]
     cameras: tuple[str, ...]
@@ -82,15 +87,25 @@ class PoseWriter:
         self._csv_file = (folder / "poses.csv").open("w", newline="", encoding="utf-8")
         self._tum_file = (folder / "poses.tum").open("w", encoding="utf-8")
         self._csv = csv.writer(self._csv_file, lineterminator="\n")
-        used = [f"tracks_{name}" for name in cameras]
-        self._csv.writerow([*_HEAD, *used, *(f"ms_{s}" for s in (*stages, "total")), "reason"])
+        self._csv.writerow(
+            [
+                *_HEAD,
+                *_names("tracks_", cameras),
+                *_clock_names(cameras),
+                *(f"ms_{s}" for s in (*stages, "total")),
+                "reason",
+            ]
+        )
         self._tum_file.write("# base_from_surface: stamp_s x y z qx qy qz qw (mm)\n")
 
-    def write(self, pose: SurfacePose, frames: int, used: NDArray[np.int64], seconds: Array, total: float) -> None:
-        """One frame set: its pose, images given, tracks used (C,), seconds per stage (S,) and `total` s."""
+    def write(self, pose: SurfacePose, frames: int, report: StepReport, total: float) -> None:
+        """One frame set: its pose, images given, what the step did, and the `total` s that it took."""
         numbers = _pose_numbers(pose.base_from_surface)
         upper = pose.covariance[_UPPER]
-        milliseconds = [f"{1000 * s:.4f}" for s in (*seconds, total)]
+        tracks = [int(n) for n in report.used]
+        in_ms = np.round(1000 * np.concatenate([report.offsets, report.offset_sigmas]), 4)
+        clocks = [f"{v:.4f}" for v in in_ms + 0.0]  # + 0.0: no -0.0000
+        milliseconds = [f"{1000 * s:.4f}" for s in (*report.seconds, total)]
         motion = pose.motion
         moved = [int(motion.moving), f"{motion.onset:.6f}", f"{motion.moved:.6f}", f"{np.rad2deg(motion.turned):.6f}"]
         bent = [0.0, 0.0] if pose.warp is None else [pose.warp.deformation, pose.warp.deformation_sigma]
@@ -103,7 +118,7 @@ class PoseWriter:
                 *moved,
                 *(f"{v:.6f}" for v in bent),
             ]
-            + [pose.state.value, int(np.count_nonzero(used)), *(int(n) for n in used), *milliseconds, pose.reason]
+            + [pose.state.value, int(np.count_nonzero(tracks)), *tracks, *clocks, *milliseconds, pose.reason]
         )
         self._csv_file.flush()
         if pose.state.measured:
@@ -122,6 +137,14 @@ class PoseWriter:
         self.close()
 
 
+def _names(column: str, cameras: Sequence[str]) -> list[str]:
+    return [f"{column}{name}" for name in cameras]
+
+
+def _clock_names(cameras: Sequence[str]) -> list[str]:
+    return [*_names("offset_ms_", cameras), *_names("offset_sigma_ms_", cameras)]
+
+
 def _pose_numbers(transform: Array) -> list[str]:
     quaternion = se3.quaternion_from_rotation(transform[:3, :3])
     return [*(f"{v:.6f}" for v in transform[:3, 3]), *(f"{v:.12f}" for v in quaternion)]
@@ -130,6 +153,7 @@ def _pose_numbers(transform: Array) -> list[str]:
 def read_poses(path: Path) -> PoseTable:
     """The table that a PoseWriter wrote to `path`; a last line cut short by a kill is left out.
 
+    Of files from before the cameras' clocks were learned, offsets are 0 and their sigmas nan.
     Raises InputError naming file, line and column for anything else that PoseWriter would not have written.
     """
     rows = [row for _, row in checks.read_csv(path, "a poses.csv of stillbed track")]
@@ -145,6 +169,9 @@ def read_poses(path: Path) -> PoseTable:
 def _table(path: Path, head: list[str], body: list[list[str]]) -> PoseTable:
     cameras = tuple(name.removeprefix("tracks_") for name in head if name.startswith("tracks_"))
     stages = tuple(name.removeprefix("ms_") for name in head if name.startswith("ms_"))
+    learned = head[len(_HEAD) + len(cameras) : len(head) - 1 - len(stages)]
+    if learned not in ([], _clock_names(cameras)):
+        raise InputError(path, "header", ",".join(learned), ",".join(_clock_names(cameras)))
     state_column = head.index("state")
     for number, row in enumerate(body, start=2):
         if len(row) != len(head):
@@ -152,10 +179,14 @@ def _table(path: Path, head: list[str], body: list[list[str]]) -> PoseTable:
         if row[state_column] not in _STATES:
             raise InputError(path, f"line {number}: state", row[state_column], ", ".join(_STATES))
     numbers = _numbers(path, head, [row[:state_column] + row[state_column + 1 : -1] for row in body])
-    stamps, frames, positions, quaternions, upper, twist, motion, deformation, cameras_used, used, milliseconds = (
-        np.split(numbers, np.cumsum([1, 1, 3, 4, 21, 6, len(_MOTION), len(_DEFORMATION), 1, len(cameras)]), axis=1)
+    stamps, frames, positions, quaternions, upper, twist, motion, deformation, cameras_used, used, rest = np.split(
+        numbers, np.cumsum([1, 1, 3, 4, 21, 6, len(_MOTION), len(_DEFORMATION), 1, len(cameras)]), axis=1
     )
     del cameras_used  # it is np.count_nonzero(used, 1)
+    clocks, milliseconds = np.split(rest, [-len(stages)], axis=1)
+    if not learned:
+        clocks = np.tile(np.repeat([0.0, np.nan], len(cameras)), (len(body), 1))
+    offsets, offset_sigmas = np.split(clocks / 1000, [len(cameras)], axis=1)
     covariance = np.zeros((len(body), 6, 6))
     covariance[:, _UPPER[0], _UPPER[1]] = covariance[:, _UPPER[1], _UPPER[0]] = upper
     return PoseTable(
@@ -172,6 +203,8 @@ def _table(path: Path, head: list[str], body: list[list[str]]) -> PoseTable:
         deformation_sigma=deformation[:, 1],
         states=tuple(TrackState(row[state_column]) for row in body),
         used=used.astype(np.int64),
+        offsets=offsets,
+        offset_sigmas=offset_sigmas,
         seconds=milliseconds / 1000,
         reasons=tuple(row[-1] for row in body),
         cameras=cameras,

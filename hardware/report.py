@@ -15,6 +15,7 @@ from estimation.errors import InputError, StillbedError
 from estimation.pose import TrackState
 from estimation.se3 import Array
 from hardware.chart import Plot, ribbon, spanning
+from hardware.clock_section import clock_section
 from hardware.evaluation import NEES_BOUND, OFF_MM, Comparison, Evaluation, spread
 from hardware.motion_section import motion_section
 from hardware.page import area_key, document, figures_table, legend, line_key, row_of_tiles, section, tile
@@ -42,7 +43,7 @@ def sections(result: Evaluation) -> list[str]:
     """The parts of the page that follow its tiles, as HTML."""
     span = _followed(result)
     parts = [_states(result), _trajectory(result), motion_section(result.table, span, WIDTH), _errors(result)]
-    parts += [_tracks(result), _latency(result)]
+    parts += [_tracks(result), clock_section(result.table, span, WIDTH), _latency(result)]
     return [part for part in parts if part]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from estimation.pose import TrackState
 from hardware.evaluation import OFF_MM, Comparison, Errors, Evaluation, Spread, spread
+from hardware.pose_file import PoseTable
 
 
 def measured_share(result: Evaluation) -> float:
@@ -33,7 +34,23 @@ def verdict(result: Evaluation) -> list[str]:
     if len(result.latency.total):
         middle, tail = result.latency.p50[-1], result.latency.p99[-1]
         sentences.append(f"A pose took {middle:.1f} ms (median), {tail:.1f} ms at the 99th percentile.")
+    if clocks_learned(result.table):
+        sentences.append(_clocks(result.table))
     return sentences
+
+
+def clocks_learned(table: PoseTable) -> bool:
+    """Whether the method learned when the cameras expose."""
+    return len(table) > 0 and len(table.cameras) > 1 and bool(np.isfinite(table.offset_sigmas[-1]).all())
+
+
+def _clocks(table: PoseTable) -> str:
+    """What was known at the end of when the cameras expose."""
+    offsets, sigmas = 1000 * table.offsets[-1], 1000 * table.offset_sigmas[-1]
+    if not offsets.any():
+        return f"No camera exposes clearly earlier or later than the others (known to {sigmas.max():.1f} ms)."
+    each = [f"{n} {o:+.1f} ± {s:.1f} ms" for n, o, s in zip(table.cameras, offsets, sigmas, strict=True)]
+    return f"Against the mean of their clocks the cameras expose at {', '.join(each)}."
 
 
 def _judgement(comparison: Comparison) -> list[str]:
@@ -71,12 +88,20 @@ def as_dict(result: Evaluation) -> dict[str, Any]:
         "states": result.shares,
         "measured_share": measured_share(result),
         "latency_ms": {name: {"p50": a, "p95": b, "p99": c, "max": d} for name, a, b, c, d in percentiles},
+        "clocks_ms": _clocks_dict(result.table),
         "initialisation_ms": late.initialisation,
         "initialisation_frame_sets": late.initial_sets,
         "errors": None if result.comparison is None else _comparison_dict(result.comparison),
     }
     cleaned: dict[str, Any] = finite(summary)
     return cleaned
+
+
+def _clocks_dict(table: PoseTable) -> dict[str, Any] | None:
+    if not clocks_learned(table):
+        return None
+    last = zip(table.cameras, 1000 * table.offsets[-1], 1000 * table.offset_sigmas[-1], strict=True)
+    return {name: {"offset": offset, "sigma": sigma} for name, offset, sigma in last}
 
 
 def _comparison_dict(comparison: Comparison) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def follow(
         start = now()
         pose = step(frames)
         spent = now() - start
-        writer.write(pose, len(frames.frames), step.last.used, step.last.seconds, spent)
+        writer.write(pose, len(frames.frames), step.last, spent)
         for sink in sinks:
             sink(frames, pose, step.last)
         step.idle()

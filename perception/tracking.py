@@ -40,11 +40,23 @@ FULL_SEARCH = 10  # frame sets of an absent surface between searches at full siz
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepReport:
-    """What one step did. used: (C,) tracks per camera that carry the pose. seconds: (len(STAGES),) by `clock`."""
+    """What one step did.
+
+    used: (C,) tracks per camera that carry the pose. seconds: (len(STAGES),) by `clock`. offsets: (C,) s, how much
+    later than stamped each camera was taken to expose, against the mean of all; offset_sigmas: (C,) s, one standard
+    deviation, nan where nothing is learned of it.
+    """
 
     observations: Observations
     used: NDArray[np.int64]
     seconds: Array
+    offsets: Array
+    offset_sigmas: Array
+
+
+def trusting_report(observations: Observations, used: NDArray[np.int64], seconds: Array) -> StepReport:
+    """Of a step that takes every stamp for the instant of its exposure."""
+    return StepReport(observations, used, seconds, np.zeros(len(used)), np.full(len(used), np.nan))
 
 
 class TrackingStep:
@@ -87,7 +99,7 @@ class TrackingStep:
         self._lap = self._clock()
         last = self._estimator.pose
         if last is not None and frames.stamp <= last.stamp:  # the same instant again tells nothing new
-            self.last = StepReport(no_observations(frames.stamp), np.zeros(len(self.rig), np.int64), self._spent)
+            self.last = self._report(no_observations(frames.stamp), np.zeros(len(self.rig), np.int64))
             return last
         self._check(frames)
         pyramids = self._pyramids(frames)
@@ -96,7 +108,7 @@ class TrackingStep:
             pose, observations, used = self._initialise(frames, pyramids)
         else:
             pose, observations, used = self._track(self._matcher, frames.stamp, pyramids)
-        self.last = StepReport(observations, used, self._spent)
+        self.last = self._report(observations, used)
         return pose
 
     @property
@@ -109,6 +121,10 @@ class TrackingStep:
         if self._matcher is not None:
             self._mapping.keep(self._matcher, self._estimator)
         self._recover()
+
+    def _report(self, observations: Observations, used: NDArray[np.int64]) -> StepReport:
+        cameras = self._estimator.cameras
+        return StepReport(observations, used, self._spent, cameras.offset, cameras.offset_sigma)
 
     def _check(self, frames: FrameSet) -> None:
         for frame in frames.frames:

@@ -14,6 +14,7 @@ from perception.frames import FrameSet
 from perception.tracking import STAGES as STEP_STAGES
 from perception.tracking import StepReport
 
+OFFSETS = 0.0143, -0.0091, -0.0052  # s, of the cameras, once they are known
 STAGES = ("prepare", "flow", "total")
 
 
@@ -60,6 +61,8 @@ def run(
         deformation_sigma=np.zeros(count),
         states=tuple(named.get(i, TrackState.TRACKING) for i in range(count)),
         used=draw.integers(30, 60, size=(count, 3)),
+        offsets=np.outer(np.minimum(np.arange(count) / 10, 1.0), OFFSETS),
+        offset_sigmas=np.tile(np.array([[0.008], [0.0004]])[np.minimum(np.arange(count), 1)], 3),
         seconds=np.concatenate([seconds, seconds.sum(axis=1, keepdims=True)], axis=1),
         reasons=tuple(f'row {i}, <so> & "so"' for i in range(count)),
         cameras=("left", "top", "right"),
@@ -83,8 +86,9 @@ class Replayed:
         self.log.append("step")
         nothing = np.empty(0, np.int64)
         observations = Observations(frames.stamp, nothing, nothing, np.empty((0, 2)), np.empty(0))
-        self.last = StepReport(observations, self.table.used[i], np.full(len(STEP_STAGES), 0.001))
         t = self.table
+        seconds = np.full(len(STEP_STAGES), 0.001)
+        self.last = StepReport(observations, t.used[i], seconds, t.offsets[i], t.offset_sigmas[i])
         return SurfacePose(frames.stamp, t.base_from_surface[i], t.covariance[i], t.twist[i], t.states[i])
 
     def idle(self) -> None:

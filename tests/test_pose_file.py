@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from estimation.errors import InputError
+from estimation.observations import no_observations
 from estimation.pose import SurfaceMotion, SurfacePose, TrackState
 from hardware.pose_file import PoseTable, PoseWriter, read_poses
+from perception.tracking import StepReport
 from tests.runs import run
 
 STATES = {3: TrackState.DEGRADED, 4: TrackState.COASTING, 5: TrackState.LOST}
@@ -27,11 +30,15 @@ def pose(table: PoseTable, i: int) -> SurfacePose:
     )
 
 
+def report(table: PoseTable, i: int) -> StepReport:
+    nothing = no_observations(float(table.stamps[i]))
+    return StepReport(nothing, table.used[i], table.seconds[i, :-1], table.offsets[i], table.offset_sigmas[i])
+
+
 def write(folder: Path, table: PoseTable) -> Path:
     with PoseWriter(folder, table.cameras, table.stages[:-1]) as writer:
         for i in range(len(table)):
-            seconds = table.seconds[i]
-            writer.write(pose(table, i), int(table.frames[i]), table.used[i], seconds[:-1], float(seconds[-1]))
+            writer.write(pose(table, i), int(table.frames[i]), report(table, i), float(table.seconds[i, -1]))
     return folder / "poses.csv"
 
 
@@ -53,7 +60,8 @@ def test_csv_round_trip(tmp_path: Path) -> None:
     assert np.array_equal(back.moving, table.moving)
     for name in ("onset", "moved", "turned"):
         assert np.allclose(getattr(back, name), getattr(table, name), atol=1e-6, equal_nan=True)
-    assert np.abs(back.seconds - table.seconds).max() < 1e-7
+    for name in ("offsets", "offset_sigmas", "seconds"):
+        assert np.abs(getattr(back, name) - getattr(table, name)).max() < 1e-7
 
 
 def test_a_second_round_trip_changes_no_byte(tmp_path: Path) -> None:
@@ -61,6 +69,23 @@ def test_a_second_round_trip_changes_no_byte(tmp_path: Path) -> None:
     first = write(tmp_path, table)
     (tmp_path / "again").mkdir()
     assert write(tmp_path / "again", read_poses(first)).read_bytes() == first.read_bytes()
+
+
+def test_a_file_from_before_the_clocks_were_learned_is_read(tmp_path: Path) -> None:
+    table, _ = run(5)
+    path = write(tmp_path, table)
+    with path.open(newline="") as file:
+        rows = list(csv.reader(file))
+    kept = [i for i, name in enumerate(rows[0]) if not name.startswith("offset_")]
+    with path.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([row[i] for i in kept] for row in rows)
+    back = read_poses(path)
+    assert not back.offsets.any()
+    assert np.isnan(back.offset_sigmas).all()
+    assert back.offsets.shape == back.offset_sigmas.shape == (5, 3)
+    assert back.stages == table.stages
+    assert np.abs(back.seconds - table.seconds).max() < 1e-7
+    assert np.array_equal(back.used, table.used)
 
 
 def test_a_pose_that_is_not_known_yet_round_trips(tmp_path: Path) -> None:
@@ -88,7 +113,7 @@ def test_every_line_stands_before_the_next_pose_is_known(tmp_path: Path) -> None
     table, _ = run(5)
     with PoseWriter(tmp_path, table.cameras, table.stages[:-1]) as writer:
         for i in range(5):
-            writer.write(pose(table, i), 3, table.used[i], table.seconds[i, :-1], 0.01)
+            writer.write(pose(table, i), 3, report(table, i), 0.01)
             assert len(read_poses(tmp_path / "poses.csv")) == i + 1
 
 
@@ -117,6 +142,7 @@ def test_an_empty_run_is_an_empty_table(tmp_path: Path) -> None:
         ("TRACKING", "FLYING", "state = 'FLYING'"),
         ("0.033333", "soon", "stamp_s = 'soon'"),
         ("0.033333,", "0.033333,7,", "columns"),
+        ("offset_ms_top,", "offset_top,", "offset_ms_top"),
     ],
 )
 def test_a_wrong_file_is_told_by_line_and_column(tmp_path: Path, old: str, new: str, says: str) -> None:

@@ -13,7 +13,7 @@ from estimation.pose import TrackState
 from hardware.chart import Plot, Scale, round_step, spanning, stretches, thinned
 from hardware.evaluation import Evaluation, evaluate
 from hardware.report import main, page, write_report
-from hardware.summary import write_summary
+from hardware.summary import as_dict, summary_text, verdict, write_summary
 from tests.runs import run
 
 SIGMA = np.array([0.002, 0.002, 0.002, 0.1, 0.1, 0.1])
@@ -84,6 +84,36 @@ def test_a_run_without_any_known_pose_has_a_page() -> None:
     table.base_from_surface[:] = np.nan
     table.covariance[:] = np.nan
     assert "INITIALISING 100 %" in text_of_page(page(evaluate(table, truth)))
+
+
+def test_the_page_says_when_each_camera_exposes() -> None:
+    table, truth = run(40, sigma=SIGMA)
+    result = evaluate(table, truth)
+    text = text_of_page(page(result))
+    at_end = "left +14.3 ± 0.4 ms, top -9.1 ± 0.4 ms, right -5.2 ± 0.4 ms"
+    assert f"the cameras expose at {at_end}." in text
+    assert "left, at the end +14.3 ± 0.4 ms" in text
+    assert at_end in summary_text(result)
+    assert as_dict(result)["clocks_ms"]["top"] == pytest.approx({"offset": -9.1, "sigma": 0.4})
+
+
+def test_cameras_that_expose_together_are_said_to() -> None:
+    table, truth = run(40, sigma=SIGMA)
+    table.offsets[:] = 0
+    assert "No camera exposes clearly earlier or later than the others (known to 0.4 ms)." in verdict(
+        evaluate(table, truth)
+    )
+
+
+@pytest.mark.parametrize("states", [{}, {i: TrackState.INITIALISING for i in range(40)}])
+def test_a_method_that_learns_no_clocks_says_nothing_of_them(states: dict[int, TrackState]) -> None:
+    table, truth = run(40, sigma=SIGMA, states=states)
+    table.offset_sigmas[:] = np.nan
+    result = evaluate(table, truth)
+    text = text_of_page(page(result))
+    assert "Clocks" not in text
+    assert "expose" not in text
+    assert as_dict(result)["clocks_ms"] is None
 
 
 def test_a_perfect_run_has_a_page() -> None:

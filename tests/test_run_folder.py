@@ -26,7 +26,7 @@ from hardware.simulator.scenario_file import read_scenario
 from hardware.simulator.session_folder import SessionFolder
 from hardware.tum import read_tum
 from perception.frames import Frame, FrameSet, Roi
-from perception.tracking import STAGES, StepReport
+from perception.tracking import STAGES, StepReport, trusting_report
 from planning.command import Command, Hold, Move
 from planning.legs import Phase
 from planning.planner import Progress
@@ -83,7 +83,7 @@ def pose(stamp: float, state: TrackState = TrackState.TRACKING) -> SurfacePose:
 
 
 def report(stamp: float) -> StepReport:
-    return StepReport(no_observations(stamp), np.zeros(3, np.int64), np.zeros(len(STAGES)))
+    return trusting_report(no_observations(stamp), np.zeros(3, np.int64), np.zeros(len(STAGES)))
 
 
 def move(stamp: float, extrude: bool) -> Move:

@@ -20,6 +20,7 @@ from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.bench import thesis, thesis_scenes
 from hardware.cli import main
 from hardware.methods import METHODS
+from hardware.pose_file import read_poses
 from hardware.simulator.scenario_file import read_scenario
 from hardware.simulator.scene import rois
 from perception.frames import Frame, FrameSet, Roi
@@ -200,6 +201,9 @@ def test_a_run_by_the_thesis_leaves_the_same_files_and_says_by_what(method: str,
     assert summary["method"] == method
     assert summary["measured_share"] == 1.0
     assert summary["errors"]["start"]["translation_mm"]["max"] < 1.0
+    table = read_poses(out / "poses.csv")
+    assert not table.offsets.any()
+    assert np.isnan(table.offset_sigmas).all()
     assert f"method {method}" in (out / "report.html").read_text()
 
 

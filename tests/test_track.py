@@ -88,12 +88,16 @@ def test_a_run_leaves_its_files_and_they_agree(tracked: Path) -> None:
     assert (len(table), summary["frame_sets"], summary["complete"]) == (10, 10, True)
     lines = (tracked / "poses.tum").read_text().splitlines()
     assert len(lines) - 1 == table.measured.sum()
+    assert np.isfinite(table.offset_sigmas).all()
+    assert (table.offset_sigmas[-1] < table.offset_sigmas[0]).all()
+    assert np.abs(table.offsets[-1]).max() < 0.001  # the cameras were triggered together
+    assert list(summary["clocks_ms"]) == list(table.cameras)
     assert (table.seconds[:, -1] >= table.seconds[:, :-1].sum(axis=1) - 1e-4).all()
 
 
 def test_the_simulated_surface_is_followed(tracked: Path) -> None:
     summary = json.loads((tracked / "summary.json").read_text())
-    assert summary["measured_share"] >= 0.8
+    assert summary["measured_share"] >= 0.6  # four of the ten frame sets are averaged into the first pose
     assert summary["errors"]["against"] == "truth"
     assert summary["errors"]["start"]["translation_mm"]["max"] < 0.5
     assert summary["errors"]["start"]["rotation_deg"]["max"] < 0.5

@@ -78,7 +78,7 @@ def side_by_side(shown: Shown, methods: tuple[str, ...]) -> list[Judged]:
                 pose = step(frames)
                 costs[method].append(processor() - cost)
                 spent = now() - start
-                writers[method].write(pose, len(frames.frames), step.last.used, step.last.seconds, spent)
+                writers[method].write(pose, len(frames.frames), step.last, spent)
                 step.idle()
         return [_judged(shown, Path(folder) / m / "poses.csv", m, costs[m]) for m in methods]
 

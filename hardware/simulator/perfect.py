@@ -13,7 +13,7 @@ from estimation.predictor import Predictor
 from estimation.se3 import Array
 from hardware.simulator.truth import Truth
 from perception.frames import FrameSet
-from perception.tracking import STAGES, StepReport
+from perception.tracking import STAGES, StepReport, trusting_report
 
 SURE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: exact, but no matrix without an inverse
 
@@ -35,7 +35,8 @@ class PerfectTracker:
         """The pose at the mean of the true exposures, under the stamp that the cameras tell."""
         instant = np.array([np.mean([self._exposed(f.camera, f.stamp) for f in frames.frames])])
         pose, twist = self._truth.base_from_surface(instant)[0], self._truth.twist(instant)[0]
-        self.last = StepReport(no_observations(frames.stamp), np.zeros(self._cameras, np.int64), np.zeros(len(STAGES)))
+        nothing, none = no_observations(frames.stamp), np.zeros(self._cameras, np.int64)
+        self.last = trusting_report(nothing, none, np.zeros(len(STAGES)))
         seen = SurfacePose(frames.stamp, self._offset @ pose, SURE, twist, TrackState.TRACKING)
         return replace(seen, forecast=self._predictor.add(seen))
 

@@ -115,7 +115,7 @@ class RunFolder:
 
     def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
         """A pose was made of a frame set in `spent` s of real time."""
-        self._poses.write(pose, len(frames.frames), report.used, report.seconds, spent)
+        self._poses.write(pose, len(frames.frames), report, spent)
         if pose.state is not self._state:
             self.event(pose.stamp, f"{pose.state.value}: {pose.reason}", INFO if pose.state.measured else WARNING)
             self._state = pose.state

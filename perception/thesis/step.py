@@ -19,7 +19,7 @@ from perception.thesis.axes import assign_axes, unmeasured
 from perception.thesis.camera import LONGEST, CameraTrack
 from perception.thesis.features import KeyPoints
 from perception.thesis.pairs import Finder
-from perception.tracking import STAGES, StepReport
+from perception.tracking import STAGES, StepReport, trusting_report
 
 LEAST_VARIANCE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: what is taken for none, with an inverse all the same
 OUTWARD = np.diag([1.0, -1.0, -1.0])  # the top camera from the surface: z out of it, to the camera
@@ -64,7 +64,7 @@ class ThesisStep:
         self._spent, start = np.zeros(len(STAGES)), self._clock()
         last = self._pose
         if last is not None and frames.stamp <= last.stamp:  # the same instant again tells nothing new
-            self.last = StepReport(no_observations(frames.stamp), np.zeros(len(self.rig), np.int64), self._spent)
+            self.last = trusting_report(no_observations(frames.stamp), np.zeros(len(self.rig), np.int64), self._spent)
             return last
         images = {f.camera: f.image for f in frames.frames}
         pose = self._begin(frames, images) if last is None else self._follow(last, frames.stamp, images)
@@ -72,7 +72,7 @@ class ThesisStep:
         used = np.zeros(len(self.rig), np.int64)
         for camera, track in self._tracks.items():
             used[camera] = len(track.pixels)
-        self.last = StepReport(self._observations(frames.stamp), used, self._spent)
+        self.last = trusting_report(self._observations(frames.stamp), used, self._spent)
         return pose
 
     def idle(self) -> None:
