@@ -82,6 +82,7 @@ class CameraErrors:
         self._mean = np.zeros(3 * n)  # delays s, shifts right px, shifts down px
         start = np.diag(np.repeat([self.OFFSET**2, self.SHIFT**2, self.SHIFT**2], n))
         self._covariance = self._free @ start @ self._free
+        self._offset = np.zeros(n)
         self._jitter = Variance(0.005, 3e-4, 1e-3)  # s: USB cameras; no stamp is better
         self._unrest = Variance(0.05, 0.005, 0.01)  # px, of a camera's shift from frame to frame
 
@@ -92,10 +93,7 @@ class CameraErrors:
         Many cameras are triggered together, and a correction by what chance made up would only carry the pose about; so
         nothing is corrected until offsets are clearly there.
         """
-        n = self._count
-        mean, known = self._mean[:n], np.linalg.pinv(self._covariance[:n, :n], hermitian=True)
-        apart = float(mean @ known @ mean) / max(1, n - 1)
-        return mean * min(1.0, max(0.0, (apart - self.PLAIN) / (self.SURE - self.PLAIN)))
+        return self._offset
 
     @property
     def offset_sigma(self) -> Array:
@@ -139,6 +137,14 @@ class CameraErrors:
         gain = self._covariance @ np.linalg.inv(eye + told @ self._covariance)
         self._mean = self._free @ (self._mean + gain @ (blurred.T @ found.pull) / self.CAREFUL)
         self._covariance = self._free @ ((gain + gain.T) / 2) @ self._free
+        self._offset = self._clear_offset()
+
+    def _clear_offset(self) -> Array:
+        """The offsets (C,), s, as far as chance does not explain them."""
+        n = self._count
+        mean, known = self._mean[:n], np.linalg.pinv(self._covariance[:n, :n], hermitian=True)
+        apart = float(mean @ known @ mean) / max(1, n - 1)
+        return mean * min(1.0, max(0.0, (apart - self.PLAIN) / (self.SURE - self.PLAIN)))
 
     def _beyond_mean(self, found: SharedFit, clear: float) -> SharedFit:
         """What a fit found beyond the shifts known, and of delays only what a clear velocity shows."""

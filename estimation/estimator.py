@@ -131,8 +131,8 @@ class Estimator:
             return self._no_fit(observations, start)
         warped = self.map.points if self._warp is None else self._warp.points(self.map)
         points, (twist, doubt) = warped[observations.track], self._twist(observations.stamp, start)
-        seen = self._together(observations, points, start, twist)
-        allowed = self.health.allowed(np.full(len(self.rig), self._smear(seen, points, start, twist)))
+        seen, smear = self._together(observations, points, start, twist)
+        allowed = self.health.allowed(np.full(len(self.rig), smear))
         solution, odd = self._solve(seen, points, start, scales, self.cameras.shared(twist), allowed)
         inlier = solution.weights > 0.2
         used = np.bincount(seen.camera[inlier], minlength=len(self.rig))
@@ -188,23 +188,28 @@ class Estimator:
         trust = np.repeat([group.mean() for group in (behind / (ahead + behind + 1e-30)).reshape(2, 3)], 3)
         return trust * last.twist + (1 - trust) * chord, trust**2 * ahead + (1 - trust) ** 2 * behind
 
-    def _together(self, observations: Observations, points: Array, start: Array, twist: Array) -> Observations:
-        """The observations as cameras without offsets would have made them, with sigmas that can be believed."""
-        sigma, pixels = np.maximum(observations.sigma, self.settings.floor_sigma), observations.pixels
-        if twist.any():
-            camera, late = observations.camera, self.as_exposed(start, twist)
-            moved = project(self.rig, camera, late, points)[0] - project(self.rig, camera, start, points)[0]
-            pixels = pixels - moved
-        return replace(observations, pixels=pixels, sigma=sigma)
+    def _together(
+        self, observations: Observations, points: Array, start: Array, twist: Array
+    ) -> tuple[Observations, float]:
+        """The observations as cameras without offsets would have made them, with sigmas that can be believed.
+
+        And how far, px, the surface moves in the time by which a camera's exposure is unknown.
+        """
+        sigma, pixels, camera = (
+            np.maximum(observations.sigma, self.settings.floor_sigma),
+            observations.pixels,
+            observations.camera,
+        )
+        at_once, _, jacobians = project(self.rig, camera, start, points)
+        velocity = jacobians @ twist
+        if self.cameras.offset.any():
+            pixels = pixels + at_once - project(self.rig, camera, self.as_exposed(start, twist), points)[0]
+        smear = self.cameras.delays.sigma * float(np.sqrt(np.median((velocity**2).sum(1))))
+        return replace(observations, pixels=pixels, sigma=sigma), smear
 
     def as_exposed(self, base_from_surface: Array, twist: Array) -> Array:
         """Where the surface is (C, 4, 4) when each camera exposes, from its pose (4, 4) and twist (6,)."""
         return np.asarray(base_from_surface @ se3.exp(twist * self.cameras.offset[:, None]))
-
-    def _smear(self, seen: Observations, points: Array, start: Array, twist: Array) -> float:
-        """How far, px, the surface moves in the time by which a camera's exposure is unknown."""
-        velocity = project(self.rig, seen.camera, start, points)[2] @ twist
-        return self.cameras.delays.sigma * float(np.median(np.linalg.norm(velocity, axis=1)))
 
     def _judge(self, found: int, used: NDArray[np.int64], covariance: Array, among: float) -> str:
         s, agreed = self.settings, int(used.sum())
@@ -236,13 +241,16 @@ class Estimator:
         lasting = shift @ self.map.covariance @ shift.T
         if self._warp is not None:
             lasting = lasting + noise @ self._warp.pull(seen.track, weighted, by_point) @ noise
-        of_camera = (seen.camera == np.arange(len(self.rig))[:, None]).astype(float)  # (C, N)
-        bias = np.einsum("cn,nik->ick", of_camera, pulled)  # (6, C, 2)
-        late = np.einsum("cn,nik,nk->ic", of_camera, pulled, solution.jacobians @ twist)  # (6, C), mm per s of delay
+        velocity, count = solution.jacobians @ twist, len(self.rig)
+        bias, late = np.zeros((6, count, 2)), np.zeros((6, count))
+        for c in range(count):
+            mine = seen.camera == c
+            bias[:, c] = pulled[mine].sum(0)
+            late[:, c] = np.einsum("nik,nk->i", pulled[mine], velocity[mine])
         shared = self.cameras.shared(twist)
-        bias = bias.reshape(6, -1)
-        new = noise + late @ shared.delay @ late.T + (bias * np.repeat(shared.shift, 2)) @ bias.T
-        return new, lasting, bias
+        flat: Array = bias.reshape(6, -1)
+        new = noise + late @ shared.delay @ late.T + (flat * np.repeat(shared.shift, 2)) @ flat.T
+        return new, lasting, flat
 
     def begin(self, stamp: float, base_from_surface: Array, surface_map: SurfaceMap, caveat: str = "") -> SurfacePose:
         """Take the first map, which defines the surface frame at `stamp`.

@@ -152,7 +152,7 @@ def solve_pose(
             predicted, depth, jacobian = project(rig, camera, pose, points)
             residual = predicted - pixels
             if common is not None:
-                residual = residual + common.explained(jacobian)
+                residual = residual + common.explained(jacobian, anew=iteration < 2)
             if np.abs(step).max() < tolerance or -step @ gradient < ARRIVED:
                 break
     if common is None:
@@ -176,7 +176,7 @@ class _Common:
             self._mine = [(int(c), np.nonzero(camera == c)[0]) for c in present]
         self._columns = np.zeros((len(camera), 2, 10))  # derivatives by pose, own delay and own shift; residual
         self._columns[:, 0, 7] = self._columns[:, 1, 8] = 1.0
-        self._eye = np.eye(3 * self._count)
+        self._effect, self._eye = np.zeros(3 * self._count), np.eye(3 * self._count)
 
     def _of(self, camera: int) -> list[int]:
         """Where a camera's own delay and shifts stand among all."""
@@ -198,12 +198,14 @@ class _Common:
         self._whole, self._cross, self._own, self._right = whole, cross, own, right
         return whole[:, :6], whole[:, 6]
 
-    def explained(self, jacobian: Array) -> Array:
-        """What of the residuals (N, 2) px is shared, of the last `normal`, were the pose allowed to follow."""
-        found = self.found()
-        # (information + prior^-1)^-1, also where the prior is singular
-        gain = self._prior @ np.linalg.inv(self._eye + found.information @ self._prior)
-        delay, right, down = (gain @ found.pull).reshape(3, -1)
+    def explained(self, jacobian: Array, anew: bool) -> Array:
+        """What of the residuals (N, 2) px is shared, were the pose allowed to follow; anew: of the last `normal`."""
+        if anew:
+            found = self.found()
+            # (information + prior^-1)^-1, also where the prior is singular
+            gain = self._prior @ np.linalg.inv(self._eye + found.information @ self._prior)
+            self._effect = gain @ found.pull
+        delay, right, down = self._effect.reshape(3, -1)
         return np.asarray(
             delay[self._camera, None] * (jacobian @ self._twist) + np.stack([right, down], -1)[self._camera]
         )

@@ -123,7 +123,7 @@ class Mapping:
             if not refit.measured:
                 break
             fit, observations = refit, again
-        self._wanted = {c: max(WANTED, int(fit.used[c])) for c in range(len(self._lenses.rig))}
+        self._wanted = dict.fromkeys(range(len(self._lenses.rig)), WANTED)
         if self._placing is not None:
             fit = self._lay_scan(self._placing, matcher, estimator, pyramids, fit, observations)
         return fit, observations

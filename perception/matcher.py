@@ -37,6 +37,20 @@ class View:
     base_from_surface: Array
 
 
+def spread_order(points: Array) -> NDArray[np.int64]:
+    """Numbers (N,) of points (N, 3) in an order of which every beginning is spread over all of them.
+
+    Each next one is the farthest from those before (Gonzalez 1985).
+    """
+    order, apart = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
+    chosen = int(np.argmin(((points - points.mean(0)) ** 2).sum(1))) if len(points) else 0
+    for i in range(len(points)):
+        order[i], apart[chosen] = chosen, -1.0
+        apart = np.minimum(apart, ((points - points[chosen]) ** 2).sum(1))
+        chosen = int(np.argmax(apart))
+    return order
+
+
 class Matcher:
     """Finds the landmarks of one map; remembers what each camera last saw of them."""
 
@@ -47,6 +61,7 @@ class Matcher:
         self.agrees = np.ones(len(surface_map), bool)  # landmarks worth looking for
         self._views: dict[int, View] = {}
         self._gathered: tuple[NDArray[np.int64], Templates] | None = None
+        self._order = spread_order(surface_map.points)
 
     def take(self, surface_map: SurfaceMap, agrees: NDArray[np.bool_]) -> None:
         """A refined map, same rows, and which of them (N,) are worth looking for."""
@@ -55,6 +70,7 @@ class Matcher:
     def extend(self, surface_map: SurfaceMap, templates: Templates) -> None:
         """The map with more rows at its end, and the reference pictures of those."""
         new = len(surface_map) - len(self.map)
+        self._order = np.concatenate([self._order, len(self.map) + spread_order(surface_map.points[len(self.map) :])])
         self.map, self._gathered = surface_map, None
         self.templates = join([self.templates, templates])
         self.agrees = np.concatenate([self.agrees, np.ones(new, bool)])
@@ -141,9 +157,17 @@ class Matcher:
         return self.lenses.image(camera, *ideal_pixels(self.rig.cameras[camera], points_base))[0]
 
     def align(
-        self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array], coarse: bool = False
+        self,
+        stamp: float,
+        pyramids: dict[int, Pyramid],
+        poses: dict[int, Array],
+        coarse: bool = False,
+        most: int | None = None,
     ) -> Observations:
-        """Measure the landmarks in every camera, begun where the camera's own pose puts them; coarse: from afar."""
+        """Measure the landmarks in every camera, begun where the camera's own pose puts them; coarse: from afar.
+
+        most: landmarks of a camera, spread over the surface and the same from frame set to frame set; all without.
+        """
         cameras = [c for c in pyramids if c in poses]
         if not cameras:
             return no_observations(stamp)
@@ -151,7 +175,7 @@ class Matcher:
         surface_map, axes = self.map, self.templates.axes[rows]
         starts = np.stack([poses[c] for c in cameras])
         where = project_into(self.lenses, cameras, starts, surface_map.points[rows], surface_map.normals[rows], axes)
-        seen = np.nonzero(where.visible)[0]
+        seen = np.nonzero(where.visible if most is None else self._some(where.visible, rows, most))[0]
         position, row = np.divmod(seen, len(rows))
         where, row = where.take(seen), rows[row]
         counts = np.bincount(position, minlength=len(cameras))
@@ -161,6 +185,15 @@ class Matcher:
         camera = np.array(cameras, np.int64)[position[kept]]
         pixels = self._ideal(camera, result.pixels[kept])
         return Observations(stamp, camera, row[kept], pixels, result.sigma[kept])
+
+    def _some(self, visible: NDArray[np.bool_], rows: NDArray[np.int64], most: int) -> NDArray[np.bool_]:
+        """Of what is visible (C * N,), at most so many landmarks of each camera: the first in the order of spread."""
+        rank = np.argsort(self._order)[rows]
+        some = np.zeros_like(visible).reshape(-1, len(rows))
+        for mine, chosen in zip(visible.reshape(some.shape), some, strict=True):
+            found = np.nonzero(mine)[0]
+            chosen[found[np.argsort(rank[found])[:most]]] = True
+        return some.ravel()
 
     def _ideal(self, camera: NDArray[np.int64], pixels: Array) -> Array:
         """Undistorted pixels (N, 2) of imaged ones, by camera (N,), in ascending blocks."""

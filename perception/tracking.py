@@ -33,6 +33,7 @@ from perception.patches import Pyramid, pyramid
 from perception.relocalise import Relocaliser
 
 STAGES = ("prepare", "flow", "align", "pose", "search")
+ENOUGH = 120  # landmarks of a camera: at 0.2 px they tell a pose to 0.01 mm, and what they share is not told by more
 FAR = 4.0, 1.0  # scales of a fit whose start may be pixels off
 NEAR = 0.8  # px, one sigma: three of it are what alignment reaches on the full image
 FULL_SEARCH = 10  # frame sets of an absent surface between searches at full size: a far one needs it
@@ -208,13 +209,13 @@ class TrackingStep:
         late = self._estimator.cameras.delays.sigma * expected.twist
         seen = self._estimator.as_exposed(guess, expected.twist)
         if matcher.doubt(guess, expected.covariance + np.outer(late, late)) < NEAR:
-            observations = matcher.align(stamp, pyramids, {c: seen[c] for c in pyramids})
+            observations = matcher.align(stamp, pyramids, {c: seen[c] for c in pyramids}, most=ENOUGH)
             self._took("align")
             if matcher.complete(observations, pyramids):
                 return guess, observations, (1.0,)
         joint, single = matcher.flow(pyramids, guess)
         self._took("flow")
-        again = matcher.align(stamp, pyramids, single)
+        again = matcher.align(stamp, pyramids, single, most=ENOUGH)
         self._took("align")
         if observations is not None and len(observations) > len(again):
             return guess, observations, FAR
