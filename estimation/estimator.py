@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.camera_errors import CameraErrors
 from estimation.camera_health import CameraHealth, HealthSettings
+from estimation.median import median
 from estimation.motion_detector import MotionDetector
 from estimation.observations import Observations
 from estimation.odd_camera import disorder, odd_ones, solve_with, standing_off
@@ -204,7 +205,7 @@ class Estimator:
         velocity = jacobians @ twist
         if self.cameras.offset.any():
             pixels = pixels + at_once - project(self.rig, camera, self.as_exposed(start, twist), points)[0]
-        smear = self.cameras.delays.sigma * float(np.sqrt(np.median((velocity**2).sum(1))))
+        smear = self.cameras.delays.sigma * float(np.sqrt(median((velocity**2).sum(1))))
         return replace(observations, pixels=pixels, sigma=sigma), smear
 
     def as_exposed(self, base_from_surface: Array, twist: Array) -> Array:

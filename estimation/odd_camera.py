@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.median import median
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.pose_solver import PoseFit, Shared, own_residuals, project, solve_pose
@@ -59,8 +60,8 @@ def standing_off(observations: Observations, fit: PoseFit, count: int, least: fl
     for c in np.unique(observations.camera):
         mine = observations.camera == c
         if np.count_nonzero(mine) >= least:
-            noise = RAYLEIGH * np.median(observations.sigma[mine])
-            off[c] = np.sqrt(max(np.median(away[mine]) ** 2 - noise**2, 0.0))
+            noise = RAYLEIGH * median(observations.sigma[mine])
+            off[c] = np.sqrt(max(median(away[mine]) ** 2 - noise**2, 0.0))
     return off
 
 
@@ -107,7 +108,7 @@ def _surprise(fit: PoseFit, expected: SurfacePose) -> float:
 def disorder(observations: Observations, solution: PoseFit, inlier: NDArray[np.bool_]) -> float:
     """Median residual, px, of the inliers when each camera may move for itself: what no pose of a surface explains."""
     whole = np.linalg.norm(solution.residuals[inlier], axis=1)
-    if not len(whole) or np.median(whole) < ORDERLY:
+    if not len(whole) or median(whole) < ORDERLY:
         return 0.0  # what is left of so little need not be asked for
     left = own_residuals(observations.camera, solution, inlier.astype(float))[inlier]
     return float(np.median(np.linalg.norm(left, axis=1)))

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.median import median
 from estimation.rig import Rig
 from estimation.se3 import Array
 
@@ -134,7 +135,7 @@ def solve_pose(
             squared = (residual * residual).sum(1) * precision
             front = depth > 0
             if iteration < 3:
-                unit = float(np.sqrt(max(np.median(squared[front]) / 1.386, 1.0))) if front.any() else 1.0
+                unit = float(np.sqrt(max(median(squared[front]) / 1.386, 1.0))) if front.any() else 1.0
             weight = np.where(front, (1 + squared / (gate * unit * widening) ** 2) ** -2, 0.0)
             if common is None:
                 weighted = (jacobian * (weight * precision)[:, None, None]).reshape(-1, 6)

@@ -17,6 +17,7 @@ from estimation.observations import no_observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.refiner import Refiner
 from estimation.se3 import Array
+from estimation.state_machine import StateSettings
 from estimation.surface_map import SurfaceMap, joined_map
 from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.simulator.bodies import Wound
