@@ -35,6 +35,7 @@ from tests.synthetic import frame_sets, patch, pictures
 RIG = arc_rig(size=(320, 240), focal=560.0)  # 0.7 mm a pixel, 228 mm wide
 LONG = patch(1, (320.0, 60.0), np.inf, Wound((310.0, 56.0)))
 STAMPS = np.arange(46) / 10
+FIRST = StateSettings().first  # the pose that is given out first
 SMALL = patch(2, (80.0, 60.0), np.inf, Wound((70.0, 54.0)))
 
 
@@ -66,10 +67,10 @@ def passed() -> tuple[list[SurfacePose], list[SurfaceMap], TrackingStep]:
 
 def test_a_surface_of_which_all_that_was_known_has_gone_is_still_followed() -> None:
     poses, maps, _ = passed()
-    late = [p for p in poses[StateSettings().first :] if p.state is not TrackState.TRACKING]
+    late = [p for p in poses[FIRST:] if p.state is not TrackState.TRACKING]
     assert len(late) <= 1  # while new landmarks are proven
-    estimated_from_true = se3.inverse(poses[1].base_from_surface) @ passing(poses[1].stamp)
-    off = [se3.inverse(passing(p.stamp)) @ p.base_from_surface @ estimated_from_true for p in poses[1:]]
+    estimated_from_true = se3.inverse(poses[FIRST].base_from_surface) @ passing(poses[FIRST].stamp)
+    off = [se3.inverse(passing(p.stamp)) @ p.base_from_surface @ estimated_from_true for p in poses[FIRST:]]
     assert max(np.linalg.norm(o[:3, 3]) for o in off) < 0.15
     ideal = se3.transform_points(poses[-1].base_from_surface, maps[0].points)[:, 0] - REST[0, 3]
     assert np.median(ideal) < -60  # the first map is mostly out of view
@@ -88,7 +89,7 @@ def test_rows_are_only_added_and_keep_their_meaning() -> None:
 def test_what_was_added_lies_on_the_true_surface_as_claimed() -> None:
     poses, maps, _ = passed()
     last, new = maps[-1], slice(len(maps[0]), None)
-    true_from_estimated = se3.inverse(passing(poses[1].stamp)) @ poses[1].base_from_surface
+    true_from_estimated = se3.inverse(passing(poses[FIRST].stamp)) @ poses[FIRST].base_from_surface
     points = se3.transform_points(true_from_estimated, last.points[new])
     blocks = np.einsum("ninj->nij", last.covariance.reshape(len(last), 3, len(last), 3))[new]
     claimed = np.sqrt(np.einsum("i,nij,j->n", true_from_estimated[2, :3], blocks, true_from_estimated[2, :3]))

@@ -89,7 +89,7 @@ class Followed:
     poses: K of them. seconds: (K,) by the clock. Of the estimated surface frame, into which the truth is carried at the
     start, and never fitted: expected: (K, 4, 4) true base_from_surface. twists: (K, 6) true ones. informations:
     (K, 6, 6), Fisher's, of each true pose from its own tracks, were all of them right. frame: (6, 6), the least
-    covariance with which the first look could lay the surface frame; 0 where it was told. offsets: (C,) s, of the
+    covariance with which one frame set could tell the pose that places the surface frame. offsets: (C,) s, of the
     cameras' instants from their stamps, as estimated at the end; None where they are not.
     """
 
