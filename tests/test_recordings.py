@@ -11,12 +11,13 @@ import pytest
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
+from estimation.state_machine import StateSettings
 from hardware.evaluation import associate
 from hardware.session import Session, open_session
 from perception.tracking import TrackingStep
 
 DATA = Path(__file__).parent.parent.parent / "shared" / "data"
-FOLLOWED = 0.95  # of the frame sets from the region's instant on
+FOLLOWED = 0.95  # of the frame sets from the first pose that is given out on
 OFF = 10.0  # mm: further off than this while TRACKING is a lie
 
 
@@ -31,7 +32,7 @@ class Recording:
 RECORDINGS = [
     Recording("webcams_a", 0.5),
     Recording("webcams_b", 2.0),  # exposed tens of ms apart at 80 mm/s; its reference is good to 0.9 mm
-    Recording("teabox", 0.25),  # 0.15 is the target
+    Recording("teabox", 0.3),  # 0.15 is the target; the reference of the first pose alone is worth 0.1
 ]
 
 
@@ -41,9 +42,10 @@ class Run:
     poses: list[SurfacePose]
 
     def followed(self) -> Array:
-        """Whether the surface was measured (N,), from the region's instant on."""
+        """Whether the surface was measured (N,), from the frame set on by which a pose is to be given out."""
         start = max(r.stamp for r in self.session.roi)
-        return np.array([p.state.measured for p in self.poses if p.stamp >= start - 1e-6])
+        measured = [p.state.measured for p in self.poses if p.stamp >= start - 1e-6]
+        return np.array(measured[StateSettings().first :])
 
     def errors(self) -> tuple[Array, Array]:
         """Position errors (M,), mm, of the measured poses under the first tracked pose's change of frame, and which
