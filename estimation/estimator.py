@@ -31,6 +31,7 @@ from estimation.surface_map import SurfaceMap
 from estimation.warp_filter import WarpFilter
 
 BEGINS = np.array([1e-4] * 3 + [1.0] * 3)  # rad^2/s^3, mm^2/s^3: what lies still may begin to breathe
+SHARP = 0.1  # mm that cameras may see the surface apart: beyond, what is late cannot be told from what is bent
 PERSISTS = 0.2  # s: what breathes is accelerated alike for so long, which adds up to more than white noise does
 
 
@@ -291,7 +292,8 @@ class Estimator:
         assert fit.measured and fit.solution.shared is not None
         if self._pose is not None:
             self.cameras.learn(fit.solution.shared, fit.stamp - self._pose.stamp, _clear(fit))
-            if self._warp is not None:
+            smeared = float(np.linalg.norm(fit.twist[3:])) * self.cameras.delays.sigma
+            if self._warp is not None and smeared < SHARP:
                 sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
                 self._warp.learn(observations, fit.solution, sigma, fit.twist, self.cameras.delays.sigma)
         self._accepted += 1
