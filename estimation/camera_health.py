@@ -63,6 +63,16 @@ class CameraHealth:
         """Whether every camera shows so much less than usual that these (C,) tracks prove nothing."""
         return bool((used < self.settings.least_share * self._tracks)[self._tracks > 0].all() and self._tracks.any())
 
+    def doubted(self, off: Array, allowed: Array, odd: Collection[int]) -> Array:
+        """How far, px, the image of each camera (C,) is to be doubted where all stand off together; else zeros.
+
+        Blurred or covered images match here and there, near where they were looked for, so that no camera is odd and
+        the tracks' number tells no error. off, allowed: (C,) px, nan in `off` where nothing is seen. odd: left out.
+        """
+        seen = np.isfinite(off) & ~np.isin(np.arange(len(off)), list(odd))
+        together = bool(seen.any() and (off > self.settings.back * allowed)[seen].all())
+        return np.where(seen & together, off, 0.0)
+
     def update(
         self, stamp: float, used: NDArray[np.int64], least: float, off: Array, allowed: Array, odd: Collection[int]
     ) -> None:

@@ -142,6 +142,8 @@ class Estimator:
         found = int((~np.isin(seen.camera, list(odd))).sum())
         reason = self._judge(found, used, noise + lasting, disorder(seen, solution, inlier))
         off = standing_off(seen, solution, len(self.rig), self._camera_least())
+        doubted = bias * np.repeat(self.health.doubted(off, allowed, odd), 2)
+        lasting = lasting + doubted @ doubted.T
         knowledge = solution, noise, lasting, twist, doubt, bias
         return Fit(seen.stamp, *knowledge, inlier, used, reason, off, allowed, odd)
 
