@@ -19,7 +19,7 @@ from estimation.liveliness import Liveliness
 from estimation.se3 import Array
 
 LAG = 0.6  # s: longer changed the newest pose by nothing (0.5, 1 s and windows of 5 to 20 agree to 1e-4 mm)
-SURPRISE = 1.0  # squared sigmas of an axis, mean: a prior that is off by more gives way to the measurement
+SURPRISE = 4.0  # squared sigmas of an axis, mean: a prior that is off by more gives way to the measurement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
