@@ -106,11 +106,6 @@ class CameraErrors:
         return self._mean[self._count :].reshape(2, -1).T.copy()
 
     @property
-    def jitter(self) -> float:
-        """One standard deviation, s, of a camera's exposures about its offset."""
-        return float(np.sqrt(self._jitter.value))
-
-    @property
     def delays(self) -> Delays:
         """What is expected of the next frame set."""
         n = self._count
