@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.camera_errors import CameraErrors
 from estimation.camera_health import CameraHealth, HealthSettings
+from estimation.fit_covariance import MapError, fit_covariance
 from estimation.median import median
 from estimation.motion_detector import MotionDetector
 from estimation.observations import Observations
 from estimation.odd_camera import disorder, odd_ones, solve_with, standing_off
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import EFFICIENCY, PoseFit, Shared, project
+from estimation.pose_solver import PoseFit, Shared, project
 from estimation.predictor import Predictor
 from estimation.rig import Rig
 from estimation.se3 import Array
@@ -94,6 +95,8 @@ class Estimator:
         self._smoother = Smoother()
         self._detector = MotionDetector(np.zeros(3))
         self._warp: WarpFilter | None = None
+        self._map_error: MapError | None = None
+        self._unlearned: tuple[Fit, float] | None = None  # accepted, and s since the one before
         self._predictor = Predictor()
         self._pose: SurfacePose | None = None
         self._measured: SurfacePose | None = None  # the last one that was
@@ -128,23 +131,24 @@ class Estimator:
 
         observations.track counts rows of the map.
         """
-        assert self.map is not None
+        self.learn()
+        assert self.map is not None and self._map_error is not None
         if len(observations) < self.settings.least_tracks:
             return self._no_fit(observations, start)
         warped = self.map.points if self._warp is None else self._warp.points(self.map)
         points, (twist, doubt) = warped[observations.track], self._twist(observations.stamp, start)
         seen, smear = self._together(observations, points, start, twist)
         allowed = self.health.allowed(np.full(len(self.rig), smear))
-        solution, odd = self._solve(seen, points, start, scales, self.cameras.shared(twist), allowed)
+        shared = self.cameras.shared(twist)
+        solution, odd = self._solve(seen, points, start, scales, shared, allowed)
         inlier = solution.weights > 0.2
         used = np.bincount(seen.camera[inlier], minlength=len(self.rig))
-        noise, lasting, bias = self._covariance(seen, solution, twist)
+        known = fit_covariance(seen, solution, shared, self._map_error, self._warp)
         found = int((~np.isin(seen.camera, list(odd))).sum())
-        reason = self._judge(found, used, noise + lasting, disorder(seen, solution, inlier))
+        reason = self._judge(found, used, known.noise + known.lasting, disorder(seen, solution, inlier))
         off = standing_off(seen, solution, len(self.rig), self._camera_least())
-        doubted = bias * np.repeat(self.health.doubted(off, allowed, odd), 2)
-        lasting = lasting + doubted @ doubted.T
-        knowledge = solution, noise, lasting, twist, doubt, bias
+        doubted = known.bias * np.repeat(self.health.doubted(off, allowed, odd), 2)
+        knowledge = solution, known.noise, known.lasting + doubted @ doubted.T, twist, doubt, known.bias
         return Fit(seen.stamp, *knowledge, inlier, used, reason, off, allowed, odd)
 
     def _no_fit(self, observations: Observations, start: Array) -> Fit:
@@ -231,31 +235,6 @@ class Estimator:
             return f"the pose is uncertain to {spread:.1f} mm"
         return ""
 
-    def _covariance(self, seen: Observations, solution: PoseFit, twist: Array) -> tuple[Array, Array, Array]:
-        """Of what is new (6, 6), of what map and deformation add (6, 6), and the effect (6, 2C) of shifted images."""
-        assert self.map is not None
-        information = solution.information + 1e-9 * np.eye(6) * np.trace(solution.information)
-        noise = np.linalg.pinv(information, hermitian=True)
-        weight = EFFICIENCY * solution.weights / (seen.sigma * solution.scale) ** 2
-        weighted, by_point = solution.jacobians * weight[:, None, None], solution.jacobians[:, :, 3:]
-        pulled = noise @ weighted.transpose(0, 2, 1)  # (N, 6, 2)
-        spread = np.zeros((len(self.map), 6, 3))
-        np.add.at(spread, seen.track, pulled @ by_point)
-        shift = spread.transpose(1, 0, 2).reshape(6, -1)
-        lasting = shift @ self.map.covariance @ shift.T
-        if self._warp is not None:
-            lasting = lasting + noise @ self._warp.pull(seen.track, weighted, by_point) @ noise
-        velocity, count = solution.jacobians @ twist, len(self.rig)
-        bias, late = np.zeros((6, count, 2)), np.zeros((6, count))
-        for c in range(count):
-            mine = seen.camera == c
-            bias[:, c] = pulled[mine].sum(0)
-            late[:, c] = np.einsum("nik,nk->i", pulled[mine], velocity[mine])
-        shared = self.cameras.shared(twist)
-        flat: Array = bias.reshape(6, -1)
-        new = noise + late @ shared.delay @ late.T + (flat * np.repeat(shared.shift, 2)) @ flat.T
-        return new, lasting, flat
-
     def begin(self, stamp: float, base_from_surface: Array, surface_map: SurfaceMap, caveat: str = "") -> SurfacePose:
         """Take the first map, which defines the surface frame at `stamp`.
 
@@ -265,6 +244,7 @@ class Estimator:
         self._accepted, self._first, self._first_bias = 0, None, None
         self._smoother.reset()
         self._detector, self._warp = MotionDetector(surface_map.points.mean(0)), WarpFilter(surface_map)
+        self._map_error = MapError(surface_map)
         self.health.begin()
         self._predictor = Predictor(surface_map.points)
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
@@ -289,11 +269,18 @@ class Estimator:
         self._pose = replace(self._pose, stamp=stamp, reason=reason)
         return self._pose
 
+    def learn(self) -> None:
+        """Take what the last accepted fit tells of the cameras: no pose waits for it, but the next fit needs it."""
+        if self._unlearned is not None:
+            (fit, seconds), self._unlearned = self._unlearned, None
+            assert fit.solution.shared is not None
+            self.cameras.learn(fit.solution.shared, seconds, _clear(fit))
+
     def accept(self, fit: Fit, observations: Observations) -> SurfacePose:
         """Take a measured fit into the window and give the pose."""
         assert fit.measured and fit.solution.shared is not None
         if self._pose is not None:
-            self.cameras.learn(fit.solution.shared, fit.stamp - self._pose.stamp, _clear(fit))
+            self._unlearned = fit, fit.stamp - self._pose.stamp
             smeared = float(np.linalg.norm(fit.twist[3:])) * self.cameras.delays.sigma
             if self._warp is not None and smeared < SHARP:
                 sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
@@ -376,7 +363,7 @@ class Estimator:
             self._warp = WarpFilter(surface_map)
         elif self._warp is not None:
             self._warp.replace_map(surface_map)
-        self.map = surface_map
+        self.map, self._map_error = surface_map, MapError(surface_map)
 
 
 def _clear(fit: Fit) -> float:

@@ -13,6 +13,7 @@ of the webcams' recordings.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,10 @@ from estimation import se3
 from estimation.median import median
 from estimation.rig import Rig
 from estimation.se3 import Array
+from estimation.track_loops import gram_by_camera, project_tracks, shared_residuals
 
 Index = NDArray[np.int64]
+NEW: tuple[Literal["C"], Literal["W"]] = "C", "W"  # the layout that compiled loops take
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,29 +79,20 @@ class PoseFit:
 
 
 def project(rig: Rig, camera: Index, base_from_surface: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Ideal pixels (N, 2), depths (N,) mm and Jacobians (N, 2, 6) of surface points (N, 3), each in its camera (N,)."""
-    extrinsics = rig.camera_from_base @ base_from_surface  # (C, 4, 4) camera_from_surface
-    count, place = len(points), np.ascontiguousarray(points.T)
-    # tracks last: rows of N numbers are what numpy is quick at
-    parts = extrinsics[:, :3].reshape(-1, 12).T.take(camera, axis=1).reshape(3, 4, count)
-    lens = rig.matrices[:, :2].reshape(-1, 6).T.take(camera, axis=1).reshape(2, 3, count)
-    rotation, focal, centre = parts[:, :3], lens[[0, 1], [0, 1]], lens[:, 2]
-    x, y, depth = np.einsum("ijn,jn->in", rotation, place) + parts[:, 3]
-    inverse_depth = 1.0 / np.where(np.abs(depth) < 1e-6, 1e-6, depth)
-    tangent = np.stack([x, y]) * inverse_depth
-    by_point = (rotation[:2] - tangent[:, None] * rotation[2]) * (focal * inverse_depth)[:, None]  # (2, 3, N)
-    jacobian = np.empty((2, 6, count))
-    jacobian[:, 3:] = by_point
-    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):  # row @ -hat(p) = cross(p, row)
-        jacobian[:, i] = place[j] * by_point[:, k] - place[k] * by_point[:, j]
-    pixels = focal * tangent + centre
-    return np.ascontiguousarray(pixels.T), depth, np.ascontiguousarray(jacobian.transpose(2, 0, 1))
+    """Ideal pixels (N, 2), depths (N,) mm and Jacobians (N, 2, 6) of surface points (N, 3), each in its camera (N,).
+
+    base_from_surface: (4, 4), or (C, 4, 4) where each camera exposes at its own instant.
+    """
+    points = np.require(points, float, NEW)
+    return project_tracks(
+        rig.camera_from_base @ base_from_surface, rig.matrices, np.require(camera, np.int64, NEW), points
+    )
 
 
 # What the weights, at a gate of 3, take from the information of Gaussian noise beyond what the estimate itself
 # loses (Huber 1981, 4.6, integrated over two dimensions): the weights' mean is 0.72, the estimate is worth 0.89.
 EFFICIENCY = 1.235
-ARRIVED = 1e-4  # squared sigmas of the pose: a step as small as that changes nothing that is known
+ARRIVED = 1e-3  # squared sigmas of the pose: a last step as small as that leaves a hundredth of a sigma to go
 
 
 def solve_pose(
@@ -125,6 +119,7 @@ def solve_pose(
     what each camera's tracks may be off by together.
     """
     pose, unit, precision = start, 1.0, 1 / sigma**2
+    camera, points = np.require(camera, np.int64, NEW), np.require(points, float, NEW)
     predicted, depth, jacobian = project(rig, camera, pose, points)
     residual = predicted - pixels
     common = None if shared is None else _Common(shared, camera)
@@ -138,9 +133,8 @@ def solve_pose(
                 unit = float(np.sqrt(max(median(squared[front]) / 1.386, 1.0))) if front.any() else 1.0
             weight = np.where(front, (1 + squared / (gate * unit * widening) ** 2) ** -2, 0.0)
             if common is None:
-                weighted = (jacobian * (weight * precision)[:, None, None]).reshape(-1, 6)
-                information = weighted.T @ jacobian.reshape(-1, 6)
-                gradient = weighted.T @ residual.ravel()
+                whole = gram_by_camera(len(rig), camera, jacobian, residual, weight * precision, np.zeros(6)).sum(0)
+                information, gradient = whole[:6, :6], whole[:6, 9]
             else:
                 trusted = weight * precision * (EFFICIENCY / unit**2)
                 information, gradient = common.normal(jacobian, predicted - pixels, trusted)
@@ -167,37 +161,18 @@ class _Common:
     def __init__(self, shared: Shared, camera: Index) -> None:
         self._twist, self._prior, self._count = shared.twist, shared.covariance(), len(shared.shift)
         self._camera = camera
-        present = np.unique(camera)
-        if (camera[1:] >= camera[:-1]).all():  # as the matcher gives them: no copies
-            bounds = np.searchsorted(camera, [present, present + 1])
-            self._mine: list[tuple[int, slice | Index]] = [
-                (int(c), slice(a, b)) for c, a, b in zip(present, *bounds, strict=True)
-            ]
-        else:
-            self._mine = [(int(c), np.nonzero(camera == c)[0]) for c in present]
-        self._columns = np.zeros((len(camera), 2, 10))  # derivatives by pose, own delay and own shift; residual
-        self._columns[:, 0, 7] = self._columns[:, 1, 8] = 1.0
-        self._effect, self._eye = np.zeros(3 * self._count), np.eye(3 * self._count)
-
-    def _of(self, camera: int) -> list[int]:
-        """Where a camera's own delay and shifts stand among all."""
-        return [camera, self._count + camera, 2 * self._count + camera]
+        self._effect, self._eye = np.zeros((3, self._count)), np.eye(3 * self._count)
 
     def normal(self, jacobian: Array, residual: Array, weight: Array) -> tuple[Array, Array]:
         """Information (6, 6) and gradient (6,) of the pose. residual: (N, 2) px, whole. weight: (N,) px^-2."""
-        n, columns = 3 * self._count, self._columns
-        columns[:, :, :6], columns[:, :, 6], columns[:, :, 9] = jacobian, jacobian @ self._twist, residual
-        weighted = columns[:, :, :9] * weight[:, None, None]
-        whole, cross, own, right = np.zeros((6, 7)), np.zeros((6, n)), np.zeros((n, n)), np.zeros(n)
-        for c, mine in self._mine:
-            gram = weighted[mine].reshape(-1, 9).T @ columns[mine].reshape(-1, 10)
-            whole[:, :6] += gram[:6, :6]
-            whole[:, 6] += gram[:6, 9]
-            for row, place in enumerate(self._of(c), 6):
-                cross[:, place], right[place] = gram[:6, row], gram[row, 9]
-                own[place, self._of(c)] = gram[row, 6:9]
-        self._whole, self._cross, self._own, self._right = whole, cross, own, right
-        return whole[:, :6], whole[:, 6]
+        n = self._count
+        grams = gram_by_camera(n, self._camera, jacobian, residual, weight, self._twist)
+        self._whole = grams[:, :6].sum(0)
+        self._cross, self._right = grams[:, :6, 6:9].transpose(1, 2, 0).reshape(6, 3 * n), grams[:, 6:9, 9].T.ravel()
+        self._own = np.zeros((3, n, 3, n))
+        each = np.arange(n)
+        self._own[:, each, :, each] = grams[:, 6:9, 6:9]
+        return self._whole[:, :6], self._whole[:, 9]
 
     def explained(self, jacobian: Array, anew: bool) -> Array:
         """What of the residuals (N, 2) px is shared, were the pose allowed to follow; anew: of the last `normal`."""
@@ -205,18 +180,16 @@ class _Common:
             found = self.found()
             # (information + prior^-1)^-1, also where the prior is singular
             gain = self._prior @ np.linalg.inv(self._eye + found.information @ self._prior)
-            self._effect = gain @ found.pull
-        delay, right, down = self._effect.reshape(3, -1)
-        return np.asarray(
-            delay[self._camera, None] * (jacobian @ self._twist) + np.stack([right, down], -1)[self._camera]
-        )
+            self._effect = (gain @ found.pull).reshape(3, -1)
+        return shared_residuals(self._camera, jacobian, self._twist, self._effect)
 
     def found(self) -> SharedFit:
         """Of the last `normal` (Schur complement)."""
-        information = self._whole[:, :6] + (1e-9 * np.trace(self._whole[:, :6]) + 1e-12) * np.eye(6)
-        solved = np.linalg.solve(information, np.c_[self._cross, self._whole[:, 6]])
-        own, right = self._own - self._cross.T @ solved[:, :-1], -(self._right - self._cross.T @ solved[:, -1])
-        return SharedFit((own + own.T) / 2, right)
+        pose = self._whole[:, :6]
+        information = pose + (1e-9 * np.trace(pose) + 1e-12) * np.eye(6)
+        solved = np.linalg.solve(information, np.c_[self._cross, self._whole[:, 9]])
+        own = self._own.reshape(self._cross.shape[1], -1) - self._cross.T @ solved[:, :-1]
+        return SharedFit((own + own.T) / 2, -(self._right - self._cross.T @ solved[:, -1]))
 
 
 def own_residuals(camera: Index, fit: PoseFit, sure: Array) -> Array:

@@ -119,6 +119,7 @@ class TrackingStep:
 
     def idle(self) -> None:
         """Work that no pose waits for; the caller's loop calls it once a pose is handed over."""
+        self._estimator.learn()
         if self._matcher is not None:
             self._mapping.keep(self._matcher, self._estimator)
         self._recover()

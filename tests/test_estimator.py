@@ -261,9 +261,19 @@ def test_offsets_widen_the_claim_to_what_they_cost() -> None:
 def test_fitting_changes_nothing() -> None:
     estimator = begun(breathing)
     follow(estimator, breathing, 0.3)
+    estimator.learn()
     pose, doubt, surface_map = estimator.pose, estimator.cameras.delays.sigma, estimator.map
     estimator.fit(look(lively, 0.4, 7), estimator.predict(0.4))
     assert estimator.pose is pose and estimator.cameras.delays.sigma == doubt and estimator.map is surface_map
+
+
+def test_learning_at_once_or_when_the_next_fit_needs_it_gives_the_same_poses() -> None:
+    early, late = begun(lively), begun(lively)
+    for t in stamps(0.5):
+        seen = look(lively, float(t), 6, delays=(0.016, 0.0, -0.016))
+        one, other = step(early, seen), step(late, seen)
+        early.learn()
+        assert one.base_from_surface.tobytes() == other.base_from_surface.tobytes()
 
 
 def test_a_caveat_keeps_every_pose_from_being_called_tracking() -> None:

@@ -16,6 +16,7 @@ FLOORS = {"estimation": 0, "perception": 1, "planning": 1, "hardware": 2}
 OWNERS = {  # library: the files that may import it
     "cv2": ("perception/*.py", "hardware/images.py", "hardware/simulator/*.py"),
     "gtsam": ("estimation/*.py",),
+    "numba": ("estimation/compiled.py",),
     "mcap": ("hardware/mcap_walk.py", "hardware/recording.py", "hardware/recording_file.py"),
     "onnxruntime": ("perception/*.py",),
     "open3d": ("hardware/mesh_file.py",),
@@ -29,7 +30,7 @@ ABSENT = {"time", "pytest"}  # the standard library's; and pytest loads its plug
 FREE = {"numpy", "scipy"}  # arrays are everywhere
 ALLOWED = {*FLOORS, "tests", "data", "docs", "pyproject.toml", "constraints.txt", "README.md", "LICENSE", "Makefile"}
 LEFTOVERS = ("build", "dist", "demo", "out", "__pycache__", "*.egg-info")  # .gitignore names them
-MOTION_NEVER = {"gtsam", "cv2", "open3d", "onnxruntime"}
+MOTION_NEVER = {"gtsam", "numba", "cv2", "open3d", "onnxruntime"}
 
 FILES = sorted(path.relative_to(ROOT).as_posix() for floor in FLOORS for path in (ROOT / floor).rglob("*.py"))
 

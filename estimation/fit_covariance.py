@@ -1,0 +1,74 @@
+"""What a fit's covariance is made of: tracks, what cameras share, and the map's joint error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.observations import Observations
+from estimation.pose_solver import EFFICIENCY, PoseFit, Shared
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap
+from estimation.track_loops import pulls
+from estimation.warp_filter import WarpFilter
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitCovariance:
+    """The parts (6, 6) of a fit's covariance. noise: new in every frame set; lasting: what map and deformation add.
+
+    bias: (6, 2C), how far a pixel's shift of each camera's image, rights, then downs by turns, takes the pose.
+    """
+
+    noise: Array
+    lasting: Array
+    bias: Array
+
+
+class MapError:
+    """The part of a map's joint covariance that the tracks in use touch.
+
+    All of it is megabytes, and to read them every frame took longer than the fit; the landmarks in use change slowly.
+    """
+
+    ROOM = 1.5  # times the landmarks in use, that may be held before the block is cut anew
+
+    def __init__(self, surface_map: SurfaceMap) -> None:
+        count = len(surface_map)
+        self._whole = surface_map.covariance.reshape(count, 3, count, 3)
+        self._position = np.full(count, -1)
+        self._block = np.zeros((0, 0))
+
+    def through(self, rows: NDArray[np.int64], pull: Array) -> Array:
+        """Covariance (6, 6) of the sum of the landmarks' pulls (6, K, 3), of rows (K,), ascending."""
+        if (self._position[rows] < 0).any() or len(self._block) > 3 * self.ROOM * len(rows):
+            held = np.union1d(rows, np.flatnonzero(self._position >= 0))
+            held = held if len(held) < self.ROOM * len(rows) else rows
+            self._position[:] = -1
+            self._position[held] = np.arange(len(held))
+            self._block = self._whole[held][:, :, held].reshape(3 * len(held), -1)
+        spread = np.zeros((6, len(self._block) // 3, 3))
+        spread[:, self._position[rows]] = pull
+        flat = spread.reshape(6, -1)
+        return np.asarray(flat @ self._block @ flat.T)
+
+
+def fit_covariance(
+    seen: Observations, solution: PoseFit, shared: Shared, map_error: MapError, warp: WarpFilter | None
+) -> FitCovariance:
+    """The covariance of a pose that was fitted to what was `seen`, by its parts."""
+    information = solution.information + 1e-9 * np.eye(6) * np.trace(solution.information)
+    noise = np.linalg.pinv(information, hermitian=True)
+    weight = EFFICIENCY * solution.weights / (seen.sigma * solution.scale) ** 2
+    rows, landmark = np.unique(seen.track, return_inverse=True)
+    cameras = len(shared.shift)
+    by_landmark, by_camera = pulls(cameras, len(rows), seen.camera, landmark, solution.jacobians, weight, shared.twist)
+    lasting = map_error.through(rows, by_landmark)
+    if warp is not None:
+        weighted = solution.jacobians * weight[:, None, None]
+        lasting = lasting + warp.pull(seen.track, weighted, solution.jacobians[:, :, 3:])
+    late, bias = noise @ by_camera[:, 0], noise @ by_camera[:, 1:].swapaxes(1, 2).reshape(6, -1)
+    new = noise + late @ shared.delay @ late.T + (bias * np.repeat(shared.shift, 2)) @ bias.T
+    return FitCovariance(new, noise @ lasting @ noise, bias)
