@@ -7,17 +7,27 @@ runs to come. The interpreter is free while one runs.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import Literal, TypeVar, cast
 
 from numba import njit
+
+NEW: tuple[Literal["C"], Literal["W"]] = "C", "W"  # np.require's words for the layout that compiled functions take
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
 
-def compiled(signature: str) -> Callable[[Function], Function]:
-    """Compile a function for the given types; arrays must be contiguous and writable, as new ones are."""
+REORDERED = {"reassoc", "contract", "nsz"}  # sums may be taken in parts, the same ones every time; nan stays nan
+
+
+def compiled(signature: str, reordered: bool = False) -> Callable[[Function], Function]:
+    """Compile a function for the given types; arrays must be contiguous and writable, as new ones are.
+
+    reordered: long sums may be taken several terms at a time, which is many times faster. Runs on one machine give the
+    same bits; another kind of processor may round otherwise.
+    """
 
     def decorate(function: Function) -> Function:
-        return cast(Function, njit(signature, cache=True, nogil=True, error_model="numpy")(function))
+        fast = REORDERED if reordered else False
+        return cast(Function, njit(signature, cache=True, nogil=True, error_model="numpy", fastmath=fast)(function))
 
     return decorate

@@ -13,19 +13,18 @@ of the webcams' recordings.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.compiled import NEW
 from estimation.median import median
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.track_loops import gram_by_camera, project_tracks, shared_residuals
 
 Index = NDArray[np.int64]
-NEW: tuple[Literal["C"], Literal["W"]] = "C", "W"  # the layout that compiled loops take
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,25 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.compiled import NEW
 from estimation.se3 import Array
+from perception.descent import RADIUS, SIDE, Float32, look
 from perception.frames import Image
 from perception.lens import Lenses
 
-RADIUS = 7  # samples: 15 x 15, of which 225 decide
-SIDE = 2 * RADIUS + 1
 FLAT = 3.0  # grey levels: a patch with less contrast is not worth a track
-
-Float32 = NDArray[np.float32]
-
-
-def _grid() -> Array:
-    line = np.arange(-RADIUS, RADIUS + 1, dtype=float)
-    return np.stack([a.ravel() for a in np.meshgrid(line, line)], -1)
-
-
-GRID = _grid()  # (SIDE * SIDE, 2)
-GRID_SIZE = len(GRID)
-_SPAN = np.ascontiguousarray(GRID.T, np.float32)  # (2, S)
 
 
 class Pyramid:
@@ -95,27 +83,16 @@ def sample(image: Image, centre: Array, per_sample: Array, spacing: float = 1.0,
     spacing: steps from sample to sample. half: the image is the half-size one of `pyramid`. Bilinear; outside the image
     the border's value.
     """
-    offsets, start = grid_offsets(per_sample, spacing, half), on_level(centre, half)
-    return look_up(image, offsets[:, 0] + start[:, :1], offsets[:, 1] + start[:, 1:]).astype(np.float32)
-
-
-def grid_offsets(per_sample: Array, spacing: float = 1.0, half: bool = False) -> Float32:
-    """Where the grid's samples lie about its centre: (N, 2, S) px of the image that is sampled."""
     scale = (0.5 if half else 1.0) * spacing
-    flat = (per_sample * scale).astype(np.float32).reshape(-1, 2) @ _SPAN
-    return np.asarray(flat.reshape(-1, 2, GRID_SIZE), np.float32)
+    steps = np.require(per_sample, float, NEW)
+    return np.asarray(look(image, on_level(centre, half), steps, scale), np.float32)
 
 
-def on_level(centre: Array, half: bool) -> Float32:
+def on_level(centre: Array, half: bool) -> Array:
     """Centres (N, 2) px of an image in the pixels of the image or of its half-size version."""
     # A quarter pixel beside the half-size grid bilinear sampling blurs the image, which widens the reach: on the grid
     # tests/test_patches.py finds fewer from 5 px away. Templates are cut alike, so what is compared is not shifted.
-    return np.asarray(centre * 0.5 - 0.25 if half else centre, np.float32)
-
-
-def look_up(image: Image, x: Float32, y: Float32) -> Image:
-    """Grey levels (N, S) of an image at x, y (N, S) px, bilinear; outside it the border's."""
-    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    return centre * 0.5 - 0.25 if half else np.require(centre, float, NEW)
 
 
 def normalise(pictures: Float32) -> tuple[Float32, Float32]:
