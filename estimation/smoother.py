@@ -49,6 +49,7 @@ class Smoother:
     def __init__(self) -> None:
         self._last: Measured | None = None
         self._liveliness = Liveliness()
+        self._psd = self._liveliness.psd
         self.restarts = 0
         self._clear()
 
@@ -80,7 +81,7 @@ class Smoother:
         if self._last is not None:
             moved = se3.log(se3.inverse(self._last.pose) @ measured.pose)
             self._liveliness.add(moved, measured.stamp - self._last.stamp, np.diag(measured.covariance))
-        self._last = measured
+        self._last, self._psd = measured, self._liveliness.psd
         try:
             self._newest = self._extend(measured)
         except (RuntimeError, IndexError, ValueError):
@@ -93,7 +94,7 @@ class Smoother:
         A jerk of the hand loosens the prior at once: where motion is not smooth it must not drag the pose.
         """
         assert self._newest is not None
-        psd, dt = self._liveliness.psd, measured.stamp - self._newest.stamp
+        psd, dt = self._psd.copy(), measured.stamp - self._newest.stamp
         off = se3.log(se3.inverse(self._newest.pose @ se3.exp(self._newest.twist * dt)) @ measured.pose)
         expected = self._newest.covariance + measured.covariance + dt**2 * self._newest.twist_covariance
         variance = np.diag(expected) + psd * dt**3 / 3
@@ -132,7 +133,7 @@ class Smoother:
             _symmetric(self._window.marginalCovariance(pose)),
             np.asarray(estimate.atVector(twist)),
             _symmetric(self._window.marginalCovariance(twist)),
-            self._liveliness.psd,
+            self._psd,
         )
         if not all(
             np.isfinite(a).all() for a in (window.pose, window.covariance, window.twist, window.twist_covariance)

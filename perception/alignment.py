@@ -7,7 +7,6 @@ A track never creeps: it is compared with its reference picture, never with the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -18,6 +17,7 @@ from estimation.compiled import NEW
 from estimation.se3 import Array
 from perception.descent import SIDE, descend
 from perception.patches import FLAT, Projection, Pyramid, Templates, normalise, on_level, sample
+from perception.side_by_side import side_by_side
 
 LEAST_SIGMA = 0.05  # px
 # Height of the surface over a patch's plane, px: seen from the side it shifts all that shows it, by the angle's
@@ -25,9 +25,6 @@ LEAST_SIGMA = 0.05  # px
 # roof's edge: 0.06 px seen squarely, 0.1 at 60 degrees, 0.2-0.3 at 70, 0.4-0.5 at 75; alignment alone claimed half.
 RELIEF, SQUINT = 0.1, 0.1  # px; cosine beyond which nothing is visible anyway
 COARSE_LOOKS, LOOKS = 4, 6  # at most, at the half-size image and at the full one; from near, three are the rule
-SIDE_BY_SIDE = ThreadPoolExecutor(
-    max_workers=3, thread_name_prefix="align"
-)  # compiled loops leave the interpreter free
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +81,7 @@ def align_in(
     ends = np.cumsum([0, *counts])
     parts = [slice(first, last) for first, last in pairwise(ends.tolist())]
     if len(parts) > 1:
-        list(SIDE_BY_SIDE.map(in_one, images, parts))
+        side_by_side(in_one, images, parts)
     else:
         in_one(images[0], parts[0])
     return _judge(templates, where, start, shift, ended, least)

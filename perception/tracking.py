@@ -2,8 +2,7 @@
 
 The motion model, or where that is not sure enough flow from the last images, predicts where each landmark is, alignment
 with the landmark's reference picture measures it, the estimator fits the pose. When too little is found the surface is
-searched by its SIFT features. All cameras are aligned in one go: most of the time is the number of calls, and a thread
-for each camera was measured to gain nothing, as short numpy calls hold the interpreter.
+searched by its SIFT features.
 """
 
 from __future__ import annotations
@@ -31,6 +30,7 @@ from perception.mapping import Mapping
 from perception.matcher import Matcher
 from perception.patches import Pyramid, pyramid
 from perception.relocalise import Relocaliser
+from perception.side_by_side import side_by_side
 
 STAGES = ("prepare", "flow", "align", "pose", "search")
 ENOUGH = 120  # landmarks of a camera: at 0.2 px they tell a pose to 0.01 mm, and what they share is not told by more
@@ -136,7 +136,8 @@ class TrackingStep:
 
     def _pyramids(self, frames: FrameSet) -> dict[int, Pyramid]:
         """The new pictures, by camera; one that was there before would say that the surface stands still."""
-        images = {f.camera: grey(f.image) for f in frames.frames}
+        greys = side_by_side(grey, [f.image for f in frames.frames])
+        images = {f.camera: image for f, image in zip(frames.frames, greys, strict=True)}
         fresh = {c: pyramid(image) for c, image in images.items() if self._fresh(c, image)}
         self._estimator.health.pictures(fresh, images.keys() - fresh.keys())
         return fresh
