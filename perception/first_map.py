@@ -19,7 +19,8 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals, moved_map, surface_frame
 from estimation.triangulation import epipolar_distance, rays, triangulate
 from perception.alignment import align, coarse_score
-from perception.features import corners, match, polygon_mask, sift
+from perception.features import Mask, corners, match, polygon_mask, sift
+from perception.keep_out import trackable
 from perception.lens import Lenses, undistort
 from perception.patches import FLAT, Pyramid, Templates, join, project_squares, take_templates
 
@@ -278,17 +279,23 @@ def _steady(pixels: Array, residual: Array) -> NDArray[np.bool_]:
     return keep
 
 
-def build_first_map(lenses: Lenses, pyramids: dict[int, Pyramid], polygons: dict[int, Array]) -> FirstMap | str:
+def build_first_map(
+    lenses: Lenses, pyramids: dict[int, Pyramid], polygons: dict[int, Array], heads: dict[int, Mask] | None = None
+) -> FirstMap | str:
     """The map of what lies inside the polygons at this instant, or the reason why there is none.
 
-    pyramids: by camera, the images. polygons: by camera, (N, 2) px as imaged; at least two cameras.
+    pyramids: by camera, the images. polygons: by camera, (N, 2) px as imaged; at least two cameras. heads: by camera,
+    where the print head is.
     """
+    heads = heads or {}
     rig = lenses.rig
     rng = np.random.default_rng(0)
     cameras = sorted(set(pyramids) & set(polygons))
     if len(cameras) < 2:
         return "the surface must be seen by two cameras to be mapped"
-    masks = {c: polygon_mask(rig.cameras[c].size, polygons[c]) for c in cameras}
+    masks = {
+        c: trackable(pyramids[c][0], polygon_mask(rig.cameras[c].size, polygons[c]), heads.get(c)) for c in cameras
+    }
     features = {c: sift(pyramids[c][0], masks[c], 1000, tilted=True) for c in cameras}
     best: dict[int, Landmarks] = {}  # by reference camera, with the partner that sees most of its corners
     for i, a in enumerate(cameras):

@@ -22,11 +22,23 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PrintHead:
+    """What the arm knows of itself. base_from_nozzle: (4, 4), z from the tip up into the head. extruding: ink flows."""
+
+    base_from_nozzle: Array
+    extruding: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
-    """The frames of one instant, at most one per camera, in the rig's order; a camera may be missing. stamp: s."""
+    """The frames of one instant, at most one per camera, in the rig's order; a camera may be missing. stamp: s.
+
+    head: the print head at that instant, where an arm is known.
+    """
 
     stamp: float
     frames: tuple[Frame, ...]
+    head: PrintHead | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,6 +22,7 @@ from estimation.surface_map import SurfaceMap
 from perception.features import Mask, sift
 from perception.first_map import Landmarks, Seeds, assemble, find_landmarks, find_seeds
 from perception.frames import Image
+from perception.keep_out import trackable
 from perception.lens import Lenses
 from perception.matcher import Matcher
 from perception.patches import Pyramid, Templates, pyramid
@@ -42,7 +43,8 @@ GIVEN_UP = 4  # looks in which a new landmark was in view and not found
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
     """One frame set in which the surface is known: where it stood, jointly and at each camera's own instant, and what
-    agreed. images: grey, by camera. single: (4, 4) by camera. seen: the inliers. wanted: landmarks, by camera."""
+    agreed. images: grey, by camera. single: (4, 4) by camera. seen: the inliers. wanted: landmarks, by camera. heads:
+    the print head's masks, by camera."""
 
     images: dict[int, Image]
     base_from_surface: Array
@@ -50,6 +52,7 @@ class Look:
     covariance: Array
     seen: Observations
     wanted: dict[int, int]
+    heads: dict[int, Mask]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +70,7 @@ def look_for_more(rig: Rig, look: Look, surface_map: SurfaceMap) -> Found | None
     lenses = Lenses(as_at_one_instant(rig, look.base_from_surface, look.single))
     pyramids = {c: pyramid(image) for c, image in look.images.items()}
     lacking = {c: look.wanted[c] - int((look.seen.camera == c).sum()) for c in sorted(pyramids)}
-    masks = {c: _unknown(lenses, c, look, surface_map) for c in lacking}
+    masks = {c: trackable(pyramids[c][0], _unknown(lenses, c, look, surface_map), look.heads.get(c)) for c in lacking}
     features = {c: sift(pyramids[c][0], masks[c], FEATURES, tilted=True) for c in lacking}
     best: dict[int, Landmarks] = {}
     cameras = sorted(lacking)

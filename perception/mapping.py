@@ -23,6 +23,7 @@ from estimation.surface_map import SurfaceMap, joined_map, moved_map
 from perception.first_map import FirstMap, build_first_map, in_frame
 from perception.frames import FrameSet, Roi
 from perception.growth import LEAST, SHARE, WANTED, Found, Look, Probation, amid, look_for_more
+from perception.keep_out import KeepOut, patch_reach
 from perception.lens import Lenses
 from perception.matcher import Matcher
 from perception.patches import Pyramid
@@ -47,11 +48,13 @@ class Mapping:
         search: Relocaliser,
         executor: Executor | None = None,
         scan: Scan | None = None,
+        keep_out: KeepOut | None = None,
     ) -> None:
         """roi: where the surface is when it first comes into view. search: learns each view that is mapped.
 
-        executor: where the map is refined. scan: its frame is the surface frame.
+        executor: where the map is refined. scan: its frame is the surface frame. keep_out: where no landmark may begin.
         """
+        self._keep_out = keep_out or KeepOut(lenses)
         self._lenses, self._roi, self._search = lenses, tuple(roi), search
         self._placing = None if scan is None else ScanPlacing(scan)
         self._place: Registration | None = None  # of the scan at the first instant
@@ -74,7 +77,7 @@ class Mapping:
         self._tries += 1
         if self._tries > EAGER and self._tries % RELAXED:
             return self._why
-        first = build_first_map(self._lenses, pyramids, polygons)
+        first = build_first_map(self._lenses, pyramids, polygons, self._keep_out.masks)
         if isinstance(first, str):
             self._why = first
             return first
@@ -164,7 +167,8 @@ class Mapping:
         inliers = Observations(seen.stamp, seen.camera[kept], seen.track[kept], seen.pixels[kept], seen.sigma[kept])
         single = self._single(matcher, fit, observations, pyramids)
         images = {c: p[0] for c, p in pyramids.items()}
-        return Look(images, fit.solution.base_from_surface, single, fit.covariance, inliers, self._wanted)
+        heads, pose = self._keep_out.masks, fit.solution.base_from_surface
+        return Look(images, pose, single, fit.covariance, inliers, self._wanted, heads)
 
     def _single(
         self, matcher: Matcher, fit: Fit, observations: Observations, pyramids: dict[int, Pyramid]
@@ -184,7 +188,8 @@ class Mapping:
     ) -> None:
         """Look for the new landmarks again; those that move with the surface join the map."""
         waiting.look(self._lenses, fit.stamp, pyramids, self._single(matcher, fit, observations, pyramids))
-        proven = waiting.proven
+        new, axes = waiting.found.map.points, waiting.found.templates.axes
+        proven = waiting.proven & ~self._keep_out.ink.covers(new, patch_reach(axes), fit.stamp)
         if proven.sum() >= LEAST:
             self._join(waiting.found, proven, matcher, estimator)
         if proven.sum() >= LEAST or waiting.over:

@@ -17,6 +17,8 @@ from estimation.surface_map import SurfaceMap
 from perception.alignment import align_in
 from perception.flow import flow as optical_flow
 from perception.frames import Image
+from perception.ink import near_bead
+from perception.keep_out import KeepOut, patch_reach
 from perception.lens import Lenses, undistort
 from perception.patches import Pyramid, Templates, join, project_into
 
@@ -54,7 +56,10 @@ def spread_order(points: Array) -> NDArray[np.int64]:
 class Matcher:
     """Finds the landmarks of one map; remembers what each camera last saw of them."""
 
-    def __init__(self, lenses: Lenses, surface_map: SurfaceMap, templates: Templates) -> None:
+    def __init__(
+        self, lenses: Lenses, surface_map: SurfaceMap, templates: Templates, keep_out: KeepOut | None = None
+    ) -> None:
+        """keep_out: what is not to be tracked in the frame set that is looked at."""
         self.lenses, self.rig = lenses, lenses.rig
         self.templates = templates
         self.map = surface_map
@@ -62,6 +67,8 @@ class Matcher:
         self._views: dict[int, View] = {}
         self._gathered: tuple[NDArray[np.int64], Templates] | None = None
         self._order = spread_order(surface_map.points)
+        self._inked = np.zeros(len(surface_map), bool)
+        self._keep_out = keep_out or KeepOut(lenses)
 
     def take(self, surface_map: SurfaceMap, agrees: NDArray[np.bool_]) -> None:
         """A refined map, same rows, and which of them (N,) are worth looking for."""
@@ -74,6 +81,11 @@ class Matcher:
         self.map, self._gathered = surface_map, None
         self.templates = join([self.templates, templates])
         self.agrees = np.concatenate([self.agrees, np.ones(new, bool)])
+        self._inked = np.concatenate([self._inked, np.zeros(new, bool)])
+
+    def cover(self, bead: Array) -> None:
+        """A bead (M, 3) mm, surface frame, lies on the surface: what it covers is not looked for any more."""
+        self._inked |= near_bead(self.map.points, bead, patch_reach(self.templates.axes))
 
     def reframe(self, surface_map: SurfaceMap, new_from_old: Array) -> None:
         """The surface frame is another from now on: new_from_old (4, 4). surface_map: in the new one, same rows."""
@@ -171,11 +183,14 @@ class Matcher:
         cameras = [c for c in pyramids if c in poses]
         if not cameras:
             return no_observations(stamp)
-        rows = np.nonzero(self.agrees)[0]
+        rows = np.nonzero(self.agrees & ~self._inked)[0]
         surface_map, axes = self.map, self.templates.axes[rows]
         starts = np.stack([poses[c] for c in cameras])
         where = project_into(self.lenses, cameras, starts, surface_map.points[rows], surface_map.normals[rows], axes)
-        seen = np.nonzero(where.visible if most is None else self._some(where.visible, rows, most))[0]
+        centres = where.centre.reshape(len(cameras), -1, 2)
+        hidden = np.concatenate([self._keep_out.hides(c, at) for c, at in zip(cameras, centres, strict=True)])
+        visible = where.visible & ~hidden
+        seen = np.nonzero(visible if most is None else self._some(visible, rows, most))[0]
         position, row = np.divmod(seen, len(rows))
         where, row = where.take(seen), rows[row]
         counts = np.bincount(position, minlength=len(cameras))

@@ -25,12 +25,15 @@ from estimation.surface_map import SurfaceMap
 from perception.features import grey
 from perception.frames import FrameSet, Roi
 from perception.freshness import Freshness
+from perception.ink import Ink
+from perception.keep_out import KeepOut
 from perception.lens import Lenses
 from perception.mapping import Mapping
 from perception.matcher import Matcher
 from perception.patches import Pyramid, pyramid
 from perception.relocalise import Relocaliser
 from perception.side_by_side import side_by_side
+from perception.tool import Tool
 
 STAGES = ("prepare", "flow", "align", "pose", "search")
 ENOUGH = 120  # landmarks of a camera: at 0.2 px they tell a pose to 0.01 mm, and what they share is not told by more
@@ -72,6 +75,7 @@ class TrackingStep:
         clock: Callable[[], float] = lambda: 0.0,
         executor: Executor | None = None,
         scan: Scan | None = None,
+        tool: Tool | None = None,
     ) -> None:
         """Ready for the first frame set.
 
@@ -79,14 +83,15 @@ class TrackingStep:
         clock: only to fill `StepReport.seconds`. executor: where the map is refined (a process of its own keeps GTSAM's
         hold on the interpreter away from the frames); without one it is done in `idle`. Poses are the same either way.
         scan: its frame is the surface frame; without one that is laid into the first map (origin at the landmarks'
-        centroid, z out of the surface).
+        centroid, z out of the surface). tool: what hangs on the arm, where frame sets tell of a print head.
         """
         self.rig, self.roi, self._clock = rig, tuple(roi), clock
         self._lenses = Lenses(rig)
         self._estimator = Estimator(rig)
         self._fresh = Freshness()
         self._search = Relocaliser(self._lenses)
-        self._mapping = Mapping(self._lenses, self.roi, self._search, executor, scan)
+        self._keep_out = KeepOut(self._lenses, tool)
+        self._mapping = Mapping(self._lenses, self.roi, self._search, executor, scan, self._keep_out)
         self._matcher: Matcher | None = None
         self._lost: dict[int, Pyramid] = {}  # images of cameras that are to be searched once the pose is handed over
         self._found: Array | None = None  # (4, 4), where the last search saw the surface
@@ -104,11 +109,16 @@ class TrackingStep:
             return last
         self._check(frames)
         pyramids = self._pyramids(frames)
+        self._keep_out.look(frames.head, pyramids)
         self._took("prepare")
         if self._matcher is None:
             pose, observations, used = self._initialise(frames, pyramids)
         else:
             pose, observations, used = self._track(self._matcher, frames.stamp, pyramids)
+            if pose.state.measured:
+                bead = self._keep_out.lay(frames.head, pose.stamp, pose.base_from_surface)
+                if bead is not None:
+                    self._matcher.cover(bead)
         self.last = self._report(observations, used)
         return pose
 
@@ -157,7 +167,8 @@ class TrackingStep:
         self._took("search")
         if isinstance(first, str):
             return identity_pose(frames.stamp, first), no_observations(frames.stamp), none
-        matcher = self._matcher = Matcher(self._lenses, first.map, first.templates)
+        matcher = self._matcher = Matcher(self._lenses, first.map, first.templates, self._keep_out)
+        self._keep_out.ink = Ink()
         pose, observations, fit = self._mapping.begin(frames.stamp, first, matcher, self._estimator, pyramids)
         self._took("search")
         return pose, observations, fit.used

@@ -131,7 +131,7 @@ def first() -> FirstMap:
 
 def waiting(amid_others: bool = False) -> Probation:
     start = first().base_from_surface
-    look = Look({}, start, dict.fromkeys(range(3), start), np.zeros((6, 6)), no_observations(0.0), {})
+    look = Look({}, start, dict.fromkeys(range(3), start), np.zeros((6, 6)), no_observations(0.0), {}, {})
     count = len(first().map)
     return Probation(Found(look, first().map, first().templates, {}), np.full(count, amid_others))
 

@@ -21,6 +21,7 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.clock import Clock
+from hardware.commanded import Commanded
 from hardware.images import decode
 from hardware.motion import MotionStep
 from hardware.progress import Report, silent
@@ -126,6 +127,7 @@ class World:
         self.tracked, self.skipped = 0, 0  # frame sets, and those that the tracker had no time for
         self._pose: SurfacePose | None = None
         self._motion: MotionStep | None = None
+        self._commanded = Commanded(profile)
         self._ticks, self._given, self._laid = 0, 0.0, 0.0
         self._bead: Array | None = None  # (2,) where the last piece of bead ended
         self._end = scenario.seconds
@@ -215,6 +217,7 @@ class World:
     def _track(self, now: float) -> None:
         assert self._waiting is not None
         frames, self._waiting, self._busy = self._waiting, None, True
+        frames = replace(frames, head=self._commanded.at(frames.stamp)) if self.scenario.nozzle else frames
         start = self._clock.now()
         pose = self._step(frames)
         spent = self._clock.now() - start
@@ -258,6 +261,7 @@ class World:
             arrival = float(self._wire.send(frame, now)[-1])
             self._agenda.at(arrival, ARRIVAL, partial(self._receive, self._line(frame)))
             self._ledger.write(self._motion.last, self._motion.progress)
+            self._commanded.add(self._motion.last, now)
             self.arm.advance(now)
             self._sink.command(self._motion.last, self._motion.progress, frame, self.arm.transmit(now))
             if self._motion.progress.phase is Phase.FINISHED:
