@@ -1,0 +1,155 @@
+"""The print head, fresh ink and highlights are not tracked; nothing else is given up for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimation import se3
+from estimation.errors import InputError
+from estimation.se3 import Array
+from estimation.synthetic.arc_rig import REST, arc_rig
+from perception.frames import PrintHead
+from perception.ink import FRESH, REACH, STEP, Ink, near_bead
+from perception.keep_out import MARGIN, KeepOut, highlights, trackable
+from perception.lens import Lenses
+from perception.tool import SYRINGE, Tool
+
+LENSES = Lenses(arc_rig(size=(640, 480), focal=700.0))
+ABOVE = REST @ se3.make(np.eye(3), [4.0, -3.0, 1.0])  # a tip a millimetre above the surface, upright
+
+
+def on_tool(rng: np.random.Generator, base_from_nozzle: Array, count: int = 300) -> Array:
+    """Points (N, 3) mm, base frame, on the syringe."""
+    z = rng.uniform(0, SYRINGE[-1, 0], count)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    radius = np.interp(z, *SYRINGE.T)
+    return np.asarray(
+        se3.transform_points(base_from_nozzle, np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1))
+    )
+
+
+def imaged(camera: int, points_base: Array) -> Array:
+    """Where points (N, 3) fall in a camera's image: those inside, (M, 2) px."""
+    x, y, depth = se3.transform_points(LENSES.rig.camera_from_base[camera], points_base).T
+    pixels, seen = LENSES.bend(camera, x / depth, y / depth, depth)
+    inside = seen & ((pixels.T >= 0) & (LENSES.sizes[camera] > pixels.T)).all(1)
+    return np.asarray(pixels.T[inside])
+
+
+@settings(max_examples=30)
+@given(
+    st.tuples(*[st.floats(-20, 20)] * 3), st.tuples(*[st.floats(-0.6, 0.6)] * 3), st.integers(0, 2), st.integers(0, 99)
+)
+def test_every_spot_of_the_head_is_hidden_and_what_is_far_from_it_is_not(
+    shift: tuple[float, ...], turn: tuple[float, ...], camera: int, seed: int
+) -> None:
+    nozzle = ABOVE @ se3.exp(np.array([*turn, *shift]))
+    keep_out = KeepOut(LENSES)
+    keep_out.look(PrintHead(nozzle, False), range(3))
+    spots = imaged(camera, on_tool(np.random.default_rng(seed), nozzle))
+    assert keep_out.hides(camera, spots).all()
+    everywhere = np.random.default_rng(seed).uniform(0, 1, (400, 2)) * LENSES.sizes[camera]
+    head = imaged(camera, on_tool(np.random.default_rng(seed + 1), nozzle, 4000))
+    if len(head) > 1000:
+        away = np.array([np.linalg.norm(head - spot, axis=1).min() for spot in everywhere])
+        assert not keep_out.hides(camera, everywhere[away > 40]).any()
+
+
+def test_without_a_head_nothing_is_hidden() -> None:
+    keep_out = KeepOut(LENSES)
+    keep_out.look(PrintHead(ABOVE, False), range(3))
+    assert keep_out.masks
+    keep_out.look(None, range(3))
+    assert not keep_out.masks and not keep_out.hides(0, np.full((5, 2), 200.0)).any()
+
+
+@pytest.mark.parametrize(
+    "profile",
+    [
+        [[0.0, 1.0]],
+        [[0.0, 1.0], [0.0, 2.0]],
+        [[0.0, -1.0], [5.0, 1.0]],
+        [[0.0, np.nan], [5.0, 1.0]],
+        [[0.0, 1.0, 2.0]] * 2,
+    ],
+)
+def test_a_tool_that_is_none_is_refused(profile: list[list[float]]) -> None:
+    with pytest.raises(InputError, match="height"):
+        Tool(np.array(profile))
+
+
+def test_the_tool_is_drawn_a_little_too_large() -> None:
+    def area(margin: float) -> float:
+        spots = np.concatenate(Tool(SYRINGE).silhouette(LENSES, 1, ABOVE, margin))
+        return float(np.prod(np.ptp(spots, axis=0)))
+
+    assert area(0.0) < area(MARGIN) < area(5.0)
+
+
+# -- ink
+
+
+@given(st.lists(st.tuples(st.floats(-15, 15), st.floats(-15, 15)), min_size=2, max_size=8))
+def test_a_bead_has_no_gaps(corners: list[tuple[float, float]]) -> None:
+    ink = Ink()
+    tips = [np.array([x, y, 0.0]) for x, y in corners]
+    for i, tip in enumerate(tips):
+        ink.lay(0.1 * i, tip)
+    for a, b in zip(tips, tips[1:], strict=False):
+        along = a + np.linspace(0, 1, 50)[:, None] * (b - a)
+        assert ink.covers(along, np.zeros(50), 1.0).all()
+
+
+def test_only_what_the_bead_reaches_is_covered_and_only_while_it_is_fresh() -> None:
+    ink, points = Ink(), np.array([[5.0, 0.0, 0.0], [5.0, REACH + 0.5, 0.0], [5.0, REACH + STEP + 2.0, 0.0]])
+    ink.lay(0.0, np.zeros(3))
+    bead = ink.lay(1.0, np.array([10.0, 0.0, 0.0]))
+    assert ink.covers(points, np.full(3, 1.0), 2.0).tolist() == [True, True, False]
+    assert near_bead(points, bead, np.full(3, 1.0)).tolist() == [True, True, False]
+    assert not ink.covers(points, np.full(3, 1.0), 1.5 + FRESH).any()
+
+
+def test_a_lifted_nozzle_draws_no_line_to_where_it_is_set_down() -> None:
+    ink = Ink()
+    ink.lay(0.0, np.zeros(3))
+    ink.lift()
+    ink.lay(1.0, np.array([20.0, 0.0, 0.0]))
+    assert not ink.covers(np.array([[10.0, 0.0, 0.0]]), np.zeros(1), 1.0).any()
+
+
+def test_ink_lies_on_the_surface_not_where_the_surface_was() -> None:
+    keep_out = KeepOut(LENSES)
+    moved = REST @ se3.exp(np.array([0.0, 0, 0.2, 8.0, 0, 3.0]))
+    tip = se3.make(np.eye(3), [1.0, 2.0, 0.0])
+    first = keep_out.lay(PrintHead(REST @ tip, True), 0.0, REST)
+    second = keep_out.lay(PrintHead(moved @ tip, True), 0.1, moved)
+    assert first is not None and second is not None
+    np.testing.assert_allclose(second[-1], first[-1], atol=1e-9)
+    assert keep_out.lay(PrintHead(moved @ tip, False), 0.2, moved) is None
+
+
+# -- highlights
+
+
+def test_small_bright_spots_are_highlights_and_an_overexposed_picture_has_none() -> None:
+    image, region = np.full((120, 160), 90, np.uint8), np.full((120, 160), 255, np.uint8)
+    image[40:46, 50:58] = 255
+    found = highlights(image, region)
+    assert found[43, 54] and found[38, 54] and not found[80, 100]
+    assert not trackable(image, region, None)[43, 54] and trackable(image, region, None)[80, 100]
+    image[:, :80] = 255
+    assert not highlights(image, region).any()
+
+
+def test_tracks_begin_neither_outside_the_region_nor_behind_the_head() -> None:
+    image, region = np.full((480, 640), 90, np.uint8), np.zeros((480, 640), np.uint8)
+    region[:, 200:] = 255
+    keep_out = KeepOut(LENSES)
+    keep_out.look(PrintHead(ABOVE, False), [0])
+    free = trackable(image, region, keep_out.masks[0])
+    assert not free[:, :199].any() and free.any()
+    y, x = np.nonzero(free)
+    assert not keep_out.hides(0, np.stack([x, y], -1).astype(float)).any()
