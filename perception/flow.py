@@ -1,4 +1,4 @@
-"""Optical flow from the last frame to this one: a predictor for the alignment, never a measurement."""
+"""Optical flow from the last frame to this one and back: a predictor for the alignment, never a measurement."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ FLAT, LEAST = 2.0, 8  # grey levels of spread below which a window tells nothing
 LIKENESS, ENOUGH = 0.7, 0.35  # correlation of a window with itself; share of alike ones that is enough
 ASKED = 40  # tracks, about
 SMALL, MOST = 0.08, (0.4, 2.5)  # changes of brightness that flow bears; gains beyond which it is another picture
+RETURNED = 1.0  # px from where a track began to where it ends when it is followed back
 MARGIN = 48.0  # px around the tracks: flow sees that far beyond them
 
 
@@ -26,8 +27,9 @@ def flow(
     guess: (N, 2) px, where to begin. Pyramidal Lucas-Kanade (thesis 4.4, Eq. 4.7-4.10) on the box around the tracks. It
     takes brightness as constant, and was measured to fail where that jumps by a quarter: where most of what it finds
     does not look like what it sought, it is tried again with the jump taken back, and the better of the two is kept.
+    What does not come back to where it began when it is followed the other way is not found (Kalal et al. 2010).
     """
-    first = _lucas_kanade(previous, current, pixels, guess, levels)
+    first = _there_and_back(previous, current, pixels, guess, levels)
     alike = _alike(previous, current, pixels, *first)
     if alike >= ENOUGH:
         return first
@@ -35,8 +37,17 @@ def flow(
     if not MOST[0] < gain < MOST[1] or (abs(gain - 1) < SMALL and abs(offset) < SMALL * 128):
         return first
     relit = np.asarray(cv2.addWeighted(current, 1 / gain, current, 0.0, -offset / gain), np.uint8)
-    second = _lucas_kanade(previous, relit, pixels, guess, levels)
+    second = _there_and_back(previous, relit, pixels, guess, levels)
     return second if _alike(previous, relit, pixels, *second) > alike else first
+
+
+def _there_and_back(
+    previous: Image, current: Image, pixels: Array, guess: Array, levels: int
+) -> tuple[Array, NDArray[np.bool_]]:
+    there, found = _lucas_kanade(previous, current, pixels, guess, levels)
+    there[~found] = guess[~found]
+    back, returned = _lucas_kanade(current, previous, there, pixels + there - guess, levels)
+    return there, found & returned & (np.linalg.norm(back - pixels, axis=1) < RETURNED)
 
 
 def _lucas_kanade(

@@ -23,7 +23,7 @@ from estimation.scan import Scan
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.features import grey
-from perception.frames import FrameSet, Roi
+from perception.frames import FrameSet, Image, Roi
 from perception.freshness import Freshness
 from perception.ink import Ink
 from perception.keep_out import KeepOut
@@ -31,6 +31,7 @@ from perception.lens import Lenses
 from perception.mapping import Mapping
 from perception.matcher import Matcher
 from perception.patches import Pyramid, pyramid
+from perception.prefilter import untouched
 from perception.relocalise import Relocaliser
 from perception.side_by_side import side_by_side
 from perception.tool import Tool
@@ -76,6 +77,7 @@ class TrackingStep:
         executor: Executor | None = None,
         scan: Scan | None = None,
         tool: Tool | None = None,
+        prefilter: Callable[[Image], Image] = untouched,
     ) -> None:
         """Ready for the first frame set.
 
@@ -84,9 +86,10 @@ class TrackingStep:
         hold on the interpreter away from the frames); without one it is done in `idle`. Poses are the same either way.
         scan: its frame is the surface frame; without one that is laid into the first map (origin at the landmarks'
         centroid, z out of the surface). tool: what hangs on the arm, where frame sets tell of a print head.
+        prefilter: done to each grey picture before anything is looked for in it.
         """
         self.rig, self.roi, self._clock = rig, tuple(roi), clock
-        self._lenses = Lenses(rig)
+        self._lenses, self._prefilter = Lenses(rig), prefilter
         self._estimator = Estimator(rig)
         self._fresh = Freshness()
         self._search = Relocaliser(self._lenses)
@@ -146,7 +149,7 @@ class TrackingStep:
 
     def _pyramids(self, frames: FrameSet) -> dict[int, Pyramid]:
         """The new pictures, by camera; one that was there before would say that the surface stands still."""
-        greys = side_by_side(grey, [f.image for f in frames.frames])
+        greys = side_by_side(lambda image: self._prefilter(grey(image)), [f.image for f in frames.frames])
         images = {f.camera: image for f, image in zip(frames.frames, greys, strict=True)}
         fresh = {c: pyramid(image) for c, image in images.items() if self._fresh(c, image)}
         self._estimator.health.pictures(fresh, images.keys() - fresh.keys())

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from estimation.se3 import Array
 from perception.features import bounding_box
 from perception.frames import Image
+from perception.prefilter import bilateral
 
 Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px, the last two excluded
 
 BORDER = 5.0  # px around the region, Appendix A
-DIAMETER, SIGMA_GREY, SIGMA_PX = 10, 75.0, 750.0  # of the bilateral filter, Appendix A
 
 
 def corners_of(polygon: Array, size: tuple[int, int]) -> Array:
@@ -29,5 +28,4 @@ def united(before: Array, now: Array, size: tuple[int, int]) -> Box:
 def cropped(view: Image, box: Box) -> Image:
     """The box of a picture, its reflections filtered out and its contours kept (thesis Fig. 4.9)."""
     x0, y0, x1, y1 = box
-    inside = np.ascontiguousarray(view[y0:y1, x0:x1])
-    return np.asarray(cv2.bilateralFilter(inside, DIAMETER, SIGMA_GREY, SIGMA_PX), np.uint8)
+    return bilateral(np.ascontiguousarray(view[y0:y1, x0:x1]))
