@@ -94,7 +94,7 @@ Nearest = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDA
 
 
 def _by_all_distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> Nearest:
-    """Squared distances (N,) of a's rows to the nearest and the next of b's, the nearest's row, and b's nearest (M,)."""
+    """Squared distances (N,) of a to the nearest and next row of b, which row is nearest, and the same back (M,)."""
     distance = np.maximum((a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T), 0.0)
     best, back = np.argmin(distance, axis=1), np.argmin(distance, axis=0)
     rows = np.arange(len(a))

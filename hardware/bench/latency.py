@@ -21,6 +21,7 @@ from perception.tracking import STAGES
 
 REFERENCE = "thesis 70; OpenVINS stereo 26 / 41 / 98 (median / 99 % / largest)"
 TARGETS = ("median", 50, at_most(8)), ("99 %", 99, at_most(16)), ("largest", 100, at_most(33))
+TRACKS = ("median", 50, at_most(5)), ("99 %", 99, at_most(10))  # 120 a camera
 ESTIMATION = at_most(4)  # ms, 99 %
 QUALITY = 95  # of JPEG: what is held in memory until it is shown
 WARM = 10  # frame sets after the first map that only fill caches and the window
@@ -78,6 +79,9 @@ def latency_figures(name: str, wall: Array, processor: Array) -> list[Figure]:
     figures.append(_figure(f"{name}: processor", processor, "median", 50, note="all threads"))
     for stage, column in zip(STAGES, wall[:, 1:].T, strict=True):
         figures.append(_figure(f"{name}: {stage}", column, "median", 50))
+    tracking = wall[:, 1 + STAGES.index("flow")] + wall[:, 1 + STAGES.index("align")]
+    for word, percentile, target in TRACKS:
+        figures.append(_figure(f"{name}: tracks of all cameras", tracking, word, percentile, target))
     estimation = wall[:, 1 + STAGES.index("pose")]
     figures.append(_figure(f"{name}: estimation alone", estimation, "99 %", 99, ESTIMATION))
     asked = float(np.mean(wall[:, 1 + STAGES.index("flow")] > 0))
