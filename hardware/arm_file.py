@@ -10,6 +10,7 @@ pwm = 0                                       # bytes 27 to 30 of a G1 frame: 0,
 baud = 115200
 tick_s = 0.02
 lag_s = 0.024                                 # from the end of a tick until the arm is where it was sent in it
+tool_mm = [[0, 0.5], [12.7, 0.5], [27, 4.8]]  # height above the tip and radius of what hangs on the arm
 [limits]                                      # as in planning/limits.py; arrays are X Y Z in mm, A B C in degrees
 speed = [150, 150, 150, 120, 120, 120]
 turn = 2.4
@@ -27,6 +28,7 @@ from estimation.se3 import Array
 from hardware import checks
 from hardware.arm_profile import ArmProfile
 from hardware.protocol import Dialect
+from perception.tool_profile import check_profile
 from planning.kinematics import SimpleArm
 from planning.limits import Limits
 
@@ -41,6 +43,7 @@ KEYS = (
     "baud",
     "tick_s",
     "lag_s",
+    "tool_mm",
     "limits",
 )
 LIMITS = tuple(f.name for f in fields(Limits))
@@ -74,6 +77,7 @@ def read_arm(path: str | Path) -> ArmProfile:
             baud=checks.integer(path, "baud", table.get("baud", default.baud), 1),
             tick=checks.number(path, "tick_s", table.get("tick_s", default.tick)),
             lag=checks.number(path, "lag_s", table.get("lag_s", default.lag)),
+            tool=tool_from_value(path, "tool_mm", table["tool_mm"]) if "tool_mm" in table else default.tool,
         )
     except InputError as error:
         if error.where == str(path):
@@ -95,11 +99,19 @@ def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
         f"baud = {profile.baud}",
         f"tick_s = {profile.tick!r}",
         f"lag_s = {profile.lag!r}",
+        f"tool_mm = {checks.toml_numbers(profile.tool)}",
         "",
         "[limits] # X Y Z in mm, A B C in degrees",
         *(f"{name} = {checks.toml_numbers(getattr(limits, name) / _unit(name))}" for name in LIMITS),
     ]
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def tool_from_value(where: object, key: str, value: object) -> Array:
+    """A tool's profile (K, 2) of [height, radius], mm, from a file; InputError names the key."""
+    profile = checks.numbers(where, key, value, (None, 2), "mm")
+    check_profile(where, key, profile)
+    return profile
 
 
 def _unit(name: str) -> Array:

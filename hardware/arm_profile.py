@@ -10,6 +10,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.protocol import LENGTH, THESIS, Dialect
+from perception.tool_profile import SYRINGE, check_profile
 from planning.follow import LEAD
 from planning.kinematics import SimpleArm
 from planning.limits import Limits
@@ -25,6 +26,7 @@ class ArmProfile:
 
     arm: its frame and home. limits: what it bears. dialect: its frames. baud: bits/s, 8N1. tick: s between commands.
     lag: s that it is later at a command's axes than one tick after the command was sent: wire, dead time, servo.
+    tool: (K, 2) mm, what hangs on it, turned about the nozzle: height above the tip, rising, and radius there.
     """
 
     arm: SimpleArm = field(default_factory=SimpleArm)
@@ -33,6 +35,7 @@ class ArmProfile:
     baud: int = 115_200  # thesis 6.2; one public driver uses 9600, at which a frame takes 50 ms
     tick: float = 0.02  # 50 commands a second: faster than any camera here, a fifth of what the wire carries
     lag: float = 0.024  # 4 ms of wire, and 20 ms that a hobby servo is taken to follow behind until it is measured
+    tool: Array = field(default_factory=SYRINGE.copy)
 
     def __post_init__(self) -> None:
         if not self.baud > 0:
@@ -42,6 +45,7 @@ class ArmProfile:
             raise InputError("arm profile", "tick", self.tick, f"{wire:.5f} s, one frame on the wire, to {LEAD / 2} s")
         if not 0 <= self.lag <= LONGEST_LAG:
             raise InputError("arm profile", "lag", self.lag, f"0 to {LONGEST_LAG} s")
+        check_profile("arm profile", "tool", self.tool)
         arm, limits = self.arm, self.limits
         if (arm.home < limits.low).any() or (arm.home > limits.high).any():
             allowed = f"within {limits.low.tolist()} and {limits.high.tolist()}"

@@ -13,8 +13,10 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware import messages
+from hardware.heads import head_from_row
 from hardware.mcap_walk import ChunkOf, parse, walk
 from hardware.messages import Message
+from perception.frames import PrintHead
 from planning.command import Command
 
 T = TypeVar("T")
@@ -52,7 +54,17 @@ def read_events(path: str | Path) -> Iterator[tuple[float, int, str]]:
 
 def read_truth_rows(path: str | Path) -> Array:
     """Truth or reference as stored, rows (N, 8) of stamp x y z qx qy qz qw, s and mm, in order of stamp."""
-    return np.array(sorted(_read(path, {"/truth": messages.truth_row})), float).reshape(-1, 8)
+    return np.array(sorted(_read(path, {"/truth": messages.row_from_message})), float).reshape(-1, 8)
+
+
+def read_heads(path: str | Path) -> Iterator[tuple[float, PrintHead]]:
+    """Stamps (s) of frame sets, and the print head at each."""
+    return _read(path, {"/head": _stamped_head})
+
+
+def _stamped_head(message: Message) -> tuple[float, PrintHead]:
+    row = messages.row_from_message(message)
+    return row[0], head_from_row(row, message["extruding"])
 
 
 def _stamped_bytes(message: Message) -> tuple[float, bytes]:

@@ -162,6 +162,7 @@ def _add_track(commands: Commands) -> None:
     command.add_argument(
         "--method", choices=METHODS, default=MAP, help="; ".join(f"{name}: {what}" for name, what in METHODS.items())
     )
+    command.add_argument("--arm", type=Path, metavar="ARM.toml", help="what tool hangs on the session's arm")
     command.add_argument("--record", type=Path, metavar="X.mcap", help="also record images, tracks and poses as MCAP")
     command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     command.set_defaults(run=_track)
@@ -238,9 +239,11 @@ def _arm(arguments: argparse.Namespace) -> None:
 
 
 def _track(arguments: argparse.Namespace) -> None:
+    from hardware.arm_file import read_arm
     from hardware.track import run_track
 
-    print(run_track(arguments.session, arguments.out, arguments.record, arguments.force, arguments.method))
+    tool = None if arguments.arm is None else read_arm(arguments.arm).tool
+    print(run_track(arguments.session, arguments.out, arguments.record, arguments.force, arguments.method, tool))
 
 
 def _replay(arguments: argparse.Namespace) -> None:

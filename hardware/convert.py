@@ -13,6 +13,7 @@ import heapq
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
 from hardware.channels import read_truth_rows
 from hardware.folder import TRUTH_FILES, truth_file
-from hardware.folder_tables import write_frames, write_roi
+from hardware.folder_tables import write_frames, write_heads, write_roi
 from hardware.recording import Recorder
 from hardware.rig_file import ImageSource, write_rig
 from hardware.session import FrameRef, Session, open_session
@@ -101,45 +102,54 @@ def _record(session: Session, folder: Path, recorder: Recorder, progress: Progre
     """Everything in order of stamp, so that viewers need not sort."""
     if session.surface is not None:
         recorder.surface(session.surface)
-    total = sum(map(len, session.sets))
-    streams = [_roi_stream(session), _truth_stream(folder), _frame_stream(session)]
-    reader, done = session.store.open(), 0
+    reader, done, total = session.store.open(), 0, sum(map(len, session.sets))
+
+    def image(ref: FrameRef) -> None:
+        nonlocal done
+        encoded = reader.encoded(ref) if exact else None
+        if encoded is None:
+            recorder.frame(Frame(ref.camera, ref.stamp, reader.read(ref)), ref.camera_stamp)
+        else:
+            recorder.encoded_frame(ref.camera, ref.stamp, *encoded, ref.camera_stamp)
+        done += 1
+        progress(done, total)
+
+    streams = [
+        _rois(session, recorder.write),
+        _truth(folder, recorder.truth_row),
+        _heads(session, recorder.head_row),
+        _images(session, image),
+    ]
     try:
-        for _, _, item in heapq.merge(*streams, key=lambda entry: entry[:2]):
-            if isinstance(item, FrameRef):
-                encoded = reader.encoded(item) if exact else None
-                if encoded is None:
-                    recorder.frame(Frame(item.camera, item.stamp, reader.read(item)), item.camera_stamp)
-                else:
-                    recorder.encoded_frame(item.camera, item.stamp, *encoded, item.camera_stamp)
-                done += 1
-                progress(done, total)
-            elif isinstance(item, Roi):
-                recorder.write(item)
-            else:
-                recorder.truth_row(*item)
+        for _, _, write in heapq.merge(*streams, key=lambda entry: entry[:2]):
+            write()
     finally:
         reader.close()
 
 
-Entry = tuple[float, int, "FrameRef | Roi | tuple[Array, bool]"]  # stamp, s; which goes first; what
+Entry = tuple[float, int, Callable[[], None]]  # stamp, s; which goes first; writes it
 
 
-def _roi_stream(session: Session) -> Iterator[Entry]:
-    return ((roi.stamp, 0, roi) for roi in sorted(session.roi, key=lambda r: r.stamp))
+def _rois(session: Session, write: Callable[[Roi], None]) -> Iterator[Entry]:
+    return ((roi.stamp, 0, partial(write, roi)) for roi in sorted(session.roi, key=lambda r: r.stamp))
 
 
-def _truth_stream(folder: Path) -> Iterator[Entry]:
+def _truth(folder: Path, write: Callable[[Array, bool], None]) -> Iterator[Entry]:
     found = truth_file(folder)
     if found is None:
         return iter(())
     path, exact = found
-    return ((float(row[0]), 1, (row, exact)) for row in read_rows(path))
+    return ((float(row[0]), 1, partial(write, row, exact)) for row in read_rows(path))
 
 
-def _frame_stream(session: Session) -> Iterator[Entry]:
+def _heads(session: Session, write: Callable[[Array, bool], None]) -> Iterator[Entry]:
+    pairs = zip(session.heads.rows, session.heads.extruding, strict=True)
+    return ((float(row[0]), 2, partial(write, row, bool(extruding))) for row, extruding in pairs)
+
+
+def _images(session: Session, write: Callable[[FrameRef], None]) -> Iterator[Entry]:
     refs = (ref for refs in session.sets for ref in refs)
-    return ((ref.stamp, 2, ref) for ref in sorted(refs, key=lambda r: (r.stamp, r.camera)))
+    return ((ref.stamp, 3, partial(write, ref)) for ref in sorted(refs, key=lambda r: (r.stamp, r.camera)))
 
 
 def _write_folder(session: Session, folder: Path, progress: Progress) -> None:
@@ -152,6 +162,8 @@ def _write_folder(session: Session, folder: Path, progress: Progress) -> None:
     if session.truth is not None:
         name = next(name for name, exact in TRUTH_FILES if exact == session.truth.exact)
         write_rows(folder / name, read_truth_rows(session.path))
+    if len(session.heads):
+        write_heads(folder / "head.csv", session.heads)
     if session.surface is not None:
         shutil.copyfile(session.surface, folder / session.surface.name)
     _write_pictures(session, folder, refs, progress)

@@ -1,6 +1,7 @@
 """A session as a plain folder that a person can make by hand: rig.toml, frames.csv, videos or pictures, and more.
 
-Optional beside them: roi.toml, truth.tum (exact) or reference.tum (measured; truth wins), surface.ply, .stl or .obj.
+Optional beside them: roi.toml, head.csv, truth.tum (exact) or reference.tum (measured; truth wins), surface.ply, .stl
+or .obj.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from estimation.errors import InputError
 from estimation.rig import Camera
 from estimation.trajectory import Trajectory
 from hardware import checks
-from hardware.folder_tables import read_frames, read_roi
+from hardware.folder_tables import read_frames, read_heads, read_roi
+from hardware.heads import NO_HEADS
 from hardware.images import Video, check_size, count_by_decoding, decode
 from hardware.rig_file import ImageSource, RigFile, read_rig
 from hardware.session import SURFACE_SUFFIXES, FrameRef, Session, common_stamps, frame_refs
@@ -100,8 +102,10 @@ def open_folder(folder: Path) -> Session:
         _check_first_image(files)
     roi = folder / "roi.toml"
     rois = read_roi(roi, rig, common_stamps(rig, stamps)) if roi.exists() else ()
-    sets = frame_refs(rig, stamps)
-    return Session(folder, rig, rois, _surface(folder, rig_file), truth_of(folder), sets, FolderStore(cameras))
+    head = folder / "head.csv"
+    heads = read_heads(head) if head.exists() else NO_HEADS
+    sets, surface = frame_refs(rig, stamps), _surface(folder, rig_file)
+    return Session(folder, rig, rois, surface, truth_of(folder), sets, FolderStore(cameras), heads=heads)
 
 
 def truth_of(folder: Path) -> Trajectory | None:

@@ -1,4 +1,4 @@
-"""The small tables of a session folder: frames.csv (stamps) and roi.toml (where the surface is at the start)."""
+"""The small tables of a session folder: frames.csv (stamps), head.csv (the print head), roi.toml (the surface)."""
 
 from __future__ import annotations
 
@@ -14,17 +14,20 @@ from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware import checks
+from hardware.heads import Heads
 from hardware.session import FrameRef
+from hardware.tum import checked_rows, row_from_words
 from perception.frames import Roi
 
 COLUMNS = ("camera", "frame", "stamp_s")
+HEAD_COLUMNS = ("stamp_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw", "extruding")
 
 
 def read_frames(path: Path, rig: Rig) -> list[Array]:
     """Stamps (N,), s, of each camera's frames 0..N-1 as its own clock gave them: finite, rising, none left out."""
     names = [c.name for c in rig.cameras]
     found: list[dict[int, float]] = [{} for _ in names]
-    for line, row in _rows(path):
+    for line, row in _rows(path, COLUMNS):
         camera, frame, stamp = _frame_row(path, line, row, names)
         if frame in found[camera]:
             raise InputError(path, f"line {line}: camera,frame", f"{names[camera]},{frame}", "each frame once")
@@ -35,7 +38,7 @@ def read_frames(path: Path, rig: Rig) -> list[Array]:
     return stamps
 
 
-def _rows(path: Path) -> list[tuple[int, dict[str, str | None]]]:
+def _rows(path: Path, columns: Sequence[str]) -> list[tuple[int, dict[str, str | None]]]:
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
@@ -44,9 +47,9 @@ def _rows(path: Path) -> list[tuple[int, dict[str, str | None]]]:
             rows = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(path, "file", error, "a readable CSV file") from error
-    for column in COLUMNS:
+    for column in columns:
         if column not in header:
-            raise InputError(path, "header", ",".join(header) or "empty", ",".join(COLUMNS))
+            raise InputError(path, "header", ",".join(header) or "empty", ",".join(columns))
     return rows
 
 
@@ -89,6 +92,32 @@ def write_frames(path: Path, rig: Rig, refs: Iterable[FrameRef]) -> None:
 def frame_line(rig: Rig, ref: FrameRef) -> str:
     """One line of frames.csv."""
     return f"{rig.cameras[ref.camera].name},{ref.number},{ref.camera_stamp!r}\n"
+
+
+def read_heads(path: Path) -> Heads:
+    """The print heads of head.csv, base_from_nozzle; none is allowed, as where a run ended before the arm moved."""
+    found = _rows(path, HEAD_COLUMNS)
+    table = [(f"line {line}", [(row[c] or "").strip() for c in HEAD_COLUMNS]) for line, row in found]
+    rows = checked_rows(path, ((line, row_from_words(path, line, words[:-1])) for line, words in table))
+    return Heads(rows, np.array([_extruding(path, line, words[-1]) for line, words in table], bool))
+
+
+def _extruding(path: Path, line: str, word: str) -> bool:
+    if word not in ("0", "1"):
+        raise InputError(path, f"{line}: extruding", word, "0 or 1")
+    return word == "1"
+
+
+def write_heads(path: Path, heads: Heads) -> None:
+    """Write head.csv, every number with the digits that give the same float64 back."""
+    with open(path, "w", encoding="utf-8") as file:
+        file.write(",".join(HEAD_COLUMNS) + "\n")
+        file.writelines(head_line(row, bool(flag)) for row, flag in zip(heads.rows, heads.extruding, strict=True))
+
+
+def head_line(row: Array, extruding: bool) -> str:
+    """One line of head.csv; row: (8,) stamp x y z qx qy qz qw, s and mm."""
+    return ",".join(repr(float(value)) for value in row) + f",{int(extruding)}\n"
 
 
 def read_roi(path: Path, rig: Rig, stamps: Sequence[Array]) -> tuple[Roi, ...]:

@@ -75,13 +75,22 @@ def roi_from_message(message: Message) -> Roi:
 
 def message_from_truth(row: Array, exact: bool) -> Message:
     """A row (8,) of stamp x y z qx qy qz qw, s and mm, as a message."""
+    return {**_message_from_row(row), "exact": exact}
+
+
+def message_from_head(row: Array, extruding: bool) -> Message:
+    """A print head's row (8,) of stamp x y z qx qy qz qw, s and mm, base_from_nozzle, as a message."""
+    return {**_message_from_row(row), "extruding": bool(extruding)}
+
+
+def row_from_message(message: Message) -> list[float]:
+    """The row of 8 numbers, stamp x y z qx qy qz qw, in a message of truth or of a print head."""
+    return [float(value) for value in (message["stamp"], *message["position"], *message["quaternion"])]
+
+
+def _message_from_row(row: Array) -> Message:
     values = row.tolist()
-    return {"stamp": values[0], "position": values[1:4], "quaternion": values[4:], "exact": exact}
-
-
-def truth_row(message: Message) -> list[float]:
-    """The row of 8 numbers in a truth message."""
-    return [message["stamp"], *message["position"], *message["quaternion"]]
+    return {"stamp": values[0], "position": values[1:4], "quaternion": values[4:]}
 
 
 def message_from_observations(observations: Observations) -> Message:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from estimation.rig import Rig
+    from estimation.se3 import Array
     from hardware.track import Step
     from perception.frames import Roi
 
@@ -23,16 +24,21 @@ METHODS = {
 
 @contextmanager
 def step_by(
-    method: str, rig: Rig, roi: Sequence[Roi], surface: Path | None = None, now: Callable[[], float] = lambda: 0.0
+    method: str,
+    rig: Rig,
+    roi: Sequence[Roi],
+    surface: Path | None = None,
+    now: Callable[[], float] = lambda: 0.0,
+    tool: Array | None = None,
 ) -> Iterator[Step]:
     """A tracking step of a method, a key of METHODS, for these cameras.
 
-    roi, surface, now: as `tracker` takes them; the thesis's methods make no use of the scan.
+    roi, surface, now, tool: as `tracker` takes them; the thesis's methods make no use of the scan and the tool.
     """
     if method == MAP:
         from hardware.tracker import tracker
 
-        with tracker(rig, roi, surface, now) as step:
+        with tracker(rig, roi, surface, now, tool) as step:
             yield step
         return
     from perception.thesis.features import KeyPoints

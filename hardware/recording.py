@@ -126,6 +126,11 @@ class Recorder:
         self._check_rising("stamp of truth", float(row[0]))
         self._message("/truth", float(row[0]), messages.message_from_truth(row, exact))
 
+    def head_row(self, row: Array, extruding: bool) -> None:
+        """Write where the print head was at a frame set: (8,) stamp x y z qx qy qz qw, s and mm, base_from_nozzle."""
+        self._check_rising("stamp of the print head", float(row[0]))
+        self._message("/head", float(row[0]), messages.message_from_head(row, extruding))
+
     def surface(self, path: Path) -> None:
         """Attach the scan (ply, stl or obj, mm) as it is."""
         if path.suffix.lower() not in SURFACE_SUFFIXES:

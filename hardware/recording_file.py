@@ -17,12 +17,13 @@ from estimation.rig import Rig
 from estimation.trajectory import Trajectory
 from hardware import messages
 from hardware.folder_tables import check_polygon
+from hardware.heads import Heads
 from hardware.images import check_size, decode
 from hardware.mcap_walk import Attached, Damage, Stored, chunk_messages, parse, walk
 from hardware.messages import Message
 from hardware.schemas import image_topic
 from hardware.session import SURFACE_SUFFIXES, FrameRef, Session, pair_refs
-from hardware.tum import trajectory_from_rows
+from hardware.tum import checked_rows, trajectory_from_rows
 from perception.frames import Image, Roi
 
 CACHED_CHUNKS = 4  # frames of one instant lie in neighbouring chunks
@@ -43,6 +44,7 @@ class Contents:
     rois: dict[tuple[int, float], Roi] = field(default_factory=dict)
     truth: set[tuple[float, ...]] = field(default_factory=set)
     exact: bool = False
+    heads: set[tuple[tuple[float, ...], bool]] = field(default_factory=set)
     frames: dict[tuple[int, int], FrameRef] = field(default_factory=dict)
     places: Places = field(default_factory=dict)
     surface: Attached | None = None
@@ -64,8 +66,8 @@ def open_recording(path: Path) -> Session:
     store = RecordingStore(path, rig, contents.places)
     _check_first_images(store, frames)
     rois = _checked_rois(path, contents, rig)
-    truth, surface = _truth(path, contents), _unpacked_surface(contents.surface, store)
-    return Session(path, rig, rois, surface, truth, pair_refs(frames, stamps, len(rig)), store, contents.damage)
+    truth, heads, surface = _truth(path, contents), _heads(path, contents), _unpacked_surface(contents.surface, store)
+    return Session(path, rig, rois, surface, truth, pair_refs(frames, stamps, len(rig)), store, contents.damage, heads)
 
 
 def _contents(path: Path) -> Contents:
@@ -85,7 +87,7 @@ def _contents(path: Path) -> Contents:
 def _take(path: Path, contents: Contents, place: tuple[int, int], stored: Stored) -> None:
     if stored.topic.endswith("/image"):
         contents.places[stored.topic, stored.sequence] = place
-    elif stored.topic in ("/rig", "/roi", "/truth", "/frames"):
+    elif stored.topic in ("/rig", "/roi", "/truth", "/head", "/frames"):
         message = parse(path, stored)
         try:
             _take_message(path, contents, stored.topic, message)
@@ -100,8 +102,12 @@ def _take_message(path: Path, contents: Contents, topic: str, message: Message) 
         roi = messages.roi_from_message(message)
         contents.rois[roi.camera, roi.stamp] = roi
     elif topic == "/truth":
-        contents.truth.add(tuple(messages.truth_row(message)))
+        contents.truth.add(tuple(messages.row_from_message(message)))
         contents.exact = bool(message["exact"])
+    elif topic == "/head":
+        if not isinstance(message["extruding"], bool):
+            raise InputError(path, "/head: extruding", message["extruding"], "true or false")
+        contents.heads.add((tuple(messages.row_from_message(message)), message["extruding"]))
     else:
         own, common = float(message["camera_stamp"]), float(message["stamp"])
         camera, number = int(message["camera"]), int(message["number"])
@@ -143,11 +149,14 @@ def _check_first_images(store: RecordingStore, frames: list[FrameRef]) -> None:
 def _truth(path: Path, contents: Contents) -> Trajectory | None:
     if not contents.truth:
         return None
-    rows = np.array(sorted(contents.truth), float)
-    quaternion_norms = np.linalg.norm(rows[:, 4:], axis=1)
-    if not np.isfinite(rows).all() or (np.diff(rows[:, 0]) <= 0).any() or (abs(quaternion_norms - 1) > 0.01).any():
-        raise InputError(path, "/truth", "a row that is none", "finite numbers, each stamp once, unit quaternions")
+    rows = checked_rows(path, ((f"/truth[{i}]", row) for i, row in enumerate(sorted(contents.truth))))
     return trajectory_from_rows(rows, contents.exact)
+
+
+def _heads(path: Path, contents: Contents) -> Heads:
+    found = sorted(contents.heads)
+    rows = checked_rows(path, ((f"/head[{i}]", row) for i, (row, _) in enumerate(found)))
+    return Heads(rows, np.array([extruding for _, extruding in found], bool))
 
 
 def _unpacked_surface(surface: Attached | None, store: RecordingStore) -> Path | None:

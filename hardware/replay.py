@@ -113,7 +113,8 @@ def replay_session(
     from hardware.tracker import tracker  # loads cv2: the motion must not
 
     checkpoints = read_path(path)
-    with tracker(session.rig, session.roi, session.surface) as step, CommandWriter(out) as writer:
+    tool = None if profile is None else profile.tool
+    with tracker(session.rig, session.roi, session.surface, tool=tool) as step, CommandWriter(out) as writer:
 
         def track() -> Iterator[SurfacePose]:
             for done, frames in enumerate(session.frame_sets(), 1):

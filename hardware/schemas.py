@@ -139,6 +139,14 @@ TRUTH = _object(
     quaternion=_array(NUMBER, 4, "qx qy qz qw"),
     exact=_about(FLAG, "true: a simulator's or an instrument's; false: a measured reference"),
 )
+HEAD = _object(
+    "stillbed.PrintHead",
+    "Pose of the nozzle in the base frame by the commands that were sent, z from the tip up into the head, mm",
+    stamp=_about(NUMBER, "s, of the frame set, exact"),
+    position=_array(NUMBER, 3, "mm"),
+    quaternion=_array(NUMBER, 4, "qx qy qz qw"),
+    extruding=_about(FLAG, "true: ink flows"),
+)
 OBSERVATIONS = _object(
     "stillbed.Observations",
     "Tracks of one frame set, parallel arrays of length N",
@@ -214,6 +222,7 @@ TOPICS: dict[str, Schema] = {
     "/roi": ROI,
     "/frames": FRAME,
     "/truth": TRUTH,
+    "/head": HEAD,
     "/observations": OBSERVATIONS,
     "/pose": POSE,
     "/move": MOVE,

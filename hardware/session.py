@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -11,6 +11,7 @@ from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
+from hardware.heads import NO_HEADS, Heads
 from perception.frames import Frame, FrameSet, Image, Roi
 from perception.pairing import frame_period, frame_set, pair, pairing_tolerance
 
@@ -61,7 +62,7 @@ class Session:
     rig: the cameras. roi: where the surface is at the start. surface: the scan's file (mm) or None (of an MCAP a copy
     that lives as long as the session). truth: base_from_surface or None; `truth.exact` tells truth.tum from
     reference.tum. sets: what belongs to one instant, in order of stamp. damage: what was lost of the file, "" if
-    nothing; all that is here was read whole.
+    nothing; all that is here was read whole. heads: where the print head was, of the sets that had one.
     """
 
     path: Path
@@ -72,6 +73,7 @@ class Session:
     sets: tuple[tuple[FrameRef, ...], ...]
     store: FrameStore
     damage: str = ""
+    heads: Heads = NO_HEADS
 
     def __len__(self) -> int:
         return len(self.sets)
@@ -84,7 +86,8 @@ class Session:
         reader = self.store.open()
         try:
             for refs in self.sets:
-                yield frame_set([Frame(ref.camera, ref.stamp, reader.read(ref)) for ref in refs])
+                frames = frame_set([Frame(ref.camera, ref.stamp, reader.read(ref)) for ref in refs])
+                yield replace(frames, head=self.heads.at(frames.stamp))
         finally:
             reader.close()
 

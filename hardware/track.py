@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from estimation.pose import SurfacePose
+from estimation.se3 import Array
 from hardware.clock import WallClock
 from hardware.evaluation import evaluate
 from hardware.methods import MAP, step_by
@@ -81,10 +82,18 @@ def finish(out: Path, session: Session, complete: bool, method: str = MAP) -> st
     return summary_text(result)
 
 
-def run_track(path: Path, out: Path, record: Path | None = None, force: bool = False, method: str = MAP) -> str:
+def run_track(
+    path: Path,
+    out: Path,
+    record: Path | None = None,
+    force: bool = False,
+    method: str = MAP,
+    tool: Array | None = None,
+) -> str:
     """Track the session at `path` into the folder `out`; returns the summary as text.
 
-    method: a key of METHODS. Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of
+    method: a key of METHODS. tool: (K, 2) mm, profile of what hangs on the session's arm, as `ArmProfile.tool`; None
+    for the usual one. Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of
     all frame sets until then.
     """
     session = open_session(path)
@@ -93,7 +102,7 @@ def run_track(path: Path, out: Path, record: Path | None = None, force: bool = F
     cameras = [camera.name for camera in session.rig.cameras]
     complete = False
     with ExitStack() as stack:
-        step = stack.enter_context(step_by(method, session.rig, session.roi, session.surface, clock.now))
+        step = stack.enter_context(step_by(method, session.rig, session.roi, session.surface, clock.now, tool))
         sinks = [] if record is None else [stack.enter_context(TrackRecorder(record, session, force)).write]
         writer = stack.enter_context(PoseWriter(out, cameras, STAGES))
         progress = stack.enter_context(Progress("track", "frame sets", clock.now))

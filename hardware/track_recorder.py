@@ -8,6 +8,7 @@ from types import TracebackType
 import numpy as np
 
 from estimation.pose import SurfacePose, TrackState
+from hardware.heads import TOLERANCE
 from hardware.recording import INFO, WARNING, Recorder
 from hardware.session import Session
 from hardware.tum import rows_from_trajectory
@@ -23,7 +24,8 @@ class TrackRecorder:
         self._recorder = Recorder(path, session.rig, overwrite=overwrite)
         self._truth = np.empty((0, 8)) if session.truth is None else rows_from_trajectory(session.truth)
         self._exact = session.truth is not None and session.truth.exact
-        self._next_truth = 0
+        self._heads = session.heads
+        self._next_truth, self._next_head = 0, 0
         self._state: TrackState | None = None
         if session.surface is not None:
             self._recorder.surface(session.surface)
@@ -31,8 +33,9 @@ class TrackRecorder:
             self._recorder.write(roi)
 
     def write(self, frames: FrameSet, pose: SurfacePose, report: StepReport) -> None:
-        """One frame set, its pose and tracks, and the truth up to its stamp."""
+        """One frame set, its pose and tracks, and truth and print heads up to its stamp."""
         self._write_truth(frames.stamp)
+        self._write_heads(frames.stamp + TOLERANCE)  # the row of this very frame set included
         for frame in frames.frames:
             self._recorder.write(frame)
         self._recorder.write(report.observations)
@@ -47,6 +50,12 @@ class TrackRecorder:
             self._recorder.truth_row(self._truth[self._next_truth], self._exact)
             self._next_truth += 1
 
+    def _write_heads(self, until: float) -> None:
+        """As stored: what a frame set holds of a head has been turned into a matrix."""
+        while self._next_head < len(self._heads) and self._heads.rows[self._next_head, 0] <= until:
+            self._recorder.head_row(self._heads.rows[self._next_head], bool(self._heads.extruding[self._next_head]))
+            self._next_head += 1
+
     def __enter__(self) -> TrackRecorder:
         return self
 
@@ -54,3 +63,4 @@ class TrackRecorder:
         with self._recorder:
             if error is None:
                 self._write_truth(np.inf)
+                self._write_heads(np.inf)

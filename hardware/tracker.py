@@ -10,18 +10,24 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from estimation.rig import Rig
+from estimation.se3 import Array
 from perception.frames import Roi
+from perception.tool import Tool
 from perception.tracking import TrackingStep
 
 
 @contextmanager
 def tracker(
-    rig: Rig, roi: Sequence[Roi], surface: Path | None = None, now: Callable[[], float] = lambda: 0.0
+    rig: Rig,
+    roi: Sequence[Roi],
+    surface: Path | None = None,
+    now: Callable[[], float] = lambda: 0.0,
+    tool: Array | None = None,
 ) -> Iterator[TrackingStep]:
     """TrackingStep for these cameras; the map is refined in a process of its own, as GTSAM holds the interpreter.
 
     roi: where the surface is at the start. surface: the scan's file, mm; InputError where it cannot be read. now: s,
-    only to say how long the stages take.
+    only to say how long the stages take. tool: (K, 2) mm, profile of what hangs on the arm, as `ArmProfile.tool`.
     """
     scan = None
     if surface is not None:
@@ -30,7 +36,7 @@ def tracker(
         scan = read_mesh(surface).scan
     with ProcessPoolExecutor(1, get_context("spawn"), _leave_interrupts) as executor:
         executor.submit(int).result()  # started before the first frame set, not beside it
-        yield TrackingStep(rig, roi, now, executor, scan)
+        yield TrackingStep(rig, roi, now, executor, scan, None if tool is None else Tool(tool))
 
 
 def _leave_interrupts() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from estimation.se3 import Array
 from estimation.trajectory import Trajectory
 
 HEADER = "# stamp_s x y z qx qy qz qw (mm, base_from_surface)\n"
+ALLOWED = "8 numbers: stamp x y z qx qy qz qw"
 
 
 def read_tum(path: str | Path, exact: bool) -> Trajectory:
@@ -46,14 +49,39 @@ def write_rows(path: str | Path, rows: Array) -> None:
 def read_rows(path: str | Path) -> Array:
     """Rows (N, 8) of a TUM file, N >= 1: finite, stamps rising, quaternions of unit length to 1 %."""
     path = Path(path)
-    rows: list[list[float]] = []
-    for number, line in _lines(path):
-        rows.append(_row(path, number, line))
-        if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
-            raise InputError(path, f"line {number}: stamp", rows[-1][0], f"later than the line before, {rows[-2][0]} s")
-    if not rows:
+    lines = ((f"line {number}", line.replace(",", " ").split()) for number, line in _lines(path))
+    rows = checked_rows(path, ((what, row_from_words(path, what, words)) for what, words in lines))
+    if not len(rows):
         raise InputError(path, "poses", "none", "at least one line `stamp x y z qx qy qz qw`")
-    return np.array(rows)
+    return rows
+
+
+def checked_rows(where: object, rows: Iterable[tuple[str, Sequence[float]]]) -> Array:
+    """Rows (N, 8) of stamp x y z qx qy qz qw, N >= 0, each told with its name, such as its line.
+
+    InputError (where, name) unless they are finite, stamps rise and quaternions are of unit length to 1 %.
+    """
+    checked: list[Sequence[float]] = []
+    for what, row in rows:
+        if len(row) != 8:
+            raise InputError(where, what, f"{len(row)} numbers", ALLOWED)
+        if not all(map(math.isfinite, row)):
+            raise InputError(where, what, " ".join(map(str, row)), "finite numbers")
+        norm = math.hypot(*row[4:])
+        if not 0.99 < norm < 1.01:
+            raise InputError(where, f"{what}: length of qx qy qz qw", norm, "1 +- 0.01 (a unit quaternion)")
+        if checked and row[0] <= checked[-1][0]:
+            raise InputError(where, f"{what}: stamp", row[0], f"later than the one before, {checked[-1][0]} s")
+        checked.append(row)
+    return np.array(checked, float).reshape(-1, 8)
+
+
+def row_from_words(where: object, what: str, words: Sequence[str]) -> list[float]:
+    """The numbers in words; InputError (where, what) unless they are numbers."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        raise InputError(where, what, " ".join(words), ALLOWED) from None
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
@@ -63,19 +91,3 @@ def _lines(path: Path) -> list[tuple[int, str]]:
         raise InputError(path, "file", error, "a readable text file") from error
     numbered = ((i, line.strip()) for i, line in enumerate(text.splitlines(), 1))
     return [(i, line) for i, line in numbered if line and not line.startswith("#")]
-
-
-def _row(path: Path, number: int, line: str) -> list[float]:
-    words = line.replace(",", " ").split()
-    try:
-        row = [float(word) for word in words]
-    except ValueError:
-        raise InputError(path, f"line {number}", line, "8 numbers: stamp x y z qx qy qz qw") from None
-    if len(row) != 8:
-        raise InputError(path, f"line {number}", f"{len(row)} numbers", "8 numbers: stamp x y z qx qy qz qw")
-    if not np.isfinite(row).all():
-        raise InputError(path, f"line {number}", line, "finite numbers")
-    norm = float(np.linalg.norm(row[4:]))
-    if not 0.99 < norm < 1.01:
-        raise InputError(path, f"line {number}: length of qx qy qz qw", norm, "1 +- 0.01 (a unit quaternion)")
-    return row

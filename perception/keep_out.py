@@ -15,7 +15,8 @@ from perception.features import Mask
 from perception.frames import Image, PrintHead
 from perception.ink import Ink
 from perception.lens import Lenses
-from perception.tool import SYRINGE, Tool, draw
+from perception.tool import Tool, draw
+from perception.tool_profile import SYRINGE
 
 SCALE = 0.25  # of the masks to the images: to a landmark's patch four pixels are nothing
 MARGIN = 1.5  # mm: to which an arm is registered to the cameras, and its lag known

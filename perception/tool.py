@@ -8,15 +8,13 @@ import cv2
 import numpy as np
 
 from estimation import se3
-from estimation.errors import InputError
 from estimation.se3 import Array
 from perception.features import Mask
 from perception.lens import Lenses
+from perception.tool_profile import check_profile
 
 AROUND = np.linspace(0, 2 * np.pi, 13)[:-1]
 NEAR = 20.0  # mm: what is nearer to a lens than that is not drawn, as its picture has no bounds
-# Height above the tip and radius, mm: a luer needle of half an inch on a 5 ml cartridge in its holder.
-SYRINGE = np.array([[0, 0.5], [12.7, 0.5], [13.6, 2.5], [23, 3.6], [27, 4.8], [50, 4.8], [58, 8], [96, 8]], float)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,11 +24,7 @@ class Tool:
     profile: Array
 
     def __post_init__(self) -> None:
-        profile = self.profile
-        rising = profile.ndim == 2 and profile.shape[1:] == (2,) and len(profile) > 1
-        if not (rising and np.isfinite(profile).all() and (np.diff(profile[:, 0]) > 0).all() and (profile >= 0).all()):
-            allowed = "two or more [height, radius] in mm, none negative, heights rising"
-            raise InputError("tool", "profile", profile.tolist(), allowed)
+        check_profile("tool", "profile", self.profile)
 
     def silhouette(self, lenses: Lenses, camera: int, base_from_nozzle: Array, margin: float) -> list[Array]:
         """Convex polygons (M, 2) px, as imaged, that together cover the tool's picture; margin: mm around it.

@@ -24,6 +24,7 @@ def same(a: ArmProfile, b: ArmProfile) -> bool:
         (getattr(x, f.name), getattr(y, f.name)) for x, y in ((a.arm, b.arm), (a.limits, b.limits)) for f in fields(x)
     ]
     numbers = all(np.allclose(x, y, rtol=1e-14, atol=1e-14) for x, y in pairs)
+    numbers &= np.array_equal(a.tool, b.tool)
     return numbers and (a.dialect, a.baud, a.tick, a.lag) == (b.dialect, b.baud, b.tick, b.lag)
 
 
@@ -37,6 +38,7 @@ def test_a_profile_comes_back(tmp_path_factory: pytest.TempPathFactory, seed: in
         int(draw.integers(57_600, 1_000_000)),
         draw.uniform(0.01, 0.04),
         draw.uniform(0, 0.5),
+        np.stack([np.cumsum(draw.uniform(0.1, 30, 3 + seed % 4)), draw.uniform(0, 9, 3 + seed % 4)], axis=-1),
     )
     file = tmp_path_factory.mktemp("arm") / "arm.toml"
     write_arm(file, profile, "made up\nfor a test")
@@ -66,6 +68,12 @@ def test_what_a_file_leaves_out_keeps_its_default(tmp_path: Path) -> None:
         ("tick_s = nan", ["tick_s", "finite"]),
         ("lag_s = -0.01", ["lag", "0 to 1"]),
         ("lag_s = 1.01", ["lag", "0 to 1"]),
+        ("tool_mm = 3", ["tool_mm", "finite numbers"]),
+        ("tool_mm = [[0, 1, 2], [5, 1, 2]]", ["tool_mm", "finite numbers"]),
+        ("tool_mm = [[0, 1]]", ["tool_mm", "two or more"]),
+        ("tool_mm = [[5, 1], [0, 1]]", ["tool_mm", "heights rising"]),
+        ("tool_mm = [[0, -1], [5, 1]]", ["tool_mm", "none negative"]),
+        ("tool_mm = [[0, nan], [5, 1]]", ["tool_mm", "finite"]),
         ("home_mm_deg = [0, 0]", ["home_mm_deg", "6 finite numbers"]),
         ("home_mm_deg = [0, 0, 9000, 0, 0, 0]", ["home", "within"]),
         ("arm_from_base = [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", ["arm_from_base", "rigid motion"]),

@@ -15,7 +15,8 @@ from perception.frames import PrintHead
 from perception.ink import FRESH, REACH, STEP, Ink, near_bead
 from perception.keep_out import MARGIN, KeepOut, highlights, trackable
 from perception.lens import Lenses
-from perception.tool import SYRINGE, Tool
+from perception.tool import Tool
+from perception.tool_profile import SYRINGE
 
 LENSES = Lenses(arc_rig(size=(640, 480), focal=700.0))
 ABOVE = REST @ se3.make(np.eye(3), [4.0, -3.0, 1.0])  # a tip a millimetre above the surface, upright

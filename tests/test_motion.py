@@ -109,6 +109,8 @@ def test_the_wire_carries_the_ticks() -> None:
     assert ArmProfile(tick=1 / 239).tick == 1 / 239
     with pytest.raises(InputError, match="baud"):
         ArmProfile(baud=0)
+    with pytest.raises(InputError, match="tool"):
+        ArmProfile(tool=np.array([[0.0, 1.0]]))
     with pytest.raises(InputError, match="home"):
         ArmProfile(limits=Limits(low=np.array([210.0, -650, -200, -1, -1, -1])))
 

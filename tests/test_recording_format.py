@@ -23,6 +23,7 @@ from hardware.messages import message_from_image, message_from_rig
 from hardware.recording import CHUNK_SECONDS, EPOCH, Recorder
 from hardware.schemas import CALIBRATION, IMAGE, TOPICS
 from hardware.session import open_session
+from hardware.tum import rows_from_trajectory
 from perception.frames import Roi
 from planning.command import Hold, Move
 from tests.recorded import LOST, pose, whole_recording, write_frames
@@ -86,6 +87,7 @@ def test_every_message_fits_its_published_schema(tmp_path: Path) -> None:
         write_frames(recorder, 2, 3)
         recorder.surface(tmp_path / "scan.obj")
         recorder.truth(trajectory(2, True))
+        recorder.head_row(rows_from_trajectory(trajectory(1, True))[0], True)
         pixels = np.array([[1.0, 2.0], [3.0, 0.0]])
         recorder.write(Observations(0.0, np.array([0, 1]), np.array([5, -1]), pixels, np.ones(2)))
         recorder.write(pose(0.0))
@@ -107,7 +109,7 @@ def test_every_message_fits_its_published_schema(tmp_path: Path) -> None:
             jsonschema.validate(json.loads(message.data), parsed, cls=jsonschema.Draft202012Validator)
             seen.add(schema.name)
     assert {"foxglove.CompressedImage", "foxglove.CameraCalibration", "foxglove.FrameTransform", "foxglove.Log"} <= seen
-    assert len(seen) == 13
+    assert len(seen) == 14
 
 
 def plain(schema: dict[str, object]) -> bool:
@@ -165,6 +167,7 @@ def foreign(path: Path, messages: list[tuple[str, object]]) -> None:
 
 
 FRAME = {"stamp": 0.0, "camera_stamp": 0.0, "camera": 0, "number": 0}
+HEAD = {"stamp": 0.0, "position": [1, 2, 3], "quaternion": [0, 0, 0, 1], "extruding": False}
 RIG = message_from_rig(rig(2))
 ONE_FRAME = [
     ("/rig", RIG),
@@ -188,6 +191,13 @@ ONE_FRAME = [
         ([*ONE_FRAME, ("/roi", {"stamp": 0.0, "camera": 0, "polygon": [0, 0, 9, 0, 9, float("nan")]})], "finite"),
         ([*ONE_FRAME, ("/roi", {"stamp": 0.0, "camera": 0, "polygon": [0, 0, 9, 0]})], "3 points"),
         ([*ONE_FRAME, ("/truth", {"stamp": 0, "position": [1, 2, 3], "quaternion": [0] * 4, "exact": True})], "unit"),
+        ([*ONE_FRAME, ("/truth", {"stamp": 0, "position": [1, 2], "quaternion": [0] * 4, "exact": True})], "7 numbers"),
+        ([*ONE_FRAME, ("/head", {**HEAD, "position": [1, 2, float("nan")]})], "/head[0] = '0.0 1.0 2.0 nan"),
+        ([*ONE_FRAME, ("/head", {**HEAD, "position": [1, 2]})], "/head[0] = '7 numbers'"),
+        ([*ONE_FRAME, ("/head", {**HEAD, "position": "far"})], "message of its schema"),
+        ([*ONE_FRAME, ("/head", HEAD), ("/head", {**HEAD, "position": [9, 9, 9]})], "/head[1]: stamp = 0.0"),
+        ([*ONE_FRAME, ("/head", {**HEAD, "quaternion": [0, 0, 0, 2]})], "/head[0]: length of qx qy qz qw = 2.0"),
+        ([*ONE_FRAME, ("/head", {**HEAD, "extruding": 1})], "/head: extruding = 1, allowed true or false"),
         ([("/rig", RIG), ("/camera/left/image", {"data": "", "format": "png"}), ("/frames", FRAME)], "undecodable"),
         ([("/rig", RIG), ("/camera/left/image", {"data": 3}), ("/frames", FRAME)], "CompressedImage"),
     ],

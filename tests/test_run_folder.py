@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from estimation import se3
 from estimation.observations import no_observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
@@ -25,7 +27,7 @@ from hardware.simulator.scenario import Scenario
 from hardware.simulator.scenario_file import read_scenario
 from hardware.simulator.session_folder import SessionFolder
 from hardware.tum import read_tum
-from perception.frames import Frame, FrameSet, Roi
+from perception.frames import Frame, FrameSet, PrintHead, Roi
 from perception.tracking import STAGES, StepReport, trusting_report
 from planning.command import Command, Hold, Move
 from planning.legs import Phase
@@ -134,6 +136,33 @@ def test_the_truth_holds_every_row_and_every_exposure_once_in_order(tmp_path: Pa
     truth = read_tum(tmp_path / "out" / "session" / "truth.tum", exact=True)
     wanted = np.unique(np.concatenate([np.arange(1, 1201) / 1000, 0.11234567 + np.arange(12) / 10]).round(9))
     assert truth.stamps == pytest.approx(wanted, abs=1e-9)
+
+
+def test_the_print_head_is_kept_in_both_sessions_and_an_instant_told_again_is_one(tmp_path: Path) -> None:
+    heads = [PrintHead(REST @ se3.exp(np.array([0.1, 0, 0.2 * n, n, 0, 3.0])), n > 2) for n in range(4)]
+    folder = opened(tmp_path, scenario(tmp_path))
+    with folder:
+        feed(folder, 1)  # before the first move nobody knows where the arm is
+        for n, head in enumerate(heads, 1):
+            for camera in range(3):
+                folder.picture(shot(camera, n), *picture(camera, n))
+            for _ in range(1 + n % 2):
+                stamp = 0.1 + n / 10
+                folder.pose(replace(frames(stamp), head=head), pose(stamp), report(stamp), 0.01)
+    for name in ("session", "session.mcap"):
+        none, *found = (frames.head for frames in open_session(tmp_path / "out" / name).frame_sets())
+        assert none is None
+        for back, head in zip(found, heads, strict=True):
+            assert back is not None
+            assert back.base_from_nozzle == pytest.approx(head.base_from_nozzle, abs=1e-12)
+            assert back.extruding == head.extruding
+
+
+def test_a_run_whose_arm_never_moved_has_no_file_of_it(tmp_path: Path) -> None:
+    folder = opened(tmp_path, scenario(tmp_path))
+    with folder:
+        feed(folder, 2)
+    assert not (tmp_path / "out" / "session" / "head.csv").exists()
 
 
 def test_the_pictures_to_show_are_of_the_printing_where_there_is_one(tmp_path: Path) -> None:

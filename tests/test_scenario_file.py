@@ -185,6 +185,8 @@ WRONG = [
     ("arm.wire_baud", {"arm": {"wire_baud": "fast"}}),
     ("arm.wire_baud", {"arm": {"wire_baud": True}}),
     ("arm.wire_baud", {"arm": {"wire_baud": math.nan}}),
+    ("arm.tool_mm", {"arm": {"tool_mm": [[0, 1]]}}),
+    ("arm.tool_mm", {"arm": {"tool_mm": "needle"}}),
     ("arm.dead_time_s", {"arm": {"dead_time_s": -0.1}}),
     ("arm.replies", {"arm": {"replies": "loud"}}),
     ("arm.speed", {"arm": {"speed": 1}}),
@@ -233,6 +235,17 @@ def test_the_files_that_a_scenario_names_must_be_there(tmp_path: Path) -> None:
             read_scenario(write_scenario(tmp_path, change))  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"nothing\.toml"):
         read_scenario(tmp_path / "nothing.toml")
+
+
+def test_the_tool_is_the_arm_files_unless_the_scenario_tells_another(tmp_path: Path) -> None:
+    assert np.array_equal(read_scenario(write_scenario(tmp_path)).profile.tool, ArmProfile().tool)
+    file = write_scenario(tmp_path, arm={"file": "arm.toml"})
+    with (tmp_path / "arm.toml").open("a") as arm:
+        arm.write("tool_mm = [[0, 1], [20, 3]]\n")
+    assert read_scenario(file).profile.tool.tolist() == [[0, 1], [20, 3]]
+    told = tmp_path / "told.toml"
+    told.write_text(file.read_text().replace('"arm.toml"', '"arm.toml", tool_mm = [[0, 2], [9, 4]]'))
+    assert read_scenario(told).profile.tool.tolist() == [[0, 2], [9, 4]]
 
 
 def test_files_are_relative_to_the_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

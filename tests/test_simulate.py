@@ -13,6 +13,8 @@ import pytest
 from estimation.errors import InputError
 from estimation.state_machine import StateSettings
 from estimation.synthetic.arc_rig import REST
+from hardware.arm_file import read_arm
+from hardware.cli import main
 from hardware.path_file import read_path
 from hardware.pose_file import PoseTable, read_poses
 from hardware.session import open_session
@@ -26,7 +28,7 @@ from tests.worlds import IDEAL, SMALL, write_path, write_scenario
 BREATHING = {"kind": "breathing", "amplitude_mm": 2.0, "rate_hz": 0.4}
 FAULTY = {  # whatever chance may bring
     "cameras": {"drop": 0.03, "duplicate": 0.03, "garble": 0.05, "jitter_s": 0.0005, "exposure_s": 0.004},
-    "arm": {"replies": "stray"},
+    "arm": {"replies": "stray", "tool_mm": [[0, 0.5], [12.7, 0.6], [21, 3.6], [58, 8], [96, 8]]},
 }
 
 
@@ -96,9 +98,22 @@ def test_with_pictures_too_an_offset_planted_in_the_rig_comes_out_as_that_offset
 
 
 def test_the_session_tracks_to_the_very_poses_of_the_run(recorded: Path, tmp_path: Path) -> None:
+    tool = read_arm(recorded / "one" / "arm.toml").tool
     for kind in ("session", "session.mcap"):
-        run_track(recorded / "one" / kind, tmp_path / kind)
+        heads = open_session(recorded / "one" / kind).heads
+        assert len(heads) > 5 and np.ptp(heads.rows[:, 1:4], axis=0).max() > 1.0 and heads.extruding.any()
+        run_track(recorded / "one" / kind, tmp_path / kind, tool=tool)
         assert same_columns(tmp_path / kind / "poses.csv", recorded / "one" / "tracking" / "poses.csv")
+
+
+def test_what_the_tool_of_an_arm_file_covers_is_not_tracked(recorded: Path, tmp_path: Path) -> None:
+    (tmp_path / "arm.toml").write_text("tool_mm = [[0, 90], [30, 90]]\n")
+    session, arm = str(recorded / "one" / "session"), str(tmp_path / "arm.toml")
+    assert main(["track", session, "-o", str(tmp_path / "out"), "--arm", arm]) == 0
+    hidden, seen = (read_poses(f / "poses.csv") for f in (tmp_path / "out", recorded / "one" / "tracking"))
+    told = hidden.stamps > open_session(session).heads.rows[0, 0] - 1e-6
+    assert seen.measured[told].all() and not hidden.measured[told].any()
+    assert np.array_equal(hidden.used[~told], seen.used[~told])
 
 
 def test_the_truth_holds_every_exposure_and_each_pose_is_near_it(recorded: Path) -> None:
@@ -118,6 +133,8 @@ def test_the_truth_holds_every_exposure_and_each_pose_is_near_it(recorded: Path)
 def test_folder_and_mcap_hold_the_same_session(recorded: Path) -> None:
     folder, mcap = (open_session(recorded / "one" / name) for name in ("session", "session.mcap"))
     assert len(folder) == len(mcap)
+    assert folder.heads.rows.tobytes() == mcap.heads.rows.tobytes()
+    assert np.array_equal(folder.heads.extruding, mcap.heads.extruding)
     for one, other in zip(folder.frame_sets(), mcap.frame_sets(), strict=True):
         assert [f.camera for f in one.frames] == [f.camera for f in other.frames]
         assert one.stamp == pytest.approx(other.stamp, abs=1e-8)

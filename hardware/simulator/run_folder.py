@@ -1,6 +1,6 @@
 """The folder of a simulated run: all that passes is written to it as it comes, and can be read if it is cut short.
 
-session.mcap, session/     the session, as `stillbed track` and `replay` take it: pictures, rig, region, exact truth
+session.mcap, session/     the session, as `stillbed track` and `replay` take it: pictures, rig, region, print head, exact truth
 tracking/                  poses.csv, poses.tum and their report, as `stillbed track` writes them
 commands.csv, frames.bin   what the motion decided, and the bytes that went to the arm
 nozzle.csv                 where the nozzle was and should have been, every millisecond
@@ -23,6 +23,7 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
 from hardware.arm_file import write_arm
+from hardware.heads import row_from_head
 from hardware.pose_file import PoseWriter
 from hardware.recording import INFO, WARNING, Recorder
 from hardware.replay import CommandWriter
@@ -76,6 +77,7 @@ class RunFolder:
         self._pending: list[Array] = []  # s, instants whose truth is still to be written
         self._written: list[Array] = []  # s, rising
         self._until = -np.inf  # s, the last of them
+        self._headed = -np.inf  # s, the last frame set whose print head was written
         cameras = scenario.cameras
         self._latest = cameras.transport + JITTER_LIMIT * cameras.transport_jitter + PATIENCE
         shutil.copyfile(scenario.file, out / "scenario.toml")
@@ -120,11 +122,21 @@ class RunFolder:
             self.event(pose.stamp, f"{pose.state.value}: {pose.reason}", INFO if pose.state.measured else WARNING)
             self._state = pose.state
         if self._session is not None:
+            self._head(frames)
             self._session[1].write(report.observations)
             self._session[1].write(pose)
             time = f"{pose.stamp:.1f} of {self._seconds:g} s"
             facts = [("time", time), ("arm", self._doing), ("error at the nozzle", self._error())]
             self.watch.show(frames, pose, self._shown, facts)
+
+    def _head(self, frames: FrameSet) -> None:
+        """What the tracker was told of the print head; of an instant told again it took no notice."""
+        assert self._session is not None
+        if frames.head is not None and frames.stamp > self._headed:
+            self._headed = frames.stamp
+            row = row_from_head(frames.stamp, frames.head)
+            for container in self._session:
+                container.head_row(row, frames.head.extruding)
 
     def registered(self, truth_from_estimate: Array) -> None:
         """The path was registered: truth_surface_from_estimated_surface (4, 4)."""

@@ -15,7 +15,8 @@ faults = ["stall 600ms at 5s"]   # of the arm
 [sensor]                         # noise, vignetting, jpeg_quality (0 for lossless pictures)
 [tracking]                       # by = "pictures", "thesis", "thesis-flow" or "truth"; processing_s = 0.02 or
                                  # "measured"; register = "texture" or "scan"
-[arm]                            # file, assumed_lag_s, wire_baud, and the virtual controller: servo, dead time, replies
+[arm]                            # file, assumed_lag_s, wire_baud, tool_mm (as in an arm file), and the virtual
+                                 # controller: servo, dead time, replies
 [planted]                        # rig_offset_mm, arm_offset_mm: errors of calibration that nothing in the loop knows of
 [limits]                         # what the run must reach, for the exit code
 """
@@ -33,7 +34,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware import checks
-from hardware.arm_file import read_arm
+from hardware.arm_file import read_arm, tool_from_value
 from hardware.arm_profile import BITS_PER_BYTE, LONGEST_LAG, ArmProfile, placed
 from hardware.checks import Table
 from hardware.methods import MAP, THESIS, THESIS_FLOW
@@ -162,7 +163,7 @@ def _planted(path: Path, table: Table) -> tuple[Array, Array]:
 
 def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:
     """The virtual controller, what the motion knows of it (all of its lag, unless told), and its line's baud."""
-    file, assumed, baud = (table.pop(key, None) for key in ("file", "assumed_lag_s", "wire_baud"))
+    file, assumed, baud, tool = (table.pop(key, None) for key in ("file", "assumed_lag_s", "wire_baud", "tool_mm"))
     settings = arm_settings_from_table(path, table)
     profile = placed(
         ArmProfile() if file is None else read_arm(path.parent / checks.text(path, "arm.file", file)), REST
@@ -178,6 +179,8 @@ def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:
         lag = _within(path, "arm.assumed_lag_s", assumed, 0, LONGEST_LAG, "s")
     elif lag > LONGEST_LAG:
         raise InputError(path, "arm.dead_time_s + servo_lag_s", lag, f"at most {LONGEST_LAG:g} s, or assumed_lag_s")
+    if tool is not None:
+        profile = replace(profile, tool=tool_from_value(path, "arm.tool_mm", tool))
     return settings, replace(profile, lag=lag), float(baud)
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import TextIO
 
 from estimation.rig import Rig
+from estimation.se3 import Array
 from estimation.trajectory import Trajectory
-from hardware.folder_tables import frame_line, write_frames, write_roi
+from hardware.folder_tables import frame_line, head_line, write_frames, write_heads, write_roi
+from hardware.heads import NO_HEADS
 from hardware.rig_file import ImageSource, write_rig
 from hardware.session import FrameRef
 from hardware.tum import write_tum
@@ -25,6 +28,7 @@ class SessionFolder:
         self.folder, self._rig = folder, rig
         self._counts = [0] * len(rig)
         self._truth: Trajectory | None = None
+        self._heads: TextIO | None = None  # a session without an arm has no such file
         for camera in rig.cameras:
             (folder / camera.name).mkdir(parents=True, exist_ok=True)
         write_rig(folder / "rig.toml", rig, [ImageSource("images", f"{c.name}/*") for c in rig.cameras])
@@ -41,6 +45,14 @@ class SessionFolder:
         self._frames.flush()
         self._counts[camera] += 1
 
+    def head_row(self, row: Array, extruding: bool) -> None:
+        """Where the print head was at a frame set: (8,) stamp x y z qx qy qz qw, s and mm; stamps rise."""
+        if self._heads is None:
+            write_heads(self.folder / "head.csv", NO_HEADS)
+            self._heads = (self.folder / "head.csv").open("a", encoding="utf-8")
+        self._heads.write(head_line(row, extruding))
+        self._heads.flush()
+
     def truth(self, trajectory: Trajectory) -> None:
         """The exact poses, written when the folder is closed."""
         self._truth = trajectory
@@ -50,5 +62,7 @@ class SessionFolder:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self._frames.close()
+        if self._heads is not None:
+            self._heads.close()
         if self._truth is not None:
             write_tum(self.folder / "truth.tum", self._truth)

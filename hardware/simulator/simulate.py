@@ -203,7 +203,8 @@ def _tracking(
 ) -> Iterator[Step]:
     """The tracking step of the scenario: that of a live run, or one that knows the truth."""
     if scenario.tracking.pictures:
-        with step_by(scenario.tracking.method, scenario.told_rig, regions, scan, WallClock().now) as step:
+        method, rig, tool = scenario.tracking.method, scenario.told_rig, scenario.profile.tool
+        with step_by(method, rig, regions, scan, WallClock().now, tool) as step:
             yield step
         return
     told, true = scenario.told_rig.cameras[0], scenario.rig.cameras[0]
