@@ -79,5 +79,5 @@ def _read(path: str | Path, decoders: dict[str, Callable[[Message], T]]) -> Iter
                 message = parse(path, stored)
                 try:
                     yield decoders[stored.topic](message)
-                except (KeyError, TypeError, ValueError) as error:
+                except (KeyError, TypeError, ValueError, OverflowError) as error:
                     raise InputError(path, stored.topic, repr(error), "a message of its schema") from error

@@ -91,7 +91,7 @@ def _take(path: Path, contents: Contents, place: tuple[int, int], stored: Stored
         message = parse(path, stored)
         try:
             _take_message(path, contents, stored.topic, message)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(path, stored.topic, repr(error), "a message of its schema") from error
 
 
@@ -204,7 +204,7 @@ class RecordingReader:
         message = parse(self._store.path, Stored(topic, ref.number, self._chunk(offset)[index]))
         try:
             return message["format"], messages.bytes_from_message(message)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(self._store.path, topic, repr(error), "a foxglove.CompressedImage") from error
 
     def _chunk(self, offset: int) -> list[bytes]:

@@ -195,6 +195,7 @@ ONE_FRAME = [
         ([*ONE_FRAME, ("/head", {**HEAD, "position": [1, 2, float("nan")]})], "/head[0] = '0.0 1.0 2.0 nan"),
         ([*ONE_FRAME, ("/head", {**HEAD, "position": [1, 2]})], "/head[0] = '7 numbers'"),
         ([*ONE_FRAME, ("/head", {**HEAD, "position": "far"})], "message of its schema"),
+        ([*ONE_FRAME, ("/head", {**HEAD, "stamp": 10**400})], "message of its schema"),
         ([*ONE_FRAME, ("/head", HEAD), ("/head", {**HEAD, "position": [9, 9, 9]})], "/head[1]: stamp = 0.0"),
         ([*ONE_FRAME, ("/head", {**HEAD, "quaternion": [0, 0, 0, 2]})], "/head[0]: length of qx qy qz qw = 2.0"),
         ([*ONE_FRAME, ("/head", {**HEAD, "extruding": 1})], "/head: extruding = 1, allowed true or false"),
