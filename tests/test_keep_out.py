@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -99,7 +101,7 @@ def test_a_bead_has_no_gaps(corners: list[tuple[float, float]]) -> None:
     tips = [np.array([x, y, 0.0]) for x, y in corners]
     for i, tip in enumerate(tips):
         ink.lay(0.1 * i, tip)
-    for a, b in zip(tips, tips[1:], strict=False):
+    for a, b in pairwise(tips):
         along = a + np.linspace(0, 1, 50)[:, None] * (b - a)
         assert ink.covers(along, np.zeros(50), 1.0).all()
 

@@ -1,6 +1,6 @@
 """The folder of a simulated run: all that passes is written to it as it comes, and can be read if it is cut short.
 
-session.mcap, session/     the session, as `stillbed track` and `replay` take it: pictures, rig, region, head, exact truth
+session.mcap, session/     the session, as `stillbed track` and `replay` take it: pictures, rig, region, head and truth
 tracking/                  poses.csv, poses.tum and their report, as `stillbed track` writes them
 commands.csv, frames.bin   what the motion decided, and the bytes that went to the arm
 nozzle.csv                 where the nozzle was and should have been, every millisecond
