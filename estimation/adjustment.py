@@ -16,17 +16,19 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.camera_errors import Delays
+from estimation.local_surface import smooth_normals
 from estimation.observations import Observations
 from estimation.pose_solver import PoseFit, project, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.surface_map import SurfaceMap, local_normals, motion_of
+from estimation.surface_map import SurfaceMap, motion_of
 
 LEAST_SIGHTINGS = 3
 LEAST_JUDGES = 6  # key frames: fewer cannot tell a stray landmark from a bent map, and a stray one is not asked again
 ASTRAY = 3.0  # px: rolling shutters and late cameras bend images that much
 FREE = 50.0  # mm: how far a landmark may lie from where it was; only there to keep a hardly seen one finite
 ROBUST = 3.0  # sigmas
+ONE_EYED = 1.0  # mm: of the depth that one camera gives
 SINGLE = np.diag([1 / 0.05**2] * 3 + [1 / 10.0**2] * 3)  # rad, mm: how far one camera's instant may be from another's
 LEAST_DRIFT = np.array([1e-5] * 3 + [1e-3] * 3)  # rad, mm: so that the tie stays well conditioned
 
@@ -46,16 +48,21 @@ class KeyFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anchors:
-    """What a scan says of the landmarks, surface frame: the nearer to its surface, the likelier.
+    """What a scan, or the surface around it, says of each landmark, surface frame: the nearer to it, the likelier.
 
-    points, normals: (N, 3), the plane each lies on. sigma: (N,) mm across it; FREE for one that is not on the scan.
-    frame: (6, 6) covariance of the scan's own place, a right perturbation, rad and mm.
+    points, normals: (N, 3), the plane each lies on. sigma: (N,) mm across it; FREE for one that nothing is said of.
+    frame: (6, 6) covariance of the scan's own place, a right perturbation, rad and mm; zero without one.
     """
 
     points: Array
     normals: Array
     sigma: Array
     frame: Array
+
+    def extended(self, new: Anchors) -> Anchors:
+        """The same with those of further rows."""
+        points, normals = np.concatenate([self.points, new.points]), np.concatenate([self.normals, new.normals])
+        return Anchors(points, normals, np.concatenate([self.sigma, new.sigma]), self.frame)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +79,7 @@ def adjust(
     """The map that fits all key frames best, or None if they do not determine one.
 
     delays: how much later than stamped the cameras expose, as is known now. anchors: of the map's first rows, where
-    there is a scan.
+    there is a scan or one camera alone sees them.
 
     Base and surface swap roles (X = surface_from_base), so that GTSAM's stock projection factor with
     body_P_sensor = base_from_camera is the measurement.
@@ -106,7 +113,7 @@ def adjust(
     refined = np.stack([_fit(rig, points, frame) for frame in keyframes])
     points = se3.transform_points(frame_change(keyframes, refined, delays.sigma), points)
     normals = surface_map.normals.copy()
-    normals[agrees] = local_normals(points[agrees], surface_map.normals[agrees].mean(0))
+    normals[agrees] = smooth_normals(points[agrees], surface_map.normals[agrees])
     return Adjusted(SurfaceMap(points, normals, whole), agrees)
 
 
@@ -134,11 +141,13 @@ def frame_change(keyframes: list[KeyFrame], refined: Array, skew: float) -> Arra
     """old_surface_from_new (4, 4): what makes refined poses (K, 4, 4) agree with the published ones in the mean.
 
     Both are plain fits to the same pixels, with the old map and with the new, so what the cameras' instants do to a fit
-    cancels. A key frame counts the less the farther the surface may have moved between its cameras' instants.
+    cancels. A key frame counts the less the farther the surface may have moved between its cameras' instants, and
+    hardly where one camera alone saw it: its depth is the map's doubt many times over.
     """
     published = np.stack([f.base_from_surface for f in keyframes])
     drift = skew * np.array([np.linalg.norm(f.twist[3:]) for f in keyframes])
-    weight = 1 / (0.05**2 + drift**2)
+    alone = np.array([len(np.unique(f.observations.camera)) < 2 for f in keyframes])
+    weight = 1 / (0.05**2 + drift**2 + np.where(alone, ONE_EYED**2, 0.0))
     change = np.eye(4)
     for _ in range(3):
         rest = se3.log(se3.inverse(published) @ refined @ se3.inverse(change))

@@ -21,6 +21,7 @@ from estimation.median import median
 from estimation.motion_detector import MotionDetector
 from estimation.observations import Observations
 from estimation.odd_camera import disorder, odd_ones, solve_with, standing_off
+from estimation.own_doubt import OwnDoubt
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import PoseFit, Shared, project
 from estimation.predictor import Predictor
@@ -209,6 +210,7 @@ class Estimator:
             observations.camera,
         )
         at_once, _, jacobians = project(self.rig, camera, start, points)
+        sigma = self._own_doubt.widened(sigma, observations.track, jacobians)
         velocity = jacobians @ twist
         if self.cameras.offset.any():
             pixels = pixels + at_once - project(self.rig, camera, self.as_exposed(start, twist), points)[0]
@@ -241,6 +243,7 @@ class Estimator:
         caveat: what is not known of that frame's place on the tissue; as long as it stands no pose is TRACKING.
         """
         self.map, self._caveat, self._view = surface_map, caveat, len(surface_map)
+        self._own_doubt = OwnDoubt(surface_map)
         self._accepted, self._first, self._first_bias = 0, None, None
         self._smoother.reset()
         self._detector, self._warp = MotionDetector(surface_map.points.mean(0)), WarpFilter(surface_map)
@@ -363,7 +366,7 @@ class Estimator:
             self._warp = WarpFilter(surface_map)
         elif self._warp is not None:
             self._warp.replace_map(surface_map)
-        self.map, self._map_error = surface_map, MapError(surface_map)
+        self.map, self._map_error, self._own_doubt = surface_map, MapError(surface_map), OwnDoubt(surface_map)
 
 
 def _clear(fit: Fit) -> float:
@@ -377,10 +380,3 @@ def _clear(fit: Fit) -> float:
 def _position_sigma(covariance: Array) -> float:
     block = covariance[3:, 3:]
     return float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0))) if np.isfinite(block).all() else float("inf")
-
-
-def identity_pose(stamp: float, reason: str) -> SurfacePose:
-    """The pose before there is any: INITIALISING, at the base's origin, without any certainty."""
-    return SurfacePose(
-        stamp, np.eye(4), np.diag([np.pi**2] * 3 + [1e6] * 3), np.zeros(6), TrackState.INITIALISING, reason=reason
-    )

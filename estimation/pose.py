@@ -145,3 +145,10 @@ class SurfacePose:
         """Covariances (N, 3, 3), mm^2, of the positions of points (N, 3)."""
         spread = point_covariance(self.covariance, points_surface)
         return spread if self.warp is None else np.asarray(spread + self.warp.spread(points_surface))
+
+
+def identity_pose(stamp: float, reason: str) -> SurfacePose:
+    """The pose before there is any: INITIALISING, at the base's origin, without any certainty."""
+    return SurfacePose(
+        stamp, np.eye(4), np.diag([np.pi**2] * 3 + [1e6] * 3), np.zeros(6), TrackState.INITIALISING, reason=reason
+    )

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from estimation.scan import Index, Scan, normals_at
 from estimation.se3 import Array, inverse, transform_points
 
+GRAZING = 0.1  # cosine of ray and normal: no landmark is seen more from the side
 _RIM = 1e-9  # barycentric slack, so that no ray slips through between two triangles
 
 
@@ -53,6 +54,17 @@ def cast(scan: Scan, surface_from_camera: Array, directions: Array) -> Hits:
     points[first_ray] = transform_points(surface_from_camera, met)
     normals[first_ray] = normals_at(scan, triangle[chosen], weights[chosen])
     return Hits(points, normals, np.isfinite(points[:, 0]))
+
+
+def feet(rays: Array, normals: Array) -> tuple[Array, Array]:
+    """How the foot of each ray (N, 3), from the camera, moves along the plane with unit normal (N, 3) that it meets.
+
+    (N, 3, 3) with a shift of the ray, and (N, 3) with a shift of the plane along its normal.
+    """
+    along = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    slope = np.einsum("ni,ni->n", along, normals)
+    slope = np.where(np.abs(slope) < GRAZING, -GRAZING, slope)
+    return np.eye(3) - along[:, :, None] * normals[:, None] / slope[:, None, None], along / slope[:, None]
 
 
 def _meet(corners: Array, directions: Array) -> tuple[Array, Array]:

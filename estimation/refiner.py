@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.adjustment import Adjusted, Anchors, KeyFrame, adjust, single_fit
+from estimation.adjustment import FREE, Adjusted, Anchors, KeyFrame, adjust, single_fit
 from estimation.camera_errors import Delays
 from estimation.deferred import Deferred
 from estimation.estimator import Fit
@@ -130,9 +130,20 @@ class Refiner:
         size[np.diag_indices(len(poses))] = np.inf
         return 1 + int(np.argmin(np.sort(size[1:], axis=1)[:, :2].sum(1)))
 
-    def extend(self, surface_map: SurfaceMap) -> None:
-        """The map has got more rows at its end; the others are as they were."""
+    def extend(self, surface_map: SurfaceMap, level: Array | None = None) -> None:
+        """The map has got more rows at its end; the others are as they were.
+
+        level: (M,) mm, of the new rows, how well the surface around tells where each lies across it; inf where it does
+        not. One camera alone never tells.
+        """
+        first, count = 0 if self._anchors is None else len(self._anchors.sigma), len(surface_map)
         self._map = surface_map
+        if level is None or not np.isfinite(level).any():
+            return
+        sigma = np.full(count - first, FREE)
+        sigma[len(sigma) - len(level) :] = np.minimum(level, FREE)
+        new = Anchors(surface_map.points[first:], surface_map.normals[first:], sigma, np.zeros((6, 6)))
+        self._anchors = new if self._anchors is None else self._anchors.extended(new)
 
     @property
     def kept(self) -> bool:

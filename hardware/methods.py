@@ -30,15 +30,17 @@ def step_by(
     surface: Path | None = None,
     now: Callable[[], float] = lambda: 0.0,
     tool: Array | None = None,
+    prefilter: str = "none",
 ) -> Iterator[Step]:
     """A tracking step of a method, a key of METHODS, for these cameras.
 
-    roi, surface, now, tool: as `tracker` takes them; the thesis's methods make no use of the scan and the tool.
+    roi, surface, now, tool, prefilter: as `tracker` takes them; the thesis's methods make no use of scan and tool, and
+    have the bilateral filter in them.
     """
     if method == MAP:
         from hardware.tracker import tracker
 
-        with tracker(rig, roi, surface, now, tool) as step:
+        with tracker(rig, roi, surface, now, tool, prefilter) as step:
             yield step
         return
     from perception.thesis.features import KeyPoints

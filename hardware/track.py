@@ -89,11 +89,12 @@ def run_track(
     force: bool = False,
     method: str = MAP,
     tool: Array | None = None,
+    prefilter: str = "none",
 ) -> str:
     """Track the session at `path` into the folder `out`; returns the summary as text.
 
     method: a key of METHODS. tool: (K, 2) mm, profile of what hangs on the session's arm, as `ArmProfile.tool`; None
-    for the usual one. Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of
+    for the usual one. prefilter: a key of perception.prefilter.PREFILTERS. Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of
     all frame sets until then.
     """
     session = open_session(path)
@@ -102,7 +103,8 @@ def run_track(
     cameras = [camera.name for camera in session.rig.cameras]
     complete = False
     with ExitStack() as stack:
-        step = stack.enter_context(step_by(method, session.rig, session.roi, session.surface, clock.now, tool))
+        follows = step_by(method, session.rig, session.roi, session.surface, clock.now, tool, prefilter)
+        step = stack.enter_context(follows)
         sinks = [] if record is None else [stack.enter_context(TrackRecorder(record, session, force)).write]
         writer = stack.enter_context(PoseWriter(out, cameras, STAGES))
         progress = stack.enter_context(Progress("track", "frame sets", clock.now))

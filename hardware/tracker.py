@@ -12,6 +12,7 @@ from pathlib import Path
 from estimation.rig import Rig
 from estimation.se3 import Array
 from perception.frames import Roi
+from perception.prefilter import NONE, PREFILTERS
 from perception.tool import Tool
 from perception.tracking import TrackingStep
 
@@ -23,11 +24,13 @@ def tracker(
     surface: Path | None = None,
     now: Callable[[], float] = lambda: 0.0,
     tool: Array | None = None,
+    prefilter: str = NONE,
 ) -> Iterator[TrackingStep]:
     """TrackingStep for these cameras; the map is refined in a process of its own, as GTSAM holds the interpreter.
 
     roi: where the surface is at the start. surface: the scan's file, mm; InputError where it cannot be read. now: s,
     only to say how long the stages take. tool: (K, 2) mm, profile of what hangs on the arm, as `ArmProfile.tool`.
+    prefilter: a key of PREFILTERS.
     """
     scan = None
     if surface is not None:
@@ -36,7 +39,8 @@ def tracker(
         scan = read_mesh(surface).scan
     with ProcessPoolExecutor(1, get_context("spawn"), _leave_interrupts) as executor:
         executor.submit(int).result()  # started before the first frame set, not beside it
-        yield TrackingStep(rig, roi, now, executor, scan, None if tool is None else Tool(tool))
+        step = TrackingStep(rig, roi, now, executor, scan, None if tool is None else Tool(tool), PREFILTERS[prefilter])
+        yield step
 
 
 def _leave_interrupts() -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from estimation import se3
+from estimation.local_surface import smooth_normals
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals, moved_map, surface_frame
@@ -202,7 +203,7 @@ def find_landmarks(
         pixels, found, points = pixels[keep], found[keep], points[keep]
         if len(pixels) < 6:
             return None
-        normals = local_normals(points, outward)
+        normals = smooth_normals(points, outward)
         on_ray = _along(rig, camera, pixels, points)
         offset = found - ideal_pixels(rig.cameras[other], on_ray)[0]
         found, good = _place(lenses, pyramids, camera, other, on_ray, normals, offset, least=0.8)
@@ -325,7 +326,7 @@ def assemble(
     surface_from_base = se3.inverse(base_from_surface)
     points = se3.transform_points(surface_from_base, points_base)
     outward = np.mean([rig.cameras[p.camera].base_from_camera[:3, 3] for p in parts], axis=0) - points_base.mean(0)
-    normals = local_normals(points, surface_from_base[:3, :3] @ outward)
+    normals = smooth_normals(points, surface_from_base[:3, :3] @ outward)
     first = np.cumsum([0] + [len(p.points) for p in parts])
     templates = join(
         [

@@ -1,12 +1,14 @@
 """New landmarks where the surface has come into view and the map knows little of it.
 
-Found as the first map was, between two cameras, begun at the landmarks that both see; kept on probation until a later
-frame set has shown that they move with the surface. A drape beside a wound looks as good, but stays where it is.
+Found as the first map was, between two cameras, begun at the landmarks that both see, or where only one camera sees the
+surface on its rays; kept on probation until a later frame set has shown that they move with the surface. A drape beside
+a wound looks as good, but stays where it is.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -14,18 +16,21 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.adjustment import of_frame
+from estimation.depth import looked_at
 from estimation.observations import Observations
 from estimation.pose_solver import project
-from estimation.rig import Rig
+from estimation.refiner import LEAST_SIGMA
+from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
-from estimation.surface_map import SurfaceMap
+from estimation.surface_map import SurfaceMap, joined_map
+from perception.alone import find_alone
 from perception.features import Mask, sift
 from perception.first_map import Landmarks, Seeds, assemble, find_landmarks, find_seeds
 from perception.frames import Image
 from perception.keep_out import trackable
 from perception.lens import Lenses
 from perception.matcher import Matcher
-from perception.patches import Pyramid, Templates, pyramid
+from perception.patches import Pyramid, Templates, join, pyramid
 from perception.scan_place import as_at_one_instant
 
 WANTED = 120  # landmarks that a camera should see at least
@@ -57,16 +62,21 @@ class Look:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """New landmarks, and the features (N, 2) px and (N, 128) of the part that they are in, by camera."""
+    """New landmarks, and the features (N, 2) px and (N, 128) of the part that they are in, by camera.
+
+    level: (N,) mm, how well each is known to lie level with its neighbours, where it has its place from them; inf where
+    two cameras see it.
+    """
 
     look: Look
     map: SurfaceMap
     templates: Templates
+    level: Array
     features: dict[int, tuple[Array, NDArray[np.float32]]]
 
 
 def look_for_more(rig: Rig, look: Look, surface_map: SurfaceMap) -> Found | None:
-    """Landmarks beside those seen, as far as two cameras tell their depth; None if hardly any."""
+    """Landmarks beside those seen, by two cameras or, where one alone sees the surface, on it; None if hardly any."""
     lenses = Lenses(as_at_one_instant(rig, look.base_from_surface, look.single))
     pyramids = {c: pyramid(image) for c, image in look.images.items()}
     lacking = {c: look.wanted[c] - int((look.seen.camera == c).sum()) for c in sorted(pyramids)}
@@ -84,13 +94,43 @@ def look_for_more(rig: Rig, look: Look, surface_map: SurfaceMap) -> Found | None
                 if part is not None and (c not in best or len(part.points) > len(best[c].points)):
                     best[c] = part
     parts = [best[c] for c in sorted(best)]
-    if sum(len(p.points) for p in parts) < LEAST:
+    found: list[tuple[SurfaceMap, Templates, Array]] = []
+    if sum(len(p.points) for p in parts) >= LEAST:
+        grown = assemble(lenses, pyramids, parts, look.base_from_surface)
+        found.append((grown.map, grown.templates, np.full(len(grown.map), np.inf)))
+    found += _alone(lenses, pyramids, look, surface_map, masks, lacking, parts)
+    if sum(len(part) for part, _, _ in found) < LEAST:
         return None
-    grown = assemble(lenses, pyramids, parts, look.base_from_surface)
-    if len(grown.map) < LEAST:
-        return None
-    joint = grown.map.covariance + of_frame(grown.map.points, look.covariance)  # all share the pose they hang on
-    return Found(look, SurfaceMap(grown.map.points, grown.map.normals, joint), grown.templates, features)
+    whole = reduce(joined_map, [part for part, _, _ in found])
+    joint = whole.covariance + of_frame(whole.points, look.covariance)  # all share the pose they hang on
+    templates, level = join([t for _, t, _ in found]), np.concatenate([sigma for _, _, sigma in found])
+    return Found(look, SurfaceMap(whole.points, whole.normals, joint), templates, level, features)
+
+
+def _alone(
+    lenses: Lenses,
+    pyramids: dict[int, Pyramid],
+    look: Look,
+    surface_map: SurfaceMap,
+    masks: dict[int, Mask],
+    lacking: dict[int, int],
+    parts: list[Landmarks],
+) -> list[tuple[SurfaceMap, Templates, Array]]:
+    """Landmarks that one camera alone sees, each with its templates and how level it is, camera by camera."""
+    sighted = [c for c in sorted(pyramids) if (look.seen.camera == c).sum() >= LEAST]
+    matched = np.concatenate([np.zeros((0, 3)), *[p.points for p in parts]])
+    found = []
+    for c in sighted:
+        rig, others = lenses.rig, [o for o in sighted if o != c]
+        taken, _ = lenses.image(c, *ideal_pixels(rig.cameras[c], matched))
+        inside = ((taken > 0) & (taken < rig.cameras[c].size)).all(1)
+        more = lacking[c] - int(inside.sum())
+        if more >= LEAST:
+            place = look.base_from_surface
+            part = find_alone(lenses, pyramids, c, others, masks[c], taken[inside], more, surface_map, place)
+            if part is not None:
+                found.append((part.map, part.templates, part.sigma))
+    return found
 
 
 def _unknown(lenses: Lenses, camera: int, look: Look, surface_map: SurfaceMap) -> Mask:
@@ -144,34 +184,60 @@ def _seeds(
 @dataclass(slots=True, eq=False)
 class Probation:
     """New landmarks that wait for proof. moved, missed: (N,) looks in which each was found where the surface's motion
-    puts it, far from where it would be at rest; and in which it was not found."""
+    puts it, far from where it would be at rest; and in which it was not found. map: of them, as known by now."""
 
     found: Found
     amid: NDArray[np.bool_]
+    map: SurfaceMap = field(init=False)
     moved: NDArray[np.int64] = field(init=False)
     stayed: NDArray[np.int64] = field(init=False)
     missed: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.moved, self.stayed, self.missed = np.zeros((3, len(self.found.map)), np.int64)
+        self.map = self.found.map
+        self.moved, self.stayed, self.missed = np.zeros((3, len(self.map)), np.int64)
 
-    def look(self, lenses: Lenses, stamp: float, pyramids: dict[int, Pyramid], single: dict[int, Array]) -> None:
-        """Look for them again at each camera's own pose of the surface."""
-        matcher = Matcher(lenses, self.found.map, self.found.templates)
+    def look(
+        self,
+        lenses: Lenses,
+        stamp: float,
+        pyramids: dict[int, Pyramid],
+        single: dict[int, Array],
+        covariance: Array | None = None,
+    ) -> None:
+        """Look for them again at each camera's own pose of the surface, known to a covariance (6, 6).
+
+        What one camera alone sees is known better by it: where the surface has turned, its depth.
+        """
+        matcher = Matcher(lenses, self.map, self.found.templates)
         seen = matcher.align(stamp, pyramids, single)
         where, rest = np.zeros((2, len(seen), 2))
+        jacobians = np.zeros((len(seen), 2, 6))
         for c in np.unique(seen.camera):
             mine = seen.camera == c
-            points = self.found.map.points[seen.track[mine]]
+            points = self.map.points[seen.track[mine]]
             before = self.found.look.single.get(int(c), self.found.look.base_from_surface)
-            where[mine] = project(lenses.rig, seen.camera[mine], single[int(c)], points)[0]
+            where[mine], _, jacobians[mine] = project(lenses.rig, seen.camera[mine], single[int(c)], points)
             rest[mine] = project(lenses.rig, seen.camera[mine], before, points)[0]
         good = np.linalg.norm(seen.pixels - where, axis=1) < AGREES
+        lone = good & np.isfinite(self.found.level[seen.track])
+        if covariance is not None and lone.any():
+            sigma = np.maximum(seen.sigma[lone], LEAST_SIGMA)
+            away = where[lone] - seen.pixels[lone]
+            self.map, good[lone] = looked_at(self.map, seen.track[lone], away, jacobians[lone], sigma, covariance)
         told = np.linalg.norm(rest - where, axis=1) > TELLS
         np.add.at(self.moved, seen.track[good & told], 1)
         np.add.at(self.stayed, seen.track[good & ~told], 1)
         lacking = np.setdiff1d(np.arange(len(self.missed)), seen.track[good])
         self.missed[lacking] += 1
+
+    @property
+    def level(self) -> Array:
+        """How well (N,) mm each is known across the surface that tells its place; inf where two cameras see it."""
+        count, normals = len(self.map), self.map.normals
+        blocks = np.einsum("ninj->nij", self.map.covariance.reshape(count, 3, count, 3))
+        now = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", normals, blocks, normals), 0.0))
+        return np.where(np.isfinite(self.found.level), now, np.inf)
 
     @property
     def proven(self) -> NDArray[np.bool_]:
@@ -186,10 +252,14 @@ class Probation:
 
 
 def amid(found: Found, surface_map: SurfaceMap, distance: float) -> NDArray[np.bool_]:
-    """Which new landmarks (N,) lie between known ones and on their surface. distance: mm to the cameras."""
+    """Which new landmarks (N,) lie between known ones and on their surface. distance: mm to the cameras.
+
+    None that was put there, since one camera alone sees it.
+    """
     away = found.map.points[:, None] - surface_map.points
     gap = np.linalg.norm(away, axis=2)
     near = np.argsort(gap, axis=1)[:, :4]
     rows = np.arange(len(near))[:, None]
     height = np.abs(np.einsum("nki,nki->nk", away[rows, near], surface_map.normals[near])).min(1)
-    return np.asarray((gap[rows, near].max(1) < AMID * distance) & (height < LEVEL * distance))
+    there = (gap[rows, near].max(1) < AMID * distance) & (height < LEVEL * distance)
+    return np.asarray(there & ~np.isfinite(found.level))

@@ -155,7 +155,7 @@ class Mapping:
         if self._last is None:
             return
         (fit, observations, pyramids), self._last = self._last, None
-        lacking = len(pyramids) >= 2 and any(fit.used[c] < SHARE * self._wanted[c] for c in pyramids)
+        lacking = any(fit.used[c] < SHARE * self._wanted[c] for c in pyramids)
         if self._probation is not None and self._refiner.kept:
             self._prove(self._probation, matcher, estimator, fit, observations, pyramids)
         elif self._refiner.kept and lacking and not self._growth.busy and len(matcher.map) < MOST:
@@ -168,7 +168,7 @@ class Mapping:
         single = self._single(matcher, fit, observations, pyramids)
         images = {c: p[0] for c, p in pyramids.items()}
         heads, pose = self._keep_out.masks, fit.solution.base_from_surface
-        return Look(images, pose, single, fit.covariance, inliers, self._wanted, heads)
+        return Look(images, pose, single, fit.covariance + fit.lasting, inliers, self._wanted, heads)
 
     def _single(
         self, matcher: Matcher, fit: Fit, observations: Observations, pyramids: dict[int, Pyramid]
@@ -187,24 +187,24 @@ class Mapping:
         pyramids: dict[int, Pyramid],
     ) -> None:
         """Look for the new landmarks again; those that move with the surface join the map."""
-        waiting.look(self._lenses, fit.stamp, pyramids, self._single(matcher, fit, observations, pyramids))
-        new, axes = waiting.found.map.points, waiting.found.templates.axes
+        single = self._single(matcher, fit, observations, pyramids)
+        waiting.look(self._lenses, fit.stamp, pyramids, single, fit.covariance + fit.lasting)
+        new, axes = waiting.map.points, waiting.found.templates.axes
         proven = waiting.proven & ~self._keep_out.ink.covers(new, patch_reach(axes), fit.stamp)
         if proven.sum() >= LEAST:
-            self._join(waiting.found, proven, matcher, estimator)
+            self._join(waiting, proven, matcher, estimator)
         if proven.sum() >= LEAST or waiting.over:
             self._probation = None
 
-    def _join(self, found: Found, proven: NDArray[np.bool_], matcher: Matcher, estimator: Estimator) -> None:
-        chosen = np.flatnonzero(proven)[: MOST - len(matcher.map)]
+    def _join(self, proven: Probation, which: NDArray[np.bool_], matcher: Matcher, estimator: Estimator) -> None:
+        chosen = np.flatnonzero(which)[: MOST - len(matcher.map)]
         rows = (3 * chosen[:, None] + np.arange(3)).ravel()
-        longer = joined_map(
-            matcher.map,
-            SurfaceMap(found.map.points[chosen], found.map.normals[chosen], found.map.covariance[np.ix_(rows, rows)]),
-        )
+        found, new = proven.found, proven.map
+        points, normals = new.points[chosen], new.normals[chosen]
+        longer = joined_map(matcher.map, SurfaceMap(points, normals, new.covariance[np.ix_(rows, rows)]))
         matcher.extend(longer, found.templates.take(chosen))
         estimator.replace_map(longer)
-        self._refiner.extend(longer)
+        self._refiner.extend(longer, proven.level[chosen])
         for c, features in found.features.items():
             pose = found.look.single.get(c, found.look.base_from_surface)
             self._search.add(c, features, pose, longer)

@@ -22,4 +22,5 @@ def untouched(image: Image) -> Image:
     return image
 
 
-PREFILTERS: dict[str, Callable[[Image], Image]] = {"none": untouched, "bilateral": bilateral}
+NONE, BILATERAL = "none", "bilateral"
+PREFILTERS: dict[str, Callable[[Image], Image]] = {NONE: untouched, BILATERAL: bilateral}

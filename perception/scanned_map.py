@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.adjustment import FREE, Anchors, of_frame
-from estimation.ray_cast import cast
+from estimation.ray_cast import cast, feet
 from estimation.registration import Registration
 from estimation.scan import Scan
 from estimation.se3 import Array
@@ -54,13 +54,8 @@ def scanned(
 def _spread(rays: Array, normals: Array, across: float, angle: float) -> Array:
     """Covariances (N, 3, 3) mm^2 of where rays (N, 3), from the camera, each known to `angle` rad, meet planes with
     `normals` (N, 3), each known to `across` mm."""
-    reach = np.linalg.norm(rays, axis=1)
-    along = rays / reach[:, None]
-    slope = np.einsum("ni,ni->n", along, normals)
-    slope = np.where(np.abs(slope) < 0.1, -0.1, slope)
-    shift = np.eye(3) - along[:, :, None] * normals[:, None] / slope[:, None, None]  # of a ray's foot, along the plane
-    depth = along / slope[:, None]
+    shift, depth = feet(rays, normals)
     return np.asarray(
-        (reach * angle)[:, None, None] ** 2 * shift @ np.swapaxes(shift, 1, 2)
+        (np.linalg.norm(rays, axis=1) * angle)[:, None, None] ** 2 * shift @ np.swapaxes(shift, 1, 2)
         + across**2 * depth[:, :, None] * depth[:, None]
     )

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.errors import InputError
-from estimation.estimator import Estimator, Fit, identity_pose
+from estimation.estimator import Estimator, Fit
 from estimation.observations import Observations, no_observations
-from estimation.pose import SurfacePose
+from estimation.pose import SurfacePose, identity_pose
 from estimation.rig import Rig
 from estimation.scan import Scan
 from estimation.se3 import Array

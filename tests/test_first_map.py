@@ -57,10 +57,10 @@ def off_surface(first: FirstMap) -> Array:
 
 
 def test_the_landmarks_lie_on_the_true_surface(first: FirstMap) -> None:
-    """A pixel is 0.7 mm here; 0.1 px of it is 0.07 mm. Patches are taken as flat: where they bend they lie too low."""
+    """A pixel is 0.7 mm here; 0.1 px of it is 0.07 mm. Patches are taken as flat: here they lie as much too low."""
     off = off_surface(first)
     assert len(off) > 100
-    assert np.median(off) < 0.09 and np.percentile(off, 95) < 0.3 and off.max() < 1.0
+    assert np.std(off) < 0.08 and np.median(off) < 0.11 and np.percentile(off, 95) < 0.25 and off.max() < 0.5
 
 
 @pytest.mark.parametrize("pair", [(0, 1), (1, 2), (0, 2)])

@@ -12,6 +12,7 @@ from perception import features
 from perception.features import match
 from perception.flow import flow
 from perception.frames import Image
+from perception.prefilter import BILATERAL, NONE, PREFILTERS
 
 SIZE = (320, 240)
 
@@ -76,3 +77,12 @@ def test_two_of_a_kind_are_nobodys_match() -> None:
     a = descriptors(50, 0)
     assert not len(match(a, np.concatenate([a, a])))
     assert not len(match(a[:1], a)) and not len(match(a, a[:0]))
+
+
+def test_the_bilateral_filter_keeps_an_edge_and_takes_the_noise() -> None:
+    image = np.where(np.arange(320) < 160, 60, 190) + np.random.default_rng(0).normal(0, 6, (240, 320))
+    filtered = PREFILTERS[BILATERAL](np.asarray(np.clip(image, 0, 255), np.uint8)).astype(float)
+    assert filtered[:, 20:140].std() < 0.5 * image[:, 20:140].std()
+    assert filtered[:, 164:].mean() - filtered[:, :156].mean() > 120
+    same = texture(0)
+    assert PREFILTERS[NONE](same) is same

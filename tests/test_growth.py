@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -133,7 +134,8 @@ def waiting(amid_others: bool = False) -> Probation:
     start = first().base_from_surface
     look = Look({}, start, dict.fromkeys(range(3), start), np.zeros((6, 6)), no_observations(0.0), {}, {})
     count = len(first().map)
-    return Probation(Found(look, first().map, first().templates, {}), np.full(count, amid_others))
+    level = np.full(count, np.inf)
+    return Probation(Found(look, first().map, first().templates, level, {}), np.full(count, amid_others))
 
 
 def at(pose: Array) -> dict[int, Array]:
@@ -166,8 +168,10 @@ def test_amid_others_means_between_them_and_level_with_them() -> None:
     known = SurfaceMap(np.c_[flat, np.zeros(len(flat))], np.tile([0.0, 0, 1], (len(flat), 1)), np.zeros((0, 0)))
     points = np.array([[2.0, 3, 0.3], [2, 3, 8], [70, 0, 0], [-28, 14, -0.5]])
     new = SurfaceMap(points, np.tile([0.0, 0, 1], (4, 1)), np.zeros((12, 12)))
-    found = Found(waiting().found.look, new, first().templates, {})
+    found = Found(waiting().found.look, new, first().templates, np.full(4, np.inf), {})
     assert amid(found, known, 400.0).tolist() == [True, False, False, True]
+    put_there = replace(found, level=np.array([0.1, np.inf, 0.1, np.inf]))
+    assert amid(put_there, known, 400.0).tolist() == [False, False, False, True]
 
 
 # -- the parts

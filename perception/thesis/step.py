@@ -8,9 +8,8 @@ from concurrent.futures import Executor
 import numpy as np
 
 from estimation import se3
-from estimation.estimator import identity_pose
 from estimation.observations import Observations, no_observations
-from estimation.pose import SurfacePose, TrackState
+from estimation.pose import SurfacePose, TrackState, identity_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
 from perception.frames import FrameSet, Image, Roi
