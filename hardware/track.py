@@ -94,8 +94,8 @@ def run_track(
     """Track the session at `path` into the folder `out`; returns the summary as text.
 
     method: a key of METHODS. tool: (K, 2) mm, profile of what hangs on the session's arm, as `ArmProfile.tool`; None
-    for the usual one. prefilter: a key of perception.prefilter.PREFILTERS. Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of
-    all frame sets until then.
+    for the usual one. prefilter: a key of perception.prefilter.PREFILTERS. Whatever ends the run early, a fault of the
+    input or Ctrl-C, leaves poses and a report of all frame sets until then.
     """
     session = open_session(path)
     prepare_out(out, force)
