@@ -1,9 +1,9 @@
 """From observations to surface poses: robust fit to the map, honest covariance, sliding window, state.
 
-The covariance of one fit has two parts. What is new in every frame set, the tracks' noise and what the tracks of a
-camera share (late exposures, shifted images), goes into the window and is averaged there. What stays from frame to
-frame, the map's joint error and the calibration's, is not averaged by anything and is added to what the window says;
-so is the error of the first pose that is given out, since the path is placed in it.
+The covariance of one fit has two parts. What is new in every frame set, the tracks' noise and shifts of whole images,
+goes into the window and is averaged there. What stays from frame to frame, the map's joint error and the calibration's,
+is not averaged by anything and is added to what the window says; so is what late exposures make of the motion, and the
+error of the first pose that is given out, since the path is placed in it.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.camera_errors import CameraErrors
 from estimation.camera_health import CameraHealth, HealthSettings
+from estimation.fit import Fit
 from estimation.fit_covariance import MapError, fit_covariance
 from estimation.median import median
 from estimation.motion_detector import MotionDetector
@@ -34,6 +35,7 @@ from estimation.warp_filter import WarpFilter
 
 BEGINS = np.array([1e-4] * 3 + [1.0] * 3)  # rad^2/s^3, mm^2/s^3: what lies still may begin to breathe
 SHARP = 0.1  # mm that cameras may see the surface apart: beyond, what is late cannot be told from what is bent
+HASTY = 0.5  # mm, likewise: no print is better than that with a map so bent
 PERSISTS = 0.2  # s: what breathes is accelerated alike for so long, which adds up to more than white noise does
 
 
@@ -50,37 +52,6 @@ class EstimatorSettings:
     floor_sigma: float = 0.1  # px: alignment claims less on clean images, interpolation and lens model do not allow it
     states: StateSettings = field(default_factory=StateSettings)
     health: HealthSettings = field(default_factory=HealthSettings)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Fit:
-    """A fit to one frame set, judged.
-
-    covariance: (6, 6), of what is new in this frame set; lasting: (6, 6), of what the map adds to it. twist: (6,) the
-    velocity by which the cameras' instants were brought together, twist_doubt: (6,) its variance. bias: (6, 2C), what
-    shifts of the cameras' images do to the pose. used: (C,) inliers per camera. reason: why it is no measurement, or
-    ''. off: (C,) px by which each camera stands off the pose, nan where it does not see the surface; allowed: (C,) px,
-    one sigma. odd: cameras that were left out.
-    """
-
-    stamp: float
-    solution: PoseFit
-    covariance: Array
-    lasting: Array
-    twist: Array
-    twist_doubt: Array
-    bias: Array
-    inlier: NDArray[np.bool_]
-    used: NDArray[np.int64]
-    reason: str
-    off: Array
-    allowed: Array
-    odd: frozenset[int] = frozenset()
-
-    @property
-    def measured(self) -> bool:
-        """Whether the fit may enter the window."""
-        return not self.reason
 
 
 class Estimator:
@@ -118,6 +89,14 @@ class Estimator:
         """Whether a frame set after the one of the first map has been measured."""
         return self._accepted > 0
 
+    def hasty(self, fit: Fit) -> bool:
+        """Whether no pose is given out yet, and the surface moves too fast for its map to be trusted."""
+        return self._first is None and self._smeared(fit) > HASTY
+
+    def _smeared(self, fit: Fit) -> float:
+        """How far, mm, the surface moves in the time by which a camera's exposure is unknown."""
+        return float(np.linalg.norm(fit.twist[3:])) * self.cameras.delays.sigma
+
     def predict(self, stamp: float) -> Array:
         """Where the surface is expected at `stamp`: (4, 4). Only after the first map."""
         assert self._pose is not None
@@ -138,25 +117,26 @@ class Estimator:
             return self._no_fit(observations, start)
         warped = self.map.points if self._warp is None else self._warp.points(self.map)
         points, (twist, doubt) = warped[observations.track], self._twist(observations.stamp, start)
-        seen, smear = self._together(observations, points, start, twist)
-        allowed = self.health.allowed(np.full(len(self.rig), smear))
+        seen, apart = self._together(observations, points, start, twist)
+        allowed = self.health.allowed(np.full(len(self.rig), apart))
         shared = self.cameras.shared(twist)
         solution, odd = self._solve(seen, points, start, scales, shared, allowed)
         inlier = solution.weights > 0.2
         used = np.bincount(seen.camera[inlier], minlength=len(self.rig))
         known = fit_covariance(seen, solution, shared, self._map_error, self._warp)
         found = int((~np.isin(seen.camera, list(odd))).sum())
-        reason = self._judge(found, used, known.noise + known.lasting, disorder(seen, solution, inlier))
+        claimed = known.noise + known.smear + known.lasting
+        reason = self._judge(found, used, claimed, disorder(seen, solution, inlier))
         off = standing_off(seen, solution, len(self.rig), self._camera_least())
         doubted = known.bias * np.repeat(self.health.doubted(off, allowed, odd), 2)
-        knowledge = solution, known.noise, known.lasting + doubted @ doubted.T, twist, doubt, known.bias
+        knowledge = solution, known.noise, known.smear, known.lasting + doubted @ doubted.T, twist, doubt, known.bias
         return Fit(seen.stamp, *knowledge, inlier, used, reason, off, allowed, odd)
 
     def _no_fit(self, observations: Observations, start: Array) -> Fit:
         count, cameras = len(observations), len(self.rig)
         nothing = PoseFit(start, np.zeros((6, 6)), np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2, 6)), 1.0)
         unknown, off = np.full((6, 6), np.inf), np.full(cameras, np.nan)
-        zeros = np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros((6, 2 * cameras))
+        zeros = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros((6, 2 * cameras))
         none, used = np.zeros(count, bool), np.zeros(cameras, np.int64)
         reason = f"{count} tracks found, {self.settings.least_tracks} needed"
         odd = self.health.left_out
@@ -251,7 +231,8 @@ class Estimator:
         self.health.begin()
         self._predictor = Predictor(surface_map.points)
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
-        return self._enter(stamp, base_from_surface, covariance, np.zeros((6, 6)), *self._states.begin(stamp))
+        nothing = np.zeros((6, 6)), np.zeros((6, 6))
+        return self._enter(stamp, base_from_surface, covariance, *nothing, *self._states.begin(stamp))
 
     def carriers(self, fit: Fit) -> NDArray[np.int64]:
         """The cameras that carry a fit, by number."""
@@ -277,15 +258,14 @@ class Estimator:
         if self._unlearned is not None:
             (fit, seconds), self._unlearned = self._unlearned, None
             assert fit.solution.shared is not None
-            self.cameras.learn(fit.solution.shared, seconds, _clear(fit))
+            self.cameras.learn(fit.solution.shared, seconds, fit.clear)
 
     def accept(self, fit: Fit, observations: Observations) -> SurfacePose:
         """Take a measured fit into the window and give the pose."""
         assert fit.measured and fit.solution.shared is not None
         if self._pose is not None:
             self._unlearned = fit, fit.stamp - self._pose.stamp
-            smeared = float(np.linalg.norm(fit.twist[3:])) * self.cameras.delays.sigma
-            if self._warp is not None and smeared < SHARP:
+            if self._warp is not None and self._smeared(fit) < SHARP:
                 sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
                 self._warp.learn(observations, fit.solution, sigma, fit.twist, self.cameras.delays.sigma)
         self._accepted += 1
@@ -301,7 +281,7 @@ class Estimator:
             0.0 if self._warp is None or self._warp.warp is None else self._warp.warp.deformation,
         )
         state, reason = self._states.measured(fit.stamp, seen)
-        return self._enter(fit.stamp, fit.solution.base_from_surface, fit.covariance, lasting, state, reason)
+        return self._enter(fit.stamp, fit.solution.base_from_surface, fit.noise, fit.smear, lasting, state, reason)
 
     def _calibration(self, fit: Fit) -> Array:
         """Covariance (6, 6) of what imperfect lenses do to the pose.
@@ -319,19 +299,24 @@ class Estimator:
         self.health.update(fit.stamp, used, self._camera_least(), fit.off, fit.allowed, fit.odd)
 
     def _enter(
-        self, stamp: float, pose: Array, covariance: Array, lasting: Array, state: TrackState, reason: str
+        self, stamp: float, pose: Array, noise: Array, smear: Array, lasting: Array, state: TrackState, reason: str
     ) -> SurfacePose:
+        """Average a pose's noise in the window. What late exposures make of it is claimed whole.
+
+        Their size is learned slowly and they err along the motion, as does an acceleration: as part of the window's
+        noise they made it believe its prior, a third farther off a waved board than the fit alone.
+        """
         self._step = 1.0 if self._measured is None else max(1e-3, stamp - self._measured.stamp)
-        window = self._smoother.add(Measured(stamp, pose, covariance))
+        window = self._smoother.add(Measured(stamp, pose, noise))
         self._psd = window.acceleration_psd
         if self._first is not None:
             lasting = lasting + self._first
         elif state.measured:
-            self._first = window.covariance
+            self._first = window.covariance + smear
         entered = SurfacePose(
             stamp,
             window.pose,
-            window.covariance + (lasting + lasting.T) / 2,
+            window.covariance + smear + (lasting + lasting.T) / 2,
             window.twist,
             state,
             window.twist_covariance,
@@ -367,14 +352,6 @@ class Estimator:
         elif self._warp is not None:
             self._warp.replace_map(surface_map)
         self.map, self._map_error, self._own_doubt = surface_map, MapError(surface_map), OwnDoubt(surface_map)
-
-
-def _clear(fit: Fit) -> float:
-    """The part, 0 to 1, of a fit's squared velocity in the images that is not the velocity's own noise."""
-    weighted = fit.solution.jacobians * np.sqrt(fit.solution.weights)[:, None, None]
-    noise = float((weighted**2).sum((0, 1)) @ fit.twist_doubt)
-    whole = float(((weighted @ fit.twist) ** 2).sum())
-    return max(0.0, 1 - noise / whole) if whole > 0 else 0.0
 
 
 def _position_sigma(covariance: Array) -> float:

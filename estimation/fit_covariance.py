@@ -19,10 +19,12 @@ from estimation.warp_filter import WarpFilter
 class FitCovariance:
     """The parts (6, 6) of a fit's covariance. noise: new in every frame set; lasting: what map and deformation add.
 
-    bias: (6, 2C), how far a pixel's shift of each camera's image, rights, then downs by turns, takes the pose.
+    smear: what late exposures make of the motion, new in every frame set too. bias: (6, 2C), how far a pixel's shift of
+    each camera's image, rights, then downs by turns, takes the pose.
     """
 
     noise: Array
+    smear: Array
     lasting: Array
     bias: Array
 
@@ -70,5 +72,5 @@ def fit_covariance(
         weighted = solution.jacobians * weight[:, None, None]
         lasting = lasting + warp.pull(seen.track, weighted, solution.jacobians[:, :, 3:])
     late, bias = noise @ by_camera[:, 0], noise @ by_camera[:, 1:].swapaxes(1, 2).reshape(6, -1)
-    new = noise + late @ shared.delay @ late.T + (bias * np.repeat(shared.shift, 2)) @ bias.T
-    return FitCovariance(new, noise @ lasting @ noise, bias)
+    new = noise + (bias * np.repeat(shared.shift, 2)) @ bias.T
+    return FitCovariance(new, late @ shared.delay @ late.T, noise @ lasting @ noise, bias)

@@ -15,7 +15,7 @@ from estimation import se3
 from estimation.adjustment import FREE, Adjusted, Anchors, KeyFrame, adjust, single_fit
 from estimation.camera_errors import Delays
 from estimation.deferred import Deferred
-from estimation.estimator import Fit
+from estimation.fit import Fit
 from estimation.observations import Observations
 from estimation.rig import Rig
 from estimation.se3 import Array
@@ -70,8 +70,19 @@ class Refiner:
         second = KeyFrame(pose, _inliers(self._rig, self._map, pose, observations), twist)
         self._frames = [KeyFrame(first.base_from_surface, first.observations, twist), second]
         self._stamps = [self._stamps[0], fit.stamp]
+        return self._at_once(delays)
+
+    def rebuild(self, fit: Fit, observations: Observations, delays: Delays) -> Adjusted | None:
+        """One more frame set before a pose is given out: what moves fast is mapped from all of them, on the spot."""
+        assert self._map is not None
+        pose = fit.solution.base_from_surface
+        self._keep(fit.stamp, pose, _inliers(self._rig, self._map, pose, observations), fit.twist)
+        return self._at_once(delays)
+
+    def _at_once(self, delays: Delays) -> Adjusted | None:
+        assert self._map is not None
         self._delays, self._doubt = delays, delays.sigma
-        refined = adjust(self._rig, self._map, self._frames, delays)
+        refined = adjust(self._rig, self._map, self._frames, delays, self._anchors)
         if refined is not None:
             self._map = refined.map
         return refined

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.adjustment import Adjusted, single_fit
 from estimation.deferred import Deferred
-from estimation.estimator import Estimator, Fit
+from estimation.estimator import Estimator
+from estimation.fit import Fit
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.refiner import Refiner
@@ -118,18 +119,34 @@ class Mapping:
                 break
             self._take(refined, matcher, estimator)
             estimator.moving(self._refiner.speed(fit))
-            pose, points = fit.solution.base_from_surface, refined.map.points
-            fits = {c: single_fit(self._lenses.rig, points, observations, c, pose) for c in pyramids}
-            starts = {c: own.base_from_surface for c, own in fits.items()}
-            again = matcher.align(fit.stamp, pyramids, starts, coarse=True)
-            refit = estimator.fit(again, pose)
-            if not refit.measured:
-                break
-            fit, observations = refit, again
+            fit, observations = self._again(matcher, estimator, pyramids, fit, observations)
         self._wanted = dict.fromkeys(range(len(self._lenses.rig)), WANTED)
         if self._placing is not None:
             fit = self._lay_scan(self._placing, matcher, estimator, pyramids, fit, observations)
         return fit, observations
+
+    def rebuild(
+        self, matcher: Matcher, estimator: Estimator, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations
+    ) -> tuple[Fit, Observations]:
+        """A frame set after the confirmation, before any pose is given out, of a surface that moves fast.
+
+        The map of its first instants is as bent as the cameras' instants are unknown; later ones are calmer or, at
+        least, others, and no path is laid yet that could jump.
+        """
+        refined = self._refiner.rebuild(fit, observations, estimator.cameras.delays)
+        if refined is None:
+            return fit, observations
+        self._take(refined, matcher, estimator)
+        return self._again(matcher, estimator, pyramids, fit, observations)
+
+    def _again(
+        self, matcher: Matcher, estimator: Estimator, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations
+    ) -> tuple[Fit, Observations]:
+        """Look and fit again with a corrected map; what was there, where that is no measurement."""
+        starts = self._single(matcher, fit, observations, pyramids)
+        again = matcher.align(fit.stamp, pyramids, starts, coarse=True)
+        refit = estimator.fit(again, fit.solution.base_from_surface)
+        return (refit, again) if refit.measured else (fit, observations)
 
     def offer(
         self,

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.errors import InputError
-from estimation.estimator import Estimator, Fit
+from estimation.estimator import Estimator
+from estimation.fit import Fit
 from estimation.observations import Observations, no_observations
 from estimation.pose import SurfacePose, identity_pose
 from estimation.rig import Rig
@@ -199,6 +200,8 @@ class TrackingStep:
                 reason = f"the first map waits for a second look by two cameras ({fit.reason or 'one sees it'})"
                 return estimator.wait(stamp, reason), observations, fit.used
             fit, observations = self._mapping.confirm(matcher, estimator, pyramids, fit, observations)
+        elif fit.measured and not fit.odd and estimator.hasty(fit):
+            fit, observations = self._mapping.rebuild(matcher, estimator, pyramids, fit, observations)
         if fit.measured:
             self._lost = {c: pyramids[c] for c in self._missing(fit, pyramids)}
             self._absent = 0

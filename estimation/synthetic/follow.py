@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.adjustment import Adjusted
 from estimation.estimator import Estimator
+from estimation.fit import Fit
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.refiner import Refiner
@@ -49,14 +50,23 @@ class Follower:
             if self.refiner is not None and refined is not None:
                 self._take(refined)
                 estimator.moving(self.refiner.speed(fit))
-                refit = estimator.fit(seen, fit.solution.base_from_surface)
-                fit = refit if refit.measured else fit
+                fit = self._again(fit, seen)
+        elif self.refiner is not None and fit.measured and not fit.odd and estimator.hasty(fit):
+            refined = self.refiner.rebuild(fit, seen, estimator.cameras.delays)
+            if refined is not None:
+                self._take(refined)
+                fit = self._again(fit, seen)
         if not fit.measured:
             return estimator.coast(fit)
         pose = estimator.accept(fit, seen)
         if self.refiner is not None:
             self.refiner.offer(fit, seen, pose.twist, estimator.cameras.delays)
         return pose
+
+    def _again(self, fit: Fit, seen: Observations) -> Fit:
+        """The fit to a corrected map, where that is a measurement."""
+        refit = self.estimator.fit(seen, fit.solution.base_from_surface)
+        return refit if refit.measured else fit
 
     def idle(self) -> None:
         """What no pose waits for: a refined map that is due."""

@@ -1,0 +1,57 @@
+"""A fit to one frame set, with what is claimed of it and whether it counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.pose_solver import PoseFit
+from estimation.se3 import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A fit to one frame set, judged.
+
+    noise, smear: (6, 6) covariances of what is new in this frame set, by tracks and images, and by late exposures of
+    what moves; lasting: (6, 6), of what the map adds to them. twist: (6,) the velocity by which the cameras' instants
+    were brought together, twist_doubt: (6,) its variance. bias: (6, 2C), what shifts of the cameras' images do to the
+    pose. used: (C,) inliers per camera. reason: why it is no measurement, or
+    ''. off: (C,) px by which each camera stands off the pose, nan where it does not see the surface; allowed: (C,) px,
+    one sigma. odd: cameras that were left out.
+    """
+
+    stamp: float
+    solution: PoseFit
+    noise: Array
+    smear: Array
+    lasting: Array
+    twist: Array
+    twist_doubt: Array
+    bias: Array
+    inlier: NDArray[np.bool_]
+    used: NDArray[np.int64]
+    reason: str
+    off: Array
+    allowed: Array
+    odd: frozenset[int] = frozenset()
+
+    @property
+    def measured(self) -> bool:
+        """Whether the fit may enter the window."""
+        return not self.reason
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6), of all that is new in this frame set."""
+        return self.noise + self.smear
+
+    @property
+    def clear(self) -> float:
+        """The part, 0 to 1, of the squared velocity in the images that is not the velocity's own noise."""
+        weighted = self.solution.jacobians * np.sqrt(self.solution.weights)[:, None, None]
+        noise = float((weighted**2).sum((0, 1)) @ self.twist_doubt)
+        whole = float(((weighted @ self.twist) ** 2).sum())
+        return max(0.0, 1 - noise / whole) if whole > 0 else 0.0
