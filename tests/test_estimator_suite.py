@@ -6,7 +6,7 @@ states with what was done to the cameras.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -171,3 +171,36 @@ def test_one_camera_does_not_confirm_a_first_map() -> None:
     poses: list[SurfacePose] = [follower(s) for s in seen[4:]]
     states = [pose.state for pose in poses]
     assert states[:3] == [TrackState.INITIALISING] * 3 and states[-1] is TRACKING and all(p.reason for p in poses[:3])
+
+
+def test_late_exposures_of_a_fast_surface_are_claimed_and_leave_the_prior_no_say() -> None:
+    fast = world("lively", seconds=6.0, rate=6.0, jitter=0.01)
+    seen = fast.observations()
+    first = next(seen)
+    follower = Follower(fast.rig, first, beginning(fast, first, "told"), refine=False)
+    estimator, pulled, smeared = follower.estimator, [], []
+    for observations in map(follower.of_map, seen):
+        fit = estimator.fit(observations, estimator.predict(observations.stamp))
+        pose = estimator.accept(fit, observations)
+        off = se3.log(se3.inverse(fit.solution.base_from_surface) @ pose.base_from_surface)
+        pulled.append(float(off[3:] @ off[3:]))
+        smeared.append(float(np.trace(fit.smear[3:, 3:])))
+        assert np.trace(pose.covariance[3:, 3:]) > smeared[-1]
+    assert np.mean(pulled) < 0.01 * np.mean(smeared) and np.mean(smeared) > 0.05**2
+
+
+def test_a_first_map_is_hasty_only_until_a_pose_is_given_out_and_only_of_what_is_fast() -> None:
+    for speed, hasty in ((10.0, False), (200.0, True)):
+        calm = world("still")
+        seen = calm.observations()
+        first = next(seen)
+        follower = Follower(calm.rig, first, beginning(calm, first, "told"), refine=False)
+        follower(next(seen))
+        estimator = follower.estimator
+        estimator.moving(np.array([0, 0, 0, speed, 0, 0]))
+        later = follower.of_map(next(seen))
+        fit = replace(estimator.fit(later, estimator.predict(later.stamp)), twist=np.array([0, 0, 0, speed, 0, 0]))
+        assert estimator.hasty(fit) is hasty
+        for observations in seen:
+            follower(observations)
+        assert not estimator.hasty(fit)
