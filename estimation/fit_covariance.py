@@ -66,7 +66,8 @@ def fit_covariance(
     weight = EFFICIENCY * solution.weights / (seen.sigma * solution.scale) ** 2
     rows, landmark = np.unique(seen.track, return_inverse=True)
     cameras = len(shared.shift)
-    by_landmark, by_camera = pulls(cameras, len(rows), seen.camera, landmark, solution.jacobians, weight, shared.twist)
+    camera = np.ascontiguousarray(seen.camera)
+    by_landmark, by_camera = pulls(cameras, len(rows), camera, landmark, solution.jacobians, weight, shared.twist)
     lasting = map_error.through(rows, by_landmark)
     if warp is not None:
         weighted = solution.jacobians * weight[:, None, None]
