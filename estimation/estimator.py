@@ -21,7 +21,7 @@ from estimation.fit_covariance import MapError, fit_covariance
 from estimation.median import median
 from estimation.motion_detector import MotionDetector
 from estimation.observations import Observations
-from estimation.odd_camera import disorder, odd_ones, solve_with, standing_off
+from estimation.odd_camera import SURER, disorder, odd_ones, solve_with, standing_off, surprise
 from estimation.own_doubt import OwnDoubt
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import PoseFit, Shared, project
@@ -158,9 +158,11 @@ class Estimator:
             return solution, odd
         most = self.settings.health.out * allowed
         off = standing_off(seen, solution, len(self.rig), least)
-        if any(off[c] > most[c] for c in range(len(self.rig)) if c not in odd):
-            expected = self._pose.predict(seen.stamp)
-            found = odd_ones(self.rig, seen, points, odd, most, least, expected, shared)
+        expected = self._pose.predict(seen.stamp)
+        apart = any(off[c] > most[c] for c in range(len(self.rig)) if c not in odd)
+        if apart or surprise(solution, expected) > SURER:  # what moved may be a camera, though the others follow it
+            left, within = (1, np.inf) if apart else (2, SURER)
+            found = odd_ones(self.rig, seen, points, odd, most, least, expected, shared, left, within)
             if found is not None:
                 return found[1], found[0]
         return solution, odd

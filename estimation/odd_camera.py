@@ -24,7 +24,7 @@ from estimation.se3 import Array
 MOST = 2  # cameras that may be wrong at once: exchanged cables
 ORDERLY = 1.5  # px of residual, at which nobody asks how much of it a camera's own motion explains
 RAYLEIGH = 1.18  # median length of a vector whose two entries are normal, in their sigmas
-SURER = 3.0  # times likelier, in sigmas of the motion, than the next: which of two that disagree is then told
+SURER = 3.0  # sigmas of the motion that make a pose surprising, and times fewer than the next: which is odd is told
 
 
 def solve_with(
@@ -74,14 +74,16 @@ def odd_ones(
     least: float,
     expected: SurfacePose,
     shared: Shared,
+    left: int = 1,
+    within: float = np.inf,
 ) -> tuple[frozenset[int], PoseFit] | None:
     """The cameras, one or else two, without which the others agree, and the fit without them; None where unclear.
 
     left_out: cameras that are so already. allowed: (C,) px by which each may stand off. expected: by the motion, at
-    this stamp.
+    this stamp. left: cameras that have to stay. within: sigmas of the motion by which their pose may surprise.
     """
     kept = [int(c) for c in np.unique(observations.camera) if c not in left_out]
-    for size in range(1, min(MOST, len(kept) - 1) + 1):
+    for size in range(1, min(MOST, len(kept) - left) + 1):
         found: list[tuple[float, frozenset[int], PoseFit]] = []
         for odd in combinations(kept, size):
             without = frozenset(left_out) | set(odd)
@@ -89,18 +91,18 @@ def odd_ones(
             apart = standing_off(observations, fit, len(rig), least) / allowed
             others = [apart[c] for c in kept if c not in odd and np.isfinite(apart[c])]
             if others and max(others) <= 1.0 and all(apart[c] > 1.0 for c in odd):
-                found.append((_surprise(fit, expected), without, fit))
+                found.append((surprise(fit, expected), without, fit))
         found.sort(key=lambda one: one[0])
         if found:
             sure = len(found) == 1 or found[1][0] > SURER * found[0][0]
-            return found[0][1:] if sure else None
+            return found[0][1:] if sure and found[0][0] <= within else None
     return None
 
 
-def _surprise(fit: PoseFit, expected: SurfacePose) -> float:
+def surprise(fit: PoseFit, expected: SurfacePose) -> float:
     """By how many sigmas a pose differs from the motion's, at least one."""
     off = se3.log(se3.inverse(expected.base_from_surface) @ fit.base_from_surface)
-    damped = fit.information + 1e-9 * np.trace(fit.information) * np.eye(6)
+    damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)  # none at all: no surprise
     spread = expected.covariance + np.linalg.inv(damped)
     return max(1.0, float(np.sqrt(off @ np.linalg.solve(spread, off) / 6)))
 

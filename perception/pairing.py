@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
@@ -14,6 +15,7 @@ from perception.frames import Frame, FrameSet
 
 DEFAULT_PERIOD = 1 / 30  # s: the rate of the thesis's cameras, where no camera has two frames to tell its own
 TOLERANCE_PERIODS = 0.5  # see `pairing_tolerance`
+USUAL = 5  # frames of a camera, of whose delays behind the first one of their sets the median is usual
 SILENT_PERIODS = 5.0  # without a frame, after which no set waits for a camera: four lost in a row are rare
 
 
@@ -95,26 +97,30 @@ class Pairing:
 
     A set is given out as soon as no frame that is still to come can belong to it: it holds every camera that is alive,
     or each one that it lacks has since delivered a younger frame. What is never to come is waited for `patience`
-    after the set's first arrival, and a camera silent for SILENT_PERIODS no longer at all. Sets come out in order of
-    stamp; a frame that is too late for that is left out and counted in `late`. The frames of one camera are taken to
-    arrive in order.
+    after the set's first arrival, and a camera silent for SILENT_PERIODS no longer at all. That is half a period, and
+    where a camera's frames usually come later, its usual delay more, a period at most: stamps need not tell when a
+    camera exposed, and one that is always too late would never be seen at all. Sets come out in order of stamp; a frame
+    that is too late for that is left out and counted in `late`. The frames of one camera are taken to arrive in order.
     """
 
     def __init__(self, cameras: int, period: float) -> None:
         """cameras: in the rig. period: s, of its frames."""
         self.late = 0
         self.patience = pairing_tolerance(period)
-        self._tolerance, self._silent = pairing_tolerance(period), SILENT_PERIODS * period
+        self._period, self._tolerance, self._silent = period, pairing_tolerance(period), SILENT_PERIODS * period
         self._open: list[_Open] = []  # oldest first
         self._newest = [-math.inf] * cameras  # stamp
         self._heard: list[float | None] = [None] * cameras  # s, arrival
         self._given: _Open | None = None
+        self._delays: list[deque[float]] = [deque(maxlen=USUAL) for _ in range(cameras)]  # s, behind the set's first
 
     def add(self, frame: Frame, now: float) -> list[FrameSet]:
         """The sets that can be given out once a frame has arrived; now: s, rising from call to call."""
         self._newest[frame.camera], self._heard[frame.camera] = frame.stamp, now
         if self._given is not None and self._given.should_have_held(frame, self._tolerance):
             self.late += 1
+            if self._given.takes(frame, self._tolerance):
+                self._learn(frame.camera, now - self._given.arrived)
         else:
             self._place(frame, now)
         return self.due(now)
@@ -131,16 +137,31 @@ class Pairing:
             self._given = out[-1]
         return [frame_set(list(group.frames.values())) for group in out]
 
+    def _learn(self, camera: int, delay: float) -> None:
+        """A frame came `delay` s after the first one of its set; what comes within half a period is waited for anyway.
+
+        A delay of most of the last frames is a camera's way to be; a single one is a hiccup.
+        """
+        self._delays[camera].append(delay)
+        usual = [float(np.median(d)) for d in self._delays if len(d) == USUAL]
+        longest = min(max(usual, default=0.0), self._period)
+        self.patience = self._tolerance + (longest if longest > self._tolerance else 0.0)
+
     def _place(self, frame: Frame, now: float) -> None:
-        for group in self._open:
-            if group.takes(frame, self._tolerance):
+        for i, group in enumerate(self._open):
+            rises = all(frame.stamp < later.last for later in self._open[i + 1 :])
+            if rises and group.takes(frame, self._tolerance):
                 group.frames[frame.camera] = frame
+                self._learn(frame.camera, now - group.arrived)
                 return
-        self._open.append(_Open(now, {frame.camera: frame}))
+        if any(group.first <= frame.stamp <= group.last for group in self._open):  # amid a set that it is no part of
+            self.late += 1
+            return
+        self._open.append(_Open(now, now + self.patience, {frame.camera: frame}))
         self._open.sort(key=lambda group: group.first)
 
     def _is_finished(self, group: _Open, now: float) -> bool:
-        return now >= group.arrived + self.patience or not any(
+        return now >= group.until or not any(
             self._may_come(group, camera, now) for camera in range(len(self._newest)) if camera not in group.frames
         )
 
@@ -152,9 +173,10 @@ class Pairing:
 
 @dataclass(slots=True)
 class _Open:
-    """A set that is being gathered. arrived: s, when its first frame came. frames: by camera."""
+    """A set that is being gathered. arrived: s, when its first frame came. until: s, waited for. frames: by camera."""
 
     arrived: float
+    until: float
     frames: dict[int, Frame]
 
     @property

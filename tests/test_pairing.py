@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from heapq import heapify, heappop, heappush
 from itertools import pairwise
 
 import numpy as np
@@ -13,6 +14,7 @@ from perception.frames import Frame, FrameSet
 from perception.pairing import (
     DEFAULT_PERIOD,
     SILENT_PERIODS,
+    USUAL,
     Pairing,
     frame_period,
     frame_set,
@@ -111,12 +113,14 @@ PERIOD = 0.04
 
 def live(arrivals: list[tuple[float, Frame]], cameras: int) -> tuple[list[tuple[float, FrameSet]], Pairing]:
     """Sets with the instants at which they come out, from frames with theirs; nobody looks later than needed."""
-    pairing = Pairing(cameras, PERIOD)
-    moments = [(now, i, frame) for i, (now, frame) in enumerate(arrivals)]
-    moments += [(now + pairing.patience, i, None) for now, i, _ in moments]  # type: ignore[misc]
-    out: list[tuple[float, FrameSet]] = []
-    for now, _, frame in sorted(moments, key=lambda m: (m[0], m[1])):
+    pairing, out = Pairing(cameras, PERIOD), []
+    moments: list[tuple[float, int, Frame | None]] = [(now, i, frame) for i, (now, frame) in enumerate(arrivals)]
+    heapify(moments)
+    while moments:
+        now, i, frame = heappop(moments)
         out += [(now, s) for s in (pairing.due(now) if frame is None else pairing.add(frame, now))]
+        if frame is not None:
+            heappush(moments, (now + pairing.patience, i + len(arrivals), None))
     return out, pairing
 
 
@@ -145,7 +149,7 @@ def test_live_sets_rise_hold_each_frame_at_most_once_and_are_never_kept_waiting(
     assert len(frames) + pairing.late == len(arrivals)
     arrived = {id(frame): now for now, frame in arrivals}
     for now, s in out:
-        assert now <= min(arrived[id(f)] for f in s.frames) + pairing.patience + 1e-12
+        assert now <= min(arrived[id(f)] for f in s.frames) + PERIOD + pairing_tolerance(PERIOD) + 1e-12
         assert all(now >= arrived[id(f)] for f in s.frames)
         stamps = [f.stamp for f in s.frames]
         assert max(stamps) - min(stamps) <= pairing_tolerance(PERIOD)
@@ -204,3 +208,25 @@ def test_a_frame_of_a_set_that_has_gone_is_counted_and_left_out() -> None:
     assert len(pairing.due(1.03 + pairing.patience)) == 1
     assert not pairing.add(Frame(1, 1.001, IMAGE), 1.06)
     assert pairing.late == 1
+
+
+def late_by(delays: list[float], count: int = 40) -> list[tuple[float, Frame]]:
+    """Frames of one stamp each time, that arrive so late by camera, s."""
+    return sorted(
+        ((k * PERIOD + 0.03 + d, Frame(c, k * PERIOD, IMAGE)) for k in range(count) for c, d in enumerate(delays)),
+        key=lambda a: a[0],
+    )
+
+
+@given(delay=st.floats(0, 0.99), other=st.floats(0, 0.99))
+def test_a_camera_that_is_always_late_is_soon_waited_for(delay: float, other: float) -> None:
+    """Where stamps do not tell that a camera exposes later than the others, only its frames' arrival does."""
+    out, _ = live(late_by([0.0, delay * PERIOD, other * PERIOD]), 3)
+    assert all(len(s.frames) == 3 for _, s in out[USUAL + 1 :])
+
+
+def test_one_frame_that_is_late_makes_nobody_wait_for_the_next() -> None:
+    arrivals = late_by([0.0, 0.001, 0.002])
+    stuck = [(now + 0.03 * (f.camera == 2 and 0.4 < f.stamp < 0.49), f) for now, f in arrivals]
+    _, pairing = live(sorted(stuck, key=lambda a: a[0]), 3)
+    assert pairing.patience == pairing_tolerance(PERIOD) and pairing.late == 2
