@@ -63,6 +63,12 @@ class CameraHealth:
         """Whether every camera shows so much less than usual that these (C,) tracks prove nothing."""
         return bool((used < self.settings.least_share * self._tracks)[self._tracks > 0].all() and self._tracks.any())
 
+    def clear(self, used: NDArray[np.int64]) -> bool:
+        """Whether two cameras, or all that there are, carry a pose with these (C,) tracks about as they usually do."""
+        known = self._tracks > 0
+        clear = (used >= self.settings.leave_share * self._tracks) & known
+        return int(clear.sum()) >= min(2, int(known.sum()))
+
     def doubted(self, off: Array, allowed: Array, odd: Collection[int]) -> Array:
         """How far, px, the image of each camera (C,) is to be doubted where all stand off together; else zeros.
 

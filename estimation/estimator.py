@@ -236,6 +236,10 @@ class Estimator:
         nothing = np.zeros((6, 6)), np.zeros((6, 6))
         return self._enter(stamp, base_from_surface, covariance, *nothing, *self._states.begin(stamp))
 
+    def sound(self, fit: Fit) -> bool:
+        """Whether map, warp and clocks may learn from a fit: what a blurred or bumped camera shows would bend them."""
+        return not fit.odd and self.health.clear(fit.used)
+
     def carriers(self, fit: Fit) -> NDArray[np.int64]:
         """The cameras that carry a fit, by number."""
         return np.nonzero(fit.used >= self._camera_least())[0] if fit.measured else np.zeros(0, np.int64)
@@ -266,8 +270,9 @@ class Estimator:
         """Take a measured fit into the window and give the pose."""
         assert fit.measured and fit.solution.shared is not None
         if self._pose is not None:
-            self._unlearned = fit, fit.stamp - self._pose.stamp
-            if self._warp is not None and self._smeared(fit) < SHARP:
+            sound = self.sound(fit)
+            self._unlearned = (fit, fit.stamp - self._pose.stamp) if sound else None
+            if self._warp is not None and sound and self._smeared(fit) < SHARP:
                 sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
                 self._warp.learn(observations, fit.solution, sigma, fit.twist, self.cameras.delays.sigma)
         self._accepted += 1
