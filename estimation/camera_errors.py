@@ -11,6 +11,7 @@ would carry the pose away from the map (measured: 0.04 mm on a surface at rest, 
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -176,3 +177,22 @@ class CameraErrors:
         known, apart = known[sure], apart[:, sure]
         doubt = np.einsum("ik,ij,jk->k", apart, self._covariance[np.ix_(part, part)], apart)
         return (apart.T @ pull) / known, 1 / known + doubt
+
+
+class Clocks:
+    """What was known of the cameras some seconds ago: as a surface begins to deform, that is taken for late cameras."""
+
+    EVERY = 2.0  # s: a deformation is seen within one
+
+    def __init__(self, cameras: CameraErrors) -> None:
+        self._before, self._last, self._stamp = copy.deepcopy(cameras), copy.deepcopy(cameras), -np.inf
+
+    def keep(self, stamp: float, cameras: CameraErrors) -> None:
+        """Remember it as it is at `stamp`, s, from time to time."""
+        if stamp - self._stamp >= self.EVERY:
+            self._before, self._last, self._stamp = self._last, copy.deepcopy(cameras), stamp
+
+    @property
+    def before(self) -> CameraErrors:
+        """What was known EVERY s ago or earlier."""
+        return copy.deepcopy(self._before)

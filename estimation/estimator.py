@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.camera_errors import CameraErrors
+from estimation.camera_errors import CameraErrors, Clocks
 from estimation.camera_health import CameraHealth, HealthSettings
 from estimation.fit import Fit
 from estimation.fit_covariance import MapError, fit_covariance
@@ -62,6 +62,7 @@ class Estimator:
         self.settings = settings or EstimatorSettings()
         self.map: SurfaceMap | None = None
         self.cameras = CameraErrors(len(rig))
+        self._clocks, self._bends = Clocks(self.cameras), False  # whether the map is kept from being bent
         self.health = CameraHealth([camera.name for camera in rig.cameras], self.settings.health)
         self._states = StateMachine(self.settings.states)
         self._smoother = Smoother()
@@ -88,6 +89,11 @@ class Estimator:
     def confirmed(self) -> bool:
         """Whether a frame set after the one of the first map has been measured."""
         return self._accepted > 0
+
+    @property
+    def deforms(self) -> bool:
+        """Whether the surface is seen to depart from the rigid."""
+        return self._warp is not None and self._warp.liveliness > 0
 
     def hasty(self, fit: Fit) -> bool:
         """Whether no pose is given out yet, and the surface moves too fast for its map to be trusted."""
@@ -226,7 +232,7 @@ class Estimator:
         """
         self.map, self._caveat, self._view = surface_map, caveat, len(surface_map)
         self._own_doubt = OwnDoubt(surface_map)
-        self._accepted, self._first, self._first_bias = 0, None, None
+        self._accepted, self._first, self._first_bias, self._bends = 0, None, None, False
         self._smoother.reset()
         self._detector, self._warp = MotionDetector(surface_map.points.mean(0)), WarpFilter(surface_map)
         self._map_error = MapError(surface_map)
@@ -264,7 +270,9 @@ class Estimator:
         if self._unlearned is not None:
             (fit, seconds), self._unlearned = self._unlearned, None
             assert fit.solution.shared is not None
-            self.cameras.learn(fit.solution.shared, seconds, fit.clear)
+            if not self._bends or not self.deforms:
+                self.cameras.learn(fit.solution.shared, seconds, fit.clear)
+                self._clocks.keep(fit.stamp, self.cameras)
 
     def accept(self, fit: Fit, observations: Observations) -> SurfacePose:
         """Take a measured fit into the window and give the pose."""
@@ -348,16 +356,19 @@ class Estimator:
         self._pose = replace(predicted, state=state, reason=reason)
         return self._pose
 
-    def replace_map(self, surface_map: SurfaceMap, crooked: bool = False) -> None:
+    def replace_map(self, surface_map: SurfaceMap, crooked: bool = False, bent: bool = False) -> None:
         """Take a refined or longer map of the same surface frame; rows keep their meaning.
 
-        crooked: whether the one before was a first map, whose own error looked like a deformation.
+        crooked: whether the one before was a first map, whose own error looked like a deformation. bent: whether it was
+        bent by one, and this one is not: then what was learned of the clocks lately was the deformation too.
         """
         assert self.map is not None and len(surface_map) >= len(self.map)
         if crooked:
             self._warp = WarpFilter(surface_map)
         elif self._warp is not None:
             self._warp.replace_map(surface_map)
+        if bent:
+            self.cameras, self._bends = self._clocks.before, True
         self.map, self._map_error, self._own_doubt = surface_map, MapError(surface_map), OwnDoubt(surface_map)
 
 

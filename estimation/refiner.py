@@ -39,6 +39,7 @@ class Refiner:
         self._frames: list[KeyFrame] = []
         self._stamps: list[float] = []
         self._map: SurfaceMap | None = None
+        self._confirmed: Adjusted | None = None  # the map as it was when the surface had hardly moved
         self._anchors: Anchors | None = None
         self._ask = self._kept = False
         self._offered: tuple[Fit, Observations, Array] | None = None
@@ -51,7 +52,7 @@ class Refiner:
         """The first map and the frame set that it was made from, whose pose defines the surface frame."""
         self._map, self._frames, self._stamps, self._anchors = surface_map, [], [], None
         self._work.forget()
-        self._ask = False
+        self._ask, self._confirmed = False, None
         kept = _inliers(self._rig, surface_map, base_from_surface, observations)
         self._keep(stamp, base_from_surface, kept, np.zeros(6))
 
@@ -85,6 +86,7 @@ class Refiner:
         refined = adjust(self._rig, self._map, self._frames, delays, self._anchors)
         if refined is not None:
             self._map = refined.map
+            self._confirmed = refined
         return refined
 
     def reframe(self, surface_map: SurfaceMap, new_from_old: Array, anchors: Anchors) -> None:
@@ -92,6 +94,7 @@ class Refiner:
         turned = se3.adjoint(new_from_old)
         old_from_new = se3.inverse(new_from_old)
         self._map, self._anchors = surface_map, anchors
+        self._confirmed = Adjusted(surface_map, np.ones(len(surface_map), bool))
         self._frames = [
             KeyFrame(f.base_from_surface @ old_from_new, f.observations, turned @ f.twist) for f in self._frames
         ]
@@ -99,6 +102,21 @@ class Refiner:
     def offer(self, fit: Fit, observations: Observations, twist: Array, delays: Delays) -> None:
         """A measured frame set; `poll` keeps it if it shows the surface anew."""
         self._offered, self._delays = (fit, observations, twist), delays
+
+    def freeze(self) -> Adjusted | None:
+        """Instead of `poll` where the surface is seen to deform: go back, once, to the map as it was confirmed.
+
+        Key frames of different shapes would be averaged to one that never was. They are chosen as ever, for what else
+        is done at them.
+        """
+        self._choose()
+        self._ask = False
+        if self._confirmed is None or self._map is None:
+            return None
+        self._work.forget()
+        back, self._confirmed = self.with_new_rows(self._confirmed), None
+        self._map = back.map
+        return back
 
     def _choose(self) -> None:
         """Whether the last frame set offered becomes a key frame."""

@@ -19,6 +19,7 @@ from estimation.warp import Warp
 from estimation.warp_modes import WarpModes, modes_from_map
 
 DECAY = 30.0  # s: some breaths; a deformation that nobody sees any more is forgotten over them
+ASLEEP = 0.05  # of the greatest liveliness: then it is over
 MEMORY = 1.0  # s: over which the liveliness is learned
 CHANCE = 4.0  # standard errors that the liveliness must reach, else it is put down to chance
 BIAS = 0.01  # mm: of a mode in one frame set, by patches that are not quite what they were
@@ -39,6 +40,7 @@ class WarpFilter:
             self._covariance[count:, count:] = _of_map(self._modes, surface_map)
         self._stamp: float | None = None
         self._seen, self._doubt = 0.0, 0.0  # liveliness, mm^2/s, signed, and the variance of one look at it
+        self._liveliness = self._liveliest = 0.0
         self._warp: Warp | None = None
 
     @property
@@ -48,7 +50,15 @@ class WarpFilter:
 
     @property
     def liveliness(self) -> float:
-        """How fast the square of the deformation grows by itself, mm^2/s; 0 on a rigid surface."""
+        """How fast the square of the deformation grows by itself, mm^2/s; 0 on a rigid surface.
+
+        A chest rests after each breath and is as lively in the next one: only over some breaths is it forgotten.
+        """
+        return self._liveliness
+
+    @property
+    def _clear(self) -> float:
+        """The liveliness of the last second, 0 where chance explains it."""
         return self._seen if self._seen > CHANCE * float(np.sqrt(self._doubt)) else 0.0
 
     def points(self, surface_map: SurfaceMap) -> Array:
@@ -70,13 +80,30 @@ class WarpFilter:
         return np.asarray(sensitivity @ self._covariance[:count, :count] @ sensitivity.T)
 
     def replace_map(self, surface_map: SurfaceMap) -> None:
-        """A refined or longer map: what it has taken in of the map's error, or of the deformation, is no error now."""
+        """A refined or longer map: what it has taken in of the map's error is none now, and was no deformation."""
         if self._modes is not None:
             count, before = len(self._modes.share), len(self._points)
-            self._state[count:] -= self._modes.modes_of(surface_map.points[:before] - self._points)
+            change = self._modes.modes_of(surface_map.points[:before] - self._points)
+            if self._warp is not None:
+                self._map_told(change, _of_map(self._modes, surface_map))
+            self._state[count:] -= change
             if len(surface_map) > before:
                 self._modes = self._modes.extended(surface_map.points[before:])
         self._points = surface_map.points
+
+    def _map_told(self, error: Array, doubt: Array) -> None:
+        """The map's error was `error` (M,), known to `doubt` (M, M); what it was taken for follows from that.
+
+        The sum of both vectors is known, and what of it is deformation is in doubt by as much as the map was wrong.
+        """
+        count = len(error)
+        assert self._modes is not None
+        self._covariance[:count, :count] += float(error @ error) * np.diag(self._modes.share)
+        across = self._covariance[:, count:]
+        gain = np.linalg.solve(self._covariance[count:, count:] + doubt, across.T).T
+        self._state = self._state + gain @ (error - self._state[count:])
+        covariance = self._covariance - gain @ across.T
+        self._covariance = (covariance + covariance.T) / 2
 
     def learn(self, observations: Observations, fit: PoseFit, sigma: Array, twist: Array, skew: float) -> None:
         """Take the residuals of a fit to `points`. sigma: (N,) px.
@@ -110,6 +137,9 @@ class WarpFilter:
             seen = (float(gradient @ (share * gradient)) - expected) / (looks * dt)
             self._seen += recent * (seen - self._seen)
             self._doubt = recent / (looks * dt**2)
+            now = max(self._clear, self._liveliness * float(np.exp(-dt / DECAY)))
+            self._liveliest = max(self._liveliest, now)
+            self._liveliness = now if now > ASLEEP * self._liveliest else 0.0
         wander = self.liveliness * dt * share
         self._covariance[:count, :count] += np.diag(wander)
         self._state = keep * self._state
@@ -126,8 +156,9 @@ class WarpFilter:
 
 def _of_map(modes: WarpModes, surface_map: SurfaceMap) -> Array:
     """Covariance (M, M), mm^2, of the modes in a map's error."""
-    fields = (modes.landmarks * modes.weights[:, None, None]).reshape(-1, len(modes.share))
-    return np.asarray(fields.T @ surface_map.covariance @ fields + MAP_SIGMA**2 * np.eye(len(modes.share)))
+    known = 3 * len(modes.weights)
+    fields = (modes.landmarks * modes.weights[:, None, None]).reshape(known, -1)
+    return np.asarray(fields.T @ surface_map.covariance[:known, :known] @ fields + MAP_SIGMA**2 * np.eye(len(modes.share)))
 
 
 def _sum(covariance: Array, count: int) -> Array:

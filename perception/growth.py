@@ -7,7 +7,7 @@ a wound looks as good, but stays where it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
 
 import cv2
@@ -23,6 +23,7 @@ from estimation.refiner import LEAST_SIGMA
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, joined_map
+from estimation.warp import Warp
 from perception.alone import find_alone
 from perception.features import Mask, sift
 from perception.first_map import Landmarks, Seeds, assemble, find_landmarks, find_seeds
@@ -49,7 +50,7 @@ GIVEN_UP = 4  # looks in which a new landmark was in view and not found
 class Look:
     """One frame set in which the surface is known: where it stood, jointly and at each camera's own instant, and what
     agreed. images: grey, by camera. single: (4, 4) by camera. seen: the inliers. wanted: landmarks, by camera. heads:
-    the print head's masks, by camera."""
+    the print head's masks, by camera. warp: of the surface there and then."""
 
     images: dict[int, Image]
     base_from_surface: Array
@@ -58,6 +59,7 @@ class Look:
     seen: Observations
     wanted: dict[int, int]
     heads: dict[int, Mask]
+    warp: Warp | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,6 +79,8 @@ class Found:
 
 def look_for_more(rig: Rig, look: Look, surface_map: SurfaceMap) -> Found | None:
     """Landmarks beside those seen, by two cameras or, where one alone sees the surface, on it; None if hardly any."""
+    if look.warp is not None:  # as it is now
+        surface_map = replace(surface_map, points=look.warp.apply(surface_map.points))
     lenses = Lenses(as_at_one_instant(rig, look.base_from_surface, look.single))
     pyramids = {c: pyramid(image) for c, image in look.images.items()}
     lacking = {c: look.wanted[c] - int((look.seen.camera == c).sum()) for c in sorted(pyramids)}
@@ -104,7 +108,8 @@ def look_for_more(rig: Rig, look: Look, surface_map: SurfaceMap) -> Found | None
     whole = reduce(joined_map, [part for part, _, _ in found])
     joint = whole.covariance + of_frame(whole.points, look.covariance)  # all share the pose they hang on
     templates, level = join([t for _, t, _ in found]), np.concatenate([sigma for _, _, sigma in found])
-    return Found(look, SurfaceMap(whole.points, whole.normals, joint), templates, level, features)
+    points = whole.points if look.warp is None else look.warp.undo(whole.points)
+    return Found(look, SurfaceMap(points, whole.normals, joint), templates, level, features)
 
 
 def _alone(

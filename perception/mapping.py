@@ -21,6 +21,7 @@ from estimation.registration import Registration
 from estimation.scan import Scan
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, joined_map, moved_map
+from estimation.warp import Warp
 from perception.first_map import FirstMap, build_first_map, in_frame
 from perception.frames import FrameSet, Roi
 from perception.growth import LEAST, SHARE, WANTED, Found, Look, Probation, amid, look_for_more
@@ -65,6 +66,7 @@ class Mapping:
         self._mapped = 0.0  # s, stamp of the first map
         self._caveat = ""
         self._taken = 0  # refinements of this map
+        self._bent = False  # whether its surface seemed to deform
         self._growth: Deferred[Found] = Deferred(executor)
         self._probation: Probation | None = None
         self._wanted: dict[int, int] = {}  # landmarks, by camera
@@ -99,7 +101,7 @@ class Mapping:
         self._refiner.begin(first.map, stamp, start, observations)
         self._growth.forget()
         self._probation = self._last = None
-        self._taken = 0
+        self._taken, self._bent = 0, False
         matcher.remember(pyramids, observations, fit.inlier, start)
         for camera, images in pyramids.items():
             self._search.learn(camera, images[0], start, first.map)
@@ -162,9 +164,10 @@ class Mapping:
 
     def keep(self, matcher: Matcher, estimator: Estimator) -> None:
         """Once a frame set, when no pose waits: put what is due into force, ask for what comes next."""
-        refined = self._refiner.poll()
+        bends = estimator.deforms and (self._bent or self._taken > CROOKED)
+        refined = self._refiner.freeze() if bends else self._refiner.poll()
         if refined is not None:
-            self._take(refined, matcher, estimator)
+            self._take(refined, matcher, estimator, bends)
         found = self._growth.poll()
         if found is not None:
             distance = float(np.linalg.norm(found.look.base_from_surface[:3, 3] - self._cameras))
@@ -176,16 +179,19 @@ class Mapping:
         if self._probation is not None and self._refiner.kept:
             self._prove(self._probation, matcher, estimator, fit, observations, pyramids)
         elif self._refiner.kept and lacking and not self._growth.busy and len(matcher.map) < MOST:
-            look = self._look(matcher, fit, observations, pyramids)
+            warp = None if estimator.pose is None else estimator.pose.warp
+            look = self._look(matcher, fit, observations, pyramids, warp)
             self._growth.ask(look_for_more, self._lenses.rig, look, matcher.map)
 
-    def _look(self, matcher: Matcher, fit: Fit, observations: Observations, pyramids: dict[int, Pyramid]) -> Look:
+    def _look(
+        self, matcher: Matcher, fit: Fit, observations: Observations, pyramids: dict[int, Pyramid], warp: Warp | None
+    ) -> Look:
         seen, kept = observations, fit.inlier
         inliers = Observations(seen.stamp, seen.camera[kept], seen.track[kept], seen.pixels[kept], seen.sigma[kept])
         single = self._single(matcher, fit, observations, pyramids)
         images = {c: p[0] for c, p in pyramids.items()}
-        heads, pose = self._keep_out.masks, fit.solution.base_from_surface
-        return Look(images, pose, single, fit.covariance + fit.lasting, inliers, self._wanted, heads)
+        heads, pose, doubt = self._keep_out.masks, fit.solution.base_from_surface, fit.covariance + fit.lasting
+        return Look(images, pose, single, doubt, inliers, self._wanted, heads, warp)
 
     def _single(
         self, matcher: Matcher, fit: Fit, observations: Observations, pyramids: dict[int, Pyramid]
@@ -261,9 +267,11 @@ class Mapping:
         estimator.moving(self._refiner.speed(fit))
         return estimator.fit(observations, place.base_from_surface)
 
-    def _take(self, refined: Adjusted, matcher: Matcher, estimator: Estimator) -> None:
+    def _take(self, refined: Adjusted, matcher: Matcher, estimator: Estimator, bends: bool = False) -> None:
         self._taken += 1
-        estimator.replace_map(refined.map, crooked=self._taken <= CROOKED)
+        crooked = self._taken <= CROOKED and not bends
+        self._bent |= crooked and estimator.deforms  # if it is seen again with a better map, that was no fault of the map
+        estimator.replace_map(refined.map, crooked, bends)
         matcher.take(refined.map, refined.agrees)
 
     def _polygons(self, frames: FrameSet) -> dict[int, Array] | str:
