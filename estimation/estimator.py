@@ -366,7 +366,7 @@ class Estimator:
         if crooked:
             self._warp = WarpFilter(surface_map)
         elif self._warp is not None:
-            self._warp.replace_map(surface_map)
+            self._warp.replace_map(surface_map, right=bent)
         if bent:
             self.cameras, self._bends = self._clocks.before, True
         self.map, self._map_error, self._own_doubt = surface_map, MapError(surface_map), OwnDoubt(surface_map)

@@ -79,12 +79,16 @@ class WarpFilter:
         sensitivity = np.einsum("nki,nkm->im", weighted, moved, optimize=True)
         return np.asarray(sensitivity @ self._covariance[:count, :count] @ sensitivity.T)
 
-    def replace_map(self, surface_map: SurfaceMap) -> None:
-        """A refined or longer map: what it has taken in of the map's error is none now, and was no deformation."""
+    def replace_map(self, surface_map: SurfaceMap, right: bool = False) -> None:
+        """A refined or longer map: what it has taken in of the map's error, or of the deformation, is no error now.
+
+        right: whether it is known to be that of the undeformed surface: then what the other was off by was no
+        deformation.
+        """
         if self._modes is not None:
             count, before = len(self._modes.share), len(self._points)
             change = self._modes.modes_of(surface_map.points[:before] - self._points)
-            if self._warp is not None:
+            if right:
                 self._map_told(change, _of_map(self._modes, surface_map))
             self._state[count:] -= change
             if len(surface_map) > before:
@@ -98,7 +102,8 @@ class WarpFilter:
         """
         count = len(error)
         assert self._modes is not None
-        self._covariance[:count, :count] += float(error @ error) * np.diag(self._modes.share)
+        doubtful = float(error @ error) * np.diag(self._modes.share)
+        self._covariance = self._covariance + np.block([[doubtful, -doubtful], [-doubtful, doubtful]])
         across = self._covariance[:, count:]
         gain = np.linalg.solve(self._covariance[count:, count:] + doubt, across.T).T
         self._state = self._state + gain @ (error - self._state[count:])
@@ -158,7 +163,9 @@ def _of_map(modes: WarpModes, surface_map: SurfaceMap) -> Array:
     """Covariance (M, M), mm^2, of the modes in a map's error."""
     known = 3 * len(modes.weights)
     fields = (modes.landmarks * modes.weights[:, None, None]).reshape(known, -1)
-    return np.asarray(fields.T @ surface_map.covariance[:known, :known] @ fields + MAP_SIGMA**2 * np.eye(len(modes.share)))
+    return np.asarray(
+        fields.T @ surface_map.covariance[:known, :known] @ fields + MAP_SIGMA**2 * np.eye(len(modes.share))
+    )
 
 
 def _sum(covariance: Array, count: int) -> Array:

@@ -270,7 +270,9 @@ class Mapping:
     def _take(self, refined: Adjusted, matcher: Matcher, estimator: Estimator, bends: bool = False) -> None:
         self._taken += 1
         crooked = self._taken <= CROOKED and not bends
-        self._bent |= crooked and estimator.deforms  # if it is seen again with a better map, that was no fault of the map
+        self._bent |= (
+            crooked and estimator.deforms
+        )  # if it is seen again with a better map, that was no fault of the map
         estimator.replace_map(refined.map, crooked, bends)
         matcher.take(refined.map, refined.agrees)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from estimation.camera_errors import CameraErrors, Variance
+from estimation.camera_errors import CameraErrors, Clocks, Variance
 from estimation.pose_solver import SharedFit
 from estimation.synthetic.follow import Follower, beginning
 from estimation.synthetic.world import synthetic_world
@@ -88,3 +88,15 @@ def test_values_that_tell_nothing_change_nothing() -> None:
     for _ in range(100):
         variance.take(3.0, 1e9)
     assert variance.value == pytest.approx(before, rel=1e-3)
+
+
+def test_clocks_go_back_to_what_was_known_some_seconds_ago() -> None:
+    early, late = learned((0.0, 0.01, -0.01), 1.0), learned((0.0, 0.05, -0.05), 1.0)
+    clocks = Clocks(early)
+    clocks.keep(0.0, early)
+    clocks.keep(1.0, late)  # what a deformation is taken for
+    assert np.array_equal(clocks.before.offset, early.offset)
+    clocks.keep(2.5, late)
+    assert np.array_equal(clocks.before.offset, early.offset)
+    clocks.keep(5.0, late)
+    assert np.array_equal(clocks.before.offset, late.offset)

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from test_adjustment import RIG, as_map, landmarks, look, shape_error, swaying, unsure
 
+from estimation.deferred import DELAY
 from estimation.estimator import Estimator
 from estimation.refiner import Refiner
 from estimation.se3 import Array
+from estimation.surface_map import joined_map
 
 STAMPS = (0.0, 0.15, 0.3, 0.45)
 DELAYS = (0.02, -0.008, -0.012)  # s
@@ -38,3 +40,25 @@ def test_each_frame_set_straightens_the_map_of_a_surface_that_moves_fast(seed: i
     start, confirmed, *rebuilt = shapes(seed)
     assert confirmed < 0.5 * start
     assert rebuilt[-1] < 0.9 * confirmed
+
+
+def test_a_surface_that_deforms_has_the_map_again_as_it_was_confirmed_and_it_stays() -> None:
+    true = landmarks(2)
+    delays, refiner, estimator = unsure(0.015), Refiner(RIG), Estimator(RIG)
+    first, *later = [look(true, stamp, 2) for stamp in (*STAMPS, 1.5, 2.5, 3.5)]
+    refiner.begin(as_map(true, 0.8), STAMPS[0], swaying(STAMPS[0]), first)
+    estimator.begin(STAMPS[0], swaying(STAMPS[0]), as_map(true, 0.8))
+    confirmed = refiner.confirm(estimator.fit(later[0], swaying(STAMPS[1])), later[0], delays)
+    assert confirmed is not None
+    refined = []
+    for seen in later[1:]:
+        for _ in range(DELAY + 1):
+            refiner.offer(estimator.fit(seen, swaying(seen.stamp)), seen, np.zeros(6), delays)
+            refined.append(refiner.poll())
+    assert any(r is not None for r in refined)
+    grown = joined_map(confirmed.map, as_map(true[:3], 0.1))
+    refiner.extend(grown)
+    back = refiner.freeze()
+    assert back is not None and len(back.map) == len(grown)
+    assert np.array_equal(back.map.points[: len(true)], confirmed.map.points)
+    assert refiner.freeze() is None

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.estimator import Estimator
 from estimation.pose import SurfacePose, TrackState
+from estimation.pose_solver import solve_pose
 from estimation.se3 import Array
 from estimation.state_machine import StateSettings
 from estimation.surface_map import SurfaceMap
@@ -20,6 +21,7 @@ from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.synthetic.look import observations
 from estimation.synthetic.surfaces import patch
 from estimation.warp import Warp
+from estimation.warp_filter import WarpFilter
 from estimation.warp_modes import WarpModes, modes_from_map
 from hardware.simulator.deformation import Deformation
 from tests.synthetic import Motion, breathing, still
@@ -171,3 +173,39 @@ def test_a_deformed_surface_is_degraded_between_two_thresholds(bulging: Follow) 
 def test_a_map_that_takes_in_the_mean_deformation_leaves_the_checkpoints_on_the_tissue() -> None:
     refined = Follow(BULGE, seconds=4.0, refined_at=2.5)
     assert np.percentile(refined.errors[90:], 95) < 0.3 * np.percentile(refined.rigid[90:], 95)
+
+
+def _filtered(amounts: Array, seed: int = 0) -> WarpFilter:
+    """A filter that has seen the cylinder bulge by so much in frame sets 1/30 s apart."""
+    warps, rng = WarpFilter(MAP), np.random.default_rng(seed)
+    for k, amount in enumerate(amounts):
+        bent = LANDMARKS + BULGE.displacement(LANDMARKS, float(amount))
+        seen = observations(RIG, bent, REST, k / 30, rng, 0.1)
+        points = warps.points(MAP)[seen.track]
+        fit = solve_pose(RIG, seen.camera, points, seen.pixels, seen.sigma, REST)
+        warps.learn(seen, fit, seen.sigma, np.zeros(6), 0.0)
+    return warps
+
+
+BREATH = 0.5 * (1 - np.cos(np.linspace(0.0, 2 * np.pi, 60)))
+
+
+def test_a_chest_that_rests_between_two_breaths_is_as_lively_as_before() -> None:
+    moving, resting = _filtered(BREATH), _filtered(np.concatenate([BREATH, np.zeros(60)]))
+    assert moving.liveliness > 0
+    assert 0.8 * moving.liveliness < resting.liveliness <= moving.liveliness
+
+
+def test_a_rigid_surface_is_never_lively() -> None:
+    assert _filtered(np.zeros(90)).liveliness == 0.0
+
+
+def test_what_the_map_is_told_of_its_error_was_no_deformation() -> None:
+    """A map that is found to have been wrong by what looked like a deformation leaves none."""
+    warps = _filtered(BREATH[:25])
+    assert warps.warp is not None
+    bent = warps.points(MAP)
+    before = warps.warp.deformation
+    warps.replace_map(replace(MAP, points=bent), right=True)
+    after = np.linalg.norm(warps.points(replace(MAP, points=bent)) - bent, axis=1)
+    assert np.sqrt(np.mean(after**2)) < 0.35 * before

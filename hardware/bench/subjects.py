@@ -45,5 +45,6 @@ SUBJECTS: Subjects = {
     "prediction": Subject("hardware.bench.prediction", "where a breathing chest will be, 100 to 500 ms ahead"),
     "steps": Subject("hardware.bench.steps", "movements of 300 um and 0.1 degree: how soon flagged, how often falsely"),
     "tracks": Subject("hardware.bench.tracks", "scatter and creep of tracks before a surface that stands still"),
+    "views": Subject("hardware.bench.views", "skin that deforms, grazing views with glare, a cube's edges"),
     "thesis": Subject("hardware.bench.thesis", "the thesis's estimator beside ours, on the same frame sets"),
 }
