@@ -103,6 +103,10 @@ class Refiner:
         """A measured frame set; `poll` keeps it if it shows the surface anew."""
         self._offered, self._delays = (fit, observations, twist), delays
 
+    def withdraw(self) -> None:
+        """The last frame set offered is no key frame after all."""
+        self._offered = None
+
     def freeze(self) -> Adjusted | None:
         """Instead of `poll` where the surface is seen to deform: go back, once, to the map as it was confirmed.
 

@@ -36,6 +36,7 @@ from perception.scanned_map import scanned
 EAGER = 5  # tries for a first map, 0.5 s and more each, before only every tenth frame set is tried
 RELAXED = 10  # frame sets from one try to the next after those
 MOST = 600  # landmarks; those out of view are kept, and cost little
+SHOWN = 0.5  # of the landmarks in a camera's view: fewer are found where it is blurred or covered
 CROOKED = 6  # refinements, two of them the confirmation, until what looks bent is not the first map itself
 PATIENCE = 2.0  # s: a first map that nobody confirms is dropped, and the next images are tried
 
@@ -70,7 +71,7 @@ class Mapping:
         self._growth: Deferred[Found] = Deferred(executor)
         self._probation: Probation | None = None
         self._wanted: dict[int, int] = {}  # landmarks, by camera
-        self._last: tuple[Fit, Observations, dict[int, Pyramid]] | None = None
+        self._last: tuple[Fit, Observations, dict[int, Pyramid], bool] | None = None  # and whether it is sound
 
     def first_map(self, frames: FrameSet, pyramids: dict[int, Pyramid]) -> FirstMap | str:
         """A first map of what these images (by camera) show, or the reason why there is none yet."""
@@ -160,10 +161,15 @@ class Mapping:
     ) -> None:
         """A measured frame set, from which the map may be refined or grow. twist: (6,), the surface's."""
         self._refiner.offer(fit, observations, twist, estimator.cameras.delays)
-        self._last = fit, observations, pyramids
+        self._last = fit, observations, pyramids, estimator.sound(fit)
 
     def keep(self, matcher: Matcher, estimator: Estimator) -> None:
         """Once a frame set, when no pose waits: put what is due into force, ask for what comes next."""
+        if self._last is not None:
+            fit, _, pyramids, sound = self._last
+            if not sound and not self._shown(matcher, fit, pyramids):
+                self._refiner.withdraw()
+                self._last = None
         bends = estimator.deforms and (self._bent or self._taken > CROOKED)
         refined = self._refiner.freeze() if bends else self._refiner.poll()
         if refined is not None:
@@ -174,7 +180,7 @@ class Mapping:
             self._probation = Probation(found, amid(found, matcher.map, distance))
         if self._last is None:
             return
-        (fit, observations, pyramids), self._last = self._last, None
+        (fit, observations, pyramids, _), self._last = self._last, None
         lacking = any(fit.used[c] < SHARE * self._wanted[c] for c in pyramids)
         if self._probation is not None and self._refiner.kept:
             self._prove(self._probation, matcher, estimator, fit, observations, pyramids)
@@ -182,6 +188,11 @@ class Mapping:
             warp = None if estimator.pose is None else estimator.pose.warp
             look = self._look(matcher, fit, observations, pyramids, warp)
             self._growth.ask(look_for_more, self._lenses.rig, look, matcher.map)
+
+    def _shown(self, matcher: Matcher, fit: Fit, pyramids: dict[int, Pyramid]) -> bool:
+        """Whether a camera shows most of what it has in view: few tracks are no fault where little is to be seen."""
+        view = matcher.in_view(list(pyramids), fit.solution.base_from_surface)
+        return any(fit.used[c] >= max(LEAST, SHOWN * min(count, WANTED)) for c, count in view.items())
 
     def _look(
         self, matcher: Matcher, fit: Fit, observations: Observations, pyramids: dict[int, Pyramid], warp: Warp | None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -99,6 +99,13 @@ class Matcher:
     def seen(self, camera: int) -> int:
         """How many landmarks a camera last saw."""
         return len(self._views[camera].rows) if camera in self._views else 0
+
+    def in_view(self, cameras: Sequence[int], base_from_surface: Array) -> dict[int, int]:
+        """How many landmarks each camera would see at a pose (4, 4), were nothing before them."""
+        rows = np.nonzero(self.agrees)[0]
+        poses, axes = np.broadcast_to(base_from_surface, (len(cameras), 4, 4)), self.templates.axes[rows]
+        where = project_into(self.lenses, cameras, poses, self.map.points[rows], self.map.normals[rows], axes)
+        return dict(zip(cameras, where.visible.reshape(len(cameras), -1).sum(1).tolist(), strict=True))
 
     def doubt(self, base_from_surface: Array, covariance: Array) -> float:
         """How far off, px, one standard deviation, a pose with a covariance (6, 6) puts the landmarks in the images.

@@ -206,7 +206,7 @@ class TrackingStep:
             self._lost = {c: pyramids[c] for c in self._missing(fit, pyramids)}
             self._absent = 0
             pose = estimator.accept(fit, observations)
-            if estimator.sound(fit):
+            if not fit.odd:
                 self._mapping.offer(fit, observations, pose.twist, estimator, pyramids)
             matcher.remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)
         else:
