@@ -27,6 +27,8 @@ def clock_section(table: PoseTable, span: tuple[float, float], width: int) -> st
         keys.append(line_key(f"series c{i % 5}", f"{name}, at the end {at_end}"))
     text = (
         "How much later than stamped each camera exposes, against the mean of all, and one standard deviation. It "
-        "shows where the surface moves, and is corrected once it is clearly there; until then a line stays at zero."
+        "shows where the surface moves, and is corrected once it is clearly there."
     )
-    return section("Clocks", text, legend(keys) + plot.svg())
+    if not np.nan_to_num(offsets).any():
+        return section("Clocks", f"{text} Here chance explains what was seen, and nothing was corrected.", legend(keys))
+    return section("Clocks", f"{text} Until then a line stays at zero.", legend(keys) + plot.svg())

@@ -24,9 +24,10 @@ def motion_section(table: PoseTable, span: tuple[float, float], width: int) -> s
         plot.dots(onsets, np.zeros(len(onsets)), "off", 3)
     share = float(np.mean(table.moving[table.measured])) if table.measured.any() else float("nan")
     still = "was never at rest" if share == 1 else f"moved in {100 * share:.0f} % of the measured frame sets"
+    began = {0: "no movement was seen to begin", 1: "one movement was seen to begin"}
     text = (
-        f"The surface {still}; {len(onsets)} times it began to move. A movement is 0.3 mm or 0.1°, and a dot "
-        "marks the first pose of each."
+        f"The surface {still}; {began.get(len(onsets), f'{len(onsets)} movements were seen to begin')}. A movement is "
+        "0.3 mm or 0.1°, and a dot marks the first pose of each."
     )
     keys = [line_key("estimate", "middle of the surface since it was last at rest")]
     return section("Motion", text, legend(keys) + plot.svg())

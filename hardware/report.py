@@ -85,7 +85,7 @@ def _states(result: Evaluation) -> str:
     keys = [area_key(name, f"{name} {percent(share)}") for name, share in result.shares.items() if share > 0]
     text = "TRACKING and DEGRADED are measured, COASTING is predicted, LOST is of no use."
     if math.isfinite(result.since):
-        text += f" Shares count from {result.since:.2f} s, the instant of the roi."
+        text += f" Shares count from {round(result.since, 2) + 0.0:.2f} s, the instant of the roi."
     return section("States", text, strip + legend(keys) + _events(result))
 
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from estimation import se3
+from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.state_machine import StateSettings
 from estimation.synthetic.first_map import triangulated
-from estimation.synthetic.follow import Follower, beginning, follow
+from estimation.synthetic.follow import Follower, Mapping, beginning, follow
 from estimation.synthetic.world import World, synthetic_world
 from hardware.bench.pooled import pooled
 
@@ -90,3 +91,11 @@ def test_where_nothing_is_seen_nothing_is_known() -> None:
     run = follow(synthetic_world("still", seconds=0.5, outages=((0.2, 0.3),)))
     assert np.array_equal(np.isinf(run.bounds).all(axis=(1, 2)), ~run.measured)
     assert np.isfinite(run.filtered_bounds()).all()
+
+
+@pytest.mark.parametrize("mapping", ["told", "seen"])
+def test_a_world_too_short_to_be_judged_says_so(mapping: Mapping) -> None:
+    with pytest.raises(InputError, match="length = '6 frame sets', allowed 7 or more"):
+        follow(synthetic_world(seconds=6 / 30), mapping)
+    judged = follow(synthetic_world(seconds=7 / 30), mapping)
+    assert len(judged.poses) == 2 and judged.filtered_bounds().shape == (2, 6, 6)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.adjustment import Adjusted
+from estimation.errors import InputError
 from estimation.estimator import Estimator
 from estimation.fit import Fit
 from estimation.observations import Observations
@@ -18,10 +19,12 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.refiner import Refiner
 from estimation.rig import Rig
 from estimation.se3 import Array
+from estimation.state_machine import StateSettings
 from estimation.synthetic.bound import filtered_bound, pose_bound, pose_information
 from estimation.synthetic.first_map import Triangulated, triangulated
 from estimation.synthetic.world import World
 
+LEAST = StateSettings().first + 3  # frame sets: the map's, those averaged into the first pose, and two to be judged
 Mapping = Literal["told", "seen"]  # the world's own map; or one that is triangulated from the first look and refined
 
 
@@ -198,7 +201,9 @@ def steps(world: World, mapping: Mapping = "told", clock: Callable[[], float] = 
 
 
 def follow(world: World, mapping: Mapping = "told", clock: Callable[[], float] = lambda: 0.0) -> Followed:
-    """Run the estimator over the whole world."""
+    """Run the estimator over the whole world; InputError where that is too short to be judged."""
+    if len(world) < LEAST:
+        raise InputError("synthetic world", "length", f"{len(world)} frame sets", f"{LEAST} or more to be followed")
     every = list(steps(world, mapping, clock))
     given = next((i for i, step in enumerate(every) if step.pose.state.measured), 0)
     begun, rest = every[given], every[given + 1 :]
@@ -216,5 +221,5 @@ def follow(world: World, mapping: Mapping = "told", clock: Callable[[], float] =
         twists=world.twists(stamps) @ se3.adjoint(se3.inverse(true_from_estimated)).T,
         informations=np.stack(informations),
         frame=pose_bound(first),
-        offsets=rest[-1].offsets if rest else begun.offsets,
+        offsets=rest[-1].offsets,
     )

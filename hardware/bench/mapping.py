@@ -13,6 +13,7 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.bench.figure import Figure, Target, at_least, at_most
+from hardware.bench.pooled import nees
 from hardware.bench.registration import shape_of
 from hardware.simulator.bodies import Wound, with_wound
 from hardware.simulator.instant import Instant
@@ -21,10 +22,13 @@ from hardware.simulator.render import render
 from hardware.simulator.scene import Scene, rois
 from hardware.simulator.sensor import Sensor
 from hardware.simulator.shape import Shape, cylinder, flat
+from perception.alignment import RELIEF
 from perception.frames import Frame, FrameSet
 from perception.tracking import TrackingStep
 
 RATE = 10.0  # frame sets a second: key frames are further apart
+DISTANCE, FOCAL = 400.0, 1100.0  # mm, px: of the cameras before the still standing surfaces
+PIXEL = DISTANCE / FOCAL  # mm
 HONEST = Target(0.3, 2.0)  # of an error's size against its claim
 FORGOTTEN = 5.0  # sigmas: a landmark beyond, which the pose solver leaves out, is none
 
@@ -81,17 +85,31 @@ def heights(shape: Shape, surface_map: SurfaceMap, true_from_estimated: Array) -
 def _map_errors(name: str, shape: Shape, stamps: Array) -> list[Figure]:
     up = 2 * (1 - np.cos(2 * np.pi * 0.25 * stamps))
     poses = REST @ se3.exp(up[:, None] * np.array([0.015, 0.01, 0.0, 0.2, 0.3, 1.0]))
-    result = ran(shape, Look(), (1280, 720), 1100.0, poses, stamps)
+    result = ran(shape, Look(), (1280, 720), FOCAL, poses, stamps)
     figures = []
     for when, number in (("confirmed", 1), ("refined", -1)):
         change = se3.inverse(poses[number]) @ result.poses[number].base_from_surface
         off, claimed = heights(shape, result.maps[number], change)
+        claimed = np.hypot(claimed, RELIEF * PIXEL)  # what all tracks of a patch share is in no covariance of poses
         kept = np.abs(off) < FORGOTTEN * max(0.1, float(np.median(claimed)))
         size = float(np.median(np.abs(off[kept]) / claimed[kept]) / 0.6745)
         note = f"{len(off)} landmarks, {np.mean(off[kept]):+.3f} mm in the mean"
         figures.append(Figure(f"{name}, {when}: off the surface", float(np.median(np.abs(off))), "mm", None, "", note))
         figures.append(Figure(f"{name}, {when}: of what is claimed", size, "", HONEST))
-    return figures
+    return [
+        *figures,
+        Figure(f"{name}: squared error of poses, of what is claimed", _of_claim(result), "", at_most(1.25)),
+    ]
+
+
+def _of_claim(result: Ran) -> float:
+    """NEES/6 of the poses after the first one given out: what map and tracks are off by alike is no error of theirs."""
+    first = next(i for i, pose in enumerate(result.poses) if pose.state.measured)
+    later = result.poses[first + 1 :]
+    change = se3.inverse(result.true[first]) @ result.poses[first].base_from_surface
+    estimated = np.stack([pose.base_from_surface for pose in later])
+    errors = se3.log(se3.inverse(estimated) @ result.true[first + 1 :] @ change)
+    return float(nees(errors, np.stack([pose.covariance for pose in later])).mean() / 6)
 
 
 def _passing() -> list[Figure]:
