@@ -49,6 +49,7 @@ class CameraHealth:
         self._missed = np.zeros(count, np.int64)  # frame sets in a row
         self._agreed = np.zeros(count, np.int64)
         self._apart = np.zeros(count, bool)
+        self._blurred = False  # all cameras stand off together
         self._stamp = np.nan
 
     def pictures(self, fresh: Collection[int], repeated: Collection[int]) -> None:
@@ -62,6 +63,10 @@ class CameraHealth:
     def hidden(self, used: NDArray[np.int64]) -> bool:
         """Whether every camera shows so much less than usual that these (C,) tracks prove nothing."""
         return bool((used < self.settings.least_share * self._tracks)[self._tracks > 0].all() and self._tracks.any())
+
+    def forgive(self) -> None:
+        """No camera is left out any more."""
+        self.left_out = frozenset()
 
     def clear(self, used: NDArray[np.int64]) -> bool:
         """Whether two cameras, or all that there are, carry a pose with these (C,) tracks about as they usually do."""
@@ -103,12 +108,14 @@ class CameraHealth:
         agrees = off < self.settings.back * allowed  # false where unknown
         self._agreed = np.where(agrees, self._agreed + 1, 0)
         self._apart = off > self.settings.out * allowed
+        self._blurred = bool(self.doubted(off, allowed, odd).any())
         self._off = np.where(np.isfinite(off), off, self._off)
         self.left_out = frozenset(c for c in odd if self._agreed[c] < self.settings.looks)
 
     def trouble(self, stamp: float, at_once: bool = False) -> str:
-        """The cameras that are missed, and why, or ''. at_once: also those that only just failed."""
-        return ", ".join(f"{self._names[c]} {self._why(c)}" for c in self._troubled(stamp, at_once))
+        """The cameras that are missed, and why, or that all look odd; or ''. at_once: also those that only just failed."""
+        said = [f"{self._names[c]} {self._why(c)}" for c in self._troubled(stamp, at_once)]
+        return ", ".join(said or ["no camera shows the surface as usual"] * self._blurred)
 
     def _troubled(self, stamp: float, at_once: bool) -> list[int]:
         late = (self._missed >= 2) & (stamp - self._carried > self.settings.away)

@@ -133,6 +133,8 @@ class Estimator:
         found = int((~np.isin(seen.camera, list(odd))).sum())
         claimed = known.noise + known.smear + known.lasting
         reason = self._judge(found, used, claimed, disorder(seen, solution, inlier))
+        if not reason and self._against_all(seen, odd, solution):
+            reason = "one camera alone, against the others and the motion"
         off = standing_off(seen, solution, len(self.rig), self._camera_least())
         doubted = known.bias * np.repeat(self.health.doubted(off, allowed, odd), 2)
         knowledge = solution, known.noise, known.smear, known.lasting + doubted @ doubted.T, twist, doubt, known.bias
@@ -172,6 +174,13 @@ class Estimator:
             if found is not None:
                 return found[1], found[0]
         return solution, odd
+
+    def _against_all(self, seen: Observations, odd: frozenset[int], solution: PoseFit) -> bool:
+        """Whether a single camera is left, the others contradict it, and the motion expects something else."""
+        if not odd or self._pose is None or self._pose.state is TrackState.LOST:
+            return False
+        out = np.isin(np.unique(seen.camera), list(odd))
+        return bool(out.any() and (~out).sum() == 1 and surprise(solution, self._pose.predict(seen.stamp)) > SURER)
 
     def _twist(self, stamp: float, start: Array) -> tuple[Array, Array]:
         """Velocity (6,) at `stamp` and its variance (6,): the window's and the chord's to `start`, as each is known."""
@@ -284,7 +293,7 @@ class Estimator:
                 sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
                 self._warp.learn(observations, fit.solution, sigma, fit.twist, self.cameras.delays.sigma)
         self._accepted += 1
-        self._detector(fit.stamp, fit.solution.base_from_surface, fit.covariance)
+        self._detector(fit.stamp, fit.solution.base_from_surface, fit.noise)
         self._heed(fit)
         lasting = fit.lasting + self._calibration(fit)
         seen = Measurement(
@@ -311,7 +320,8 @@ class Estimator:
 
     def _heed(self, fit: Fit) -> None:
         used = fit.used if fit.measured else np.zeros_like(fit.used)
-        self.health.update(fit.stamp, used, self._camera_least(), fit.off, fit.allowed, fit.odd)
+        odd = fit.odd if fit.measured else fit.odd & self.health.left_out  # what is no measurement accuses nobody
+        self.health.update(fit.stamp, used, self._camera_least(), fit.off, fit.allowed, odd)
 
     def _enter(
         self, stamp: float, pose: Array, noise: Array, smear: Array, lasting: Array, state: TrackState, reason: str
@@ -350,7 +360,8 @@ class Estimator:
         trouble = self.health.trouble(fit.stamp, at_once=True)
         state, reason = self._states.missed(fit.stamp, f"{fit.reason}; {trouble}" if trouble else fit.reason)
         predicted, lost = self._measured.predict(fit.stamp), state is TrackState.LOST
-        if lost:  # a velocity that old would carry the pose away
+        if lost:  # a velocity that old would carry the pose away, and which camera was wrong is as old
+            self.health.forgive()
             stays = self._measured.predict(self._measured.stamp + self.settings.states.coast)
             predicted = replace(predicted, base_from_surface=stays.base_from_surface, twist=np.zeros(6), forecast=None)
         self._pose = replace(predicted, state=state, reason=reason)

@@ -28,3 +28,18 @@ def test_shape_and_clocks_are_learned_only_where_two_cameras_see_about_as_much_a
     alone = CameraHealth(["a"])
     alone.update(0.0, np.array([50]), 10, np.zeros(1), np.ones(1), ())
     assert alone.clear(np.array([20])) and not alone.clear(np.array([10]))
+
+
+def test_images_that_all_stand_off_are_said_to() -> None:
+    health = CameraHealth(["a", "b"])
+    for off, said in ((np.array([0.1, 0.9]), ""), (np.array([0.9, 0.8]), "no camera shows the surface as usual")):
+        health.update(0.0, np.array([50, 50]), 10, off, np.full(2, 0.25), ())
+        assert health.trouble(0.0) == said
+
+
+def test_a_lost_surface_forgives_all_cameras() -> None:
+    health = CameraHealth(["a", "b"])
+    health.update(0.0, np.array([50, 0]), 10, np.array([0.1, 5.0]), np.full(2, 0.25), {1})
+    assert health.left_out == {1}
+    health.forgive()
+    assert not health.left_out

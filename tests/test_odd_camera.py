@@ -61,3 +61,13 @@ def test_a_jerk_of_the_surface_is_followed_by_all_cameras(size: float) -> None:
         fit = estimator.fit(look(lambda stamp, pose=jerked: pose, NEXT, 1), estimator.predict(NEXT))  # type: ignore[misc]
         assert fit.measured and not fit.odd
         assert np.linalg.norm(fit.solution.base_from_surface[:3, 3] - jerked[:3, 3]) < 0.15
+
+
+def test_one_camera_against_the_others_and_the_motion_is_no_measurement() -> None:
+    """Matches by chance in one camera agree with each other; where the others contradict them, a pose is not more."""
+    estimator = followed()
+    estimator.health.left_out = frozenset({1, 2})
+    far = breathing(NEXT) @ se3.exp(np.array([0, 0, 0, 6.0, -4.0, 0]))
+    for cameras, there, measured in (((0, 1, 2), far, False), ((0,), far, True), ((0, 1, 2), breathing(NEXT), True)):
+        seen = look(lambda stamp, pose=there: pose, NEXT, 1, cameras=cameras)  # type: ignore[misc]
+        assert estimator.fit(seen, there).measured is measured
