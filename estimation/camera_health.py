@@ -113,7 +113,7 @@ class CameraHealth:
         self.left_out = frozenset(c for c in odd if self._agreed[c] < self.settings.looks)
 
     def trouble(self, stamp: float, at_once: bool = False) -> str:
-        """The cameras that are missed, or that all look odd, and why; or ''. at_once: also those that only just failed."""
+        """Which cameras are missed, or that all look odd, and why; or ''. at_once: also those that only just failed."""
         said = [f"{self._names[c]} {self._why(c)}" for c in self._troubled(stamp, at_once)]
         return ", ".join(said or ["no camera shows the surface as usual"] * self._blurred)
 
