@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,10 +10,11 @@ import numpy as np
 from hardware.bench.outage_judge import Verdict
 from hardware.bench.outage_run import Watched
 from hardware.chart import Plot, ribbon
-from hardware.page import document, legend, line_key, section
+from hardware.page import area_key, document, legend, line_key, section
 from hardware.simulator.outage import Kind
 
 WIDTH, LEAST = 900, 1e-3  # px; mm, where the logarithmic axis begins
+MOST = 3  # reasons that are shown of each
 WORST = 12  # outages that went worst are shown after one of each kind
 
 
@@ -38,11 +40,15 @@ def _one(watched: Watched, verdict: Verdict) -> str:
     edges = np.append(stamps, stamps[-1] + (stamps[-1] - stamps[-2]))
     titles = [f"{s.value} {r}" for s, r in zip(watched.states, watched.reasons, strict=True)]
     strip = ribbon(edges, [s.value for s in watched.states], titles, span, WIDTH)
-    keys = legend([line_key("estimate", "error, mm"), line_key("truth", "claimed for 95 %, mm")])
+    lines = [line_key("estimate", "error, mm"), line_key("truth", "claimed for 95 %, mm")]
+    areas = [area_key("holding", "the outage"), *(area_key(s.value, s.value) for s in dict.fromkeys(watched.states))]
+    keys = legend([*lines, *areas])
     cameras = ", ".join(f"cam_{c}" for c in outage.cameras)
     text = (
         f"{cameras}, {outage.end - outage.start:.2f} s; flagged after {1000 * verdict.flagged:.0f} ms, back after "
         f"{1000 * verdict.back:.0f} ms at {verdict.after:.3f} mm; time in s from its beginning"
     )
-    reasons = list(dict.fromkeys(r for r in watched.reasons if r))[:3]
-    return section(outage.kind.value, f"{text}. {'; '.join(reasons)}", keys + strip + plot.svg())
+    # of reasons that differ in their figures only, the first
+    reasons = {re.sub(r"(?<!_)\d", "", reason): reason for reason in reversed(watched.reasons) if reason}
+    said = " / ".join(list(reversed(reasons.values()))[:MOST]) or "nothing"
+    return section(outage.kind.value, f"{text}. Said: {said}", keys + strip + plot.svg())
