@@ -96,19 +96,14 @@ class WarpFilter:
         self._points = surface_map.points
 
     def _map_told(self, error: Array, doubt: Array) -> None:
-        """The map's error was `error` (M,), known to `doubt` (M, M); what it was taken for follows from that.
+        """The map's error was `error` (M,), and what is left of it is known to `doubt` (M, M).
 
-        The sum of both vectors is known, and what of it is deformation is in doubt by as much as the map was wrong.
+        The sum of both vectors is what was seen, so the rest of it was deformation.
         """
         count = len(error)
-        assert self._modes is not None
-        doubtful = float(error @ error) * np.diag(self._modes.share)
-        self._covariance = self._covariance + np.block([[doubtful, -doubtful], [-doubtful, doubtful]])
-        across = self._covariance[:, count:]
-        gain = np.linalg.solve(self._covariance[count:, count:] + doubt, across.T).T
-        self._state = self._state + gain @ (error - self._state[count:])
-        covariance = self._covariance - gain @ across.T
-        self._covariance = (covariance + covariance.T) / 2
+        total, spread = self._state[:count] + self._state[count:], _sum(self._covariance, count)
+        self._state = np.concatenate([total - error, error])
+        self._covariance = np.block([[spread + doubt, -doubt], [-doubt, doubt]])
 
     def learn(self, observations: Observations, fit: PoseFit, sigma: Array, twist: Array, skew: float) -> None:
         """Take the residuals of a fit to `points`. sigma: (N,) px.
