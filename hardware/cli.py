@@ -1,4 +1,4 @@
-"""The command line: stillbed simulate, track, replay, arm, import, export, bench. Imports lazily: help is instant."""
+"""The command line: stillbed simulate, track, segment, replay, train, bench and others. Imports lazily."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from estimation.errors import StillbedError
 from hardware.bench.command import add_bench
 from hardware.methods import MAP, METHODS
+from hardware.wound_commands import add_segment, add_train
 
 if TYPE_CHECKING:
     from hardware.progress import Progress
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 MISSED = 1  # a simulation that ran to its end and did not reach its own limits
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
 WRONG_INPUT = 2
+NAMED = 20  # files of an interrupted command that are told by name; of more, the count is
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,6 +60,8 @@ def kept(out: Path | None) -> str:
         return "nothing was to be written"
     if out.is_dir():
         names = sorted(file.name for file in out.iterdir())
+        if len(names) > NAMED:
+            return f"kept in {out}: {len(names)} files"
         return f"kept in {out}: {', '.join(names)}" if names else f"nothing was written to {out}"
     if out.exists():
         return f"kept {out}, readable up to its last whole chunk"
@@ -75,10 +79,12 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(metavar="COMMAND", required=True)
     _add_simulate(commands)
     _add_track(commands)
+    add_segment(commands)
     _add_replay(commands)
     _add_arm(commands)
     _add_import(commands)
     _add_export(commands)
+    add_train(commands)
     add_bench(commands)
     return top
 
@@ -169,6 +175,7 @@ def _add_track(commands: Commands) -> None:
         default="none",
         help="done to each picture first: the thesis's bilateral filter (4.6), 50 ms a picture",
     )
+    command.add_argument("--wound", action="store_true", help="also segment the wound beside it, into wound.csv")
     command.add_argument("--record", type=Path, metavar="X.mcap", help="also record images, tracks and poses as MCAP")
     command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     command.set_defaults(run=_track)
@@ -250,7 +257,7 @@ def _track(arguments: argparse.Namespace) -> None:
 
     tool = None if arguments.arm is None else read_arm(arguments.arm).tool
     a = arguments
-    print(run_track(a.session, a.out, a.record, a.force, a.method, tool, a.prefilter))
+    print(run_track(a.session, a.out, a.record, a.force, a.method, tool, a.prefilter, a.wound))
 
 
 def _replay(arguments: argparse.Namespace) -> None:

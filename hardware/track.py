@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -23,6 +23,9 @@ from hardware.summary import summary_text, write_summary
 from hardware.track_recorder import TrackRecorder
 from perception.frames import FrameSet
 from perception.tracking import STAGES, StepReport
+
+if TYPE_CHECKING:
+    from hardware.wound_file import WoundFile
 
 
 class Step(Protocol):
@@ -82,6 +85,15 @@ def finish(out: Path, session: Session, complete: bool, method: str = MAP) -> st
     return summary_text(result)
 
 
+def _wound_file(out: Path, session: Session) -> WoundFile:
+    from hardware.wound_file import WoundFile  # loads onnxruntime
+    from perception.segmentation import NetworkSegmenter
+    from perception.wound_network import WoundNetwork, shipped
+
+    network = WoundNetwork(shipped(), threads=1)  # the other core is the tracker's
+    return WoundFile(out, session.rig, NetworkSegmenter(network, network.settings))
+
+
 def run_track(
     path: Path,
     out: Path,
@@ -90,12 +102,14 @@ def run_track(
     method: str = MAP,
     tool: Array | None = None,
     prefilter: str = "none",
+    wound: bool = False,
 ) -> str:
     """Track the session at `path` into the folder `out`; returns the summary as text.
 
     method: a key of METHODS. tool: (K, 2) mm, profile of what hangs on the session's arm, as `ArmProfile.tool`; None
-    for the usual one. prefilter: a key of perception.prefilter.PREFILTERS. Whatever ends the run early, a fault of the
-    input or Ctrl-C, leaves poses and a report of all frame sets until then.
+    for the usual one. prefilter: a key of perception.prefilter.PREFILTERS. wound: whether the wound is segmented
+    beside it, into wound.csv. Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of
+    all frame sets until then.
     """
     session = open_session(path)
     prepare_out(out, force)
@@ -106,6 +120,8 @@ def run_track(
         follows = step_by(method, session.rig, session.roi, session.surface, clock.now, tool, prefilter)
         step = stack.enter_context(follows)
         sinks = [] if record is None else [stack.enter_context(TrackRecorder(record, session, force)).write]
+        if wound:
+            sinks.append(stack.enter_context(_wound_file(out, session)).write)
         writer = stack.enter_context(PoseWriter(out, cameras, STAGES))
         progress = stack.enter_context(Progress("track", "frame sets", clock.now))
         try:

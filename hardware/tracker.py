@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
@@ -15,6 +15,7 @@ from perception.frames import Roi
 from perception.prefilter import NONE, PREFILTERS
 from perception.tool import Tool
 from perception.tracking import TrackingStep
+from perception.wound_first import WoundFirst
 
 
 @contextmanager
@@ -25,12 +26,13 @@ def tracker(
     now: Callable[[], float] = lambda: 0.0,
     tool: Array | None = None,
     prefilter: str = NONE,
-) -> Iterator[TrackingStep]:
+) -> Iterator[TrackingStep | WoundFirst]:
     """TrackingStep for these cameras; the map is refined in a process of its own, as GTSAM holds the interpreter.
 
-    roi: where the surface is at the start. surface: the scan's file, mm; InputError where it cannot be read. now: s,
-    only to say how long the stages take. tool: (K, 2) mm, profile of what hangs on the arm, as `ArmProfile.tool`.
-    prefilter: a key of PREFILTERS.
+    roi: where the surface is at the start; without one the wound is looked for first, by the network that comes along,
+    and where it sees none the whole pictures are the surface. surface: the scan's file, mm; InputError where it cannot
+    be read. now: s, only to say how long the stages take. tool: (K, 2) mm, profile of what hangs on the arm,
+    as `ArmProfile.tool`. prefilter: a key of PREFILTERS.
     """
     scan = None
     if surface is not None:
@@ -39,8 +41,21 @@ def tracker(
         scan = read_mesh(surface).scan
     with ProcessPoolExecutor(1, get_context("spawn"), _leave_interrupts) as executor:
         executor.submit(int).result()  # started before the first frame set, not beside it
-        step = TrackingStep(rig, roi, now, executor, scan, None if tool is None else Tool(tool), PREFILTERS[prefilter])
-        yield step
+
+        def made(found: Sequence[Roi]) -> TrackingStep:
+            held = None if tool is None else Tool(tool)
+            return TrackingStep(rig, found, now, executor, scan, held, PREFILTERS[prefilter])
+
+        if roi:
+            yield made(roi)
+            return
+        from perception.segmentation import NetworkSegmenter  # loads onnxruntime, which a known region does not need
+        from perception.wound_network import WoundNetwork, shipped
+
+        network = WoundNetwork(shipped(), threads=1)  # the other core is the tracker's
+        with ThreadPoolExecutor(1) as thread:
+            segmenter = NetworkSegmenter(network, network.settings)
+            yield WoundFirst(rig, made, segmenter, thread)
 
 
 def _leave_interrupts() -> None:

@@ -16,8 +16,10 @@ FLOORS = {"estimation": 0, "perception": 1, "planning": 1, "hardware": 2}
 OWNERS = {  # library: the files that may import it
     "cv2": ("perception/*.py", "hardware/images.py", "hardware/simulator/*.py"),
     "gtsam": ("estimation/*.py",),
-    "numba": ("estimation/compiled.py",),
+    "matplotlib": ("perception/training/*.py",),
     "mcap": ("hardware/mcap_walk.py", "hardware/recording.py", "hardware/recording_file.py"),
+    "numba": ("estimation/compiled.py",),
+    "onnx": ("perception/training/*.py",),
     "onnxruntime": ("perception/*.py",),
     "open3d": ("hardware/mesh_file.py",),
     "pytest": ("estimation/synthetic/plugin.py",),
@@ -25,6 +27,7 @@ OWNERS = {  # library: the files that may import it
     "serial": ("hardware/*.py",),
     "time": ("hardware/clock.py",),
     "toppra": ("planning/*.py",),
+    "torch": ("perception/training/*.py",),
 }
 ABSENT = {"time", "pytest"}  # the standard library's; and pytest loads its plugin itself
 FREE = {"numpy", "scipy"}  # arrays are everywhere
@@ -77,7 +80,7 @@ def test_every_dependency_is_imported_by_someone_and_declared() -> None:
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     packages = {"opencv-python-headless": "cv2", "open3d-cpu": "open3d", "pyserial": "serial"}
-    declared = {line.split(">")[0] for line in project["dependencies"]}
+    declared = {line.split(">")[0] for line in project["dependencies"] + project["optional-dependencies"]["train"]}
     declared = {packages.get(name, name) for name in declared}
     assert set.union(*map(roots, FILES)) & {*OWNERS, *FREE} - ABSENT <= declared
 

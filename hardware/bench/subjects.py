@@ -43,6 +43,9 @@ SUBJECTS: Subjects = {
     "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?"),
     "registration": Subject("hardware.bench.registration", "a scan laid into the first pictures: error and verdict"),
     "prediction": Subject("hardware.bench.prediction", "where a breathing chest will be, 100 to 500 ms ahead"),
+    "segmentation": Subject(
+        "hardware.bench.segmentation", "finding the wound: Dice, silence, a half covered one, time"
+    ),
     "steps": Subject("hardware.bench.steps", "movements of 300 um and 0.1 degree: how soon flagged, how often falsely"),
     "tracks": Subject("hardware.bench.tracks", "scatter and creep of tracks before a surface that stands still"),
     "views": Subject("hardware.bench.views", "skin that deforms, grazing views with glare, a cube's edges"),

@@ -1,0 +1,1 @@
+"""Training of the wound networks; needs the extra `[train]` (torch), which nothing else in the project imports."""

@@ -1,0 +1,191 @@
+"""The network that comes along: it is the one its settings belong to, finds wounds, and keeps silent about skin."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation import se3
+from estimation.errors import InputError
+from estimation.pose import SurfacePose, TrackState
+from estimation.rig import Rig
+from hardware.bench.segmentation import add_options, judged_by, run
+from hardware.bench.subjects import SUBJECTS
+from hardware.cli import main
+from hardware.simulator.wound_views import WoundView, inside, wound_view
+from hardware.wound_file import FILE, WoundFile
+from perception.dice import dice
+from perception.frames import Frame, FrameSet
+from perception.segmentation import NetworkSegmenter, centroid
+from perception.tracking import StepReport, trusting_report
+from perception.training.dataset import Labelled, read_dataset
+from perception.wound_network import MODEL, WoundNetwork, hash_of, read_settings, shipped
+from tests.test_segmentation import disc
+
+DATA = Path(__file__).parent.parent.parent / "shared" / "data" / "fuseg"
+
+
+@pytest.fixture(scope="module")
+def segmenter() -> NetworkSegmenter:
+    network = WoundNetwork(shipped(), 1)
+    return NetworkSegmenter(network, network.settings)
+
+
+@pytest.fixture(scope="module")
+def views() -> list[WoundView]:
+    return [wound_view(seed) for seed in range(4)]
+
+
+def test_rendered_wounds_are_found_and_their_masks_are_exact(
+    segmenter: NetworkSegmenter, views: list[WoundView]
+) -> None:
+    for view in views:
+        found = segmenter(view.image)
+        assert dice(found.mask, view.wound) > 0.7
+        assert np.linalg.norm(centroid(found.mask) - centroid(view.wound)) < 8
+    redness = [float(v.image[v.wound][:, 2].mean() - v.image[v.wound][:, 1].mean()) for v in views]
+    assert min(redness) > 20
+
+
+def test_rendered_healthy_skin_shows_no_wound(segmenter: NetworkSegmenter) -> None:
+    for seed in range(3):
+        view = wound_view(seed, wounded=False)
+        assert not view.wound.any() and view.area == 0
+        assert not segmenter(view.image).found
+
+
+def test_the_network_answers_the_same_on_one_thread_and_on_two(views: list[WoundView]) -> None:
+    one, two = (WoundNetwork(shipped(), threads) for threads in (1, 2))
+    first, second = (NetworkSegmenter(each, each.settings)(views[0].image) for each in (one, two))
+    assert np.array_equal(first.mask, second.mask)
+
+
+def test_a_network_of_other_bytes_than_its_settings_say_is_refused(tmp_path: Path) -> None:
+    for suffix in (".onnx", ".toml"):
+        shutil.copy(shipped(suffix=suffix), tmp_path / f"x{suffix}")
+    WoundNetwork(tmp_path / "x.onnx", 1)
+    with (tmp_path / "x.onnx").open("ab") as stream:
+        stream.write(b"\0")
+    with pytest.raises(InputError, match="sha256"):
+        WoundNetwork(tmp_path / "x.onnx", 1)
+
+
+def test_what_is_wrong_with_a_network_is_told_by_its_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        WoundNetwork(tmp_path / "gone.onnx")
+    bad = tmp_path / "bad.onnx"
+    bad.write_bytes(b"no network")
+    with pytest.raises(InputError, match="settings"):
+        WoundNetwork(bad)
+    for extra, match in (("", "network"), ("edge = true", "edge"), ("colour = 3", "colour"), ("[looks]\nx = 1", "x")):
+        bad.with_suffix(".toml").write_text(f'sha256 = "{hash_of(bad)}"\n{extra}\n', encoding="utf-8")
+        with pytest.raises(InputError, match=match):
+            WoundNetwork(bad)
+
+
+def test_settings_without_a_word_are_the_usual_ones(tmp_path: Path) -> None:
+    (tmp_path / "x.toml").write_text('sha256 = "abc"\n[looks]\nwindow = 0\n', encoding="utf-8")
+    settings = read_settings(tmp_path / "x.toml", "abc")
+    assert settings.looks.window == 0 and settings.edge == 0.5
+
+
+def test_the_true_mask_of_a_disc_has_the_discs_area() -> None:
+    angle = np.linspace(0, 2 * np.pi, 300, endpoint=False)
+    rim = np.column_stack([50 + 20.3 * np.cos(angle), 40 + 20.3 * np.sin(angle)])
+    assert inside([rim], (100, 80)).sum() == pytest.approx(np.pi * 20.3**2, rel=0.02)
+    assert not inside([], (100, 80)).any()
+
+
+class Red:
+    """Finds what is red."""
+
+    def __call__(self, image: np.ndarray) -> object:
+        from perception.segmentation import Segmentation
+
+        return Segmentation(image[..., 2].astype(int) - image[..., 1] > 60, 0.9, 0.7)
+
+
+def test_the_file_of_a_run_holds_each_cameras_wound_and_its_area_once_the_surface_is_tracked(tmp_path: Path) -> None:
+    view = wound_view(0)
+    rig = Rig((view.camera,))
+    image = np.zeros_like(view.image)
+    image[view.wound] = (20, 20, 200)
+    pose = SurfacePose(0.0, view.base_from_surface, np.eye(6), np.zeros(6), TrackState.TRACKING)
+    with WoundFile(tmp_path, rig, Red()) as file:
+        for number in range(8):
+            stamp = number / 30
+            now = SurfacePose(stamp, pose.base_from_surface, pose.covariance, pose.twist, pose.state)
+            file.write(FrameSet(stamp, (Frame(0, stamp, image),)), now, report())
+    with (tmp_path / FILE).open(newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [float(row["stamp_s"]) for row in rows] == pytest.approx([0, 0.1], abs=1e-5)
+    # A plane stands for a bed some mm deep, and for a body that is curved
+    assert float(rows[0]["area_mm2"]) == pytest.approx(view.area, rel=0.12)
+    assert rows[0]["camera"] == view.camera.name and rows[0]["wound"] == "1"
+
+
+def report() -> StepReport:
+    from estimation.observations import no_observations
+
+    return trusting_report(no_observations(0.0), np.zeros(1, np.int64), np.zeros(5))
+
+
+def test_the_bench_judges_by_what_was_held_out_of_the_networks_own_data_and_by_all_of_another(tmp_path: Path) -> None:
+    names = shipped(f"{MODEL}_held_out", ".txt").read_text(encoding="utf-8").split()
+    empty = np.zeros((4, 4), bool)
+    own = [Labelled(name, np.zeros((4, 4, 3), np.uint8), empty) for name in (*names, "fuseg/trained.jpg")]
+    assert [each.name for each in judged_by(own, tmp_path)] == names
+    other = [Labelled("x/1.jpg", np.zeros((4, 4, 3), np.uint8), empty)]
+    assert judged_by(other, tmp_path) == other
+    with pytest.raises(InputError, match="held out"):
+        judged_by(own[:5], tmp_path)
+    assert len(names) >= 150
+
+
+def test_the_bench_runs_without_data_and_says_what_is_missing() -> None:
+    import argparse
+
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    figures = {figure.what: figure for figure in run(parser.parse_args(["--rendered", "2"]))}
+    assert "segmentation" in SUBJECTS
+    assert np.isnan(figures["Dice of each picture, mean"].value)
+    assert figures["Dice of each picture, mean"].note == "no DATASET named"
+    assert figures["Dice on rendered wounds, mean"].value > 0.7
+    assert figures["network, a picture: median"].value > 0
+
+
+def test_training_refuses_what_cannot_be_before_it_reads_a_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "there.toml").touch()
+    for arguments in (
+        ["-o", str(tmp_path / "x.txt")],
+        ["-o", str(tmp_path / "gone" / "x.toml"), "--network", "shape"],
+        ["-o", str(tmp_path / "there.toml"), "--network", "shape"],
+        ["-o", str(tmp_path / "x.toml"), "--network", "shape", "--hold-out", "0"],
+        ["-o", str(tmp_path / "x.toml"), "--network", "shape"],
+    ):
+        assert main(["train", str(tmp_path / "data"), *arguments]) == 2
+        assert capsys.readouterr().err.startswith("stillbed: ")
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="labelled pictures of wounds are not beside the project")
+def test_real_wounds_held_out_are_found(segmenter: NetworkSegmenter) -> None:
+    names = shipped(f"{MODEL}_held_out", ".txt").read_text(encoding="utf-8").split()
+    pictures = {each.name: each for each in read_dataset(DATA)}
+    some = [pictures[name] for name in names[::8]]
+    reached = [dice(segmenter(np.ascontiguousarray(p.picture[..., ::-1])).mask, p.wound) for p in some]
+    assert float(np.mean(reached)) > 0.7
+
+
+def test_a_pose_behind_the_camera_gives_no_area() -> None:
+    from perception.wound_region import area_on_plane
+
+    view = wound_view(1)
+    far = view.camera.base_from_camera @ se3.make(np.eye(3), [0, 0, -50])
+    assert np.isnan(area_on_plane(disc(view.wound.shape, (300, 200), 20), view.camera, far))
