@@ -40,7 +40,7 @@ from perception.tool import Tool
 STAGES = ("prepare", "flow", "align", "pose", "search")
 ENOUGH = 120  # landmarks of a camera: at 0.2 px they tell a pose to 0.01 mm, and what they share is not told by more
 FAR = 4.0, 1.0  # scales of a fit whose start may be pixels off
-NEAR = 0.8  # px, one sigma: three of it are what alignment reaches on the full image
+NEAR, AROUND = 0.8, 2.5  # px, one sigma: three of it are what alignment reaches on the full image, and on the half one
 FULL_SEARCH = 10  # frame sets of an absent surface between searches at full size: a far one needs it
 
 
@@ -221,17 +221,19 @@ class TrackingStep:
     ) -> tuple[Array, Observations, tuple[float, ...]]:
         """A rough joint pose, the landmarks found in the images, and the scales at which a fit should begin and end.
 
-        Alignment begins where the motion puts the surface, if that is known to a pixel or so. Flow is asked where it is
-        not, and where alignment then finds fewer landmarks than the last images had.
+        Alignment begins where the motion puts the surface, if that is known to some pixels, on the half-size images if
+        not to one. Flow is asked where it is not, and where alignment finds fewer landmarks than the last images had.
         """
         stamp, guess, observations = expected.stamp, expected.base_from_surface, None
         late = self._estimator.cameras.delays.sigma * expected.twist
         seen = self._estimator.as_exposed(guess, expected.twist)
-        if matcher.doubt(guess, expected.covariance + np.outer(late, late)) < NEAR:
-            observations = matcher.align(stamp, pyramids, {c: seen[c] for c in pyramids}, most=ENOUGH)
+        doubt = matcher.doubt(guess, expected.covariance + np.outer(late, late))
+        if doubt < AROUND:
+            starts = {c: seen[c] for c in pyramids}
+            observations = matcher.align(stamp, pyramids, starts, coarse=doubt > NEAR, most=ENOUGH)
             self._took("align")
             if matcher.complete(observations, pyramids):
-                return guess, observations, (1.0,)
+                return guess, observations, FAR if doubt > NEAR else (1.0,)
         joint, single = matcher.flow(pyramids, guess)
         self._took("flow")
         again = matcher.align(stamp, pyramids, single, most=ENOUGH)
