@@ -13,7 +13,7 @@ demo: $(STAMP)
 	@$(BIN)/stillbed simulate data/scenarios/demo.toml -o $(DEMO) --pty --force
 
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 outages: $(STAMP)
 	$(BIN)/stillbed bench outages --count 1000 --seed 1 -o out/outages --force

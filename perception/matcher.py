@@ -21,6 +21,7 @@ from perception.ink import near_bead
 from perception.keep_out import KeepOut, patch_reach
 from perception.lens import Lenses, undistort
 from perception.patches import Pyramid, Templates, join, project_into
+from perception.side_by_side import side_by_side
 
 LOOSE = np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3)  # how far one camera's own pose may stray from the joint one
 FLOW_TRACKS = 80  # a camera: enough for a start, and flow is only that
@@ -129,7 +130,8 @@ class Matcher:
         """The joint pose by optical flow, and each camera's own: cameras are seldom exposed at the same instant."""
         points = self.map.points
         ready = [c for c in pyramids if self.seen(c) >= 6]
-        moved = {c: self._flow_one(c, pyramids[c][0], guess) for c in ready}
+        found = side_by_side(lambda c: self._flow_one(c, pyramids[c][0], guess), ready)
+        moved = dict(zip(ready, found, strict=True))
         single = dict.fromkeys(pyramids, guess)
         if sum(len(rows) for rows, _ in moved.values()) < 6:
             return guess, single
