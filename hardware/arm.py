@@ -1,0 +1,382 @@
+"""The arm on its line: armed by an operator only, fed no faster than it moves, stopped without waiting for its queue.
+
+Nothing here waits and nothing knows the time: the loop that owns an Arm calls `poll` every few milliseconds and `send`
+once a tick, with the instant. What the arm has yet to do is known by a model of its queue (arm_queue.py); what it
+answers is compared with that (arm_echo.py) where it answers at all.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from math import degrees
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.arm_echo import ArmEcho
+from hardware.arm_line import ArmLine
+from hardware.arm_port import Opener, UnpluggedError
+from hardware.arm_profile import ArmProfile
+from hardware.arm_queue import ArmQueue
+from hardware.arm_status import ArmEvent, ArmState, ArmStatus
+from hardware.arm_travel import lifted, travel
+from hardware.link_settings import LinkSettings
+from hardware.protocol import G1, G4, G54, LENGTH, Instruction, Pause, decode, encode
+from hardware.replies import Reply, ReplyKind
+
+DEFAULT = LinkSettings()
+REMEMBERED = 1000  # events and stray bytes that are kept until somebody takes them
+ORIGIN_ROUNDING = 0.11  # mm, twice half of what an answer counts
+
+
+class Arm:
+    """One arm on one line. The methods that an operator's word calls for say why not, "" where it was done."""
+
+    def __init__(self, opener: Opener, profile: ArmProfile, now: float, settings: LinkSettings = DEFAULT) -> None:
+        """opener: opens the device, and opens it again when it was away. InputError where another program has it."""
+        self.profile, self.settings = profile, settings
+        self.state, self.reason = ArmState.UNPLUGGED, "not opened yet"
+        self.frames, self.strays = 0, 0
+        self.stray_bytes: deque[tuple[float, bytes]] = deque(maxlen=REMEMBERED)
+        self.stops: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)  # decided, and on the wire, s
+        self.origin = np.zeros(3)
+        self._events: deque[ArmEvent] = deque(maxlen=REMEMBERED)
+        self._opener = opener
+        self._line: ArmLine | None = None
+        self._queue: ArmQueue | None = None  # None while nobody knows where the arm stands
+        self._echo = ArmEcho(settings, profile.lag)
+        self._steps: Iterator[G1] = iter(())
+        self._step: G1 | None = None  # of its own moves, the next one
+        self._look = now  # when the device is looked for next
+        self._doubt_since: float | None = None
+        self.poll(now)
+
+    # -- what an operator asks for
+
+    def stand(self, axes: Array, now: float) -> str:
+        """Take it that the arm stands at `axes` (6,), mm and rad; only while it is not armed."""
+        if self.state is ArmState.ARMED:
+            return "the arm is armed"
+        if axes.shape != (6,) or not np.isfinite(axes).all():
+            raise InputError("arm", "axes", axes.tolist(), "6 finite numbers X Y Z A B C, mm and rad")
+        self._queue = ArmQueue(axes.tolist(), self.profile.frame_time, now)
+        self._echo.restart()
+        return ""
+
+    def arm(self, now: float, goal: Array | None = None) -> str:
+        """Let moves be sent. goal: (6,) where the motion left off; the arm goes there first, slowly, if it is near."""
+        if self.state is ArmState.ARMED:
+            return ""
+        if self._line is None:
+            return f"the arm is unplugged: {self.reason}"
+        if self.in_flight(now) > 0 or not self._echo.still(now):
+            return "the arm still moves"
+        self._believe(now)
+        if self._queue is None:
+            return "nobody knows where the arm stands: it does not answer, and was not told"
+        place = np.array(self._queue.target)
+        if goal is not None:
+            if (away := float(np.linalg.norm((goal - place)[:3]))) > self.settings.lost:
+                return f"the arm is {away:.1f} mm from where the motion left off, limit {self.settings.lost:g} mm"
+            self._start(self._travel(place, goal, lift=False))
+        self._doubt_since = None
+        self._change(ArmState.ARMED, "by the operator", now)
+        return ""
+
+    def disarm(self, now: float) -> None:
+        """Send nothing more; what is under way, 50 ms at most, is done."""
+        if self.state in (ArmState.ARMED, ArmState.STOPPED):
+            self._halt()
+            self._change(ArmState.DISARMED, "by the operator", now)
+
+    def stop(self, reason: str, now: float) -> None:
+        """Stop at once: what waits is called back, and the control frame that stops the arm goes next."""
+        if self._line is None:
+            return
+        self._halt()
+        if self.settings.pause_frame:
+            self._give(Pause(), now, decided=now)
+        if self._line is not None:  # it was not lost over that
+            self._change(ArmState.STOPPED, reason, now)
+
+    def go(self, axes: Array, now: float, lift: bool = False) -> str:
+        """Go to `axes` (6,), mm and rad, slowly and in steps. lift: up first and down last, never low across."""
+        limits = self.profile.limits
+        if self.state is not ArmState.ARMED or self._queue is None:
+            return f"the arm is {self.state.value}: {self.reason}"
+        if axes.shape != (6,) or not ((axes >= limits.low) & (axes <= limits.high)).all():
+            return f"{axes.tolist()} is out of bounds"
+        self._start(self._travel(np.array(self._queue.target), axes, lift))
+        return ""
+
+    def home(self, now: float) -> str:
+        """Go home: X202.5 Y225 Z113 A0 B0 C0, if the profile says nothing else (thesis 6.3)."""
+        return self.go(self.profile.arm.home, now, lift=True)
+
+    def set_origin(self, origin: Array, now: float) -> str:
+        """Make `origin` (3,), mm in machine axes, the arm's (0, 0, 0) by G54; all else here stays in machine axes."""
+        if self.state is not ArmState.ARMED or self._queue is None or self._queue.in_flight(now) > 0 or self.travels:
+            return "an origin is set while the arm is armed and at rest"
+        frame = G54(origin)
+        encode(frame, self.profile.dialect)  # InputError for what no frame holds
+        self._give(frame, now)
+        self.origin = np.array(origin, float)
+        return ""
+
+    # -- what the loop does
+
+    def poll(self, now: float) -> None:
+        """Read, write what waited, look for a device that is gone, send its own moves; every few milliseconds."""
+        if self._line is None:
+            if now >= self._look:
+                self._open(now)
+            return
+        try:
+            self._read(self._line, now)
+            if (share := self._line.flush(now)) and self._queue is not None:
+                self._queue.occupy(now, share)
+        except UnpluggedError as error:
+            self._unplugged(str(error), now)
+            return
+        if self.state is ArmState.ARMED:
+            self._judge(now)
+        if self.state is ArmState.ARMED and self._step is not None and not self._full(now, self.profile.tick):
+            self._advance(now)
+
+    def hold(self, now: float) -> str:
+        """Why no frame may be sent now, "" where one may."""
+        if self.state is not ArmState.ARMED:
+            return f"the arm is {self.state.value}: {self.reason}"
+        if self.travels:
+            return "the arm is on its way"
+        return self._full(now, self.profile.tick) or self._echo.doubt(now)
+
+    def send(self, frame: bytes, now: float) -> str:
+        """Send the frame of a move or pause; why it was not sent, "" if it was. What cannot be sent stops the arm.
+
+        InputError for bytes that are no G1 or G4 of the arm's dialect.
+        """
+        instruction = decode(frame, self.profile.dialect)
+        if not isinstance(instruction, G1 | G4):
+            raise InputError("arm", "frame", frame.hex(" "), "the frame of a G1 or G4")
+        if reason := self.hold(now):
+            return reason
+        assert self._queue is not None
+        if reason := self._check(instruction, now):
+            self.stop(reason, now)
+            return reason
+        self._give(instruction, now, frame if not self.origin.any() else None)
+        return ""
+
+    @property
+    def travels(self) -> bool:
+        """Whether the arm makes a move of its own: home, or back to where it was stopped."""
+        return self._step is not None
+
+    @property
+    def target(self) -> Array | None:
+        """Where the arm was last sent (6,), mm and rad; None where nobody knows."""
+        return None if self._queue is None else np.array(self._queue.target)
+
+    def arrived(self, now: float) -> bool:
+        """Whether it stands where it was sent: by dead reckoning, and by its answers where it answers."""
+        if self._queue is None or self.travels or self._queue.in_flight(now) > 0:
+            return False
+        answered = self._echo.axes(now)
+        if answered is None:
+            return self._echo.count == 0
+        return self._echo.still(now) and not self._echo.doubt(now)
+
+    def in_flight(self, now: float) -> float:
+        """Seconds of motion that was sent and not done, wire included."""
+        return 0.0 if self._queue is None else self._queue.in_flight(now)
+
+    def reckoned(self, instant: float) -> Array | None:
+        """Where the arm is at `instant`, s, by what was sent (6,), the servo's lag included; None if not known."""
+        late = self.profile.lag - self.profile.frame_time
+        return None if self._queue is None else np.array(self._queue.at(instant - max(late, 0.0)))
+
+    def events(self) -> list[ArmEvent]:
+        """What happened since the last call."""
+        taken = list(self._events)
+        self._events.clear()
+        return taken
+
+    def status(self, now: float) -> ArmStatus:
+        """All that is known."""
+        queued = 0 if self._queue is None else self._queue.frames(now)
+        echo, rate = self._echo, 1 / self._echo.period if self._echo.count > 1 else float("nan")
+        return ArmStatus(
+            *(now, self.state, self.reason, self.reckoned(now), echo.axes(now), echo.off, echo.lag, rate),
+            *(self.in_flight(now), queued, self.frames, echo.count, self.strays),
+        )
+
+    def close(self) -> None:
+        """Let the device go, without a word to the arm."""
+        if self._line is not None:
+            self._line.port.close()
+        self._line, self.state, self.reason = None, ArmState.UNPLUGGED, "closed"
+        self._look = float("inf")
+
+    # -- the device
+
+    def _open(self, now: float) -> None:
+        try:
+            self._line = ArmLine(self._opener())
+        except UnpluggedError as error:
+            self._look, self.reason = now + self.settings.reopen, str(error)
+            return
+        self._echo.restart()
+        self._change(ArmState.DISARMED, "connected; the operator has not armed it", now)
+
+    def _unplugged(self, reason: str, now: float) -> None:
+        """The device is gone: where the arm stands when it comes back, nobody knows."""
+        if self._line is not None:
+            self._line.port.close()
+        self._line, self._queue = None, None
+        self._steps, self._step = iter(()), None
+        self.origin = np.zeros(3)
+        self._look = now + self.settings.reopen
+        self._change(ArmState.UNPLUGGED, reason, now)
+
+    def _read(self, line: ArmLine, now: float) -> None:
+        replies, strays = line.receive()
+        if strays:
+            self.strays += len(strays)
+            self.stray_bytes.append((now, strays))
+        for reply in replies:
+            if reply.kind is ReplyKind.ORIGIN:
+                self._check_origin(reply, now)
+            elif self._queue is not None:
+                self._echo.take(reply, self._queue, self.origin, now)
+            else:
+                self._find(reply, now)
+
+    def _find(self, reply: Reply, now: float) -> None:
+        """While nobody knows where the arm stands, its answers say so; they are believed when it is armed."""
+        place = [*reply.values, 0, 0, 0] if reply.kind is ReplyKind.PLACE else [0, 0, 0, *reply.values]
+        self._echo.take(reply, ArmQueue(place, self.profile.frame_time, now), np.zeros(3), now)
+
+    def _check_origin(self, reply: Reply, now: float) -> None:
+        if np.abs(reply.values - self.origin).max() > ORIGIN_ROUNDING and self.state is ArmState.ARMED:
+            self.stop(f"the arm's origin is {reply.values.tolist()}, not {self.origin.tolist()}", now)
+
+    # -- sending
+
+    def _give(self, instruction: Instruction, now: float, frame: bytes | None = None, decided: float = 0.0) -> None:
+        """Put a frame on the line. Machine axes are told from the arm's origin."""
+        assert self._line is not None
+        if frame is None:
+            told = instruction
+            if isinstance(instruction, G1) and self.origin.any():
+                told = G1(instruction.axes - np.concatenate([self.origin, np.zeros(3)]), instruction.feed)
+            frame = encode(told, self.profile.dialect)
+
+        def sent(at: float, share: float) -> None:
+            self.frames += 1
+            self._book(instruction, at, share, decided)
+
+        try:
+            self._line.send(frame, sent, now)
+        except UnpluggedError as error:
+            self._unplugged(str(error), now)
+
+    def _book(self, instruction: Instruction, now: float, share: float, decided: float) -> None:
+        """The last byte of a frame is gone: what the arm will do because of it."""
+        if isinstance(instruction, G1 | G4):
+            assert self._queue is not None
+            self._queue.add(instruction, now, share)
+        elif self._queue is not None:
+            self._queue.occupy(now, share)
+        if isinstance(instruction, Pause):
+            if self._queue is not None:
+                self._queue.stop()
+            on_wire = now + share * self.profile.frame_time if self._queue is None else self._queue.wire_free
+            self.stops.append((decided, on_wire))
+
+    def _full(self, now: float, more: float) -> str:
+        """Why a frame of `more` s must wait."""
+        assert self._line is not None and self._queue is not None
+        if self._line.blocked:
+            return f"the port has taken no bytes for {self._line.blocked_for(now):.3f} s"
+        passing = max(self._queue.wire_free - now, 0.0) / self.profile.frame_time * LENGTH
+        waiting = self._line.port.waiting() - passing
+        if waiting > LENGTH:
+            return f"{waiting:.0f} bytes wait in the port"
+        if (count := self._queue.frames(now)) >= self.settings.frames:
+            return f"{count} frames are under way, limit {self.settings.frames}"
+        if self._queue.in_flight_with(more, now) > self.settings.flight:
+            return f"{1000 * self._queue.in_flight(now):.0f} ms are under way, limit {1000 * self.settings.flight:g} ms"
+        return ""
+
+    def _check(self, instruction: G1 | G4, now: float) -> str:
+        """Why the arm is stopped rather than sent this."""
+        assert self._queue is not None
+        if isinstance(instruction, G1) and instruction.feed > self.profile.limits.feed * (1 + 1e-6):
+            return f"feed of {instruction.feed:g} mm/s, limit {self.profile.limits.feed:g}"
+        flight = self._queue.in_flight_with(self._queue.duration(instruction), now)
+        if flight > self.settings.flight:
+            return f"{1000 * flight:.1f} ms would be under way, limit {1000 * self.settings.flight:g} ms"
+        return ""
+
+    # -- its own moves, and what stops them
+
+    def _travel(self, start: Array, goal: Array, lift: bool) -> Iterator[G1]:
+        rates = self.settings.speed, self.settings.turning, self.profile.tick
+        return lifted(start, goal, *rates) if lift else travel(start, goal, *rates)
+
+    def _start(self, steps: Iterator[G1]) -> None:
+        self._steps = steps
+        self._step = next(steps, None)
+
+    def _advance(self, now: float) -> None:
+        """Send the next step of its own move, when the one before is nearly done."""
+        assert self._queue is not None and self._step is not None
+        if self._queue.in_flight(now) > self.profile.tick:
+            return
+        step = self._step
+        self._step = next(self._steps, None)
+        self._give(step, now)
+
+    def _halt(self) -> None:
+        """Drop its own moves, and the frames of which nothing is on the wire."""
+        if self._line is not None:
+            self._line.recall()
+        self._steps, self._step = iter(()), None
+
+    def _judge(self, now: float) -> None:
+        """Stop the arm where a fault lasts, or is too large to wait."""
+        assert self._line is not None
+        if (blocked := self._line.blocked_for(now)) > self.settings.write_timeout:
+            self.stop(f"the port took no bytes for {blocked:.2f} s, limit {self.settings.write_timeout:g} s", now)
+        elif self._echo.off > self.settings.lost:
+            self.stop(f"the arm is {self._echo.off:.1f} mm off its way, limit {self.settings.lost:g} mm", now)
+        elif doubt := self._echo.doubt(now):
+            self._doubt_since = now if self._doubt_since is None else self._doubt_since
+            if now - self._doubt_since > self.settings.patience:
+                self.stop(f"{doubt}, for {self.settings.patience:g} s", now)
+        else:
+            self._doubt_since = None
+
+    def _believe(self, now: float) -> None:
+        """What the arm answers at rest is where it stands, unless that is what was known, to within its limits."""
+        answered, known = self._echo.axes(now), self._queue
+        if answered is None:
+            return
+        if known is not None:
+            away = np.abs(answered - known.target)
+            if np.linalg.norm(away[:3]) <= self.settings.off and away[3:].max() <= self.settings.off_turn:
+                return
+        self._queue = ArmQueue(answered.tolist(), self.profile.frame_time, now)
+        told = ", ".join([*(f"{v:.1f}" for v in answered[:3]), *(f"{degrees(v):.2f}" for v in answered[3:])])
+        self._note(f"stands at {told} by its own answer", now)
+
+    def _change(self, state: ArmState, reason: str, now: float) -> None:
+        if (state, reason) != (self.state, self.reason):
+            self._note(f"{state.value}: {reason}", now)
+        self.state, self.reason = state, reason
+
+    def _note(self, text: str, now: float) -> None:
+        self._events.append(ArmEvent(now, text))

@@ -1,0 +1,129 @@
+"""What the arm answers, set beside what it was told: measured lag, how far off its way it is, whether it has arrived.
+
+An answer need not come; then all of this stays unknown. Answers have no check sum, so one alone proves nothing: what
+counts is the smaller of the last two deviations, which a single garbled answer cannot raise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from estimation.se3 import Array
+from hardware.arm_queue import ArmQueue, Axes
+from hardware.link_settings import LinkSettings
+from hardware.replies import Reply, ReplyKind
+
+ENOUGH = 3  # answers before their absence means anything, as noise that looks like one comes alone
+SPAN = 0.05  # s over which the set-point's speed is taken, and the slowest answers of a public driver come
+FORGET = 0.98  # of the lag's sums with each answer: two or three seconds of them
+STILL = 0.15, float(np.deg2rad(0.015))  # mm and rad between answers of an arm at rest: one count of rounding
+RESTS = 0.2  # s after which it counts as at rest: four of the slowest answers
+MOVING = 2.0  # mm/s below which an answer says nothing about the lag
+KNOWN = 100.0  # (mm/s)^2 in all, after which the lag is told: one answer at 10 mm/s
+
+
+@dataclass(slots=True)
+class _Part:
+    """The last answer about one half of the axes: X Y Z, or A B C."""
+
+    values: Array | None = None
+    stamp: float = -math.inf
+    before: float = 0.0  # deviation of the answer before
+    off: float = 0.0  # deviation, confirmed by two answers
+    since: float = math.inf  # when it was first where it is
+
+    def take(self, values: Array, deviation: float, still: float, now: float) -> None:
+        if self.values is None or np.abs(values - self.values).max() > still:
+            self.since = now
+        self.off = min(deviation, self.before)
+        self.values, self.stamp, self.before = values, now, deviation
+
+
+@dataclass(slots=True)
+class ArmEcho:
+    """Answers so far. count: of places. lag: s from set-point to answer, NaN until the arm has moved enough."""
+
+    settings: LinkSettings
+    late: float  # s that the arm is known to be later at its set-point
+    count: int = 0
+    period: float = math.nan  # s between places, smoothed
+    _place: _Part = field(default_factory=_Part)
+    _turn: _Part = field(default_factory=_Part)
+    _sums: tuple[float, float] = (0.0, 0.0)
+
+    def take(self, reply: Reply, queue: ArmQueue, origin: Array, now: float) -> None:
+        """An answer that came at `now`, s. origin: (3,) mm, from which the arm counts its place."""
+        if reply.kind is ReplyKind.PLACE:
+            place = reply.values + origin
+            gap = now - self._place.stamp
+            if math.isfinite(gap):
+                self.period = gap if math.isnan(self.period) else self.period + 0.1 * (gap - self.period)
+            self.count += 1
+            self._place.take(place, self._deviation(place, slice(0, 3), queue, now), STILL[0], now)
+            self._learn(place, queue, now)
+        elif reply.kind is ReplyKind.TOOL:
+            self._turn.take(reply.values, self._deviation(reply.values, slice(3, 6), queue, now), STILL[1], now)
+
+    @property
+    def lag(self) -> float:
+        """Measured s from set-point to answer; NaN until known."""
+        product, square = self._sums
+        return product / square if square >= KNOWN else math.nan
+
+    @property
+    def off(self) -> float:
+        """Distance, mm, of the arm from its way; 0 until two answers say otherwise."""
+        return self._place.off
+
+    def axes(self, now: float) -> Array | None:
+        """The answered axes (6,), mm and rad; None where they are older than a silence."""
+        place, turn = self._place, self._turn
+        if place.values is None or turn.values is None or now - min(place.stamp, turn.stamp) > self.settings.silence:
+            return None
+        return np.concatenate([place.values, turn.values])
+
+    def still(self, now: float) -> bool:
+        """Whether its answers say that it is at rest; an arm that does not answer says nothing against it."""
+        return self.axes(now) is None or now - max(self._place.since, self._turn.since) >= RESTS
+
+    def doubt(self, now: float) -> str:
+        """Why the arm may not be where it should be; "" if it answers from there, or never answered."""
+        if self.count < ENOUGH:
+            return ""
+        if (since := now - self._place.stamp) > self.settings.silence:
+            return f"the arm has not answered for {since:.2f} s, limit {self.settings.silence:g} s"
+        if self.off > self.settings.off:
+            return f"the arm is {self.off:.1f} mm off its way, limit {self.settings.off:g} mm"
+        if (turn := self._turn.off) > self.settings.off_turn:
+            limit = np.rad2deg(self.settings.off_turn)
+            return f"the arm is turned {np.rad2deg(turn):.1f} degrees off its way, limit {limit:g} degrees"
+        return ""
+
+    def restart(self) -> None:
+        """Forget what was answered before: a device was away, or the arm was told where it stands."""
+        self.count, self.period, self._sums = 0, math.nan, (0.0, 0.0)
+        self._place, self._turn = _Part(), _Part()
+
+    def _deviation(self, values: Array, axes: slice, queue: ArmQueue, now: float) -> float:
+        """How far an answer (3,) is from where the set-point was since the arm could be there."""
+        low, high = queue.bounds(now - self.late - self.settings.slack, now)
+        return _beyond(values.tolist(), low[axes], high[axes])
+
+    def _learn(self, place: Array, queue: ArmQueue, now: float) -> None:
+        """Fit the lag: the set-point's lead over the answer is its speed times that."""
+        ahead, before = queue.at(now)[:3], queue.at(now - SPAN)[:3]
+        speed = [(a - b) / SPAN for a, b in zip(ahead, before, strict=True)]
+        lead = [a - p for a, p in zip(ahead, place.tolist(), strict=True)]
+        if math.hypot(*speed) < MOVING or self.off > self.settings.off:
+            return
+        product = sum(v * e for v, e in zip(speed, lead, strict=True))
+        square = sum(v * v for v in speed)
+        self._sums = FORGET * self._sums[0] + product, FORGET * self._sums[1] + square
+
+
+def _beyond(values: Sequence[float], low: Axes, high: Axes) -> float:
+    return math.hypot(*(max(a - v, v - b, 0.0) for v, a, b in zip(values, low, high, strict=True)))

@@ -1,0 +1,367 @@
+"""The arm on its line: nothing moves unasked, little is ever under way, every fault ends at rest and with a reason."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimation.errors import InputError
+from hardware.arm_profile import ArmProfile
+from hardware.arm_status import ArmState
+from hardware.link_settings import LinkSettings
+from hardware.protocol import G1, G4, Dialect, Pause, encode
+from hardware.simulator.arm_faults import fault_from_text
+from hardware.simulator.arm_settings import ArmSettings, Replies
+from hardware.simulator.virtual_port import PortFaults
+from tests.linked import circle, linked
+from tests.virtual_arm import HOME
+
+ANSWERING = ArmSettings(servo_lag=0.02, replies=Replies.STREAM)
+
+
+# -- who may move it
+
+
+def test_nothing_is_sent_before_an_operator_says_so() -> None:
+    link = linked(stand=False)
+    assert link.arm.state is ArmState.DISARMED
+    link.arm.stand(HOME, 0.0)
+    frame = encode(G1(HOME + 1, 50.0))
+    assert "disarmed" in link.arm.send(frame, 0.0)
+    assert "disarmed" in link.arm.home(0.0)
+    link.run(1.0)
+    assert (link.virtual.frames, link.arm.frames) == (0, 0)
+    assert link.arm.arm(1.0) == "" and link.arm.state is ArmState.ARMED
+    assert link.arm.send(frame, 1.0) == ""
+    link.run(0.5)
+    assert link.virtual.frames == 1
+
+
+def test_an_arm_of_which_nobody_knows_where_it_stands_is_not_armed() -> None:
+    link = linked(stand=False)
+    assert "nobody knows" in link.arm.arm(0.0)
+    with pytest.raises(InputError, match="axes"):
+        link.arm.stand(np.full(6, np.nan), 0.0)
+    answering = linked(ANSWERING, stand=False)
+    answering.run(1.0)
+    assert answering.arm.arm(1.0) == ""
+    assert answering.arm.target == pytest.approx(HOME, abs=0.05)
+
+
+def test_disarmed_it_ends_what_is_under_way_and_no_more() -> None:
+    link = linked()
+    link.follow(1.0)
+    frames = link.arm.frames
+    link.arm.disarm(1.0)
+    assert link.arm.stand(HOME, 1.0) == ""
+    link.run(1.0, lambda now: link.arm.send(encode(G1(HOME, 50.0)), now) and None)
+    assert (link.arm.state, link.arm.frames) == (ArmState.DISARMED, frames)
+
+
+def test_only_moves_and_pauses_of_its_dialect_are_taken() -> None:
+    link = linked()
+    for frame in (encode(Pause()), b"\0" * 48, encode(G1(HOME, 5.0), Dialect(motion_byte=0)), encode(G4(0.001))[:-1]):
+        with pytest.raises(InputError):
+            link.arm.send(frame, 0.0)
+    assert link.arm.frames == 0
+
+
+def test_a_command_too_long_or_too_fast_stops_the_arm_and_is_not_sent() -> None:
+    for wrong in (G1(HOME + [3, 0, 0, 0, 0, 0], 60.0), G4(0.05), G1(HOME + [3, 0, 0, 0, 0, 0], 250.1)):
+        link = linked()
+        assert "limit" in link.arm.send(encode(wrong), 0.0)
+        assert link.arm.state is ArmState.STOPPED
+        link.run(0.5)
+        assert link.executed() == pytest.approx(HOME)
+    exact = 0.05 - 1 / 240
+    link = linked()
+    assert link.arm.send(encode(G4(exact * (1 - 1e-6))), 0.0) == ""
+    assert "limit" in linked().arm.send(encode(G4(exact * (1 + 1e-6))), 0.0)
+
+
+# -- pacing
+
+
+@settings(max_examples=15)
+@given(st.lists(st.floats(0.0, 0.1), min_size=5, max_size=40), st.integers(0, 9))
+def test_however_it_is_called_no_more_is_under_way_than_may_be(waits: list[float], seed: int) -> None:
+    link = linked(port=PortFaults(partial=0.3))
+    rng = np.random.default_rng(seed)
+    for wait in waits:
+        axes = link.arm.target
+        assert axes is not None
+        step = np.append(rng.normal(size=3), np.zeros(3))
+        step *= rng.uniform(0.2, 2.0) / np.linalg.norm(step)
+        now = link.clock.now()
+        if not link.arm.hold(now):
+            link.send(axes + step)
+        link.run(wait)
+        assert link.arm.in_flight(link.clock.now()) <= 0.05 + 1e-9
+    assert link.arm.state is ArmState.ARMED
+    assert max(link.deepest, link.device.deepest) <= 0.05 + 1e-9
+    link.run(0.3)
+    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
+
+
+def test_a_motion_at_the_tick_flows_and_is_where_it_is_reckoned() -> None:
+    link = linked()
+    assert link.follow(2.0) == []
+    assert not link.virtual.underruns
+    now = link.clock.now()
+    reckoned = link.arm.reckoned(now + link.arm.profile.lag - link.arm.profile.frame_time)
+    assert reckoned is not None and np.allclose(reckoned, link.executed(), atol=1e-3)
+    assert link.arm.status(now).queued <= 2
+
+
+def test_more_than_four_frames_are_never_under_way() -> None:
+    link = linked()
+    sent = [link.arm.hold(0.0) or link.arm.send(encode(G4(0.001)), 0.0) for _ in range(6)]
+    assert sent[:4] == ["", "", "", ""] and "4 frames" in sent[4]
+
+
+# -- stop
+
+
+def test_a_stop_does_not_wait_for_the_queue() -> None:
+    link = linked()
+    for k in (1, 2):
+        link.arm.send(encode(G1(HOME + [2 * k, 0, 0, 0, 0, 0], 100.0)), 0.0)
+    link.run(0.010)
+    link.arm.stop("asked for", 0.010)
+    link.run(1.0)
+    decided, on_wire = link.arm.stops[0]
+    assert on_wire - decided == pytest.approx(1 / 240)
+    assert link.executed()[0] - HOME[0] == pytest.approx(100 * (on_wire - 1 / 240), abs=0.01)
+    assert link.arm.target == pytest.approx(link.executed(), abs=0.01)
+    assert (link.arm.state, link.arm.reason) == (ArmState.STOPPED, "asked for")
+    assert "stopped" in link.arm.send(encode(G1(HOME, 50.0)), 1.1)
+
+
+def test_an_arm_that_knows_no_pause_frame_stops_by_an_empty_queue() -> None:
+    link = linked(link=LinkSettings(pause_frame=False))
+    link.follow(0.5)
+    frames = link.virtual.frames
+    link.arm.stop("asked for", 0.5)
+    link.run(0.5)
+    assert link.virtual.frames <= frames + 1
+    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
+
+
+def test_armed_again_it_goes_back_slowly_to_where_the_motion_left_off() -> None:
+    link = linked()
+    link.follow(1.0)
+    left_off = link.arm.target
+    assert left_off is not None
+    link.arm.stop("asked for", 1.0)
+    assert link.arm.arm(1.0, left_off) == "the arm still moves"
+    link.run(0.5)
+    assert "limit 10 mm" in link.arm.arm(1.5, left_off + [11, 0, 0, 0, 0, 0])
+    assert link.arm.arm(1.5, left_off) == ""
+    assert link.arm.hold(1.5) == "the arm is on its way"
+    link.run(0.5)
+    assert link.arm.hold(2.0) == ""
+    assert link.executed() == pytest.approx(left_off, abs=1e-3)
+
+
+# -- home, origin, jog
+
+
+def test_home_is_reached_slowly_by_way_of_above_and_never_much_is_under_way() -> None:
+    low = HOME + np.array([-30.0, 20, -60, 0.2, 0, 0])
+    link = linked(begin=low)
+    assert link.arm.home(0.0) == ""
+    seen: list[np.ndarray] = []
+    link.run(8.0, lambda now: seen.append(link.executed()))
+    assert link.arm.arrived(8.0) and link.executed() == pytest.approx(HOME, abs=1e-3)
+    path = np.array(seen)
+    assert np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1).max() <= 20 * 0.0201
+    across = np.abs(path[:, 0] - low[0]) > 1e-3
+    assert path[across, 2].min() > HOME[2] - 0.01
+    assert max(link.deepest, link.device.deepest) <= 0.05
+
+
+def test_a_place_out_of_bounds_is_not_gone_to() -> None:
+    link = linked()
+    assert "out of bounds" in link.arm.go(HOME + [1000, 0, 0, 0, 0, 0], 0.0)
+    assert "out of bounds" in link.arm.go(np.full(6, np.nan), 0.0)
+    assert not link.arm.travels
+
+
+def test_a_work_origin_changes_what_is_said_and_not_where_it_goes() -> None:
+    link = linked(ANSWERING)
+    origin = np.array([200.0, 200, 100])
+    assert link.arm.set_origin(origin, 0.0) == ""
+    link.run(0.1)
+    assert link.virtual.origin == pytest.approx(origin)
+    refused = []
+    link.run(3.0, lambda now: refused.append(link.arm.hold(now) or link.send(circle(now - 0.1))))
+    assert not any(refused) and not link.virtual.refused
+    link.run(0.5)
+    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
+    assert link.arm.status(link.clock.now()).answered == pytest.approx(link.arm.target, abs=0.06)
+    link.send(circle(3.0))
+    assert "at rest" in link.arm.set_origin(np.zeros(3), link.clock.now())
+
+
+# -- what it answers
+
+
+def test_answers_give_lag_and_arrival_and_no_doubt_of_an_arm_that_follows() -> None:
+    link = linked(ANSWERING)
+    assert link.follow(4.0) == []
+    status = link.arm.status(4.0)
+    assert status.lag == pytest.approx(0.02 + 3 * 9 * 10 / 115_200, abs=0.003)
+    assert status.off < 0.2 and status.answer_rate == pytest.approx(20, rel=0.1)
+    assert not link.arm.arrived(4.0)
+    link.run(0.5)
+    assert link.arm.arrived(link.clock.now())
+
+
+def test_stray_bytes_are_kept_with_their_instants_and_harm_nothing() -> None:
+    link = linked(ArmSettings(replies=Replies.STRAY), port=PortFaults(noise=20.0))
+    assert link.follow(5.0) == []
+    status = link.arm.status(5.0)
+    assert status.strays > 100 and status.answers == 0
+    stamps = [stamp for stamp, _ in link.arm.stray_bytes]
+    assert stamps == sorted(stamps) and stamps[0] >= 0 and stamps[-1] <= 5.0
+
+
+@pytest.mark.parametrize("seconds", [0.3, 0.6])
+def test_an_arm_that_stalls_is_held_until_it_has_caught_up(seconds: float) -> None:
+    link = linked(ANSWERING, fault_from_text("t", "f", f"stall {1000 * seconds:g}ms at 2s"))
+    refused = link.follow(6.0)
+    assert any("off its way" in reason for reason in refused)
+    assert link.arm.state is ArmState.ARMED
+    assert link.device.deepest < seconds + 0.25  # what was sent until two answers had told
+    assert link.arm.hold(6.0) == "" and link.arm.status(6.0).off < 0.2
+    link.run(0.3)
+    assert link.virtual.in_flight == 0
+
+
+def test_an_arm_that_stays_behind_is_stopped() -> None:
+    link = linked(ANSWERING, fault_from_text("t", "f", "stall 5s at 1s"))
+    link.follow(6.0)
+    assert link.arm.state is ArmState.STOPPED
+    assert "off its way" in link.arm.reason
+
+
+def test_an_arm_that_runs_away_is_stopped_at_once() -> None:
+    link = linked(ANSWERING)
+    link.follow(1.0)
+    link.virtual.receive(encode(G1(HOME + [200, 0, 0, 0, 0, 0], 200.0)), link.virtual.now)
+    link.follow(0.4)
+    assert link.arm.state is ArmState.STOPPED and "off its way" in link.arm.reason
+    link.run(0.5)
+    assert link.executed()[0] - HOME[0] < 60
+
+
+def test_an_arm_that_falls_silent_is_held_and_then_stopped() -> None:
+    link = linked(ANSWERING, fault_from_text("t", "f", "unplug at 2s"))
+    refused = link.follow(6.0)
+    assert any("has not answered for" in reason for reason in refused)
+    assert link.arm.state is ArmState.STOPPED
+    never = linked()
+    assert never.follow(2.0) == []
+
+
+def test_one_wrong_answer_alone_is_not_believed() -> None:
+    link = linked(ANSWERING)
+    link.follow(1.0)
+    from hardware.replies import Reply, ReplyKind
+
+    assert link.arm._queue is not None
+    link.arm._echo.take(Reply(ReplyKind.PLACE, HOME[:3] + 100), link.arm._queue, np.zeros(3), 1.0)
+    assert link.arm.hold(1.0) == ""
+    assert link.follow(1.0) == []
+
+
+# -- the port
+
+
+def test_partial_writes_change_nothing_that_arrives() -> None:
+    link = linked(port=PortFaults(partial=0.5))
+    link.follow(3.0)
+    assert link.arm.state is ArmState.ARMED
+    link.run(0.2)
+    assert link.virtual.garbage == [] and link.virtual.frames == link.arm.frames > 100
+    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
+
+
+def test_a_port_that_takes_nothing_for_a_moment_is_a_hold() -> None:
+    link = linked(port=PortFaults(blocked=[(1.0, 1.15)]))
+    refused = link.follow(2.0)
+    assert any("taken no bytes" in reason for reason in refused)
+    assert link.arm.state is ArmState.ARMED and len(refused) < 12
+    assert max(link.deepest, link.device.deepest) <= 0.05
+
+
+@pytest.mark.parametrize("partial", [0.0, 0.9])
+def test_a_port_that_takes_nothing_for_long_is_a_stop_and_a_torn_frame_is_completed(partial: float) -> None:
+    link = linked(port=PortFaults(blocked=[(1.0, 1.6)], partial=partial))
+    link.follow(1.5)
+    assert link.arm.state is ArmState.STOPPED and "took no bytes" in link.arm.reason
+    link.run(0.5)
+    assert link.virtual.garbage == []
+    assert link.arm.frames == link.virtual.frames
+    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
+    assert link.device.deepest <= 0.05
+
+
+def test_bytes_that_wait_in_the_port_are_a_hold() -> None:
+    link = linked()
+    port = link.arm._line.port  # type: ignore[union-attr]
+    port.waiting = lambda: 500  # type: ignore[method-assign]
+    assert "500 bytes wait" in link.arm.hold(0.0)
+
+
+def test_a_device_that_was_away_is_found_again_and_moves_only_when_armed_anew() -> None:
+    link = linked(port=PortFaults(away=[(1.0, 3.0)]))
+    link.follow(2.0)
+    assert link.arm.state is ArmState.UNPLUGGED
+    assert "unplugged" in link.arm.hold(2.0) and link.arm.arm(2.0) != ""
+    link.follow(2.0)
+    assert link.arm.state is ArmState.DISARMED
+    assert "nobody knows" in link.arm.arm(4.0)
+    frames = link.virtual.frames
+    link.follow(1.0)
+    assert link.virtual.frames == frames
+    link.arm.stand(link.executed(), 5.0)
+    assert link.arm.arm(5.0) == ""
+    texts = [event.text for event in link.arm.events()]
+    assert [text.split(":")[0] for text in texts] == ["disarmed", "armed", "unplugged", "disarmed", "armed"]
+
+
+def test_a_device_that_is_not_there_is_waited_for() -> None:
+    link = linked(port=PortFaults(away=[(0.0, 1.2)]), stand=False)
+    assert link.arm.state is ArmState.UNPLUGGED
+    link.run(2.0)
+    assert link.arm.state is ArmState.DISARMED
+
+
+def test_every_fault_of_the_line_ends_at_rest() -> None:
+    for text in ("drop at 1s for 1s", "garble at 1s for 1s", "unplug at 1s for 1s", "stall 600ms at 1s"):
+        link = linked(ANSWERING, fault_from_text("t", "f", text))
+        link.follow(4.0)
+        link.arm.stop("the end", link.clock.now())
+        link.run(1.0)
+        before = link.executed()
+        link.run(1.0)
+        assert np.array_equal(before, link.executed()) or np.allclose(before, link.executed(), atol=1e-6)
+        assert not link.virtual.ignored
+
+
+@pytest.mark.parametrize("name", ["flight", "frames", "poll", "off", "patience"])
+def test_settings_of_the_link_are_checked(name: str) -> None:
+    for wrong in (0.0, -1.0, np.nan):
+        with pytest.raises(InputError, match=name):
+            LinkSettings(**{name: wrong})
+    with pytest.raises(InputError, match="ease"):
+        LinkSettings(ease=0.2)
+
+
+def test_a_slower_line_leaves_room_for_less() -> None:
+    slow = linked(profile=ArmProfile(baud=24_000))  # 20 ms a frame
+    assert slow.arm.send(encode(G4(0.02)), 0.0) == ""
+    assert "limit 50 ms" in slow.arm.hold(0.0)

@@ -1,0 +1,201 @@
+"""The port over what pyserial opens: nothing waits, a full buffer takes a part, and a device that goes is told."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.errors import InputError
+from hardware import arm_port
+from hardware.arm import Arm
+from hardware.arm_port import Device, SerialPort, UnpluggedError
+from hardware.arm_profile import ArmProfile
+from hardware.arm_status import ArmState
+from hardware.clock import WallClock
+from hardware.protocol import LENGTH
+from hardware.simulator.arm_settings import ArmSettings, Replies
+from hardware.simulator.pty_link import open_pty
+from tests.linked import circle
+from tests.test_arm_port import serving
+from tests.virtual_arm import HOME, move
+
+CLOCK = WallClock()
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[int, str]]:
+    """The arm's side of a pty, and the name of the host's."""
+    ours, theirs, name = open_pty()
+    yield ours, name
+    for file in (ours, theirs):
+        os.close(file)
+
+
+def test_bytes_go_both_ways_and_nothing_waits(pair: tuple[int, str]) -> None:
+    ours, name = pair
+    port = SerialPort(name, 115_200)
+    start = CLOCK.now()
+    assert port.read() == b"" and port.waiting() == 0
+    assert port.write(b"abc") == 3
+    assert os.read(ours, 9) == b"abc"
+    os.write(ours, b"\xce\x00\xcf")
+    assert port.read() == b"\xce\x00\xcf"
+    port.close()
+    assert CLOCK.now() - start < 0.5
+
+
+def test_a_full_buffer_takes_a_part_and_then_nothing_and_then_again(pair: tuple[int, str]) -> None:
+    ours, name = pair
+    port = SerialPort(name, 115_200)
+    data, sent = bytes(range(LENGTH)) * 2000, 0
+    while taken := port.write(data[sent:]):
+        sent += taken
+    assert 0 < sent < len(data)
+    got = bytearray()
+    while len(got) < sent:
+        got += os.read(ours, 4096)
+    assert bytes(got) == data[:sent]
+    assert port.write(b"x") == 1
+    port.close()
+
+
+def test_a_device_that_goes_is_told_by_reading_and_by_writing() -> None:
+    ours, theirs, name = open_pty()
+    port = SerialPort(name, 115_200)
+    os.close(theirs)
+    os.close(ours)
+    with pytest.raises(UnpluggedError):
+        port.read()
+    with pytest.raises(UnpluggedError):
+        port.write(b"x")
+    port.close()
+    with pytest.raises(UnpluggedError):
+        SerialPort("/dev/there-is-none", 115_200)
+
+
+def test_a_socket_is_a_port_too_and_its_end_is_an_unplugged_device() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = SerialPort(f"socket://127.0.0.1:{server.getsockname()[1]}", 115_200)
+        theirs, _ = server.accept()
+        assert port.read() == b""
+        assert port.write(b"abc") == 3 and theirs.recv(9) == b"abc"
+        theirs.sendall(b"xyz")
+        for _ in range(100):
+            if data := port.read():
+                break
+            CLOCK.wait_until(CLOCK.now() + 0.005)
+        assert data == b"xyz"
+        while port.write(b"\0" * 65_536):  # full, and does not wait
+            pass
+        theirs.close()
+        with pytest.raises(UnpluggedError):
+            for _ in range(100):
+                port.read()
+                CLOCK.wait_until(CLOCK.now() + 0.005)
+        port.close()
+        with pytest.raises(UnpluggedError):
+            SerialPort("socket://127.0.0.1:1", 115_200)
+
+
+def test_a_loop_gives_back_what_it_was_given() -> None:
+    port = SerialPort("loop://", 115_200)
+    assert port.write(b"abc") == 3
+    assert port.read() == b"abc" and port.read() == b"" and port.waiting() == 0
+    port.close()
+
+
+def test_a_url_that_means_nothing_is_wrong_input() -> None:
+    with pytest.raises(InputError, match="URL of pyserial's"):
+        SerialPort("gopher://x", 115_200)
+
+
+def test_two_writers_on_one_port_are_impossible(pair: tuple[int, str], tmp_path: Path) -> None:
+    _, name = pair
+    link = tmp_path / "arm"
+    link.symlink_to(name)
+    first = Device(name, 115_200)
+    port = first()
+    for second in (name, str(link)):
+        with pytest.raises(InputError, match="a port that is free"):
+            Device(second, 115_200)()
+    first.release()
+    other = Device(name, 115_200)
+    with pytest.raises(InputError, match="no other program"):  # its lock is gone, but it is still open
+        other()
+    other.release()
+    port.close()
+    again = Device(name, 115_200)
+    again().close()
+    again.release()
+
+
+def test_an_adapter_that_comes_back_under_another_name_is_the_same(
+    pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, name = pair
+    there = [("/dev/ttyUSB0", (0x1A86, 0x7523, "at 1-1")), ("/dev/ttyUSB7", (0x0403, 0x6001, "A50285BI"))]
+    monkeypatch.setattr(arm_port, "_adapters", lambda: list(there))
+    device = Device("/dev/ttyUSB7", 115_200)
+    there[:] = [("/dev/ttyUSB7", (0x1A86, 0x7523, "at 1-1"))]  # another one has taken its name
+    with pytest.raises(UnpluggedError, match="0403:6001 A50285BI"):
+        device()
+    there.append((name, (0x0403, 0x6001, "A50285BI")))
+    device().close()
+    device.release()
+
+
+def test_over_a_pty_in_real_time_the_arm_moves_answers_and_stops(tmp_path: Path) -> None:
+    settings = ArmSettings(servo_lag=0.0, replies=Replies.STREAM)
+    with serving(tmp_path / "arm", settings) as ended:
+        device = Device(str(tmp_path / "arm"), 115_200)
+        arm = Arm(device, ArmProfile(), CLOCK.now())
+        assert arm.stand(HOME, CLOCK.now()) == "" and arm.arm(CLOCK.now()) == ""
+        phase, start, most = 0.0, CLOCK.now(), 0.0
+        tick = start
+        while (now := CLOCK.now()) < start + 1.5:
+            arm.poll(now)
+            if now >= tick:
+                tick = max(tick + 0.02, now)
+                if not arm.hold(now) and arm.target is not None:
+                    phase += 0.02
+                    goal = circle(phase)
+                    feed = float(np.linalg.norm((goal - arm.target)[:3])) / 0.02
+                    frame = move(feed, x=goal[0], y=goal[1], c=np.rad2deg(goal[5]))
+                    assert arm.send(frame, now) == ""
+            most = max(most, arm.in_flight(now))
+            CLOCK.wait_until(now + 0.002)
+        arm.stop("asked for", CLOCK.now())
+        CLOCK.wait_until(CLOCK.now() + 0.4)
+        arm.poll(CLOCK.now())
+        status = arm.status(CLOCK.now())
+        arm.close()
+        device.release()
+    virtual = ended[0]
+    assert status.state is ArmState.STOPPED and status.answers > 10 and most <= 0.05
+    assert virtual.frames == arm.frames and not virtual.garbage and not virtual.ignored
+    assert virtual.axes_at(np.array([virtual.now]))[0] == pytest.approx(status.answered, abs=0.06)
+
+
+def test_a_pty_that_goes_and_comes_back_is_disarmed(tmp_path: Path) -> None:
+    link = tmp_path / "arm"
+    device = Device(str(link), 115_200)
+    with serving(link):
+        arm = Arm(device, ArmProfile(), CLOCK.now())
+        arm.stand(HOME, CLOCK.now())
+        arm.arm(CLOCK.now())
+        arm.poll(CLOCK.now())
+        assert arm.state is ArmState.ARMED
+    arm.poll(CLOCK.now())
+    assert arm.state is ArmState.UNPLUGGED
+    with serving(link):
+        CLOCK.wait_until(CLOCK.now() + 0.6)
+        arm.poll(CLOCK.now())
+        assert arm.state is ArmState.DISARMED
+        assert "nobody knows" in arm.arm(CLOCK.now())
+        arm.close()
+        device.release()
