@@ -239,8 +239,12 @@ def rotation_from_euler(angles: ArrayLike) -> Array:
     order in which its angles are recovered (Eq. 4.3), for column vectors.
     """
     angles = np.asarray(angles, float)
-    x, y, z = (exp_rotation(angles[..., i, None] * np.eye(3)[i]) for i in range(3))
-    return np.asarray(z @ y @ x)
+    (sa, sb, sg), (ca, cb, cg) = (np.moveaxis(f(angles), -1, 0) for f in (np.sin, np.cos))
+    out = np.empty((*angles.shape, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = cg * cb, cg * sb * sa - sg * ca, cg * sb * ca + sg * sa
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = sg * cb, sg * sb * sa + cg * ca, sg * sb * ca - cg * sa
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = -sb, cb * sa, cb * ca
+    return out
 
 
 def euler_from_rotation(rotation: ArrayLike) -> Array:

@@ -12,7 +12,8 @@ from hardware.protocol import G1, G4, Dialect, encode
 from planning.command import Command, Hold, Move
 from planning.guard import Guard
 from planning.path import Path
-from planning.planner import Planner, Progress
+from planning.planner import Planner
+from planning.progress import Progress
 
 
 class MotionStep:
@@ -20,11 +21,12 @@ class MotionStep:
 
     last: Command
 
-    def __init__(self, path: Path, profile: ArmProfile | None = None) -> None:
+    def __init__(self, path: Path, profile: ArmProfile | None = None, start: float = 0.0) -> None:
+        """start: how much of the path is printed already, counted in checkpoints."""
         self.profile = ArmProfile() if profile is None else profile
         settings = self.profile.limits, self.profile.arm, self.profile.tick
         lag = self.profile.lag
-        self._planner, self._guard = Planner(path, *settings, lag), Guard(*settings, path.zone, lag)
+        self._planner, self._guard = Planner(path, *settings, lag, start), Guard(*settings, path.zone, lag)
 
     def __call__(self, pose: SurfacePose | None, now: float) -> bytes:
         """One frame for the tick at `now`, s: G1 of a move, G4 of a hold. pose: the newest there is."""

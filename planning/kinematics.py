@@ -52,3 +52,8 @@ def nozzle_from_axes(arm: SimpleArm, axes: Array) -> Array:
     """base_from_nozzle (..., 4, 4) at machine axes (..., 6): inverse of `axes_from_nozzle`."""
     turn = se3.rotation_from_euler(axes[..., 3:])
     return np.asarray(se3.inverse(arm.arm_from_base) @ se3.make(turn @ arm.arm_from_upright, axes[..., :3]))
+
+
+def limited_axes(arm: SimpleArm, base_from_nozzle: Array) -> Array:
+    """What limits of speed and acceleration bind (..., D) at base_from_nozzle (..., 4, 4): the machine axes."""
+    return axes_from_nozzle(arm, base_from_nozzle)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from estimation.se3 import Array
 from planning.curve import Curve, curve_through
 from planning.follow import LEAD
 from planning.path import NEAREST, lengths
+from planning.progress import Phase
 from planning.retime import Timing
 
 CLEARANCE = 10.0  # mm above the surface, along the nozzle, on the way to and from the path
@@ -19,16 +19,6 @@ TRAVEL = 20.0  # mm/s on that way, slow enough for a person to step in
 NEAR = 2.0  # mm: from here the nozzle goes straight to its place, without going up first
 CORNER = 0.05  # mm by which corners are cut: an eighth of a thin bead
 SWERVE = 8 * CORNER / LEAD  # mm/s: a change of velocity in less than LEAD is cut by LEAD / 8 of it, once more CORNER
-
-
-class Phase(Enum):
-    """What the nozzle is doing."""
-
-    WAITING = "waiting"  # at rest, nothing begun
-    ENTERING = "entering"  # on the way to where printing begins or goes on
-    PRINTING = "printing"
-    LEAVING = "leaving"  # on the way up from the last checkpoint
-    FINISHED = "finished"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,14 +31,13 @@ class Leg:
 
 
 def entry(surface_from_nozzle: Array, goal: Array, speed: float) -> Curve | None:
-    """From the nozzle (4, 4) up, over and down to `goal` (4, 4), the last part at `speed`, mm/s; None if there."""
+    """From the nozzle (4, 4) up, over and down to `goal` (4, 4), the last NEAR at `speed`, mm/s; None if there."""
     outwards, place = goal[:3, 2], surface_from_nozzle[:3, 3]
-    above = goal[:3, 3] + CLEARANCE * outwards
-    lift = max(0.0, float((above - place) @ outwards))
+    lift = max(0.0, float((goal[:3, 3] + CLEARANCE * outwards - place) @ outwards))
     lifted = se3.make(surface_from_nozzle[:3, :3], place + lift * outwards)
-    over = se3.make(goal[:3, :3], above)
+    over, before = (se3.make(goal[:3, :3], goal[:3, 3] + height * outwards) for height in (CLEARANCE, NEAR))
     near = np.linalg.norm(place - goal[:3, 3]) < NEAR
-    return _through([surface_from_nozzle, goal] if near else [surface_from_nozzle, lifted, over, goal], speed)
+    return _through([surface_from_nozzle, goal] if near else [surface_from_nozzle, lifted, over, before, goal], speed)
 
 
 def exit_from(surface_from_nozzle: Array) -> Curve:

@@ -11,7 +11,7 @@ doubt included. A surface that deforms, but whose warp is known, carries the che
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,48 +20,43 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from planning.command import TURNING, Command, Hold, Move
 from planning.curve import Curve, curve_through
+from planning.demand import demand
 from planning.follow import LEAD, Follower
+from planning.grid import grid_on
 from planning.kinematics import SimpleArm, axes_from_nozzle, nozzle_from_axes
-from planning.legs import CORNER, SWERVE, Leg, Phase, entry, exit_from
+from planning.legs import CORNER, SWERVE, Leg, entry, exit_from
 from planning.limits import Limits
 from planning.path import Path, check_path
+from planning.progress import Phase, Progress, check_start
 from planning.retime import Timing, retime
 
 HORIZON = 2.0  # s of path timed at once
-RENEW = 1.0  # s of it left when the next is timed; a horizon ends at rest
+RENEW = 1.5  # s of it left when the next is timed; a horizon ends at rest, and the surface is foreseen for 0.5 s
 STALL = 3.0  # ticks without a call after which the arm has come to rest by itself
 MARGIN = np.array([5.0, 5, 5, *np.deg2rad([2, 2, 2])])  # that targets keep from the bounds: braking needs room
 SHARE = 0.98  # of what the guard tolerates of a pose: the planner brakes before the guard would cut
-PATH_SPEED, PATH_ACCELERATION = 0.5, 0.2  # of the axes' limits, for the path alone; the rest carries the surface
 SLOWEST = 1.0  # mm/s, or degrees/s, of any move
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """How far the print is. checkpoint: the one being printed, of `total`; place: of `length` mm of path.
-
-    fraction: the same place counted in checkpoints: 2.35 is 35 % of the way from checkpoint 2 to 3.
-    """
-
-    phase: Phase
-    checkpoint: int
-    total: int
-    place: float
-    length: float
-    fraction: float
 
 
 class Planner:
     """Decides each tick where the nozzle goes next; remembers the place on the path and the arm's commanded motion."""
 
-    def __init__(self, path: Path, limits: Limits, arm: SimpleArm, tick: float, lag: float = 0.0) -> None:
-        """tick: s between calls. lag: s that the arm is later at a command's axes than one tick after the command."""
+    def __init__(
+        self, path: Path, limits: Limits, arm: SimpleArm, tick: float, lag: float = 0.0, start: float = 0.0
+    ) -> None:
+        """tick: s between calls. lag: s that the arm is later at a command's axes than one tick after the command.
+
+        start: how much of the path is printed already, counted in checkpoints (a Progress's fraction).
+        """
         self._path, self._limits, self._arm, self._tick, self._lag = check_path(path), limits, arm, tick, lag
         self._curve = curve_through(path.surface_from_nozzle, path.speed[1:], CORNER, SWERVE)
         self._zone = path.zone
         self._follower = Follower(arm.home, limits, tick)
         self._leg: Leg | None = None
-        self._place = 0.0  # mm of the path that are printed
+        self._asked: tuple[Leg | None, Array] = None, np.empty((5, 6))  # a leg and what it asks for at this tick
+        start = check_start(path, start)
+        self._place = float(np.interp(start, np.arange(len(path)), self._curve.knots))  # mm of it that are printed
+        self.horizons = 0  # timed so far
         self._finished = False
         self._before = -np.inf
 
@@ -116,7 +111,8 @@ class Planner:
         if np.linalg.norm(turn) > SHARE * limits.surface_turn:
             turn_deg, limit_deg = np.rad2deg(np.linalg.norm(turn)), np.rad2deg(limits.surface_turn)
             return f"surface turns at {turn_deg:.1f} degrees/s, limit {limit_deg:g} degrees/s"
-        error = float(pose.predict(then).error_at(place[None])[0])
+        with np.errstate(invalid="ignore"):  # of a matrix that is no covariance: NaN, which is too much
+            error = float(pose.predict(then).error_at(place[None])[0])
         if not error <= SHARE * limits.pose_error:
             return f"the place under the nozzle is known to {error:.3f} mm, limit {limits.pose_error:g} mm"
         return ""
@@ -128,7 +124,8 @@ class Planner:
         leg = self._leg
         if leg is None:
             return self._begin(pose, now)
-        off = self._error(pose, leg, now) > self._limits.on_path
+        self._asked = leg, self._look(pose, leg, now)
+        off = np.linalg.norm(self._follower.position[:3] - self._asked[1][0, :3]) > self._limits.on_path
         if off and leg.phase is Phase.PRINTING:
             return self._begin(pose, now)
         if now < leg.timing.end - RENEW:
@@ -165,8 +162,8 @@ class Planner:
         return ""
 
     def _start(self, pose: SurfacePose, phase: Phase, curve: Curve, place: float, now: float) -> str:
-        """Begin a leg from rest at `place`, mm; why that cannot be, or ""."""
-        timing = self._timed(pose, curve, place, 0.0, now)
+        """Begin a leg from rest at `place`, mm; why that cannot be, or "". It begins where the follower looks."""
+        timing = self._timed(pose, curve, place, 0.0, now + LEAD)
         self._leg = None if isinstance(timing, str) else Leg(phase, curve, timing)
         return timing if isinstance(timing, str) else ""
 
@@ -179,20 +176,21 @@ class Planner:
         self._leg = replace(leg, timing=timing)
         return ""
 
-    def _timed(self, pose: SurfacePose, curve: Curve, place: float, speed: float, now: float) -> Timing | str:
-        turn = (self._arm.arm_from_base @ pose.base_from_surface)[:3, :3]
-        limits = PATH_SPEED * self._limits.speed, PATH_ACCELERATION * self._limits.acceleration
-        return retime(curve, place, curve.after(place, HORIZON), speed, now, turn, limits)
+    def _timed(self, pose: SurfacePose, curve: Curve, place: float, speed: float, begin: float) -> Timing | str:
+        """The timing of the next horizon from `place`, mm, passed at `begin`, s, with `speed`, mm/s."""
+        grid = grid_on(curve, place, curve.after(place, HORIZON))
+        asked = demand(self._arm, pose, curve, grid, begin)
+        self.horizons += 1
+        return retime(grid, asked, speed, begin, (self._limits.speed, self._limits.acceleration))
 
     # -- the motion
 
     def _follow(self, pose: SurfacePose, now: float) -> Command:
         leg = self._leg
         assert leg is not None
+        asked, targets = self._asked
+        _, reference, before, ahead, after = targets if asked is leg else self._look(pose, leg, now)
         half = self._tick / 2
-        reference, before, ahead, after = self._targets(
-            pose, leg, now + np.array([2 * half, LEAD - half, LEAD, LEAD + half])
-        )
         outside = np.flatnonzero((ahead < self._limits.low + MARGIN) | (ahead > self._limits.high - MARGIN))
         if len(outside):
             return self._stop(now, self._out_of_reach(int(outside[0]), ahead))
@@ -202,21 +200,19 @@ class Planner:
             return self._stop(now, axes)
         extrude = False
         if leg.phase is Phase.PRINTING and np.linalg.norm(axes[:3] - reference[:3]) <= self._limits.on_path:
-            self._place = float(leg.timing.at(np.array([now + self._tick]))[0])
-            extrude = bool(self._path.extrude[self._checkpoint()])
+            before = self._place
+            self._place = max(before, float(leg.timing.at(np.array([now + self._tick]))[0]))
+            extrude = bool(self._path.extrude[self._checkpoint()]) and self._place > before
         return self._move(now, start, axes, extrude)
 
-    def _targets(self, pose: SurfacePose, leg: Leg, times: Array) -> Array:
-        """Machine axes (T, 6) that the leg asks for at times (T,), s."""
+    def _look(self, pose: SurfacePose, leg: Leg, now: float) -> Array:
+        """Machine axes (5, 6) that the leg asks for: now, a tick later, and before, at and after LEAD."""
+        half = self._tick / 2
+        times = now + np.array([0.0, self._tick, LEAD - half, LEAD, LEAD + half])
         surface_from_nozzle = leg.curve.poses(leg.timing.at(times))
         if pose.warp is not None:
             surface_from_nozzle = pose.warp.carry(surface_from_nozzle)
         return axes_from_nozzle(self._arm, pose.base_at(times) @ surface_from_nozzle)
-
-    def _error(self, pose: SurfacePose, leg: Leg, now: float) -> float:
-        """Distance, mm, of the nozzle from where the leg wants it at `now`."""
-        wanted = self._targets(pose, leg, np.array([now]))[0]
-        return float(np.linalg.norm(self._follower.position[:3] - wanted[:3]))
 
     def _stop(self, now: float, reason: str) -> Command:
         """Brake, and hold once at rest."""

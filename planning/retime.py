@@ -1,5 +1,9 @@
 """How fast along the curve: TOPP-RA (Pham and Pham 2018) over the next horizon, always ending at rest.
 
+The limits of the axes hold for path and surface together: what the surface's predicted motion takes of them at each
+grid point is not the path's to use. Speed changes by no more than the cruising speed in RISE, as the follower, whose
+jerk is limited, rounds off what is faster: a start at 5 mm/s was measured to cost 40 um along the path without that.
+
 What was measured of toppra 0.6.10 and is kept here: about 20 us a grid point, so the horizon has few; the start speed
 is carried at most at 0.999 of a limit, or half of all replans fail; the speed between grid points follows constant
 acceleration (ParametrizeConstAccel's rule), not a spline; a solve can end without a result or with an infinite time.
@@ -16,15 +20,23 @@ import toppra
 from numpy.typing import NDArray
 from toppra import constraint
 from toppra.algorithm import TOPPRA
+from toppra.algorithm.algorithm import ParameterizationAlgorithm
+from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
 from toppra.interpolator import AbstractGeometricPath
+from toppra.solverwrapper import seidelWrapper
 
 from estimation.se3 import Array
-from planning.curve import Curve
+from planning.demand import Demand
+from planning.grid import Grid
 
 logging.getLogger("toppra").setLevel(logging.CRITICAL)  # its failures are handled here, not printed
 
-GRID = 60  # evenly spread grid points of one horizon
 CARRIED = 0.999  # of a limit, as start speed
+RISE = 0.1  # s from rest to cruising speed: with it a start costs 3 um, with half of it 9
+TOTAL = 0.8  # of the axes' limits, for path and surface together; the rest makes good what was not foreseen
+PATH_SPEED, PATH_ACCELERATION = 0.5, 0.2  # of the axes' limits, for the path at most: jerk bears no more
+LEAST = 0.02  # of the axes' limits, for the path however the surface moves: slow, and never stuck
+BRAKED = 0.9  # of the change of speed that is allowed, where a speed carried over is brought down
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,28 +73,21 @@ class Timing:
         return np.asarray((self.speeds[i + 1] - self.speeds[i]) / (self.times[i + 1] - self.times[i]))
 
 
-def retime(
-    curve: Curve, start: float, end: float, speed: float, now: float, turn: Array, limits: tuple[Array, Array]
-) -> Timing | str:
-    """The fastest timing from `start` to `end`, mm, that begins at `now`, s, with `speed`, mm/s, and ends at rest.
+def retime(grid: Grid, asked: Demand, speed: float, begin: float, limits: tuple[Array, Array]) -> Timing | str:
+    """The fastest timing along the grid that begins at `begin`, s, with `speed`, mm/s, and ends at rest.
 
-    turn: (3, 3) rotation from the surface to the arm's frame. limits: speed and acceleration (6,) of the six axes in
-    it, which the curve alone may use. The speeds of the curve's stretches hold everywhere, not at grid points only.
-    A str says why there is none.
+    limits: speed and acceleration (D,) of what `asked` is about. The grid's speeds hold everywhere, not at its points
+    only. A speed too high for limits that have shrunk since is brought down to them as the grid's `cruise` lets it.
+    A str says why there is no timing.
     """
-    grid = _grid(curve, start, end)
-    allowed = _allowed(curve, grid)
-    rate, strength = limits
-    constraints = [
-        constraint.JointVelocityConstraint(np.stack([-rate, rate], 1)),
-        constraint.JointAccelerationConstraint(np.stack([-strength, strength], 1)),
-        _ToolSpeed(allowed),
-    ]
-    for constrained in constraints:
-        constrained.set_discretization_type(1)  # checked at both ends of each interval
-    instance = TOPPRA(constraints, _AxesCurve(curve, turn, grid), gridpoints=grid, solver_wrapper="seidel")
+    carried = min(speed, CARRIED * float(grid.allowed[0]))
+    change = grid.cruise / RISE
+    bounds = _speeds(grid, asked, limits[0], carried, float(change.min()))
+    constraints = [_Speed(bounds, change), _Acceleration(asked, limits[1])]
+    instance = _Solver(constraints, grid.places)
+    start, end = grid.places[[0, -1]]
     try:
-        _, speeds, _ = instance.compute_parameterization(min(speed, CARRIED * allowed[0]), 0.0)
+        _, speeds, _ = instance.compute_parameterization(carried, 0.0)
     except (ValueError, toppra.exceptions.ToppraError) as error:
         return f"no timing from {start:.2f} to {end:.2f} mm: {error}"
     if speeds is None or not np.isfinite(speeds).all():
@@ -90,72 +95,78 @@ def retime(
     pace = speeds[:-1] + speeds[1:]
     if (pace <= 0).any():
         return f"no timing from {start:.2f} to {end:.2f} mm: it would stand still"
-    return Timing(now + np.concatenate([[0.0], np.cumsum(2 * np.diff(grid) / pace)]), grid, np.asarray(speeds))
+    times = begin + np.concatenate([[0.0], np.cumsum(2 * np.diff(grid.places) / pace)])
+    return Timing(times, grid.places, np.asarray(speeds))
 
 
-def _grid(curve: Curve, start: float, end: float) -> Array:
-    """Grid points on [start, end], mm: evenly spread, and where there is room the bounds and middle of each blend."""
-    even = np.linspace(start, end, GRID)
-    inside = (curve.knots > start) & (curve.knots < end)
-    if inside.sum() > GRID // 3:
-        return even
-    knots, half = curve.knots[inside], curve.half[inside]
-    points = np.concatenate([even, knots - half, knots, knots + half])
-    points = np.unique(points[(points >= start) & (points <= end)])
-    apart = np.concatenate([[True], np.diff(points) > 1e-6])
-    points = points[apart]
-    points[-1] = end
-    return np.asarray(points)
+def _speeds(grid: Grid, asked: Demand, limit: Array, carried: float, change: float) -> Array:
+    """Speed (M,), mm/s, that tool and axes bear; from `carried` down no faster than by `change`, mm/s^2."""
+    left = np.clip(TOTAL * limit - asked.speed, LEAST * limit, PATH_SPEED * limit)
+    axes = (left / np.maximum(np.abs(asked.first), 1e-12)).min(axis=1)
+    braking = np.sqrt(np.maximum(carried**2 - 2 * BRAKED * change * (grid.places - grid.places[0]), 0.0))
+    return np.asarray(np.minimum(grid.allowed, np.maximum(axes, braking / CARRIED)))
 
 
-def _allowed(curve: Curve, grid: Array) -> Array:
-    """Speed (M,), mm/s, that the stretches and corners on both sides of each grid point bear."""
-    first, last = curve.stretch(grid[:-1]), curve.stretch(np.nextafter(grid[1:], 0.0))
-    between = np.array([curve.speed[a : b + 1].min() for a, b in zip(first, last, strict=True)])
-    for knot in range(first[0], last[-1] + 2):
-        if np.isfinite(curve.corner[knot]):
-            bounds = curve.knots[knot] + curve.half[knot] * np.array([-1.0, 1.0])
-            a, b = max(int(np.searchsorted(grid, bounds[0], "right")) - 1, 0), int(np.searchsorted(grid, bounds[1]))
-            between[a:b] = np.minimum(between[a:b], curve.corner[knot])
-    return np.concatenate([between[:1], np.minimum(between[:-1], between[1:]), between[-1:]])
+class _Solver(TOPPRA):  # type: ignore[misc]
+    """TOPPRA with its one solver; its own constructor searches the disk for others each time."""
+
+    def __init__(self, constraints: list[constraint.LinearConstraint], places: Array) -> None:
+        way = _Way(places)
+        ParameterizationAlgorithm.__init__(self, constraints, way, gridpoints=places)
+        self.solver_wrapper = seidelWrapper(constraints, way, places, solve_lp1d=True)
 
 
-class _AxesCurve(AbstractGeometricPath):  # type: ignore[misc]
-    """A curve as toppra reads it: X Y Z in the arm's frame and three rates of turn."""
+class _Way(AbstractGeometricPath):  # type: ignore[misc]
+    """What toppra asks of a path when the constraints know the rest."""
 
-    def __init__(self, curve: Curve, turn: Array, grid: Array) -> None:
-        self._curve, self._turn, self._interval = curve, turn, grid[[0, -1]]
+    def __init__(self, places: Array) -> None:
+        self._interval = places[[0, -1]]
 
     @property
     def dof(self) -> int:
-        """Six axes."""
-        return 6
+        """One: the length."""
+        return 1
 
     @property
     def path_interval(self) -> Array:
         """First and last s (2,), mm."""
         return self._interval
 
-    def __call__(self, path_positions: Array, order: int = 0) -> Array:
-        """Derivatives (M, 6) of the given order, 0 to 2, at s (M,)."""
-        s = np.atleast_1d(path_positions)
-        if order == 0:
-            moved, turned = self._curve.poses(s)[:, :3, 3], np.zeros((len(s), 3))
-        elif order == 1:
-            moved, turned = self._curve.slope(s), self._curve.spin[self._curve.stretch(s)]
-        else:
-            moved, turned = self._curve.curvature(s), np.zeros((len(s), 3))
-        return np.concatenate([moved @ self._turn.T, turned], axis=1)
 
+class _Speed(constraint.LinearConstraint):  # type: ignore[misc]
+    """Speed along the curve at each grid point, and how fast that may change.
 
-class _ToolSpeed(constraint.LinearConstraint):  # type: ignore[misc]
-    """Speed along the curve at each grid point: exact for the tool, whose way is never longer than the curve's."""
+    It is exact for the tool, whose way is never longer than the curve's.
+    """
 
-    def __init__(self, allowed: Array) -> None:
+    def __init__(self, allowed: Array, change: Array) -> None:
         super().__init__()
-        self._allowed = allowed
-        self._format_string = "tool speed"
+        self.set_discretization_type(1)  # checked at both ends of each interval
+        self._allowed, self._change = allowed, change
+        self._format_string = "speed"
 
     def compute_constraint_params(self, path: object, gridpoints: Array, *_: object, **__: object) -> tuple[Any, ...]:
-        """Bounds (M, 2) on the squared speed; no other parameter."""
-        return None, None, None, None, None, None, np.stack([np.zeros(len(gridpoints)), self._allowed**2], 1)
+        """Bounds (M, 2) on the acceleration and on the squared speed; no other parameter."""
+        squared = np.stack([np.zeros(len(gridpoints)), self._allowed**2], 1)
+        return None, None, None, None, None, np.stack([-self._change, self._change], 1), squared
+
+
+class _Acceleration(constraint.LinearConstraint):  # type: ignore[misc]
+    """|q' u + q'' x| of each axis, as a share of what is left to the path at each grid point, is at most 1."""
+
+    def __init__(self, asked: Demand, limit: Array) -> None:
+        super().__init__()
+        self.set_discretization_type(1)
+        self.identical = True
+        left = np.clip(TOTAL * limit - asked.acceleration, LEAST * limit, PATH_ACCELERATION * limit)
+        self._first, self._second = asked.first / left, asked.second / left
+        self._format_string = "acceleration"
+
+    def compute_constraint_params(self, path: object, gridpoints: Array, *_: object, **__: object) -> tuple[Any, ...]:
+        """a, b, c (M, 2 D), F and g of F (a u + b x + c) <= g; no bounds."""
+        none, one = np.zeros_like(self._first), np.eye(self._first.shape[1])
+        rows, ends = np.concatenate([one, -one]), np.ones(2 * len(one))
+        made = canlinear_colloc_to_interpolate(
+            self._first, self._second, none, rows, ends, None, None, gridpoints, identical=True
+        )
+        return tuple(made)

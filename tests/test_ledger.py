@@ -17,9 +17,8 @@ from hardware.arm_profile import ArmProfile, placed
 from hardware.simulator.ledger import Ledger, executed_rows
 from hardware.simulator.truth import Truth
 from planning.command import Command, Hold, Move
-from planning.legs import Phase
 from planning.path import Path
-from planning.planner import Progress
+from planning.progress import Phase, Progress
 from tests.moving import path_through
 
 TICK, LAG = 0.02, 0.03

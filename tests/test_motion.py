@@ -16,8 +16,8 @@ from hardware.motion import MotionStep
 from hardware.protocol import G1, G4, Dialect, decode
 from planning.command import Hold, Move
 from planning.kinematics import axes_from_nozzle
-from planning.legs import Phase
 from planning.limits import Limits
+from planning.progress import Phase
 from tests.moving import REST, breathing, pose_at, raster
 
 

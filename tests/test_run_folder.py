@@ -30,8 +30,7 @@ from hardware.tum import read_tum
 from perception.frames import Frame, FrameSet, PrintHead, Roi
 from perception.tracking import STAGES, StepReport, trusting_report
 from planning.command import Command, Hold, Move
-from planning.legs import Phase
-from planning.planner import Progress
+from planning.progress import Phase, Progress
 from tests.nozzle_logs import nozzle_log, part, straight
 from tests.worlds import IDEAL, SMALL, write_scenario
 

@@ -32,7 +32,7 @@ from hardware.simulator.world import Exposures, World
 from perception.frames import FrameSet
 from perception.tracking import StepReport
 from planning.command import Command, Hold
-from planning.planner import Progress
+from planning.progress import Progress
 
 HEADER = "x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,speed_mm_s,material,temperature_c,layer,extrude"
 IDEAL = {  # nothing takes time

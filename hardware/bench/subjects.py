@@ -43,6 +43,7 @@ SUBJECTS: Subjects = {
     "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?"),
     "registration": Subject("hardware.bench.registration", "a scan laid into the first pictures: error and verdict"),
     "prediction": Subject("hardware.bench.prediction", "where a breathing chest will be, 100 to 500 ms ahead"),
+    "planner": Subject("hardware.bench.planner", "random poses into planner and guard: limits kept, cost of a step"),
     "segmentation": Subject(
         "hardware.bench.segmentation", "finding the wound: Dice, silence, a half covered one, time"
     ),

@@ -15,9 +15,8 @@ from hardware.simulator.planned_line import planned_line
 from hardware.simulator.truth import Truth
 from planning.command import Command, Hold, Move
 from planning.kinematics import SimpleArm, nozzle_from_axes
-from planning.legs import Phase
 from planning.path import Path
-from planning.planner import Progress
+from planning.progress import Phase, Progress
 
 Index = NDArray[np.int64]
 

@@ -38,7 +38,7 @@ from hardware.tum import rows_from_trajectory
 from perception.frames import FrameSet, Roi
 from perception.tracking import STAGES, StepReport
 from planning.command import Command, Hold, Move
-from planning.planner import Progress
+from planning.progress import Progress
 
 DIGITS = 9  # of a stamp: a row and an exposure of one instant are one
 PATIENCE = 0.5  # s beyond the transport until a picture has surely arrived; truth is written in order of stamp

@@ -44,9 +44,9 @@ from perception.pairing import Pairing
 from perception.tracking import StepReport
 from planning.command import Command
 from planning.kinematics import nozzle_from_axes
-from planning.legs import Phase
 from planning.path import Path
-from planning.planner import Progress as Print
+from planning.progress import Phase
+from planning.progress import Progress as Print
 
 BLOCK = 0.2  # s of rows given out at once
 REST = 0.3  # s that the run goes on after the path is finished

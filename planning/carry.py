@@ -1,0 +1,76 @@
+"""The whole path carried along with the surface (thesis 5.4): Eq. 5.1 to 5.7 are one product of transforms.
+
+    base_from_nozzle = base_from_surface @ surface_from_nozzle
+
+The thesis turns about one axis after the other, about a point P_R (Eq. 5.4 to 5.6), and then shifts (Eq. 5.7); the
+product does all of that at once for every checkpoint, turn of the tool included, and knows no special point.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+
+from estimation import se3
+from estimation.pose import SurfacePose
+from estimation.se3 import Array
+from planning.kinematics import SimpleArm
+
+
+class Update(Enum):
+    """What became of the trajectory, the three answers of thesis Fig. 5.9."""
+
+    CHANGED = 0  # new coordinates are there
+    UNCHANGED = 1  # thesis code 1: the surface did not move, go on with those there are
+    ERROR = -1  # the pose is not worth following: keep the last checkpoint in mind and do not move
+
+
+class CarriedPath:
+    """N checkpoints where the newest surface pose puts them; what they were carried to last is kept on an error.
+
+    Inside, transforms are (3, 4, N) in memory, so that one product of matrices carries them all.
+    """
+
+    def __init__(self, surface_from_nozzle: Array, arm: SimpleArm) -> None:
+        """surface_from_nozzle: (N, 4, 4) mm."""
+        self._path, self._arm = surface_from_nozzle, arm
+        self._rows = self._rows_of(surface_from_nozzle)
+        self._carried = np.full_like(self._rows, np.nan)
+        self._arm_from_surface: Array | None = None
+
+    def __call__(self, pose: SurfacePose | None) -> Update:
+        """Carry all checkpoints to the pose, warp included."""
+        if pose is None or not pose.state.measured or not np.isfinite(pose.base_from_surface).all():
+            return Update.ERROR
+        arm_from_surface = self._arm.arm_from_base @ pose.base_from_surface
+        same = self._arm_from_surface is not None and np.array_equal(arm_from_surface, self._arm_from_surface)
+        if same and pose.warp is None:
+            return Update.UNCHANGED
+        rows = self._rows if pose.warp is None else self._rows_of(pose.warp.carry(self._path))
+        np.matmul(arm_from_surface[:3, :3], rows.reshape(3, -1), out=self._carried.reshape(3, -1))
+        self._carried[:, 3] += arm_from_surface[:3, 3:]
+        self._arm_from_surface = None if pose.warp is not None else arm_from_surface
+        return Update.CHANGED
+
+    @property
+    def base_from_nozzle(self) -> Array:
+        """Where the nozzle shall be at each checkpoint (N, 4, 4)."""
+        columns = np.moveaxis(self._carried, -1, 0)
+        turn = columns[..., :3] @ self._arm.arm_from_upright
+        return np.asarray(se3.inverse(self._arm.arm_from_base) @ se3.make(turn, columns[..., 3]))
+
+    @property
+    def axes(self) -> Array:
+        """Machine axes (6, N) in the simple mode, mm and rad."""
+        r, axes = self._carried, np.empty((6, self._carried.shape[2]))
+        axes[:3] = r[:, 3]
+        np.arctan2(r[2, 1], r[2, 2], out=axes[3])
+        np.arctan2(-r[2, 0], np.sqrt(r[0, 0] ** 2 + r[1, 0] ** 2), out=axes[4])
+        np.arctan2(r[1, 0], r[0, 0], out=axes[5])
+        return axes
+
+    def _rows_of(self, transforms: Array) -> Array:
+        """Transforms (N, 4, 4) as (3, 4, N), seen from the tool upright at A = B = C = 0."""
+        turn = transforms[:, :3, :3] @ self._arm.arm_from_upright.T
+        return np.ascontiguousarray(np.moveaxis(se3.make(turn, transforms[:, :3, 3])[:, :3], 0, -1))

@@ -1,0 +1,84 @@
+"""How far a print is, and the record that lets a later run go on where it stopped (thesis 5.2)."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from enum import Enum
+from math import floor
+
+import numpy as np
+
+from estimation.errors import InputError
+from planning.path import Path
+
+
+class Phase(Enum):
+    """What the nozzle is doing."""
+
+    WAITING = "waiting"  # at rest, nothing begun
+    ENTERING = "entering"  # on the way to where printing begins or goes on
+    PRINTING = "printing"
+    LEAVING = "leaving"  # on the way up from the last checkpoint
+    FINISHED = "finished"
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far the print is. checkpoint: the one being printed, of `total`; place: of `length` mm of path.
+
+    fraction: the same place counted in checkpoints: 2.35 is 35 % of the way from checkpoint 2 to 3.
+    """
+
+    phase: Phase
+    checkpoint: int
+    total: int
+    place: float
+    length: float
+    fraction: float
+
+    @property
+    def printed(self) -> int:
+        """The last checkpoint that is done."""
+        return floor(self.fraction)
+
+    @property
+    def next(self) -> int | None:
+        """The checkpoint after the one being printed; None where there is none."""
+        return self.checkpoint + 1 if self.checkpoint + 1 < self.total else None
+
+
+@dataclass(frozen=True, slots=True)
+class Bookmark:
+    """Where a print stopped. path: fingerprint of the path it belongs to. fraction: place, counted in checkpoints."""
+
+    path: str
+    fraction: float
+
+
+def bookmark(path: Path, progress: Progress) -> Bookmark:
+    """The record of a print of `path` that is as far as `progress` says."""
+    return Bookmark(fingerprint(path), progress.fraction)
+
+
+def resumed(path: Path, mark: Bookmark, where: object = "bookmark") -> float:
+    """The fraction at which a print of `path` goes on; InputError if the record is of another path or lies outside."""
+    if mark.path != (own := fingerprint(path)):
+        raise InputError(where, "path", mark.path, f"{own}, the fingerprint of the path to be printed")
+    return check_start(path, mark.fraction, where)
+
+
+def check_start(path: Path, fraction: float, where: object = "planner") -> float:
+    """The fraction itself if it is a place on the path, counted in checkpoints; else InputError."""
+    if not 0 <= fraction <= len(path) - 1:
+        raise InputError(where, "fraction", fraction, f"0 to {len(path) - 1} checkpoints")
+    return fraction
+
+
+def fingerprint(path: Path) -> str:
+    """A short name of all that is printed: places, speeds, materials, temperatures, layers, extrusion."""
+    digest = hashlib.sha256()
+    for column in (path.surface_from_nozzle, path.speed, path.temperature, path.layer, path.extrude):
+        digest.update(np.ascontiguousarray(column).tobytes())
+    digest.update("\n".join(map(str, path.material.tolist())).encode())
+    return digest.hexdigest()[:16]

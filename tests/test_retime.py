@@ -1,0 +1,135 @@
+"""Timing: per-checkpoint speeds, axes' limits with the surface's own motion added, gentle starts; and failures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimation import se3
+from hardware.bench.random_runs import Swing, random_path
+from planning.curve import Curve, curve_through
+from planning.demand import Demand, demand
+from planning.grid import grid_on
+from planning.kinematics import SimpleArm, axes_from_nozzle
+from planning.legs import CORNER, SWERVE
+from planning.limits import Limits
+from planning.retime import RISE, TOTAL, Timing, retime
+from tests.moving import Motion, pose_at, raster, still
+
+ARM, LIMITS = SimpleArm(), Limits()
+BOUNDS = LIMITS.speed, LIMITS.acceleration
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def curve_of(seed: int) -> Curve:
+    path = random_path(np.random.default_rng(seed))
+    return curve_through(path.surface_from_nozzle, path.speed[1:], CORNER, SWERVE)
+
+
+def timed(curve: Curve, start: float, end: float, speed: float = 0.0, motion: Motion = still) -> Timing:
+    grid = grid_on(curve, start, end)
+    timing = retime(grid, demand(ARM, pose_at(motion, 10.0), curve, grid, 10.0), speed, 10.0, BOUNDS)
+    assert isinstance(timing, Timing), timing
+    return timing
+
+
+@settings(max_examples=30)
+@given(SEEDS)
+def test_no_stretch_and_no_corner_is_passed_faster_than_it_may_be(seed: int) -> None:
+    curve = curve_of(seed)
+    timing = timed(curve, 0.0, curve.after(0.0, 2.0))
+    t = np.linspace(10.0, timing.end, 500)
+    places, speeds = timing.at(t), np.array([timing.speed_at(x) for x in t.tolist()])
+    assert (speeds <= curve.speed[curve.stretch(places)] * (1 + 1e-6)).all()
+    inside = np.abs(places[:, None] - curve.knots) < curve.half - 1e-9
+    assert (speeds <= np.where(inside, curve.corner, np.inf).min(axis=1) * (1 + 1e-6)).all()
+    assert (places[0], speeds[-1]) == (0.0, pytest.approx(0.0, abs=1e-9))
+    assert (np.diff(places) >= 0).all()
+
+
+@settings(max_examples=20)
+@given(SEEDS, st.sampled_from([(5.0, 0.05, 0.3), (12.0, 0.1, 0.5), (20.0, 0.0, 0.3)]))
+def test_path_and_surface_together_keep_the_axes_limits(seed: int, swing: tuple[float, float, float]) -> None:
+    """Judged by differences of the axes asked for, with the surface moving as it was foreseen."""
+    curve, pose = curve_of(seed), pose_at(Swing(*swing).at, 10.4)
+    grid = grid_on(curve, 0.0, curve.after(0.0, 2.0))
+    timing = retime(grid, demand(ARM, pose, curve, grid, 10.4), 0.0, 10.4, BOUNDS)
+    assert isinstance(timing, Timing)
+    step = 0.02
+    t = np.arange(10.4, timing.end, step)
+    axes = axes_from_nozzle(ARM, pose.base_at(t) @ curve.poses(timing.at(t)))
+    speed, acceleration = np.abs(np.diff(axes, axis=0)) / step, np.abs(np.diff(axes, 2, axis=0)) / step**2
+    assert (speed <= LIMITS.speed).all()
+    assert (acceleration <= LIMITS.acceleration).all()
+
+
+def test_a_surface_that_takes_most_of_an_axis_leaves_the_path_little() -> None:
+    """X may do 150 mm/s; a surface that asks 115 of TOTAL * 150 leaves 5 to a path that would go at 40."""
+    curve = curve_through(raster(size=40, lines=2).surface_from_nozzle, np.full(3, 40.0), CORNER, SWERVE)
+    grid = grid_on(curve, 0.0, 35.0)
+    asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
+    taken = np.zeros_like(asked.speed)
+    taken[:, 0] = TOTAL * LIMITS.speed[0] - 5.0
+    slow = retime(grid, Demand(asked.first, asked.second, taken, asked.acceleration), 0.0, 10.0, BOUNDS)
+    free = retime(grid, asked, 0.0, 10.0, BOUNDS)
+    assert isinstance(slow, Timing) and isinstance(free, Timing)
+    assert slow.speeds.max() == pytest.approx(5.0, rel=1e-3)
+    assert free.speeds.max() == pytest.approx(40.0, rel=1e-3)
+
+
+def test_a_surface_faster_than_an_axis_slows_the_path_and_does_not_stop_it() -> None:
+    curve = curve_through(raster().surface_from_nozzle, np.full(5, 40.0), CORNER, SWERVE)
+    grid = grid_on(curve, 0.0, 8.0)
+    asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
+    much = np.full_like(asked.speed, 1e4)
+    timing = retime(grid, Demand(asked.first, asked.second, much, much), 0.0, 10.0, BOUNDS)
+    assert isinstance(timing, Timing)
+    assert 0 < timing.speeds.max() <= 3.001
+
+
+@settings(max_examples=15)
+@given(SEEDS)
+def test_a_speed_carried_into_narrower_limits_is_brought_down_and_not_refused(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    curve = curve_through(raster(size=60, lines=2).surface_from_nozzle, np.full(3, 30.0), CORNER, SWERVE)
+    grid = grid_on(curve, 10.0, 55.0)
+    asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
+    taken = np.broadcast_to(draw.uniform(0, 2) * LIMITS.speed, asked.speed.shape)
+    timing = retime(grid, Demand(asked.first, asked.second, taken, asked.acceleration), 30.0, 10.0, BOUNDS)
+    assert isinstance(timing, Timing)
+    assert timing.speeds[0] == pytest.approx(30.0, rel=0.002)
+    slowing = -np.diff(timing.speeds**2) / (2 * np.diff(timing.places))
+    assert slowing.max() <= 30.0 / RISE * 1.001
+
+
+@settings(max_examples=15)
+@given(SEEDS)
+def test_speed_changes_by_no_more_than_the_cruising_speed_in_a_rise(seed: int) -> None:
+    curve = curve_of(seed)
+    timing = timed(curve, 0.0, curve.length)
+    change = np.abs(np.diff(timing.speeds)) / np.diff(timing.times)
+    assert (change <= curve.speed.max() / RISE * 1.001).all()
+
+
+def test_the_demand_of_a_surface_is_its_axes_own_speed_and_acceleration() -> None:
+    swing = Swing(10.0, 0.1, 0.25)
+    pose = pose_at(swing.at, 10.0)
+    curve = curve_through(raster().surface_from_nozzle, np.full(5, 5.0), CORNER, SWERVE)
+    grid = grid_on(curve, 0.0, 4.0)
+    asked = demand(ARM, pose, curve, grid, 10.0)
+    fixed = curve.poses(grid.places[:1])
+    before, after = (axes_from_nozzle(ARM, pose.base_at(np.array([10.0 + h])) @ fixed)[0] for h in (-1e-3, 1e-3))
+    own = np.abs(after - before) / 2e-3
+    assert (asked.speed[0] >= 0.999 * own).all()
+    assert asked.speed[0, 2] == pytest.approx(10.0 * 2 * np.pi * 0.25, rel=0.06)  # and the tilt lowers it
+    assert np.linalg.norm(asked.first[:, :3], axis=1).max() == pytest.approx(1.0, abs=1e-9)
+
+
+def test_two_places_that_are_one_have_no_timing_and_say_so() -> None:
+    curve = curve_through(se3.make(np.eye(3), np.array([[0.0, 0, 0], [1, 0, 0]])), np.array([5.0]), CORNER, SWERVE)
+    grid = grid_on(curve, 0.0, 1.0)
+    asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
+    reason = retime(grid, Demand(asked.first * np.nan, asked.second, asked.speed, asked.acceleration), 0.0, 1.0, BOUNDS)
+    assert isinstance(reason, str) and "no timing from 0.00 to 1.00 mm" in reason
