@@ -18,13 +18,13 @@ from estimation.se3 import Array
 from hardware.arm_echo import ArmEcho
 from hardware.arm_line import ArmLine
 from hardware.arm_port import Opener, UnpluggedError
-from hardware.arm_profile import ArmProfile
+from hardware.arm_profile import BITS_PER_BYTE, ArmProfile
 from hardware.arm_queue import ArmQueue
 from hardware.arm_status import ArmEvent, ArmState, ArmStatus
 from hardware.arm_travel import lifted, travel
 from hardware.link_settings import LinkSettings
 from hardware.protocol import G1, G4, G54, LENGTH, Instruction, Pause, decode, encode
-from hardware.replies import Reply, ReplyKind
+from hardware.replies import REPLY_LENGTH, Reply, ReplyKind
 
 DEFAULT = LinkSettings()
 REMEMBERED = 1000  # events and stray bytes that are kept until somebody takes them
@@ -51,7 +51,7 @@ class Arm:
         self._step: G1 | None = None  # of its own moves, the next one
         self._look = now  # when the device is looked for next
         self._doubt_since: float | None = None
-        self.poll(now)
+        self._open(now)
 
     # -- what an operator asks for
 
@@ -131,7 +131,10 @@ class Arm:
         """Read, write what waited, look for a device that is gone, send its own moves; every few milliseconds."""
         if self._line is None:
             if now >= self._look:
-                self._open(now)
+                try:
+                    self._open(now)
+                except InputError as error:  # another program has taken it meanwhile
+                    self._look, self.reason = now + self.settings.reopen, str(error)
             return
         try:
             self._read(self._line, now)
@@ -207,9 +210,9 @@ class Arm:
     def status(self, now: float) -> ArmStatus:
         """All that is known."""
         queued = 0 if self._queue is None else self._queue.frames(now)
-        echo, rate = self._echo, 1 / self._echo.period if self._echo.count > 1 else float("nan")
+        echo = self._echo
         return ArmStatus(
-            *(now, self.state, self.reason, self.reckoned(now), echo.axes(now), echo.off, echo.lag, rate),
+            *(now, self.state, self.reason, self.reckoned(now), echo.axes(now), echo.off, echo.lag, echo.rate),
             *(self.in_flight(now), queued, self.frames, echo.count, self.strays),
         )
 
@@ -243,6 +246,7 @@ class Arm:
 
     def _read(self, line: ArmLine, now: float) -> None:
         replies, strays = line.receive()
+        now -= REPLY_LENGTH * BITS_PER_BYTE / self.profile.baud  # that an answer took on the wire
         if strays:
             self.strays += len(strays)
             self.stray_bytes.append((now, strays))

@@ -45,12 +45,12 @@ class _Part:
 
 @dataclass(slots=True)
 class ArmEcho:
-    """Answers so far. count: of places. lag: s from set-point to answer, NaN until the arm has moved enough."""
+    """Answers so far. late: s that the arm is known to be behind its set-point. count: of places."""
 
     settings: LinkSettings
-    late: float  # s that the arm is known to be later at its set-point
+    late: float
     count: int = 0
-    period: float = math.nan  # s between places, smoothed
+    _period: float = math.nan  # s between places, smoothed
     _place: _Part = field(default_factory=_Part)
     _turn: _Part = field(default_factory=_Part)
     _sums: tuple[float, float] = (0.0, 0.0)
@@ -61,7 +61,7 @@ class ArmEcho:
             place = reply.values + origin
             gap = now - self._place.stamp
             if math.isfinite(gap):
-                self.period = gap if math.isnan(self.period) else self.period + 0.1 * (gap - self.period)
+                self._period = gap if math.isnan(self._period) else self._period + 0.1 * (gap - self._period)
             self.count += 1
             self._place.take(place, self._deviation(place, slice(0, 3), queue, now), STILL[0], now)
             self._learn(place, queue, now)
@@ -78,6 +78,11 @@ class ArmEcho:
     def off(self) -> float:
         """Distance, mm, of the arm from its way; 0 until two answers say otherwise."""
         return self._place.off
+
+    @property
+    def rate(self) -> float:
+        """Places a second, NaN until known."""
+        return 1 / self._period if self._period > 0 else math.nan
 
     def axes(self, now: float) -> Array | None:
         """The answered axes (6,), mm and rad; None where they are older than a silence."""
@@ -105,7 +110,7 @@ class ArmEcho:
 
     def restart(self) -> None:
         """Forget what was answered before: a device was away, or the arm was told where it stands."""
-        self.count, self.period, self._sums = 0, math.nan, (0.0, 0.0)
+        self.count, self._period, self._sums = 0, math.nan, (0.0, 0.0)
         self._place, self._turn = _Part(), _Part()
 
     def _deviation(self, values: Array, axes: slice, queue: ArmQueue, now: float) -> float:

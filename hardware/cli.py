@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from estimation.errors import StillbedError
+from hardware.arm_commands import add_arm
 from hardware.bench.command import add_bench
 from hardware.methods import MAP, METHODS
 from hardware.wound_commands import add_segment, add_train
@@ -81,7 +82,7 @@ def parser() -> argparse.ArgumentParser:
     _add_track(commands)
     add_segment(commands)
     _add_replay(commands)
-    _add_arm(commands)
+    add_arm(commands)
     _add_import(commands)
     _add_export(commands)
     add_train(commands)
@@ -134,24 +135,6 @@ def _add_simulate(commands: Commands) -> None:
     command.add_argument("--pty", action="store_true", help="send the arm's bytes through a pseudo-terminal")
     command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     command.set_defaults(run=_simulate)
-
-
-def _add_arm(commands: Commands) -> None:
-    command = _command(
-        commands,
-        "arm",
-        "serve a virtual arm on a pseudo-terminal",
-        "Serve a virtual SEED S6H4D on a pseudo-terminal, for any client that speaks its protocol, and print the\n"
-        "device's name. Ctrl-C ends it with a summary of what it received.",
-        "stillbed arm --virtual --link ./arm --replies stream --fault 'stall 600ms at 5s'",
-    )
-    command.add_argument("--virtual", action="store_true", required=True, help="the only kind of arm served so far")
-    command.add_argument("--link", type=Path, metavar="LINK", help="a symbolic link to make to the device")
-    command.add_argument("--replies", choices=("off", "stream", "stray"), default="off", help="what the arm sends")
-    command.add_argument("--fault", action="append", default=[], metavar="FAULT", help="e.g. 'slow 80%% at 2s for 1s'")
-    command.add_argument("--arm", type=Path, metavar="ARM.toml", help="its home, dialect and baud rate")
-    command.add_argument("--log", type=Path, metavar="X.csv", help="write the executed motion, a row a millisecond")
-    command.set_defaults(run=_arm)
 
 
 def _add_track(commands: Commands) -> None:
@@ -237,18 +220,6 @@ def _simulate(arguments: argparse.Namespace) -> int:
     outcome = run_simulation(arguments.scenario, arguments.out, options)
     print(outcome.text)
     return 0 if outcome.met else MISSED
-
-
-def _arm(arguments: argparse.Namespace) -> None:
-    from hardware.arm_file import read_arm
-    from hardware.simulator.arm_faults import fault_from_text
-    from hardware.simulator.arm_settings import arm_settings_from_table
-    from hardware.simulator.port import run_virtual_arm
-
-    settings = arm_settings_from_table("command line", {"replies": arguments.replies})
-    faults = [fault_from_text("command line", "--fault", text) for text in arguments.fault]
-    profile = None if arguments.arm is None else read_arm(arguments.arm)
-    run_virtual_arm(settings, profile, faults, arguments.link, arguments.log)
 
 
 def _track(arguments: argparse.Namespace) -> None:

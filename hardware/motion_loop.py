@@ -1,0 +1,162 @@
+"""The clock-driven loop of the motion: the newest pose, MotionStep, the arm, 50 times a second.
+
+It runs in a process of its own (motion_process.py), or under a simulated clock. Between ticks it looks at the line and
+at the operator's orders every few milliseconds, so that a stop waits for no tick. A motion is asked only when the arm
+can take its frame: what was decided is sent, and planner, guard and arm agree on where the arm is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+
+from estimation.pose import SurfacePose
+from estimation.se3 import Array
+from hardware.arm import Arm
+from hardware.arm_status import ArmState, ArmStatus
+from hardware.clock import Clock
+from planning.command import Command, Hold, Move
+
+REMEMBERED = 3000  # ticks whose lateness is kept: a minute
+FAREWELL = 0.05  # s in which the last frame, which stops the arm, goes out
+
+
+class Motion(Protocol):
+    """What the loop asks of a MotionStep."""
+
+    last: Command
+
+    def __call__(self, pose: SurfacePose | None, now: float) -> bytes:
+        """The frame of the tick at `now`, s."""
+        ...
+
+
+class Order(Enum):
+    """What an operator may ask of the motion."""
+
+    AT_HOME = "at home"  # the arm stands at home: whoever looks at it says so
+    ARM = "arm"  # let it move; it goes back to where the motion left off, if that is near
+    HOME = "home"  # arm it, go home, disarm it
+    DISARM = "disarm"
+    STOP = "stop"
+    QUIT = "quit"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tick:
+    """What one tick did. stamp: s. frame: the bytes sent, none of a hold by the link. late: s behind its instant."""
+
+    stamp: float
+    command: Command
+    frame: bytes
+    late: float
+    status: ArmStatus
+    answer: str  # why the last order was not followed, "" if it was
+
+
+def nobody(tick: Tick) -> None:
+    """Tell nobody."""
+
+
+class MotionLoop:
+    """One motion on one arm. lateness: s of the last ticks behind their instants. skipped: ticks too late to make."""
+
+    def __init__(
+        self,
+        motion: Motion,
+        arm: Arm,
+        clock: Clock,
+        pose: Callable[[], SurfacePose | None],
+        orders: Callable[[], Sequence[Order]],
+        tell: Callable[[Tick], None] = nobody,
+    ) -> None:
+        """pose: the newest there is. orders: those that have come since the last call. tell: is told of each tick."""
+        self.motion, self.arm = motion, arm
+        self.lateness: deque[float] = deque(maxlen=REMEMBERED)
+        self.skipped = 0
+        self._clock, self._pose, self._orders, self._tell = clock, pose, orders, tell
+        profile, settings = arm.profile, arm.settings
+        self._period, self._pause, self._look = profile.tick * (1 + settings.ease), profile.limits.pause, settings.poll
+        self._left_off: Array = profile.arm.home  # where planner and guard take the arm to be
+        self._homing = False
+        self._answer = ""
+        self._quit = False
+
+    def run(self, until: float = float("inf")) -> None:
+        """Go on until `until`, s, or until an order ends it; whatever ends it, the arm is stopped."""
+        start, ticks = self._clock.now(), 0
+        try:
+            while not self._quit and (now := self._clock.now()) < until:
+                self._obey(now)
+                self.arm.poll(now)
+                if (late := now - (start + ticks * self._period)) >= 0:
+                    self._tick(now, late)
+                    ticks += 1
+                    if (missed := int((self._clock.now() - start) / self._period) - ticks) > 0:
+                        self.skipped += missed
+                        ticks += missed
+                due = start + ticks * self._period
+                self._clock.wait_until(min(due, self._clock.now() + self._look))
+        finally:
+            self._end()
+
+    def _end(self) -> None:
+        if self.arm.state is ArmState.ARMED:
+            self.arm.stop("the motion has ended", self._clock.now())
+        until = self._clock.now() + FAREWELL
+        while (now := self._clock.now()) < until:
+            self.arm.poll(now)
+            self._clock.wait_until(now + self._look)
+
+    def _obey(self, now: float) -> None:
+        for order in self._orders():
+            self._answer = self._do(order, now)
+        if self._homing and (self.arm.state is not ArmState.ARMED or self.arm.arrived(now)):
+            self._homing = False
+            self.arm.disarm(now)
+
+    def _do(self, order: Order, now: float) -> str:
+        """Follow an order; why it cannot be followed, or ""."""
+        arm = self.arm
+        if order is Order.STOP:
+            arm.stop("by the operator", now)
+        elif order is Order.DISARM:
+            arm.disarm(now)
+        elif order is Order.QUIT:
+            self._quit = True
+        elif order is Order.AT_HOME:
+            return arm.stand(arm.profile.arm.home, now)
+        elif order is Order.ARM:
+            return arm.arm(now, self._left_off)
+        elif order is Order.HOME:
+            if reason := arm.arm(now) or arm.home(now):
+                return reason
+            self._homing = True
+        return ""
+
+    def _tick(self, now: float, late: float) -> None:
+        self.lateness.append(late)
+        frame = b""
+        if reason := "the arm goes home" if self._homing else self.arm.hold(now):
+            command: Command = Hold(now, self._pause, reason)
+        else:
+            frame = self.motion(self._pose(), now)
+            command = self.motion.last
+            if isinstance(command, Move):
+                self._left_off = command.axes
+            if reason := self.arm.send(frame, now):
+                frame, command = b"", Hold(now, self._pause, reason)
+        self._tell(Tick(now, command, frame, late, self.arm.status(now), self._answer))
+
+
+def lateness_figures(lateness: Sequence[float]) -> tuple[float, float, float]:
+    """Median, 99 % and largest, s, of how late ticks were; NaN of none."""
+    if not lateness:
+        return float("nan"), float("nan"), float("nan")
+    median, high, most = np.percentile(np.array(lateness), [50, 99, 100])
+    return float(median), float(high), float(most)

@@ -1,0 +1,215 @@
+"""The loop of the motion: a tick when it is due, a stop at once, and planner, guard and arm in one place."""
+
+from __future__ import annotations
+
+import multiprocessing
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.pose import SurfacePose, TrackState
+from hardware.arm_profile import ArmProfile
+from hardware.arm_status import ArmState
+from hardware.clock import SimClock, WallClock
+from hardware.link_settings import LinkSettings
+from hardware.motion import MotionStep
+from hardware.motion_loop import MotionLoop, Order, Tick, lateness_figures
+from hardware.motion_process import MotionPlan, MotionReport, motion_process
+from hardware.newest import Newest
+from hardware.simulator.arm_settings import ArmSettings, Replies
+from hardware.simulator.virtual_port import PortFaults
+from planning.command import Hold, Move
+from tests.linked import Linked, linked
+from tests.moving import breathing, pose_at, raster
+from tests.test_arm_port import serving
+from tests.test_floors import MOTION_NEVER
+from tests.virtual_arm import HOME
+
+ROOT = Path(__file__).parents[1]
+
+
+class Looping:
+    """A motion loop on a virtual arm in virtual time; orders are given by instant."""
+
+    def __init__(self, orders: dict[float, Order], link: Linked, pose: Callable[[float], SurfacePose | None]) -> None:
+        self.link, self.ticks, self._orders = link, list[Tick](), dict(orders)
+        self.motion = MotionStep(raster(speed=10.0), link.arm.profile)
+        clock = link.clock
+        self.loop = MotionLoop(self.motion, link.arm, clock, lambda: pose(clock.now()), self._due, self.ticks.append)
+
+    def _due(self) -> list[Order]:
+        due = [at for at in self._orders if at <= self.link.clock.now()]
+        return [self._orders.pop(at) for at in due]
+
+    def run(self, until: float) -> list[Tick]:
+        self.loop.run(until)
+        return self.ticks
+
+
+def seen(now: float) -> SurfacePose:
+    return pose_at(breathing, round(now - 0.02, 2))
+
+
+START = {0.0: Order.AT_HOME, 0.1: Order.ARM}
+
+
+def test_it_moves_only_between_arming_and_disarming() -> None:
+    looping = Looping({**START, 2.0: Order.DISARM}, linked(stand=False), seen)
+    ticks = looping.run(3.0)
+    moving = [t.stamp for t in ticks if isinstance(t.command, Move)]
+    assert 0.1 <= min(moving) < 0.13 and max(moving) < 2.0
+    assert len(moving) == pytest.approx(1.9 / 0.02, abs=4)
+    assert all("disarmed" in t.command.reason for t in ticks[:4] if isinstance(t.command, Hold))
+    assert looping.link.virtual.frames == sum(bool(t.frame) for t in ticks)
+    assert looping.link.arm.state is ArmState.DISARMED
+
+
+def test_ticks_come_a_hair_slower_than_moves_last_so_that_no_queue_grows() -> None:
+    looping = Looping(START, linked(stand=False), seen)
+    ticks = looping.run(4.0)
+    stamps = np.array([t.stamp for t in ticks])
+    assert np.diff(stamps) == pytest.approx(0.02 * 1.002, abs=1e-6)
+    assert looping.link.device.deepest <= 0.0205
+
+
+def test_what_was_decided_is_what_arrives() -> None:
+    looping = Looping({**START, 3.9: Order.DISARM}, linked(stand=False), seen)
+    ticks = looping.run(4.0)
+    looping.link.run(0.3)
+    moves = [t.command for t in ticks if isinstance(t.command, Move)]
+    assert looping.link.executed() == pytest.approx(moves[-1].axes, abs=1e-3)
+    assert looping.motion.progress.checkpoint >= 1
+
+
+def test_a_stop_waits_for_no_tick() -> None:
+    for instant in (1.0001, 1.0051, 1.0111, 1.0191):
+        looping = Looping({**START, instant: Order.STOP}, linked(stand=False), seen)
+        looping.run(1.5)
+        decided, on_wire = looping.link.arm.stops[0]
+        assert decided - instant <= 0.0021 and on_wire - instant <= 0.010
+        assert looping.link.arm.reason == "by the operator"
+
+
+def test_after_a_stop_and_a_new_arming_the_print_goes_on_where_it_was() -> None:
+    looping = Looping({**START, 2.0: Order.STOP, 3.0: Order.ARM}, linked(stand=False), seen)
+    ticks = looping.run(9.0)
+    before = [t for t in ticks if t.stamp < 2.0][-1]
+    after = [t for t in ticks if t.stamp > 3.0]
+    assert isinstance(after[-1].command, Move | Hold) and looping.motion.progress.checkpoint == 5
+    assert isinstance(before.command, Move)
+    axes = np.array([t.command.axes for t in ticks if isinstance(t.command, Move)])
+    assert np.linalg.norm(np.diff(axes, axis=0)[:, :3], axis=1).max() <= 3.0
+    assert not looping.link.virtual.ignored
+
+
+def test_an_arm_far_from_home_is_not_armed_before_it_went_there() -> None:
+    away = HOME + np.array([30.0, 0, 20, 0, 0, 0])
+    link = linked(ArmSettings(servo_lag=0.01, replies=Replies.STREAM), stand=False, begin=away)
+    looping = Looping({0.5: Order.ARM, 1.0: Order.HOME, 5.0: Order.ARM}, link, seen)
+    ticks = looping.run(6.0)
+    assert any("from where the motion left off" in t.answer for t in ticks)
+    assert {t.status.state for t in ticks if 4.5 < t.stamp < 5.0} == {ArmState.DISARMED}
+    first = next(t for t in ticks if isinstance(t.command, Move))
+    assert first.stamp > 5.0
+
+
+def test_while_the_arm_is_held_the_motion_is_not_asked() -> None:
+    link = linked(port=PortFaults(blocked=[(1.0, 1.15)]), stand=False)
+    looping = Looping(START, link, seen)
+    ticks = looping.run(2.0)
+    held = [t for t in ticks if isinstance(t.command, Hold) and "taken no bytes" in t.command.reason]
+    assert 4 <= len(held) <= 9
+    assert max(link.device.deepest, link.deepest) <= 0.05
+
+
+def test_a_lost_surface_is_a_pause_on_the_wire_and_the_arm_at_rest() -> None:
+    def lost(now: float) -> SurfacePose:
+        return replace(seen(now), state=TrackState.LOST) if now > 1.0 else seen(now)
+
+    looping = Looping(START, linked(stand=False), lost)
+    ticks = looping.run(3.0)
+    assert isinstance(ticks[-1].command, Hold) and len(ticks[-1].frame) == 48
+    assert looping.link.virtual.frames == sum(bool(t.frame) for t in ticks) + 1  # the stop at the end
+
+
+def test_a_late_tick_is_made_once_and_missed_ones_are_not_made_up() -> None:
+    class Slow(SimClock):
+        def wait_until(self, instant: float) -> None:
+            late = 0.07 if 1.0 <= self.now() < 1.003 else 0.0
+            super().wait_until(instant + late)
+
+    link = linked(stand=False)
+    link.clock.__class__ = Slow  # type: ignore[assignment]
+    looping = Looping(START, link, seen)
+    ticks = looping.run(2.0)
+    assert looping.loop.skipped in (2, 3)
+    assert np.diff([t.stamp for t in ticks]).max() > 0.06
+    assert lateness_figures(looping.loop.lateness)[2] > 0.005
+    assert link.device.deepest <= 0.05
+
+
+def test_whatever_ends_it_the_arm_is_stopped() -> None:
+    def broken(now: float) -> SurfacePose:
+        if now > 1.0:
+            raise RuntimeError("broken")
+        return seen(now)
+
+    looping = Looping(START, linked(stand=False), broken)
+    with pytest.raises(RuntimeError):
+        looping.run(2.0)
+    assert looping.link.arm.state is ArmState.STOPPED
+    looping.link.run(0.2)
+    assert looping.link.virtual.in_flight == 0 and len(looping.link.arm.stops) == 1
+    ended = Looping({**START, 1.0: Order.QUIT}, linked(stand=False), seen)
+    assert ended.run(5.0)[-1].stamp < 1.03
+
+
+def test_the_same_input_gives_the_same_bytes() -> None:
+    runs = [Looping(START, linked(stand=False), seen).run(2.0) for _ in range(2)]
+    assert b"".join(t.frame for t in runs[0]) == b"".join(t.frame for t in runs[1])
+
+
+def test_nothing_was_late_before_the_first_tick() -> None:
+    assert np.isnan(lateness_figures([])).all()
+
+
+def test_the_motion_process_loads_nothing_that_would_stall_it() -> None:
+    code = "import sys, hardware.motion_process; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert "hardware.arm" in done.stdout.split()
+    assert MOTION_NEVER.isdisjoint(done.stdout.split())
+
+
+def test_in_a_process_of_its_own_it_prints_over_a_pty_and_ends_when_nobody_is_left(tmp_path: Path) -> None:
+    clock = WallClock()
+    context = multiprocessing.get_context("spawn")
+    poses: Newest[SurfacePose] = Newest()
+    reports: Newest[MotionReport] = Newest()
+    orders, theirs = context.Pipe()
+    with serving(tmp_path / "arm", ArmSettings(replies=Replies.STREAM)) as ended:
+        plan = MotionPlan(raster(speed=10.0), ArmProfile(), str(tmp_path / "arm"), LinkSettings())
+        process = context.Process(target=motion_process, args=(plan, poses, reports, theirs))
+        process.start()
+        theirs.close()
+        orders.send(Order.AT_HOME)
+        orders.send(Order.ARM)
+        until = clock.now() + 20
+        while clock.now() < until:
+            poses.put(pose_at(breathing, clock.now()))
+            report = reports.get()
+            if report is not None and report.tick.status.frames > 60:
+                break
+            clock.wait_until(clock.now() + 0.03)
+        orders.close()
+        process.join(10)
+        clock.wait_until(clock.now() + 0.1)
+    assert report is not None and report.tick.status.state is ArmState.ARMED, report
+    assert process.exitcode == 0
+    assert report.total == 6 and any("armed" in event.text for event in report.events)
+    assert ended[0].frames > 60 and not ended[0].garbage and not ended[0].ignored
+    assert ended[0].in_flight == 0
