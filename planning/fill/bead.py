@@ -47,15 +47,26 @@ class Bead:
         """The same bead from its other end."""
         return Bead(self.points[::-1], self.width[::-1])
 
-    def begun_at(self, start: int) -> Bead:
-        """A closed bead that begins and ends at its point number `start` instead."""
-        return Bead(_turned(self.points, start), _turned(self.width, start))
+    def at(self, along: Array) -> Array:
+        """x, y and width (M, 3) at lengths (M,) mm from the start; its ends beyond them."""
+        length = np.concatenate([[0.0], np.cumsum(self.steps)])
+        return np.stack([np.interp(along, length, values) for values in (*self.points.T, self.width)], axis=1)
+
+    def between(self, start: float, end: float) -> Bead:
+        """The stretch from one length to another, mm from the start."""
+        length = np.concatenate([[0.0], np.cumsum(self.steps)])
+        inner = length[(length > start + SAME) & (length < end - SAME)]
+        found = self.at(np.concatenate([[start], inner, [end]]))
+        return Bead(found[:, :2], found[:, 2])
+
+    def turned(self, start: float) -> Bead:
+        """A closed bead that begins and ends at `start` mm from its start instead."""
+        a, b = self.between(start, self.length), self.between(0.0, start)
+        if start < SAME or start > self.length - SAME:
+            return self
+        return Bead(np.concatenate([a.points, b.points[1:]]), np.concatenate([a.width, b.width[1:]]))
 
 
 def even(points: Array, width: float) -> Bead:
     """A bead of one width, mm, through points (N, 2)."""
     return Bead(points, np.full(len(points), width))
-
-
-def _turned(values: Array, start: int) -> Array:
-    return np.concatenate([values[start:-1], values[: start + 1]])

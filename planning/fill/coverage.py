@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon
 from shapely.geometry.base import BaseGeometry
 
+from estimation.se3 import Array
 from planning.fill.bead import Bead
-from planning.fill.region import Region, only_areas
+from planning.fill.region import Region, minus, only_areas
+
+PIECE = 32  # steps buffered at once: of a long spiral, which touches itself all along, GEOS makes invalid areas
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,25 +36,41 @@ def coverage(beads: Sequence[Bead], region: Region) -> Coverage:
     if region.area == 0:
         return Coverage(1.0, 0.0, 0.0, MultiPolygon())
     union = covered_by(beads)
-    inside = shapely.intersection(union, region).area
     laid = sum(bead.laid for bead in beads)
-    gaps = only_areas(shapely.difference(region, union))
-    area = region.area
-    return Coverage(inside / area, (union.area - inside) / area, (laid - union.area) / area, gaps)
+    gaps = only_areas(minus(region, union))
+    over, area = minus(union, region).area, region.area
+    return Coverage((union.area - over) / area, over / area, (laid - union.area) / area, gaps)
 
 
 def covered_by(beads: Sequence[Bead]) -> BaseGeometry:
     """The area that beads cover."""
-    return shapely.union_all([footprint(bead) for bead in beads])
+    return shapely.union_all([shape for bead in beads for shape in _shapes(bead)])
 
 
 def footprint(bead: Bead) -> BaseGeometry:
     """The area that one bead covers."""
-    if np.ptp(bead.width) < 1e-9:
-        return shapely.buffer(shapely.linestrings(bead.points), bead.width[0] / 2)
-    step = np.diff(bead.points, axis=0)
-    side = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(bead.steps, 1e-12)[:, None] / 2
-    a, b = side * bead.width[:-1, None], side * bead.width[1:, None]
-    corners = np.stack([bead.points[:-1] + a, bead.points[:-1] - a, bead.points[1:] - b, bead.points[1:] + b], axis=1)
-    discs = shapely.buffer(shapely.points(bead.points), bead.width / 2)
-    return shapely.union_all(np.concatenate([shapely.polygons(corners), discs]))
+    return covered_by([bead])
+
+
+def _shapes(bead: Bead) -> list[BaseGeometry]:
+    """Areas that together are a bead's: stretches of one width as a whole, and each step on which the width changes."""
+    change = np.abs(np.diff(bead.width)) > 1e-9
+    ends = np.concatenate([[0], np.flatnonzero(np.diff(change)) + 1, [len(change)]])
+    found: list[BaseGeometry] = []
+    for a, b in pairwise(ends.tolist()):
+        if change[a]:
+            found += _tapered(bead.points[a : b + 1], bead.width[a : b + 1])
+        else:
+            cuts = [*range(a, b, PIECE), b]
+            lines = [shapely.linestrings(bead.points[i : j + 1]) for i, j in pairwise(cuts)]
+            found += shapely.buffer(lines, bead.width[a] / 2).tolist()
+    return found
+
+
+def _tapered(points: Array, width: Array) -> list[BaseGeometry]:
+    step = np.diff(points, axis=0)
+    side = np.stack([-step[:, 1], step[:, 0]], axis=1)
+    side /= 2 * np.maximum(np.linalg.norm(step, axis=1), 1e-12)[:, None]
+    a, b = side * width[:-1, None], side * width[1:, None]
+    corners = np.stack([points[:-1] + a, points[:-1] - a, points[1:] - b, points[1:] + b], axis=1)
+    return [*shapely.polygons(corners), *shapely.buffer(shapely.points(points), width / 2)]

@@ -12,6 +12,8 @@ from shapely.geometry.base import BaseGeometry
 from estimation.errors import InputError
 from estimation.se3 import Array
 
+GRID = 1e-6  # mm to which corners are rounded where exact arithmetic finds no answer
+
 Region: TypeAlias = Polygon | MultiPolygon
 
 
@@ -56,3 +58,11 @@ def areas(shape: BaseGeometry) -> list[Polygon]:
 def points_of(ring: BaseGeometry) -> Array:
     """Points (N, 2) of a line or ring."""
     return np.asarray(shapely.get_coordinates(ring))
+
+
+def minus(a: BaseGeometry, b: BaseGeometry) -> BaseGeometry:
+    """What lies in a and not in b, also where simplified outlines cross themselves by a micrometre."""
+    try:
+        return shapely.difference(a, b)
+    except shapely.GEOSException:
+        return shapely.difference(shapely.buffer(a, 0), shapely.buffer(b, 0), grid_size=GRID)

@@ -44,7 +44,7 @@ def crossings(region: Region, angle: float, spacing: float) -> tuple[Crossings, 
 
     The outermost lines touch the region; the distance is the nearest to `spacing` that divides its height evenly.
     """
-    points, ring = shapely.get_coordinates(shapely.get_rings(region), return_index=True)
+    points, ring = shapely.get_coordinates(shapely.get_rings(shapely.get_parts(region)), return_index=True)
     last = np.flatnonzero(np.diff(ring, append=-1))
     start = np.concatenate([[0], last[:-1] + 1])
     kept = np.ones(len(points), bool)

@@ -1,0 +1,73 @@
+"""Single beads along the middle of what is too narrow for two: as wide as the place."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
+
+from estimation.se3 import Array
+from planning.fill.axis import Axis
+from planning.fill.bead import Bead
+
+ONE, TWO = 0.25, 0.75  # spacings: radius from which one bead fits, and from which two do
+SHORTEST = 0.1  # spacings: a shorter line is a dot
+SAMPLED = 0.25  # spacings from point to point
+SMOOTHED = 4  # roundings, each over two points
+
+
+def paths(edges: NDArray[np.intp]) -> list[list[int]]:
+    """The edges (E, 2) of a graph as paths between its ends and forks; circles end where they begin."""
+    beside: dict[int, list[int]] = {}
+    for a, b in np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0).tolist():
+        beside.setdefault(a, []).append(b)
+        beside.setdefault(b, []).append(a)
+    found, gone = [], set()
+    ends = [v for v, near in beside.items() if len(near) != 2]
+    for start in (*ends, *beside):
+        for second in beside[start]:
+            if (start, second) in gone:
+                continue
+            path = [start, second]
+            gone |= {(start, second), (second, start)}
+            while len(beside[path[-1]]) == 2 and path[-1] != start:
+                a, b = beside[path[-1]]
+                path.append(b if a == path[-2] else a)
+                gone |= {(path[-2], path[-1]), (path[-1], path[-2])}
+            found.append(path)
+    return found
+
+
+def strokes(axis: Axis, edge: BaseGeometry, spacing: float, levels: int | None = None) -> list[tuple[int, Bead]]:
+    """Beads along the parts of an axis that closed lines at multiples of the spacing leave, each with its level.
+
+    edge: the boundary that the axis belongs to; no bead reaches over it.
+    """
+    share = axis.radii / spacing
+    level = np.floor(share - ONE).astype(int)
+    single = (share - level < TWO) & (level >= 0)
+    if levels is not None:
+        single &= level < levels
+    a, b = axis.edges.T
+    kept = axis.edges[single[a] & single[b] & (level[a] == level[b])]
+    found = []
+    for path in paths(kept):
+        points = _smooth(axis.middles[path], spacing)
+        if len(points):
+            inner = int(level[path[0]])
+            width = 2 * (shapely.distance(edge, shapely.points(points)) - spacing * inner)
+            found.append((inner, Bead(points, np.clip(width, 2 * ONE * spacing, 2 * TWO * spacing))))
+    return found
+
+
+def _smooth(points: Array, spacing: float) -> Array:
+    """The same line (N, 2) without the Voronoi diagram's jitter; none where it is too short to be one."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    if along[-1] < SHORTEST * spacing:
+        return points[:0]
+    at = np.linspace(0, along[-1], max(2, int(np.ceil(along[-1] / (SAMPLED * spacing))) + 1))
+    line = np.stack([np.interp(at, along, v) for v in points.T], axis=1)
+    for _ in range(SMOOTHED):
+        line[1:-1] = (line[:-2] + 2 * line[1:-1] + line[2:]) / 4
+    return line
