@@ -14,6 +14,7 @@ tool_mm = [[0, 0.5], [12.7, 0.5], [27, 4.8]]  # height above the tip and radius 
 [limits]                                      # as in planning/limits.py; arrays are X Y Z in mm, A B C in degrees
 speed = [150, 150, 150, 120, 120, 120]
 turn = 2.4
+[kinematics]                                  # optional, see hardware/kinematics_table.py
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware import checks
 from hardware.arm_profile import ArmProfile
+from hardware.kinematics_table import kinematics_from_table, kinematics_lines
 from hardware.protocol import Dialect
 from perception.tool_profile import check_profile
 from planning.kinematics import SimpleArm
@@ -45,6 +47,7 @@ KEYS = (
     "lag_s",
     "tool_mm",
     "limits",
+    "kinematics",
 )
 LIMITS = tuple(f.name for f in fields(Limits))
 _AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
@@ -71,6 +74,7 @@ def read_arm(path: str | Path) -> ArmProfile:
                 given.get("arm_from_base", default.arm.arm_from_base),
                 given.get("arm_from_upright", default.arm.arm_from_upright),
                 given["home_mm_deg"] * _TO_RAD if "home_mm_deg" in given else default.arm.home,
+                *kinematics_from_table(path, table.get("kinematics")),
             ),
             limits=_limits(path, table.get("limits", {})),
             dialect=_dialect(path, table),
@@ -103,6 +107,7 @@ def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
         "",
         "[limits] # X Y Z in mm, A B C in degrees",
         *(f"{name} = {checks.toml_numbers(getattr(limits, name) / _unit(name))}" for name in LIMITS),
+        *kinematics_lines(arm),
     ]
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 

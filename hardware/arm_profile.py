@@ -12,7 +12,8 @@ from estimation.se3 import Array
 from hardware.protocol import LENGTH, THESIS, Dialect
 from perception.tool_profile import SYRINGE, check_profile
 from planning.follow import LEAD
-from planning.kinematics import SimpleArm
+from planning.joints import JointModel
+from planning.kinematics import SimpleArm, joints_from_axes
 from planning.limits import Limits
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
@@ -50,11 +51,26 @@ class ArmProfile:
         if (arm.home < limits.low).any() or (arm.home > limits.high).any():
             allowed = f"within {limits.low.tolist()} and {limits.high.tolist()}"
             raise InputError("arm profile", "home", arm.home.tolist(), allowed)
+        if arm.jointed is not None:
+            _check_joints(arm, arm.jointed, limits)
 
     @property
     def frame_time(self) -> float:
         """Seconds that one frame takes on the wire: 4.17 ms at 115200 bits/s."""
         return LENGTH * BITS_PER_BYTE / self.baud
+
+
+def _check_joints(arm: SimpleArm, model: JointModel, limits: Limits) -> None:
+    """That A B C may do no more than the joints that they are, and that home can be reached."""
+    for name, most in (("speed", model.speed), ("acceleration", model.acceleration), ("high", model.high)):
+        if (getattr(limits, name)[3:] > most[3:] + 1e-9).any():
+            got, allowed = (np.rad2deg(value[3:]).tolist() for value in (getattr(limits, name), most))
+            raise InputError("arm profile", f"limits.{name} of A B C", got, f"at most J4 J5 J6's, {allowed} degrees")
+    if (limits.low[3:] < model.low[3:] - 1e-9).any():
+        got, allowed = (np.rad2deg(value[3:]).tolist() for value in (limits.low, model.low))
+        raise InputError("arm profile", "limits.low of A B C", got, f"at least J4 J5 J6's, {allowed} degrees")
+    if not np.isfinite(joints_from_axes(model, arm.home)).all():
+        raise InputError("arm profile", "home", arm.home.tolist(), "a place that the arm's posture reaches")
 
 
 def placed(profile: ArmProfile, base_from_surface: Array, arm_from_surface: Array = BENCH) -> ArmProfile:

@@ -15,6 +15,7 @@ from estimation.errors import StillbedError
 from hardware.arm_commands import add_arm
 from hardware.bench.command import add_bench
 from hardware.methods import MAP, METHODS
+from hardware.reach_command import add_reach
 from hardware.wound_commands import add_segment, add_train
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ def parser() -> argparse.ArgumentParser:
     _add_track(commands)
     add_segment(commands)
     _add_replay(commands)
+    add_reach(commands)
     add_arm(commands)
     _add_import(commands)
     _add_export(commands)

@@ -22,10 +22,12 @@ AROUND = 3  # grid points of a horizon's 30, to each side: the place is passed l
 class Demand:
     """At grid points (M,) of a curve, for the D numbers that the limits bind (`limited_axes`).
 
-    first, second: (M, D), derivatives by mm along the curve. speed, acceleration: (M, D), mm or rad per s and s^2, the
+    axes: (M, D), there when each point is passed at the soonest. first, second: (M, D), derivatives by mm along the
+    curve. speed, acceleration: (M, D), mm or rad per s and s^2, the
     largest that the surface's predicted motion alone asks about each point.
     """
 
+    axes: Array
     first: Array
     second: Array
     speed: Array
@@ -51,7 +53,7 @@ def demand(arm: SimpleArm, pose: SurfacePose, curve: Curve, grid: Grid, begin: f
     first[:, :3] = (turn @ curve.slope(places)[..., None])[..., 0]
     second[:, :3] = (turn @ curve.curvature(places)[..., None])[..., 0]
     moved = [maximum_filter1d(np.abs(part), 2 * AROUND + 1, axis=0) for part in _differences(over, PAUSE)]
-    return Demand(first, second, *moved)
+    return Demand(along[1], first, second, *moved)
 
 
 def _differences(values: Array, step: float) -> tuple[Array, Array]:

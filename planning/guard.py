@@ -14,7 +14,7 @@ from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from planning.command import Command, Hold, Move
-from planning.kinematics import SimpleArm, nozzle_from_axes
+from planning.kinematics import SimpleArm, joints_from_axes, nozzle_from_axes
 from planning.limits import Limits
 
 AXES = "XYZABC"
@@ -52,7 +52,8 @@ class Guard:
         if not reason and not doubt:
             self._trusted_at, self._trusted_axes = now, self._axes
         if not reason and isinstance(command, Move):
-            reason = self._reach(command) or self._motion(command) or (self._stopping(command, doubt) if doubt else "")
+            reason = self._reach(command) or self._motion(command) or self._joints(command)
+            reason = reason or (self._stopping(command, doubt) if doubt else "")
         if reason:
             return Hold(now, self._limits.pause, f"refused: {reason}")
         self._stamp = now
@@ -87,6 +88,21 @@ class Guard:
         for i, (speed, limit) in enumerate(zip(step / self._tick, limits.speed, strict=True)):
             if speed > limit:
                 return f"{AXES[i]} at {_shown(i, speed)}/s, limit {_shown(i, limit)}/s"
+        return ""
+
+    def _joints(self, move: Move) -> str:
+        """What the joints of an arm that is sent its last three cannot do, "" for one whose controller sees to them."""
+        if (model := self._arm.jointed) is None:
+            return ""
+        before, after = joints_from_axes(model, np.stack([self._axes, move.axes]))
+        if not np.isfinite(after).all():
+            return "the arm has no posture for these axes"
+        for i, (value, low, high) in enumerate(zip(after, model.low, model.high, strict=True)):
+            if not low <= value <= high:
+                return f"J{i + 1} = {_degrees(value)}, allowed {_degrees(low)} to {_degrees(high)}"
+        for i, (speed, limit) in enumerate(zip(np.abs(after - before) / self._tick, model.speed, strict=True)):
+            if not speed <= limit:
+                return f"J{i + 1} at {_degrees(speed)}/s, limit {_degrees(limit)}/s"
         return ""
 
     def _stopping(self, move: Move, doubt: str) -> str:
@@ -147,4 +163,8 @@ def _error(pose: SurfacePose, place: Array, ahead: float) -> float:
 
 
 def _shown(axis: int, value: float) -> str:
-    return f"{value:.3f} mm" if axis < LINEAR else f"{np.rad2deg(value):.3f} degrees"
+    return f"{value:.3f} mm" if axis < LINEAR else _degrees(value)
+
+
+def _degrees(value: float) -> str:
+    return f"{np.rad2deg(value):.3f} degrees"

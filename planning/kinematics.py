@@ -1,23 +1,38 @@
-"""From nozzle pose to machine axes and back: the thesis's simple mode, where the arm's controller solves its joints.
+"""From nozzle pose to machine axes X Y Z A B C and back.
 
-X Y Z are the nozzle tip in the arm's frame, mm. A B C (the arm's J4 J5 J6) are the angles alpha, beta, gamma of thesis
-Eq. 4.3 of the turn that carries the tool from where it stands at A = B = C = 0 to where it must stand:
+X Y Z are the nozzle tip in the arm's frame, mm. What A B C (the arm's J4 J5 J6) are, is one of two things:
+
+* `surface`, the thesis's simple mode: the angles alpha, beta, gamma of Eq. 4.3 of the turn that carries the tool from
+  where it stands at A = B = C = 0 to where it must stand; the arm's controller solves its joints.
 
     Rz(C) @ Ry(B) @ Rx(A) = rotation of arm_from_nozzle @ inverse(arm_from_nozzle at zero)
 
-For an upright path (alpha = beta = gamma = 0) over a surface that started parallel to the arm, that turn is the
-surface's own rotation since then: the thesis adds exactly that to its angles (6.3, J5 and J6).
+  For an upright path (alpha = beta = gamma = 0) over a surface that started parallel to the arm, that turn is the
+  surface's own rotation since then: the thesis adds exactly that to its angles (6.3, J5 and J6).
+* `joints`: the angles of the last three joints of a kinematic model, in one posture that the arm keeps.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
+from planning.inverse import joints_from_nozzle, joints_from_tip
+from planning.joints import JointModel
+from planning.joints import arm_from_nozzle as arm_from_joints
+from planning.limits import Limits
+
+
+class Angles(Enum):
+    """What the axes A B C are."""
+
+    SURFACE = "surface"
+    JOINTS = "joints"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,12 +40,15 @@ class SimpleArm:
     """An arm that is told where its tool shall be.
 
     arm_from_base: (4, 4) mm, where the arm stands in the base frame. arm_from_upright: (3, 3) rotation of the nozzle
-    frame at A = B = C = 0. home: (6,) mm and rad, where the arm stands at start.
+    frame at A = B = C = 0, where A B C are the surface's. home: (6,) mm and rad, where the arm stands at start. joints:
+    the arm's kinematic model, if there is one. angles: what A B C are.
     """
 
     arm_from_base: Array = field(default_factory=lambda: np.eye(4))
     arm_from_upright: Array = field(default_factory=lambda: np.eye(3))
     home: Array = field(default_factory=lambda: np.array([202.5, 225, 113, 0, 0, 0]))  # thesis 6.3
+    joints: JointModel | None = None
+    angles: Angles = Angles.SURFACE
 
     def __post_init__(self) -> None:
         if not se3.is_transform(self.arm_from_base):
@@ -39,21 +57,57 @@ class SimpleArm:
             raise InputError("arm", "arm_from_upright", self.arm_from_upright.tolist(), "a 3x3 rotation")
         if self.home.shape != (6,) or not np.isfinite(self.home).all():
             raise InputError("arm", "home", self.home.tolist(), "6 finite numbers X Y Z A B C, mm and rad")
+        if self.angles is Angles.JOINTS and self.joints is None:
+            raise InputError("arm", "angles", self.angles.value, "surface, where there is no model of the joints")
+
+    @property
+    def jointed(self) -> JointModel | None:
+        """The model of the joints where A B C are its last three."""
+        return self.joints if self.angles is Angles.JOINTS else None
 
 
 def axes_from_nozzle(arm: SimpleArm, base_from_nozzle: Array) -> Array:
-    """Machine axes (..., 6), mm and rad, that bring the nozzle to base_from_nozzle (..., 4, 4); A and C in +-pi."""
+    """Machine axes (..., 6), mm and rad, that bring the nozzle to base_from_nozzle (..., 4, 4).
+
+    In the simple mode A and C are in +-pi. With joints, angles are NaN where the arm's posture does not reach.
+    """
     arm_from_nozzle = arm.arm_from_base @ base_from_nozzle
-    turn = arm_from_nozzle[..., :3, :3] @ arm.arm_from_upright.T
-    return np.concatenate([arm_from_nozzle[..., :3, 3], se3.euler_from_rotation(turn)], axis=-1)
+    if arm.jointed is not None:
+        angles = joints_from_nozzle(arm.jointed, arm_from_nozzle)[..., 3:]
+    else:
+        angles = se3.euler_from_rotation(arm_from_nozzle[..., :3, :3] @ arm.arm_from_upright.T)
+    return np.concatenate([arm_from_nozzle[..., :3, 3], angles], axis=-1)
 
 
 def nozzle_from_axes(arm: SimpleArm, axes: Array) -> Array:
     """base_from_nozzle (..., 4, 4) at machine axes (..., 6): inverse of `axes_from_nozzle`."""
-    turn = se3.rotation_from_euler(axes[..., 3:])
-    return np.asarray(se3.inverse(arm.arm_from_base) @ se3.make(turn @ arm.arm_from_upright, axes[..., :3]))
+    if arm.jointed is not None:
+        arm_from_nozzle = arm_from_joints(arm.jointed, joints_from_axes(arm.jointed, axes))
+    else:
+        arm_from_nozzle = se3.make(se3.rotation_from_euler(axes[..., 3:]) @ arm.arm_from_upright, axes[..., :3])
+    return np.asarray(se3.inverse(arm.arm_from_base) @ arm_from_nozzle)
+
+
+def joints_from_axes(model: JointModel, axes: Array) -> Array:
+    """All joints (..., 6), rad, at machine axes (..., 6) X Y Z J4 J5 J6; NaN where the posture does not reach."""
+    return joints_from_tip(model, axes[..., :3], axes[..., 3:])
 
 
 def limited_axes(arm: SimpleArm, base_from_nozzle: Array) -> Array:
-    """What limits of speed and acceleration bind (..., D) at base_from_nozzle (..., 4, 4): the machine axes."""
-    return axes_from_nozzle(arm, base_from_nozzle)
+    """What limits of speed and acceleration bind (..., D) at base_from_nozzle (..., 4, 4).
+
+    The machine axes; with joints, J1 to J3 after them, as these are nobody else's to watch.
+    """
+    if arm.jointed is None:
+        return axes_from_nozzle(arm, base_from_nozzle)
+    arm_from_nozzle = arm.arm_from_base @ base_from_nozzle
+    joints = joints_from_nozzle(arm.jointed, arm_from_nozzle)
+    return np.concatenate([arm_from_nozzle[..., :3, 3], joints[..., 3:], joints[..., :3]], axis=-1)
+
+
+def limits_of(arm: SimpleArm, limits: Limits) -> tuple[Array, Array]:
+    """Speed and acceleration (D,) that bind `limited_axes`."""
+    if arm.jointed is None:
+        return limits.speed, limits.acceleration
+    model = arm.jointed
+    return np.append(limits.speed, model.speed[:3]), np.append(limits.acceleration, model.acceleration[:3])

@@ -20,10 +20,10 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from planning.command import TURNING, Command, Hold, Move
 from planning.curve import Curve, curve_through
-from planning.demand import demand
+from planning.demand import Demand, demand
 from planning.follow import LEAD, Follower
-from planning.grid import grid_on
-from planning.kinematics import SimpleArm, axes_from_nozzle, nozzle_from_axes
+from planning.grid import Grid, grid_on
+from planning.kinematics import SimpleArm, axes_from_nozzle, joints_from_axes, limits_of, nozzle_from_axes
 from planning.legs import CORNER, SWERVE, Leg, entry, exit_from
 from planning.limits import Limits
 from planning.path import Path, check_path
@@ -34,6 +34,7 @@ HORIZON = 2.0  # s of path timed at once
 RENEW = 1.5  # s of it left when the next is timed; a horizon ends at rest, and the surface is foreseen for 0.5 s
 STALL = 3.0  # ticks without a call after which the arm has come to rest by itself
 MARGIN = np.array([5.0, 5, 5, *np.deg2rad([2, 2, 2])])  # that targets keep from the bounds: braking needs room
+JOINT_MARGIN = float(np.deg2rad(2))  # that joints keep from the ends of their ranges
 SHARE = 0.98  # of what the guard tolerates of a pose: the planner brakes before the guard would cut
 SLOWEST = 1.0  # mm/s, or degrees/s, of any move
 
@@ -163,25 +164,31 @@ class Planner:
 
     def _start(self, pose: SurfacePose, phase: Phase, curve: Curve, place: float, now: float) -> str:
         """Begin a leg from rest at `place`, mm; why that cannot be, or "". It begins where the follower looks."""
-        timing = self._timed(pose, curve, place, 0.0, now + LEAD)
+        grid, asked = self._ask(pose, curve, place, now + LEAD)
+        if reason := self._unreachable(asked.axes[:, :6]):
+            self._leg = None
+            return reason
+        timing = self._timed(grid, asked, 0.0, now + LEAD)
         self._leg = None if isinstance(timing, str) else Leg(phase, curve, timing)
         return timing if isinstance(timing, str) else ""
 
     def _renew(self, pose: SurfacePose, leg: Leg, now: float) -> str:
         """Time the next horizon from where and how fast the old one is; if that fails, the old one ends at rest."""
         place = float(leg.timing.at(np.array([now]))[0])
-        timing = self._timed(pose, leg.curve, place, leg.timing.speed_at(now), now)
+        timing = self._timed(*self._ask(pose, leg.curve, place, now), leg.timing.speed_at(now), now)
         if isinstance(timing, str):
             return timing if now >= leg.timing.end else ""
         self._leg = replace(leg, timing=timing)
         return ""
 
-    def _timed(self, pose: SurfacePose, curve: Curve, place: float, speed: float, begin: float) -> Timing | str:
-        """The timing of the next horizon from `place`, mm, passed at `begin`, s, with `speed`, mm/s."""
+    def _ask(self, pose: SurfacePose, curve: Curve, place: float, begin: float) -> tuple[Grid, Demand]:
+        """The next horizon from `place`, mm, passed at `begin`, s, and what it asks of the axes."""
         grid = grid_on(curve, place, curve.after(place, HORIZON))
-        asked = demand(self._arm, pose, curve, grid, begin)
+        return grid, demand(self._arm, pose, curve, grid, begin)
+
+    def _timed(self, grid: Grid, asked: Demand, speed: float, begin: float) -> Timing | str:
         self.horizons += 1
-        return retime(grid, asked, speed, begin, (self._limits.speed, self._limits.acceleration))
+        return retime(grid, asked, speed, begin, limits_of(self._arm, self._limits))
 
     # -- the motion
 
@@ -191,9 +198,8 @@ class Planner:
         asked, targets = self._asked
         _, reference, before, ahead, after = targets if asked is leg else self._look(pose, leg, now)
         half = self._tick / 2
-        outside = np.flatnonzero((ahead < self._limits.low + MARGIN) | (ahead > self._limits.high - MARGIN))
-        if len(outside):
-            return self._stop(now, self._out_of_reach(int(outside[0]), ahead))
+        if reason := self._unreachable(ahead[None]):
+            return self._stop(now, reason)
         start = self._follower.position
         axes = self._follower.aim(ahead, (after - before) / self._tick, (after - 2 * ahead + before) / half**2)
         if isinstance(axes, str):
@@ -234,11 +240,35 @@ class Planner:
         """The checkpoint that the place on the path leads to."""
         return min(int(np.searchsorted(self._curve.knots, self._place, "left")), len(self._path) - 1)
 
-    def _out_of_reach(self, axis: int, axes: Array) -> str:
-        shown = np.array([axes, self._limits.low + MARGIN, self._limits.high - MARGIN])[:, axis]
-        got, low, high = np.rad2deg(shown) if axis > 2 else shown
-        allowed = f"{low:g} to {high:g} {'degrees' if axis > 2 else 'mm'}"
-        return f"checkpoint {self._checkpoint()} is out of reach: {'XYZABC'[axis]} = {got:.1f}, allowed {allowed}"
+    def _unreachable(self, axes: Array) -> str:
+        """Why the arm must not go to machine axes (M, 6), the first of them that it must not; "" if it may.
+
+        Axes keep MARGIN from their bounds; an arm that stands nearer already must not go nearer still.
+        """
+        stands = self._follower.position
+        low = np.minimum(self._limits.low + MARGIN, stands)
+        high = np.maximum(self._limits.high - MARGIN, stands)
+        rows, columns = np.nonzero(~((axes >= low) & (axes <= high)))  # NaN is outside
+        if len(rows):
+            return self._told("XYZABC"[columns[0]], axes[rows[0], columns[0]], low[columns[0]], high[columns[0]])
+        if (model := self._arm.jointed) is None:
+            return ""
+        joints, own = joints_from_axes(model, axes), joints_from_axes(model, stands)
+        low, high = np.fmin(model.low + JOINT_MARGIN, own), np.fmax(model.high - JOINT_MARGIN, own)
+        rows, columns = np.nonzero(~((joints >= low) & (joints <= high)))
+        return (
+            self._told(f"J{columns[0] + 1}", joints[rows[0], columns[0]], low[columns[0]], high[columns[0]])
+            if len(rows)
+            else ""
+        )
+
+    def _told(self, axis: str, got: float, low: float, high: float) -> str:
+        where = f"checkpoint {self._checkpoint()} is out of reach"
+        if not np.isfinite(got):
+            return f"{where}: the arm has no such posture"
+        unit = "mm" if axis in "XYZ" else "degrees"
+        shown = np.array([got, low, high]) if unit == "mm" else np.rad2deg([got, low, high])
+        return f"{where}: {axis} = {shown[0]:.1f}, allowed {shown[1]:g} to {shown[2]:g} {unit}"
 
 
 def _late(pose: SurfacePose, lag: float) -> SurfacePose:

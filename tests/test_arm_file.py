@@ -20,9 +20,8 @@ from planning.limits import Limits
 
 
 def same(a: ArmProfile, b: ArmProfile) -> bool:
-    pairs = [
-        (getattr(x, f.name), getattr(y, f.name)) for x, y in ((a.arm, b.arm), (a.limits, b.limits)) for f in fields(x)
-    ]
+    pairs = [(getattr(a.limits, f.name), getattr(b.limits, f.name)) for f in fields(a.limits)]
+    pairs += [(getattr(a.arm, name), getattr(b.arm, name)) for name in ("arm_from_base", "arm_from_upright", "home")]
     numbers = all(np.allclose(x, y, rtol=1e-14, atol=1e-14) for x, y in pairs)
     numbers &= np.array_equal(a.tool, b.tool)
     return numbers and (a.dialect, a.baud, a.tick, a.lag) == (b.dialect, b.baud, b.tick, b.lag)

@@ -15,7 +15,7 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.warp import Warp
-from hardware.bench.planner import Tally, follow
+from hardware.bench.planner import Tally, bench_arm, follow
 from planning.command import Command, Hold, Move
 from planning.guard import Guard
 from planning.kinematics import SimpleArm, axes_from_nozzle, nozzle_from_axes
@@ -222,7 +222,7 @@ def test_a_surface_that_jumps_is_found_again_before_printing_goes_on() -> None:
 @given(st.integers(0, 2**32 - 1))
 def test_no_stream_of_poses_breaks_a_limit(seed: int) -> None:
     tally = Tally()
-    follow((seed, 0), tally, 200)
+    follow((seed, 0), tally, bench_arm(), 200)
     assert tally.samples == 200
     assert tally.worst.max() <= 1 + 1e-6
     assert (tally.refused, tally.errors) == (0, [])

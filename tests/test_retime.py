@@ -72,7 +72,7 @@ def test_a_surface_that_takes_most_of_an_axis_leaves_the_path_little() -> None:
     asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     taken = np.zeros_like(asked.speed)
     taken[:, 0] = TOTAL * LIMITS.speed[0] - 5.0
-    slow = retime(grid, Demand(asked.first, asked.second, taken, asked.acceleration), 0.0, 10.0, BOUNDS)
+    slow = retime(grid, Demand(asked.axes, asked.first, asked.second, taken, asked.acceleration), 0.0, 10.0, BOUNDS)
     free = retime(grid, asked, 0.0, 10.0, BOUNDS)
     assert isinstance(slow, Timing) and isinstance(free, Timing)
     assert slow.speeds.max() == pytest.approx(5.0, rel=1e-3)
@@ -84,7 +84,7 @@ def test_a_surface_faster_than_an_axis_slows_the_path_and_does_not_stop_it() -> 
     grid = grid_on(curve, 0.0, 8.0)
     asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     much = np.full_like(asked.speed, 1e4)
-    timing = retime(grid, Demand(asked.first, asked.second, much, much), 0.0, 10.0, BOUNDS)
+    timing = retime(grid, Demand(asked.axes, asked.first, asked.second, much, much), 0.0, 10.0, BOUNDS)
     assert isinstance(timing, Timing)
     assert 0 < timing.speeds.max() <= 3.001
 
@@ -97,7 +97,7 @@ def test_a_speed_carried_into_narrower_limits_is_brought_down_and_not_refused(se
     grid = grid_on(curve, 10.0, 55.0)
     asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     taken = np.broadcast_to(draw.uniform(0, 2) * LIMITS.speed, asked.speed.shape)
-    timing = retime(grid, Demand(asked.first, asked.second, taken, asked.acceleration), 30.0, 10.0, BOUNDS)
+    timing = retime(grid, Demand(asked.axes, asked.first, asked.second, taken, asked.acceleration), 30.0, 10.0, BOUNDS)
     assert isinstance(timing, Timing)
     assert timing.speeds[0] == pytest.approx(30.0, rel=0.002)
     slowing = -np.diff(timing.speeds**2) / (2 * np.diff(timing.places))
@@ -131,5 +131,7 @@ def test_two_places_that_are_one_have_no_timing_and_say_so() -> None:
     curve = curve_through(se3.make(np.eye(3), np.array([[0.0, 0, 0], [1, 0, 0]])), np.array([5.0]), CORNER, SWERVE)
     grid = grid_on(curve, 0.0, 1.0)
     asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
-    reason = retime(grid, Demand(asked.first * np.nan, asked.second, asked.speed, asked.acceleration), 0.0, 1.0, BOUNDS)
+    reason = retime(
+        grid, Demand(asked.axes, asked.first * np.nan, asked.second, asked.speed, asked.acceleration), 0.0, 1.0, BOUNDS
+    )
     assert isinstance(reason, str) and "no timing from 0.00 to 1.00 mm" in reason

@@ -8,13 +8,15 @@ the first one's record says. Time is virtual; the cost of a step is the thread's
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path as File
 
 import numpy as np
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
+from hardware.arm_file import read_arm
 from hardware.arm_profile import ArmProfile
 from hardware.bench.axes_judge import KINDS, AxesJudge
 from hardware.bench.figure import Figure, at_least, at_most
@@ -24,14 +26,14 @@ from hardware.progress import Progress as Bar
 from planning.carry import CarriedPath
 from planning.command import Hold, Move
 from planning.guard import Guard
-from planning.kinematics import SimpleArm
+from planning.kinematics import SimpleArm, axes_from_nozzle
 from planning.path import Path
 from planning.planner import STALL, Planner
 from planning.progress import bookmark, resumed
 
 STREAM = 500  # updates of one stream: 10 s
 CUT = 0.6  # of a stream, after which a second planner takes over
-HOME = SimpleArm(home=SimpleArm().home - [0, 0, 61.0, 0, 0, 0])  # 2 mm above the surface, so that prints begin soon
+ABOVE = se3.make(np.eye(3), [0, 0, 2.0])  # mm: the arm starts so high above the surface, so that prints begin soon
 CHECKPOINTS = 50_000
 CARRIES = 300
 PLAN = at_most(3.0), at_most(8.0)  # ms, median and 99 %
@@ -56,30 +58,37 @@ class Tally:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """How many updates, and which."""
     parser.add_argument("--updates", type=int, default=10_000, metavar="N", help="in all; default 10000")
+    parser.add_argument("--arm", type=File, metavar="ARM.toml", help="instead of the default arm")
     parser.add_argument("--seed", type=int, default=0, help="of the streams; runs with other seeds may go side by side")
 
 
 def run(options: argparse.Namespace) -> list[Figure]:
     """Judge the streams, then time the transform of a long path."""
-    tally = Tally()
+    tally, profile = Tally(), bench_arm(None if options.arm is None else read_arm(options.arm))
     streams = -(-options.updates // STREAM)
     with Bar("planner", "streams", WallClock().now) as bar:
         for stream in range(streams):
             try:
-                follow((options.seed, stream), tally)
+                follow((options.seed, stream), tally, profile)
             except Exception as error:  # every uncaught error is a finding, whatever it is
                 tally.errors.append(f"stream {stream}: {type(error).__name__}: {error}")
             bar(stream + 1, streams)
     return [*_limits(tally), *_costs(tally), *carry_figures()]
 
 
-def follow(seed: tuple[int, int], tally: Tally, ticks: int = STREAM) -> None:
+def bench_arm(profile: ArmProfile | None = None) -> ArmProfile:
+    """An arm, the default one or another, that starts ABOVE the surface at rest."""
+    profile = ArmProfile() if profile is None else profile
+    return replace(profile, arm=replace(profile.arm, home=axes_from_nozzle(profile.arm, REST @ ABOVE)))
+
+
+def follow(seed: tuple[int, int], tally: Tally, profile: ArmProfile, ticks: int = STREAM) -> None:
     """One stream through planner and guard."""
     path, seen = random_run(seed, ticks)
-    profile, clock = ArmProfile(arm=HOME), CpuClock()
+    clock = CpuClock()
     settings = profile.limits, profile.arm, TICK
     planner, guard = Planner(path, *settings), Guard(*settings, path.zone)
-    judge, before, printed = AxesJudge(HOME.home, profile.limits, TICK), -np.inf, 0.0
+    judge, before, printed = AxesJudge(profile.arm.home, profile.limits, TICK), -np.inf, 0.0
     for k, (now, pose) in enumerate(seen):
         if now - before > STALL * TICK:
             judge.rest()
@@ -107,7 +116,7 @@ def follow(seed: tuple[int, int], tally: Tally, ticks: int = STREAM) -> None:
 
 def _taken_over(path: Path, profile: ArmProfile, planner: Planner, guard: Guard) -> tuple[Planner, Guard]:
     """A planner and a guard of a later run, on an arm that stands where it was left."""
-    arm = SimpleArm(profile.arm.arm_from_base, profile.arm.arm_from_upright, guard.axes.copy())
+    arm = replace(profile.arm, home=guard.axes.copy())
     start = resumed(path, bookmark(path, planner.progress))
     return Planner(path, profile.limits, arm, TICK, start=start), Guard(profile.limits, arm, TICK, path.zone)
 
@@ -141,7 +150,7 @@ def _costs(tally: Tally) -> list[Figure]:
 def carry_figures() -> list[Figure]:
     """What it costs to carry a long path to another pose."""
     draw, clock = np.random.default_rng(0), CpuClock()
-    carried = CarriedPath(se3.exp(draw.normal(size=(CHECKPOINTS, 6)) * [0.2, 0.2, 0.2, 20, 20, 2]), HOME)
+    carried = CarriedPath(se3.exp(draw.normal(size=(CHECKPOINTS, 6)) * [0.2, 0.2, 0.2, 20, 20, 2]), SimpleArm())
     moves = REST @ se3.exp(draw.normal(size=(CARRIES, 6)) * [0.05, 0.05, 0.05, 5, 5, 5])
     transform, axes = np.empty(CARRIES), np.empty(CARRIES)
     for k, base_from_surface in enumerate(moves):

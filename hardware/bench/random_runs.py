@@ -41,7 +41,7 @@ class Swing:
     tilt: float
     rate: float
 
-    def at(self, t: Array) -> Array:
+    def at(self, t: Array | float) -> Array:
         """base_from_surface (..., 4, 4) at t (...), s."""
         phase = 2 * np.pi * self.rate * np.asarray(t)
         sine, none = np.sin(phase), np.zeros_like(phase)

@@ -1,0 +1,122 @@
+"""Reach: what is too far, beyond a range, singular or too fast is told per checkpoint, before anything moves."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation import se3
+from estimation.se3 import Array
+from hardware.arm_file import read_arm
+from hardware.arm_profile import BENCH
+from hardware.cli import main
+from hardware.path_file import read_path, write_path
+from planning.inverse import POSTURES
+from planning.joints import JointModel, arm_from_nozzle
+from planning.reach import REASONS, Motion, best_posture, reach_of
+from planning.spin import at_spin, best_spin
+from tests.moving import path_through, raster
+
+ARMS = Path(__file__).parents[1] / "data" / "arms"
+STILL = Motion()
+
+
+def nominal() -> JointModel:
+    model = read_arm(ARMS / "s6h4d.toml").arm.joints
+    assert model is not None
+    return model
+
+
+def reasons(model: JointModel, place: Array, motion: Motion = STILL, speed: float = 5.0) -> set[str]:
+    return {REASONS[i] for i in reach_of(model, place, raster(speed=speed), motion).reason}
+
+
+def test_a_path_under_home_is_printable_and_its_joints_bring_the_nozzle_there() -> None:
+    model, path = nominal(), raster()
+    found = reach_of(model, BENCH, path, Motion(10.0, 0.05, 0.25))
+    assert found.feasible.all()
+    assert np.allclose(arm_from_nozzle(model, found.joints), BENCH @ path.surface_from_nozzle, atol=1e-9)
+    assert best_posture(model, BENCH, path, STILL) == (int(np.argmax((model.signs == POSTURES).all(1))), len(path))
+
+
+@pytest.mark.parametrize(
+    ("place", "motion", "speed", "reason"),
+    [
+        (BENCH @ se3.exp([0, 0, 0, 500, 0, 0]), STILL, 5.0, "too far"),
+        (se3.make(np.eye(3), [5.0, 0, 100]), STILL, 5.0, "too far"),
+        (se3.make(se3.exp_rotation([0, 0, np.pi]), [-300.0, 5, 50]), STILL, 5.0, "joint range"),
+        (BENCH, STILL, 199.0, "joint speed"),
+        (BENCH, Motion(40.0, 0.3, 3.0), 5.0, "joint speed"),
+    ],
+)
+def test_each_reason_is_told(place: Array, motion: Motion, speed: float, reason: str) -> None:
+    model = nominal()
+    if speed > 100:
+        model = replace(model, speed=np.full(6, 0.3))
+    assert reason in reasons(model, place, motion, speed)
+
+
+def test_a_wrist_within_five_degrees_of_singular_is_told_though_its_range_allows_it() -> None:
+    model = nominal()
+    point = path_through(np.array([[0.0, 0, 0], [0.1, 0, 0]]))
+    for degrees, reason in ((80.0, "ok"), (86.5, "singular"), (89.0, "joint range")):
+        place = arm_from_nozzle(model, np.array([0.1, -0.4, -0.3, 0.2, np.deg2rad(degrees), 0.1]))
+        assert {REASONS[i] for i in reach_of(model, place, point, STILL).reason} == {reason}
+
+
+def test_a_motion_of_the_surface_takes_reach_away() -> None:
+    model, path = nominal(), raster()
+    edge = next(
+        place
+        for x in np.arange(300.0, 600.0, 2.0)
+        if not reach_of(model, place := se3.make(np.eye(3), [x + 2.0, 0, 50.0]), path, STILL).feasible.all()
+    )
+    near = edge @ se3.exp([0, 0, 0, -4.0, 0, 0])
+    assert reach_of(model, near, path, STILL).feasible.all()
+    assert not reach_of(model, near, path, Motion(30.0)).feasible.all()
+
+
+def test_speed_of_joints_is_that_of_differences() -> None:
+    model, path = nominal(), path_through(np.linspace([0, 0, 0], [4, 3, 0], 101), speed=20.0)
+    found = reach_of(model, BENCH, path, STILL)
+    rates = np.abs(np.diff(found.joints, axis=0)) / (0.05 / 20.0) / model.speed
+    assert np.allclose(found.speed[1:], rates.max(axis=1), rtol=0.01)
+
+
+def test_the_tool_spins_to_stay_within_the_last_joint_and_no_more_than_it_must() -> None:
+    model, path = nominal(), raster()
+    narrow = replace(model, low=np.append(model.low[:5], -0.5), high=np.append(model.high[:5], 0.5))
+    assert {REASONS[i] for i in reach_of(narrow, BENCH, path, STILL).reason} == {"joint range"}
+    spin = best_spin(narrow, BENCH, path, STILL)
+    assert at_spin(narrow, BENCH, path, STILL, spin).feasible.all()
+    assert np.ptp(spin) < 1e-9  # one angle serves the whole path
+    assert np.allclose(best_spin(model, BENCH, path, STILL), best_spin(model, BENCH, path, STILL)[0])
+
+
+def test_the_command_marks_the_path_and_says_whether_all_can_be_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_path(tmp_path / "path.csv", raster())
+    command = ["reach", str(tmp_path / "path.csv"), "--arm", str(ARMS / "s6h4d.toml")]
+    assert main([*command, "-o", str(tmp_path / "good")]) == 0
+    text = capsys.readouterr().out
+    assert "6 of 6 can be printed" in text and "NOMINAL" in text
+    assert main([*command, "--surface", "580,0,50,0,0,0", "-o", str(tmp_path / "bad"), "--spin"]) == 1
+    marked = read_path(tmp_path / "bad" / "path.csv").extra["feasible"]
+    assert 0 < (marked == "0").sum() <= 6
+    with (tmp_path / "bad" / "reach.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["feasible"] for row in rows] == marked.tolist()
+    assert {row["reason"] for row in rows if row["feasible"] == "0"} <= set(REASONS[1:])
+    assert "<svg" in (tmp_path / "bad" / "reach.html").read_text()
+
+
+def test_an_arm_file_without_joints_cannot_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_path(tmp_path / "path.csv", raster())
+    (tmp_path / "arm.toml").write_text("baud = 115200\n")
+    assert main(["reach", str(tmp_path / "path.csv"), "--arm", str(tmp_path / "arm.toml")]) == 2
+    assert "kinematics = 'missing'" in capsys.readouterr().err
