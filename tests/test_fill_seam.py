@@ -20,7 +20,8 @@ ROUND = region_of(np.stack([9 * np.cos(np.arange(60) * 2 * np.pi / 60), 6 * np.s
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_ellipse_is_covered_and_nothing_beside_it(kind: Kind) -> None:
     found = coverage(fill(ROUND, Pattern(kind), Pace()), ROUND)
-    assert found.covered > 0.96 and found.over < 0.001 and abs(found.double) < 0.05
+    least = 0.94 if kind in ("zigzag", "raster", "hybrid") else 0.995
+    assert found.covered > least and found.over < 0.001 and abs(found.double) < 0.05
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -25,7 +25,10 @@ OWNERS = {  # library: the files that may import it
     "pytest": ("estimation/synthetic/plugin.py",),
     "ruckig": ("planning/*.py",),
     "serial": ("hardware/*.py",),
-    "shapely": ("hardware/bench/wounds.py", "planning/fill/*.py",),
+    "shapely": (
+        "hardware/bench/wounds.py",
+        "planning/fill/*.py",
+    ),
     "time": ("hardware/clock.py",),
     "toppra": ("planning/*.py",),
     "torch": ("perception/training/*.py",),

@@ -28,6 +28,23 @@ def random_wound(rng: Rng) -> tuple[str, Region]:
     return name, _without_specks(moved)
 
 
+def mapped(region: Region, change: Callable[[Array], Array]) -> Region:
+    """A region with its points (N, 2) changed."""
+    return shapely.transform(region, change)
+
+
+def outline(name: str) -> Polygon:
+    """One of two fixed outlines: an `oval` with bays, a `bow` with four corners; both with points every millimetre."""
+    t = np.linspace(0, 2 * np.pi, 160, endpoint=False)
+    if name == "oval":
+        r = 14 * (1 + 0.12 * np.cos(2 * t + 0.4) + 0.07 * np.cos(3 * t + 2) + 0.03 * np.cos(5 * t))
+        return Polygon(_xy(r * np.cos(t), r * np.sin(t)))
+    t = np.linspace(-1.3, 1.3, 60)
+    half = 2.8 + 0.7 * np.sin(3 * t + 1)
+    sides = [_xy((16 + way * half) * np.cos(t), (16 + way * half) * np.sin(t)) for way in (1, -1)]
+    return Polygon(np.concatenate([sides[0], sides[1][::-1]]))
+
+
 def _round(rng: Rng, radius: tuple[float, float] = (6.0, 18.0), strength: float = 0.25) -> Polygon:
     """A radius with harmonics, each weaker than the one before."""
     angle = np.linspace(0, 2 * np.pi, int(rng.integers(60, 300)), endpoint=False)
@@ -44,7 +61,7 @@ def _star(rng: Rng) -> Polygon:
 
 def _angular(rng: Rng) -> Polygon:
     """A few straight edges, as of a cut or a flap."""
-    angle = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(4, 10)))) + np.linspace(0, 1e-3, 1)
+    angle = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(4, 10))))
     r = rng.uniform(6, 18, len(angle))
     return Polygon(np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1))
 

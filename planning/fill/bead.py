@@ -30,7 +30,8 @@ class Bead:
     @property
     def steps(self) -> Array:
         """Lengths (N-1,) mm from point to point."""
-        return np.asarray(np.linalg.norm(np.diff(self.points, axis=0), axis=1))
+        x, y = (self.points[1:] - self.points[:-1]).T
+        return np.asarray(np.sqrt(x * x + y * y))
 
     @property
     def length(self) -> float:
@@ -47,24 +48,33 @@ class Bead:
         """The same bead from its other end."""
         return Bead(self.points[::-1], self.width[::-1])
 
+    @property
+    def along(self) -> Array:
+        """Length (N,) mm from the start to each point."""
+        return np.concatenate([[0.0], np.cumsum(self.steps)])
+
     def at(self, along: Array) -> Array:
         """x, y and width (M, 3) at lengths (M,) mm from the start; its ends beyond them."""
-        length = np.concatenate([[0.0], np.cumsum(self.steps)])
+        length = self.along
         return np.stack([np.interp(along, length, values) for values in (*self.points.T, self.width)], axis=1)
 
     def between(self, start: float, end: float) -> Bead:
         """The stretch from one length to another, mm from the start."""
-        length = np.concatenate([[0.0], np.cumsum(self.steps)])
-        inner = length[(length > start + SAME) & (length < end - SAME)]
-        found = self.at(np.concatenate([[start], inner, [end]]))
-        return Bead(found[:, :2], found[:, 2])
+        length = self.along
+        a, b = np.searchsorted(length, [start + SAME, end - SAME])
+        ends = self.at(np.array([start, end]))
+        lines = np.concatenate([ends[:1], np.column_stack([self.points[a:b], self.width[a:b]]), ends[1:]])
+        return Bead(lines[:, :2], lines[:, 2])
 
     def turned(self, start: float) -> Bead:
         """A closed bead that begins and ends at `start` mm from its start instead."""
-        a, b = self.between(start, self.length), self.between(0.0, start)
-        if start < SAME or start > self.length - SAME:
+        length = self.along
+        if start < SAME or start > length[-1] - SAME:
             return self
-        return Bead(np.concatenate([a.points, b.points[1:]]), np.concatenate([a.width, b.width[1:]]))
+        a, b = np.searchsorted(length, [start - SAME, start + SAME])
+        here, lines = self.at(np.array([start])), np.column_stack([self.points, self.width])
+        lines = np.concatenate([here, lines[b:], lines[1:a], here])
+        return Bead(lines[:, :2], lines[:, 2])
 
 
 def even(points: Array, width: float) -> Bead:

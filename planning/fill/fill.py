@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 import shapely
 
 from estimation.se3 import Array
-from planning.fill.bead import Bead
+from planning.fill.bead import Bead, even
 from planning.fill.ease import eased
 from planning.fill.order import Run, ordered
-from planning.fill.pace import Pace, spent
+from planning.fill.pace import Pace, hops, spent
 from planning.fill.pattern import Pattern
 from planning.fill.region import Region, checked
 from planning.fill.rings import Level, ring_levels
 from planning.fill.spiral import nests, wound
-from planning.fill.zigzag import raster_beads, zigzag_beads
+from planning.fill.zigzag import raster_lines, zigzag_lines
 
-CORNER = 0.12  # spacings by which corners are cut: less than a bead's own rounding
+CORNER = 0.2  # spacings by which corners are cut: less than the rounding of a bead itself
 
-Lines = Callable[[Region, float, float, float], list[Bead]]
+Lines = Callable[[Region, float, float], tuple[list[Array], float]]
 
 
 def fill(region: Region, pattern: Pattern, pace: Pace) -> list[Bead]:
@@ -31,13 +32,10 @@ def fill(region: Region, pattern: Pattern, pace: Pace) -> list[Bead]:
     corner = _corner(region, pattern)
     if pattern.kind in ("zigzag", "raster"):
         return _lines(region, pattern, pace)
-    if pattern.kind == "hybrid":
-        levels, core = _levels(region, pattern, pattern.rims)
-        return ordered(_runs(levels, pattern, joined=True), corner) + _lines(core, pattern, pace)
-    levels, _ = _levels(region, pattern)
-    ways = {"contour": (False,), "spiral": (True,)}.get(pattern.kind, (True, False))
-    found = [ordered(_runs(levels, pattern, joined), corner) for joined in ways]
-    return min(found, key=lambda beads: spent(beads, pace).seconds)
+    hybrid = pattern.kind == "hybrid"
+    levels, core = _levels(region, pattern, pattern.rims if hybrid else None)
+    beads = ordered(_runs(levels, pattern, pace), corner)
+    return beads + _lines(core, pattern, pace) if hybrid else beads
 
 
 def _corner(region: Region, pattern: Pattern) -> Array:
@@ -50,12 +48,14 @@ def _levels(region: Region, pattern: Pattern, most: int | None = None) -> tuple[
     return ring_levels(shapely.buffer(region, (pattern.spacing - pattern.width) / 2), pattern.spacing, most)
 
 
-def _runs(levels: list[Level], pattern: Pattern, joined: bool) -> list[Run]:
+def _runs(levels: list[Level], pattern: Pattern, pace: Pace) -> list[Run]:
     start, s = np.array(pattern.start), pattern.spacing
-    rings = [level.rings for level in levels]
-    runs = [wound(nest, s, start, pattern.seam, joined) for nest in nests(rings, s)]
-    runs += [[bead] for level in levels for bead in level.single]
-    return [[_laid(bead, pattern) for bead in run] for run in runs]
+    runs = []
+    for nest in nests([level.rings for level in levels], s):
+        ways = [[_laid(bead, pattern) for bead in run] for run in wound(nest, s, start, pattern.seam)]
+        choice = {"contour": ways[:1], "spiral": ways[1:]}.get(pattern.kind, ways)
+        runs.append(min(choice, key=lambda run: spent(run, pace).seconds))
+    return runs + [[_laid(bead, pattern)] for level in levels for bead in level.single]
 
 
 def _laid(bead: Bead, pattern: Pattern) -> Bead:
@@ -64,12 +64,31 @@ def _laid(bead: Bead, pattern: Pattern) -> Bead:
 
 
 def _lines(region: Region, pattern: Pattern, pace: Pace) -> list[Bead]:
-    lay: Lines = raster_beads if pattern.kind == "raster" else zigzag_beads
+    """The shortest or fastest way to fill a region with parallel lines, begun on the side of the pattern's start."""
+    lay: Lines = raster_lines if pattern.kind == "raster" else zigzag_lines
     middle = shapely.buffer(region, -pattern.width / 2)
-    found = [lay(middle, angle, pattern.spacing, pattern.overlap) for angle in _angles(pattern)]
-    if pattern.angle == "shorter":
-        return min(found, key=lambda beads: spent(beads, pace).printed + spent(beads, pace).travelled)
-    return min(found, key=lambda beads: spent(beads, pace).seconds)
+    if middle.is_empty:
+        return []
+    corner = _corner(region, pattern)
+    found = [_placed(lay(middle, angle, pattern.spacing), pattern, corner) for angle in _angles(pattern)]
+    if pattern.angle == "shorter":  # the printed line and the way between its parts, thesis 5.3
+        return [_cut(b, pattern) for b in min(found, key=lambda way: sum(bead.length for bead in way) + hops(way))]
+    return min(([_cut(bead, pattern) for bead in way] for way in found), key=lambda way: spent(way, pace).seconds)
+
+
+def _placed(laid: tuple[list[Array], float], pattern: Pattern, corner: Array) -> list[Bead]:
+    """Lines as beads of one width, in printing order."""
+    lines, step = laid
+    width = min(pattern.width, step / (1 - pattern.overlap))
+    beads = [even(line, width) for line in lines]
+    if pattern.kind == "raster":
+        first, last = (min(math.dist(end, corner) for end in bead.points[[0, -1]]) for bead in (beads[0], beads[-1]))
+        return beads if first <= last else beads[::-1]
+    return ordered([[bead] for bead in beads], corner)
+
+
+def _cut(bead: Bead, pattern: Pattern) -> Bead:
+    return eased(bead, CORNER * pattern.spacing)
 
 
 def _angles(pattern: Pattern) -> list[float]:

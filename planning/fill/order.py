@@ -5,6 +5,7 @@ Printing itself takes as long in any order and direction, so the shortest travel
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,9 +21,10 @@ LEAST = 1e-6  # mm: a smaller gain is none
 
 def ordered(runs: Sequence[Run], start: Array) -> list[Bead]:
     """The beads of all runs, runs in the order and direction that travel least from `start` (2,)."""
-    if not runs:
-        return []
-    ends = np.array([[run[0].points[0], run[-1].points[-1]] for run in runs])  # (M, entry or exit, 2)
+    if len(runs) < 2:
+        near = min((math.dist(end, start), way) for way, end in enumerate(_ends(runs[0]))) if runs else (0.0, 0)
+        return [bead for run in runs for bead in (_reversed(run) if near[1] else run)]
+    ends = np.array([_ends(run) for run in runs])  # (M, entry or exit, 2)
     tour = _nearest(ends, start)
     for _ in range(MOST):
         better = _turned(tour, ends, start)
@@ -34,6 +36,10 @@ def ordered(runs: Sequence[Run], start: Array) -> list[Bead]:
 
 
 Tour = NDArray[np.intp]  # (M, 2): number of the run, and 1 where it is printed from its end
+
+
+def _ends(run: Run) -> tuple[Array, Array]:
+    return run[0].points[0], run[-1].points[-1]
 
 
 def _reversed(run: Run) -> Run:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -36,15 +37,19 @@ class Spent:
 def spent(beads: Sequence[Bead], pace: Pace) -> Spent:
     """Length, travel, turns and time of beads printed in this order."""
     printed = sum(bead.length for bead in beads)
-    hops = [b.points[0] - a.points[-1] for a, b in pairwise(beads)]
-    travelled = float(sum(np.hypot(*hop) for hop in hops))
+    travelled = hops(beads)
     turns = sum(int((turning(bead.points) > SHARP).sum()) for bead in beads)
     seconds = printed / pace.printing + travelled / pace.travel + turns * pace.turn
     return Spent(printed, travelled, turns, seconds)
 
 
+def hops(beads: Sequence[Bead]) -> float:
+    """Length mm of the way from the end of each bead to the start of the next."""
+    return sum(math.dist(a.points[-1], b.points[0]) for a, b in pairwise(beads))
+
+
 def turning(points: Array) -> Array:
     """By how much a line through points (N, 2) turns at each inner one (N-2,), rad, 0 to pi."""
-    step = np.diff(points, axis=0)
-    a, b = step[:-1], step[1:]
-    return np.asarray(np.abs(np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], (a * b).sum(axis=1))))
+    x, y = (points[1:] - points[:-1]).T
+    cross, dot = x[:-1] * y[1:] - y[:-1] * x[1:], x[:-1] * x[1:] + y[:-1] * y[1:]
+    return np.asarray(np.abs(np.arctan2(cross, dot)))

@@ -27,9 +27,11 @@ ROUND = 0.15  # spacings: radius of corners, so that none stops the nozzle
 SLIVER = 0.02  # spacings squared: a smaller loop is a dot
 FINE = 0.003  # spacings: to which lines are simplified; offsets of offsets double their points each time
 FACING = 0.15  # spacings: a line's point nearer to or farther from a disc's rim faces another disc
+SMALLEST = 0.04  # spacings squared: of a gap worth filling, as in a corner of 110 degrees
 CALM = 3  # roundings
 
 DEEPEST = 0.5  # spacings by which a line widens into a corner
+SOUNDINGS = 8  # places across that depth at which it is asked whether a corner lies open
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,24 +70,25 @@ def _simple(region: Region, spacing: float) -> Region:
 
 def _middle(left: Region, single: list[Bead], spacing: float) -> Region:
     """What lies inside the middle lines of the next level; tongues that single beads fill are cut off."""
-    middle = shapely.buffer(shapely.buffer(left, -(0.5 + ROUND) * spacing), ROUND * spacing)
+    middle = shapely.buffer(shapely.buffer(left, -(0.5 + ROUND) * spacing), ROUND * spacing, quad_segs=4)
     if single:
         lean = (TWO - 0.5) * spacing
         rest = shapely.get_parts(minus(middle, shapely.buffer(shapely.buffer(middle, -lean), lean)))
         lines = shapely.multilinestrings([shapely.linestrings(bead.points) for bead in single])
         middle = minus(middle, shapely.union_all(rest[shapely.intersects(rest, lines)]))
-        middle = shapely.buffer(shapely.buffer(middle, -ROUND * spacing), ROUND * spacing)
+        middle = shapely.buffer(shapely.buffer(middle, -ROUND * spacing), ROUND * spacing, quad_segs=4)
     parts = shapely.get_parts(middle)
     return shapely.multipolygons(parts[shapely.area(parts) > SLIVER * spacing**2])
 
 
 def _gaps(left: Region, middle: Region, single: list[Bead], spacing: float) -> NDArray[np.object_]:
     """What a level leaves open between the line outside it and its own."""
-    gaps = minus(left, shapely.buffer(middle, 0.51 * spacing))
-    if gaps.is_empty:
+    reached = shapely.buffer(middle, 0.51 * spacing, quad_segs=4)
+    if left.area - reached.area < SMALLEST * spacing**2:
         return np.empty(0, object)
+    gaps = minus(left, reached)
     gaps = shapely.get_parts(minus(gaps, covered_by(single)) if single else gaps)
-    return np.asarray(gaps[shapely.area(gaps) > 0.04 * spacing**2])
+    return np.asarray(gaps[shapely.area(gaps) > SMALLEST * spacing**2])
 
 
 def _dots(gaps: NDArray[np.object_], spacing: float) -> list[Bead]:
@@ -132,19 +135,22 @@ def _into(ring: Bead, gaps: NDArray[np.object_], spacing: float) -> Bead:
         return ring
     ring = _denser(ring, near, spacing)
     inward = _inward(ring.points)
-    half = ring.width[:, None] / 2
-    rays = shapely.linestrings(
-        np.stack([ring.points + inward * half, ring.points + inward * (half + DEEPEST * spacing)], axis=1)
-    )
-    ray, gap = shapely.STRtree(near).query(rays)
-    depth = shapely.length(shapely.intersection(rays[ray], near[gap]))
-    more: Array = np.bincount(ray, depth, len(rays)).astype(float)
+    depths = (np.arange(SOUNDINGS) + 0.5) * DEEPEST * spacing / SOUNDINGS
+    sounded = ring.points[:, None] + inward[:, None] * (ring.width[:, None] / 2 + depths)[..., None]  # (N, S, 2)
+    open_there = shapely.contains_xy(_prepared(near), sounded[..., 0], sounded[..., 1])
+    more: Array = open_there.sum(axis=1) * (DEEPEST * spacing / SOUNDINGS)
     more[np.abs(ring.width - spacing) > 1e-9] = 0.0
     more = _calm(more[:, None], np.ones(len(more)))[:, 0]
     points = _calm(ring.points + inward * (more / 2)[:, None], np.asarray(more > 0.01 * spacing, float))
     line = shapely.simplify(shapely.linestrings(np.column_stack([points, ring.width + more])), 0.01 * spacing)
     lines = shapely.get_coordinates(line, include_z=True)
     return Bead(lines[:, :2], lines[:, 2])
+
+
+def _prepared(shapes: NDArray[np.object_]) -> BaseGeometry:
+    whole = shapely.multipolygons(shapes)
+    shapely.prepare(whole)
+    return whole
 
 
 def _inward(points: Array) -> Array:
@@ -166,13 +172,13 @@ def _calm(values: Array, where: Array) -> Array:
 
 def _denser(ring: Bead, near: NDArray[np.object_], spacing: float) -> Bead:
     """The same line with points close together where it passes gaps."""
-    wide = shapely.buffer(shapely.union_all(near), 0.7 * spacing)
-    shapely.prepare(wide)
-    along = np.concatenate([[0.0], np.cumsum(ring.steps)])
+    along = ring.along
     extra = np.linspace(0, along[-1], int(along[-1] / (0.15 * spacing)) + 2)[1:-1]
-    at = np.stack([np.interp(extra, along, v) for v in ring.points.T], axis=1)
-    extra = extra[shapely.contains_xy(wide, at)]
-    every = np.unique(np.concatenate([along, extra]))
+    at = ring.at(extra)
+    low, high = np.moveaxis(shapely.bounds(near).reshape(-1, 2, 2), 1, 0)  # (G, 2) each
+    reach = 0.8 * spacing
+    beside = ((at[:, None, :2] > low - reach) & (at[:, None, :2] < high + reach)).all(axis=2).any(axis=1)
+    every = np.unique(np.concatenate([along, extra[beside]]))
     return Bead(
         np.stack([np.interp(every, along, v) for v in ring.points.T], axis=1), np.interp(every, along, ring.width)
     )

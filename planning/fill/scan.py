@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from estimation.se3 import Array
 from planning.fill.region import Region
 
+STRETCH = 0.25  # of a line more would be laid before lines lie farther apart than asked
 INWARD = 1e-6  # share of the height by which the outermost lines stay off the tangent
 
 
@@ -42,10 +43,10 @@ def turned(points: Array, angle: float) -> Array:
 def crossings(region: Region, angle: float, spacing: float) -> tuple[Crossings, float]:
     """Crossings of lines at an angle with the boundary of a region, and the distance of the lines, mm.
 
-    The outermost lines touch the region; the distance is the nearest to `spacing` that divides its height evenly.
+    The outermost lines touch the region; the distance divides its height evenly and is about `spacing`, rather less.
     """
     points, ring = shapely.get_coordinates(shapely.get_rings(shapely.get_parts(region)), return_index=True)
-    last = np.flatnonzero(np.diff(ring, append=-1))
+    last = np.append(np.flatnonzero(ring[1:] != ring[:-1]), len(ring) - 1)
     start = np.concatenate([[0], last[:-1] + 1])
     kept = np.ones(len(points), bool)
     kept[last] = False  # a ring repeats its first point
@@ -53,7 +54,7 @@ def crossings(region: Region, angle: float, spacing: float) -> tuple[Crossings, 
     ring_start, ring_end = (np.repeat(v, count) for v in (np.cumsum(count) - count, np.cumsum(count)))
     vertices = turned(points[kept], -angle)
     low, high = float(vertices[:, 1].min()), float(vertices[:, 1].max())
-    lines = max(1, round((high - low) / spacing)) + 1
+    lines = max(1, int(np.ceil((high - low) / spacing - STRETCH))) + 1
     step = (high - low) / (lines - 1)
     found = _crossed(vertices, ring_start, ring_end, low, step, lines)
     return found, step
@@ -78,8 +79,8 @@ def _crossed(
     after = np.empty(len(edge), np.intp)
     before = np.empty(len(edge), np.intp)
     ring = ring_start[edge[along]]
-    opens = np.flatnonzero(np.diff(ring, prepend=-1))
-    closes = np.append(opens[1:], len(ring)) - 1
+    closes = np.append(np.flatnonzero(ring[1:] != ring[:-1]), len(ring) - 1)
+    opens = np.concatenate([[0], closes[:-1] + 1])
     nxt, prv = np.arange(1, len(ring) + 1), np.arange(-1, len(ring) - 1)
     nxt[closes], prv[opens] = opens, closes
     after[along], before[along] = along[nxt], along[prv]

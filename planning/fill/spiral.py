@@ -44,27 +44,25 @@ def nests(levels: list[list[Bead]], spacing: float) -> list[list[Bead]]:
     return done + [nest for nest, _ in open_nests]
 
 
-def wound(nest: list[Bead], spacing: float, start: Array, seam: float, joined: bool) -> Run:
-    """The lines of a nest as one run from the outermost inwards, begun near the side that `start` (2,) points to.
+def wound(nest: list[Bead], spacing: float, start: Array, seam: float) -> tuple[Run, Run]:
+    """The lines of a nest, outermost first, begun near the side that `start` (2,) points to: one by one, or joined.
 
-    seam: share of the outermost line by which the run begins later. joined: as one bead, else as a closed bead each.
+    seam: share of the outermost line by which the run begins later.
     """
     turned = _begun(nest, _wanted(nest[0], start, seam), spacing)
-    if not joined:
-        return turned
     runs: list[list[Bead]] = [[turned[0]]]
     closing: list[Bead] = []  # what the last line of a run lacks beside the ramp that led to it
     for outer, inner in pairwise(turned):
         if np.hypot(*(outer.points[0] - inner.points[0])) > NEAR * spacing:
             runs[-1] += closing
-            runs.append([inner])
+            runs.append([inner])  # not beside one another here
             closing = []
             continue
         ramp = min(RAMP * spacing, inner.length / 4, outer.length / 4)
         runs[-1] += [_ramp(outer, inner, ramp), inner.between(ramp, inner.length)]
         closing = [inner.between(0.0, ramp)]
     runs[-1] += closing
-    return [_chained(run) for run in runs]
+    return turned, [_chained(run) for run in runs]
 
 
 def _chained(run: list[Bead]) -> Bead:
