@@ -64,19 +64,20 @@ def _of_contour(name: str, region: Region, pattern: Pattern) -> list[Figure]:
     pace = Pace()
     beads = fill(region, pattern, pace)
     found, cost = coverage(beads, region), spent(beads, pace)
-    least, most = WANTED.get(name, (None, None))
+    wanted = WANTED.get(name)
+    least, most = (at_least(wanted[0]), at_most(wanted[1])) if wanted else (None, None)
     laid = f"{cost.printed:.0f} mm printed, {cost.travelled:.0f} mm travelled, {cost.turns} turns, {len(beads)} beads"
     return [
         Figure(
             f"{name}: covered",
             100 * found.covered,
             "%",
-            None if least is None else at_least(least),
+            least,
             PEERS.get(name, ""),
         ),
         Figure(f"{name}: over", 100 * found.over, "%", at_most(0.05)),
         Figure(f"{name}: double", 100 * found.double, "%", at_most(3.0)),
-        Figure(f"{name}: time", cost.seconds, "s", None if most is None else at_most(most), PEERS.get(name, ""), laid),
+        Figure(f"{name}: time", cost.seconds, "s", most, PEERS.get(name, ""), laid),
     ]
 
 
@@ -127,9 +128,7 @@ def _times(kind: Kind) -> list[Figure]:
     whole = _median_ms(lambda: fill(wide, Pattern(kind, 0.4), Pace()), 5)
     return [
         Figure("two orientations of 4,000 px2", both, "ms", at_most(1.0), "thesis 3 ms", "median of 200, CPU"),
-        Figure(
-            "layer of 60 x 40 mm, bead 0.4 mm", whole, "ms", at_most(130.0), "", "median of 5, CPU; 15 layers in 2 s"
-        ),
+        Figure("layer of 60 x 40 mm, bead 0.4 mm", whole, "ms", at_most(130.0), "", "median of 5, CPU; 15 in 2 s"),
     ]
 
 
