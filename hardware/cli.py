@@ -1,4 +1,4 @@
-"""The command line: stillbed simulate, track, segment, replay, train, bench and others. Imports lazily."""
+"""The command line: stillbed simulate, track, segment, plan, replay, train, bench and others. Imports lazily."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from estimation.errors import StillbedError
 from hardware.arm_commands import add_arm
 from hardware.bench.command import add_bench
 from hardware.methods import MAP, METHODS
+from hardware.plan_commands import add_plan
 from hardware.reach_command import add_reach
 from hardware.wound_commands import add_segment, add_train
 
@@ -65,6 +66,8 @@ def kept(out: Path | None) -> str:
         if len(names) > NAMED:
             return f"kept in {out}: {len(names)} files"
         return f"kept in {out}: {', '.join(names)}" if names else f"nothing was written to {out}"
+    if out.suffix == ".csv" and out.exists():
+        return f"kept {out}, whole, and what stands beside it"
     if out.exists():
         return f"kept {out}, readable up to its last whole chunk"
     return "nothing was written"
@@ -82,6 +85,7 @@ def parser() -> argparse.ArgumentParser:
     _add_simulate(commands)
     _add_track(commands)
     add_segment(commands)
+    add_plan(commands)
     _add_replay(commands)
     add_reach(commands)
     add_arm(commands)

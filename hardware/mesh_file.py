@@ -14,6 +14,7 @@ from estimation.scan import Scan, open_edges, scan_from_triangles
 
 SUFFIXES = (".ply", ".stl", ".obj")
 SMALLEST, LARGEST = 1.0, 2000.0  # mm: the longest side of a scan; a hand in metres is 0.2, a leg in micrometres 1e6
+WHOLE = "a whole PLY, STL or OBJ file with triangles"
 APT_LINE = "sudo apt-get install -y libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0"
 
 
@@ -25,22 +26,37 @@ class MeshFile:
     open_edges: int
 
 
-def read_mesh(path: str | Path) -> MeshFile:
-    """Read and check a scan, mm; InputError says what is wrong with the file, StillbedError what open3d lacks."""
+@dataclass(frozen=True, slots=True, eq=False)
+class RawMesh:
+    """A mesh as its file has it. vertices: (V, 3), in whatever unit. triangles: (T, 3) numbers of vertices."""
+
+    vertices: np.ndarray[Any, Any]
+    triangles: np.ndarray[Any, Any]
+
+
+def read_raw_mesh(path: str | Path) -> RawMesh:
+    """What a PLY, STL or OBJ file holds, unchecked but for being whole; InputError where it cannot be read."""
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(path, "scan", path.suffix or "no suffix", f"a file {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise InputError(path, "scan", "no such file", f"a file {', '.join(SUFFIXES)}")
     vertices, triangles = _arrays(path)
-    allowed = "a whole PLY, STL or OBJ file with triangles"
     if not len(vertices):
-        raise InputError(path, "scan", f"{path.stat().st_size} bytes, nothing that can be read", allowed)
+        raise InputError(path, "scan", f"{path.stat().st_size} bytes, nothing that can be read", WHOLE)
     told = _told_faces(path)
     if len(triangles) < told:
         raise InputError(path, "faces", len(triangles), f"{told}, as the file's own header says (is it cut short?)")
     if not len(triangles):
-        raise InputError(path, "scan", f"{len(vertices)} points and no triangles", allowed)
+        raise InputError(path, "scan", f"{len(vertices)} points and no triangles", WHOLE)
+    return RawMesh(vertices, triangles)
+
+
+def read_mesh(path: str | Path) -> MeshFile:
+    """Read and check a scan, mm; InputError says what is wrong with the file, StillbedError what open3d lacks."""
+    path = Path(path)
+    raw = read_raw_mesh(path)
+    vertices, triangles = raw.vertices, raw.triangles
     if not np.isfinite(vertices).all():
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
         raise InputError(path, f"vertex {bad}", vertices[bad].tolist(), "three finite numbers, mm")
@@ -50,7 +66,7 @@ def read_mesh(path: str | Path) -> MeshFile:
     _check_size(path, vertices[np.unique(triangles)])
     scan = scan_from_triangles(vertices, triangles)
     if not len(scan.triangles):
-        raise InputError(path, "scan", f"{len(triangles)} triangles, all of them without area", allowed)
+        raise InputError(path, "scan", f"{len(triangles)} triangles, all of them without area", WHOLE)
     return MeshFile(scan, len(open_edges(scan)))
 
 

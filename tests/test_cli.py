@@ -32,7 +32,7 @@ from tests.worlds import IDEAL, SMALL, write_scenario
 
 ROOT = Path(__file__).parents[1]
 CLOCK = WallClock()
-COMMANDS = ([], ["simulate"], ["track"], ["replay"], ["arm"], ["import"], ["export"], ["bench"])
+COMMANDS = ([], ["simulate"], ["track"], ["plan"], ["replay"], ["arm"], ["import"], ["export"], ["bench"])
 
 
 def stillbed(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -167,7 +167,9 @@ def test_what_was_kept_is_said(tmp_path: Path) -> None:
     assert kept(None) == "nothing was to be written"
     (tmp_path / "poses.csv").write_text("x")
     assert kept(tmp_path) == f"kept in {tmp_path}: poses.csv"
-    assert "readable" in kept(tmp_path / "poses.csv")
+    assert "whole" in kept(tmp_path / "poses.csv")
+    (tmp_path / "x.mcap").write_text("x")
+    assert "readable" in kept(tmp_path / "x.mcap")
 
 
 def frame_sets(count: int, ending: BaseException | None = None) -> Iterator[FrameSet]:

@@ -1,0 +1,168 @@
+"""Checkpoints: every bead is laid, the tip is on the layer, the tool within its limits, travels clear of the wound."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimation import se3
+from hardware.gcode_file import gcode_text
+from hardware.path_file import read_path, write_path
+from planning.fill.bead import Bead, even
+from planning.fill.coverage import coverage
+from planning.fill.pattern import Pattern
+from planning.layers.checkpoints import Way
+from planning.layers.figures import figures_of, seconds_to, total_of
+from planning.layers.flat_wound import flat_wound
+from planning.layers.grid import at
+from planning.layers.plan import Order, Plan, make_plan
+from planning.layers.runs import runs_of, spaced, spacing_over
+from planning.layers.stack import MODES, Mode
+from planning.layers.tissue import Tissue
+from planning.path import check_path
+from tests.wounds import SKIN, wound_of
+
+BLOB = np.array([[0.0, 0], [20, -3], [31, 6], [24, 17], [15, 12], [4, 18], [-6, 9]])
+
+
+@cache
+def plan_of(mode: Mode = "skin") -> Plan:
+    return make_plan(wound_of(), Order(SKIN, Pattern("zigzag", 0.5, angle=0.3), mode))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_plan_is_a_path_that_can_be_printed_and_fills_the_wound(mode: Mode) -> None:
+    plan = plan_of(mode)
+    check_path(plan.path)
+    assert (np.diff(plan.path.layer) >= 0).all() and not plan.path.extrude[0]
+    assert plan.points.volume.sum() == pytest.approx(plan.wound.findings.volume, rel=0.05)
+    assert total_of(figures_of(plan)).covered > 0.97
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_where_ink_flows_the_tip_is_on_its_layer_inside_the_outline(mode: Mode) -> None:
+    plan = plan_of(mode)
+    laid = plan.points.extrude
+    tip = plan.points.tip[laid]
+    shares = np.array([layer.share for layer in plan.stack.layers])
+    assert np.allclose(tip[:, 2], plan.stack.tops(tip[:, :2], shares[plan.points.layer[laid]]))
+    assert shapely.contains_xy(shapely.buffer(plan.wound.outline, 0.05), tip[:, 0], tip[:, 1]).all()
+
+
+def test_the_path_file_is_read_back_as_it_was_planned(tmp_path: Path) -> None:
+    path = plan_of().path
+    write_path(tmp_path / "path.csv", path)
+    again = read_path(tmp_path / "path.csv")
+    assert np.allclose(again.surface_from_nozzle, path.surface_from_nozzle, atol=1e-9)
+    assert np.array_equal(again.extrude, path.extrude) and np.array_equal(again.material, path.material)
+    assert list(again.extra) == ["wait_s", "width_mm", "height_mm", "volume_mm3", "run"]
+
+
+def test_the_tool_keeps_its_limits_along_the_path() -> None:
+    plan = plan_of("conformal")
+    limits = plan.order.way.tool
+    tool = plan.path.surface_from_nozzle[:, :3, 2]
+    assert (tool @ plan.wound.surface_from_plane[:3, 2]).min() >= np.cos(limits.tilt) - 1e-9
+    step = np.linalg.norm(np.diff(plan.path.surface_from_nozzle[:, :3, 3], axis=0), axis=1)
+    turn = np.arccos(np.clip(np.einsum("ni,ni->n", tool[:-1], tool[1:]), -1, 1))
+    laid = plan.path.extrude[1:]
+    assert (turn[laid] <= 1.3 * limits.turning * step[laid] + 1e-6).all()
+
+
+def test_the_spin_turns_the_tool_about_its_axis_only() -> None:
+    plan = plan_of()
+    way = replace(plan.order.way, tool=replace(plan.order.way.tool, spin=0.7))
+    spun = make_plan(plan.wound, replace(plan.order, way=way)).path.surface_from_nozzle
+    assert np.allclose(spun[:, :3, 2:], plan.path.surface_from_nozzle[:, :3, 2:])
+    assert np.allclose(spun, plan.path.surface_from_nozzle @ se3.make(se3.exp_rotation([0, 0, 0.7]), np.zeros(3)))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_travels_keep_clear_of_the_scan(mode: Mode) -> None:
+    plan = plan_of(mode)
+    inner = ~plan.points.extrude
+    inner[1:] &= ~plan.points.extrude[:-1]
+    inner[:-1] &= ~plan.points.extrude[1:]  # neither rising from a bead nor coming down to one
+    tip = plan.points.tip[inner]
+    assert (tip[:, 2] - at(plan.wound.grid, plan.wound.bed, tip[:, :2])).min() > 0.2
+
+
+def test_layers_begin_with_their_wait_and_time_adds_up() -> None:
+    plan = plan_of()
+    way = replace(plan.order.way, wait=30.0)
+    waiting = make_plan(plan.wound, replace(plan.order, way=way))
+    layers = sum(bool(layer.beads) for layer in plan.layers)
+    assert seconds_to(waiting.points)[-1] - seconds_to(plan.points)[-1] == pytest.approx(30.0 * layers)
+    figures = figures_of(plan)
+    assert sum(f.seconds for f in figures) == pytest.approx(seconds_to(plan.points)[-1], rel=1e-6)
+    assert sum(f.volume for f in figures) == pytest.approx(plan.points.volume.sum())
+
+
+def test_bends_are_taken_slower_and_never_below_the_slowest() -> None:
+    plan = plan_of()
+    speed, full = plan.points.speed[plan.points.extrude], SKIN[0].speed
+    assert speed.max() == full and speed.min() >= plan.order.way.slowest * full - 1e-9 and (speed < full).any()
+
+
+def test_a_flat_contour_is_one_layer_covered_as_its_beads_cover_it() -> None:
+    wound = flat_wound(BLOB, 0.8, "blob")
+    plan = make_plan(wound, Order((Tissue("layer", None, "ink", height=0.8),), Pattern("zigzag", 0.8, angle=0.0)))
+    assert len(plan.layers) == 1 and plan.layers[0].region.area == pytest.approx(wound.outline.area, rel=1e-4)
+    assert np.allclose(plan.points.tip[plan.points.extrude, 2], 0.8)
+    result = coverage(plan.layers[0].beads, plan.layers[0].region)
+    assert result.covered > 0.96 and result.over < 1e-3
+    assert plan.points.volume.sum() == pytest.approx(0.8 * sum(b.laid for b in plan.layers[0].beads), rel=1e-3)
+
+
+def test_the_same_wound_gives_the_same_path() -> None:
+    again = make_plan(wound_of(), plan_of().order).path
+    assert np.array_equal(again.surface_from_nozzle, plan_of().path.surface_from_nozzle)
+
+
+@given(st.integers(0, 1000), st.floats(0.1, 3.0), st.floats(0.005, 0.2))
+@settings(max_examples=30, deadline=None)
+def test_checkpoints_are_as_near_as_asked_and_on_the_bead(seed: int, spacing: float, chord: float) -> None:
+    rng = np.random.default_rng(seed)
+    lines = [even(rng.uniform(0, 20, (rng.integers(2, 9), 2)), 0.4) for _ in range(4)]
+    circle = np.linspace(0, 2 * np.pi, 300)
+    points = 5 * np.column_stack([np.cos(circle), np.sin(circle)])
+    lines.append(Bead(points, 0.4 + 0.1 * np.sin(circle)))
+    runs = runs_of(lines, chord)
+    dense = spaced(runs, np.full(len(runs.bead), spacing))
+    assert dense.steps.max() <= spacing + 1e-9
+    for i, line in enumerate(lines):
+        own = dense.points[dense.bead == i]
+        assert np.allclose(own[[0, -1]], line.points[[0, -1]])
+        assert shapely.hausdorff_distance(shapely.linestrings(own), shapely.linestrings(line.points)) <= chord + 1e-9
+        assert dense.width[dense.bead == i].min() >= line.width.min() - 1e-9
+
+
+@given(st.floats(1, 100), st.floats(0.002, 0.1))
+def test_over_a_ball_a_chord_departs_by_what_is_allowed(radius: float, chord: float) -> None:
+    spacing = float(spacing_over(np.array([1 / radius]), 5.0, chord)[0])
+    assert spacing**2 / (8 * radius) <= chord * (1 + 1e-6) or spacing == 0.25 * 5.0
+    assert spacing <= 5.0
+
+
+def test_gcode_says_what_the_path_says() -> None:
+    path = plan_of().path
+    lines = gcode_text(path).splitlines()
+    moves = [line.split() for line in lines if line.startswith(("G0 ", "G1 "))]
+    assert len(moves) == len(path) and sum(move[0] == "G1" for move in moves) == path.extrude.sum()
+    places = np.array([[float(word[1:]) for word in move[1:4]] for move in moves])
+    assert np.abs(places - path.surface_from_nozzle[:, :3, 3]).max() < 6e-4
+    laid = [float(move[-1][1:]) for move in moves if move[-1].startswith("E")]
+    assert (np.diff(laid) >= 0).all()
+    assert laid[-1] == pytest.approx(path.extra["volume_mm3"].astype(float).sum(), rel=1e-6)
+    assert sum(line.startswith("; layer") for line in lines) == len(np.unique(path.layer))
+
+
+def test_default_way_is_what_the_help_says() -> None:
+    assert (Way().spacing, Way().chord, Way().travel, Way().lift) == (1.0, 0.02, 60.0, 2.0)
