@@ -27,7 +27,9 @@ OWNERS = {  # library: the files that may import it
     "serial": ("hardware/*.py",),
     "shapely": (
         "hardware/bench/wounds.py",
+        "hardware/plan_layer_picture.py",
         "planning/fill/*.py",
+        "planning/layers/*.py",
     ),
     "time": ("hardware/clock.py",),
     "toppra": ("planning/*.py",),

@@ -60,7 +60,8 @@ def test_each_kind_of_damage_is_counted() -> None:
     vertices = np.concatenate([vertices, [far, far + [1, 0, 0], far + [0, 1, 0], [np.nan, 0, 0], [0, 0, 9]]])
     v = len(vertices)
     inner = len(triangles) // 4
-    extra = [[v - 5, v - 4, v - 3], [0, 1, v - 2], [0, 1, v + 7], [3, 3, 4], triangles[7], [*triangles[inner, :2], v - 1]]
+    third = [*triangles[inner, :2], v - 1]
+    extra = [[v - 5, v - 4, v - 3], [0, 1, v - 2], [0, 1, v + 7], [3, 3, 4], triangles[7], third]
     scan, done = repaired(vertices, np.concatenate([np.delete(triangles, 400, axis=0), extra]), "scan")
     assert (done.islands, done.island_triangles) == (1, 1)
     assert (done.broken, done.empty, done.double, done.crowded, done.holes) == (2, 1, 1, 1, 1)

@@ -99,7 +99,7 @@ def test_a_scan_that_is_inside_out_is_refused_and_with_flip_it_is_not() -> None:
 def test_a_wound_at_the_rim_of_the_scan_is_refused() -> None:
     vertices, triangles = scan_of()
     cut = triangles[(vertices[triangles][:, :, 0] < 1.0).all(axis=1)]
-    with pytest.raises(InputError, match="rim|none found"):
+    with pytest.raises(InputError, match=r"rim|none found"):
         wound_in(repaired(vertices, cut, "scan")[0], 0.4, "scan")
 
 

@@ -180,7 +180,7 @@ def _leaving(all_of: Laid, way: Way) -> Laid:
 
 
 def path_of(points: Laid, ground: Ground, spin: float) -> Path:
-    """The path, in the scan's frame, with the columns wait_s, width_mm, height_mm, volume_mm3 and run, the number of the bead."""
+    """The path, in the scan's frame, with columns wait_s, width_mm, height_mm, volume_mm3 and run, the bead."""
     plane_from_nozzle = se3.make(rotations(points.tilt, spin), points.tip)
     apart = np.r_[True, np.linalg.norm(np.diff(points.tip, axis=0), axis=1) >= 2 * NEAREST]
     tissues = [layer.slab.tissue for layer in ground.stack.layers]
