@@ -184,6 +184,7 @@ def _add_replay(commands: Commands) -> None:
     command.add_argument("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
     command.add_argument("--path", type=Path, required=True, metavar="PATH.csv", help="checkpoints on the surface")
     command.add_argument("--arm", type=Path, metavar="ARM.toml", help="the arm's place, limits and dialect of the link")
+    command.add_argument("--resume", type=Path, metavar="PROGRESS.toml", help="go on where an earlier run stopped")
     command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
     command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     command.set_defaults(run=_replay)
@@ -239,17 +240,20 @@ def _track(arguments: argparse.Namespace) -> None:
 
 def _replay(arguments: argparse.Namespace) -> None:
     from hardware.arm_file import read_arm
+    from hardware.bookmark_file import read_start
     from hardware.out_folder import prepare_out
     from hardware.path_file import read_path
     from hardware.replay import replay_session
     from hardware.session import open_session
 
     session = open_session(arguments.session)
-    read_path(arguments.path)  # what is wrong with it is told before anything is made
+    path = read_path(arguments.path)  # what is wrong with it is told before anything is made
+    if arguments.resume is not None:
+        read_start(arguments.resume, path)
     profile = None if arguments.arm is None else read_arm(arguments.arm)
     prepare_out(arguments.out, arguments.force)
     with _progress("replay", "frame sets") as progress:
-        replay_session(session, arguments.path, arguments.out, progress, profile)
+        replay_session(session, arguments.path, arguments.out, progress, profile, arguments.resume)
     rows = (arguments.out / "commands.csv").read_text(encoding="utf-8").splitlines()[1:]
     moves = sum(row.split(",", 2)[1] == "move" for row in rows)
     print(f"{moves} moves and {len(rows) - moves} holds: commands.csv and frames.bin in {arguments.out}")

@@ -18,6 +18,7 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from hardware.arm_file import write_arm
 from hardware.arm_profile import ArmProfile, placed
+from hardware.bookmark_file import BookmarkFile, read_start
 from hardware.clock import SimClock
 from hardware.motion import MotionStep
 from hardware.path_file import read_path
@@ -103,16 +104,23 @@ def _row(command: Command) -> list[str]:
 
 
 def replay_session(
-    session: Session, path: File, out: File, progress: Report = silent, profile: ArmProfile | None = None
+    session: Session,
+    path: File,
+    out: File,
+    progress: Report = silent,
+    profile: ArmProfile | None = None,
+    resume: File | None = None,
 ) -> None:
-    """Replay a session with the path at `path` (CSV) into the folder `out`: commands.csv, frames.bin, arm.toml.
+    """Replay a session with the path at `path` (CSV) into `out`: commands.csv, frames.bin, arm.toml, progress.toml.
 
     A recording knows no arm. Without a profile the default arm is placed so that the first measured surface lies on its
     bench, level and below home; arm.toml says where that is. What was written before an error stays readable.
+    resume: progress.toml of an earlier run, to go on where that stopped.
     """
     from hardware.tracker import tracker  # loads cv2: the motion must not
 
     checkpoints = read_path(path)
+    start = 0.0 if resume is None else read_start(resume, checkpoints)
     tool = None if profile is None else profile.tool
     with tracker(session.rig, session.roi, session.surface, tool=tool) as step, CommandWriter(out) as writer:
 
@@ -126,8 +134,10 @@ def replay_session(
         if profile is None:
             poses, profile = placed_by(poses)
         write_arm(out / "arm.toml", profile, f"what this replay assumed; poses were known {DELAY} s after their stamps")
-        for _, command, frame in replay(poses, MotionStep(checkpoints, profile)):
+        motion, keeper = MotionStep(checkpoints, profile, start), BookmarkFile(out / "progress.toml", checkpoints)
+        for _, command, frame in replay(poses, motion):
             writer.write(command, frame)
+            keeper.write(motion.progress)
 
 
 def placed_by(poses: Iterable[SurfacePose]) -> tuple[Iterator[SurfacePose], ArmProfile]:

@@ -30,8 +30,8 @@ from planning.path import Path, check_path
 from planning.progress import Phase, Progress, check_start
 from planning.retime import Timing, retime
 
-HORIZON = 2.0  # s of path timed at once
-RENEW = 1.5  # s of it left when the next is timed; a horizon ends at rest, and the surface is foreseen for 0.5 s
+HORIZON = 1.0  # s of path timed at once: any speed can be stopped in it
+RENEW = 0.5  # s of it left when the next is timed; a horizon ends at rest, and the surface is foreseen for 0.5 s
 STALL = 3.0  # ticks without a call after which the arm has come to rest by itself
 MARGIN = np.array([5.0, 5, 5, *np.deg2rad([2, 2, 2])])  # that targets keep from the bounds: braking needs room
 JOINT_MARGIN = float(np.deg2rad(2))  # that joints keep from the ends of their ranges
