@@ -82,8 +82,9 @@ def _add_layers(command: argparse.ArgumentParser) -> None:
 def _add_pattern(command: argparse.ArgumentParser) -> None:
     group = command.add_argument_group("pattern")
     group.add_argument(
-        "--pattern", choices=("zigzag", "raster", "contour", "spiral", "hybrid", "best"), default="hybrid",
-        help="hybrid: rims around a zigzag; default hybrid",
+        "--pattern", choices=("zigzag", "raster", "contour", "spiral", "hybrid", "best"), default="contour",
+        help="contour: closed lines, nothing left open; zigzag, raster: straight lines, the quickest to plan; hybrid: "
+        "rims around a zigzag; spiral: closed lines joined; best: the faster of contour and spiral; default contour",
     )  # fmt: skip
     group.add_argument(
         "--angle", default="fastest", metavar="DEG",

@@ -34,7 +34,7 @@ class Wishes:
     tissues: tuple[str, ...] = ()
     layers: str = "skin"
     layer_height: float | None = None
-    pattern: str = "hybrid"
+    pattern: str = "contour"
     angle: str = "fastest"
     parallel: bool = False
     bead: float = 0.4
@@ -100,14 +100,16 @@ def _tissues(wishes: Wishes, flat: bool) -> tuple[Tissue, ...]:
             Tissue(name, thickness, names[min(i, len(names) - 1)], wishes.temperature, wishes.speed, height)
             for i, (name, thickness) in enumerate(SKIN)
         )
-    if flat:
-        first = found[0]
-        name = first.name if wishes.tissues else "layer"
-        return (Tissue(name, None, first.material, first.temperature, first.speed, first.height),)
     if len({t.name for t in found}) < len(found):
         raise InputError(WHERE, "--tissue", ", ".join(t.name for t in found), "each name once")
     if sum(t.thickness is None for t in found) > 1:
         raise InputError(WHERE, "--tissue", ", ".join(wishes.tissues), "at most one that takes the rest")
+    if flat and len(wishes.tissues) > 1:
+        raise InputError(WHERE, "--tissue", ", ".join(wishes.tissues), "one: a contour is one layer")
+    if flat:
+        first = found[0]
+        name = first.name if wishes.tissues else "layer"
+        return (Tissue(name, None, first.material, first.temperature, first.speed, first.height),)
     return found
 
 

@@ -42,6 +42,7 @@ SUBJECTS: Subjects = {
     "latency": Subject("hardware.bench.latency", "from three decoded frames to the pose, by wall clock and processor"),
     "map": Subject("hardware.bench.mapping", "landmarks off the true surface beside their claim, and the map's growth"),
     "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?"),
+    "plan": Subject("hardware.bench.plan", "a whole plan of a large wound: time, memory, coverage, ink"),
     "registration": Subject("hardware.bench.registration", "a scan laid into the first pictures: error and verdict"),
     "prediction": Subject("hardware.bench.prediction", "where a breathing chest will be, 100 to 500 ms ahead"),
     "planner": Subject("hardware.bench.planner", "random poses into planner and guard: limits kept, cost of a step"),

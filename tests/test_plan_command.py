@@ -1,0 +1,185 @@
+"""`stillbed plan`: one line for a new user, everything beside the path, one line for what is wrong."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from estimation.errors import InputError
+from hardware import plan as planning_command
+from hardware.cli import main
+from hardware.contour_file import read_contour
+from hardware.path_file import read_path
+from hardware.plan_order import RANGES, Wishes, order_of
+from hardware.ply_file import write_ply
+from hardware.scan_units import UNITS, in_mm
+from planning.command import Move
+from planning.kinematics import SimpleArm
+from planning.limits import Limits
+from planning.planner import Planner
+from tests.moving import pose_at, still
+from tests.test_mesh_file import needs_open3d
+from tests.wounds import scan_of
+
+SQUARE = "x_mm,y_mm\n0,0\n12,0\n12,8\n0,8\n"
+
+
+def contour(folder: Path, text: str = SQUARE) -> Path:
+    file = folder / "contour.csv"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_a_contour_becomes_a_path_with_everything_beside_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "new" / "path.csv"
+    gcode = tmp_path / "print.gcode"
+    assert main(["plan", str(contour(tmp_path)), "-o", str(out), "--bead", "0.8", "--gcode", str(gcode)]) == 0
+    assert "coverage: 99" in capsys.readouterr().out
+    path = read_path(out)
+    planner = Planner(path, Limits(), SimpleArm(), 0.02)
+    commands = [planner(pose_at(still, 0.02 * k), 0.02 * k) for k in range(600)]
+    assert sum(isinstance(command, Move) for command in commands) > 500 and planner.progress.place > 0
+    assert sorted(file.name for file in out.parent.iterdir()) == [
+        "path.csv", "path.html", "path.json", "path_layers", "path_layers.csv",
+    ]  # fmt: skip
+    assert gcode.read_text().count("\nG1 ") == path.extrude.sum()
+    facts = json.loads(out.with_suffix(".json").read_text())
+    assert facts["checkpoints"] == len(path) and facts["wound"]["area"] == pytest.approx(96)
+    with (out.parent / "path_layers.csv").open(encoding="utf-8") as stream:
+        (row,) = csv.DictReader(stream)
+    assert float(row["covered"]) > 0.99 and float(row["gap_mm2"]) < 1
+    (picture,) = (out.parent / "path_layers").iterdir()
+    drawn = ElementTree.parse(picture).getroot()
+    assert sum("start" == e.get("class") for e in drawn.iter()) == 1
+
+
+def test_the_report_needs_no_network_and_holds_every_checkpoint(tmp_path: Path) -> None:
+    out = tmp_path / "path.csv"
+    assert main(["plan", str(contour(tmp_path)), "-o", str(out), "--bead", "0.8"]) == 0
+    page = out.with_suffix(".html").read_text(encoding="utf-8")
+    assert not re.search(r"(src|href)\s*=\s*[\"']?(https?:)?//", page) and "@import" not in page
+    data = re.search(r'<script type="application/json" id="plan-data">(.*?)</script>', page)
+    assert data is not None
+    held = json.loads(data[1])
+    assert len(held["extrude"]) == -(-len(read_path(out)) // 3) * 4  # a byte each, as base64
+
+
+@needs_open3d
+def test_a_scan_in_metres_is_recognised_and_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    vertices, triangles = scan_of()
+    write_ply(tmp_path / "scan.ply", vertices / 1000, triangles)
+    command = ["plan", str(tmp_path / "scan.ply"), "-o", str(tmp_path / "path.csv"), "--bead", "1", "--no-pictures"]
+    assert main(command) == 2
+    assert "--unit m (" in capsys.readouterr().err
+    assert main([*command, "--unit", "m", "--pattern", "zigzag"]) == 0
+    assert (tmp_path / "path_scan.ply").is_file() and not (tmp_path / "path.html").exists()
+    assert np.abs(read_path(tmp_path / "path.csv").surface_from_nozzle[:, :3, 3]).max() < 100
+
+
+def test_an_example_needs_no_scan(tmp_path: Path) -> None:
+    out = tmp_path / "path.csv"
+    command = ["plan", "--example", "chest", "-o", str(out), "--bead", "1.5", "--pattern", "zigzag", "--no-pictures"]
+    assert main(command) == 0
+    path = read_path(out)
+    assert len(np.unique(path.layer)) > 1 and set(path.material.tolist()) <= {1, 2, 3}
+    assert (tmp_path / "path_example.ply").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--pattern", "zigzag", "--angle", "steep"], "--angle"),
+        (["--speed", "-1"], "--speed"),
+        (["--bead", "0"], "width"),
+        (["--bead", "nan"], "width"),
+        (["--material", "a,b"], "--material"),
+        (["--tissue", "dermis"], "--tissue"),
+        (["--tissue", "dermis=thick:1"], "--tissue"),
+        (["--tissue", "a=1:1", "--tissue", "a=2:1"], "once"),
+        (["--tissue", "a=rest:1", "--tissue", "b=rest:1"], "rest"),
+        (["--bead", "15"], "room"),
+        (["-o", "path.txt"], ".csv"),
+    ],
+)
+def test_what_is_wrong_is_one_line(
+    tmp_path: Path, options: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "path.csv"
+    assert main(["plan", str(contour(tmp_path)), "-o", str(out), *options]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("stillbed: ") and said in error and "allowed" in error
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "x,y\n0,0\n1,0\n1,1\n", "x_mm,y_mm\n0,0\n9,0\n", "x_mm,y_mm\n0,0\n9,nan\n9,9\n", "x_mm,y_mm\n0,0\n9\n9,9\n",
+        "x_mm,y_mm\n0,0\n9,9\n9,0\n0,9\n", "x_mm,y_mm,z_mm\n0,0,0\n9,0,0\n9,9,0\n",
+    ],
+)  # fmt: skip
+def test_a_contour_that_is_none_is_one_line(tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", str(contour(tmp_path, text)), "-o", str(tmp_path / "path.csv")]) == 2
+    assert "allowed" in capsys.readouterr().err
+
+
+def test_a_path_that_is_there_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "path.csv"
+    out.write_text("mine")
+    command = ["plan", str(contour(tmp_path)), "-o", str(out), "--bead", "2", "--no-pictures"]
+    assert main(command) == 2
+    assert out.read_text() == "mine" and "--force" in capsys.readouterr().err
+    assert main([*command, "--force"]) == 0
+    assert len(read_path(out)) > 2
+
+
+def test_ctrl_c_leaves_a_whole_path_or_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    out = tmp_path / "path.csv"
+    command = ["plan", str(contour(tmp_path)), "-o", str(out), "--bead", "2"]
+    with monkeypatch.context() as patched:
+        patched.setattr(planning_command, "layer_svg", interrupted)  # while the first picture is drawn
+        assert main(command) == 130
+    assert "whole" in capsys.readouterr().err and len(read_path(out)) > 2
+    with monkeypatch.context() as patched:
+        patched.setattr("planning.layers.plan.path_of", interrupted)
+        assert main([*command, "--force"]) == 130
+    assert len(read_path(out)) > 2 and not list(tmp_path.glob("*.part"))
+
+
+@given(st.sampled_from(sorted(UNITS)), st.floats(25, 900))
+def test_the_right_unit_is_taken_and_a_wrong_one_is_answered_with_it(unit: str, size: float) -> None:
+    vertices = np.random.default_rng(0).uniform(0, 1.05 * size / UNITS[unit], (2000, 3))
+    triangles = np.arange(1998).reshape(-1, 3)
+    assert np.allclose(in_mm(vertices, triangles, unit, "scan"), vertices * UNITS[unit])
+    for other in UNITS:
+        try:
+            in_mm(vertices, triangles, other, "scan")
+        except InputError as error:
+            assert f"--unit {unit}" in str(error)
+
+
+@given(st.sampled_from([name for name, _, _ in RANGES]), st.booleans())
+def test_every_setting_is_refused_just_beyond_its_range(name: str, above: bool) -> None:
+    low, high = next((low, high) for n, low, high in RANGES if n == name)
+    inside, outside = (high, np.nextafter(high, np.inf)) if above else (low, np.nextafter(low, -np.inf))
+    order_of(Wishes(**{name: inside}), flat=False)
+    with pytest.raises(InputError, match="--" + name.replace("_", "-")):
+        order_of(Wishes(**{name: float(outside)}), flat=False)
+
+
+def test_a_contour_may_be_closed_and_repeat_points(tmp_path: Path) -> None:
+    file = contour(tmp_path, "x_mm,y_mm\n0,0\n0,0\n5,0\n5,5\n0,0\n")
+    assert np.array_equal(read_contour(file), [[0, 0], [5, 0], [5, 5]])
