@@ -17,7 +17,7 @@ def eased(bead: Bead, reach: float) -> Bead:
     """The same bead with each sharp corner cut, `reach` mm before and after it or less where its sides are short."""
     lines = np.column_stack([bead.points, bead.width])
     for _ in range(ROUNDS):
-        sharp = np.flatnonzero(turning(lines[:, :2]) > MARGIN * SHARP) + 1
+        sharp = (turning(lines[:, :2]) > MARGIN * SHARP).nonzero()[0] + 1
         if not len(sharp):
             break
         lines = _cut(lines, sharp, reach)
@@ -27,12 +27,14 @@ def eased(bead: Bead, reach: float) -> Bead:
 
 def _cut(lines: Array, corner: NDArray[np.intp], reach: float) -> Array:
     """Lines (N, 3) with two points instead of each corner (C,), equally far from it so that each turns half as much."""
-    to = [lines[corner + way] - lines[corner] for way in (-1, 1)]
-    far = [np.linalg.norm(side[:, :2], axis=1) for side in to]
-    cut = np.minimum(reach, 0.4 * np.minimum(*far))
-    before, after = (
-        lines[corner] + (cut / np.maximum(length, 1e-12))[:, None] * side for side, length in zip(to, far, strict=True)
-    )
-    lines = lines.copy()
-    lines[corner] = before
-    return np.insert(lines, corner + 1, after, axis=0)
+    here = lines[corner]
+    back, on = lines[corner - 1] - here, lines[corner + 1] - here
+    far_back, far_on = np.hypot(back[:, 0], back[:, 1]), np.hypot(on[:, 0], on[:, 1])
+    cut = np.minimum(reach, 0.4 * np.minimum(far_back, far_on))
+    times = np.ones(len(lines), int)
+    times[corner] = 2
+    found = np.repeat(lines, times, axis=0)
+    place = corner + np.arange(len(corner))
+    found[place] = here + (cut / np.maximum(far_back, 1e-12))[:, None] * back
+    found[place + 1] = here + (cut / np.maximum(far_on, 1e-12))[:, None] * on
+    return found

@@ -11,6 +11,7 @@ import shapely
 from estimation.se3 import Array
 from planning.fill.bead import Bead, even
 from planning.fill.ease import eased
+from planning.fill.fit import fit_of
 from planning.fill.order import Run, ordered
 from planning.fill.pace import Pace, hops, spent
 from planning.fill.pattern import Pattern
@@ -26,7 +27,9 @@ Lines = Callable[[Region, float, float], tuple[list[Array], float]]
 
 def fill(region: Region, pattern: Pattern, pace: Pace) -> list[Bead]:
     """Beads that fill a region, mm, in printing order; none where it is empty. InputError where contours cross."""
-    region = shapely.buffer(checked(region), -pattern.inset)
+    region = checked(region)
+    if pattern.inset:
+        region = shapely.buffer(region, -pattern.inset)
     if region.is_empty:
         return []
     corner = _corner(region, pattern)
@@ -40,12 +43,13 @@ def fill(region: Region, pattern: Pattern, pace: Pace) -> list[Bead]:
 
 def _corner(region: Region, pattern: Pattern) -> Array:
     """The corner (2,) of the box around a region that printing begins nearest to."""
-    low, high = np.array(region.bounds).reshape(2, 2)
-    return np.where(np.array(pattern.start) > 0, high, low)
+    left, low, right, high = region.bounds
+    x, y = pattern.start
+    return np.array([right if x > 0 else left, high if y > 0 else low])
 
 
 def _levels(region: Region, pattern: Pattern, most: int | None = None) -> tuple[list[Level], Region]:
-    return ring_levels(shapely.buffer(region, (pattern.spacing - pattern.width) / 2), pattern.spacing, most)
+    return ring_levels(shapely.buffer(region, (pattern.spacing - pattern.width) / 2), fit_of(pattern), most)
 
 
 def _runs(levels: list[Level], pattern: Pattern, pace: Pace) -> list[Run]:

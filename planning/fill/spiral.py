@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -49,11 +50,15 @@ def wound(nest: list[Bead], spacing: float, start: Array, seam: float) -> tuple[
 
     seam: share of the outermost line by which the run begins later.
     """
-    turned = _begun(nest, _wanted(nest[0], start, seam), spacing)
+    wanted = _wanted(nest[0], start, seam)
+    apart = _begun(nest, _inwards(nest, wanted), spacing)
+    turned = apart
+    if any(_far(outer, inner, spacing) for outer, inner in pairwise(apart)):
+        turned = _begun(nest, _outwards(nest, wanted, spacing), spacing)
     runs: list[list[Bead]] = [[turned[0]]]
     closing: list[Bead] = []  # what the last line of a run lacks beside the ramp that led to it
     for outer, inner in pairwise(turned):
-        if np.hypot(*(outer.points[0] - inner.points[0])) > NEAR * spacing:
+        if _far(outer, inner, spacing):
             runs[-1] += closing
             runs.append([inner])  # not beside one another here
             closing = []
@@ -62,7 +67,7 @@ def wound(nest: list[Bead], spacing: float, start: Array, seam: float) -> tuple[
         runs[-1] += [_ramp(outer, inner, ramp), inner.between(ramp, inner.length)]
         closing = [inner.between(0.0, ramp)]
     runs[-1] += closing
-    return turned, [_chained(run) for run in runs]
+    return apart, [_chained(run) for run in runs]
 
 
 def _chained(run: list[Bead]) -> Bead:
@@ -78,25 +83,41 @@ def _wanted(ring: Bead, start: Array, seam: float) -> Array:
     return ring.at(np.array([along % ring.length]))[0, :2]
 
 
-def _begun(nest: list[Bead], wanted: Array, spacing: float) -> list[Bead]:
-    """The lines begun where each lies beside the next, the outermost as near to `wanted` (2,) as that allows."""
+def _far(outer: Bead, inner: Bead, spacing: float) -> bool:
+    """Whether two lines begin too far apart to be joined there."""
+    return math.dist(outer.points[0], inner.points[0]) > NEAR * spacing
+
+
+def _inwards(nest: list[Bead], wanted: Array) -> list[float]:
+    """Where along each line it begins, mm: nearest to `wanted` (2,), or to where the one before begins."""
+    arcs = []
+    for ring in nest:
+        arcs.append(float(shapely.line_locate_point(shapely.linestrings(ring.points), shapely.points(wanted))))
+        wanted = ring.at(np.array(arcs[-1:]))[0, :2]
+    return arcs
+
+
+def _outwards(nest: list[Bead], wanted: Array, spacing: float) -> list[float]:
+    """The same, so that each begins beside the one within it, the outermost as near to `wanted` as that allows."""
     inmost = nest[-1]
     place = inmost.at(np.linspace(0, inmost.length, PLACES, endpoint=False))[:, :2]
     arcs, far = [], np.zeros(PLACES)
     for ring in nest[::-1]:
-        line = shapely.linestrings(ring.points)
-        arc = shapely.line_locate_point(line, shapely.points(place))
+        arc = shapely.line_locate_point(shapely.linestrings(ring.points), shapely.points(place))
         outer = ring.at(arc)[:, :2]
         far += np.linalg.norm(outer - place, axis=1) > NEAR * spacing
         place = outer
         arcs.append(arc)
     best = int((np.linalg.norm(place - wanted, axis=1) + 1e6 * far).argmin())
+    return [float(arc[best]) for arc in arcs[::-1]]
+
+
+def _begun(nest: list[Bead], arcs: list[float], spacing: float) -> list[Bead]:
+    """The lines begun at these lengths, all in one sense."""
     found: list[Bead] = []
-    for ring, arc in zip(nest, arcs[::-1], strict=True):
-        ring = ring.turned(float(arc[best]))
-        if found and _against(found[-1], ring, spacing):
-            ring = ring.reversed
-        found.append(ring)
+    for ring, arc in zip(nest, arcs, strict=True):
+        turned = ring.turned(arc)
+        found.append(turned.reversed if found and _against(found[-1], turned, spacing) else turned)
     return found
 
 

@@ -10,10 +10,12 @@ from shapely.geometry.base import BaseGeometry
 from estimation.se3 import Array
 from planning.fill.axis import Axis
 from planning.fill.bead import Bead
+from planning.fill.fit import Fit
 
-ONE, TWO = 0.25, 0.75  # spacings: radius from which one bead fits, and from which two do
 SHORTEST = 0.1  # spacings: a shorter line is a dot
 SAMPLED = 0.25  # spacings from point to point
+CLEAR = 0.5  # of the radius at a wide end, by which a bead stays away from the line that turns there
+WIDE = 0.9  # of the widest: an end at least that wide lies before such a turn
 SMOOTHED = 4  # roundings, each over two points
 
 
@@ -39,26 +41,35 @@ def paths(edges: NDArray[np.intp]) -> list[list[int]]:
     return found
 
 
-def strokes(axis: Axis, edge: BaseGeometry, spacing: float, levels: int | None = None) -> list[tuple[int, Bead]]:
+def strokes(axis: Axis, edge: BaseGeometry, fit: Fit, levels: int | None = None) -> list[tuple[int, Bead]]:
     """Beads along the parts of an axis that closed lines at multiples of the spacing leave, each with its level.
 
     edge: the boundary that the axis belongs to; no bead reaches over it.
     """
-    share = axis.radii / spacing
-    level = np.floor(share - ONE).astype(int)
-    single = (share - level < TWO) & (level >= 0)
+    level = np.floor((axis.radii - fit.one) / fit.spacing).astype(int)
+    single = (axis.radii - level * fit.spacing < fit.two) & (level >= 0)
     if levels is not None:
         single &= level < levels
     a, b = axis.edges.T
     kept = axis.edges[single[a] & single[b] & (level[a] == level[b])]
     found = []
     for path in paths(kept):
-        points = _smooth(axis.middles[path], spacing)
+        points = _smooth(axis.middles[path], fit.spacing)
         if len(points):
             inner = int(level[path[0]])
-            width = 2 * (shapely.distance(edge, shapely.points(points)) - spacing * inner)
-            found.append((inner, Bead(points, np.clip(width, 2 * ONE * spacing, 2 * TWO * spacing))))
+            radius = shapely.distance(edge, shapely.points(points)) - fit.spacing * inner
+            bead = _clear(Bead(points, 2 * np.clip(radius, fit.one, fit.two)), fit)
+            if bead is not None:
+                found.append((inner, bead))
     return found
+
+
+def _clear(bead: Bead, fit: Fit) -> Bead | None:
+    """What stays of a bead once it keeps clear of the closed lines that turn round where it is widest."""
+    start, end = (CLEAR * fit.two if width > WIDE * 2 * fit.two else 0.0 for width in bead.width[[0, -1]])
+    if bead.length - start - end < SHORTEST * fit.spacing:
+        return None
+    return bead.between(start, bead.length - end)
 
 
 def _smooth(points: Array, spacing: float) -> Array:

@@ -1,0 +1,170 @@
+"""What holds for every region that is filled."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely.geometry import MultiPolygon, Polygon, box
+
+from estimation.errors import InputError
+from hardware.bench.wounds import random_wound
+from planning.fill.bead import Bead, even
+from planning.fill.coverage import coverage
+from planning.fill.ease import eased
+from planning.fill.fill import fill
+from planning.fill.order import ordered
+from planning.fill.pace import SHARP, Pace, hops, spent, turning
+from planning.fill.pattern import KINDS, Kind, Pattern
+from planning.fill.region import Region, around, region_of
+
+PACE = Pace()
+WOUNDS = st.integers(0, 10**6).map(lambda seed: random_wound(np.random.default_rng(seed))[1])
+SMALL = WOUNDS.filter(lambda wound: wound.area < 250)
+ANGLES: tuple[float | Literal["shorter"], ...] = 0.0, np.pi / 2, "shorter"
+few = settings(max_examples=8, deadline=None)
+
+
+@few
+@given(WOUNDS, st.sampled_from([0.4, 0.8]))
+def test_middle_lines_stay_inside_and_widths_within_what_the_nozzle_lays(wound: Region, width: float) -> None:
+    pattern = Pattern(width=width)
+    roomy = wound.buffer(1e-3 * width)
+    for bead in fill(wound, pattern, PACE):
+        assert roomy.contains(shapely.linestrings(bead.points))
+        assert bead.width.min() >= 0.999 * pattern.narrowest * width
+        assert bead.width.max() <= 1.001 * pattern.widest * width
+
+
+@few
+@given(SMALL)
+def test_a_wound_is_covered_once_and_nothing_beside_it(wound: Region) -> None:
+    found = coverage(fill(wound, Pattern(), PACE), wound)
+    assert found.covered > 0.985 and found.double < 0.05 and found.over < 0.003
+
+
+@few
+@given(SMALL, st.floats(0.1, 6.2))
+def test_coverage_does_not_depend_on_how_a_wound_is_turned(wound: Region, angle: float) -> None:
+    turned = shapely.affinity.rotate(wound, angle, use_radians=True)
+    before, after = (coverage(fill(region, Pattern(), PACE), region).covered for region in (wound, turned))
+    assert abs(before - after) < 0.002
+
+
+@few
+@given(WOUNDS, st.sampled_from(KINDS))
+def test_no_corner_within_a_bead_is_sharp(wound: Region, kind: Kind) -> None:
+    assert max((turning(b.points).max(initial=0.0) for b in fill(wound, Pattern(kind), PACE)), default=0.0) <= SHARP
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_island_of_healthy_skin_is_not_printed_on(kind: Kind) -> None:
+    island = box(2, 1, 6, 5)
+    region = box(-8, -6, 10, 9).difference(island)
+    for bead in fill(region, Pattern(kind), PACE):
+        assert not shapely.linestrings(bead.points).intersects(island)
+
+
+def test_bumps_are_gone_round_with_clearance() -> None:
+    bump = box(0, 0, 3, 3)
+    for bead in fill(around(box(-9, -6, 9, 6), bump, 1.0), Pattern(), PACE):
+        assert shapely.distance(shapely.linestrings(bead.points), bump) >= 1.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "region",
+    [
+        MultiPolygon(),
+        box(0, 0, 1e-5, 1e-5),
+        box(0, 0, 10, 0.05),
+        Polygon([(0, 0), (10, 0), (5, 1e-9)]),
+        MultiPolygon([box(0, 0, 1, 1), box(3, 0, 3.01, 9)]),
+    ],
+)
+def test_what_is_too_small_for_a_bead_is_left_open(kind: Kind, region: Region) -> None:
+    beads = fill(region, Pattern(kind), PACE)
+    assert all(region.buffer(1e-6).contains(shapely.linestrings(bead.points)) for bead in beads)
+
+
+def test_a_slit_narrower_than_two_beads_gets_one_of_its_own_width() -> None:
+    (bead,) = fill(box(0, 0, 10, 0.52), Pattern(), PACE)
+    assert np.allclose(bead.width, 0.52, atol=0.02) and bead.length > 9
+
+
+def test_of_a_slit_narrower_than_any_bead_the_gap_is_told() -> None:
+    slit = box(0, 0, 10, 0.1)
+    assert coverage(fill(slit, Pattern(), PACE), slit).gaps.area == pytest.approx(slit.area)
+
+
+def test_the_same_region_gives_the_same_bytes() -> None:
+    wound = random_wound(np.random.default_rng(5))[1]
+    first, second = (
+        b"".join(b.points.tobytes() + b.width.tobytes() for b in fill(wound, Pattern(), PACE)) for _ in "ab"
+    )
+    assert first == second
+
+
+def test_printing_begins_at_the_top_left_and_seams_move() -> None:
+    region = region_of(np.array([[0, 0], [20, 0], [20, 12], [0, 12]]))
+    first, moved = (fill(region, Pattern("contour", seam=seam), PACE)[0].points[0] for seam in (0.0, 0.5))
+    assert np.linalg.norm(first - [0, 12]) < 4 and np.linalg.norm(first - moved) > 4
+
+
+@few
+@given(WOUNDS)
+def test_the_shorter_of_horizontal_and_vertical_lines_wins(wound: Region) -> None:
+    ways = [fill(wound, Pattern("zigzag", angle=angle), PACE) for angle in ANGLES]
+    across, along, found = (sum(bead.length for bead in beads) + hops(beads) for beads in ways)
+    assert found == pytest.approx(min(across, along), rel=0.01)
+
+
+def test_a_plain_bead_covers_its_length_times_width_and_both_ends() -> None:
+    bead = even(np.array([[0.0, 0.0], [10.0, 0.0]]), 1.0)
+    found = coverage([bead, bead], box(-5, -5, 15, 5))
+    assert found.covered * 200 == pytest.approx(10 + np.pi / 4, rel=1e-3)
+    assert found.double * 200 == pytest.approx(10 - np.pi / 4, rel=1e-2)
+
+
+def test_time_counts_printing_travel_and_turns() -> None:
+    corner = even(np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]), 0.4)
+    cost = spent([corner, corner], Pace(20, 60, 0.05))
+    assert cost.turns == 2 and cost.seconds == pytest.approx(40 / 20 + np.hypot(10, 10) / 60 + 0.1)
+    assert spent([eased(corner, 0.1)], PACE).turns == 0
+
+
+@few
+@given(st.integers(0, 10**6), st.integers(2, 25))
+def test_ordering_keeps_every_run_and_never_travels_farther_than_nearest_neighbour(seed: int, count: int) -> None:
+    ends = np.random.default_rng(seed).uniform(-20, 20, (count, 2, 2))
+    beads = [even(pair, 0.4) for pair in ends]
+    found = ordered([[bead] for bead in beads], np.array([-20.0, 20.0]))
+    assert sorted(b.length for b in found) == sorted(b.length for b in beads)
+    assert hops(found) <= _greedy(ends, np.array([-20.0, 20.0])) + 1e-9
+
+
+def _greedy(ends: np.ndarray, here: np.ndarray) -> float:
+    start, free, way = here, list(range(len(ends))), 0.0
+    while free:
+        far = [(float(np.linalg.norm(ends[i, k] - here)), i, k) for i in free for k in (0, 1)]
+        step, i, k = min(far)
+        way, here = way + step, ends[i, 1 - k]
+        free.remove(i)
+    return way + float(np.linalg.norm(start))
+
+
+def test_a_closed_bead_begins_anywhere_without_changing() -> None:
+    ring = even(np.array([[0.0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]), 0.4)
+    turned = ring.turned(5.5)
+    assert turned.closed and turned.length == pytest.approx(14) and turned.points[0] == pytest.approx([4, 1.5])
+    assert isinstance(turned.between(1.0, 2.0), Bead) and turned.between(1.0, 2.0).length == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("name", "value"), [("width", 0), ("overlap", 0.95), ("narrowest", 0), ("kind", "star")])
+def test_a_pattern_that_cannot_be_laid_is_refused(name: str, value: object) -> None:
+    with pytest.raises(InputError, match=name):
+        Pattern(**{name: value})  # type: ignore[arg-type]
