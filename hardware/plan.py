@@ -41,6 +41,7 @@ LAYER_COLUMNS = (
     "layer", "tissue", "material", "area_mm2", "covered", "double", "over", "gap_mm2", "gap_over_half_a_bead_mm2",
     "gap_over_a_bead_mm2", "runs", "checkpoints", "printed_mm", "travelled_mm", "time_s", "volume_mm3",
 )  # fmt: skip
+ASLANT_DEG = 35.0  # off the normal: a bead is then pushed aside by a fifth of its width, as the tip is no point
 REPAIRED_STEP = 0.5  # mm between the vertices of the repaired scan that is written
 
 
@@ -48,7 +49,8 @@ REPAIRED_STEP = 0.5  # mm between the vertices of the repaired scan that is writ
 class Request:
     """What is to be planned and written. scan: mesh or contour; example: a built-in body instead.
 
-    outline: of the wound on the scan. unit: of the scan's numbers. flip: it was scanned inside out.
+    outline: of the wound on the scan. unit: of the scan's numbers. flip: it was scanned inside out. session: in whose
+    pictures the scan is to be found.
     """
 
     out: Path
@@ -58,6 +60,7 @@ class Request:
     unit: str = "mm"
     flip: bool = False
     gcode: Path | None = None
+    session: Path | None = None
     pictures: bool = True
     force: bool = False
     wishes: Wishes = field(default_factory=Wishes)
@@ -76,6 +79,8 @@ def run_plan(request: Request) -> str:
     """Plan and write; what it came to, in words. The path is whole before anything beside it is begun."""
     flat = request.scan is not None and request.scan.suffix.lower() == ".csv"
     order = order_of(request.wishes, flat)
+    if request.session is not None:
+        _check_session(request.session, flat)
     check_out(request.out, request.gcode, request.force)
     subject = _subject(request, flat)
     with _progress("plan", "layers") as progress:
@@ -90,7 +95,8 @@ def run_plan(request: Request) -> str:
     written = [request.out.name, *_tables(request, plan, subject, layers, total)]
     if request.pictures:
         written += _pictures(request, plan, subject, layers, total)
-    return _told(plan, subject, total, request.out, written)
+    placed = [] if request.session is None else _placed(request.session, request.out, plan)
+    return "\n".join([_told(plan, subject, total, request.out, written), *placed])
 
 
 def planned_scan(vertices: Array, triangles: Index, step: float, where: object, flip: bool = False) -> Subject:
@@ -245,6 +251,11 @@ def notes_of(plan: Plan) -> list[str]:
     notes = list(plan.wound.findings.notes)
     if plan.stack.missing:
         notes.append(f"not printed, as the wound is not deep enough: {', '.join(plan.stack.missing)}")
+    off_deg = max(np.rad2deg(t.departure) for t in (plan.ground.low, plan.ground.high))
+    if off_deg > ASLANT_DEG:
+        notes.append(
+            f"the tool stands up to {off_deg:.0f} degrees off the normal, as its limits ask for: on the steepest walls"
+        )
     empty = sum(not layer.beads for layer in plan.layers)
     if empty:
         notes.append(f"{empty} of {len(plan.layers)} layers have no room for a bead and are left out")
@@ -267,6 +278,22 @@ def _told(plan: Plan, subject: Subject, total: Total, out: Path, written: Sequen
         lines.append("scan: " + ", ".join(done))
     lines += [f"note: {note}" for note in notes_of(plan)]
     return "\n".join([*lines, f"in {out.parent}: {', '.join(written)}"])
+
+
+def _check_session(session: Path, flat: bool) -> None:
+    from hardware.session import open_session
+
+    if flat:
+        raise InputError("command line", "--session", session, "nothing with a contour: it has no shape to be found by")
+    open_session(session)  # what is wrong with it is told before anything is written
+
+
+def _placed(session: Path, out: Path, plan: Plan) -> list[str]:
+    """Where the scan lies in a session's pictures, in words."""
+    from hardware.plan_placing import placing_in
+
+    ring = plan.wound.rim
+    return placing_in(session, out.with_name(f"{out.stem}_scan.ply"), ring).lines()
 
 
 def _progress(what: str, unit: str) -> Progress:

@@ -42,6 +42,10 @@ def add_plan(commands: Commands) -> None:
         "--example", choices=("forearm", "chest", "foot"), help="a built-in scan instead of SCAN; also written"
     )
     command.add_argument("--gcode", type=Path, metavar="FILE", help="also write the path as plain G-code text")
+    command.add_argument(
+        "--session", type=Path, metavar="SESSION",
+        help="also lay the scan into this session's first pictures, and say how well it fits the wound they show",
+    )  # fmt: skip
     command.add_argument("--no-pictures", action="store_true", help="write neither pictures nor the report")
     command.add_argument("--force", action="store_true", help="overwrite PATH.csv and what stands beside it")
     _add_scan(command)
@@ -127,6 +131,18 @@ def _plan(arguments: argparse.Namespace) -> None:
     )  # fmt: skip
     print(
         run_plan(
-            Request(a.out, a.scan, a.example, a.outline, a.unit, a.flip, a.gcode, not a.no_pictures, a.force, wishes)
+            Request(
+                a.out,
+                a.scan,
+                a.example,
+                a.outline,
+                a.unit,
+                a.flip,
+                a.gcode,
+                a.session,
+                not a.no_pictures,
+                a.force,
+                wishes,
+            )
         )
     )

@@ -58,7 +58,7 @@ def test_a_contour_becomes_a_path_with_everything_beside_it(tmp_path: Path, caps
     assert float(row["covered"]) > 0.99 and float(row["gap_mm2"]) < 1
     (picture,) = (out.parent / "path_layers").iterdir()
     drawn = ElementTree.parse(picture).getroot()
-    assert sum("start" == e.get("class") for e in drawn.iter()) == 1
+    assert sum(e.get("class") == "start" for e in drawn.iter()) == 1
 
 
 def test_the_report_needs_no_network_and_holds_every_checkpoint(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """`stillbed bench plan`: a whole plan of a large wound, from a damaged mesh in memory to the path: time, memory, fit.
 
 Each plan is made in a process of its own, whose peak memory is its own too. The time is of the processor, from the
-mesh's arrays to the path: imports, the scan's making and the writing of files are not in it; imports are told beside it.
+mesh's arrays to the path: the scan's making and the writing of files are not in it, and imports are told beside it.
 """
 
 from __future__ import annotations

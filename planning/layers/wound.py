@@ -59,6 +59,12 @@ class Wound:
         """(H, W) mm from the restored skin down to the bed; not positive beside the wound."""
         return np.asarray(self.skin - self.bed)
 
+    @property
+    def rim(self) -> Array:
+        """Points (N, 3) mm, scan frame, around the largest piece of the outline, on the scan."""
+        xy = shapely.get_coordinates(self.outline.geoms[0].exterior)[:-1]
+        return se3.transform_points(self.surface_from_plane, np.column_stack([xy, at(self.grid, self.bed, xy)]))
+
 
 @dataclass(frozen=True, slots=True)
 class Findings:
