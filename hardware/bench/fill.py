@@ -10,6 +10,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from hardware.bench.figure import Figure, at_least, at_most
+from hardware.bench.fill_picture import picture
 from hardware.bench.wounds import mapped, outline, random_wound
 from hardware.clock import CpuClock, WallClock
 from hardware.progress import Progress
@@ -36,6 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--width", type=float, default=0.4, metavar="MM", help="bead of the wounds; default 0.4")
     parser.add_argument("--count", type=int, default=1000, metavar="N", help="random wounds; default 1000")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--picture", type=Path, metavar="SVG", help="also draw all patterns side by side")
 
 
 def run(options: argparse.Namespace) -> list[Figure]:
@@ -43,6 +45,8 @@ def run(options: argparse.Namespace) -> list[Figure]:
     regions = {path.stem: contour(path) for path in options.contours}
     if not regions:
         regions = {name: outline(name) for name in ("oval", "bow")}
+    if options.picture is not None:
+        options.picture.write_text(picture(), encoding="utf-8")
     figures = []
     for name, region in regions.items():
         figures += _of_contour(name, region, Pattern(options.kind, options.contour_width))
@@ -119,7 +123,7 @@ def _again(region: Region, pattern: Pattern) -> Coverage:
 
 def _times(kind: Kind) -> list[Figure]:
     area, spacing = THESIS
-    wound = outline("bow")
+    wound = outline("oval")
     large = mapped(wound, lambda points: points * np.sqrt(area / wound.area))
     wide = outline("oval")
     low, high = np.array(wide.bounds).reshape(2, 2)

@@ -20,6 +20,7 @@ from planning.fill.rings import Level, ring_levels
 from planning.fill.spiral import nests, wound
 from planning.fill.zigzag import raster_lines, zigzag_lines
 
+INTO_RIM = 0.1  # spacings by which lines run into the rim of hybrid, whose round ends leave gaps else
 CORNER = 0.2  # spacings by which corners are cut: less than the rounding of a bead itself
 
 Lines = Callable[[Region, float, float], tuple[list[Array], float]]
@@ -38,7 +39,9 @@ def fill(region: Region, pattern: Pattern, pace: Pace) -> list[Bead]:
     hybrid = pattern.kind == "hybrid"
     levels, core = _levels(region, pattern, pattern.rims if hybrid else None)
     beads = ordered(_runs(levels, pattern, pace), corner)
-    return beads + _lines(core, pattern, pace) if hybrid else beads
+    if not hybrid:
+        return beads
+    return beads + _lines(shapely.buffer(core, INTO_RIM * pattern.spacing), pattern, pace)
 
 
 def _corner(region: Region, pattern: Pattern) -> Array:
