@@ -283,7 +283,9 @@ class Arm:
             self._book(instruction, at, share, decided)
 
         try:
-            self._line.send(frame, sent, now)
+            share = self._line.send(frame, sent, now)
+            if share and self._queue is not None:
+                self._queue.occupy(now, share)
         except UnpluggedError as error:
             self._unplugged(str(error), now)
 

@@ -13,7 +13,7 @@ from hardware.arm_port import Port
 from hardware.protocol import LENGTH
 from hardware.replies import Reply, reply_stream
 
-Sent = Callable[[float, float], None]  # (now, share of the frame that went with the last write)
+Sent = Callable[[float, float], None]  # (now, share of the frame that went just now, and not before)
 
 
 class ArmLine:
@@ -35,25 +35,29 @@ class ArmLine:
         """Seconds that the first frame has waited."""
         return now - self._since if self._frames else 0.0
 
-    def send(self, frame: bytes, sent: Sent, now: float) -> None:
-        """Give out a frame behind those that wait; `sent` is told when its last byte is gone."""
+    def send(self, frame: bytes, sent: Sent, now: float) -> float:
+        """Give out a frame behind those that wait; `sent` is told when its last byte is gone. Gives what flush does."""
         if not self._frames:
             self._since = now
         self._frames.append((frame, sent))
-        self.flush(now)
+        return self.flush(now)
 
     def flush(self, now: float) -> float:
         """Write what the port takes; the share of a frame that went out of one that is not complete."""
+        share = 0.0
         while self._frames:
             frame, sent = self._frames[0]
             taken = self.port.write(frame[self._done :])
             self._done += taken
-            if self._done < LENGTH:
-                return taken / LENGTH
-            self._frames.popleft()
-            self._done, self._since = 0, now
-            sent(now, taken / LENGTH)
-        return 0.0
+            share += taken / LENGTH
+            if self._done == LENGTH:
+                self._frames.popleft()
+                self._done, self._since = 0, now
+                sent(now, share)
+                share = 0.0
+            elif not taken:
+                break
+        return share
 
     def recall(self) -> int:
         """Take back the frames of which no byte is gone; how many."""

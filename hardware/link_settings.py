@@ -28,9 +28,7 @@ class LinkSettings:
 
     flight: float = 0.05
     frames: int = 4
-    ease: float = (
-        0.002  # beats the crystals of both clocks, 0.01 % each; what a stall of 0.6 s piles up is gone in 300 s
-    )
+    ease: float = 0.005  # more than clocks differ by; what a stall of 0.6 s has piled up is gone in 120 s
     poll: float = 0.002  # half a frame on the wire
     write_timeout: float = 0.2  # ten ticks
     off: float = 1.0  # a bead's width; answers count 0.1 mm, and come some ms late

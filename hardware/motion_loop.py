@@ -7,22 +7,19 @@ can take its frame: what was decided is sent, and planner, guard and arm agree o
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
-
-import numpy as np
 
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm import Arm
 from hardware.arm_status import ArmState, ArmStatus
 from hardware.clock import Clock
+from hardware.lateness import Lateness
 from planning.command import Command, Hold, Move
 
-REMEMBERED = 3000  # ticks whose lateness is kept: a minute
 FAREWELL = 0.05  # s in which the last frame, which stops the arm, goes out
 
 
@@ -64,7 +61,7 @@ def nobody(tick: Tick) -> None:
 
 
 class MotionLoop:
-    """One motion on one arm. lateness: s of the last ticks behind their instants. skipped: ticks too late to make."""
+    """One motion on one arm. lateness: of its ticks. skipped: ticks that were too late to be made."""
 
     def __init__(
         self,
@@ -77,7 +74,7 @@ class MotionLoop:
     ) -> None:
         """pose: the newest there is. orders: those that have come since the last call. tell: is told of each tick."""
         self.motion, self.arm = motion, arm
-        self.lateness: deque[float] = deque(maxlen=REMEMBERED)
+        self.lateness = Lateness()
         self.skipped = 0
         self._clock, self._pose, self._orders, self._tell = clock, pose, orders, tell
         profile, settings = arm.profile, arm.settings
@@ -140,7 +137,7 @@ class MotionLoop:
         return ""
 
     def _tick(self, now: float, late: float) -> None:
-        self.lateness.append(late)
+        self.lateness.add(late)
         frame = b""
         if reason := "the arm goes home" if self._homing else self.arm.hold(now):
             command: Command = Hold(now, self._pause, reason)
@@ -152,11 +149,3 @@ class MotionLoop:
             if reason := self.arm.send(frame, now):
                 frame, command = b"", Hold(now, self._pause, reason)
         self._tell(Tick(now, command, frame, late, self.arm.status(now), self._answer))
-
-
-def lateness_figures(lateness: Sequence[float]) -> tuple[float, float, float]:
-    """Median, 99 % and largest, s, of how late ticks were; NaN of none."""
-    if not lateness:
-        return float("nan"), float("nan"), float("nan")
-    median, high, most = np.percentile(np.array(lateness), [50, 99, 100])
-    return float(median), float(high), float(most)

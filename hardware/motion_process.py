@@ -20,7 +20,7 @@ from hardware.arm_status import ArmEvent
 from hardware.clock import WallClock
 from hardware.link_settings import LinkSettings
 from hardware.motion import MotionStep
-from hardware.motion_loop import MotionLoop, Order, Tick, lateness_figures
+from hardware.motion_loop import MotionLoop, Order, Tick
 from hardware.newest import Newest
 from hardware.priority import ask_for_real_time
 from planning.path import Path
@@ -30,20 +30,21 @@ EVENTS = 50  # of the last ones that a report holds
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionPlan:
-    """What is to be printed, and on which arm. url: of the arm's port, anything that pyserial opens."""
+    """What is to be printed, and on which arm. url: of its port, for pyserial. real_time: ask for that priority."""
 
     path: Path
     profile: ArmProfile
     url: str
     settings: LinkSettings = field(default_factory=LinkSettings)
+    real_time: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionReport:
     """What the motion process says after each tick.
 
-    checkpoint, of `total`. events: the last ones. late: (3,) s, median, 99 % and largest of all ticks; skipped: ticks
-    that were not made. priority: that the system granted.
+    checkpoint, of `total`. events: the last ones. late: (3,) s, median, 99 % and largest of all ticks so far; skipped:
+    ticks that were not made. stop: when the last stop was decided, and when it was on the wire, s. priority: granted.
     """
 
     tick: Tick
@@ -52,29 +53,35 @@ class MotionReport:
     events: tuple[ArmEvent, ...]
     late: tuple[float, float, float]
     skipped: int
+    stop: tuple[float, float] | None
     priority: str
 
 
 class _Reporter:
     """Puts a report after each tick."""
 
-    def __init__(self, arm: Arm, motion: MotionStep, reports: Newest[MotionReport]) -> None:
+    def __init__(self, arm: Arm, motion: MotionStep, reports: Newest[MotionReport], real_time: bool) -> None:
         self._arm, self._motion, self._reports = arm, motion, reports
-        self._priority = ask_for_real_time()
+        self._priority = ask_for_real_time() if real_time else "nothing asked for"
         self._events: deque[ArmEvent] = deque(maxlen=EVENTS)
-        self._late = lateness_figures([])
         self.loop: MotionLoop | None = None
-        self._count = 0
 
     def __call__(self, tick: Tick) -> None:
         assert self.loop is not None
         self._events.extend(self._arm.events())
-        self._count += 1
-        if self._count % EVENTS == 0:  # takes as long as a pose
-            self._late = lateness_figures(self.loop.lateness)
-        progress, skipped = self._motion.progress, self.loop.skipped
-        place = progress.checkpoint, progress.total
-        self._reports.put(MotionReport(tick, *place, tuple(self._events), self._late, skipped, self._priority))
+        progress, late = self._motion.progress, self.loop.lateness
+        self._reports.put(
+            MotionReport(
+                tick,
+                progress.checkpoint,
+                progress.total,
+                tuple(self._events),
+                (late.percentile(50), late.percentile(99), late.most),
+                self.loop.skipped,
+                self._arm.stops[-1] if self._arm.stops else None,
+                self._priority,
+            )
+        )
 
 
 class _Orders:
@@ -105,7 +112,7 @@ def motion_process(
     """Print until told to QUIT, or until whoever gives orders is gone; then the arm is stopped."""
     clock, device = WallClock(), Device(plan.url, plan.profile.baud)
     arm, motion = Arm(device, plan.profile, clock.now(), plan.settings), MotionStep(plan.path, plan.profile)
-    reporter = _Reporter(arm, motion, reports)
+    reporter = _Reporter(arm, motion, reports, plan.real_time)
     loop = reporter.loop = MotionLoop(motion, arm, clock, poses.get, _Orders(orders), reporter)
     try:
         loop.run()

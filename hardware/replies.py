@@ -20,6 +20,7 @@ from hardware.protocol import FrameStream
 REPLY_LENGTH = 9
 _REPLY = struct.Struct(">B3hBB")
 _HEAD, _TAIL = 0xCE, 0xCF
+REPLY_TAILS = {_HEAD: _TAIL}
 _MOST = 32_767  # int16; its -32768 has no opposite and is not sent
 
 
@@ -68,7 +69,7 @@ def reply_stream() -> FrameStream[Reply]:
 
     A stray byte just before a reply never costs it: byte 8 would then be the reply's kind, which is no 0xCF.
     """
-    return FrameStream(REPLY_LENGTH, {_HEAD: _TAIL}, decode_reply)
+    return FrameStream(REPLY_LENGTH, REPLY_TAILS, decode_reply)
 
 
 def _unit(kind: ReplyKind) -> float:

@@ -100,7 +100,7 @@ def test_however_it_is_called_no_more_is_under_way_than_may_be(waits: list[float
         link.run(wait)
         assert link.arm.in_flight(link.clock.now()) <= 0.05 + 1e-9
     assert link.arm.state is ArmState.ARMED
-    assert max(link.deepest, link.device.deepest) <= 0.05 + 1e-9
+    assert max(link.deepest, link.virtual.deepest) <= 0.05 + 1e-9
     link.run(0.3)
     assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
 
@@ -179,7 +179,7 @@ def test_home_is_reached_slowly_by_way_of_above_and_never_much_is_under_way() ->
     assert np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1).max() <= 20 * 0.0201
     across = np.abs(path[:, 0] - low[0]) > 1e-3
     assert path[across, 2].min() > HOME[2] - 0.01
-    assert max(link.deepest, link.device.deepest) <= 0.05
+    assert max(link.deepest, link.virtual.deepest) <= 0.05
 
 
 def test_a_place_out_of_bounds_is_not_gone_to() -> None:
@@ -234,7 +234,7 @@ def test_an_arm_that_stalls_is_held_until_it_has_caught_up(seconds: float) -> No
     refused = link.follow(6.0)
     assert any("off its way" in reason for reason in refused)
     assert link.arm.state is ArmState.ARMED
-    assert link.device.deepest < seconds + 0.25  # what was sent until two answers had told
+    assert link.virtual.deepest < seconds + 0.25  # what was sent until two answers had told
     assert link.arm.hold(6.0) == "" and link.arm.status(6.0).off < 0.2
     link.run(0.3)
     assert link.virtual.in_flight == 0
@@ -294,7 +294,7 @@ def test_a_port_that_takes_nothing_for_a_moment_is_a_hold() -> None:
     refused = link.follow(2.0)
     assert any("taken no bytes" in reason for reason in refused)
     assert link.arm.state is ArmState.ARMED and len(refused) < 12
-    assert max(link.deepest, link.device.deepest) <= 0.05
+    assert max(link.deepest, link.virtual.deepest) <= 0.05
 
 
 @pytest.mark.parametrize("partial", [0.0, 0.9])
@@ -306,7 +306,7 @@ def test_a_port_that_takes_nothing_for_long_is_a_stop_and_a_torn_frame_is_comple
     assert link.virtual.garbage == []
     assert link.arm.frames == link.virtual.frames
     assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
-    assert link.device.deepest <= 0.05
+    assert link.virtual.deepest <= 0.05
 
 
 def test_bytes_that_wait_in_the_port_are_a_hold() -> None:

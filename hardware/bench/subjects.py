@@ -40,6 +40,7 @@ SUBJECTS: Subjects = {
     "estimator": Subject("hardware.bench.estimator", "the estimator on synthetic tracks: accuracy, honesty, time"),
     "fill": Subject("hardware.bench.fill", "beads laid into contours and random wounds: coverage and time"),
     "latency": Subject("hardware.bench.latency", "from three decoded frames to the pose, by wall clock and processor"),
+    "link": Subject("hardware.bench.link", "the arm's line with everything going wrong; stops, jitter, the guard"),
     "map": Subject("hardware.bench.mapping", "landmarks off the true surface beside their claim, and the map's growth"),
     "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?"),
     "plan": Subject("hardware.bench.plan", "a whole plan of a large wound: time, memory, coverage, ink"),

@@ -49,6 +49,7 @@ class VirtualArm:
     frames: instructions understood. ignored: instants, s, of commands that found the FIFO full. refused: of targets and
     origins out of reach. garbage: instants and bytes that belong to no frame of this dialect. underruns: instants at
     which the queue ran dry within a motion, so that the arm stopped before the next move came. mode: the last one set.
+    deepest: s that the queue was ever ahead.
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class VirtualArm:
         if home_axes.shape != (AXES,) or not np.isfinite(home_axes).all():
             raise InputError("arm", "home", home_axes.tolist(), "6 finite numbers X Y Z A B C, mm and rad")
         self.frames, self.mode, self.now = 0, 0, 0.0
+        self.deepest = 0.0
         self.ignored: list[float] = []
         self.refused: list[float] = []
         self.underruns: list[float] = []
@@ -161,6 +163,7 @@ class VirtualArm:
         stretches = self._rates.stretches(begin, work, moving)
         self._free = stretches[-1][1]
         self._ends.append(self._free)
+        self.deepest = max(self.deepest, self._free - self.now)
         if target is not None and self._free > begin and moving:
             self._interpolate(stretches, (target - self._target) / work)
             self._setpoint.append(self._free, target, np.zeros(AXES))

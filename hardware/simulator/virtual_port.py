@@ -8,8 +8,9 @@ arm_faults.py.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -41,6 +42,26 @@ class PortFaults:
             raise InputError("port", "faults", (self.partial, self.noise, self.noise_out), allowed)
 
 
+class Tap(Protocol):
+    """Who listens on the line."""
+
+    def opened(self) -> None:
+        """The host has opened the device."""
+        ...
+
+    def from_host(self, data: bytes) -> None:
+        """The port has taken bytes."""
+        ...
+
+    def to_arm(self, data: bytes) -> None:
+        """Bytes have reached the arm."""
+        ...
+
+    def to_host(self, sent: bytes, read: bytes) -> None:
+        """What the arm has sent, and what the host reads with the noise."""
+        ...
+
+
 class VirtualPort:
     """One opening of the device before a VirtualArm."""
 
@@ -49,6 +70,8 @@ class VirtualPort:
         self._wire = Wire(device.baud)
         self._under_way: deque[tuple[float, bytes]] = deque()
         self._looked = device.here()
+        if device.tap is not None:
+            device.tap.opened()
 
     def write(self, data: bytes) -> int:
         """Take bytes, or some of them, or none."""
@@ -59,6 +82,8 @@ class VirtualPort:
         if faults.partial and rng.random() < faults.partial:
             data = data[: rng.integers(len(data))]
         taken = len(data)
+        if device.tap is not None:
+            device.tap.from_host(data)
         if faults.noise_out and rng.random() < faults.noise_out:
             place = rng.integers(taken + 1)
             data = data[:place] + rng.bytes(1) + data[place:]
@@ -73,7 +98,10 @@ class VirtualPort:
         data = device.arm.transmit(now)
         noise = device.rng.poisson(device.faults.noise * (now - self._looked)) if device.faults.noise else 0
         self._looked = now
-        return data + device.rng.bytes(noise) if noise else data
+        read = data + device.rng.bytes(noise) if noise else data
+        if device.tap is not None and read:
+            device.tap.to_host(data, read)
+        return read
 
     def waiting(self) -> int:
         """Bytes that are not through the wire yet."""
@@ -92,7 +120,7 @@ class VirtualPort:
 
 
 class VirtualDevice:
-    """What opens ports to a VirtualArm; an Opener. deepest: s of motion that were in the arm's queue at most."""
+    """What opens ports to a VirtualArm; an Opener."""
 
     def __init__(
         self,
@@ -101,14 +129,13 @@ class VirtualDevice:
         baud: float = 115_200,
         faults: PortFaults | None = None,
         seed: int = 0,
-        heard: Callable[[bytes], None] | None = None,
+        tap: Tap | None = None,
     ) -> None:
-        """heard: is told all bytes that reach the arm."""
+        """tap: is told all that passes."""
         self.arm, self.clock, self.baud = arm, clock, baud
         self.faults = PortFaults() if faults is None else faults
         self.rng = np.random.default_rng(seed)
-        self.deepest = 0.0
-        self._heard = heard
+        self.tap = tap
 
     def __call__(self) -> VirtualPort:
         """Open it; UnpluggedError while it is away."""
@@ -124,6 +151,5 @@ class VirtualDevice:
     def receive(self, data: bytes, arrival: float) -> None:
         """Bytes reach the arm at `arrival`, s."""
         self.arm.receive(data, max(arrival, self.arm.now))
-        self.deepest = max(self.deepest, self.arm.in_flight)
-        if self._heard is not None:
-            self._heard(data)
+        if self.tap is not None:
+            self.tap.to_arm(data)

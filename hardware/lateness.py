@@ -1,0 +1,31 @@
+"""How late ticks were: a histogram, so that a run of any length costs the same memory and the same time."""
+
+from __future__ import annotations
+
+import math
+
+BIN = 1e-4  # s
+_BINS = 1000  # a tenth of a second; what is later counts as that
+
+
+class Lateness:
+    """Counts of lateness. most: s, the largest."""
+
+    def __init__(self) -> None:
+        self._counts = [0] * _BINS
+        self.count, self.most = 0, 0.0
+
+    def add(self, late: float) -> None:
+        """One tick was `late` s behind its instant."""
+        self._counts[min(int(max(late, 0.0) / BIN), _BINS - 1)] += 1
+        self.count += 1
+        self.most = max(self.most, late)
+
+    def percentile(self, share: float) -> float:
+        """Lateness, s, that `share` percent of the ticks do not exceed, rounded up to a bin; NaN of none."""
+        wanted, seen = share / 100 * self.count, 0
+        for index, count in enumerate(self._counts):
+            seen += count
+            if count and seen >= wanted:
+                return (index + 1) * BIN
+        return math.nan
