@@ -1,4 +1,9 @@
-"""The link's own moves, home and back to where a stop caught the arm: slow, in small steps, lifted where they cross."""
+"""The link's own moves, home and back to where a stop caught the arm: slow, in small steps, lifted where they cross.
+
+Where the arm stands is known to a fraction of a millimetre only. At a feed made for a step of a micrometre, that
+fraction would take the arm a minute, with all that is sent meanwhile behind it. So a travel never asks for less than
+its speed: it begins with a step to where the arm should be, and moves and turns one after the other, each at its feed.
+"""
 
 from __future__ import annotations
 
@@ -8,28 +13,43 @@ import numpy as np
 
 from estimation.se3 import Array
 from hardware.protocol import G1
-from planning.command import TURNING
 
 
 def travel(start: Array, goal: Array, speed: float, turning: float, tick: float) -> Iterator[G1]:
-    """Steps of one tick each, in a straight line from `start` to `goal`, both (6,) mm and rad; none where they are one.
+    """Steps of a tick at most: to `start` (6,), mm and rad, straight to the place of `goal` (6,), then its angles.
 
     speed: mm/s. turning: rad/s. The last step ends at the goal exactly.
     """
-    way = goal - start
-    length, turn = float(np.linalg.norm(way[:3])), float(np.linalg.norm(way[3:]))
-    count = int(np.ceil(max(length / speed, turn / turning) / tick))
-    for k in range(1, count + 1):
-        step = way / count
-        size = float(np.linalg.norm(step[:3]))
-        amount = size if size > TURNING else float(np.rad2deg(np.linalg.norm(step[3:])))
-        yield G1(goal if k == count else start + k * step, max(amount / tick, 1e-3))
+    yield G1(start, speed)
+    yield from _moved(start, goal, speed, tick)
+    yield from _turned(np.concatenate([goal[:3], start[3:]]), goal, turning, tick)
 
 
 def lifted(start: Array, goal: Array, speed: float, turning: float, tick: float) -> Iterator[G1]:
-    """Steps that go up first if the goal is higher, then across, and down last: never low across."""
+    """The same by way of above: up first if the goal is higher, across and turned, and down last: never low across."""
     height = max(start[2], goal[2])
-    above_start = np.array([*start[:2], height, *start[3:]])
-    above_goal = np.array([*goal[:2], height, *goal[3:]])
-    for a, b in ((start, above_start), (above_start, above_goal), (above_goal, goal)):
-        yield from travel(a, b, speed, turning, tick)
+    above = np.array([*goal[:2], height, *goal[3:]])
+    lift = np.array([*start[:2], height, *start[3:]])
+    yield G1(start, speed)
+    yield from _moved(start, lift, speed, tick)
+    yield from travel(lift, above, speed, turning, tick)
+    yield from _moved(above, goal, speed, tick)
+
+
+def _moved(start: Array, goal: Array, speed: float, tick: float) -> Iterator[G1]:
+    """Steps to the place of `goal`, with the angles of `start`."""
+    way = goal[:3] - start[:3]
+    count = int(np.ceil(np.linalg.norm(way) / (speed * tick) - 1e-9))
+    for k in range(1, count + 1):
+        place = goal[:3] if k == count else start[:3] + k / count * way
+        yield G1(np.concatenate([place, start[3:]]), speed)
+
+
+def _turned(start: Array, goal: Array, turning: float, tick: float) -> Iterator[G1]:
+    """Steps to the angles of `goal`, on the spot; their feed counts degrees."""
+    way = goal[3:] - start[3:]
+    count = int(np.ceil(np.linalg.norm(way) / (turning * tick) - 1e-9))
+    for k in range(1, count + 1):
+        yield G1(
+            np.concatenate([goal[:3], goal[3:] if k == count else start[3:] + k / count * way]), np.rad2deg(turning)
+        )

@@ -44,7 +44,8 @@ class MotionReport:
     """What the motion process says after each tick.
 
     checkpoint, of `total`. events: the last ones. late: (3,) s, median, 99 % and largest of all ticks so far; skipped:
-    ticks that were not made. stop: when the last stop was decided, and when it was on the wire, s. priority: granted.
+    ticks that were not made, beside `ticks` that were. stop: when the last one was decided and when it was on the wire,
+    s. priority: what the system granted.
     """
 
     tick: Tick
@@ -52,6 +53,7 @@ class MotionReport:
     total: int
     events: tuple[ArmEvent, ...]
     late: tuple[float, float, float]
+    ticks: int
     skipped: int
     stop: tuple[float, float] | None
     priority: str
@@ -77,6 +79,7 @@ class _Reporter:
                 progress.total,
                 tuple(self._events),
                 (late.percentile(50), late.percentile(99), late.most),
+                late.count,
                 self.loop.skipped,
                 self._arm.stops[-1] if self._arm.stops else None,
                 self._priority,
@@ -117,5 +120,6 @@ def motion_process(
     try:
         loop.run()
     finally:
+        reporter.loop = None  # else the two would keep each other, and the planner's solver, until the very end
         arm.close()
         device.release()

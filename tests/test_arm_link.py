@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from estimation.errors import InputError
 from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmState
+from hardware.arm_travel import lifted, travel
 from hardware.link_settings import LinkSettings
 from hardware.protocol import G1, G4, Dialect, Pause, encode
 from hardware.simulator.arm_faults import fault_from_text
@@ -365,3 +366,27 @@ def test_a_slower_line_leaves_room_for_less() -> None:
     slow = linked(profile=ArmProfile(baud=24_000))  # 20 ms a frame
     assert slow.arm.send(encode(G4(0.02)), 0.0) == ""
     assert "limit 50 ms" in slow.arm.hold(0.0)
+
+
+@pytest.mark.parametrize("off", [0.02, 0.3, 0.9])
+def test_an_arm_that_stands_a_hair_beside_where_it_is_thought_to_is_not_sent_there_for_minutes(off: float) -> None:
+    link = linked(begin=HOME + [off, 0, 0, 0.001, 0, 0], stand=False)
+    link.arm.stand(HOME, 0.0)
+    for goal in (HOME, HOME + [0.001, 0, 0, 0, 0, 0], HOME + [0, 0.0, 0, 1e-6, 0, 0]):
+        assert link.arm.arm(link.clock.now(), goal) == ""
+        link.run(0.3)
+        assert link.arm.hold(link.clock.now()) == "" and link.virtual.in_flight == 0
+        assert link.executed() == pytest.approx(goal, abs=1e-4)
+        link.arm.disarm(link.clock.now())
+    assert link.virtual.deepest <= 0.05
+
+
+def test_travel_ends_at_its_goal_and_no_step_is_faster_than_asked() -> None:
+    rng = np.random.default_rng(0)
+    for way in (travel, lifted):
+        start, goal = HOME + rng.normal(size=6) * [20, 20, 20, 0.2, 0.2, 0.2], HOME
+        steps = [step.axes for step in way(start, goal, 20.0, 0.3, 0.02)]
+        moved = np.diff([start, *steps], axis=0)
+        assert np.array_equal(steps[-1], goal)
+        assert np.linalg.norm(moved[:, :3], axis=1).max() <= 20 * 0.02 + 1e-9
+        assert np.linalg.norm(moved[:, 3:], axis=1).max() <= 0.3 * 0.02 + 1e-9

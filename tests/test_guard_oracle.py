@@ -1,0 +1,78 @@
+"""The guard before an oracle written from the limits alone: nothing that breaks one passes, nothing else is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hardware.bench.guard_oracle import Rules, judge
+from hardware.bench.link_guard import jointed, random_log, simple
+from planning.guard import Guard
+from planning.limits import Limits
+
+COUNT = 1000
+
+
+@pytest.mark.parametrize("rules", [simple, jointed])
+def test_no_random_command_that_breaks_a_limit_passes_and_none_that_keeps_all_is_refused(
+    rules: Callable[[], Rules],
+) -> None:
+    for seed in range(2):
+        asked, passed, broken, refused = judge(random_log(seed, COUNT, rules()), rules())
+        assert (asked, broken, refused) == (COUNT, 0, 0)
+        assert 0.3 * COUNT < passed < 0.9 * COUNT  # both sides are tried
+
+
+def loosened(limits: Limits, name: str) -> Limits:
+    value = getattr(limits, name)
+    wide = value + {"low": -100, "high": 100}[name] if name in ("low", "high") else value * 1.6
+    if name in ("low", "high"):
+        wide[3:] = value[3:]
+    return replace(limits, **{name: wide})
+
+
+def forgetful(rules: Rules, name: str) -> Guard:
+    """A guard with one limit looser than it was told."""
+    return Guard(loosened(rules.limits, name), rules.arm, rules.tick, rules.zone, rules.lag)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("low", "high", "jump", "turn", "speed", "feed"),
+        *("pose_age", "pose_error", "surface_speed", "surface_turn", "stop_time", "stop_distance"),
+    ],
+)
+def test_the_oracle_finds_a_guard_that_is_loose_in_any_limit(name: str) -> None:
+    rules = simple()
+    if name == "turn":  # the speed alone would stop it
+        rules = replace(rules, limits=replace(rules.limits, speed=np.append(rules.limits.speed[:3], [9.0] * 3)))
+    if name == "speed":  # jump and turn alone would
+        rules = replace(rules, limits=replace(rules.limits, jump=9.0, turn=1.0))
+    if name == "stop_distance":  # none is tried for so long
+        rules = replace(rules, limits=replace(rules.limits, stop_distance=2.0))
+    found = 0
+    for seed in range(4):
+        log = random_log(seed, COUNT, rules, forgetful(rules, name))
+        found = judge(log, rules)[2]
+        if found:
+            break
+    assert found
+
+
+def test_the_oracle_finds_a_guard_that_refuses_too_much() -> None:
+    rules = simple()
+    strict = Guard(replace(rules.limits, jump=2.9), rules.arm, rules.tick, rules.zone, rules.lag)
+    assert judge(random_log(0, COUNT, rules, strict), rules)[3] > 0
+
+
+def test_the_oracle_finds_a_guard_that_does_not_look_at_the_joints() -> None:
+    rules = jointed()
+    assert rules.arm.jointed is not None
+    slow = replace(rules.arm.jointed, speed=rules.arm.jointed.speed / 10)
+    tight = replace(rules, arm=replace(rules.arm, joints=slow))
+    guard = Guard(rules.limits, rules.arm, rules.tick, rules.zone, rules.lag)
+    assert judge(random_log(0, COUNT, tight, guard), tight)[2] > 0
