@@ -64,7 +64,7 @@ def test_a_whole_print_keeps_the_joints_within_ranges_and_speeds() -> None:
 @given(st.integers(0, 10_000))
 def test_no_stream_of_poses_breaks_a_limit(seed: int) -> None:
     tally = Tally()
-    follow((seed, 1), tally, profile(), 150)
+    follow((seed, 1), tally, profile(), 100)
     assert tally.worst.max() <= 1 + 1e-6
     assert tally.errors == []
 
