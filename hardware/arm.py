@@ -28,6 +28,7 @@ from hardware.replies import REPLY_LENGTH, Reply, ReplyKind
 
 DEFAULT = LinkSettings()
 REMEMBERED = 1000  # events and stray bytes that are kept until somebody takes them
+PASSED = 1e-3  # bytes: rounding
 ORIGIN_ROUNDING = 0.11  # mm, twice half of what an answer counts
 
 
@@ -308,6 +309,8 @@ class Arm:
         if self._line.blocked:
             return f"the port has taken no bytes for {self._line.blocked_for(now):.3f} s"
         passing = max(self._queue.wire_free - now, 0.0) / self.profile.frame_time * LENGTH
+        if passing > PASSED:
+            return f"{passing:.0f} bytes are on the wire: a stop would wait for two frames"
         waiting = self._line.port.waiting() - passing
         if waiting > LENGTH:
             return f"{waiting:.0f} bytes wait in the port"

@@ -116,10 +116,22 @@ def test_a_motion_at_the_tick_flows_and_is_where_it_is_reckoned() -> None:
     assert link.arm.status(now).queued <= 2
 
 
-def test_more_than_four_frames_are_never_under_way() -> None:
+def test_more_frames_than_may_be_are_never_under_way() -> None:
+    link, sent = linked(link=LinkSettings(frames=2)), []
+    for _ in range(3):
+        sent.append(link.arm.send(encode(G4(0.018)), link.clock.now()))
+        link.run(0.005)
+    assert sent[:2] == ["", ""] and "2 frames are under way, limit 2" in sent[2]
+
+
+def test_a_frame_waits_for_the_one_on_the_wire_so_that_a_stop_waits_for_no_more_than_one() -> None:
     link = linked()
-    sent = [link.arm.hold(0.0) or link.arm.send(encode(G4(0.001)), 0.0) for _ in range(6)]
-    assert sent[:4] == ["", "", "", ""] and "4 frames" in sent[4]
+    assert link.arm.send(encode(G4(0.001)), 0.0) == ""
+    assert "48 bytes are on the wire" in link.arm.send(encode(G4(0.001)), 0.0)
+    assert link.arm.send(encode(G4(0.001)), 1 / 240) == ""
+    link.arm.stop("asked for", 1 / 240)
+    decided, on_wire = link.arm.stops[0]
+    assert on_wire - decided == pytest.approx(2 / 240)
 
 
 # -- stop
@@ -128,7 +140,7 @@ def test_more_than_four_frames_are_never_under_way() -> None:
 def test_a_stop_does_not_wait_for_the_queue() -> None:
     link = linked()
     for k in (1, 2):
-        link.arm.send(encode(G1(HOME + [2 * k, 0, 0, 0, 0, 0], 100.0)), 0.0)
+        assert link.arm.send(encode(G1(HOME + [2 * k, 0, 0, 0, 0, 0], 100.0)), (k - 1) / 200) == ""
     link.run(0.010)
     link.arm.stop("asked for", 0.010)
     link.run(1.0)
@@ -363,9 +375,9 @@ def test_settings_of_the_link_are_checked(name: str) -> None:
 
 
 def test_a_slower_line_leaves_room_for_less() -> None:
-    slow = linked(profile=ArmProfile(baud=24_000))  # 20 ms a frame
-    assert slow.arm.send(encode(G4(0.02)), 0.0) == ""
-    assert "limit 50 ms" in slow.arm.hold(0.0)
+    slow = ArmProfile(baud=24_000)  # 20 ms a frame
+    assert linked(profile=slow).arm.send(encode(G4(0.0299)), 0.0) == ""
+    assert "limit 50 ms" in linked(profile=slow).arm.send(encode(G4(0.0301)), 0.0)
 
 
 @pytest.mark.parametrize("off", [0.02, 0.3, 0.9])

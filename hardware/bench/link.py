@@ -68,14 +68,7 @@ def soak_figures(counts: Counts) -> list[Figure]:
         Figure(f"{name}: frames taken", counts.frames, "", note=f"of {counts.ticks} ticks; {counts.held} held"),
         Figure(f"{name}: commands that found the queue full", counts.overflows, "", NONE),
         Figure(f"{name}: frames taken that nobody sent", counts.foreign, "", NONE),
-        Figure(
-            f"{name}: answers taken that the arm never gave",
-            counts.forged,
-            "",
-            NONE,
-            "",
-            f"{counts.strays} stray bytes",
-        ),
+        Figure(f"{name}: noise that reads as an answer", counts.forged, "", None, "", _noise(counts)),
         Figure(f"{name}: frames that the arm refused", counts.refused, "", NONE),
         Figure(f"{name}: most under way, by the model", 1000 * counts.modelled, "ms", at_most(50), FIFO),
         Figure(f"{name}: still moving 55 ms after the last frame", counts.restless, "", NONE, note="an arm that obeys"),
@@ -87,6 +80,10 @@ def soak_figures(counts: Counts) -> list[Figure]:
         ),
     ]
     return figures
+
+
+def _noise(counts: Counts) -> str:
+    return f"of {counts.strays} stray bytes; there is no check sum, and one answer alone is not believed"
 
 
 def _queued(name: str, counts: Counts) -> list[Figure]:
