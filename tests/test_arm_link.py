@@ -8,11 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmState
-from hardware.arm_travel import lifted, travel
 from hardware.link_settings import LinkSettings
 from hardware.protocol import G1, G4, Dialect, Pause, encode
+from hardware.replies import Reply, ReplyKind
 from hardware.simulator.arm_faults import fault_from_text
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.virtual_port import PortFaults
@@ -282,123 +281,7 @@ def test_an_arm_that_falls_silent_is_held_and_then_stopped() -> None:
 def test_one_wrong_answer_alone_is_not_believed() -> None:
     link = linked(ANSWERING)
     link.follow(1.0)
-    from hardware.replies import Reply, ReplyKind
-
     assert link.arm._queue is not None
     link.arm._echo.take(Reply(ReplyKind.PLACE, HOME[:3] + 100), link.arm._queue, np.zeros(3), 1.0)
     assert link.arm.hold(1.0) == ""
     assert link.follow(1.0) == []
-
-
-# -- the port
-
-
-def test_partial_writes_change_nothing_that_arrives() -> None:
-    link = linked(port=PortFaults(partial=0.5))
-    link.follow(3.0)
-    assert link.arm.state is ArmState.ARMED
-    link.run(0.2)
-    assert link.virtual.garbage == [] and link.virtual.frames == link.arm.frames > 100
-    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
-
-
-def test_a_port_that_takes_nothing_for_a_moment_is_a_hold() -> None:
-    link = linked(port=PortFaults(blocked=[(1.0, 1.15)]))
-    refused = link.follow(2.0)
-    assert any("taken no bytes" in reason for reason in refused)
-    assert link.arm.state is ArmState.ARMED and len(refused) < 12
-    assert max(link.deepest, link.virtual.deepest) <= 0.05
-
-
-@pytest.mark.parametrize("partial", [0.0, 0.9])
-def test_a_port_that_takes_nothing_for_long_is_a_stop_and_a_torn_frame_is_completed(partial: float) -> None:
-    link = linked(port=PortFaults(blocked=[(1.0, 1.6)], partial=partial))
-    link.follow(1.5)
-    assert link.arm.state is ArmState.STOPPED and "took no bytes" in link.arm.reason
-    link.run(0.5)
-    assert link.virtual.garbage == []
-    assert link.arm.frames == link.virtual.frames
-    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
-    assert link.virtual.deepest <= 0.05
-
-
-def test_bytes_that_wait_in_the_port_are_a_hold() -> None:
-    link = linked()
-    port = link.arm._line.port  # type: ignore[union-attr]
-    port.waiting = lambda: 500  # type: ignore[method-assign]
-    assert "500 bytes wait" in link.arm.hold(0.0)
-
-
-def test_a_device_that_was_away_is_found_again_and_moves_only_when_armed_anew() -> None:
-    link = linked(port=PortFaults(away=[(1.0, 3.0)]))
-    link.follow(2.0)
-    assert link.arm.state is ArmState.UNPLUGGED
-    assert "unplugged" in link.arm.hold(2.0) and link.arm.arm(2.0) != ""
-    link.follow(2.0)
-    assert link.arm.state is ArmState.DISARMED
-    assert "nobody knows" in link.arm.arm(4.0)
-    frames = link.virtual.frames
-    link.follow(1.0)
-    assert link.virtual.frames == frames
-    link.arm.stand(link.executed(), 5.0)
-    assert link.arm.arm(5.0) == ""
-    texts = [event.text for event in link.arm.events()]
-    assert [text.split(":")[0] for text in texts] == ["disarmed", "armed", "unplugged", "disarmed", "armed"]
-
-
-def test_a_device_that_is_not_there_is_waited_for() -> None:
-    link = linked(port=PortFaults(away=[(0.0, 1.2)]), stand=False)
-    assert link.arm.state is ArmState.UNPLUGGED
-    link.run(2.0)
-    assert link.arm.state is ArmState.DISARMED
-
-
-def test_every_fault_of_the_line_ends_at_rest() -> None:
-    for text in ("drop at 1s for 1s", "garble at 1s for 1s", "unplug at 1s for 1s", "stall 600ms at 1s"):
-        link = linked(ANSWERING, fault_from_text("t", "f", text))
-        link.follow(4.0)
-        link.arm.stop("the end", link.clock.now())
-        link.run(1.0)
-        before = link.executed()
-        link.run(1.0)
-        assert np.array_equal(before, link.executed()) or np.allclose(before, link.executed(), atol=1e-6)
-        assert not link.virtual.ignored
-
-
-@pytest.mark.parametrize("name", ["flight", "frames", "poll", "off", "patience"])
-def test_settings_of_the_link_are_checked(name: str) -> None:
-    for wrong in (0.0, -1.0, np.nan):
-        with pytest.raises(InputError, match=name):
-            LinkSettings(**{name: wrong})
-    with pytest.raises(InputError, match="ease"):
-        LinkSettings(ease=0.2)
-
-
-def test_a_slower_line_leaves_room_for_less() -> None:
-    slow = ArmProfile(baud=24_000)  # 20 ms a frame
-    assert linked(profile=slow).arm.send(encode(G4(0.0299)), 0.0) == ""
-    assert "limit 50 ms" in linked(profile=slow).arm.send(encode(G4(0.0301)), 0.0)
-
-
-@pytest.mark.parametrize("off", [0.02, 0.3, 0.9])
-def test_an_arm_that_stands_a_hair_beside_where_it_is_thought_to_is_not_sent_there_for_minutes(off: float) -> None:
-    link = linked(begin=HOME + [off, 0, 0, 0.001, 0, 0], stand=False)
-    link.arm.stand(HOME, 0.0)
-    for goal in (HOME, HOME + [0.001, 0, 0, 0, 0, 0], HOME + [0, 0.0, 0, 1e-6, 0, 0]):
-        assert link.arm.arm(link.clock.now(), goal) == ""
-        link.run(0.3)
-        assert link.arm.hold(link.clock.now()) == "" and link.virtual.in_flight == 0
-        assert link.executed() == pytest.approx(goal, abs=1e-4)
-        link.arm.disarm(link.clock.now())
-    assert link.virtual.deepest <= 0.05
-
-
-def test_travel_ends_at_its_goal_and_no_step_is_faster_than_asked() -> None:
-    rng = np.random.default_rng(0)
-    for way in (travel, lifted):
-        start, goal = HOME + rng.normal(size=6) * [20, 20, 20, 0.2, 0.2, 0.2], HOME
-        steps = [step.axes for step in way(start, goal, 20.0, 0.3, 0.02)]
-        moved = np.diff([start, *steps], axis=0)
-        assert np.array_equal(steps[-1], goal)
-        assert np.linalg.norm(moved[:, :3], axis=1).max() <= 20 * 0.02 + 1e-9
-        assert np.linalg.norm(moved[:, 3:], axis=1).max() <= 0.3 * 0.02 + 1e-9

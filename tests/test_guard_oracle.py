@@ -8,12 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from estimation.pose import SurfacePose, TrackState
 from hardware.bench.guard_oracle import Rules, judge
-from hardware.bench.link_guard import jointed, random_log, simple
+from hardware.bench.link_guard import REST, jointed, random_log, simple
+from planning.command import Move
 from planning.guard import Guard
+from planning.kinematics import joints_from_axes
 from planning.limits import Limits
 
 COUNT = 1000
+HAIR = 1e-12  # rad, rad/s: the joints are solved anew under each limit, which moves their last bits
 
 
 @pytest.mark.parametrize("rules", [simple, jointed])
@@ -67,6 +71,42 @@ def test_the_oracle_finds_a_guard_that_refuses_too_much() -> None:
     rules = simple()
     strict = Guard(replace(rules.limits, jump=2.9), rules.arm, rules.tick, rules.zone, rules.lag)
     assert judge(random_log(0, COUNT, rules, strict), rules)[3] > 0
+
+
+def standing(rules: Rules, **changes: np.ndarray) -> tuple[Guard, Move, np.ndarray, np.ndarray]:
+    """A guard whose arm has these joints, a small move, and the joints before and after it (6,)."""
+    model = rules.arm.jointed
+    assert model is not None
+    home = rules.arm.home
+    axes = home + np.array([1.0, -0.5, 0.7, 0.01, -0.02, 0.015])
+    before, after = joints_from_axes(model, np.stack([home, axes]))
+    guard = Guard(rules.limits, replace(rules.arm, joints=replace(model, **changes)), rules.tick)
+    return guard, Move(1.0, axes, 50.0, 0, False), before, after
+
+
+def passes(guard: Guard, move: Move) -> bool:
+    return guard(move, SurfacePose(1.0, REST, np.zeros((6, 6)), np.zeros(6), TrackState.TRACKING), 1.0) is move
+
+
+@pytest.mark.parametrize("joint", range(6))
+def test_the_range_and_speed_of_each_joint_are_met_and_broken_by_next_to_nothing(joint: int) -> None:
+    rules = jointed()
+    model = rules.arm.jointed
+    assert model is not None
+    _, _, before, after = standing(rules)
+    for name, exact, beyond in (
+        ("low", after[joint], HAIR),
+        ("high", after[joint], -HAIR),
+        ("speed", abs(after[joint] - before[joint]) / rules.tick, -HAIR),
+    ):
+        limit = getattr(model, name).copy()
+        limit[joint] = exact - beyond
+        guard, move, _, _ = standing(rules, **{name: limit})
+        assert passes(guard, move), name
+        limit = limit.copy()
+        limit[joint] = exact + beyond
+        guard, move, _, _ = standing(rules, **{name: limit})
+        assert not passes(guard, move), name
 
 
 def test_the_oracle_finds_a_guard_that_does_not_look_at_the_joints() -> None:

@@ -196,6 +196,12 @@ def test_the_motion_process_loads_nothing_that_would_stall_it() -> None:
     assert MOTION_NEVER.isdisjoint(done.stdout.split())
 
 
+def test_what_priority_was_granted_is_said() -> None:
+    code = "from hardware.priority import ask_for_real_time; print(ask_for_real_time())"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split(",")[0].split(":")[0].strip() in {"real time", "nice -10", "nothing"}
+
+
 def test_in_a_process_of_its_own_it_prints_over_a_pty_and_ends_when_nobody_is_left(tmp_path: Path) -> None:
     clock = WallClock()
     context = multiprocessing.get_context("spawn")
