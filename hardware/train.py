@@ -53,7 +53,7 @@ def run_train(options: argparse.Namespace) -> str:
     from perception.training.choosing import chosen_settings
     from perception.training.curves import draw_curves
     from perception.training.export import export
-    from perception.training.loop import THESIS, Recipe, Schedule, Source, as_function, train
+    from perception.training.loop import THESIS, Recipe, Schedule, Source, train
     from perception.training.networks import made, size_of
 
     parts = _parts(options)
@@ -69,10 +69,15 @@ def run_train(options: argparse.Namespace) -> str:
     rng = np.random.default_rng(SPLIT_SEED)
     real = [piece for _ in range(DRAWS) for piece in healthy_pieces(parts.chosen_on, rng, HEALTHY)]
     healthy = [*real, *_healthy_rendered(RENDERED_SEED - HEALTHY, HEALTHY // 6)]
-    settings = chosen_settings(as_function(network), parts.chosen_on, healthy, recipe.looks)
-    difference = export(network, out, settings)
+    alike = export(
+        network,
+        out,
+        parts.chosen_on,
+        recipe.looks,
+        lambda written: chosen_settings(written, parts.chosen_on, healthy, recipe.looks),
+    )
     (out.with_name(f"{out.stem}_held_out.txt")).write_text("".join(f"{p.name}\n" for p in parts.held_out), "utf-8")
-    return finish(out, parts, Making(out.stem, size_of(network), str(schedule), difference))
+    return finish(out, parts, Making(out.stem, size_of(network), str(schedule), alike))
 
 
 def _shapes(parts: Parts, out: Path, seed: int) -> str:

@@ -29,7 +29,6 @@ from perception.wound_network import MODEL, REFERENCE, WoundNetwork, shipped
 
 PIECES = 200  # of healthy skin, real
 SIZE_KNOWN = 0.2  # deviation of the logarithm of the area that a scan and the camera's distance tell
-HALF = 2  # bytes of a stored weight
 SHEET_QUALITY = 85  # JPEG
 WARM = 5  # first pictures, not timed
 NO_DATA = "no DATASET named"
@@ -194,9 +193,9 @@ def _time(network: WoundNetwork, pictures: Sequence[Labelled]) -> list[Figure]:
         segmenter(bgr(each.picture))
         times.append(1000 * spent)
     median, late = np.percentile(times[WARM:] or times, [50, 99])
-    note = "both looks, wall, 2 threads"
+    note = "all looks, wall, 2 threads"
     return [
         Figure("network, a picture: median", float(median), "ms", None, "thesis 9 ms on an RTX 3080 Ti", note),
         Figure("network, a picture: p99", float(late), "ms", at_most(20.0), "", note),
-        Figure("parameters, at most", network.size / HALF / 1e6, "million", at_most(3.0), "", "by the file's size"),
+        Figure("parameters, at most", network.size / 1e6, "million", at_most(3.0), "", "a byte each in the file"),
     ]
