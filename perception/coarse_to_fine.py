@@ -27,7 +27,6 @@ class Looks:
     largest_zoom: float = 3.0  # beyond this the picture holds nothing more
     found: float = 0.3  # probability from which a place of the first look is looked at again
     second_weight: float = 0.75  # of the second look's logits where both looked
-    mirrored: int = 0  # looks that are also taken in the mirror and averaged: 0 none, 1 the second, 2 both
 
 
 def wound_logits(picture: NDArray[np.uint8], network: Network, looks: Looks) -> NDArray[np.float32]:
@@ -37,7 +36,7 @@ def wound_logits(picture: NDArray[np.uint8], network: Network, looks: Looks) -> 
     if box is None:
         return first
     rows, columns = window(box, picture.shape[:2], looks)
-    second = _look(picture[rows, columns], network, (looks.window, looks.window), looks.mirrored > 0)
+    second = _look(picture[rows, columns], network, (looks.window, looks.window))
     first[rows, columns] += looks.second_weight * (second - first[rows, columns])
     return first
 
@@ -58,17 +57,15 @@ def window(box: NDArray[np.float64], size: tuple[int, int], looks: Looks) -> tup
 def _first_look(picture: NDArray[np.uint8], network: Network, looks: Looks) -> NDArray[np.float32]:
     scale = min(1.0, looks.long_side / max(picture.shape[:2]))  # a small piece, enlarged, is no whole picture
     height, width = (max(STEP, STEP * round(side * scale / STEP)) for side in picture.shape[:2])
-    return _look(picture, network, (height, width), looks.mirrored > 1)
+    return _look(picture, network, (height, width))
 
 
-def _look(picture: NDArray[np.uint8], network: Network, size: tuple[int, int], mirrored: bool) -> NDArray[np.float32]:
-    """Logits at the picture's own size, seen at `size` (H, W); mirrored: averaged with those of its mirror image."""
+def _look(picture: NDArray[np.uint8], network: Network, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Logits at the picture's own size, seen at `size` (H, W)."""
     shrinks = picture.shape[0] > size[0]
     seen = cv2.resize(picture, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     planes = np.ascontiguousarray(seen.transpose(2, 0, 1)[None], np.float32) / np.float32(255)
     logits = network(planes)[0, 0]
-    if mirrored:
-        logits = 0.5 * (logits + network(np.ascontiguousarray(planes[..., ::-1]))[0, 0, :, ::-1])
     return np.asarray(cv2.resize(logits, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 

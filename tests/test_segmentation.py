@@ -73,22 +73,6 @@ def test_a_second_look_makes_a_small_wound_sharper() -> None:
     assert dice(both.mask, truth) > dice(one.mask, truth)
 
 
-def test_looks_in_the_mirror_are_taken_as_often_as_asked_and_put_back_where_they_were() -> None:
-    image, _ = picture((120, 260), 30)
-    taken: list[int] = []
-
-    def counted(planes: np.ndarray) -> np.ndarray:
-        taken[-1] += 1
-        return red_is_wound(planes)
-
-    for mirrored in (0, 1, 2):
-        taken.append(0)
-        wound_logits(image[..., ::-1], counted, Looks(mirrored=mirrored))
-    assert taken == [2, 3, 4]
-    plain, both = (wound_logits(image[..., ::-1], red_is_wound, Looks(mirrored=m)) for m in (0, 2))
-    assert np.abs(plain - both).mean() < 0.05 * np.ptp(plain)
-
-
 def test_a_grey_picture_and_one_of_eight_pixels_are_looked_at_too() -> None:
     for image in (np.full((90, 120), 128, np.uint8), np.zeros((8, 8, 3), np.uint8)):
         found = NetworkSegmenter(red_is_wound, SETTINGS)(image)
