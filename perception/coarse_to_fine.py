@@ -19,11 +19,11 @@ STEP = 32
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """How the two looks are taken; chosen on the training folds."""
+    """How the two looks are taken; chosen on pictures that were neither trained on nor judged by."""
 
-    long_side: int = 256  # px of the first look
+    long_side: int = 320  # px of the first look
     window: int = 192  # px, side of the second look; 0: there is none
-    share: float = 0.5  # of the window's side that the found place takes
+    share: float = 0.65  # of the window's side that the found place takes
     largest_zoom: float = 3.0  # beyond this the picture holds nothing more
     found: float = 0.3  # probability from which a place of the first look is looked at again
     second_weight: float = 0.75  # of the second look's logits where both looked

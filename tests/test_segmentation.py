@@ -90,7 +90,7 @@ def test_padding_is_not_looked_at() -> None:
         return red_is_wound(planes)
 
     found = NetworkSegmenter(network, SETTINGS)(padded)
-    assert seen[0] == (1, 3, 256, 256)
+    assert seen[0] == (1, 3, 288, 288)
     assert dice(found.mask[:300, 100:400], truth) > 0.95
 
 
