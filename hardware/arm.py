@@ -15,7 +15,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm_echo import ArmEcho
+from hardware.arm_echo import STILL, ArmEcho
 from hardware.arm_line import ArmLine
 from hardware.arm_port import Opener, UnpluggedError
 from hardware.arm_profile import BITS_PER_BYTE, ArmProfile
@@ -370,13 +370,13 @@ class Arm:
             self._doubt_since = None
 
     def _believe(self, now: float) -> None:
-        """What the arm answers at rest is where it stands, unless that is what was known, to within its limits."""
+        """What the arm answers at rest is where it stands, unless that is what was known, to rounding."""
         answered, known = self._echo.axes(now), self._queue
         if answered is None:
             return
         if known is not None:
             away = np.abs(answered - known.target)
-            if np.linalg.norm(away[:3]) <= self.settings.off and away[3:].max() <= self.settings.off_turn:
+            if away[:3].max() <= STILL[0] and away[3:].max() <= STILL[1]:
                 return
         self._queue = ArmQueue(answered.tolist(), self.profile.frame_time, now)
         told = ", ".join([*(f"{v:.1f}" for v in answered[:3]), *(f"{degrees(v):.2f}" for v in answered[3:])])

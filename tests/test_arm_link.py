@@ -50,6 +50,16 @@ def test_an_arm_of_which_nobody_knows_where_it_stands_is_not_armed() -> None:
     assert answering.arm.target == pytest.approx(HOME, abs=0.05)
 
 
+def test_an_arm_that_answers_at_rest_from_beside_where_it_is_thought_to_be_is_believed() -> None:
+    link = linked(ANSWERING, stand=False, begin=HOME + [0.5, 0, 0, 0, 0, 0])
+    link.arm.stand(HOME, 0.0)
+    link.run(1.0)
+    assert link.arm.arm(1.0, HOME) == ""
+    assert link.arm.target == pytest.approx(HOME + [0.5, 0, 0, 0, 0, 0], abs=0.06)
+    link.run(0.5)
+    assert link.executed() == pytest.approx(HOME, abs=1e-3) and link.virtual.deepest <= 0.03
+
+
 def test_disarmed_it_ends_what_is_under_way_and_no_more() -> None:
     link = linked()
     link.follow(1.0)
