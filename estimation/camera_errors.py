@@ -112,9 +112,19 @@ class CameraErrors:
         n = self._count
         return Delays(self.offset, self._covariance[:n, :n] + self._jitter.value * np.eye(n))
 
+    @property
+    def unrest(self) -> float:
+        """Variance, px^2 per axis, of an image's shift from frame to frame."""
+        return self._unrest.value
+
+    def beyond(self, corrected: Array) -> Array:
+        """Second moments (C, C), s^2, of the delays that are left where offsets (C,), s, were corrected by."""
+        left = self._mean[: self._count] - corrected
+        return np.asarray(self.delays.covariance + np.outer(left, left))
+
     def shared(self, twist: Array) -> Shared:
         """What the next fit has to reckon with beyond `offset`, at a velocity (6,)."""
-        return Shared(twist, self.delays.covariance, np.full(self._count, self._unrest.value))
+        return Shared(twist, self.delays.covariance, np.full(self._count, self.unrest))
 
     def learn(self, found: SharedFit, seconds: float, clear: float = 1.0) -> None:
         """Take what a fit found, beyond the offsets that it was corrected by, `seconds` after the last one.

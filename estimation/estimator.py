@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.camera_errors import CameraErrors, Clocks
 from estimation.camera_health import CameraHealth, HealthSettings
+from estimation.claim import Claim
 from estimation.fit import Fit
 from estimation.fit_covariance import MapError, fit_covariance
 from estimation.median import median
 from estimation.motion_detector import MotionDetector
 from estimation.observations import Observations
-from estimation.odd_camera import SURER, disorder, odd_ones, solve_with, standing_off, surprise
+from estimation.odd_camera import SURER, contradiction, disorder, odd_ones, solve_with, standing_off, surprise
 from estimation.own_doubt import OwnDoubt
-from estimation.pose import SurfacePose, TrackState
+from estimation.pose import SurfacePose, TrackState, position_sigma
 from estimation.pose_solver import PoseFit, Shared, project
 from estimation.predictor import Predictor
 from estimation.rig import Rig
@@ -69,9 +70,11 @@ class Estimator:
         self._detector = MotionDetector(np.zeros(3))
         self._warp: WarpFilter | None = None
         self._map_error: MapError | None = None
-        self._unlearned: tuple[Fit, float] | None = None  # accepted, and s since the one before
+        self._claim = Claim(len(rig))
+        self._unlearned: tuple[Fit, Observations, float] | None = None  # accepted, and s since the one before
         self._predictor = Predictor()
-        self._pose: SurfacePose | None = None
+        self._pose: SurfacePose | None = None  # as decisions are made by it
+        self._given: SurfacePose | None = None  # as it is claimed
         self._measured: SurfacePose | None = None  # the last one that was
         self._caveat = ""
         self._view = 0  # landmarks of the first view: what is added later is not all seen at once
@@ -83,7 +86,7 @@ class Estimator:
     @property
     def pose(self) -> SurfacePose | None:
         """The last pose given, or None before there is a map."""
-        return self._pose
+        return self._given
 
     @property
     def confirmed(self) -> bool:
@@ -103,14 +106,18 @@ class Estimator:
         """How far, mm, the surface moves in the time by which a camera's exposure is unknown."""
         return float(np.linalg.norm(fit.twist[3:])) * self.cameras.delays.sigma
 
+    def expected(self, stamp: float) -> SurfacePose:
+        """The pose that is expected at `stamp`, as doubtful as it is searched for. Only after the first map."""
+        assert self._pose is not None
+        return self._pose.predict(stamp)
+
     def predict(self, stamp: float) -> Array:
         """Where the surface is expected at `stamp`: (4, 4). Only after the first map."""
-        assert self._pose is not None
-        return self._pose.predict(stamp).base_from_surface
+        return self.expected(stamp).base_from_surface
 
     def sigma(self) -> float:
         """Standard deviation, mm, of the last pose's position."""
-        return np.inf if self._pose is None else _position_sigma(self._pose.covariance)
+        return np.inf if self._pose is None else position_sigma(self._pose.covariance)
 
     def fit(self, observations: Observations, start: Array, scales: tuple[float, ...] = (4.0, 1.0)) -> Fit:
         """Fit the pose to observations of the map's landmarks, from a rough pose `start` (4, 4); nothing is changed.
@@ -123,8 +130,8 @@ class Estimator:
             return self._no_fit(observations, start)
         warped = self.map.points if self._warp is None else self._warp.points(self.map)
         points, (twist, doubt) = warped[observations.track], self._twist(observations.stamp, start)
-        seen, apart = self._together(observations, points, start, twist)
-        allowed = self.health.allowed(np.full(len(self.rig), apart))
+        seen, moved = self._together(observations, points, start, twist)
+        allowed = self.health.allowed(np.full(len(self.rig), moved))
         shared = self.cameras.shared(twist)
         solution, odd = self._solve(seen, points, start, scales, shared, allowed)
         inlier = solution.weights > 0.2
@@ -133,18 +140,22 @@ class Estimator:
         found = int((~np.isin(seen.camera, list(odd))).sum())
         claimed = known.noise + known.smear + known.lasting
         reason = self._judge(found, used, claimed, disorder(seen, solution, inlier))
-        if not reason and self._against_all(seen, odd, solution):
-            reason = "one camera alone, against the others and the motion"
         off = standing_off(seen, solution, len(self.rig), self._camera_least())
-        doubted = known.bias * np.repeat(self.health.doubted(off, allowed, odd), 2)
-        knowledge = solution, known.noise, known.smear, known.lasting + doubted @ doubted.T, twist, doubt, known.bias
-        return Fit(seen.stamp, *knowledge, inlier, used, reason, off, allowed, odd)
+        apart = self.health.doubted(off, allowed, odd)
+        if not reason and self._pose is not None:
+            torn = bool(apart.any()) and not self.health.clear(used)
+            reason = contradiction(seen, solution, odd, torn, self.expected(seen.stamp))
+        doubted = known.bias * np.repeat(apart, 2)
+        lasting = known.lasting + doubted @ doubted.T
+        knowledge = known.noise, known.smear, lasting, twist, doubt, known.scatter, known.tracks, known.late, known.bias
+        return Fit(seen.stamp, solution, *knowledge, inlier, used, reason, off, allowed, odd)
 
     def _no_fit(self, observations: Observations, start: Array) -> Fit:
         count, cameras = len(observations), len(self.rig)
         nothing = PoseFit(start, np.zeros((6, 6)), np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2, 6)), 1.0)
         unknown, off = np.full((6, 6), np.inf), np.full(cameras, np.nan)
-        zeros = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros((6, 2 * cameras))
+        pulls = np.zeros((6, 6)), np.zeros((6, cameras)), np.zeros((6, 2 * cameras))
+        zeros = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(6), 1.0, *pulls
         none, used = np.zeros(count, bool), np.zeros(cameras, np.int64)
         reason = f"{count} tracks found, {self.settings.least_tracks} needed"
         odd = self.health.left_out
@@ -166,7 +177,7 @@ class Estimator:
             return solution, odd
         most = self.settings.health.out * allowed
         off = standing_off(seen, solution, len(self.rig), least)
-        expected = self._pose.predict(seen.stamp)
+        expected = self.expected(seen.stamp)
         apart = any(off[c] > most[c] for c in range(len(self.rig)) if c not in odd)
         if apart or surprise(solution, expected) > SURER:  # what moved may be a camera, though the others follow it
             left, within = (1, np.inf) if apart else (2, SURER)
@@ -174,13 +185,6 @@ class Estimator:
             if found is not None:
                 return found[1], found[0]
         return solution, odd
-
-    def _against_all(self, seen: Observations, odd: frozenset[int], solution: PoseFit) -> bool:
-        """Whether a single camera is left, the others contradict it, and the motion expects something else."""
-        if not odd or self._pose is None or self._pose.state is TrackState.LOST:
-            return False
-        out = np.isin(np.unique(seen.camera), list(odd))
-        return bool(out.any() and (~out).sum() == 1 and surprise(solution, self._pose.predict(seen.stamp)) > SURER)
 
     def _twist(self, stamp: float, start: Array) -> tuple[Array, Array]:
         """Velocity (6,) at `stamp` and its variance (6,): the window's and the chord's to `start`, as each is known."""
@@ -229,7 +233,7 @@ class Estimator:
         bent = not self.confirmed  # first maps of a moving surface are
         if among > s.disorder * (3.0 if bent else 1.0):
             return f"the tracks of a camera disagree among themselves by {among:.1f} px"
-        spread = _position_sigma(covariance)
+        spread = position_sigma(covariance)
         if not spread <= s.sigma_measured:
             return f"the pose is uncertain to {spread:.1f} mm"
         return ""
@@ -240,7 +244,7 @@ class Estimator:
         caveat: what is not known of that frame's place on the tissue; as long as it stands no pose is TRACKING.
         """
         self.map, self._caveat, self._view = surface_map, caveat, len(surface_map)
-        self._own_doubt = OwnDoubt(surface_map)
+        self._own_doubt, self._claim = OwnDoubt(surface_map), Claim(len(self.rig))
         self._accepted, self._first, self._first_bias, self._bends = 0, None, None, False
         self._smoother.reset()
         self._detector, self._warp = MotionDetector(surface_map.points.mean(0)), WarpFilter(surface_map)
@@ -266,29 +270,31 @@ class Estimator:
     def moving(self, twist: Array) -> None:
         """What is known of the velocity (6,) before the window can tell: the first pose's covariance needs it."""
         assert self._pose is not None
-        self._pose = replace(self._pose, twist=twist)
+        self._pose = self._given = replace(self._pose, twist=twist)
 
     def wait(self, stamp: float, reason: str) -> SurfacePose:
         """The first map is not confirmed at `stamp`: the pose stands still and counts for nothing."""
         assert self._pose is not None
-        self._pose = replace(self._pose, stamp=stamp, reason=reason)
-        return self._pose
+        self._pose = self._given = replace(self._pose, stamp=stamp, reason=reason)
+        return self._given
 
     def learn(self) -> None:
         """Take what the last accepted fit tells of the cameras: no pose waits for it, but the next fit needs it."""
         if self._unlearned is not None:
-            (fit, seconds), self._unlearned = self._unlearned, None
+            (fit, seen, seconds), self._unlearned = self._unlearned, None
             assert fit.solution.shared is not None
             if not self._bends or not self.deforms:
                 self.cameras.learn(fit.solution.shared, seconds, fit.clear)
                 self._clocks.keep(fit.stamp, self.cameras)
+            sigma = np.maximum(seen.sigma, self.settings.floor_sigma)
+            self._claim.learn(replace(seen, sigma=sigma), fit, self.cameras)
 
     def accept(self, fit: Fit, observations: Observations) -> SurfacePose:
         """Take a measured fit into the window and give the pose."""
         assert fit.measured and fit.solution.shared is not None
         if self._pose is not None:
             sound = self.sound(fit)
-            self._unlearned = (fit, fit.stamp - self._pose.stamp) if sound else None
+            self._unlearned = (fit, observations, fit.stamp - self._pose.stamp) if sound else None
             if self._warp is not None and sound and self._smeared(fit) < SHARP:
                 sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
                 self._warp.learn(observations, fit.solution, sigma, fit.twist, self.cameras.delays.sigma)
@@ -299,13 +305,15 @@ class Estimator:
         seen = Measurement(
             tuple(self.rig.cameras[c].name for c in self.carriers(fit)),
             int(fit.used.sum()),
-            _position_sigma(fit.covariance + lasting),
+            position_sigma(fit.covariance + lasting),
             self.health.trouble(fit.stamp),
             self._caveat,
             0.0 if self._warp is None or self._warp.warp is None else self._warp.warp.deformation,
         )
         state, reason = self._states.measured(fit.stamp, seen)
-        return self._enter(fit.stamp, fit.solution.base_from_surface, fit.noise, fit.smear, lasting, state, reason)
+        pose = self._enter(fit.stamp, fit.solution.base_from_surface, fit.noise, fit.smear, lasting, state, reason)
+        self._given = self._claim.measured(pose, fit, self.cameras, self._first)
+        return self._given
 
     def _calibration(self, fit: Fit) -> Array:
         """Covariance (6, 6) of what imperfect lenses do to the pose.
@@ -350,8 +358,9 @@ class Estimator:
             self._detector.motion,
             None if self._warp is None else self._warp.warp,
         )
-        self._pose = self._measured = replace(entered, forecast=self._predictor.add(entered, lasting))
-        return self._pose
+        entered = replace(entered, forecast=self._predictor.add(entered, lasting))
+        self._pose = self._measured = self._given = entered
+        return entered
 
     def coast(self, fit: Fit) -> SurfacePose:
         """No measurement at `fit.stamp`: predict from the last one, and say for how long already and why."""
@@ -365,7 +374,8 @@ class Estimator:
             stays = self._measured.predict(self._measured.stamp + self.settings.states.coast)
             predicted = replace(predicted, base_from_surface=stays.base_from_surface, twist=np.zeros(6), forecast=None)
         self._pose = replace(predicted, state=state, reason=reason)
-        return self._pose
+        self._given = self._claim.missed(self._pose)
+        return self._given
 
     def replace_map(self, surface_map: SurfaceMap, crooked: bool = False, bent: bool = False) -> None:
         """Take a refined or longer map of the same surface frame; rows keep their meaning.
@@ -381,8 +391,3 @@ class Estimator:
         if bent:
             self.cameras, self._bends = self._clocks.before, True
         self.map, self._map_error, self._own_doubt = surface_map, MapError(surface_map), OwnDoubt(surface_map)
-
-
-def _position_sigma(covariance: Array) -> float:
-    block = covariance[3:, 3:]
-    return float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0))) if np.isfinite(block).all() else float("inf")

@@ -16,11 +16,12 @@ class Fit:
     """A fit to one frame set, judged.
 
     noise, smear: (6, 6) covariances of what is new in this frame set, by tracks and images, and by late exposures of
-    what moves; lasting: (6, 6), of what the map adds to them. twist: (6,) the velocity by which the cameras' instants
-    were brought together, twist_doubt: (6,) its variance. bias: (6, 2C), what shifts of the cameras' images do to the
-    pose. used: (C,) inliers per camera. reason: why it is no measurement, or
-    ''. off: (C,) px by which each camera stands off the pose, nan where it does not see the surface; allowed: (C,) px,
-    one sigma. odd: cameras that were left out.
+    what moves; lasting: (6, 6), of what the map adds to them. twist: (6,) the velocity by which the cameras'
+    instants were brought together, twist_doubt: (6,) its variance. scatter: variance of the tracks in parts of what is
+    claimed of them. tracks: (6, 6), what the tracks' own errors, as claimed, do to the pose; late: (6, C) and bias:
+    (6, 2C), what a delay, s, and a shift, px, of each camera's image do. used: (C,) inliers per camera. reason: why it
+    is no measurement, or ''. off: (C,) px by which each camera stands off the pose, nan where it does not see the
+    surface; allowed: (C,) px, one sigma. odd: cameras that were left out.
     """
 
     stamp: float
@@ -30,6 +31,9 @@ class Fit:
     lasting: Array
     twist: Array
     twist_doubt: Array
+    scatter: float
+    tracks: Array
+    late: Array
     bias: Array
     inlier: NDArray[np.bool_]
     used: NDArray[np.int64]

@@ -152,3 +152,9 @@ def identity_pose(stamp: float, reason: str) -> SurfacePose:
     return SurfacePose(
         stamp, np.eye(4), np.diag([np.pi**2] * 3 + [1e6] * 3), np.zeros(6), TrackState.INITIALISING, reason=reason
     )
+
+
+def position_sigma(covariance: Array) -> float:
+    """Standard deviation, mm, of the position along its worst direction; inf where (6, 6) is not finite."""
+    block = covariance[3:, 3:]
+    return float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0))) if np.isfinite(block).all() else float("inf")

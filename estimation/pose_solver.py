@@ -91,6 +91,7 @@ def project(rig: Rig, camera: Index, base_from_surface: Array, points: Array) ->
 # What the weights, at a gate of 3, take from the information of Gaussian noise beyond what the estimate itself
 # loses (Huber 1981, 4.6, integrated over two dimensions): the weights' mean is 0.72, the estimate is worth 0.89.
 EFFICIENCY = 1.235
+GATE = 3.0  # residual in sigmas at which a track's weight has fallen to a quarter
 ARRIVED = 1e-3  # squared sigmas of the pose: a last step as small as that leaves a hundredth of a sigma to go
 
 
@@ -101,7 +102,7 @@ def solve_pose(
     pixels: Array,
     sigma: Array,
     start: Array,
-    gate: float = 3.0,
+    gate: float = GATE,
     scales: tuple[float, ...] = (1.0,),
     prior: Array | None = None,
     iterations: int = 8,

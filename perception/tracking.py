@@ -183,8 +183,8 @@ class TrackingStep:
         self, matcher: Matcher, stamp: float, pyramids: dict[int, Pyramid]
     ) -> tuple[SurfacePose, Observations, NDArray[np.int64]]:
         estimator = self._estimator
-        assert estimator.map is not None and estimator.pose is not None
-        expected = estimator.pose.predict(stamp)
+        assert estimator.map is not None
+        expected = estimator.expected(stamp)
         if self._found is not None:
             expected, self._found = replace(expected, base_from_surface=self._found), None
         joint, observations, scales = self._measure(matcher, expected, pyramids)

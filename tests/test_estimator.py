@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -101,6 +102,37 @@ def test_the_first_map_is_not_a_measurement_yet() -> None:
     waited = estimator.wait(0.2, "nothing seen")
     assert (waited.state, waited.reason, waited.stamp) == (TrackState.INITIALISING, "nothing seen", 0.2)
     assert np.array_equal(waited.base_from_surface, breathing(0.0))
+
+
+def dragged(seen: Observations, seed: int) -> Observations:
+    """The tracks as they are when something that slides over the surface drags them along, some farther."""
+    rng = np.random.default_rng([seed, 77])
+    return replace(seen, pixels=seen.pixels + np.array([12.0, 8.0]) + rng.uniform(-4, 4, size=seen.pixels.shape))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_last_tracks_that_a_hand_drags_along_do_not_throw_the_pose(seed: int) -> None:
+    estimator, covered = begun(breathing), begun(breathing)
+    for either in (estimator, covered):
+        follow(either, breathing, 2.0, seed)
+    first, *later = stamps(0.2, 2.0 + 1 / RATE)
+    thrown = step(estimator, dragged(look(breathing, float(first), seed, 14, (2,)), seed))
+    assert thrown.state is TrackState.COASTING and "the motion" in thrown.reason
+    for t in later:
+        thrown, still = (step(one, look(breathing, float(t), seed, cameras=())) for one in (estimator, covered))
+        assert np.allclose(thrown.base_from_surface, still.base_from_surface, atol=1e-9)
+        assert np.allclose(thrown.covariance, still.covariance, atol=1e-9)
+
+
+def test_a_lost_surface_is_not_found_in_few_tracks_that_disagree() -> None:
+    estimator = begun(breathing)
+    follow(estimator, breathing, 2.0)
+    for t in stamps(0.7, 2.0 + 1 / RATE):
+        step(estimator, look(breathing, float(t), 1, cameras=()))
+    pose = step(estimator, dragged(look(breathing, 2.8, 1, 14, (2,)), 1))
+    assert pose.state is TrackState.LOST and "each other" in pose.reason
+    assert step(estimator, look(breathing, 2.9, 1, 14, (2,))).state is TrackState.DEGRADED
+    assert step(estimator, look(breathing, 3.0, 1)).state.measured
 
 
 def test_a_clear_view_is_tracking_without_a_reason() -> None:
