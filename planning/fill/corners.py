@@ -22,7 +22,9 @@ FINE = 0.01  # spacings: less is no widening
 def widened(ring: Bead, gaps: NDArray[np.object_], fit: Fit) -> Bead:
     """A closed line widened inwards, over what the next level leaves open."""
     spacing, deepest = fit.spacing, min(DEEPEST * fit.spacing, fit.most - fit.spacing)
-    near = gaps[shapely.dwithin(gaps, shapely.linestrings(ring.points), BESIDE * spacing)]
+    line = shapely.linestrings(ring.points)
+    shapely.prepare(line)
+    near = gaps[shapely.dwithin(line, gaps, BESIDE * spacing)]
     if not len(near):
         return ring
     ring = _denser(ring, near, spacing)
@@ -67,9 +69,10 @@ def _denser(ring: Bead, near: NDArray[np.object_], spacing: float) -> Bead:
     along = ring.along
     extra = np.linspace(0, along[-1], int(along[-1] / (DENSE * spacing)) + 2)[1:-1]
     at = ring.at(extra)
-    low, high = np.moveaxis(shapely.bounds(near).reshape(-1, 2, 2), 1, 0)  # (G, 2) each
-    reach = BESIDE * spacing
-    beside = ((at[:, None, :2] > low - reach) & (at[:, None, :2] < high + reach)).all(axis=2).any(axis=1)
+    left, low, right, high = shapely.bounds(near).T[..., None]  # (G, 1) each
+    (x, y, _), reach = at.T, BESIDE * spacing
+    across, upwards = (x > left - reach) & (x < right + reach), (y > low - reach) & (y < high + reach)
+    beside = (across & upwards).any(axis=0)
     every = np.unique(np.concatenate([along, extra[beside]]))
     return Bead(
         np.stack([np.interp(every, along, v) for v in ring.points.T], axis=1), np.interp(every, along, ring.width)

@@ -17,7 +17,7 @@ from planning.fill.pace import Pace, hops, spent
 from planning.fill.pattern import Pattern
 from planning.fill.region import Region, checked
 from planning.fill.rings import Level, ring_levels
-from planning.fill.spiral import nests, wound
+from planning.fill.spiral import apart, nests, wound
 from planning.fill.zigzag import raster_lines, zigzag_lines
 
 INTO_RIM = 0.1  # spacings by which lines run into the rim of hybrid, whose round ends leave gaps else
@@ -57,11 +57,11 @@ def _levels(region: Region, pattern: Pattern, most: int | None = None) -> tuple[
 
 def _runs(levels: list[Level], pattern: Pattern, pace: Pace) -> list[Run]:
     start, s = np.array(pattern.start), pattern.spacing
+    joins = {"contour": [apart], "spiral": [wound]}.get(pattern.kind, [apart, wound])
     runs = []
     for nest in nests([level.rings for level in levels], s):
-        ways = [[_laid(bead, pattern) for bead in run] for run in wound(nest, s, start, pattern.seam)]
-        choice = {"contour": ways[:1], "spiral": ways[1:]}.get(pattern.kind, ways)
-        runs.append(min(choice, key=lambda run: spent(run, pace).seconds))
+        ways = [[_laid(bead, pattern) for bead in way(nest, s, start, pattern.seam)] for way in joins]
+        runs.append(min(ways, key=lambda run: spent(run, pace).seconds))
     return runs + [[_laid(bead, pattern)] for level in levels for bead in level.single]
 
 

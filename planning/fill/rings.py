@@ -31,6 +31,7 @@ OUTERMOST = 0.05  # the same at the contour, where no line outside widens into t
 SLIVER = 0.02  # spacings squared: a smaller loop is a dot
 FINE = 0.003  # spacings: to which lines are simplified; offsets of offsets double their points each time
 FACING = 0.15  # spacings: a line's point nearer to or farther from a disc's rim faces another disc
+HAIR = 0.01  # spacings: a narrower opening between two lines is none
 SMALLEST = 0.04  # spacings squared: of a gap worth filling, as in a corner of 110 degrees
 
 
@@ -75,9 +76,11 @@ def _middle(left: Region, single: list[Bead], fit: Fit, radius: float) -> Region
     middle = shapely.buffer(shapely.buffer(left, -spacing / 2 - radius), radius, quad_segs=4)
     if single:
         lean = max(fit.two - spacing / 2, radius)
-        rest = shapely.get_parts(minus(middle, shapely.buffer(shapely.buffer(middle, -lean), lean)))
+        wide = shapely.buffer(shapely.buffer(middle, -lean), lean + HAIR * spacing)  # not edge upon edge: that is slow
+        rest = shapely.get_parts(minus(middle, wide))
         lines = shapely.multilinestrings([shapely.linestrings(bead.points) for bead in single])
-        middle = minus(middle, shapely.union_all(rest[shapely.intersects(rest, lines)]))
+        shapely.prepare(lines)
+        middle = minus(middle, shapely.union_all(rest[shapely.intersects(lines, rest)]))
         middle = shapely.buffer(shapely.buffer(middle, -radius), radius, quad_segs=4)
     parts = shapely.get_parts(middle)
     return shapely.multipolygons(parts[shapely.area(parts) > SLIVER * spacing**2])
@@ -85,9 +88,11 @@ def _middle(left: Region, single: list[Bead], fit: Fit, radius: float) -> Region
 
 def _gaps(left: Region, middle: Region, single: list[Bead], spacing: float) -> NDArray[np.object_]:
     """What a level leaves open between the line outside it and its own."""
-    if left.area - shapely.buffer(middle, spacing / 2, quad_segs=4).area < SMALLEST * spacing**2:
+    reached = shapely.buffer(middle, (0.5 + HAIR) * spacing, quad_segs=4)
+    beyond = HAIR * spacing * reached.length  # by so much its area is larger than the beads' own (Steiner's formula)
+    if left.area - reached.area + beyond < SMALLEST * spacing**2:
         return np.empty(0, object)
-    gaps = minus(left, shapely.buffer(middle, 0.51 * spacing, quad_segs=4))
+    gaps = minus(left, reached)
     gaps = shapely.get_parts(minus(gaps, covered_by(single)) if single else gaps)
     return np.asarray(gaps[shapely.area(gaps) > SMALLEST * spacing**2])
 

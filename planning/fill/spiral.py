@@ -45,16 +45,19 @@ def nests(levels: list[list[Bead]], spacing: float) -> list[list[Bead]]:
     return done + [nest for nest, _ in open_nests]
 
 
-def wound(nest: list[Bead], spacing: float, start: Array, seam: float) -> tuple[Run, Run]:
-    """The lines of a nest, outermost first, begun near the side that `start` (2,) points to: one by one, or joined.
+def apart(nest: list[Bead], spacing: float, start: Array, seam: float) -> Run:
+    """The lines of a nest one by one, outermost first, begun near the side that `start` (2,) points to.
 
     seam: share of the outermost line by which the run begins later.
     """
-    wanted = _wanted(nest[0], start, seam)
-    apart = _begun(nest, _inwards(nest, wanted), spacing)
-    turned = apart
-    if any(_far(outer, inner, spacing) for outer, inner in pairwise(apart)):
-        turned = _begun(nest, _outwards(nest, wanted, spacing), spacing)
+    return _begun(nest, _inwards(nest, _wanted(nest[0], start, seam)), spacing)
+
+
+def wound(nest: list[Bead], spacing: float, start: Array, seam: float) -> Run:
+    """The same lines joined inwards wherever one begins beside the one before."""
+    turned = apart(nest, spacing, start, seam)
+    if any(_far(outer, inner, spacing) for outer, inner in pairwise(turned)):
+        turned = _begun(nest, _outwards(nest, _wanted(nest[0], start, seam), spacing), spacing)
     runs: list[list[Bead]] = [[turned[0]]]
     closing: list[Bead] = []  # what the last line of a run lacks beside the ramp that led to it
     for outer, inner in pairwise(turned):
@@ -67,7 +70,7 @@ def wound(nest: list[Bead], spacing: float, start: Array, seam: float) -> tuple[
         runs[-1] += [_ramp(outer, inner, ramp), inner.between(ramp, inner.length)]
         closing = [inner.between(0.0, ramp)]
     runs[-1] += closing
-    return apart, [_chained(run) for run in runs]
+    return [_chained(run) for run in runs]
 
 
 def _chained(run: list[Bead]) -> Bead:

@@ -42,21 +42,31 @@ class Runs:
 
 
 def runs_of(beads: Sequence[Bead], chord: float) -> Runs:
-    """Beads without the points that a line of one width does not need, to `chord` mm."""
+    """Beads without the points that neither the line nor its width needs, each kept to `chord` mm."""
+    count = np.array([len(bead.points) for bead in beads])
+    every = Runs(
+        np.concatenate([bead.points for bead in beads]),
+        np.concatenate([bead.width for bead in beads]),
+        np.repeat(np.arange(len(beads)), count),
+    )
     even = np.array([np.ptp(bead.width) < 1e-9 for bead in beads], bool)
-    lines = [bead.points for bead in beads]
-    if even.any():
-        which = np.flatnonzero(even)
-        coordinates = np.concatenate([lines[i] for i in which])
-        owner = np.repeat(np.arange(len(which)), [len(lines[i]) for i in which])
-        simple = shapely.simplify(shapely.linestrings(coordinates, indices=owner), chord)
-        points, owner = shapely.get_coordinates(simple, return_index=True)
-        cuts = np.searchsorted(owner, np.arange(1, len(which)))
-        for i, part in zip(which, np.split(points, cuts), strict=True):
-            lines[i] = part
-    widths = [np.full(len(p), b.width[0]) if e else b.width for p, b, e in zip(lines, beads, even, strict=True)]
-    number = np.repeat(np.arange(len(beads)), [len(p) for p in lines])
-    return _apart(Runs(np.concatenate(lines), np.concatenate(widths), number))
+    within = np.where(
+        even, chord, chord / 2
+    )  # points kept for the one cut the stretches of the other: twice as far off
+    along = np.cumsum(every.steps)
+    needed = _needed(every.points, every.bead, within) | _needed(
+        np.column_stack([along, every.width]), every.bead, within
+    )
+    return _apart(Runs(every.points[needed], every.width[needed], every.bead[needed]))
+
+
+def _needed(points: Array, owner: Index, within: Array) -> NDArray[np.bool_]:
+    """Which points (N, 2) of lines, each of one `owner` (N,), Douglas and Peucker keep to `within` (lines,)."""
+    numbered = np.column_stack([points, np.arange(len(points))])
+    simple = shapely.simplify(shapely.linestrings(numbered, indices=owner), within, preserve_topology=False)
+    kept = np.zeros(len(points), bool)
+    kept[shapely.get_coordinates(simple, include_z=True)[:, 2].astype(np.int64)] = True
+    return kept
 
 
 def _apart(runs: Runs) -> Runs:
