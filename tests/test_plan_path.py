@@ -144,6 +144,18 @@ def test_checkpoints_are_as_near_as_asked_and_on_the_bead(seed: int, spacing: fl
         assert dense.width[dense.bead == i].min() >= line.width.min() - 1e-9
 
 
+@given(st.floats(0.005, 0.2), st.floats(0.02, 0.15), st.integers(1, 6))
+@settings(max_examples=30, deadline=None)
+def test_points_that_go_leave_line_and_edges_where_they_were(chord: float, swing: float, waves: int) -> None:
+    turn = np.linspace(0, 2 * np.pi, 600)
+    line = Bead(5 * np.column_stack([np.cos(turn), np.sin(turn)]), 0.4 + swing * np.sin(waves * turn))
+    runs = runs_of([line], chord)
+    where = shapely.line_locate_point(shapely.linestrings(runs.points), shapely.points(line.points[1:-1]))
+    width = np.interp(where, np.cumsum(runs.steps), runs.width)
+    assert len(runs.points) < len(line.points)
+    assert np.abs(width - line.width[1:-1]).max() / 2 <= 1.1 * chord  # the way along the cut line is a little shorter
+
+
 @given(st.floats(1, 100), st.floats(0.002, 0.1))
 def test_over_a_ball_a_chord_departs_by_what_is_allowed(radius: float, chord: float) -> None:
     spacing = float(spacing_over(np.array([1 / radius]), 5.0, chord)[0])

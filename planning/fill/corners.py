@@ -36,8 +36,8 @@ def widened(ring: Bead, gaps: NDArray[np.object_], fit: Fit) -> Bead:
     more[np.abs(ring.width - spacing) > 1e-9] = 0.0
     more = _calm(more[:, None], np.ones(len(more)))[:, 0]
     points = _calm(ring.points + inward * (more / 2)[:, None], np.asarray(more > FINE * spacing, float))
-    line = shapely.simplify(shapely.linestrings(np.column_stack([points, ring.width + more])), FINE * spacing)
-    lines = shapely.get_coordinates(line, include_z=True)
+    line = shapely.linestrings(np.column_stack([points, ring.width + more]))
+    lines = shapely.get_coordinates(shapely.simplify(line, FINE * spacing, preserve_topology=False), include_z=True)
     return Bead(lines[:, :2], lines[:, 2])
 
 
@@ -60,7 +60,8 @@ def _calm(values: Array, where: Array) -> Array:
     """Values (N, D) along a closed line, smoothed where `where` (N,) is 1."""
     values, weight = values[:-1], where[:-1, None] / 4
     for _ in range(CALM):
-        values = values + weight * (np.roll(values, 1, axis=0) - 2 * values + np.roll(values, -1, axis=0))
+        round_ = np.concatenate([values[-1:], values, values[:1]])
+        values = values + weight * (round_[:-2] - 2 * values + round_[2:])
     return np.concatenate([values, values[:1]])
 
 

@@ -42,7 +42,7 @@ class Runs:
 
 
 def runs_of(beads: Sequence[Bead], chord: float) -> Runs:
-    """Beads without the points that neither the line nor its width needs, each kept to `chord` mm."""
+    """Beads without the points that neither the line nor the half width to its edges needs, to `chord` mm each."""
     count = np.array([len(bead.points) for bead in beads])
     every = Runs(
         np.concatenate([bead.points for bead in beads]),
@@ -50,13 +50,10 @@ def runs_of(beads: Sequence[Bead], chord: float) -> Runs:
         np.repeat(np.arange(len(beads)), count),
     )
     even = np.array([np.ptp(bead.width) < 1e-9 for bead in beads], bool)
-    within = np.where(
-        even, chord, chord / 2
-    )  # points kept for the one cut the stretches of the other: twice as far off
-    along = np.cumsum(every.steps)
-    needed = _needed(every.points, every.bead, within) | _needed(
-        np.column_stack([along, every.width]), every.bead, within
-    )
+    # points kept for the line cut the stretches found for the width, and the other way round: twice as far off at most
+    within = np.where(even, chord, chord / 2)
+    edge = np.column_stack([np.cumsum(every.steps), every.width / 2])
+    needed = _needed(every.points, every.bead, within) | _needed(edge, every.bead, within)
     return _apart(Runs(every.points[needed], every.width[needed], every.bead[needed]))
 
 
