@@ -76,9 +76,11 @@ def scatter(seen: Observations, solution: PoseFit) -> float:
     square = (solution.residuals**2).sum(1) / root**2
     used = solution.weights > 0
     weight = (1 + square[used] / GATE**2) ** -2
-    slope = float(np.mean(weight * (1 - 2 * square[used] / (GATE**2 + square[used]))))
     told = weight.sum() * 2 - 6
-    if told <= 0 or slope <= LEAST_SLOPE:
+    if told <= 0:
+        return 1.0
+    slope = float(np.mean(weight * (1 - 2 * square[used] / (GATE**2 + square[used]))))
+    if slope <= LEAST_SLOPE:
         return 1.0
     pull = float(np.mean(weight**2 * square[used])) / 2 * (2 * weight.sum() / told)
     found = EFFICIENCY * float(weight.mean()) * pull / slope**2
