@@ -16,7 +16,6 @@ from estimation.se3 import Array
 from hardware.path_file import HEADER, read_path, write_path
 from planning.curve import curve_through
 from planning.path import LEVER, Path, check_path, lengths
-from planning.retime import retime
 from tests.moving import path_through, raster
 
 HEAD = ",".join(HEADER)
@@ -197,34 +196,3 @@ def test_corners_closer_than_their_blends_share_the_way_between_them(seed: int, 
     assert np.linalg.norm(curve.slope(s), axis=1).max() <= 1 + 1e-12
     assert np.linalg.norm(np.diff(curve.poses(s)[:, :3, 3], axis=0), axis=1).max() <= s[1] * (1 + 1e-9)
     assert np.linalg.norm(curve.poses(curve.knots)[:, :3, 3] - points, axis=1).max() <= 0.05 + 1e-9
-
-
-@given(st.integers(0, 10_000), st.floats(0, 0.9), st.floats(0, 60))
-def test_timing_keeps_the_speed_of_every_stretch_and_ends_at_rest(seed: int, share: float, speed: float) -> None:
-    path = wandering(seed)
-    curve = curve_through(path.surface_from_nozzle, path.speed[1:], 0.05, 4.0)
-    start = share * curve.length
-    limits = np.full(6, 75.0), np.full(6, 300.0)
-    timing = retime(curve, start, curve.length, speed, 3.0, np.eye(3), limits)
-    if isinstance(timing, str):  # too fast to begin with
-        assert speed > 1
-        return
-    assert timing.at(np.array([-1.0, 3.0, timing.end, 1e9])) == pytest.approx(
-        np.array([start, start] + [curve.length] * 2)
-    )
-    t = np.linspace(3.0, timing.end, 5001)
-    places = timing.at(t)
-    assert (np.diff(places) >= -1e-9).all()
-    assert timing.speeds[-1] == 0
-    pace = np.diff(places) / np.diff(t)
-    allowed = np.maximum(curve.speed[curve.stretch(places[:-1])], curve.speed[curve.stretch(places[1:])])
-    assert (pace <= allowed * (1 + 1e-6)).all()
-    tip = curve.poses(places)[:, :3, 3]
-    assert (np.linalg.norm(np.diff(tip, axis=0), axis=1) <= np.diff(places) * (1 + 1e-9) + 1e-12).all()
-
-
-def test_a_horizon_that_cannot_be_stopped_in_is_no_timing() -> None:
-    curve = curve_through(raster(speed=150).surface_from_nozzle, np.full(5, 150.0), 0.05, 4.0)
-    weak = np.full(6, 200.0), np.full(6, 10.0)
-    assert isinstance(retime(curve, 1.0, 1.1, 100.0, 0.0, np.eye(3), weak), str)
-    assert not isinstance(retime(curve, 1.0, 1.1, 0.0, 0.0, np.eye(3), weak), str)

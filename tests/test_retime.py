@@ -47,6 +47,9 @@ def test_no_stretch_and_no_corner_is_passed_faster_than_it_may_be(seed: int) -> 
     assert (speeds <= np.where(inside, curve.corner, np.inf).min(axis=1) * (1 + 1e-6)).all()
     assert (places[0], speeds[-1]) == (0.0, pytest.approx(0.0, abs=1e-9))
     assert (np.diff(places) >= 0).all()
+    tip = curve.poses(places)[:, :3, 3]
+    assert (np.linalg.norm(np.diff(tip, axis=0), axis=1) <= np.diff(places) * (1 + 1e-9) + 1e-12).all()
+    assert timing.at(np.array([-1.0, 10.0, timing.end, 1e9])) == pytest.approx(places[[0, 0, -1, -1]])
 
 
 @settings(max_examples=20)
