@@ -28,9 +28,9 @@ from hardware.track import follow
 from perception.frames import FrameSet
 from perception.tracking import STAGES, StepReport
 from tests.runs import Replayed
+from tests.started import ROOT, started
 from tests.worlds import IDEAL, SMALL, write_scenario
 
-ROOT = Path(__file__).parents[1]
 CLOCK = WallClock()
 COMMANDS = ([], ["simulate"], ["track"], ["plan"], ["replay"], ["arm"], ["import"], ["export"], ["bench"])
 
@@ -126,8 +126,7 @@ def test_the_exit_code_of_a_simulation_says_whether_its_limits_were_met(
 def test_a_simulation_ended_by_ctrl_c_keeps_what_there_was(tmp_path: Path) -> None:
     small = {"rig": {"size": [96, 64], "focal_px": 140}, "scene": {"texel_mm": 1.0}}
     file, out = write_scenario(tmp_path, SMALL, small, seconds=600.0), tmp_path / "out"
-    command = [sys.executable, "-m", "hardware.cli", "simulate", str(file), "-o", str(out), "--threads", "1"]
-    running = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    running = started(["simulate", str(file), "-o", str(out), "--threads", "1"])
     try:
         for _ in range(600):
             if (out / "nozzle.csv").exists() and (out / "nozzle.csv").stat().st_size > 30_000:

@@ -6,8 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from time import monotonic, sleep
 
@@ -26,9 +24,8 @@ from hardware.session import FrameRef, open_session
 from hardware.track_recorder import TrackRecorder
 from tests.runs import Replayed
 from tests.session_files import change
+from tests.started import started
 from tests.synthetic import still, write_session
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -143,8 +140,7 @@ def write_table(folder: Path, rig: Rig) -> None:
 
 def test_ctrl_c_keeps_what_was_written_and_says_so(tmp_path: Path) -> None:
     folder, out = endless(tmp_path / "endless"), tmp_path / "out"
-    command = [sys.executable, "-m", "hardware.cli", "track", str(folder), "-o", str(out)]
-    running = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    running = started(["track", str(folder), "-o", str(out)])
     deadline = monotonic() + 60
     while running.poll() is None and monotonic() < deadline:
         if (out / "poses.csv").exists() and (out / "poses.csv").read_bytes().count(b"\n") > 5:
