@@ -47,11 +47,6 @@ def covered_by(beads: Sequence[Bead]) -> BaseGeometry:
     return shapely.union_all([shape for bead in beads for shape in _shapes(bead)])
 
 
-def footprint(bead: Bead) -> BaseGeometry:
-    """The area that one bead covers."""
-    return covered_by([bead])
-
-
 def _shapes(bead: Bead) -> list[BaseGeometry]:
     """Areas that together are a bead's: stretches of one width as a whole, and each step on which the width changes."""
     change = np.abs(np.diff(bead.width)) > 1e-9
