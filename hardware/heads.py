@@ -1,4 +1,4 @@
-"""Where a session's print head was: a row for each frame set that was tracked with an arm."""
+"""Where a session's print head was: a row for each frame set that was taken with an arm."""
 
 from __future__ import annotations
 

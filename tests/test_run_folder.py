@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -147,7 +146,8 @@ def test_the_print_head_is_kept_in_both_sessions_and_an_instant_told_again_is_on
                 folder.picture(shot(camera, n), *picture(camera, n))
             for _ in range(1 + n % 2):
                 stamp = 0.1 + n / 10
-                folder.pose(replace(frames(stamp), head=head), pose(stamp), report(stamp), 0.01)
+                folder.head(stamp, head)
+                folder.pose(frames(stamp), pose(stamp), report(stamp), 0.01)
     for name in ("session", "session.mcap"):
         none, *found = (frames.head for frames in open_session(tmp_path / "out" / name).frame_sets())
         assert none is None

@@ -197,6 +197,17 @@ def test_a_slow_tracker_takes_the_newest_frame_set_and_the_rest_is_counted(tmp_p
     assert world.tracked + world.skipped == pytest.approx(95, abs=2)  # what waits at the end is neither
 
 
+def test_a_frame_set_that_is_left_out_has_a_print_head_all_the_same(tmp_path: Path) -> None:
+    change = {"cameras": {"fps": 50.0, "transport_s": 0.003}, "tracking": {"processing_s": 0.07}}
+    scenario = read_scenario(write_scenario(tmp_path, IDEAL, change))
+    world_of(replace(scenario, nozzle=True), sink := Heard()).run()
+    told = np.array([stamp for stamp, _ in sink.heads])
+    assert np.diff(told) == pytest.approx(0.02)  # one by one, while the tracker takes every fourth
+    with_head = [frames for frames in sink.frames if frames.head is not None]
+    assert len(with_head) > 20
+    assert {frames.stamp for frames in with_head} < set(told)
+
+
 def test_measured_processing_times_come_from_the_clock(tmp_path: Path) -> None:
     scenario = read_scenario(write_scenario(tmp_path, IDEAL, {"tracking": {"processing_s": "measured"}}))
     assert scenario.tracking.processing is None

@@ -29,7 +29,7 @@ from hardware.simulator.scene import STILL, Scene
 from hardware.simulator.shape import flat
 from hardware.simulator.truth import Truth
 from hardware.simulator.world import Exposures, World
-from perception.frames import FrameSet
+from perception.frames import FrameSet, PrintHead
 from perception.tracking import StepReport
 from planning.command import Command, Hold
 from planning.progress import Progress
@@ -58,6 +58,7 @@ class Heard:
         self.poses: list[SurfacePose] = []
         self.commands: list[Command] = []
         self.progress: list[Progress] = []
+        self.heads: list[tuple[float, PrintHead]] = []
         self.sent, self.received = b"", b""
         self.logs: list[NozzleLog] = []
         self.changes: list[Array] = []
@@ -65,6 +66,9 @@ class Heard:
 
     def picture(self, shot: Shot, kind: str, data: bytes) -> None:
         self.pictures.append((shot, kind, data))
+
+    def head(self, stamp: float, head: PrintHead) -> None:
+        self.heads.append((stamp, head))
 
     def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
         self.frames.append(frames)

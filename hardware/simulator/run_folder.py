@@ -35,7 +35,7 @@ from hardware.simulator.scenario import Scenario
 from hardware.simulator.session_folder import SessionFolder
 from hardware.simulator.watch import Watch
 from hardware.tum import rows_from_trajectory
-from perception.frames import FrameSet, Roi
+from perception.frames import FrameSet, PrintHead, Roi
 from perception.tracking import STAGES, StepReport
 from planning.command import Command, Hold, Move
 from planning.progress import Progress
@@ -115,6 +115,13 @@ class RunFolder:
             self.pictures[shot.camera] = data
             self._printed |= self._printing
 
+    def head(self, stamp: float, head: PrintHead) -> None:
+        """Where the print head was at the stamp of a frame set, tracked or not; an instant told again is one."""
+        if self._session is not None and stamp > self._headed:
+            self._headed = stamp
+            for container in self._session:
+                container.head_row(row_from_head(stamp, head), head.extruding)
+
     def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
         """A pose was made of a frame set in `spent` s of real time."""
         self._poses.write(pose, len(frames.frames), report, spent)
@@ -122,21 +129,11 @@ class RunFolder:
             self.event(pose.stamp, f"{pose.state.value}: {pose.reason}", INFO if pose.state.measured else WARNING)
             self._state = pose.state
         if self._session is not None:
-            self._head(frames)
             self._session[1].write(report.observations)
             self._session[1].write(pose)
             time = f"{pose.stamp:.1f} of {self._seconds:g} s"
             facts = [("time", time), ("arm", self._doing), ("error at the nozzle", self._error())]
             self.watch.show(frames, pose, self._shown, facts)
-
-    def _head(self, frames: FrameSet) -> None:
-        """What the tracker was told of the print head; of an instant told again it took no notice."""
-        assert self._session is not None
-        if frames.head is not None and frames.stamp > self._headed:
-            self._headed = frames.stamp
-            row = row_from_head(frames.stamp, frames.head)
-            for container in self._session:
-                container.head_row(row, frames.head.extruding)
 
     def registered(self, truth_from_estimate: Array) -> None:
         """The path was registered: truth_surface_from_estimated_surface (4, 4)."""

@@ -39,7 +39,7 @@ from hardware.simulator.scene import Scene
 from hardware.simulator.truth import Truth
 from hardware.simulator.wire import Wire
 from hardware.track import Step
-from perception.frames import Frame, FrameSet
+from perception.frames import Frame, FrameSet, PrintHead
 from perception.pairing import Pairing
 from perception.tracking import StepReport
 from planning.command import Command
@@ -62,6 +62,10 @@ class Sink(Protocol):
 
     def picture(self, shot: Shot, kind: str, data: bytes) -> None:
         """A picture that can be decoded has arrived, as encoded by its camera."""
+        ...
+
+    def head(self, stamp: float, head: PrintHead) -> None:
+        """Where the print head was at the stamp of a frame set, s, which may yet find the tracker busy."""
         ...
 
     def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
@@ -210,14 +214,21 @@ class World:
         for frames in sets:
             if self._waiting is not None:
                 self.skipped += 1
-            self._waiting = frames
+            self._waiting = self._with_head(frames)
         if not self._busy and self._waiting is not None:
             self._track(now)
+
+    def _with_head(self, frames: FrameSet) -> FrameSet:
+        """The frame set with its print head, which the sink is told of even if the set is left out."""
+        head = self._commanded.at(frames.stamp) if self.scenario.nozzle else None
+        if head is None:
+            return frames
+        self._sink.head(frames.stamp, head)
+        return replace(frames, head=head)
 
     def _track(self, now: float) -> None:
         assert self._waiting is not None
         frames, self._waiting, self._busy = self._waiting, None, True
-        frames = replace(frames, head=self._commanded.at(frames.stamp)) if self.scenario.nozzle else frames
         start = self._clock.now()
         pose = self._step(frames)
         spent = self._clock.now() - start
