@@ -1,0 +1,183 @@
+"""What the run shows its operator, a few times a second: one record, made of what the run knows anyway.
+
+Everything but stamp, turn and stage may be missing: a part that does not exist yet is None, a figure that nobody knows
+is NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from math import nan
+
+from estimation.pose import SurfacePose, TrackState, position_sigma
+from estimation.se3 import Array
+from hardware.operator.request import Wish
+
+
+class Stage(StrEnum):
+    """Where a run is, as an operator knows it."""
+
+    CHECK = "check"  # cameras, calibration, arm, path, reach
+    FIND = "find"  # the wound is looked for and the path laid on it
+    CONFIRM = "confirm"  # the path is shown over the pictures; somebody has to say that it is right
+    READY = "ready"  # all is well; the arm waits for the word
+    APPROACH = "approach"  # the nozzle goes to where printing begins or goes on
+    PRINT = "print"
+    PAUSED = "paused"  # by the operator; the arm is armed and stands
+    STOPPED = "stopped"  # by the operator or by a fault; nothing is sent to the arm
+    HOMING = "homing"  # the arm goes home
+    DONE = "done"  # the path is printed
+    FAILED = "failed"  # the run cannot go on; the arm is at rest
+
+
+class Verdict(StrEnum):
+    """What a check found, or how something fares."""
+
+    PASS = "pass"
+    WARN = "warn"  # goes on, but should be looked at
+    FAIL = "fail"
+    BUSY = "busy"  # not known yet
+
+
+class Activity(StrEnum):
+    """What the nozzle is doing."""
+
+    RESTING = "resting"  # the arm is not armed
+    ENTERING = "entering"  # on its way to where printing begins
+    PRINTING = "printing"
+    TRAVELLING = "travelling"  # along the path without extruding
+    HOLDING = "holding"  # it stands, or is carried along, until the reason is gone
+    LEAVING = "leaving"
+    HOMING = "homing"
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One line of the check table. found: in words; remedy: what to do, "" where nothing is to be done."""
+
+    name: str
+    verdict: Verdict
+    found: str = ""
+    remedy: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackingView:
+    """The estimate, as it is shown.
+
+    reason: why the state is what it is. age: s, of the pose. sigma: mm, of the position along its worst direction.
+    base_from_surface: (4, 4) mm. covariance: (3, 3) mm^2 of the position, in the surface frame. tracks: in use.
+    """
+
+    state: TrackState
+    reason: str
+    age: float
+    sigma: float
+    base_from_surface: Array
+    covariance: Array
+    tracks: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionView:
+    """What the arm does, and why.
+
+    error: mm, predicted at the nozzle when it will be there; limit: mm, beyond which it
+    does not extrude. true_error: mm, where it is known because the world is simulated. in_flight: s of motion that is
+    under way in the arm; most_in_flight: s, that it may be. base_from_nozzle: (4, 4) mm, z from the tip into the tool.
+    arm: its state in words. speed: mm/s of the nozzle over the surface.
+    """
+
+    activity: Activity
+    reason: str = ""
+    error: float = nan
+    limit: float = nan
+    true_error: float = nan
+    in_flight: float = nan
+    most_in_flight: float = nan
+    base_from_nozzle: Array | None = None
+    arm: str = ""
+    speed: float = nan
+
+
+@dataclass(frozen=True, slots=True)
+class ProgressView:
+    """How far the print is.
+
+    fraction: place counted in checkpoints, of `total` of them. share: 0 to 1, of the time or
+    of the length. left: s until it is done if nothing holds it. duty: 0 to 1, share of the time since the start in
+    which it was not held. layer, layers: counted from 1, 0 where there are none.
+    """
+
+    fraction: float
+    total: int
+    share: float
+    left: float = nan
+    duty: float = nan
+    layer: int = 0
+    layers: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyView:
+    """From the newest image handed over to the bytes on the wire: median, 99 % and limit, s."""
+
+    median: float
+    high: float
+    limit: float = nan
+
+
+@dataclass(frozen=True, slots=True)
+class CameraView:
+    """How one camera fares. rate: pictures per second that arrive. tracks: in use. words: what is wrong, or ""."""
+
+    name: str
+    verdict: Verdict
+    rate: float = nan
+    tracks: int = 0
+    words: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What became of a request. number: its own. words: why it was not followed, or what it led to."""
+
+    number: int
+    wish: Wish
+    followed: bool
+    words: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OperatorView:
+    """All that the page shows, but for pictures and scene.
+
+    stamp: s, on any clock that never goes back; a view that is not newer than the last one counts as none. turn: goes
+    up whenever stage or question changes; a request tells the turn it was asked under. question: what the operator is
+    asked or told now, in a sentence. reason: why the stage is what it is. offers: what would be followed now, but for
+    Wish.STOP, which always is. notes: what one should know all the time, such as "dry run" or "simulated". events: the
+    last ones, newest last.
+    """
+
+    stamp: float
+    turn: int
+    stage: Stage
+    question: str = ""
+    reason: str = ""
+    offers: tuple[Wish, ...] = ()
+    checks: tuple[Check, ...] = ()
+    tracking: TrackingView | None = None
+    motion: MotionView | None = None
+    progress: ProgressView | None = None
+    latency: LatencyView | None = None
+    cameras: tuple[CameraView, ...] = ()
+    answer: Answer | None = None
+    notes: tuple[str, ...] = ()
+    events: tuple[str, ...] = ()
+
+
+def tracking_from_pose(pose: SurfacePose, now: float, tracks: int = 0) -> TrackingView:
+    """The estimate as it is shown at `now`, s. tracks: in use."""
+    sigma, place = position_sigma(pose.covariance), pose.covariance[3:, 3:]
+    return TrackingView(pose.state, pose.reason, now - pose.stamp, sigma, pose.base_from_surface, place, tracks)
