@@ -17,6 +17,16 @@ from hardware import checks
 from hardware.checks import Table
 
 CAMERA_KEYS = ("name", "size", "matrix", "distortion", "base_from_camera")
+RECORDED_KEYS = ("video", "images")  # where a recorded session's images are
+LIVE_KEYS = (
+    "source",
+    "exposure_s",
+    "gain",
+    "focus_abs",
+    "white_balance_k",
+    "fps",
+    "format",
+)  # hardware/cameras reads them
 PINHOLE = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px"
 ROTATION_TOLERANCE = 1e-3  # four digits written by hand pass (and are made orthonormal); a wrong matrix does not
 EXACT_ROTATION = 1e-12  # below, the matrix is kept bit by bit, so that a rig written by us comes back the same
@@ -48,7 +58,7 @@ def read_rig(path: str | Path) -> RigFile:
     table = checks.read_toml(path)
     checks.check_keys(path, "", table, ["camera"], ["surface"])
     surface = table.get("surface")
-    rig = rig_from_table(path, table, ("video", "images"))
+    rig = rig_from_table(path, table, (*RECORDED_KEYS, *LIVE_KEYS))
     sources = tuple(_source(path, camera) for camera in table["camera"])
     return RigFile(rig, sources, None if surface is None else checks.text(path, "surface", surface))
 
@@ -100,7 +110,7 @@ def write_rig(path: str | Path, rig: Rig, sources: Sequence[ImageSource | None])
 
 def _source(path: Path, camera: Table) -> ImageSource | None:
     name = camera["name"]
-    named = [key for key in ("video", "images") if key in camera]
+    named = [key for key in RECORDED_KEYS if key in camera]
     if len(named) > 1:
         raise InputError(path, f"camera {name!r}", "video and images", "one of the two")
     return ImageSource(named[0], checks.text(path, f"camera {name!r}: {named[0]}", camera[named[0]])) if named else None

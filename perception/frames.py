@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,15 +11,20 @@ from numpy.typing import NDArray
 from estimation.se3 import Array
 
 Image = NDArray[np.uint8]
+StampedBy = Literal["", "driver", "stream", "arrival"]  # who told a live frame's instant; "" where it was recorded
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One image. camera: number in the rig. stamp: s, middle of the exposure. image: (H, W) grey or (H, W, 3) BGR."""
+    """One image. camera: number in the rig. stamp: s, middle of the exposure. image: (H, W) grey or (H, W, 3) BGR.
+
+    by: who told the stamp of a live frame.
+    """
 
     camera: int
     stamp: float
     image: Image
+    by: StampedBy = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

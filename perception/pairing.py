@@ -106,13 +106,17 @@ class Pairing:
     def __init__(self, cameras: int, period: float) -> None:
         """cameras: in the rig. period: s, of its frames."""
         self.late = 0
-        self.patience = pairing_tolerance(period)
-        self._period, self._tolerance, self._silent = period, pairing_tolerance(period), SILENT_PERIODS * period
+        self.retime(period)
         self._open: list[_Open] = []  # oldest first
         self._newest = [-math.inf] * cameras  # stamp
         self._heard: list[float | None] = [None] * cameras  # s, arrival
         self._given: _Open | None = None
         self._delays: list[deque[float]] = [deque(maxlen=USUAL) for _ in range(cameras)]  # s, behind the set's first
+
+    def retime(self, period: float) -> None:
+        """The cameras' frames come every `period` s from now on."""
+        self.patience = pairing_tolerance(period)
+        self._period, self._tolerance, self._silent = period, pairing_tolerance(period), SILENT_PERIODS * period
 
     def add(self, frame: Frame, now: float) -> list[FrameSet]:
         """The sets that can be given out once a frame has arrived; now: s, rising from call to call."""

@@ -14,7 +14,14 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FLOORS = {"estimation": 0, "perception": 1, "planning": 1, "hardware": 2}
 OWNERS = {  # library: the files that may import it
-    "cv2": ("perception/*.py", "hardware/images.py", "hardware/simulator/*.py"),
+    "cv2": (
+        "perception/*.py",
+        "hardware/cameras/capture.py",  # VideoCapture: devices, streams, files
+        "hardware/cameras/controls.py",  # its numbers for exposure, gain, focus, white balance
+        "hardware/cameras/sheet.py",  # draws the preview
+        "hardware/images.py",
+        "hardware/simulator/*.py",
+    ),
     "gtsam": ("estimation/*.py",),
     "matplotlib": ("perception/training/*.py",),
     "mcap": ("hardware/mcap_walk.py", "hardware/recording.py", "hardware/recording_file.py"),
