@@ -24,7 +24,10 @@ BROKEN = 30  # frames in a row that cannot be decoded, after which a camera is o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrival:
-    """A frame that is fit to be used. steady: s, its stamp without jitter. period: s, of its camera, None before it is known. now: s, when it was ready."""
+    """A frame that is fit to be used.
+
+    steady: s, its stamp without jitter. period: s, of its camera, None before it is known. now: s, when it was ready.
+    """
 
     frame: Frame
     steady: float

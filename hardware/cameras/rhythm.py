@@ -66,7 +66,7 @@ class Rhythm:
         return bool(alike) and abs(median / period - 1) > CHANGED
 
     def _find(self) -> bool:
-        """Lay the straight line through the last instants, counted in their median step; False where it is too steep."""
+        """Lay the straight line through the last instants, counted in their median step; False where that is none."""
         instants = np.array(self._instants)
         steps = np.diff(instants)
         counts = np.append(0, np.cumsum(np.round(steps / max(float(np.median(steps)), SHORTEST))))
