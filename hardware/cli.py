@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from estimation.errors import StillbedError
 from hardware.arm_commands import add_arm
 from hardware.bench.command import add_bench
+from hardware.cameras.command import add_cameras
 from hardware.methods import MAP, METHODS
 from hardware.plan_commands import add_plan
 from hardware.reach_command import add_reach
@@ -89,6 +90,7 @@ def parser() -> argparse.ArgumentParser:
     _add_replay(commands)
     add_reach(commands)
     add_arm(commands)
+    add_cameras(commands)
     _add_import(commands)
     _add_export(commands)
     add_train(commands)

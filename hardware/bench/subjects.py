@@ -37,6 +37,7 @@ class Subject:
 Subjects = Mapping[str, Subject]
 
 SUBJECTS: Subjects = {
+    "cameras": Subject("hardware.bench.cameras", "frames of live cameras put into sets: complete, wrong, waited for"),
     "estimator": Subject("hardware.bench.estimator", "the estimator on synthetic tracks: accuracy, honesty, time"),
     "fill": Subject("hardware.bench.fill", "beads laid into contours and random wounds: coverage and time"),
     "latency": Subject("hardware.bench.latency", "from three decoded frames to the pose, by wall clock and processor"),

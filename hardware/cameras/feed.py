@@ -124,7 +124,7 @@ class Feed:
         missed = self._stamping.rhythm.missed
         stamped = self._stamping(now, position, capture.clocked)
         image = capture.retrieve()
-        fault = (None if stamped.fresh else Fault.BACKLOG) or self._watch.fault(image)
+        fault = self._watch.fault(image) or (None if stamped.fresh else Fault.BACKLOG)
         with self._lock:
             self._missed += max(0, self._stamping.rhythm.missed - missed)
             self._stamped = stamped

@@ -25,6 +25,11 @@ LOOK = 0.005  # s between looks whether a set need not be waited for any longer
 JOINED = 0.5  # s that a thread has to end; one that waits for a dead stream ends with the process
 
 
+def places_of(rig: Rig) -> tuple[Place, ...]:
+    """What live cameras need of a rig."""
+    return tuple(Place(i, c.name, c.size, c.clock_offset) for i, c in enumerate(rig.cameras))
+
+
 class LiveCameras:
     """The frame sets of a rig's cameras, newest first served: iterate, or ask with `next_set`.
 
@@ -35,25 +40,28 @@ class LiveCameras:
 
     def __init__(
         self,
-        rig: Rig,
+        rig: Rig | Sequence[Place],
         sources: Sequence[CameraSource],
         clock: Clock,
         offsets: Sequence[float] | Array | None = None,
         opener: Opener = open_capture,
     ) -> None:
-        """sources: one per camera of the rig. offsets: (C,) s, as `set_offsets` takes them."""
-        if len(sources) != len(rig):
-            raise InputError("live cameras", "sources", len(sources), f"one per camera of the rig, {len(rig)}")
+        """rig: or the places of cameras that are not calibrated. sources: one per camera.
+
+        offsets: (C,) s, as `set_offsets` takes them.
+        """
+        places = places_of(rig) if isinstance(rig, Rig) else tuple(rig)
+        if len(sources) != len(places):
+            raise InputError("live cameras", "sources", len(sources), f"one per camera of the rig, {len(places)}")
         self._clock, self._changed = clock, threading.Condition()
         self._waiting: deque[Arrival] = deque()
-        self._overrun = [0] * len(rig)
+        self._overrun = [0] * len(places)
         self._sets = self._complete = self._passed_over = 0
         self._closed = False
         period = min((1 / source.fps for source in sources if source.fps), default=DEFAULT_PERIOD)
-        self._gathering = Gathering(len(rig), period, offsets)
+        self._gathering = Gathering(len(places), period, offsets)
         self._feeds = tuple(
-            Feed(Place(i, c.name, c.size, c.clock_offset), source, clock, self._deliver, opener)
-            for i, (c, source) in enumerate(zip(rig.cameras, sources, strict=True))
+            Feed(place, source, clock, self._deliver, opener) for place, source in zip(places, sources, strict=True)
         )
         names = [f"camera {feed.place.name}" for feed in self._feeds]
         self._threads = [

@@ -11,6 +11,9 @@ from perception.frames import StampedBy
 
 OLDEST = 1.0  # s: four buffers of 4 Hz; a driver's stamp beyond is of another clock
 WINDOW = 60  # frames whose least delay is taken for the way's own: two seconds of a webcam
+LEAST = (
+    10  # one in so many frames comes sooner than what is taken for the way's own delay, where a beat is all there is
+)
 AGREE = 0.01  # s, that the least delays of both halves of the window may differ by: a stream whose clock runs as ours
 
 
@@ -50,7 +53,7 @@ class Stamping:
         beat = self.rhythm(instant)
         if by == "arrival":
             self._late.append(arrival - beat.steady)
-            instant = min(arrival, beat.steady + min(self._late))
+            instant = min(arrival, beat.steady + sorted(self._late)[len(self._late) // LEAST])
         middle = self.exposure / 2
         fresh = by != "arrival" or beat.count > 0
         steady = instant if by == "arrival" else beat.steady

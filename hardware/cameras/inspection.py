@@ -1,0 +1,170 @@
+"""Looking at cameras for a few seconds: what each delivers, how they stand to each other, in words and in JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hardware.cameras.live import LiveCameras
+from hardware.cameras.sheet import brightness, sharpness, sheet
+from hardware.cameras.state import CameraState, LiveHealth, Phase
+from hardware.clock import Clock
+from perception.frames import FrameSet, Image
+
+STAMPED = {
+    "driver": "by its driver",
+    "stream": "by its stream",
+    "arrival": "by arrival",
+    "": "not at all",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inspection:
+    """What was seen.
+
+    offsets, scatter: (C,) s, median and deviation of each camera's stamp from the first one's in the same set; nan
+    where they never met.
+    """
+
+    health: LiveHealth
+    offsets: tuple[float, ...]
+    scatter: tuple[float, ...]
+
+    @property
+    def faulty(self) -> bool:
+        """Whether a camera is in trouble; a file that has been played is not."""
+        return any(camera.trouble and camera.phase is not Phase.ENDED for camera in self.health.cameras)
+
+
+def inspect(live: LiveCameras, seconds: float, clock: Clock) -> Inspection:
+    """Watch cameras that have been started for so many seconds, or until they end."""
+    end = clock.now() + seconds
+    sets: list[FrameSet] = []
+    while clock.now() < end and (one := live.next_set(end)) is not None:
+        sets.append(one)
+    health = live.health()
+    behind = [_behind(sets, camera) for camera in range(len(health.cameras))]
+    return Inspection(health, tuple(median for median, _ in behind), tuple(scatter for _, scatter in behind))
+
+
+def _behind(sets: Sequence[FrameSet], camera: int) -> tuple[float, float]:
+    stamps = [{frame.camera: frame.stamp for frame in one.frames} for one in sets]
+    off = np.array([s[camera] - s[0] for s in stamps if camera in s and 0 in s])
+    return (float(np.median(off)), float(off.std())) if len(off) else (math.nan, math.nan)
+
+
+def inspection_table(inspection: Inspection) -> dict[str, Any]:
+    """For JSON: plain numbers with their units in the keys, None for what is not known."""
+    health = inspection.health
+    cameras = [
+        _camera_table(camera, offset, scatter)
+        for camera, offset, scatter in zip(health.cameras, inspection.offsets, inspection.scatter, strict=True)
+    ]
+    return {
+        "cameras": cameras,
+        "sets": health.sets,
+        "complete_sets": health.complete,
+        "late_frames": health.late,
+        "trouble": health.trouble,
+    }
+
+
+def _camera_table(camera: CameraState, offset: float, scatter: float) -> dict[str, Any]:
+    seen = None if camera.newest is None else (sharpness(camera.newest), *brightness(camera.newest))
+    return {
+        "name": camera.name,
+        "source": camera.source,
+        "size_px": None if camera.newest is None else list(camera.newest.shape[1::-1]),
+        "rate_hz": _known(camera.rate),
+        "jitter_ms": _known(1e3 * camera.jitter),
+        "lag_ms": _known(1e3 * camera.lag),
+        "stamped": camera.by or None,
+        "offset_ms": _known(1e3 * offset),
+        "offset_scatter_ms": _known(1e3 * scatter),
+        "sharpness": None if seen is None else round(seen[0], 1),
+        "grey_level": None if seen is None else round(seen[1], 1),
+        "blown_out": None if seen is None else round(seen[2], 4),
+        "frames": camera.given,
+        "missed": camera.missed,
+        "not_fetched": camera.overrun,
+        "left_out": {
+            fault.name.lower(): count for fault, count in sorted(camera.faults.items(), key=lambda f: f[0].name)
+        },
+        "reopened": camera.reopened,
+        "controls": [
+            {"name": c.name, "asked": c.asked, "got": c.got, "automatic": c.automatic, "taken": c.taken}
+            for c in camera.controls
+        ],
+        "trouble": camera.trouble,
+    }
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else round(value, 3)
+
+
+def inspection_text(inspection: Inspection) -> str:
+    """A paragraph a camera, and one about their sets."""
+    table = inspection_table(inspection)
+    health = inspection.health
+    paragraphs = ["\n".join([one["name"], *(f"  {line}" for line in camera_lines(one))]) for one in table["cameras"]]
+    if len(health.cameras) > 1:
+        share = f" ({health.complete / health.sets:.1%})" if health.sets else ""
+        paragraphs.append(
+            f"{health.sets} sets, {health.complete} with all cameras{share}, {health.late} frames too late"
+        )
+    return "\n\n".join(paragraphs)
+
+
+def camera_lines(one: dict[str, Any]) -> list[str]:
+    """What is known of one camera (as in `inspection_table`), a line each."""
+    if one["size_px"] is None:
+        return [one["source"], f"TROUBLE: {one['trouble'] or 'no picture came'}"]
+    width, height = one["size_px"]
+    left_out = ", ".join(f"{count} {name}" for name, count in one["left_out"].items())
+    controls = ", ".join(_control_words(c) for c in one["controls"])
+    lines = [
+        one["source"],
+        f"{width} x {height} px, {_number(one['rate_hz'])} Hz, jitter {_number(one['jitter_ms'])} ms, "
+        f"lag {_number(one['lag_ms'])} ms, stamped {STAMPED[one['stamped'] or '']}",
+        _offset_words(one),
+        f"sharpness {one['sharpness']:.0f}, grey level {one['grey_level']:.0f}, {one['blown_out']:.1%} blown out",
+        f"{one['frames']} frames; {one['missed']} missed; left out: {left_out or 'none'}",
+    ]
+    lines += [f"controls: {controls}"] if controls else []
+    return lines + ([f"TROUBLE: {one['trouble']}"] if one["trouble"] else [])
+
+
+def _offset_words(one: dict[str, Any]) -> str:
+    if one["offset_ms"] is None:
+        return "never in a set with the first camera"
+    return f"{_number(one['offset_ms'])} ms after the first camera's stamp, +- {_number(one['offset_scatter_ms'])} ms"
+
+
+def _control_words(control: dict[str, Any]) -> str:
+    got = "not there" if control["got"] is None else _number(control["got"])
+    if not control["taken"]:
+        return f"{control['name']} {got} (asked for {_number(control['asked'])}: NOT TAKEN)"
+    state = "automatic" if control["automatic"] else "locked" if control["asked"] is not None else "not asked"
+    return f"{control['name']} {got} ({state})"
+
+
+def _number(value: float | str | None) -> str:
+    return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def inspection_sheet(inspection: Inspection) -> Image:
+    """(H, W, 3) BGR: each camera's last picture with what is known of it."""
+    tables = inspection_table(inspection)["cameras"]
+    cameras = inspection.health.cameras
+    return sheet(
+        [
+            (camera.newest, [one["name"], *camera_lines(one)[1:]], not one["trouble"])
+            for camera, one in zip(cameras, tables, strict=True)
+        ]
+    )

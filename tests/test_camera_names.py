@@ -1,0 +1,199 @@
+"""Which camera is meant, what it is told, and what it took: names that stay, and controls read back."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from estimation.errors import InputError
+from estimation.rig import Camera, Rig
+from hardware.cameras.command import NOTHING_THERE, list_text
+from hardware.cameras.controls import Control, ask_picture, lock, read_back, untaken
+from hardware.cameras.identity import Identity, Kind, device_node, identity_from_text, list_devices
+from hardware.cameras.settings import RANGES, CameraSource, read_live_rig, source_from_table
+from hardware.rig_file import read_rig, write_rig
+
+BY_ID = "/dev/v4l/by-id/usb-Maker_Eye_A1-video-index0"
+NAMED = Identity(Kind.DEVICE, BY_ID)
+
+
+def plugged_in(root: Path, number: int, name: str, serial: str, by_id: bool = True) -> None:
+    """A camera as Linux shows it: a node for pictures and one for metadata, links, and the USB device's serial."""
+    usb = root / f"sys/devices/usb1/1-{number}"
+    (usb / f"1-{number}:1.0").mkdir(parents=True)
+    if serial:
+        (usb / "serial").write_text(serial + "\n")
+    for index in range(2):
+        node = root / f"dev/video{number + index}"
+        entry = root / f"sys/class/video4linux/{node.name}"
+        node.parent.mkdir(exist_ok=True)
+        node.touch()
+        entry.mkdir(parents=True)
+        (entry / "index").write_text(f"{index}\n")
+        (entry / "name").write_text(name + "\n")
+        (entry / "device").symlink_to(usb / f"1-{number}:1.0")
+        links = {"by-path": f"pci-0-usb-0:{number}:1.0-video-index{index}"}
+        if by_id:
+            links["by-id"] = f"usb-{name.replace(' ', '_')}_{serial}-video-index{index}"
+        for folder, link in links.items():
+            (root / "dev/v4l" / folder).mkdir(parents=True, exist_ok=True)
+            (root / "dev/v4l" / folder / link).symlink_to(f"../../{node.name}")
+
+
+def test_cameras_are_listed_by_names_that_stay(tmp_path: Path) -> None:
+    plugged_in(tmp_path, 0, "Maker Eye", "A1")
+    plugged_in(tmp_path, 10, "Cheap", "", by_id=False)
+    first, second = list_devices(tmp_path)
+    assert (first.identity, first.serial, first.name) == (BY_ID, "A1", "Maker Eye")
+    assert second.identity == "/dev/v4l/by-path/pci-0-usb-0:10:1.0-video-index0"
+    text = list_text((first, second))
+    assert BY_ID in text and "usb:A1" in text and second.identity in text
+    assert list_text(list_devices(tmp_path / "empty")) == NOTHING_THERE
+
+
+def test_a_name_leads_to_the_camera_wherever_it_is_plugged_in(tmp_path: Path) -> None:
+    plugged_in(tmp_path, 4, "Maker Eye", "A1")
+    for text in (BY_ID, "usb:A1", "/dev/v4l/by-path/pci-0-usb-0:4:1.0-video-index0"):
+        node = device_node(identity_from_text("here", "source", text, tmp_path, tmp_path), tmp_path)
+        assert node is not None and node.resolve() == (tmp_path / "dev/video4").resolve()
+    assert device_node(Identity(Kind.DEVICE, "usb:B2"), tmp_path) is None
+    plugged_in(tmp_path, 8, "Maker Twin", "A1")
+    assert device_node(Identity(Kind.DEVICE, "usb:A1"), tmp_path) is None  # two of them: neither is meant
+
+
+@pytest.mark.parametrize("index", ["0", "-1", "/dev/video0", "video0"])
+def test_an_index_is_refused_with_what_to_write_instead(tmp_path: Path, index: str) -> None:
+    with pytest.raises(InputError, match="stillbed cameras"):
+        identity_from_text("here", "source", index, tmp_path, tmp_path)
+    plugged_in(tmp_path, 0, "Maker Eye", "A1")
+    with pytest.raises(InputError, match=BY_ID):
+        identity_from_text("here", "source", index, tmp_path, tmp_path)
+
+
+def test_urls_and_files_name_themselves_and_nothing_else_does(tmp_path: Path) -> None:
+    (tmp_path / "a.avi").touch()
+    assert identity_from_text("here", "source", "rtsp://10.0.0.2/x", tmp_path).kind is Kind.STREAM
+    found = identity_from_text("here", "source", "a.avi", tmp_path)
+    assert found == Identity(Kind.FILE, str((tmp_path / "a.avi").resolve()))
+    for wrong in ("b.avi", "ftp://10.0.0.2/x", "usb:", "."):
+        with pytest.raises(InputError, match="usb:SERIAL"):
+            identity_from_text("here", "source", wrong, tmp_path)
+
+
+def rig_file(folder: Path, *keys: str) -> Path:
+    """A rig.toml of a camera each, with further keys."""
+    matrix, straight = np.diag([1000.0, 1000.0, 1.0]), np.zeros(5)
+    poses = [np.eye(4) + 100 * i * np.eye(4, k=3) for i in range(len(keys))]
+    cameras = tuple(Camera(f"c{i}", (1280, 720), matrix, straight, pose) for i, pose in enumerate(poses))
+    write_rig(folder / "rig.toml", Rig(cameras), [None] * len(keys))
+    blocks = (folder / "rig.toml").read_text().split("[[camera]]\n")
+    text = blocks[0] + "".join(f"[[camera]]\n{more}\n{block}" for more, block in zip(keys, blocks[1:], strict=True))
+    (folder / "rig.toml").write_text(text)
+    return folder / "rig.toml"
+
+
+def test_a_rig_names_its_live_cameras_and_is_still_a_sessions(tmp_path: Path) -> None:
+    told = 'exposure_s = 0.008\ngain = 32\nfocus_abs = 40\nwhite_balance_k = 4500\nfps = 30.0\nformat = "MJPG"'
+    path = rig_file(tmp_path, f'source = "{BY_ID}"\n{told}', 'source = "http://10.0.0.2/x"')
+    rig, sources = read_live_rig(path)
+    assert [c.name for c in rig.cameras] == ["c0", "c1"]
+    assert sources[0] == CameraSource(NAMED, 0.008, 32, 40, 4500, 30.0, "MJPG")
+    assert sources[1] == CameraSource(Identity(Kind.STREAM, "http://10.0.0.2/x"))
+    assert read_rig(path).sources == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        ("gain = 3", "source = 'missing'"),
+        ("source = 0", "'0'"),
+        ('source = "http://h/1"\nexposure_ms = 8', "did you mean 'exposure_s'"),
+        ('source = "http://h/1"\nformat = "MJPEG"', "four characters"),
+        ('source = "http://h/0"', "a source of its own; camera 'c0' has this one"),
+    ],
+)
+def test_what_is_wrong_with_a_live_rig_is_told(tmp_path: Path, keys: str, told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        read_live_rig(rig_file(tmp_path, 'source = "http://h/0"', keys))
+
+
+@pytest.mark.parametrize("key", list(RANGES))
+def test_a_control_may_be_at_the_ends_of_its_range_and_not_beyond(tmp_path: Path, key: str) -> None:
+    low, high = RANGES[key]
+    for value in (low, high):
+        source_from_table("here", "c", {"source": "http://h/1", key: value}, tmp_path)
+    for value in (math.nextafter(low, -math.inf), math.nextafter(high, math.inf)):
+        with pytest.raises(InputError, match=key):
+            source_from_table("here", "c", {"source": "http://h/1", key: value}, tmp_path)
+
+
+class Driver:
+    """Controls as a driver has them: some are not there, gain is clamped, the automatics overrule what is set."""
+
+    def __init__(self, most_gain: float = 255.0, focus: bool = True) -> None:
+        self.most_gain = most_gain
+        self.values = {
+            cv2.CAP_PROP_FOURCC: float(cv2.VideoWriter.fourcc(*"YUYV")),
+            cv2.CAP_PROP_FPS: 30.0,
+            cv2.CAP_PROP_FRAME_WIDTH: 640.0,
+            cv2.CAP_PROP_FRAME_HEIGHT: 480.0,
+            cv2.CAP_PROP_AUTO_EXPOSURE: 3.0,
+            cv2.CAP_PROP_EXPOSURE: 250.0,
+            cv2.CAP_PROP_GAIN: 0.0,
+            cv2.CAP_PROP_AUTO_WB: 1.0,
+            cv2.CAP_PROP_WB_TEMPERATURE: 6500.0,
+        }
+        if focus:
+            self.values |= {cv2.CAP_PROP_AUTOFOCUS: 1.0, cv2.CAP_PROP_FOCUS: 0.0}
+
+    def set(self, control: int, value: float) -> bool:
+        automatic = {cv2.CAP_PROP_EXPOSURE: self.values[cv2.CAP_PROP_AUTO_EXPOSURE] == 3.0}
+        if control in self.values and not automatic.get(control, False):
+            self.values[control] = min(value, self.most_gain) if control == cv2.CAP_PROP_GAIN else float(round(value))
+        return True  # which promises nothing
+
+    def get(self, control: int) -> float:
+        return self.values.get(control, -1.0)
+
+
+ASKED = CameraSource(NAMED, exposure=0.00812, gain=32, focus=40, white_balance=4500, fps=30.0, format="MJPG")
+
+
+def test_controls_are_locked_and_read_back() -> None:
+    driver = Driver()
+    ask_picture(driver, ASKED, (1280, 720))
+    lock(driver, ASKED)
+    controls = {control.name: control for control in read_back(driver, ASKED)}
+    assert all(control.taken and not control.automatic for control in controls.values())
+    assert controls["exposure_s"].got == pytest.approx(0.0081) and controls["format"].got == "MJPG"
+    assert driver.values[cv2.CAP_PROP_FRAME_WIDTH] == 1280 and driver.values[cv2.CAP_PROP_FRAME_HEIGHT] == 720
+
+
+def test_what_a_driver_did_not_take_is_named_with_what_it_does_instead() -> None:
+    driver = Driver(most_gain=16.0, focus=False)
+    lock(driver, ASKED)
+    refused = [str(control) for control in read_back(driver, ASKED) if not control.taken]
+    assert refused == ["format YUYV, asked for MJPG", "gain 16, asked for 32", "focus_abs not there, asked for 40"]
+
+
+def test_what_was_not_asked_for_is_left_as_it_is_and_told_to_be_automatic() -> None:
+    driver, nothing = Driver(), CameraSource(NAMED)
+    before = dict(driver.values)
+    ask_picture(driver, nothing, None)
+    lock(driver, nothing)
+    controls = read_back(driver, nothing)
+    assert driver.values == before and all(control.taken for control in controls)
+    assert [c.name for c in controls if c.automatic] == ["exposure_s", "focus_abs", "white_balance_k"]
+
+
+def test_an_exposure_is_taken_to_half_a_step_and_not_beyond() -> None:
+    assert Control("exposure_s", 0.001, 0.00105).taken and not Control("exposure_s", 0.001, 0.001051).taken
+    assert not Control("exposure_s", 0.001, 0.001, automatic=True).taken
+
+
+def test_a_stream_takes_no_controls_and_says_so() -> None:
+    assert [c.taken for c in untaken(CameraSource(Identity(Kind.STREAM, "http://h/1"), gain=3))] == [False]
