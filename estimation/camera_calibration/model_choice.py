@@ -1,0 +1,94 @@
+"""Which distortion model a camera's views support, by the error on views that were held out (cross-validation)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.camera_calibration.lens_fit import LensFit, fit_lens, fit_poses, start
+from estimation.camera_calibration.lens_model import MODELS
+from estimation.camera_calibration.plausible import Implausible, check_lens
+from estimation.camera_calibration.views import Views
+from estimation.se3 import Array
+
+FOLDS = 4
+BLOCKS = 12  # stretches of neighbouring views that are held out as one: neighbours look alike
+WORTH = 1.0  # standard errors of the gain by which a model must beat every simpler one
+
+
+@dataclass(frozen=True, slots=True)
+class ModelScore:
+    """One model's root mean square error on held-out views, px, and the standard error of its gain on the best."""
+
+    model: str
+    held_out: float
+    behind: float
+    doubt: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """The chosen model's fit to all views, and how all models did."""
+
+    fit: LensFit
+    scores: tuple[ModelScore, ...]
+
+
+def choose(views: Views) -> Choice:
+    """The simplest model whose held-out error is not clearly above the best one's; one camera's views.
+
+    Models whose fit no lens can have are passed over, unless all are.
+    """
+    folds = folds_of(len(views))
+    fits = _fits(views)
+    errors = {model: _held_out(views, fits[model], folds) for model in MODELS}
+    possible = [model for model in MODELS if _is_possible(views, fits[model].lens)] or list(MODELS)
+    best = min(possible, key=lambda model: float(errors[model].mean()))
+    scores = tuple(_score(model, errors[model], errors[best]) for model in MODELS)
+    chosen = next(s.model for s in scores if s.model in possible and s.behind <= WORTH * s.doubt)
+    return Choice(fits[chosen], scores)
+
+
+def _is_possible(views: Views, lens: Array) -> bool:
+    try:
+        check_lens("", views.sizes[int(views.camera[0])], lens)
+    except Implausible:
+        return False
+    return True
+
+
+def _fits(views: Views) -> dict[str, LensFit]:
+    """Every model's fit to all views, each from the next simpler one's."""
+    begin, out = start(views), {}
+    for model in MODELS:
+        out[model] = fit_lens(views, model, begin)
+        begin = out[model].lens, out[model].camera_from_board
+    return out
+
+
+def folds_of(count: int) -> NDArray[np.int64]:
+    """(N,) the fold that each view is held out in; neighbours go together, each fold is spread over the recording."""
+    blocks = min(BLOCKS, count)
+    return np.asarray(np.arange(count) * blocks // count % min(FOLDS, blocks), np.int64)
+
+
+def _held_out(views: Views, whole: LensFit, folds: NDArray[np.int64]) -> Array:
+    """(V,) mean squared error, px^2, of each view under the lens of those outside its fold; whole: the fit to all."""
+    out = np.zeros(len(views))
+    for fold in range(folds.max() + 1):
+        kept, held = folds != fold, folds == fold
+        lens = fit_lens(views.only(kept), whole.model, (whole.lens, whole.camera_from_board[kept])).lens
+        rest = views.only(held)
+        residuals = fit_poses(rest, lens, whole.camera_from_board[held])[1]
+        limit = (6 * rest.sigma[:, None]) ** 2  # a blunder says nothing of a lens
+        out[held] = np.nanmean(np.minimum((residuals**2).sum(-1), limit * 4), axis=1)
+    return out
+
+
+def _score(model: str, errors: Array, best: Array) -> ModelScore:
+    behind = errors - best
+    return ModelScore(
+        model, float(np.sqrt(errors.mean() / 2)), float(behind.mean()), float(behind.std() / np.sqrt(len(behind)))
+    )

@@ -1,0 +1,317 @@
+"""Calibration from corners: derivatives, synthetic truth, honest uncertainties, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from boards import LENSES, MODELS, SIZE, Truth, corners, places, waved
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimation import se3
+from estimation.camera_calibration.board_motion import carried, stencils
+from estimation.camera_calibration.calibrate import Calibration, calibrate, rebased
+from estimation.camera_calibration.homography import homography
+from estimation.camera_calibration.lens_fit import Undetermined, fit_lens
+from estimation.camera_calibration.lens_model import image, lens_of
+from estimation.camera_calibration.model_choice import choose
+from estimation.camera_calibration.plausible import Implausible, check_lens, check_neighbours
+from estimation.camera_calibration.rig_error import predicted_error, volume_error, working_volume
+from estimation.camera_calibration.rig_fit import RigState, fit_rig, free_numbers
+from estimation.camera_calibration.views import Views
+from estimation.rig import Rig, pixels_from_points
+from estimation.se3 import Array
+
+TOP = [2155.93, 2125.24, 749.77, 318.26, -1.5, -0.65, 0.05, -0.02, 13.77]  # thesis Table 4.1
+SIDE = [980.82, 1002.93, 601.57, 445.87, -0.08, -1.31, -0.04, 0.03, 1.53]
+BOTTOM = [5258.69, 5800.13, 703.83, 302.84, -10.81, 114.43, 0.13, 0.05, 5751.0]
+
+tangents = st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6).map(np.array)
+
+
+@pytest.fixture(scope="module")
+def known() -> tuple[Calibration, Truth]:
+    views, truth = waved(np.random.default_rng(3))
+    return calibrate(views), truth
+
+
+def errors(found: Calibration, truth: Truth) -> Array:
+    """(C, 16): what has to be added to the estimate, in the estimate's own tangent space."""
+    state = found.fit.state
+    place = se3.log(se3.inverse(state.base_from_camera) @ truth.base_from_camera)
+    offset = truth.offset - state.offset
+    return np.concatenate([truth.lens - state.lens, place, offset[:, None]], 1)
+
+
+def nees(error: Array, covariance: Array) -> float:
+    """Per degree of freedom; the last offset follows from the others."""
+    free = np.flatnonzero(np.diag(covariance) > 0)[:-1]
+    e = error.ravel()[free]
+    return float(e @ np.linalg.solve(covariance[np.ix_(free, free)], e)) / len(free)
+
+
+@given(tangents, st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
+def test_pixels_are_those_of_the_rig_and_their_derivatives_are_differences(xi: Array, x: float, y: float) -> None:
+    point = np.array([x, y, 1.0]) * 700
+    found, by_lens, by_point = image(LENSES[0], point)
+    camera = Rig((camera_of(LENSES[0]),)).cameras[0]
+    assert np.allclose(found, pixels_from_points(camera, point[None])[0][0])
+    assert np.allclose(lens_of(camera), LENSES[0])
+    for k, step in enumerate([1e-3] * 4 + [1e-6] * 5):
+        change = (image(LENSES[0] + np.eye(9)[k] * step, point)[0] - found) / step
+        assert np.allclose(change, by_lens[:, k], rtol=1e-4, atol=1e-4 * abs(by_lens).max())
+    for k in range(3):
+        assert np.allclose((image(LENSES[0], point + np.eye(3)[k] * 1e-3)[0] - found) / 1e-3, by_point[:, k], atol=1e-4)
+
+
+def camera_of(lens: Array):  # type: ignore[no-untyped-def]
+    from estimation.camera_calibration.lens_model import matrix_of
+    from estimation.rig import Camera
+
+    return Camera("a", SIZE, matrix_of(lens), np.array(lens[4:]), np.eye(4))
+
+
+@given(st.lists(st.floats(-1, 1), min_size=8, max_size=8))
+def test_a_homography_carries_the_points_it_was_made_of(numbers: list[float]) -> None:
+    made = np.eye(3) + 0.2 * np.append(numbers, 0).reshape(3, 3) * [[1, 1, 100], [1, 1, 100], [1e-3, 1e-3, 1]]
+    plane = corners()[:, :2]
+    there = np.c_[plane, np.ones(12)] @ made.T
+    found = homography(plane, there[:, :2] / there[:, 2:])
+    again = np.c_[plane, np.ones(12)] @ found.T
+    assert np.allclose(again[:, :2] / again[:, 2:], there[:, :2] / there[:, 2:], atol=1e-6)
+
+
+def moving(stamps: Array) -> Array:
+    """A motion with a constant twist and one that turns back."""
+    way = np.stack([0.2 * stamps, 0.1 * np.sin(stamps), 0.3 * stamps, 40 * np.sin(stamps), 9 * stamps, 5 * stamps], 1)
+    return se3.exp(way)
+
+
+@given(st.floats(-0.06, 0.06))
+@settings(max_examples=20)
+def test_a_smooth_motion_is_found_between_its_poses(delay: float) -> None:
+    stamps = np.arange(9) / 8
+    inner = np.arange(2, 7)
+    found = carried(moving(stamps), stencils(stamps), inner, np.full(5, delay)).pose
+    assert np.abs(se3.log(se3.inverse(found) @ moving(stamps[inner] + delay))[:, 3:]).max() < 5e-3
+
+
+def test_the_motions_derivatives_are_differences() -> None:
+    stamps, delay = np.array([0.0, 0.1, 0.22, 0.3, 0.9, 1.0]), np.array([0.03, -0.02, 0.04, 0.01])
+    poses, who, instant = moving(stamps), stencils(stamps), np.array([0, 1, 2, 5])
+    at = carried(poses, who, instant, delay)
+    ahead = carried(poses, who, instant, delay + 1e-6).pose
+    assert np.allclose(se3.log(se3.inverse(at.pose) @ ahead) / 1e-6, at.by_delay, atol=1e-3)
+    for s in range(len(stamps)):
+        for k in range(6):
+            pushed = poses.copy()
+            pushed[s] = pushed[s] @ se3.exp(1e-5 * np.eye(6)[k])
+            change = se3.log(se3.inverse(at.pose) @ carried(pushed, who, instant, delay).pose) / 1e-5
+            for v, i in enumerate(instant):
+                columns = [0] * int(i == s) + [1 + j for j in np.flatnonzero((who.neighbours[i] == s) & (s != i))]
+                expected = sum((at.by_pose[v, :, 6 * c + k] for c in columns), np.zeros(6))
+                assert np.allclose(change[v], expected, atol=2e-3)
+
+
+def test_an_instant_without_neighbours_is_taken_to_rest() -> None:
+    who = stencils(np.array([0.0, 2.0, 4.0]))
+    assert not who.moving.any()
+    poses = moving(np.array([0.0, 2.0, 4.0]))
+    assert np.array_equal(carried(poses, who, np.arange(3), np.full(3, 0.05)).pose, poses)
+
+
+def test_exact_corners_give_the_exact_rig() -> None:
+    views, truth = waved(np.random.default_rng(1), noise=1e-6, offsets=(0.0, 0.0, 0.0))
+    fits = [fit_lens(views.only(views.camera == c), MODELS[c]) for c in range(3)]
+    assert np.abs(np.stack([f.lens for f in fits]) - truth.lens).max() < 1e-3
+
+
+def test_offsets_are_found_to_a_millisecond_and_lenses_to_a_percent(known: tuple[Calibration, Truth]) -> None:
+    found, truth = known
+    error = errors(found, truth)
+    assert np.abs(error[:, 15]).max() < 1e-3
+    assert np.abs(error[:, 0] / truth.lens[:, 0]).max() < 0.01
+    assert found.jitter == 0.0
+    assert abs(found.fit.state.offset.sum()) < 1e-6
+
+
+def test_what_is_stated_to_be_uncertain_is_so_over_fifty_runs() -> None:
+    values = []
+    for seed in range(50):
+        views, truth = waved(np.random.default_rng([seed, 5]), instants=30)
+        state = RigState(truth.lens, truth.base_from_camera, np.zeros(3), np.zeros(len(views)), _boards(views, truth))
+        fit = fit_rig(views, state, free_numbers(MODELS), 0.0)
+        found = Calibration(Rig(()), fit, views, MODELS, (), 0.0, 0)
+        values.append(nees(errors(found, truth), fit.covariance))
+    # the mean of 50 chi-squares of 29 degrees each, divided by 29, is 1 +- 0.037
+    assert 0.88 < np.mean(values) < 1.12
+
+
+def _boards(views: Views, truth: Truth) -> Array:
+    first = [np.flatnonzero(views.instant == i)[0] for i in range(views.instant.max() + 1)]
+    fits = [fit_lens(views.only(views.camera == c), MODELS[c]) for c in range(3)]
+    poses = np.zeros((len(views), 4, 4))
+    for c, fit in enumerate(fits):
+        poses[views.camera == c] = fit.camera_from_board
+    return np.asarray(truth.base_from_camera[views.camera[first]] @ poses[first])
+
+
+def test_pictures_that_are_late_each_for_itself_are_noticed_and_forgiven() -> None:
+    views, truth = waved(np.random.default_rng(3), jitter=0.006)
+    found = calibrate(views)
+    assert 0.003 < found.jitter < 0.008
+    assert found.fit.scale < 1.1
+    assert nees(errors(found, truth), found.fit.covariance) < 2
+
+
+def test_blunders_are_dropped() -> None:
+    views, truth = waved(np.random.default_rng(3))
+    wrong = views.pixels.copy()
+    rng = np.random.default_rng(0)
+    rows, points = rng.integers(0, len(views), 25), rng.integers(0, 12, 25)
+    wrong[rows, points] += rng.choice([-1, 1], (25, 2)) * rng.uniform(5, 60, (25, 2))
+    found = calibrate(replace(views, pixels=wrong))
+    assert found.dropped >= 20
+    assert nees(errors(found, truth), found.fit.covariance) < 2
+
+
+def test_the_model_is_as_rich_as_the_lens_and_no_richer() -> None:
+    views, _ = waved(np.random.default_rng(3), noise=0.05)
+    models = [choose(views.only(views.camera == c)).fit.model for c in range(3)]
+    assert models[0] != "none" and models[1] != "none"
+    assert models[2] in ("none", "k1")
+    assert "k3" not in models
+
+
+@pytest.mark.parametrize("lens", [TOP, SIDE, BOTTOM])
+def test_the_thesis_own_table_is_refused(lens: list[float]) -> None:
+    with pytest.raises(Implausible, match=r"camera a: .* allowed"):
+        check_lens("a", SIZE, np.array(lens))
+
+
+def test_k3_of_5751_and_a_focal_length_five_times_its_neighbours_are_named() -> None:
+    square = np.array(BOTTOM)
+    square[1] = square[0]
+    square[6:8] = square[4:6] = 0
+    with pytest.raises(Implausible, match="k3 = 5751"):
+        check_lens("bottom", SIZE, square)
+    with pytest.raises(Implausible, match=r"camera bottom: fx beside top's 980.8 px = 5258.7 px, 5.4 times apart"):
+        check_neighbours(("top", "side", "bottom"), (SIZE,) * 3, np.array([SIDE, SIDE, BOTTOM]))
+
+
+def test_lenses_of_webcams_that_were_measured_are_not_refused() -> None:
+    for lens in (
+        [894.0354, 895.6201, 624.237, 361.1172, -0.33769, 0.117941, -0.001162, 0.003221, -0.003749],
+        [636.5446, 633.6219, 657.4653, 378.1315, 0.199428, -0.247856, -9e-05, 0.008356, 0.156319],
+    ):
+        check_lens("a", SIZE, np.array(lens))
+
+
+def test_a_camera_that_never_sees_the_board_is_named() -> None:
+    views, _ = waved(np.random.default_rng(3))
+    with pytest.raises(Undetermined, match="camera side: never sees the board"):
+        calibrate(views.only(views.camera != 1))
+
+
+def test_cameras_that_never_see_it_together_are_named() -> None:
+    views, _ = waved(np.random.default_rng(3))
+    apart = (views.camera == 2) == (views.instant % 2 == 0)
+    with pytest.raises(Undetermined, match="camera front: saw the board together with top, side in 0"):
+        calibrate(views.only(apart))
+
+
+def test_too_few_views_are_refused() -> None:
+    views, _ = waved(np.random.default_rng(3))
+    with pytest.raises(Undetermined, match=r"camera top: views of the board = 6, allowed 10"):
+        calibrate(views.only((views.camera != 0) | (views.instant < 6)))
+
+
+def test_views_from_one_side_only_are_refused() -> None:
+    level = np.array([se3.make(np.eye(3), [x, 10 * y, 700.0]) for x in range(-150, 150, 60) for y in range(-10, 10, 5)])
+    inside = se3.transform_points(level, corners() - corners().mean(0))
+    pixels = image(LENSES[2], inside)[0] + np.random.default_rng(0).normal(0, 0.2, (20, 12, 2))
+    views = Views(
+        ("a",), (SIZE,), corners(), np.zeros(20, int), np.arange(20), np.arange(20.0), pixels, np.full(20, 0.2)
+    )
+    with pytest.raises((Implausible, Undetermined), match="camera a: "):
+        calibrate(views)
+
+
+def test_a_wrong_board_is_refused() -> None:
+    views, _ = waved(np.random.default_rng(3))
+    drawn = views.points * [1.0, 1.2, 1.0]
+    with pytest.raises((Implausible, Undetermined), match="camera top: "):
+        calibrate(replace(views, points=drawn))
+
+
+def test_the_predicted_error_is_the_one_that_is_made(known: tuple[Calibration, Truth]) -> None:
+    found, truth = known
+    points = working_volume(found, 3)
+    predicted = predicted_error(found, points)
+    made = triangulated(found, truth, points)
+    ratio = np.sqrt(np.nanmean(made**2)) / predicted.typical
+    assert 0.3 < ratio < 2.5
+
+
+def triangulated(found: Calibration, truth: Truth, points: Array) -> Array:
+    """Distances (N,), mm, between points and where the found rig puts them, after the best rigid motion."""
+    true = [replace(camera_of(lens), base_from_camera=place) for lens, place in zip(*truth_of(truth), strict=True)]
+    seen = [pixels_from_points(camera, points)[0] for camera in true]
+    there = np.array(
+        [_nearest([(c, s[i]) for c, s in zip(found.rig.cameras, seen, strict=True)], p) for i, p in enumerate(points)]
+    )
+    a, b = points - points.mean(0), there - there.mean(0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    turn = vt.T @ np.diag([1, 1, np.linalg.det(vt.T @ u.T)]) @ u.T
+    return np.asarray(np.linalg.norm(b - a @ turn.T, axis=1))
+
+
+def truth_of(truth: Truth) -> tuple[Array, Array]:
+    return truth.lens, truth.base_from_camera
+
+
+def _nearest(sides: list, start: Array) -> Array:  # type: ignore[type-arg]
+    point = start.copy()
+    for _ in range(8):
+        rows, rest = [], []
+        for camera, seen in sides:
+            camera_from_base = se3.inverse(camera.base_from_camera)
+            pixels, _, by = image(lens_of(camera), se3.transform_points(camera_from_base, point[None]))
+            rows.append(by[0] @ camera_from_base[:3, :3])
+            rest.append(pixels[0] - seen)
+        point = point - np.linalg.lstsq(np.concatenate(rows), np.concatenate(rest), rcond=None)[0]
+    return point
+
+
+def test_a_rig_without_doubt_has_no_error_and_a_point_behind_it_none_at_all(known: tuple[Calibration, Truth]) -> None:
+    found, _ = known
+    points = np.vstack([working_volume(found), [[0.0, 0.0, -500.0]]])
+    error = volume_error(found.rig, np.zeros((48, 48)), points)
+    assert error.typical == pytest.approx(0.0, abs=1e-9)
+    assert np.isnan(error.error[-1])
+    assert np.isfinite(error.pixel[:-1]).any()
+
+
+def test_a_late_clock_costs_more_the_faster_the_surface_moves(known: tuple[Calibration, Truth]) -> None:
+    found, _ = known
+    points = working_volume(found)
+    slow, fast = (predicted_error(found, points, speed).typical for speed in (0.0, 200.0))
+    assert fast > slow
+
+
+def test_another_base_leaves_the_cameras_where_they_are_to_each_other(known: tuple[Calibration, Truth]) -> None:
+    found, _ = known
+    base = se3.exp(np.array([0.3, -0.2, 1.0, 100.0, -50.0, 30.0]))
+    moved = rebased(found.rig, base)
+    assert np.allclose(moved.cameras[0].base_from_camera, base)
+    for a, b in zip(found.rig.cameras, moved.cameras, strict=True):
+        assert np.allclose(base @ a.base_from_camera, b.base_from_camera)
+
+
+def test_the_same_corners_give_the_same_rig() -> None:
+    views, _ = waved(np.random.default_rng(9), instants=20)
+    a, b = calibrate(views), calibrate(views)
+    assert np.array_equal(a.fit.covariance, b.fit.covariance)
+    assert places().shape == (3, 4, 4)
