@@ -17,18 +17,19 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm_echo import STILL, ArmEcho
 from hardware.arm_line import ArmLine
+from hardware.arm_pace import Pace
 from hardware.arm_port import Opener, UnpluggedError
 from hardware.arm_profile import BITS_PER_BYTE, ArmProfile
 from hardware.arm_queue import ArmQueue
 from hardware.arm_status import ArmEvent, ArmState, ArmStatus
-from hardware.arm_travel import lifted, travel
+from hardware.arm_travel import OwnMoves, lifted, travel
 from hardware.link_settings import LinkSettings
-from hardware.protocol import G1, G4, G54, LENGTH, Instruction, Pause, decode, encode
+from hardware.protocol import G1, G4, G54, Instruction, Pause, decode, encode
 from hardware.replies import REPLY_LENGTH, Reply, ReplyKind
 
 DEFAULT = LinkSettings()
 REMEMBERED = 1000  # events and stray bytes that are kept until somebody takes them
-PASSED = 1e-3  # bytes: rounding
+RECALLED = "what was queued is called back"
 ORIGIN_ROUNDING = 0.11  # mm, twice half of what an answer counts
 
 
@@ -47,9 +48,8 @@ class Arm:
         self._opener = opener
         self._line: ArmLine | None = None
         self._queue: ArmQueue | None = None  # None while nobody knows where the arm stands
-        self._echo = ArmEcho(settings, profile.lag)
-        self._steps: Iterator[G1] = iter(())
-        self._step: G1 | None = None  # of its own moves, the next one
+        self._echo, self._pace = ArmEcho(settings, profile.lag), Pace(profile, settings)
+        self._own = OwnMoves()
         self._look = now  # when the device is looked for next
         self._doubt_since: float | None = None
         self._open(now)
@@ -81,7 +81,7 @@ class Arm:
         if goal is not None:
             if (away := float(np.linalg.norm((goal - place)[:3]))) > self.settings.lost:
                 return f"the arm is {away:.1f} mm from where the motion left off, limit {self.settings.lost:g} mm"
-            self._start(self._travel(place, goal, lift=False))
+            self._own.start(self._travel(place, goal, lift=False))
         self._doubt_since = None
         self._change(ArmState.ARMED, "by the operator", now)
         return ""
@@ -109,7 +109,7 @@ class Arm:
             return f"the arm is {self.state.value}: {self.reason}"
         if axes.shape != (6,) or not ((axes >= limits.low) & (axes <= limits.high)).all():
             return f"{axes.tolist()} is out of bounds"
-        self._start(self._travel(np.array(self._queue.target), axes, lift))
+        self._own.start(self._travel(np.array(self._queue.target), axes, lift))
         return ""
 
     def home(self, now: float) -> str:
@@ -146,7 +146,7 @@ class Arm:
             return
         if self.state is ArmState.ARMED:
             self._judge(now)
-        if self.state is ArmState.ARMED and self._step is not None and not self._full(now, self.profile.tick):
+        if self.state is ArmState.ARMED and self.travels and not self._wait(now):
             self._advance(now)
 
     def hold(self, now: float) -> str:
@@ -155,7 +155,9 @@ class Arm:
             return f"the arm is {self.state.value}: {self.reason}"
         if self.travels:
             return "the arm is on its way"
-        return self._full(now, self.profile.tick) or self._echo.doubt(now)
+        if self._own.goal is not None:
+            return RECALLED
+        return self._wait(now)
 
     def send(self, frame: bytes, now: float) -> str:
         """Send the frame of a move or pause; why it was not sent, "" if it was. What cannot be sent stops the arm.
@@ -168,7 +170,7 @@ class Arm:
         if reason := self.hold(now):
             return reason
         assert self._queue is not None
-        if reason := self._check(instruction, now):
+        if reason := self._pace.excess(instruction, self._queue, now):
             self.stop(reason, now)
             return reason
         self._give(instruction, now, frame if not self.origin.any() else None)
@@ -177,7 +179,7 @@ class Arm:
     @property
     def travels(self) -> bool:
         """Whether the arm makes a move of its own: home, or back to where it was stopped."""
-        return self._step is not None
+        return self._own.step is not None
 
     @property
     def target(self) -> Array | None:
@@ -186,6 +188,9 @@ class Arm:
 
     def arrived(self, now: float) -> bool:
         """Whether it stands where it was sent: by dead reckoning, and by its answers where it answers."""
+        return self._own.goal is None and self._there(now)
+
+    def _there(self, now: float) -> bool:
         if self._queue is None or self.travels or self._queue.in_flight(now) > 0:
             return False
         answered = self._echo.axes(now)
@@ -240,7 +245,7 @@ class Arm:
         if self._line is not None:
             self._line.port.close()
         self._line, self._queue = None, None
-        self._steps, self._step = iter(()), None
+        self._own.drop()
         self.origin = np.zeros(3)
         self._look = now + self.settings.reopen
         self._change(ArmState.UNPLUGGED, reason, now)
@@ -303,57 +308,36 @@ class Arm:
             on_wire = now + share * self.profile.frame_time if self._queue is None else self._queue.wire_free
             self.stops.append((decided, on_wire))
 
-    def _full(self, now: float, more: float) -> str:
-        """Why a frame of `more` s must wait."""
-        assert self._line is not None and self._queue is not None
-        if self._line.blocked:
-            return f"the port has taken no bytes for {self._line.blocked_for(now):.3f} s"
-        passing = max(self._queue.wire_free - now, 0.0) / self.profile.frame_time * LENGTH
-        if passing > PASSED:
-            return f"{passing:.0f} bytes are on the wire: a stop would wait for two frames"
-        waiting = self._line.port.waiting() - passing
-        if waiting > LENGTH:
-            return f"{waiting:.0f} bytes wait in the port"
-        if (count := self._queue.frames(now)) >= self.settings.frames:
-            return f"{count} frames are under way, limit {self.settings.frames}"
-        if self._queue.in_flight_with(more, now) > self.settings.flight:
-            return f"{1000 * self._queue.in_flight(now):.0f} ms are under way, limit {1000 * self.settings.flight:g} ms"
-        return ""
-
-    def _check(self, instruction: G1 | G4, now: float) -> str:
-        """Why the arm is stopped rather than sent this."""
-        assert self._queue is not None
-        if isinstance(instruction, G1) and instruction.feed > self.profile.limits.feed * (1 + 1e-6):
-            return f"feed of {instruction.feed:g} mm/s, limit {self.profile.limits.feed:g}"
-        flight = self._queue.in_flight_with(self._queue.duration(instruction), now)
-        if flight > self.settings.flight:
-            return f"{1000 * flight:.1f} ms would be under way, limit {1000 * self.settings.flight:g} ms"
-        return ""
-
     # -- its own moves, and what stops them
 
     def _travel(self, start: Array, goal: Array, lift: bool) -> Iterator[G1]:
         rates = self.settings.speed, self.settings.turning, self.profile.tick
         return lifted(start, goal, *rates) if lift else travel(start, goal, *rates)
 
-    def _start(self, steps: Iterator[G1]) -> None:
-        self._steps = steps
-        self._step = next(steps, None)
-
     def _advance(self, now: float) -> None:
         """Send the next step of its own move, when the one before is nearly done."""
-        assert self._queue is not None and self._step is not None
-        if self._queue.in_flight(now) > self.profile.tick:
-            return
-        step = self._step
-        self._step = next(self._steps, None)
-        self._give(step, now)
+        assert self._queue is not None
+        if self._queue.in_flight(now) <= self.profile.tick and (self._own.goal is None or self._confirmed(now)):
+            self._give(self._own.take(), now)
+
+    def _confirmed(self, now: float) -> bool:
+        """Whether it answers from so near that one step more leaves no more than may be under way, stalled or not."""
+        answered, target, ahead = self._echo.axes(now), self.target, self.settings.flight - self.profile.tick
+        if answered is None or target is None:
+            return False
+        way, turn = np.linalg.norm((answered - target)[:3]), np.linalg.norm((answered - target)[3:])
+        return bool(way <= ahead * self.settings.speed and turn <= ahead * self.settings.turning)
 
     def _halt(self) -> None:
         """Drop its own moves, and the frames of which nothing is on the wire."""
         if self._line is not None:
             self._line.recall()
-        self._steps, self._step = iter(()), None
+        self._own.drop()
+
+    def _wait(self, now: float) -> str:
+        """Why no frame of a tick may go out now."""
+        assert self._line is not None and self._queue is not None
+        return self._pace.full(self._line, self._queue, self.profile.tick, now) or self._echo.doubt(now)
 
     def _judge(self, now: float) -> None:
         """Stop the arm where a fault lasts, or is too large to wait."""
@@ -362,12 +346,31 @@ class Arm:
             self.stop(f"the port took no bytes for {blocked:.2f} s, limit {self.settings.write_timeout:g} s", now)
         elif self._echo.off > self.settings.lost:
             self.stop(f"the arm is {self._echo.off:.1f} mm off its way, limit {self.settings.lost:g} mm", now)
-        elif doubt := self._echo.doubt(now):
+        elif doubt := self._echo.doubt(now) or (RECALLED if self._own.goal is not None else ""):
             self._doubt_since = now if self._doubt_since is None else self._doubt_since
             if now - self._doubt_since > self.settings.patience:
                 self.stop(f"{doubt}, for {self.settings.patience:g} s", now)
         else:
             self._doubt_since = None
+        if self.state is ArmState.ARMED and self.settings.pause_frame:
+            self._catch_up(now)
+
+    def _catch_up(self, now: float) -> None:
+        """Call back what an arm has queued that is known to be late, and once it rests go to where that led, slowly."""
+        assert self._line is not None and self._queue is not None
+        own, answered = self._own, self._echo.axes(now) is not None
+        if self._echo.behind > self.settings.slack and not own.halted:
+            self._note(f"{RECALLED}: {self._echo.doubt(now)}", now)
+            own.break_off(np.array(self._queue.target))
+            self._line.recall()
+            self._give(Pause(), now, decided=now)
+        elif own.halted and answered and self._queue.in_flight(now) == 0 and self._echo.still(now):
+            assert own.goal is not None
+            self._believe(now)
+            self._echo.behind = 0.0
+            own.start(self._travel(np.array(self._queue.target), own.goal, lift=False))
+        elif own.goal is not None and self._there(now) and not own.halted:
+            own.resume()
 
     def _believe(self, now: float) -> None:
         """What the arm answers at rest is where it stands, unless that is what was known, to rounding."""

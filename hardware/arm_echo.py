@@ -21,6 +21,7 @@ ENOUGH = 3  # answers before their absence means anything, as noise that looks l
 SPAN = 0.05  # s over which the set-point's speed is taken, and the slowest answers of a public driver come
 FORGET = 0.98  # of the lag's sums with each answer: two or three seconds of them
 STILL = 0.15, float(np.deg2rad(0.015))  # mm and rad between answers of an arm at rest: one count of rounding
+MISSED = 4  # answers in a row: noise spoils one of them now and then
 RESTS = 0.2  # s after which it counts as at rest: four of the slowest answers
 MOVING = 2.0  # mm/s below which an answer says nothing about the lag
 KNOWN = 100.0  # (mm/s)^2 in all, after which the lag is told: one answer at 10 mm/s
@@ -45,11 +46,15 @@ class _Part:
 
 @dataclass(slots=True)
 class ArmEcho:
-    """Answers so far. late: s that the arm is known to be behind its set-point. count: of places."""
+    """Answers so far. late: s that the arm is known to be behind its set-point. count: of places.
+
+    behind: an answer that is on the way of the last second tells it by itself: what is garbled is hardly ever there.
+    """
 
     settings: LinkSettings
     late: float
     count: int = 0
+    behind: float = 0.0  # s that the last answer on its way was later there than its lag
     _period: float = math.nan  # s between places, smoothed
     _place: _Part = field(default_factory=_Part)
     _turn: _Part = field(default_factory=_Part)
@@ -64,7 +69,9 @@ class ArmEcho:
                 self._period = gap if math.isnan(self._period) else self._period + 0.1 * (gap - self._period)
             self.count += 1
             self._place.take(place, self._deviation(place, slice(0, 3), queue, now), STILL[0], now)
-            self._learn(place, queue, now)
+            self._time(place, queue, now)
+            if self.behind <= self.settings.slack:
+                self._learn(place, queue, now)
         elif reply.kind is ReplyKind.TOOL:
             self._turn.take(reply.values, self._deviation(reply.values, slice(3, 6), queue, now), STILL[1], now)
 
@@ -99,8 +106,12 @@ class ArmEcho:
         """Why the arm may not be where it should be; "" if it answers from there, or never answered."""
         if self.count < ENOUGH:
             return ""
-        if (since := now - self._place.stamp) > self.settings.silence:
-            return f"the arm has not answered for {since:.2f} s, limit {self.settings.silence:g} s"
+        quiet = min(self.settings.silence, max(MISSED * self._period, self.settings.slack))
+        if (since := now - self._place.stamp) > quiet:
+            return f"the arm has not answered for {since:.2f} s, limit {quiet:.2g} s"
+        if self.behind > self.settings.slack:
+            limit = 1000 * self.settings.slack
+            return f"the arm is {1000 * self.behind:.0f} ms later on its way than its lag, limit {limit:g} ms"
         if self.off > self.settings.off:
             return f"the arm is {self.off:.1f} mm off its way, limit {self.settings.off:g} mm"
         if (turn := self._turn.off) > self.settings.off_turn:
@@ -110,13 +121,19 @@ class ArmEcho:
 
     def restart(self) -> None:
         """Forget what was answered before: a device was away, or the arm was told where it stands."""
-        self.count, self._period, self._sums = 0, math.nan, (0.0, 0.0)
+        self.count, self.behind, self._period, self._sums = 0, 0.0, math.nan, (0.0, 0.0)
         self._place, self._turn = _Part(), _Part()
 
     def _deviation(self, values: Array, axes: slice, queue: ArmQueue, now: float) -> float:
         """How far an answer (3,) is from where the set-point was since the arm could be there."""
         low, high = queue.bounds(now - self.late - self.settings.slack, now)
         return _beyond(values.tolist(), low[axes], high[axes])
+
+    def _time(self, place: Array, queue: ArmQueue, now: float) -> None:
+        """How late the arm is where it answers from."""
+        passed = queue.passed(place.tolist(), STILL[0], now)
+        if not math.isnan(passed):
+            self.behind = now - passed - (self.late if math.isnan(self.lag) else max(self.late, self.lag))
 
     def _learn(self, place: Array, queue: ArmQueue, now: float) -> None:
         """Fit the lag: the set-point's lead over the answer is its speed times that."""

@@ -7,8 +7,8 @@ motion_byte = 1                               # byte 2 of a G1 frame, 1 or 0
 slots = ["J4", "J5", "J6"]                    # which joint stands in each angle slot
 origin_scale = 1                              # 10: the origin is sent in tenths of a millimetre
 pwm = 0                                       # bytes 27 to 30 of a G1 frame: 0, or 1500 as one driver sends
-baud = 115200
-tick_s = 0.02
+baud = 115200                                 # or 9600, at which a frame takes 50 ms
+tick_s = 0.02                                 # at least a frame's time on the wire, which is the default where longer
 lag_s = 0.024                                 # from the end of a tick until the arm is where it was sent in it
 tool_mm = [[0, 0.5], [12.7, 0.5], [27, 4.8]]  # height above the tip and radius of what hangs on the arm
 [limits]                                      # as in planning/limits.py; arrays are X Y Z in mm, A B C in degrees
@@ -27,7 +27,7 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware import checks
-from hardware.arm_profile import ArmProfile
+from hardware.arm_profile import ArmProfile, at_baud
 from hardware.kinematics_table import kinematics_from_table, kinematics_lines
 from hardware.protocol import Dialect
 from perception.tool_profile import check_profile
@@ -61,14 +61,14 @@ def read_arm(path: str | Path) -> ArmProfile:
     path = Path(path)
     table = checks.read_toml(path)
     checks.check_keys(path, "", table, (), KEYS)
-    default = ArmProfile()
-    shapes: dict[str, tuple[int | None, ...]] = {
-        "home_mm_deg": (6,),
-        "arm_from_base": (4, 4),
-        "arm_from_upright": (3, 3),
-    }
-    given = {key: checks.numbers(path, key, table[key], shape) for key, shape in shapes.items() if key in table}
     try:
+        default = at_baud(ArmProfile(), checks.integer(path, "baud", table.get("baud", ArmProfile().baud), 1))
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "home_mm_deg": (6,),
+            "arm_from_base": (4, 4),
+            "arm_from_upright": (3, 3),
+        }
+        given = {key: checks.numbers(path, key, table[key], shape) for key, shape in shapes.items() if key in table}
         return ArmProfile(
             arm=SimpleArm(
                 given.get("arm_from_base", default.arm.arm_from_base),
@@ -78,7 +78,7 @@ def read_arm(path: str | Path) -> ArmProfile:
             ),
             limits=_limits(path, table.get("limits", {})),
             dialect=_dialect(path, table),
-            baud=checks.integer(path, "baud", table.get("baud", default.baud), 1),
+            baud=default.baud,
             tick=checks.number(path, "tick_s", table.get("tick_s", default.tick)),
             lag=checks.number(path, "lag_s", table.get("lag_s", default.lag)),
             tool=tool_from_value(path, "tool_mm", table["tool_mm"]) if "tool_mm" in table else default.tool,

@@ -42,7 +42,7 @@ class ArmProfile:
         if not self.baud > 0:
             raise InputError("arm profile", "baud", self.baud, "> 0 bits/s")
         wire = self.frame_time
-        if not wire <= self.tick < LEAD / 2:
+        if not wire <= self.tick <= LEAD / 2:
             raise InputError("arm profile", "tick", self.tick, f"{wire:.5f} s, one frame on the wire, to {LEAD / 2} s")
         if not 0 <= self.lag <= LONGEST_LAG:
             raise InputError("arm profile", "lag", self.lag, f"0 to {LONGEST_LAG} s")
@@ -58,6 +58,15 @@ class ArmProfile:
     def frame_time(self) -> float:
         """Seconds that one frame takes on the wire: 4.17 ms at 115200 bits/s."""
         return LENGTH * BITS_PER_BYTE / self.baud
+
+
+def at_baud(profile: ArmProfile, baud: int) -> ArmProfile:
+    """The profile on a line of `baud` bits/s: no tick is shorter than a frame, and each comes later by what that takes.
+
+    At 9600 bits/s that is 20 ticks a second of 50 ms. The limits of one tick stay: 3 mm of jump are 60 mm/s there.
+    """
+    wire = LENGTH * BITS_PER_BYTE / baud if baud > 0 else 0.0
+    return replace(profile, baud=baud, tick=max(profile.tick, wire), lag=profile.lag - profile.frame_time + wire)
 
 
 def _check_joints(arm: SimpleArm, model: JointModel, limits: Limits) -> None:

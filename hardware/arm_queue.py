@@ -114,6 +114,20 @@ class ArmQueue:
         index = bisect_right(self._stretches, instant, key=lambda stretch: stretch.start) - 1
         return self._stretches[max(index, 0)].at(instant)
 
+    def passed(self, place: Sequence[float], still: float, until: float) -> float:
+        """When X Y Z of the set-point last were within `still` mm of a place (3,) each, s; NaN if not of late."""
+        after = until
+        for stretch in reversed(self._stretches):
+            if stretch.end <= after and _share(stretch.target, stretch.target, place, still, 1.0) is not None:
+                return after
+            if stretch.start < min(after, stretch.end):
+                length = stretch.end - stretch.start
+                most = min((after - stretch.start) / length, 1.0)
+                if (share := _share(stretch.source, stretch.target, place, still, most)) is not None:
+                    return stretch.start + share * length
+            after = min(after, stretch.start)
+        return math.nan
+
     def bounds(self, since: float, until: float) -> tuple[Axes, Axes]:
         """Least and greatest set-point of each axis between two instants, s."""
         knots = [self.at(since), self.at(until)]
@@ -123,3 +137,16 @@ class ArmQueue:
             ends = (stretch.start, stretch.source), (stretch.end, stretch.target)
             knots += [place for instant, place in ends if since <= instant <= until]
         return tuple(map(min, *knots)), tuple(map(max, *knots))
+
+
+def _share(source: Axes, target: Axes, place: Sequence[float], still: float, most: float) -> float | None:
+    """The last share of a straight way, up to `most`, at which X Y Z are `still` or less from a place (3,), or None."""
+    first, last = 0.0, most
+    for a, b, p in zip(source[:3], target[:3], place, strict=True):
+        if a == b:
+            if abs(p - a) > still:
+                return None
+            continue
+        ends = (p - still - a) / (b - a), (p + still - a) / (b - a)
+        first, last = max(first, min(ends)), min(last, max(ends))
+    return last if first <= last else None

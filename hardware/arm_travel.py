@@ -8,6 +8,7 @@ its speed: it begins with a step to where the arm should be, and moves and turns
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 
 import numpy as np
 
@@ -53,3 +54,48 @@ def _turned(start: Array, goal: Array, turning: float, tick: float) -> Iterator[
         yield G1(
             np.concatenate([goal[:3], goal[3:] if k == count else start[3:] + k / count * way]), np.rad2deg(turning)
         )
+
+
+class OwnMoves:
+    """What the link moves by itself.
+
+    step: the next one, None without. goal: (6,) to go to after a recall, before anything else. halted: a recall was
+    sent, and the way to the goal has not begun.
+    """
+
+    def __init__(self) -> None:
+        self.step: G1 | None = None
+        self.goal: Array | None = None
+        self.halted = False
+        self._steps: Iterator[G1] = iter(())
+        self._broken: Iterator[G1] = iter(())  # off by a recall
+
+    def start(self, steps: Iterator[G1]) -> None:
+        """Make these the next steps."""
+        self._steps = steps
+        self.step, self.halted = next(steps, None), False
+
+    def take(self) -> G1:
+        """The next step, once."""
+        step = self.step
+        assert step is not None
+        self.step = next(self._steps, None)
+        return step
+
+    def break_off(self, goal: Array) -> None:
+        """What was sent last, to `goal` (6,), was called back; a second time that is not where it has to go."""
+        if self.goal is None:
+            rest = self._steps if self.step is None else chain([self.step], self._steps)
+            self.goal, self._broken = goal, rest
+        self.start(iter(()))
+        self.halted = True
+
+    def resume(self) -> None:
+        """The goal is reached: go on with what was broken off."""
+        self.goal = None
+        self.start(self._broken)
+
+    def drop(self) -> None:
+        """Forget all."""
+        self.goal, self._broken = None, iter(())
+        self.start(iter(()))

@@ -22,6 +22,7 @@ LENGTH = 48
 _G1 = struct.Struct("<BcB6ff12xfB")  # X Y Z, three angles, pwm, reserved, feed
 _G4 = struct.Struct("<BcBf40xB")  # pause
 _G54 = struct.Struct("<BBB3f32xB")  # X Y Z
+_SINGLE = struct.Struct("<f")
 _MOTION, _MOTION_END, _SYSTEM, _SYSTEM_END = 238, 239, 252, 253
 TAILS = {_MOTION: _MOTION_END, _SYSTEM: _SYSTEM_END}  # last byte of a frame by its first
 
@@ -166,11 +167,15 @@ def _decode_move(fields: tuple[Any, ...], dialect: Dialect) -> G1:
 
 def _singles(numbers: list[float], where: str) -> list[float]:
     """Numbers as binary32 holds them."""
-    with np.errstate(over="ignore"):
-        singles = [float(np.float32(number)) for number in numbers]
-    for number, single in zip(numbers, singles, strict=True):
+    singles = []
+    for number in numbers:
+        try:
+            single = _SINGLE.unpack(_SINGLE.pack(number))[0]
+        except OverflowError:
+            single = math.inf
         if not math.isfinite(single):
             raise InputError(where, "parameter", number, "a finite number that binary32 can hold")
+        singles.append(single)
     return singles
 
 

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from estimation.se3 import Array
 
+SLOWEST = 1.0  # mm/s, or degrees/s: where the arm is off by rounding or a lost frame, it must not take for ever
+HASTE = 0.98  # of a tick in which a move is made: what a stall that nobody saw has queued is worked off in the rest
 TURNING = 1e-3  # mm: a shorter move only turns; the arm gets its axes as binary32, good to 6e-5 mm at 1 m
 
 
@@ -34,3 +38,13 @@ class Hold:
 
 
 Command = Move | Hold
+
+
+def feed_for(start: Array, axes: Array, tick: float) -> float:
+    """Feed, mm/s or degrees/s as `Move` has it, of a move from `start` to `axes`, (6,) each, within a tick of `tick` s.
+
+    No slower than SLOWEST: a lesser way is gone in less than the tick, and the arm waits for the next one.
+    """
+    length, turn = float(np.linalg.norm(axes[:3] - start[:3])), float(np.linalg.norm(axes[3:] - start[3:]))
+    way = length if length > TURNING else float(np.rad2deg(turn))
+    return max(way / (HASTE * tick), SLOWEST)

@@ -24,8 +24,7 @@ class Follower:
 
     def __init__(self, axes: Array, limits: Limits, tick: float) -> None:
         self.position, self.velocity, self.acceleration = axes.copy(), np.zeros(6), np.zeros(6)
-        per_tick = np.repeat([limits.jump / 3**0.5, limits.turn], 3) / tick
-        self._speed = WITHIN * np.minimum(limits.speed, per_tick)
+        self._speed = WITHIN * limits.per_tick(tick)
         self._acceleration, self._jerk = WITHIN * limits.acceleration, WITHIN * limits.jerk
         self._tick, self._ruckig = tick, Ruckig(6, tick)
 

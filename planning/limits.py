@@ -42,6 +42,10 @@ class Limits:
     on_path: float = 0.5  # half a bead
     pause: float = 0.001  # thesis 6.3: pauses of 1 ms, repeated
 
+    def per_tick(self, tick: float) -> Array:
+        """Speed of each axis (6,), per s, that keeps jump and turn of one tick of `tick` s whatever the others do."""
+        return np.minimum(self.speed, np.repeat([self.jump / 3**0.5, self.turn], 3) / tick)
+
     def __post_init__(self) -> None:
         for name in (f.name for f in fields(self)):
             value: Array = np.asarray(getattr(self, name), float)

@@ -18,7 +18,7 @@ import numpy as np
 from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from planning.command import TURNING, Command, Hold, Move
+from planning.command import Command, Hold, Move, feed_for
 from planning.curve import Curve, curve_through
 from planning.demand import Demand, demand
 from planning.follow import LEAD, Follower
@@ -36,7 +36,6 @@ STALL = 3.0  # ticks without a call after which the arm has come to rest by itse
 MARGIN = np.array([5.0, 5, 5, *np.deg2rad([2, 2, 2])])  # that targets keep from the bounds: braking needs room
 JOINT_MARGIN = float(np.deg2rad(2))  # that joints keep from the ends of their ranges
 SHARE = 0.98  # of what the guard tolerates of a pose: the planner brakes before the guard would cut
-SLOWEST = 1.0  # mm/s, or degrees/s, of any move
 
 
 class Planner:
@@ -54,6 +53,7 @@ class Planner:
         self._zone = path.zone
         self._follower = Follower(arm.home, limits, tick)
         self._leg: Leg | None = None
+        self._bounds = limits_of(arm, replace(limits, speed=limits.per_tick(tick)))
         self._asked: tuple[Leg | None, Array] = None, np.empty((5, 6))  # a leg and what it asks for at this tick
         start = check_start(path, start)
         self._place = float(np.interp(start, np.arange(len(path)), self._curve.knots))  # mm of it that are printed
@@ -188,7 +188,7 @@ class Planner:
 
     def _timed(self, grid: Grid, asked: Demand, speed: float, begin: float) -> Timing | str:
         self.horizons += 1
-        return retime(grid, asked, speed, begin, limits_of(self._arm, self._limits))
+        return retime(grid, asked, speed, begin, self._bounds)
 
     # -- the motion
 
@@ -232,9 +232,8 @@ class Planner:
         return Hold(now, self._limits.pause, reason)
 
     def _move(self, now: float, start: Array, axes: Array, extrude: bool) -> Move:
-        length, turn_deg = float(np.linalg.norm(axes[:3] - start[:3])), np.rad2deg(np.linalg.norm(axes[3:] - start[3:]))
-        speed = (length if length > TURNING else float(turn_deg)) / self._tick
-        return Move(now, axes, min(max(speed, SLOWEST), self._limits.feed), self._checkpoint(), extrude)
+        feed = min(feed_for(start, axes, self._tick), self._limits.feed)
+        return Move(now, axes, feed, self._checkpoint(), extrude)
 
     def _checkpoint(self) -> int:
         """The checkpoint that the place on the path leads to."""

@@ -51,13 +51,24 @@ def test_what_a_file_leaves_out_keeps_its_default(tmp_path: Path) -> None:
     assert same(profile, ArmProfile(limits=Limits(turn=np.deg2rad(1.5)), dialect=Dialect(0)))
 
 
+def test_on_a_slow_line_ticks_and_lag_follow_unless_they_are_given(tmp_path: Path) -> None:
+    file = tmp_path / "arm.toml"
+    file.write_text("baud = 9600\n", encoding="utf-8")
+    profile = read_arm(file)
+    assert (profile.baud, profile.tick, profile.frame_time) == (9600, 0.05, 0.05)
+    assert profile.lag == pytest.approx(0.024 - 1 / 240 + 0.05)
+    file.write_text("baud = 9600\nlag_s = 0.1\n", encoding="utf-8")
+    assert read_arm(file).lag == 0.1
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", ["empty"]),
         ("baud = ", ["syntax"]),
         ("boud = 9600", ["boud", "did you mean 'baud'"]),
-        ("baud = 9600", ["tick", "0.05"]),
+        ("baud = 9600\ntick_s = 0.049", ["tick", "0.05"]),
+        ("baud = 4800", ["tick", "0.1"]),
         ("baud = -1", ["baud", ">= 1"]),
         ("motion_byte = 2", ["motion_byte", "0 or 1"]),
         ("origin_scale = 2", ["origin_scale", "1 or 10"]),

@@ -15,6 +15,7 @@ from hardware.replies import Reply, ReplyKind
 from hardware.simulator.arm_faults import fault_from_text
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.virtual_port import PortFaults
+from planning.command import feed_for
 from tests.linked import circle, linked
 from tests.virtual_arm import HOME
 
@@ -250,23 +251,59 @@ def test_stray_bytes_are_kept_with_their_instants_and_harm_nothing() -> None:
     assert stamps == sorted(stamps) and stamps[0] >= 0 and stamps[-1] <= 5.0
 
 
-@pytest.mark.parametrize("seconds", [0.3, 0.6])
-def test_an_arm_that_stalls_is_held_until_it_has_caught_up(seconds: float) -> None:
-    link = linked(ANSWERING, fault_from_text("t", "f", f"stall {1000 * seconds:g}ms at 2s"))
-    refused = link.follow(6.0)
-    assert any("off its way" in reason for reason in refused)
-    assert link.arm.state is ArmState.ARMED
-    assert link.virtual.deepest < seconds + 0.25  # what was sent until two answers had told
-    assert link.arm.hold(6.0) == "" and link.arm.status(6.0).off < 0.2
+@pytest.mark.parametrize("seconds", [0.2, 0.3, 0.6])
+def test_what_an_arm_that_stalls_has_queued_is_called_back_and_it_goes_on_by_itself(seconds: float) -> None:
+    link = linked(ANSWERING, fault_from_text("t", "f", f"stall {1000 * seconds:g}ms at 2.01s"))
+    refused = link.follow(2.01 + seconds)
+    assert any("later on its way" in reason or "called back" in reason for reason in refused)
+    assert link.virtual.held <= 0.05 and link.virtual.queued <= 4
+    assert link.virtual.deepest < 0.15  # what was sent until an answer told
+    link.follow(4.0)
+    assert link.arm.state is ArmState.ARMED and link.arm.hold(link.clock.now()) == ""
+    assert any("called back" in event.text for event in link.arm.events())
     link.run(0.3)
-    assert link.virtual.in_flight == 0
+    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
+    assert link.virtual.in_flight == 0 and not link.virtual.ignored
+
+
+def test_without_a_pause_frame_an_arm_that_stalls_is_held_until_it_has_caught_up() -> None:
+    link = linked(ANSWERING, fault_from_text("t", "f", "stall 600ms at 2s"), link=LinkSettings(pause_frame=False))
+    refused = link.follow(6.0)
+    assert any("later on its way than its lag, limit 50 ms" in reason for reason in refused)
+    assert link.virtual.deepest < 0.15 and link.arm.state is ArmState.ARMED
+    assert link.arm.hold(6.0) == "" and link.arm.status(6.0).off < 0.2
+
+
+def test_an_arm_that_stalls_on_its_way_home_gets_there() -> None:
+    low = HOME + np.array([-20.0, 10, -20, 0, 0, 0])
+    link = linked(ANSWERING, fault_from_text("t", "f", "stall 600ms at 1s"), begin=low)
+    assert link.arm.home(0.0) == ""
+    link.run(8.0)
+    assert link.virtual.deepest < 0.16
+    assert link.arm.arrived(8.0) and link.executed() == pytest.approx(HOME, abs=1e-3)
+
+
+def test_an_arm_that_does_not_answer_works_off_what_a_stall_has_queued() -> None:
+    link = linked(ArmSettings(servo_lag=0.0), fault_from_text("t", "f", "stall 600ms at 1s"))
+
+    def each(now: float) -> None:
+        goal = circle(link.phase + 0.02)
+        assert link.arm.target is not None
+        feed = feed_for(link.arm.target, goal, 0.02)
+        if not link.arm.hold(now) and not link.arm.send(encode(G1(goal, feed)), now):
+            link.phase += 0.02
+
+    link.run(1.65, each, tick=0.0201)
+    assert link.virtual.held > 0.5  # nothing can tell
+    link.run(30.0, each, tick=0.0201)
+    assert link.virtual.held <= 0.05
 
 
 def test_an_arm_that_stays_behind_is_stopped() -> None:
     link = linked(ANSWERING, fault_from_text("t", "f", "stall 5s at 1s"))
     link.follow(6.0)
     assert link.arm.state is ArmState.STOPPED
-    assert "off its way" in link.arm.reason
+    assert "called back" in link.arm.reason and link.virtual.deepest < 0.15
 
 
 def test_an_arm_that_runs_away_is_stopped_at_once() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from estimation.errors import InputError
 from hardware.arm import Arm
-from hardware.arm_profile import ArmProfile
+from hardware.arm_profile import ArmProfile, at_baud
 from hardware.arm_status import ArmState
 from hardware.arm_travel import lifted, travel
 from hardware.link_settings import LinkSettings
@@ -16,7 +16,8 @@ from hardware.replies import Reply, ReplyKind, encode_reply
 from hardware.simulator.arm_faults import fault_from_text
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.virtual_port import PortFaults, VirtualPort
-from tests.linked import linked
+from planning.command import feed_for
+from tests.linked import circle, linked
 from tests.virtual_arm import HOME
 
 ANSWERING = ArmSettings(servo_lag=0.02, replies=Replies.STREAM)
@@ -110,6 +111,31 @@ def test_a_slower_line_leaves_room_for_less() -> None:
     slow = ArmProfile(baud=24_000)  # 20 ms a frame
     assert linked(profile=slow).arm.send(encode(G4(0.0299)), 0.0) == ""
     assert "limit 50 ms" in linked(profile=slow).arm.send(encode(G4(0.0301)), 0.0)
+
+
+def test_at_9600_bits_a_second_one_frame_is_on_the_wire_and_one_move_in_the_arm() -> None:
+    slow = at_baud(ArmProfile(), 9600)
+    assert (slow.frame_time, slow.tick) == (0.05, 0.05)
+    link = linked(profile=slow)
+    refused: list[str] = []
+
+    def each(now: float) -> None:
+        goal = circle(link.phase + 0.05)
+        assert link.arm.target is not None
+        feed = feed_for(link.arm.target, goal, 0.05)
+        if reason := link.arm.hold(now) or link.arm.send(encode(G1(goal, feed)), now):
+            refused.append(reason)
+        else:
+            link.phase += 0.05
+
+    link.run(10.0, each, tick=0.05025)
+    assert not refused and link.arm.state is ArmState.ARMED and link.arm.frames > 195
+    assert link.virtual.deepest <= 0.05 and link.deepest <= 0.1 + 1e-5 and link.virtual.fullest <= 2
+    link.arm.stop("asked for", link.clock.now())
+    decided, on_wire = link.arm.stops[0]
+    assert on_wire - decided <= 2 * slow.frame_time + 1e-9
+    assert linked(profile=slow).arm.send(encode(G4(0.05)), 0.0) == ""
+    assert "limit 100" in linked(profile=slow).arm.send(encode(G4(0.0501)), 0.0)
 
 
 @pytest.mark.parametrize("off", [0.02, 0.3, 0.9])

@@ -87,3 +87,21 @@ def test_bounds_hold_every_set_point_between() -> None:
     seen = np.array([queue.at(t) for t in np.linspace(0.9, 1.1, 200)])
     assert (seen >= np.array(low) - 1e-9).all() and (seen <= np.array(high) + 1e-9).all()
     assert low[0] == pytest.approx(seen[:, 0].min(), abs=1e-3) and high[0] == pytest.approx(seen[:, 0].max(), abs=1e-3)
+
+
+@given(st.lists(st.tuples(st.floats(-5, 5), st.floats(5.0, 50.0)), min_size=1, max_size=8), st.floats(0, 1))
+def test_when_it_passed_a_place_last_is_when_its_set_point_was_last_there(
+    moves: list[tuple[float, float]], share: float
+) -> None:
+    queue, now = ArmQueue(HOME.tolist(), 1 / 240, 0.0), 0.0
+    for way, feed in moves:
+        queue.add(G1(HOME + [way, 0, 0, 0, 0, 0], feed), now)
+        now += 0.05
+    until = share * queue.in_flight(0.0)
+    instants = np.linspace(0.0, until, 2000)
+    places = np.array([queue.at(t)[0] for t in instants])
+    for place in places[:: len(places) // 7]:
+        passed = queue.passed([place, *HOME[1:3]], 0.1, until)
+        near = instants[np.abs(places - place) <= 0.1]
+        assert passed == pytest.approx(near[-1], abs=2 * until / 2000 + 1e-9)
+    assert np.isnan(queue.passed([HOME[0] + 100, *HOME[1:3]], 0.1, until))

@@ -7,8 +7,9 @@ import os
 
 import numpy as np
 
+from hardware.arm_profile import ArmProfile
 from hardware.bench.figure import Figure, Target, at_most
-from hardware.bench.link_run import LOSSY, OBEYING, SECONDS, STALLING, Counts, Run
+from hardware.bench.link_run import LOSSY, NOTICED, OBEYING, SECONDS, STALLING, Counts, Run
 from hardware.clock import WallClock
 from hardware.progress import Progress
 
@@ -26,6 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--hours", type=float, default=1.0, metavar="H", help="of virtual time; default 1")
     parser.add_argument("--minutes", type=float, default=0.0, metavar="M", help="of real time on a pty; default none")
     parser.add_argument("--commands", type=int, default=100_000, metavar="N", help="random ones before the guard")
+    parser.add_argument("--baud", type=int, default=115_200, metavar="B", help="of the line in virtual time")
     parser.add_argument("--seed", type=int, default=0, help="of the first run")
     parser.add_argument(
         "--busy", type=int, default=1, metavar="N", help="processes that saturate a core each; default 1"
@@ -37,7 +39,7 @@ def run(options: argparse.Namespace) -> list[Figure]:
     """The figures of all parts that were asked for."""
     figures: list[Figure] = []
     if options.hours > 0:
-        figures += soak_figures(soaked(options.hours, options.seed))
+        figures += soak_figures(soaked(options.hours, options.seed, options.baud))
     if options.minutes > 0:
         from hardware.bench.link_live import live_figures
 
@@ -49,12 +51,12 @@ def run(options: argparse.Namespace) -> list[Figure]:
     return figures
 
 
-def soaked(hours: float, seed: int) -> Counts:
+def soaked(hours: float, seed: int, baud: int = ArmProfile().baud) -> Counts:
     """What happened in `hours` h of virtual time, in runs of ten minutes that take turns in what goes wrong."""
     counts, runs = Counts(), max(1, round(3600 * hours / SECONDS))
     with Progress("link", "runs of 10 min", WallClock().now) as progress:
         for k in range(runs):
-            Run(seed + k, counts).run()
+            Run(seed + k, counts, baud).run()
             counts.seconds += SECONDS
             progress(k + 1, runs)
     return counts
@@ -91,7 +93,14 @@ def _queued(name: str, counts: Counts) -> list[Figure]:
     for kind, most in sorted(counts.queued.items()):
         manner = kind.split(",")[0]
         target = at_most(50) if manner == OBEYING else None
-        figures.append(Figure(f"{name}: most queued, {kind}", 1000 * most, "ms", target, FIFO, KINDS[manner]))
+        note = f"{KINDS[manner]}; {counts.commands.get(kind, 0)} commands at most"
+        figures.append(Figure(f"{name}: most queued, {kind}", 1000 * most, "ms", target, FIFO, note))
+    for kind, most in sorted(counts.after.items()):
+        target = at_most(50) if kind.endswith("answering") else None
+        note = f"of {1000 * NOTICED:.0f} ms or more"
+        figures.append(
+            Figure(f"{name}: most queued at the end of a stall, {kind}", 1000 * most, "ms", target, "", note)
+        )
     return figures
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from estimation.se3 import Array
 from hardware.arm import Arm
-from hardware.arm_profile import ArmProfile
+from hardware.arm_profile import ArmProfile, at_baud
 from hardware.arm_status import ArmState
 from hardware.clock import SimClock
 from hardware.link_settings import LinkSettings
@@ -19,10 +19,11 @@ from hardware.simulator.arm_faults import ArmFault, FaultKind
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.controller import VirtualArm
 from hardware.simulator.virtual_port import PortFaults, VirtualDevice, Window
-from planning.command import TURNING
+from planning.command import feed_for
 
 SECONDS = 600.0  # of one run
 LONGEST = 0.6  # s of a stall
+NOTICED = 0.2  # s of a stall that answers 50 ms apart can tell before it is over
 REST = 0.055  # s after the last frame by which nothing may be under way: 50 ms, and a look at the line
 LOOK = 0.005  # s between looks at the line
 HOME = ArmProfile().arm.home
@@ -44,7 +45,9 @@ class Counts:
     forged: int = 0  # answers that the host took and the arm never gave
     refused: int = 0  # frames that the arm found out of reach
     modelled: float = 0.0  # most under way by the link's model
-    queued: dict[str, float] = field(default_factory=dict)  # most ahead in the arm, by kind of run
+    queued: dict[str, float] = field(default_factory=dict)  # most work held by the arm, by kind of run
+    commands: dict[str, int] = field(default_factory=dict)  # most commands held by the arm, by kind of run
+    after: dict[str, float] = field(default_factory=dict)  # most work held at the end of a stall that could be noticed
     restless: int = 0  # looks at which the arm still had work long after the last frame
     underruns: int = 0
     stops: list[float] = field(default_factory=list)  # from the decision to the last byte on the wire
@@ -121,18 +124,21 @@ def goal_at(phase: float) -> Array:
 class Run:
     """One run; its faults and the operator's impatience follow from the seed. kind: of the arm's own faults."""
 
-    def __init__(self, seed: int, counts: Counts) -> None:
+    def __init__(self, seed: int, counts: Counts, baud: int = ArmProfile().baud) -> None:
         rng = self._rng = np.random.default_rng(seed)
         self._counts = counts
         replies = Replies.STREAM if seed % 2 else (Replies.OFF, Replies.STRAY)[rng.integers(2)]
         manner = MANNERS[seed // 2 % len(MANNERS)]
         self.kind = f"{manner}, {'answering' if seed % 2 else 'silent'}"
         faults: list[ArmFault] = []
+        self._ends: deque[float] = deque()
         if manner == STALLING:
-            faults = [ArmFault(FaultKind.STALL, a, b - a) for a, b in windows(rng, 40.0, LONGEST)]
+            stalls = windows(rng, 40.0, LONGEST)
+            faults = [ArmFault(FaultKind.STALL, a, b - a) for a, b in stalls]
+            self._ends = deque(b for a, b in stalls if b - a >= NOTICED)
         if manner == LOSSY:
             faults = [ArmFault(FaultKind.UNPLUG, a, b - a) for a, b in windows(rng, 150.0, 2.0)]
-        profile = ArmProfile()
+        profile = at_baud(ArmProfile(), baud)
         settings = ArmSettings(replies=replies, seed=seed)
         self._clock = SimClock()
         self._virtual = VirtualArm(settings, profile.dialect, profile.arm.home, faults, profile.baud)
@@ -175,10 +181,7 @@ class Run:
             return
         assert arm.target is not None
         goal = goal_at(self._phase + arm.profile.tick)
-        way = goal - arm.target
-        length = float(np.linalg.norm(way[:3]))
-        speed = (length if length > TURNING else float(np.rad2deg(np.linalg.norm(way[3:])))) / arm.profile.tick
-        frame = encode(G1(goal, min(max(speed, 1.0), 250.0)))
+        frame = encode(G1(goal, min(feed_for(arm.target, goal, arm.profile.tick), 250.0)))
         if not arm.send(frame, now):
             self._phase += arm.profile.tick
             self._last = now
@@ -206,6 +209,9 @@ class Run:
             blocked = any(a < on_wire and b > decided for a, b in self._blocked)
             (counts.blocked_stops if blocked else counts.stops).append(on_wire - decided)
         self._seen_stops = stops
+        if self._ends and self._virtual.now >= self._ends[0]:
+            self._ends.popleft()
+            counts.after[self.kind] = max(counts.after.get(self.kind, 0.0), self._virtual.held)
 
     def _close(self) -> None:
         counts, virtual = self._counts, self._virtual
@@ -217,3 +223,4 @@ class Run:
         counts.refused += len(virtual.refused)
         counts.underruns += len(virtual.underruns)
         counts.queued[self.kind] = max(counts.queued.get(self.kind, 0.0), virtual.deepest)
+        counts.commands[self.kind] = max(counts.commands.get(self.kind, 0), virtual.fullest)

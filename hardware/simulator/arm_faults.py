@@ -100,6 +100,9 @@ def unplugged(faults: Sequence[ArmFault], instant: float) -> bool:
     return any(fault.kind is FaultKind.UNPLUG and fault.covers(instant) for fault in faults)
 
 
+Stretches = list[tuple[float, float, float]]  # of one command: begin and end, s, and the share of its usual rate
+
+
 class Rates:
     """How fast queued work is done while the controller stalls or is slow."""
 
@@ -107,12 +110,12 @@ class Rates:
         self._faults = [fault for fault in faults if fault.kind in (FaultKind.STALL, FaultKind.SLOW)]
         self._edges = sorted({edge for fault in self._faults for edge in (fault.start, fault.end)} | {math.inf})
 
-    def stretches(self, start: float, work: float, moving: bool) -> list[tuple[float, float, float]]:
+    def stretches(self, start: float, work: float, moving: bool) -> Stretches:
         """Work of `work` s at the usual rate, begun at `start`: stretches, each its begin, end and share of that rate.
 
         A stall stops pauses too; being slow, like a feed override, changes moves only.
         """
-        stretches: list[tuple[float, float, float]] = []
+        stretches: Stretches = []
         for edge in (edge for edge in self._edges if edge > start):
             rate = self._rate(start, moving)
             end = min(edge, start + work / rate) if rate else edge
@@ -145,12 +148,13 @@ class FaultyLine:
     def __call__(self, data: bytes, now: float) -> bytes:
         """What arrives of `data`, which comes at `now`, s."""
         arrived = bytearray()
-        for byte in data:
+        while data:
             if self._place == 0:
                 self._begin(now)
+            part, data = data[: LENGTH - self._place], data[LENGTH - self._place :]
             if self._mask is not None:
-                arrived.append(byte ^ self._mask[self._place])
-            self._place = (self._place + 1) % LENGTH
+                arrived += bytes(a ^ b for a, b in zip(part, self._mask[self._place :], strict=False))
+            self._place = (self._place + len(part)) % LENGTH
         return b"" if unplugged(self._faults, now) else bytes(arrived)
 
     def _begin(self, now: float) -> None:

@@ -34,7 +34,7 @@ from hardware.protocol import (
     decode,
 )
 from hardware.simulator.answers import Answers
-from hardware.simulator.arm_faults import ArmFault, FaultyLine, Rates
+from hardware.simulator.arm_faults import ArmFault, FaultyLine, Rates, Stretches
 from hardware.simulator.arm_settings import ArmSettings
 from hardware.simulator.polyline import AXES, Polyline
 from hardware.simulator.servo import Servo
@@ -49,7 +49,7 @@ class VirtualArm:
     frames: instructions understood. ignored: instants, s, of commands that found the FIFO full. refused: of targets and
     origins out of reach. garbage: instants and bytes that belong to no frame of this dialect. underruns: instants at
     which the queue ran dry within a motion, so that the arm stopped before the next move came. mode: the last one set.
-    deepest: s that the queue was ever ahead.
+    deepest: s of work that the queue ever held, however long a stall let it wait; fullest: commands.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class VirtualArm:
         if home_axes.shape != (AXES,) or not np.isfinite(home_axes).all():
             raise InputError("arm", "home", home_axes.tolist(), "6 finite numbers X Y Z A B C, mm and rad")
         self.frames, self.mode, self.now = 0, 0, 0.0
-        self.deepest = 0.0
+        self.deepest, self.fullest = 0.0, 0
         self.ignored: list[float] = []
         self.refused: list[float] = []
         self.underruns: list[float] = []
@@ -78,7 +78,7 @@ class VirtualArm:
         self._servo = Servo(self._setpoint, settings.dead_time, settings.servo_lag, _most(settings))
         self._target = home_axes.copy()  # machine coordinates, of the last command queued
         self._origin = np.zeros(3)
-        self._ends: deque[float] = deque()  # of the commands in the FIFO
+        self._fifo: deque[Stretches] = deque()  # of the commands in it
         self._free = 0.0  # when the last one ends
         self._flowing = False  # it is a move, and the next one may follow without a stop
 
@@ -96,8 +96,8 @@ class VirtualArm:
         """Let time pass until `until`, s."""
         assert until >= self.now
         self.now = until
-        while self._ends and self._ends[0] <= until:
-            self._ends.popleft()
+        while self._fifo and self._fifo[0][-1][1] <= until:
+            self._fifo.popleft()
         self._answers.advance(until, self.axes_at, self._origin)
 
     def transmit(self, now: float) -> bytes:
@@ -113,12 +113,17 @@ class VirtualArm:
     @property
     def queued(self) -> int:
         """Commands in the FIFO, the one being done included."""
-        return len(self._ends)
+        return len(self._fifo)
 
     @property
     def in_flight(self) -> float:
         """Seconds until the queue is done."""
         return max(self._free - self.now, 0.0)
+
+    @property
+    def held(self) -> float:
+        """Seconds of work in the queue: what it would take if nothing stalled."""
+        return sum(rate * max(end - max(begin, self.now), 0.0) for each in self._fifo for begin, end, rate in each)
 
     @property
     def origin(self) -> Array:
@@ -162,14 +167,14 @@ class VirtualArm:
         self._flowing = moving
         stretches = self._rates.stretches(begin, work, moving)
         self._free = stretches[-1][1]
-        self._ends.append(self._free)
-        self.deepest = max(self.deepest, self._free - self.now)
+        self._fifo.append(stretches)
+        self.deepest, self.fullest = max(self.deepest, self.held), max(self.fullest, self.queued)
         if target is not None and self._free > begin and moving:
             self._interpolate(stretches, (target - self._target) / work)
             self._setpoint.append(self._free, target, np.zeros(AXES))
             self._target = target
 
-    def _interpolate(self, stretches: list[tuple[float, float, float]], speed: Array) -> None:
+    def _interpolate(self, stretches: Stretches, speed: Array) -> None:
         axes = self._target
         for begin, end, rate in stretches:
             self._setpoint.append(begin, axes, rate * speed)
@@ -185,7 +190,7 @@ class VirtualArm:
         """Rest where the set-point is, with nothing queued."""
         self._setpoint.stop(self.now)
         self._target = self._setpoint.axes[-1].copy()
-        self._ends.clear()
+        self._fifo.clear()
         self._free, self._flowing = self.now, False
 
 
