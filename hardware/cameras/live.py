@@ -109,13 +109,18 @@ class LiveCameras:
                 self._changed.wait(LOOK)
 
     def set_offsets(self, offsets: Sequence[float] | Array) -> None:
-        """How much later than stamped each camera exposes beyond its rig's offset, (C,) s, as the estimator learns it.
+        """How much later than its own stamps each camera exposes beyond its rig's offset, (C,) s.
 
         Frames are paired by it from now on; their stamps stay as they are, so that whoever learns from them does not
-        learn from itself.
+        learn from itself. The estimator learns offsets from the stamps of sets: theirs are `learned - behind()`.
         """
         with self._changed:
             self._gathering.set_offsets(offsets)
+
+    def behind(self) -> Array:
+        """How much later than its set's stamp each camera is stamped, (C,) s, usually: cameras may be out of step."""
+        with self._changed:
+            return self._gathering.behind
 
     def health(self) -> LiveHealth:
         """How every camera fares now."""
