@@ -94,3 +94,11 @@ def check_size(image: Image, size: tuple[int, int], where: object, what: str) ->
     height, width = image.shape[:2]
     if (width, height) != size:
         raise InputError(where, what, f"{width} x {height} px", f"{size[0]} x {size[1]} px, the camera's `size`")
+
+
+def small_jpeg(image: Image, width: int, quality: int) -> bytes:
+    """JPEG, at a quality of 0-100, of an (H, W) grey or (H, W, 3) BGR image, at most `width` px wide."""
+    height = round(image.shape[0] * width / image.shape[1])
+    if width < image.shape[1]:
+        image = np.asarray(cv2.resize(image, (width, max(height, 1)), interpolation=cv2.INTER_AREA), np.uint8)
+    return encode(image, quality)[1]

@@ -1,0 +1,116 @@
+// One camera's live picture with what was found in it: outline, tracks, the path where it will lie, the nozzle.
+import { drawPath, Lens } from "./lens.js";
+
+export class CameraPane {
+  constructor(name, chosen) {
+    this.name = name;
+    this.root = document.createElement("figure");
+    this.root.className = "camera";
+    this.root.dataset.camera = name;
+    this.canvas = document.createElement("canvas");
+    const caption = document.createElement("figcaption");
+    this.title = document.createElement("span");
+    this.fare = document.createElement("span");
+    this.fare.className = "fare";
+    caption.append(this.title, this.fare);
+    this.root.append(this.canvas, caption);
+    this.root.addEventListener("click", () => chosen(name));
+    this.image = this.found = this.lens = null;
+    this.title.textContent = name;
+    this.fare.hidden = true;
+  }
+  see(camera) {
+    this.lens = new Lens(camera);
+  }
+  show(image, found) {
+    if (this.image) this.image.close();
+    [this.image, this.found] = [image, found];
+  }
+  fares(view) {
+    this.root.dataset.verdict = view ? view.verdict : "";
+    const parts = [];
+    if (view && view.words) parts.push(view.words);
+    else if (view) {
+      if (view.rate !== null) parts.push(`${view.rate.toFixed(0)} Hz`);
+      if (view.tracks) parts.push(`${view.tracks} tracks`);
+    }
+    this.fare.textContent = parts.join(" · ");
+    this.fare.hidden = !parts.length;
+  }
+  draw(scene, pose, fraction, base_from_nozzle) {
+    const ratio = window.devicePixelRatio || 1, w = Math.round(this.canvas.clientWidth * ratio), h = Math.round(this.canvas.clientHeight * ratio);
+    if (!w || !h) return;
+    if (this.canvas.width !== w || this.canvas.height !== h) [this.canvas.width, this.canvas.height] = [w, h];
+    const g = this.canvas.getContext("2d");
+    g.setTransform(1, 0, 0, 1, 0, 0);
+    g.clearRect(0, 0, w, h);
+    const size = this.lens ? this.lens.camera.size : this.image ? [this.image.width, this.image.height] : null;
+    if (!size) return;
+    const scale = Math.min(w / size[0], h / size[1]), x0 = (w - scale * size[0]) / 2, y0 = (h - scale * size[1]) / 2;
+    this.canvas.dataset.drawn = !this.image ? "" : scene && pose && this.lens ? "path" : "picture";
+    if (this.image) g.drawImage(this.image, x0, y0, scale * size[0], scale * size[1]);
+    if (!this.lens) return;
+    g.save();
+    g.beginPath();
+    g.rect(x0, y0, scale * size[0], scale * size[1]);
+    g.clip();
+    const on = (p) => p && [x0 + scale * (p[0] + 0.5), y0 + scale * (p[1] + 0.5)];
+    this.found && this.overlay(g, on, ratio);
+    if (scene && pose) {
+      const pixel = this.lens.from(pose);
+      const line = Math.min(Math.max(w / ratio / 260, 1), 3) * ratio; // thin where the picture is small
+      const here = drawPath(g, scene, fraction, (x, y, z) => on(pixel(x, y, z)), {
+        halo: { colour: "rgb(10 18 28 / .45)", width: 2.2 * line }, next: { colour: "#9fdcff", width: 0.9 * line },
+        done: { colour: "#3ddc84", width: 1.4 * line },
+      });
+      if (here) this.ring(g, here, ratio);
+    }
+    if (base_from_nozzle) this.nozzle(g, on, base_from_nozzle, ratio);
+    g.restore();
+  }
+  overlay(g, on, ratio) {
+    g.lineJoin = "round";
+    for (const polygon of this.found.outline) {
+      g.beginPath();
+      for (let i = 0; i + 1 < polygon.length; i += 2) g.lineTo(...on([polygon[i], polygon[i + 1]]));
+      g.closePath();
+      for (const [colour, width] of [["rgb(10 18 28 / .6)", 4], ["#ffd75e", 2]]) {
+        [g.strokeStyle, g.lineWidth] = [colour, width * ratio];
+        g.stroke();
+      }
+    }
+    const tracks = this.found.tracks, dot = 1.5 * ratio;
+    g.fillStyle = "#ffffff";
+    g.beginPath();
+    for (let i = 0; i + 1 < tracks.length; i += 2) {
+      const p = on(this.lens.distorted(tracks[i], tracks[i + 1]));
+      if (p) g.rect(p[0] - dot / 2, p[1] - dot / 2, dot, dot);
+    }
+    g.fill();
+  }
+  ring(g, [x, y], ratio) {
+    g.beginPath();
+    g.arc(x, y, 6 * ratio, 0, 2 * Math.PI);
+    for (const [colour, width] of [["rgb(10 18 28 / .7)", 4], ["#ffffff", 2]]) {
+      [g.strokeStyle, g.lineWidth] = [colour, width * ratio];
+      g.stroke();
+    }
+  }
+  nozzle(g, on, pose, ratio) {
+    const pixel = this.lens.from(pose), tip = on(pixel(0, 0, 0)), back = on(pixel(0, 0, 12));
+    if (!tip) return;
+    g.lineCap = "round";
+    for (const [colour, width] of [["rgb(10 18 28 / .75)", 6], ["#ff9f43", 3]]) {
+      [g.strokeStyle, g.fillStyle, g.lineWidth] = [colour, colour, width * ratio];
+      if (back) {
+        g.beginPath();
+        g.moveTo(...tip);
+        g.lineTo(...back);
+        g.stroke();
+      }
+      g.beginPath();
+      g.arc(tip[0], tip[1], 0.8 * width * ratio, 0, 2 * Math.PI);
+      g.fill();
+    }
+  }
+}

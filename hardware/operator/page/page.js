@@ -1,0 +1,213 @@
+// The operator's page: hears the run, shows it, and asks. The newest wins; nothing is kept but the last minute's error.
+import { Buttons } from "./buttons.js";
+import { CameraPane } from "./camera.js";
+import { Course } from "./course.js";
+import { SceneView } from "./scene.js";
+import { Line } from "./socket.js";
+import { ACTIVITIES, duration, figure, milliseconds, STAGES, TRACKING, upper, VERDICTS } from "./words.js";
+
+const LARGE = ["find", "confirm"]; // stages in which the pictures are what matters
+const CHECKED = ["check", "find", "confirm", "ready", "failed"];
+const by = (id) => document.getElementById(id);
+const state = { view: null, scene: null, poses: null, age: Infinity, since: 0, stale: 1, gone: false, full: false, chosen: null, large: null };
+const panes = new Map();
+const course = new Course(document.querySelector("#course canvas"));
+const space = new SceneView(by("scene"));
+
+async function hear(message) {
+  if (message instanceof ArrayBuffer) return pictures(message);
+  if (message.kind === "scene") scene(message);
+  else if (message.kind === "course") course.begin(message.rows);
+  else if (message.kind === "asked") buttons.asked(message);
+  else if (message.kind === "full") state.full = true;
+  else if (message.kind === "view" || message.kind === "gone") view(message);
+}
+
+function view(message) {
+  state.gone = message.kind === "gone";
+  state.full = false;
+  state.stale = message.stale;
+  state.age = message.age === null ? Infinity : message.age;
+  state.since = performance.now();
+  state.view = message.view;
+  if (state.view) course.add(state.view);
+  show();
+}
+
+function scene(message) {
+  for (const key of ["path", "surface"]) message[key] = Float32Array.from(message[key]);
+  state.scene = message;
+  for (const camera of message.cameras) pane(camera.name).see(camera);
+  space.see(message);
+  refresh();
+}
+
+async function pictures(data) {
+  const size = new DataView(data).getUint32(0, true), head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size)));
+  let offset = 4 + size;
+  const decoded = head.pictures.map((each) => {
+    const bytes = new Blob([new Uint8Array(data, offset, each.size)], { type: "image/jpeg" });
+    offset += each.size;
+    return createImageBitmap(bytes).catch(() => null);
+  });
+  const images = await Promise.all(decoded);
+  head.pictures.forEach((each, k) => images[k] && pane(each.camera).show(images[k], each));
+  state.poses = head.base_from_surface;
+  refresh();
+}
+
+function pane(name) {
+  if (!panes.has(name)) {
+    const made = new CameraPane(name, choose);
+    panes.set(name, made);
+    by("pictures").append(made.root);
+  }
+  return panes.get(name);
+}
+
+function choose(name) {
+  const large = document.body.dataset.large === "yes";
+  state.large = !(large && state.chosen === name);
+  if (large && state.chosen !== name) state.large = true;
+  state.chosen = name;
+  show();
+}
+
+function show() {
+  const seen = state.view, age = state.age + (performance.now() - state.since) / 1000;
+  const news = state.full ? "full" : state.gone ? "gone" : !line.connected ? "lost" : !seen ? "wait" : age > state.stale ? "old" : "live";
+  document.body.dataset.news = news;
+  by("news").textContent = { live: "live", wait: "waiting", old: "old", gone: "ended", lost: "not connected", full: "too many windows" }[news];
+  alarm(news, age);
+  if (seen) stage(seen);
+  buttons.show(seen, news === "live");
+  if (seen) {
+    checks(seen.checks);
+    states(seen);
+    tiles(seen);
+    progress(seen);
+    for (const camera of seen.cameras) pane(camera.name).fares(camera);
+  }
+  refresh();
+}
+
+function alarm(news, age) {
+  const words = {
+    old: `No news from the run for ${Number.isFinite(age) ? duration(age) : "a while"}. What is shown is old.`,
+    gone: "The run has ended. Nothing is connected to this page.",
+    lost: "No connection to the run. What is shown is old. To stop, use the emergency stop.",
+    full: "Too many windows show this page. Close one of them.",
+  }[news];
+  by("alarm").hidden = !words;
+  if (words) by("alarm").textContent = words;
+}
+
+function stage(seen) {
+  if (document.body.dataset.stage !== seen.stage) state.large = null;
+  document.body.dataset.stage = seen.stage;
+  document.body.dataset.turn = seen.turn;
+  const about = STAGES[seen.stage], holds = held(seen);
+  by("chip").textContent = holds ? "Holding" : about.word;
+  document.body.dataset.tone = holds ? "hold" : about.tone;
+  by("question").textContent = seen.question || (holds ? "Holding until it is safe to print." : about.say);
+  by("reason").textContent = upper((holds && seen.motion.reason) || seen.reason);
+  by("notes").replaceChildren(...seen.notes.map((note) => text("span", note)));
+  document.body.dataset.large = (state.large ?? LARGE.includes(seen.stage)) ? "yes" : "no";
+  const names = [...panes.keys()];
+  for (const [name, each] of panes) each.root.classList.toggle("chosen", name === (state.chosen ?? names[0]));
+}
+
+// whether it would print if it could; the reason then stands at the top
+function held(seen) {
+  return seen.stage === "print" && seen.motion !== null && seen.motion.activity === "holding";
+}
+
+function text(kind, words, style) {
+  const made = document.createElement(kind);
+  made.textContent = words;
+  if (style) made.className = style;
+  return made;
+}
+
+// all rows while it checks; later, while nothing is printed, those that are not good
+function checks(all) {
+  const rows = state.view.stage === "check" ? all : all.filter((row) => row.verdict === "warn" || row.verdict === "fail");
+  document.body.dataset.checks = rows.length && CHECKED.includes(state.view.stage) ? "yes" : "no";
+  const body = document.querySelector("#checks tbody");
+  const wanted = JSON.stringify(rows);
+  if (body.dataset.rows === wanted) return;
+  body.dataset.rows = wanted;
+  body.replaceChildren(...rows.map((row) => {
+    const line = document.createElement("tr"), found = text("td", row.found);
+    line.className = row.verdict;
+    if (row.remedy) found.append(text("div", row.remedy, "remedy"));
+    line.append(text("td", VERDICTS[row.verdict]), text("td", upper(row.name)), found);
+    return line;
+  }));
+}
+
+function states(seen) {
+  const put = (name, about, words) => {
+    const row = document.querySelector(`[data-state=${name}]`);
+    row.dataset.tone = about.tone;
+    row.querySelector("b").textContent = about.word;
+    row.querySelector("span").textContent = words;
+  };
+  const none = { word: "–", tone: "" }, { tracking, motion } = seen;
+  put("tracking", tracking ? TRACKING[tracking.state] : none, tracking ? tracking.reason : "");
+  const arm = motion && motion.arm ? `arm ${motion.arm}` : "";
+  put("motion", motion ? ACTIVITIES[motion.activity] : none, [held(seen) ? "" : motion && motion.reason, arm].filter(Boolean).join(" · "));
+}
+
+function tiles(seen) {
+  const { tracking, motion, latency } = seen;
+  const put = (name, value, unit, words, over) => {
+    const box = document.querySelector(`[data-tile=${name}]`);
+    box.firstElementChild.replaceChildren(value, text("small", value === "–" ? "" : unit));
+    box.lastElementChild.textContent = words;
+    box.classList.toggle("over", Boolean(over));
+  };
+  const beyond = (value, limit) => value !== null && limit !== null && value > limit;
+  put("error", figure(motion && motion.error, 2), "mm", motion && motion.limit !== null ? `error to come, limit ${motion.limit}` : "error to come", motion && beyond(motion.error, motion.limit));
+  put("truth", figure(motion && motion.true_error, 2), "mm", "true error", motion && beyond(motion.true_error, motion.limit));
+  document.querySelector("[data-tile=truth]").hidden = !motion || motion.true_error === null;
+  put("sigma", figure(tracking && tracking.sigma, 3), "mm", "uncertainty");
+  put("age", milliseconds(tracking && tracking.age), "ms", "age of pose");
+  put("latency", latency ? `${milliseconds(latency.median)} / ${milliseconds(latency.high)}` : "–", "ms", "image to arm", latency && beyond(latency.high, latency.limit));
+  put("flight", milliseconds(motion && motion.in_flight), "ms", "under way", motion && beyond(motion.in_flight, motion.most_in_flight));
+}
+
+function progress(seen) {
+  const far = seen.progress;
+  by("progress").hidden = !far;
+  if (!far) return;
+  document.querySelector("#progress i").style.width = `${(100 * far.share).toFixed(2)}%`;
+  const words = [`${(100 * far.share).toFixed(1)} %`, `checkpoint ${Math.floor(far.fraction) + 1} of ${far.total}`];
+  if (far.layers) words.push(`layer ${far.layer} of ${far.layers}`);
+  if (far.duty !== null) words.push(`printing ${(100 * far.duty).toFixed(0)} % of the time`);
+  by("place").textContent = words.join(" · ");
+  by("left").textContent = far.left === null ? "" : far.share >= 1 ? "done" : `${duration(far.left)} left`;
+}
+
+let due = false;
+function refresh() {
+  if (due) return;
+  due = true;
+  requestAnimationFrame(() => {
+    due = false;
+    const seen = state.view, fraction = seen && seen.progress ? seen.progress.fraction : -1;
+    const nozzle = seen && seen.motion && seen.motion.base_from_nozzle;
+    for (const each of panes.values()) each.draw(state.scene, state.poses, fraction, nozzle);
+    space.draw(seen, fraction);
+    course.draw();
+  });
+}
+
+space.changed = refresh;
+window.addEventListener("resize", refresh);
+const line = new Line(hear);
+const buttons = new Buttons((wish, turn) => line.ask(wish, turn));
+setInterval(() => {
+  show();
+  buttons.tick();
+}, 200);

@@ -1,0 +1,229 @@
+// The scene in three dimensions on a plain canvas: cheap without a graphics card, and there in every browser.
+import { drawPath, moved } from "./lens.js";
+
+const SIGMAS = 20; // the uncertainty is drawn so many times as large: 0.05 mm would not be seen
+const TOOL = { long: 26, wide: 3.2 }; // mm
+const PYRAMID = 0.2; // of a camera, as a share of what the view reaches
+
+export class SceneView {
+  constructor(root) {
+    this.canvas = root.querySelector("canvas");
+    this.scale = root.querySelector(".scale");
+    this.fit = "near";
+    this.eye = { turn: -0.6, tilt: 0.75, near: 1 };
+    this.scene = this.middle = null;
+    this.pose = null;
+    this.fingers = new Map();
+    this.changed = () => {};
+    this.listen(root);
+  }
+  see(scene) {
+    this.scene = scene;
+    this.middle = null;
+    const places = scene.cameras.map((c) => [0, 1, 2].map((r) => c.base_from_camera[r][3])), one = places[0] || [0, 0, 0];
+    const apart = Math.max(...places.map((p) => Math.hypot(...p.map((v, k) => v - one[k]))), ...places.map((p) => Math.hypot(...p)), 1);
+    this.reach = { all: 0.5 * apart, near: this.radius(scene) };
+  }
+  radius(scene) {
+    const points = scene.surface.length ? scene.surface : scene.path;
+    let most = 0;
+    for (let i = 0; i + 2 < points.length; i += 3) most = Math.max(most, Math.hypot(points[i], points[i + 1], points[i + 2]));
+    return Math.max(most, 10) * 0.8; // seen aslant, and what stands at the corners may leave the picture
+  }
+  listen(root) {
+    const canvas = this.canvas;
+    canvas.addEventListener("pointerdown", (e) => {
+      this.fingers.set(e.pointerId, [e.clientX, e.clientY]);
+      canvas.setPointerCapture(e.pointerId);
+    });
+    for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (e) => this.fingers.delete(e.pointerId));
+    canvas.addEventListener("pointermove", (e) => this.drag(e));
+    canvas.addEventListener("wheel", (e) => {
+      e.preventDefault();
+      this.zoom(Math.exp(e.deltaY * 0.001));
+    }, { passive: false });
+    for (const button of root.querySelectorAll("[data-fit]")) button.addEventListener("click", () => {
+      this.fit = button.dataset.fit;
+      this.eye.near = 1;
+      for (const each of root.querySelectorAll("[data-fit]")) each.setAttribute("aria-pressed", String(each === button));
+      this.changed();
+    });
+  }
+  drag(e) {
+    const before = this.fingers.get(e.pointerId);
+    if (!before) return;
+    const others = [...this.fingers].filter(([id]) => id !== e.pointerId).map(([, place]) => place);
+    this.fingers.set(e.pointerId, [e.clientX, e.clientY]);
+    if (others.length) {
+      const far = (p) => Math.hypot(p[0] - others[0][0], p[1] - others[0][1]) || 1;
+      return this.zoom(far(before) / far([e.clientX, e.clientY]));
+    }
+    this.eye.turn -= (e.clientX - before[0]) * 0.008;
+    this.eye.tilt = Math.min(Math.max(this.eye.tilt + (e.clientY - before[1]) * 0.008, 0.05), Math.PI / 2);
+    this.changed();
+  }
+  zoom(factor) {
+    this.eye.near = Math.min(Math.max(this.eye.near * factor, 0.1), 4);
+    this.changed();
+  }
+  // from a place in the base, mm, to canvas px and depth
+  project(w, h) {
+    const { turn, tilt, near } = this.eye, ct = Math.cos(turn), st = Math.sin(turn), cp = Math.cos(tilt), sp = Math.sin(tilt);
+    const right = [ct, st, 0], up = [-st * sp, ct * sp, cp], back = [st * cp, -ct * cp, sp], m = this.middle;
+    const reach = this.reach[this.fit] * near, scale = (0.5 * Math.min(0.8 * w, h)) / reach, eye = 6 * reach;
+    this.px = scale;
+    return ([x, y, z]) => {
+      const d = [x - m[0], y - m[1], z - m[2]], dot = (v) => v[0] * d[0] + v[1] * d[1] + v[2] * d[2];
+      const depth = dot(back), k = (scale * eye) / Math.max(eye - depth, 0.1 * eye);
+      return [w / 2 + k * dot(right), h / 2 - k * dot(up), depth];
+    };
+  }
+  draw(view, fraction) {
+    const ratio = window.devicePixelRatio || 1, canvas = this.canvas, w = Math.round(canvas.clientWidth * ratio), h = Math.round(canvas.clientHeight * ratio);
+    if (!w || !h) return;
+    if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
+    const g = canvas.getContext("2d");
+    g.clearRect(0, 0, w, h);
+    if (!this.scene) return;
+    const pose = view && view.tracking && view.tracking.state !== "INITIALISING" ? view.tracking.base_from_surface : null;
+    this.follow(pose);
+    const place = this.project(w, h);
+    g.lineJoin = g.lineCap = "round";
+    if (pose) {
+      this.surface(g, place, pose);
+      drawPath(g, this.scene, fraction, (x, y, z) => place(moved(pose, x, y, z)), {
+        hop: { colour: "rgb(42 111 151 / .18)", width: ratio }, next: { colour: "#2a6f97", width: 1.4 * ratio },
+        done: { colour: "#1f9d57", width: 3 * ratio },
+      });
+      this.uncertainty(g, place, pose, view.tracking.covariance, ratio);
+    }
+    this.cameras(g, place, ratio);
+    if (view && view.motion && view.motion.base_from_nozzle) this.tool(g, place, view.motion.base_from_nozzle);
+    this.ruler(ratio);
+  }
+  // the middle stays where it is, so that the wound is seen to move, unless it leaves
+  follow(pose) {
+    const at = pose ? [pose[0][3], pose[1][3], pose[2][3]] : [0, 0, 0];
+    const off = this.middle ? Math.hypot(...at.map((v, k) => v - this.middle[k])) : Infinity;
+    if (this.fit === "all") this.middle = at.map((v, k) => 0.5 * (v + this.average(k)));
+    else if (!(off < 0.6 * this.reach.near) || this.last !== this.fit) this.middle = at;
+    this.last = this.fit;
+  }
+  average(k) {
+    const cameras = this.scene.cameras;
+    return cameras.reduce((sum, c) => sum + c.base_from_camera[k][3], 0) / Math.max(cameras.length, 1);
+  }
+  surface(g, place, pose) {
+    const { surface, triangles } = this.scene, at = [], seen = [];
+    for (let i = 0; i + 2 < surface.length; i += 3) {
+      at.push(moved(pose, surface[i], surface[i + 1], surface[i + 2]));
+      seen.push(place(at[at.length - 1]));
+    }
+    if (!triangles.length) {
+      g.fillStyle = "rgb(176 122 100 / .7)";
+      for (const [x, y] of seen) g.fillRect(x - 1, y - 1, 2, 2);
+      return;
+    }
+    const faces = [];
+    for (let i = 0; i + 2 < triangles.length; i += 3) {
+      const [a, b, c] = [triangles[i], triangles[i + 1], triangles[i + 2]];
+      faces.push([seen[a][2] + seen[b][2] + seen[c][2], a, b, c]);
+    }
+    faces.sort((p, q) => p[0] - q[0]);
+    for (const [, a, b, c] of faces) {
+      const u = at[b].map((v, k) => v - at[a][k]), v = at[c].map((t, k) => t - at[a][k]);
+      const n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+      const lit = 0.72 + 0.28 * Math.abs((0.35 * n[0] - 0.25 * n[1] + 0.9 * n[2]) / (Math.hypot(...n) || 1));
+      g.fillStyle = g.strokeStyle = `rgb(${(240 * lit) | 0} ${(212 * lit) | 0} ${(198 * lit) | 0})`;
+      g.lineWidth = 1; // hides the seams between neighbours
+      g.beginPath();
+      for (const k of [a, b, c]) g.lineTo(seen[k][0], seen[k][1]);
+      g.closePath();
+      g.fill();
+      g.stroke();
+    }
+  }
+  uncertainty(g, place, pose, covariance, ratio) {
+    const root = cholesky(covariance);
+    if (!root) return;
+    g.strokeStyle = "#7a5ea8";
+    g.fillStyle = "rgb(122 94 168 / .12)";
+    g.lineWidth = 1.5 * ratio;
+    for (const [i, j] of [[0, 1], [1, 2], [2, 0]]) {
+      g.beginPath();
+      for (let k = 0; k <= 32; k++) {
+        const v = [0, 0, 0];
+        v[i] = SIGMAS * Math.cos((k * Math.PI) / 16);
+        v[j] = SIGMAS * Math.sin((k * Math.PI) / 16);
+        const p = root.map((row) => row[0] * v[0] + row[1] * v[1] + row[2] * v[2]);
+        const [x, y] = place(moved(pose, ...p));
+        g.lineTo(x, y);
+      }
+      g.fill();
+      g.stroke();
+    }
+  }
+  cameras(g, place, ratio) {
+    g.font = `${14 * ratio}px system-ui, "DejaVu Sans", sans-serif`;
+    for (const camera of this.scene.cameras) {
+      const t = camera.base_from_camera, [w, h] = camera.size, f = camera.matrix[0][0];
+      const long = PYRAMID * this.reach[this.fit];
+      const corner = (x, y) => place(moved(t, (long * x * w) / (2 * f), (long * y * h) / (2 * f), long));
+      const tip = place(moved(t, 0, 0, 0)), rim = [corner(-1, -1), corner(1, -1), corner(1, 1), corner(-1, 1)];
+      g.strokeStyle = g.fillStyle = "#4f5a66";
+      g.lineWidth = 1.5 * ratio;
+      g.beginPath();
+      for (const p of rim) {
+        g.moveTo(tip[0], tip[1]);
+        g.lineTo(p[0], p[1]);
+      }
+      g.moveTo(rim[3][0], rim[3][1]);
+      for (const p of rim) g.lineTo(p[0], p[1]);
+      g.stroke();
+      g.fillText(camera.name, tip[0] + 8 * ratio, tip[1] - 6 * ratio);
+    }
+  }
+  tool(g, place, pose) {
+    const tip = place(moved(pose, 0, 0, 0)), rim = [];
+    for (let k = 0; k < 16; k++) {
+      const a = (k * Math.PI) / 8;
+      rim.push(place(moved(pose, TOOL.wide * Math.cos(a), TOOL.wide * Math.sin(a), TOOL.long)));
+    }
+    const sides = rim.map((p, k) => [p, rim[(k + 1) % 16], k]).sort((p, q) => p[0][2] - q[0][2]);
+    for (const [p, q, k] of sides) {
+      const shade = 0.75 + 0.25 * Math.cos((k * Math.PI) / 8);
+      g.fillStyle = g.strokeStyle = `rgb(${(217 * shade) | 0} ${(131 * shade) | 0} ${(50 * shade) | 0})`;
+      g.lineWidth = 0.7;
+      g.beginPath();
+      for (const [x, y] of [tip, p, q]) g.lineTo(x, y);
+      g.closePath();
+      g.fill();
+      g.stroke();
+    }
+    g.fillStyle = "#a5621d";
+    g.beginPath();
+    for (const [x, y] of rim) g.lineTo(x, y);
+    g.fill();
+  }
+  ruler(ratio) {
+    const wanted = (70 * ratio) / this.px, power = 10 ** Math.floor(Math.log10(wanted));
+    const mm = [5, 2, 1].map((k) => k * power).find((k) => k <= wanted);
+    this.scale.firstElementChild.style.width = `${((mm * this.px) / ratio).toFixed(1)}px`;
+    this.scale.lastElementChild.textContent = `${mm} mm`;
+  }
+}
+
+// lower triangle of a covariance (3, 3); null where it is none
+function cholesky(c) {
+  const l = [[0, 0, 0], [0, 0, 0], [0, 0, 0]];
+  for (let i = 0; i < 3; i++)
+    for (let j = 0; j <= i; j++) {
+      let sum = c[i][j];
+      if (sum === null) return null;
+      for (let k = 0; k < j; k++) sum -= l[i][k] * l[j][k];
+      if (i !== j) l[i][j] = l[j][j] > 0 ? sum / l[j][j] : 0;
+      else if (sum < -1e-12) return null;
+      else l[i][i] = Math.sqrt(Math.max(sum, 0));
+    }
+  return l;
+}

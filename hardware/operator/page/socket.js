@@ -1,0 +1,43 @@
+// The line to the page's process: opened again whenever it breaks, and a stop goes by every way there is.
+
+const AGAIN = 700; // ms between two tries
+const SILENCE = 1500; // ms without a word, after which a stop does not trust the socket alone
+
+export class Line {
+  // hear: given each message, as an object or as an ArrayBuffer; resolves once it is shown
+  constructor(hear) {
+    this.hear = hear;
+    this.tag = 0;
+    this.heard = -Infinity;
+    this.open();
+  }
+  get connected() {
+    return this.socket.readyState === WebSocket.OPEN;
+  }
+  open() {
+    const url = new URL("socket", location.href);
+    url.protocol = url.protocol.replace("http", "ws");
+    const socket = (this.socket = new WebSocket(url));
+    socket.binaryType = "arraybuffer";
+    let before = Promise.resolve();
+    socket.addEventListener("message", (event) => {
+      this.heard = performance.now();
+      before = before.then(() => this.take(socket, event.data)).catch((error) => console.error(error));
+    });
+    socket.addEventListener("close", () => setTimeout(() => this.open(), AGAIN));
+  }
+  async take(socket, data) {
+    const message = typeof data === "string" ? JSON.parse(data) : data;
+    await this.hear(message);
+    if (message.bundle && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ shown: message.bundle }));
+  }
+  // ask for a wish under the turn that was shown; its tag, or null where nobody can be asked
+  ask(wish, turn) {
+    const tag = ++this.tag;
+    if (this.connected) this.socket.send(JSON.stringify({ ask: wish, turn, tag }));
+    if (wish === "stop" && (!this.connected || performance.now() - this.heard > SILENCE)) {
+      fetch("stop", { method: "POST" }).catch(() => {});
+    } else if (!this.connected) return null;
+    return tag;
+  }
+}

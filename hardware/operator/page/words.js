@@ -1,0 +1,53 @@
+// What things are called, and how figures are written.
+
+export const STAGES = {
+  check: { word: "Checking", tone: "wait", say: "Everything is checked before the arm may move." },
+  find: { word: "Looking", tone: "wait", say: "The wound is being looked for." },
+  confirm: { word: "Confirm", tone: "wait", say: "Does the path lie where it should in every picture?" },
+  ready: { word: "Ready", tone: "wait", say: "Ready to print. The arm waits." },
+  approach: { word: "Approach", tone: "good", say: "The nozzle goes to the wound." },
+  print: { word: "Printing", tone: "good", say: "Printing." },
+  paused: { word: "Paused", tone: "hold", say: "Paused. The arm stands and can go on." },
+  stopped: { word: "Stopped", tone: "bad", say: "Stopped. Nothing is sent to the arm." },
+  homing: { word: "Going home", tone: "good", say: "The arm goes home." },
+  done: { word: "Done", tone: "good", say: "The path is printed." },
+  failed: { word: "Failed", tone: "bad", say: "The run cannot go on. The arm is at rest." },
+};
+export const TRACKING = {
+  INITIALISING: { word: "Starting", tone: "hold" },
+  TRACKING: { word: "Good", tone: "good" },
+  DEGRADED: { word: "Weak", tone: "hold" },
+  COASTING: { word: "Predicted only", tone: "hold" },
+  LOST: { word: "Lost", tone: "bad" },
+};
+export const ACTIVITIES = {
+  resting: { word: "At rest", tone: "" },
+  entering: { word: "Entering", tone: "good" },
+  printing: { word: "Printing", tone: "good" },
+  travelling: { word: "Travelling", tone: "good" },
+  holding: { word: "Holding", tone: "hold" },
+  leaving: { word: "Leaving", tone: "good" },
+  homing: { word: "Going home", tone: "good" },
+};
+export const WISHES = {
+  confirm: "Yes, it lies right", start: "Start", resume: "Resume", pause: "Pause", again: "Again", home: "Home",
+  end: "Finish", stop: "Stop",
+};
+export const AGAIN = { check: "Check again", find: "Look again", confirm: "No, look again" };
+export const VERDICTS = { pass: "✓ good", warn: "! look", fail: "✗ mend", busy: "… busy" };
+
+export function figure(value, digits) {
+  return value === null || value === undefined ? "–" : value.toFixed(digits);
+}
+export function milliseconds(seconds) {
+  if (seconds === null || seconds === undefined) return "–";
+  return (1000 * seconds).toFixed(0);
+}
+export function duration(seconds) {
+  const whole = Math.max(0, Math.round(seconds)), h = Math.floor(whole / 3600), m = Math.floor(whole / 60) % 60, s = whole % 60;
+  if (h) return `${h} h ${m} min`;
+  return m ? `${m} min ${s} s` : `${s} s`;
+}
+export function upper(words) {
+  return words ? words[0].toUpperCase() + words.slice(1) : "";
+}

@@ -1,0 +1,102 @@
+"""An operator's page for tests: the server in a thread of this process, and views put by hand."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from estimation.pose import TrackState
+from hardware.operator.link import OperatorLink
+from hardware.operator.request import Request, Wish
+from hardware.operator.server import serve
+from hardware.operator.settings import Limits, OperatorSettings
+from hardware.operator.view import (
+    Activity,
+    CameraView,
+    Check,
+    LatencyView,
+    MotionView,
+    OperatorView,
+    ProgressView,
+    Stage,
+    TrackingView,
+    Verdict,
+)
+
+OFFERED = tuple(wish for wish in Wish if wish is not Wish.STOP)
+
+
+def full_view(stamp: float = 1.0, turn: int = 1, stage: Stage = Stage.PRINT, **changed: Any) -> OperatorView:
+    """A view with something in every place."""
+    pose = np.eye(4)
+    tracking = TrackingView(TrackState.TRACKING, "three cameras agree", 0.018, 0.052, pose, np.diag([1e-3] * 3), 182)
+    motion = MotionView(Activity.PRINTING, "", 0.21, 0.5, 0.19, 0.031, 0.05, pose, "armed", 6.0)
+    made = OperatorView(
+        stamp,
+        turn,
+        stage,
+        offers=OFFERED,
+        checks=(Check("arm", Verdict.FAIL, "does not answer", "Switch it on."), Check("path", Verdict.PASS, "fine")),
+        tracking=tracking,
+        motion=motion,
+        progress=ProgressView(1203.4, 3420, 0.352, 754.0, 0.87, 3, 12),
+        latency=LatencyView(0.0142, 0.0271, 0.035),
+        cameras=tuple(CameraView(f"camera{k}", Verdict.PASS, 29.9, 60) for k in range(3)),
+    )
+    return replace(made, **changed)
+
+
+class Served:
+    """The page being served. address: to open. It can be ended and begun again on the same port, as its process is."""
+
+    def __init__(self, limits: Limits | None = None) -> None:
+        self.link, self.settings = OperatorLink(), OperatorSettings()
+        self._limits = limits or Limits(stale=30.0, patience=30.0)
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.host = f"127.0.0.1:{self.listener.getsockname()[1]}"
+        self.address = f"http://{self.host}/{self.settings.token}/"
+        self.begin()
+
+    def begin(self) -> None:
+        """Serve."""
+        self._loop, self._ended = asyncio.new_event_loop(), asyncio.Event()
+        serving = serve(self.link, self.settings, self.listener.dup(), self._ended, self._limits)
+        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(serving,), daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """End serving, and tell the windows."""
+        self._loop.call_soon_threadsafe(self._ended.set)
+        self._thread.join(10)
+        assert not self._thread.is_alive()
+
+    def put(self, view: OperatorView) -> None:
+        """Show a view."""
+        self.link.views.put(view)
+
+    def taken(self, count: int = 1, timeout: float = 10.0) -> list[Request]:
+        """The requests that come until there are `count`."""
+        found, end = [], time.monotonic() + timeout
+        while len(found) < count and time.monotonic() < end:
+            found += self.link.requests.take()
+            time.sleep(0.005)
+        return found
+
+
+@contextmanager
+def served(limits: Limits | None = None) -> Iterator[Served]:
+    """The page, ended afterwards."""
+    made = Served(limits)
+    try:
+        yield made
+    finally:
+        made.end()
+        made.listener.close()

@@ -1,0 +1,179 @@
+"""Who is let in to the operator's page, what is served, and what it says back."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import shutil
+import ssl
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import aiohttp
+import pytest
+from operator_page import Served, served
+
+from estimation.errors import InputError
+from hardware.operator.gate import Gate
+from hardware.operator.link import OperatorLink
+from hardware.operator.process import OperatorPage
+from hardware.operator.request import Wish
+from hardware.operator.server import page_files
+from hardware.operator.settings import OperatorSettings, check_settings
+
+TOKEN = "a-token-of-sixteen-letters"
+SETTINGS = OperatorSettings(token=TOKEN)
+OWN = {"Host": "127.0.0.1:81", "Origin": "http://127.0.0.1:81", "Sec-Fetch-Site": "same-origin"}
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Served]:
+    with served() as made:
+        yield made
+
+
+def get(url: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], str]:
+    async def ask() -> tuple[int, dict[str, str], str]:
+        async with aiohttp.ClientSession() as session, session.request(method, url, headers=headers) as answer:
+            return answer.status, dict(answer.headers), await answer.text()
+
+    return asyncio.run(ask())
+
+
+@pytest.mark.parametrize(
+    ("reason", "changed", "token"),
+    [
+        ("token", {}, TOKEN[:-1] + "t"),
+        ("token", {}, ""),
+        ("token", {}, "schlüssel\udce4"),
+        ("host", {"Host": "evil.example:81"}, TOKEN),
+        ("host", {"Host": "127.0.0.1:82"}, TOKEN),
+        ("host", {"Host": "127.0.0.1"}, TOKEN),
+        ("origin", {"Origin": "http://evil.example"}, TOKEN),
+        ("origin", {"Origin": "http://127.0.0.1:9000"}, TOKEN),
+        ("origin", {"Origin": "null"}, TOKEN),
+        ("site", {"Sec-Fetch-Site": "cross-site"}, TOKEN),
+        ("site", {"Sec-Fetch-Site": "same-site"}, TOKEN),
+    ],
+)
+def test_each_thing_that_is_wrong_is_refused_alone(reason: str, changed: dict[str, str], token: str) -> None:
+    gate = Gate(SETTINGS, 81)
+    assert gate.refusal(TOKEN, OWN, True) == ""
+    assert gate.refusal(token, OWN | changed, True) == reason
+    assert gate.refused == {reason: 1}
+
+
+def test_what_could_change_something_needs_an_origin_and_what_only_looks_does_not() -> None:
+    gate = Gate(SETTINGS, 81)
+    bare = {"Host": "localhost:81"}
+    assert gate.refusal(TOKEN, bare, False) == ""
+    assert gate.refusal(TOKEN, bare, True) == "origin"
+
+
+def test_the_page_and_all_its_files_come_with_the_token_and_forbid_all_that_is_outside(page: Served) -> None:
+    names = page_files()
+    assert {"index.html", "page.css", "page.js", "icon.svg"} <= names.keys()
+    for name in ("", *names):
+        status, headers, text = get(page.address + name)
+        assert status == 200 and text
+        policy = headers["Content-Security-Policy"]
+        assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self'")
+        assert "unsafe" not in policy and "*" not in policy and "frame-ancestors 'none'" in policy
+        assert headers["X-Content-Type-Options"] == "nosniff" and headers["Referrer-Policy"] == "no-referrer"
+        assert headers["Cache-Control"] == "no-store" and headers["Server"] == "stillbed"
+
+
+def test_no_file_of_the_page_names_anything_outside() -> None:
+    for name, data in page_files().items():
+        outside = re.sub(r"http://www\.w3\.org/2000/svg", "", data.decode())
+        assert not re.search(r"(?:https?|wss?):?//|@import|url\(", outside), name
+
+
+@pytest.mark.parametrize("name", ["", "page.js", "socket", "stop", "nothing"])
+def test_without_the_token_nothing_is_there(page: Served, name: str) -> None:
+    base = f"http://{page.host}/"
+    for address in (base, f"{base}{page.settings.token[:-1]}/{name}", f"{base}%00/{name}"):
+        assert get(address)[0] == 403
+
+
+@pytest.mark.parametrize("name", ["nothing", "..%2f..%2fetc%2fpasswd", "../gate.py", "%2e%2e/gate.py", "page.js/x"])
+def test_nothing_but_the_pages_files_is_served(page: Served, name: str) -> None:
+    assert get(page.address + name)[0] in (403, 404)
+
+
+def test_a_stop_without_a_socket_is_taken_from_the_own_page_alone(page: Served) -> None:
+    before = page.link.requests.last_stop
+    assert get(page.address + "stop", "POST")[0] == 403
+    assert get(page.address + "stop", "POST", Origin="http://evil.example")[0] == 403
+    assert get(page.address + "stop", "GET", Origin=f"http://{page.host}")[0] == 404
+    assert page.link.requests.last_stop == before
+    assert get(page.address + "stop", "POST", Origin=f"http://{page.host}")[0] == 200
+    assert [request.wish for request in page.taken()] == [Wish.STOP]
+
+
+def test_a_page_of_another_origin_gets_no_socket(page: Served) -> None:
+    async def connect(**headers: str) -> None:
+        async with aiohttp.ClientSession() as session, session.ws_connect(page.address + "socket", headers=headers):
+            pass
+
+    for origin in ("http://evil.example", "http://127.0.0.1:9000"):
+        with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
+            asyncio.run(connect(Origin=origin))
+    with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
+        asyncio.run(connect())
+    with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
+        asyncio.run(connect(Origin=f"http://{page.host}", Host="evil.example"))
+    asyncio.run(connect(Origin=f"http://{page.host}"))
+
+
+@pytest.mark.parametrize(
+    ("what", "settings"),
+    [
+        ("host", OperatorSettings(host="0.0.0.0")),
+        ("host", OperatorSettings(host="192.168.1.7")),
+        ("host", OperatorSettings(host="somewhere")),
+        ("certificate", OperatorSettings(host="0.0.0.0", elsewhere=True)),
+        ("certificate", OperatorSettings(host="::", elsewhere=True)),
+        ("certificate", OperatorSettings(elsewhere=True, certificate=Path("/nowhere.pem"), key=Path("/nowhere.key"))),
+        ("token", OperatorSettings(token="short")),
+        ("token", OperatorSettings(token="sixteen letters/and more")),
+        ("port", OperatorSettings(port=70_000)),
+    ],
+)
+def test_settings_that_would_let_others_in_are_refused(what: str, settings: OperatorSettings) -> None:
+    with pytest.raises(InputError, match=what):
+        check_settings(settings)
+
+
+def test_tokens_differ_and_do_not_show_in_logs() -> None:
+    tokens = {OperatorSettings().token for _ in range(100)}
+    assert len(tokens) == 100 and all(len(token) >= 22 for token in tokens)
+    assert TOKEN not in repr(SETTINGS)
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl to make a certificate with")
+def test_other_machines_are_served_encrypted_under_the_certificates_name_alone(tmp_path: Path) -> None:
+    certificate, key = tmp_path / "page.pem", tmp_path / "page.key"
+    make = f"openssl req -x509 -newkey rsa:2048 -nodes -subj /CN=printer -days 2 -keyout {key} -out {certificate}"
+    subprocess.run(f"{make} -addext subjectAltName=DNS:printer".split(), check=True, capture_output=True)
+    names = ("printer",)
+    page = OperatorPage(OperatorLink(), OperatorSettings("0.0.0.0", 0, TOKEN, True, certificate, key, names))
+    page.tend(0.0)
+    port = int(page.address.split(":")[2].split("/")[0])
+    trusted = ssl.create_default_context(cafile=str(certificate))
+    trusted.check_hostname = False
+
+    async def ask(scheme: str, host: str) -> int:
+        url = f"{scheme}://127.0.0.1:{port}/{TOKEN}/"
+        async with aiohttp.ClientSession() as session, session.get(url, headers={"Host": host}, ssl=trusted) as answer:
+            return answer.status
+
+    try:
+        assert page.address == f"https://printer:{port}/{TOKEN}/"
+        assert asyncio.run(ask("https", f"printer:{port}")) == 200
+        assert asyncio.run(ask("https", f"localhost:{port}")) == 403
+        with pytest.raises(aiohttp.ClientError):
+            asyncio.run(ask("http", f"printer:{port}"))
+    finally:
+        page.close()
