@@ -79,6 +79,7 @@ def test_urls_and_files_name_themselves_and_nothing_else_does(tmp_path: Path) ->
     assert identity_from_text("here", "source", "rtsp://10.0.0.2/x", tmp_path).kind is Kind.STREAM
     found = identity_from_text("here", "source", "a.avi", tmp_path)
     assert found == Identity(Kind.FILE, str((tmp_path / "a.avi").resolve()))
+    assert identity_from_text("here", "source", "/dev/wound_left", tmp_path).kind is Kind.DEVICE
     for wrong in ("b.avi", "ftp://10.0.0.2/x", "usb:", "."):
         with pytest.raises(InputError, match="usb:SERIAL"):
             identity_from_text("here", "source", wrong, tmp_path)

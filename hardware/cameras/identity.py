@@ -58,7 +58,7 @@ def identity_from_text(where: object, key: str, text: str, folder: Path, root: P
         raise InputError(where, key, text, _instead(text, root))
     if text.startswith(URLS):
         return Identity(Kind.STREAM, text)
-    if text.startswith(tuple(f"/{link}/" for link in _LINKS)) or (text.startswith(USB) and text != USB):
+    if text.startswith("/dev/") or (text.startswith(USB) and text != USB):
         return Identity(Kind.DEVICE, text)
     path = folder / text
     if "://" in text or not path.exists() or path.is_dir():
