@@ -12,7 +12,7 @@ import pytest
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
 from hardware.cameras.command import NOTHING_THERE, list_text
-from hardware.cameras.controls import Control, ask_picture, lock, read_back, untaken
+from hardware.cameras.controls import Control, ask_picture, lock, locked_exposure, read_back, untaken
 from hardware.cameras.identity import Identity, Kind, device_node, identity_from_text, list_devices
 from hardware.cameras.settings import RANGES, CameraSource, read_live_rig, source_from_table
 from hardware.rig_file import read_rig, write_rig
@@ -83,6 +83,13 @@ def test_urls_and_files_name_themselves_and_nothing_else_does(tmp_path: Path) ->
     for wrong in ("b.avi", "ftp://10.0.0.2/x", "usb:", "."):
         with pytest.raises(InputError, match="usb:SERIAL"):
             identity_from_text("here", "source", wrong, tmp_path)
+
+
+@pytest.mark.parametrize("secret", ["p", "p@ss:w", ""])
+def test_a_password_is_not_shown(secret: str) -> None:
+    assert Identity(Kind.STREAM, f"rtsp://me:{secret}@10.0.0.2:554/x?y=@").shown == "rtsp://me:***@10.0.0.2:554/x?y=@"
+    for plain in ("rtsp://10.0.0.2:554/x", "http://h/a:b@c", BY_ID):
+        assert Identity(Kind.STREAM, plain).shown == plain
 
 
 def rig_file(folder: Path, *keys: str) -> Path:
@@ -194,6 +201,12 @@ def test_what_was_not_asked_for_is_left_as_it_is_and_told_to_be_automatic() -> N
 def test_an_exposure_is_taken_to_half_a_step_and_not_beyond() -> None:
     assert Control("exposure_s", 0.001, 0.00105).taken and not Control("exposure_s", 0.001, 0.001051).taken
     assert not Control("exposure_s", 0.001, 0.001, automatic=True).taken
+
+
+def test_only_an_exposure_that_is_locked_is_known() -> None:
+    assert locked_exposure([Control("gain", None, 3.0), Control("exposure_s", None, 0.004)]) == 0.004
+    assert locked_exposure([Control("exposure_s", None, 0.004, automatic=True)]) == 0.0
+    assert locked_exposure([Control("exposure_s", 0.008, 0.004)]) == locked_exposure([]) == 0.0
 
 
 def test_a_stream_takes_no_controls_and_says_so() -> None:

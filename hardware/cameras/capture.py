@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Protocol
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg's own lines on stderr: our words say it instead
+os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")  # s, as SILENT below; usually 10
 
 import cv2
 import numpy as np
@@ -20,7 +21,8 @@ from hardware.cameras.settings import CameraSource
 from hardware.clock import Clock
 from perception.frames import Image
 
-OPEN_TIMEOUT, READ_TIMEOUT = 3.0, 2.0  # s: a stream that is silent for longer is opened anew
+SILENT = 2  # s: a camera or stream that sends nothing for longer is opened anew
+OPEN_TIMEOUT = 3  # s until a stream that does not answer is given up
 FILE_FPS = 30.0  # Hz, where neither the container nor rig.toml tells a rate
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # an unplugged camera is told in our words
@@ -72,9 +74,12 @@ def open_capture(source: CameraSource, size: tuple[int, int] | None, clock: Cloc
 
 
 def _open_ffmpeg(identity: Identity) -> cv2.VideoCapture:
-    waits = {cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: OPEN_TIMEOUT, cv2.CAP_PROP_READ_TIMEOUT_MSEC: READ_TIMEOUT}
-    options = [int(number) for key, wait in waits.items() for number in (key, 1000 * wait)]
-    return cv2.VideoCapture(identity.text, cv2.CAP_FFMPEG, options)
+    options = {
+        cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: 1000 * OPEN_TIMEOUT,
+        cv2.CAP_PROP_READ_TIMEOUT_MSEC: 1000 * SILENT,
+        cv2.CAP_PROP_N_THREADS: 1,  # decoders of several threads hand each picture out that many frames later
+    }
+    return cv2.VideoCapture(identity.text, cv2.CAP_FFMPEG, [number for item in options.items() for number in item])
 
 
 class _OpenCapture:
@@ -92,7 +97,10 @@ class _OpenCapture:
         if self.ends:
             self._clock.wait_until(self._next)
             self._next = max(self._next, self._clock.now() - self._period) + self._period
-        return bool(self._capture.grab())
+        try:
+            return bool(self._capture.grab())
+        except cv2.error:
+            return False
 
     def position(self) -> float:
         told = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -111,6 +112,14 @@ def untaken(source: CameraSource) -> tuple[Control, ...]:
     """What was asked of a stream or a file, which takes nothing."""
     wanted = zip(LOCKABLE, _asked(source), strict=True)
     return tuple(Control(one.name, asked, None) for one, asked in wanted if asked is not None)
+
+
+def locked_exposure(controls: Sequence[Control]) -> float:
+    """The exposure that was read back, s; 0 where it is not locked, as an automatic one may be any."""
+    for control in controls:
+        if control.name == "exposure_s" and control.taken and not control.automatic and isinstance(control.got, float):
+            return control.got
+    return 0.0
 
 
 def _read_one(port: ControlPort, one: _Lockable, asked: float | None) -> Control:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hardware.cameras.capture import Capture, Opener, open_capture
-from hardware.cameras.controls import Control
+from hardware.cameras.controls import Control, locked_exposure
 from hardware.cameras.settings import CameraSource
 from hardware.cameras.stamping import Stamped, Stamping
 from hardware.cameras.state import CameraState, Phase, rate
@@ -136,9 +136,7 @@ class Feed:
 
     def _first(self, capture: Capture) -> None:
         controls = capture.lock()
-        exposures = [control.got for control in controls if control.name == "exposure_s"]
-        known = exposures and isinstance(exposures[0], float)
-        self._stamping.exposure = float(exposures[0]) if known and exposures[0] else self.source.exposure or 0.0
+        self._stamping.exposure = locked_exposure(controls)
         with self._lock:
             self._controls = controls
             self._opened += 1
@@ -183,7 +181,7 @@ class Feed:
             now, rhythm, last = self._clock.now(), self._stamping.rhythm, self._stamped
             return CameraState(
                 name=self.place.name,
-                source=self.source.identity.text,
+                source=self.source.identity.shown,
                 phase=self._phase,
                 since=now - self._since,
                 age=now - self._good,

@@ -14,6 +14,7 @@ URLS = ("rtsp://", "rtsps://", "http://", "https://")
 USB = "usb:"  # before a USB serial number
 STAYS = "a path in /dev/v4l/by-id or /dev/v4l/by-path, usb:SERIAL, a URL (rtsp, http) or a video file"
 _INDEX = re.compile(r"-?\d+|(/dev/)?video\d+")
+_PASSWORD = re.compile(r"(://[^/@:]*:)[^/]*@")
 _LINKS = ("dev/v4l/by-id", "dev/v4l/by-path")
 
 
@@ -31,6 +32,11 @@ class Identity:
 
     kind: Kind
     text: str
+
+    @property
+    def shown(self) -> str:
+        """The name without a password, for screens and recordings."""
+        return _PASSWORD.sub(r"\1***@", self.text)
 
 
 @dataclass(frozen=True, slots=True)

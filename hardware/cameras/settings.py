@@ -91,6 +91,6 @@ def _all_different(where: object, rig: Rig, sources: tuple[CameraSource, ...]) -
     for camera, source in zip(rig.cameras, sources, strict=True):
         if source.identity in seen:
             allowed = f"a source of its own; camera {seen[source.identity]!r} has this one"
-            raise InputError(where, f"camera {camera.name!r}: source", source.identity.text, allowed)
+            raise InputError(where, f"camera {camera.name!r}: source", source.identity.shown, allowed)
         seen[source.identity] = camera.name
     return sources

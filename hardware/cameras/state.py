@@ -30,7 +30,7 @@ class CameraState:
 
     since: s, how long its phase has lasted. age: s since its last good frame, or since the start. rate: Hz; jitter: s,
     rms; nan before frames come. lag: s, from the middle of the exposure to arrival, as far as the stamps tell. given:
-    frames that went into sets. missed: frames that never came, by the gaps between stamps. overrun: that nobody
+    good frames that were not overrun. missed: frames that never came, by the gaps between stamps. overrun: that nobody
     fetched in time. faults: left out, by reason. fault: that of the last frame. reopened: times that it came back.
     newest: its last picture, whatever is wrong with it.
     """
