@@ -7,6 +7,8 @@ printed = 12          # the last checkpoint that is done, for people
 
 from __future__ import annotations
 
+import os
+from math import floor
 from pathlib import Path as File
 
 from hardware import checks
@@ -30,6 +32,11 @@ class BookmarkFile:
             _replace(self._file, Bookmark(self._path, progress.fraction), progress.printed)
 
 
+def keep_bookmark(file: File, fingerprint: str, fraction: float) -> None:
+    """Write how far a print is, so that it outlives a power cut as well: this waits for the disk."""
+    _replace(file, Bookmark(fingerprint, fraction), floor(fraction), sure=True)
+
+
 def write_bookmark(file: File, path: Path, progress: Progress) -> None:
     """Write how far a print of `path` is."""
     _replace(file, bookmark(path, progress), progress.printed)
@@ -43,9 +50,13 @@ def read_start(file: File, path: Path) -> float:
     return resumed(path, mark, file)
 
 
-def _replace(file: File, mark: Bookmark, printed: int) -> None:
-    """Write beside the file and rename: there is always one that can be read."""
+def _replace(file: File, mark: Bookmark, printed: int, sure: bool = False) -> None:
+    """Write beside the file and rename: there is always one that can be read. sure: it is on the disk on return."""
     text = f'path = "{mark.path}"\nfraction = {mark.fraction!r}\nprinted = {printed}\n'
     beside = file.with_name(file.name + ".new")
-    beside.write_text(text, encoding="utf-8")
+    with beside.open("w", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        if sure:
+            os.fsync(stream.fileno())
     beside.replace(file)

@@ -15,6 +15,7 @@ from estimation.errors import StillbedError
 from hardware.arm_commands import add_arm
 from hardware.bench.command import add_bench
 from hardware.cameras.command import add_cameras
+from hardware.live.command import add_init, add_live
 from hardware.methods import MAP, METHODS
 from hardware.plan_commands import add_plan
 from hardware.reach_command import add_reach
@@ -87,6 +88,8 @@ def parser() -> argparse.ArgumentParser:
     _add_track(commands)
     add_segment(commands)
     add_plan(commands)
+    add_live(commands)
+    add_init(commands)
     _add_replay(commands)
     add_reach(commands)
     add_arm(commands)

@@ -21,6 +21,11 @@ class Lateness:
         self.count += 1
         self.most = max(self.most, late)
 
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """How many there were in each bin of BIN s; the last one holds all that were later."""
+        return tuple(self._counts)
+
     def percentile(self, share: float) -> float:
         """Lateness, s, that `share` percent of the ticks do not exceed, rounded up to a bin; NaN of none."""
         wanted, seen = share / 100 * self.count, 0

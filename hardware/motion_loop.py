@@ -60,6 +60,10 @@ def nobody(tick: Tick) -> None:
     """Tell nobody."""
 
 
+def nothing() -> None:
+    """Do nothing."""
+
+
 class MotionLoop:
     """One motion on one arm. lateness: of its ticks. skipped: ticks that were too late to be made."""
 
@@ -71,12 +75,16 @@ class MotionLoop:
         pose: Callable[[], SurfacePose | None],
         orders: Callable[[], Sequence[Order]],
         tell: Callable[[Tick], None] = nobody,
+        homed: Callable[[], None] = nothing,
     ) -> None:
-        """pose: the newest there is. orders: those that have come since the last call. tell: is told of each tick."""
+        """pose: the newest there is. orders: those that have come since the last call. tell: is told of each tick.
+
+        homed: is told when the arm has gone home, so that the motion begins from there.
+        """
         self.motion, self.arm = motion, arm
         self.lateness = Lateness()
         self.skipped = 0
-        self._clock, self._pose, self._orders, self._tell = clock, pose, orders, tell
+        self._clock, self._pose, self._orders, self._tell, self._homed = clock, pose, orders, tell, homed
         profile, settings = arm.profile, arm.settings
         self._period, self._pause, self._look = profile.tick * (1 + settings.ease), profile.limits.pause, settings.poll
         self._left_off: Array = profile.arm.home  # where planner and guard take the arm to be
@@ -115,6 +123,9 @@ class MotionLoop:
             self._answer = self._do(order, now)
         if self._homing and (self.arm.state is not ArmState.ARMED or self.arm.arrived(now)):
             self._homing = False
+            if self.arm.state is ArmState.ARMED:
+                self._left_off = self.arm.profile.arm.home
+                self._homed()
             self.arm.disarm(now)
 
     def _do(self, order: Order, now: float) -> str:

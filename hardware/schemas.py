@@ -13,6 +13,8 @@ from typing import Any
 
 Schema = dict[str, Any]
 
+INFO, WARNING, ERROR = 2, 3, 4  # levels of an event, Foxglove's numbers
+
 NUMBER: Schema = {"type": "number"}
 TEXT: Schema = {"type": "string"}
 WHOLE: Schema = {"type": "integer", "minimum": 0}
@@ -216,6 +218,25 @@ MOVE = _object(
 )
 HOLD = _object("stillbed.Hold", "Stay, because of the reason", stamp=STAMP, duration=_about(NUMBER, "s"), reason=TEXT)
 BYTES = _object("stillbed.Bytes", "Bytes on the arm's link", stamp=STAMP, data=BASE64)
+TICK = _object(
+    "stillbed.Tick",
+    "A tick of the motion: what it was given, and the frame that it gave",
+    stamp=STAMP,
+    pose_stamp=_array(NUMBER, None, "s, of the newest pose it had; empty: none"),
+    asked=_about(FLAG, "whether planner and guard were asked; otherwise the link held"),
+    fraction=_about(NUMBER, "place on the path, counted in checkpoints"),
+    phase=TEXT,
+    frame=BASE64,
+)
+LATENCY = _object(
+    "stillbed.Latency",
+    "How long a stage took so far",
+    stamp=STAMP,
+    stage=TEXT,
+    width=_about(NUMBER, "s, of a bin"),
+    counts=_array(WHOLE, None, "in each bin; the last holds all that were later"),
+    most=_about(NUMBER, "s, the largest"),
+)
 
 TOPICS: dict[str, Schema] = {
     "/rig": RIG,
@@ -229,6 +250,8 @@ TOPICS: dict[str, Schema] = {
     "/hold": HOLD,
     "/arm/sent": BYTES,
     "/arm/received": BYTES,
+    "/tick": TICK,
+    "/latency": LATENCY,
     "/events": LOG,
     "/tf": TRANSFORM,
 }

@@ -9,7 +9,8 @@ import numpy as np
 
 from estimation.pose import SurfacePose, TrackState
 from hardware.heads import TOLERANCE
-from hardware.recording import INFO, WARNING, Recorder
+from hardware.recording import Recorder
+from hardware.schemas import INFO, WARNING
 from hardware.session import Session
 from hardware.tum import rows_from_trajectory
 from perception.frames import FrameSet

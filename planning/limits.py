@@ -9,6 +9,9 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 
+MARGIN = np.array([5.0, 5, 5, *np.deg2rad([2, 2, 2])])  # that targets keep from the bounds: braking needs room
+JOINT_MARGIN = float(np.deg2rad(2))  # that joints keep from the ends of their ranges
+
 
 def _six(length: float, angle_deg: float) -> Array:
     return np.array([length] * 3 + [np.deg2rad(angle_deg)] * 3)

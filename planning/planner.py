@@ -25,7 +25,7 @@ from planning.follow import LEAD, Follower
 from planning.grid import Grid, grid_on
 from planning.kinematics import SimpleArm, axes_from_nozzle, joints_from_axes, limits_of, nozzle_from_axes
 from planning.legs import CORNER, SWERVE, Leg, entry, exit_from
-from planning.limits import Limits
+from planning.limits import JOINT_MARGIN, MARGIN, Limits
 from planning.path import Path, check_path
 from planning.progress import Phase, Progress, check_start
 from planning.retime import Timing, retime
@@ -33,8 +33,6 @@ from planning.retime import Timing, retime
 HORIZON = 1.0  # s of path timed at once: any speed can be stopped in it
 RENEW = 0.5  # s of it left when the next is timed; a horizon ends at rest, and the surface is foreseen for 0.5 s
 STALL = 3.0  # ticks without a call after which the arm has come to rest by itself
-MARGIN = np.array([5.0, 5, 5, *np.deg2rad([2, 2, 2])])  # that targets keep from the bounds: braking needs room
-JOINT_MARGIN = float(np.deg2rad(2))  # that joints keep from the ends of their ranges
 SHARE = 0.98  # of what the guard tolerates of a pose: the planner brakes before the guard would cut
 
 

@@ -15,8 +15,9 @@ from estimation.errors import InputError, StillbedError
 from estimation.observations import Observations
 from estimation.pose import TrackState
 from hardware import channels
-from hardware.recording import WARNING, Recorder
+from hardware.recording import Recorder
 from hardware.rig_file import table_from_rig
+from hardware.schemas import WARNING
 from hardware.session import open_session
 from hardware.tum import rows_from_trajectory
 from perception.frames import Frame, Roi

@@ -19,7 +19,7 @@ from estimation.errors import InputError
 from estimation.observations import Observations
 from hardware.images import encode
 from hardware.mcap_walk import ChunkOf, Damage, walk
-from hardware.messages import message_from_image, message_from_rig
+from hardware.messages import message_from_rig, text_of_image
 from hardware.recording import CHUNK_SECONDS, EPOCH, Recorder
 from hardware.schemas import CALIBRATION, IMAGE, TOPICS
 from hardware.session import open_session
@@ -171,7 +171,7 @@ HEAD = {"stamp": 0.0, "position": [1, 2, 3], "quaternion": [0, 0, 0, 1], "extrud
 RIG = message_from_rig(rig(2))
 ONE_FRAME = [
     ("/rig", RIG),
-    ("/camera/left/image", message_from_image(*encode(image(0, 0)), "left", 0)),
+    ("/camera/left/image", json.loads(text_of_image(*encode(image(0, 0)), "left", 0))),
     ("/frames", FRAME),
 ]
 

@@ -15,7 +15,7 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.clock import SimClock
 from hardware.path_file import read_path
-from hardware.recording import WARNING
+from hardware.schemas import WARNING
 from hardware.simulator.cameras import Shot
 from hardware.simulator.deformation import Deformation
 from hardware.simulator.look import Look

@@ -25,8 +25,9 @@ from estimation.trajectory import Trajectory
 from hardware.arm_file import write_arm
 from hardware.heads import row_from_head
 from hardware.pose_file import PoseWriter
-from hardware.recording import INFO, WARNING, Recorder
+from hardware.recording import Recorder
 from hardware.replay import CommandWriter
+from hardware.schemas import INFO, WARNING
 from hardware.simulator.cameras import JITTER_LIMIT, Shot
 from hardware.simulator.nozzle_file import NozzleWriter
 from hardware.simulator.nozzle_log import NozzleLog

@@ -97,13 +97,13 @@ def run_simulation(file: Path, out: Path, options: Options | None = None) -> Out
     prepare_out(out, options.force)
     clear(out)
     truth = Truth(scenario.rest, scenario.motion, scene.deformation, scenario.strain, scene.shape.surface_from_grid)
-    regions, scan = _regions(scenario, scene, truth), _scan(scenario, scene, out)
-    folder = RunFolder(out, scenario, planned_line(path), regions, truth.base_from_surface, scan)
+    around, scan = regions(scenario, scene, truth), _scan(scenario, scene, out)
+    folder = RunFolder(out, scenario, planned_line(path), around, truth.base_from_surface, scan)
     complete, skipped = False, 0
     try:
         with folder, ExitStack() as stack:
             exposures: Exposures = {}
-            step = stack.enter_context(_tracking(scenario, truth, regions, scan, exposures))
+            step = stack.enter_context(_tracking(scenario, truth, around, scan, exposures))
             line = stack.enter_context(PtyLink()).transfer if options.pty else bytes
             progress = stack.enter_context(Progress("simulate", "frame sets", WallClock().now))
             print(f"watch: {folder.watch.page.resolve().as_uri()}", file=sys.stderr)
@@ -114,7 +114,7 @@ def run_simulation(file: Path, out: Path, options: Options | None = None) -> Out
                 skipped = world.skipped
         complete = True
     finally:
-        outcome = _finish(scenario, path, truth, folder, regions, complete, skipped)
+        outcome = _finish(scenario, path, truth, folder, around, complete, skipped)
     return outcome
 
 
@@ -176,7 +176,7 @@ def _tracking_report(
     return result
 
 
-def _regions(scenario: Scenario, scene: Scene, truth: Truth) -> tuple[Roi, ...]:
+def regions(scenario: Scenario, scene: Scene, truth: Truth) -> tuple[Roi, ...]:
     """What an operator would draw around the wound in each camera's first picture."""
     start = SimulatedCameras(scenario.cameras, scenario.seed)
     found: list[Roi] = []

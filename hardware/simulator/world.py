@@ -25,7 +25,7 @@ from hardware.commanded import Commanded
 from hardware.images import decode
 from hardware.motion import MotionStep
 from hardware.progress import Report, silent
-from hardware.recording import WARNING
+from hardware.schemas import WARNING
 from hardware.simulator.agenda import ARRIVAL, EXPOSURE, KNOWN, TICK, Agenda
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras
 from hardware.simulator.controller import VirtualArm

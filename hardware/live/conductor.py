@@ -1,0 +1,297 @@
+"""The stages of a run as an operator knows them: what is asked for and what has happened lead from one to the next.
+
+Nothing here waits, sends or knows the time. Each call is given the newest reports and what was asked for, and answers
+with orders for the motion process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hardware.arm_profile import ArmProfile
+from hardware.arm_status import ArmState
+from hardware.live import checklist
+from hardware.live.laid import Laid, laid_on, lifted
+from hardware.live.records import Begin, LiveMotionReport, Pace, RecorderReport, TrackingReport
+from hardware.motion_loop import Order
+from hardware.operator.request import Request, Wish, refusal
+from hardware.operator.view import Answer, Check, Stage, Verdict
+from planning.path import Path
+from planning.progress import Phase, fingerprint
+
+Orders = list[Order | Pace | Begin]
+
+HOME_PATIENCE, ARM_PATIENCE = 60.0, 5.0  # s: across the whole room at 20 mm/s; until a stopped arm is at rest
+ASK_AGAIN = 0.3  # s between orders to an arm that was not ready for the last one
+LONGEST_LAG = 0.3  # s: a lag measured beyond this is no servo's
+SOUGHT = 180.0  # s in which all must be found, or nobody looks any longer where nobody watches
+MOVING = (Stage.APPROACH, Stage.PRINT, Stage.HOMING)
+RUNNING = (*MOVING, Stage.PAUSED)
+OFFERS = {
+    Stage.CHECK: (Wish.END,),
+    Stage.FIND: (Wish.END,),
+    Stage.CONFIRM: (Wish.CONFIRM, Wish.AGAIN, Wish.END),
+    Stage.READY: (Wish.START, Wish.AGAIN, Wish.END),
+    Stage.APPROACH: (Wish.PAUSE, Wish.HOME, Wish.END),
+    Stage.PRINT: (Wish.PAUSE, Wish.HOME, Wish.END),
+    Stage.PAUSED: (Wish.RESUME, Wish.HOME, Wish.END),
+    Stage.STOPPED: (Wish.RESUME, Wish.HOME, Wish.END),
+    Stage.HOMING: (Wish.END,),
+}
+QUESTIONS = {
+    Stage.CHECK: "Checking cameras, arm, path and recording",
+    Stage.FIND: "Looking for the wound and laying the path on it",
+    Stage.CONFIRM: "Does the path lie where it should be printed?",
+    Stage.READY: "Is nobody within the arm's reach? Then it may start",
+    Stage.APPROACH: "The nozzle goes to where printing begins",
+    Stage.PRINT: "Printing",
+    Stage.PAUSED: "Paused: resume, go home, or end",
+    Stage.STOPPED: "Stopped: resume, go home, or end",
+    Stage.HOMING: "The arm goes home",
+    Stage.DONE: "The path is printed",
+    Stage.FAILED: "The run has ended",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """What is to be printed, and how. path: in its own frame; start: counted in checkpoints, where it goes on.
+
+    place: put the arm where the surface lies below its home. stands_home: the operator says that the arm does.
+    lift: mm, of a dry run; None for a real one. unattended: nobody confirms and nobody resumes. patience: s, without
+    pictures or without an arm, after which the run ends.
+    """
+
+    path: Path
+    profile: ArmProfile
+    start: float = 0.0
+    place: bool = False
+    stands_home: bool = False
+    lift: float | None = None
+    unattended: bool = False
+    patience: float = 10.0
+
+
+@dataclass(slots=True)
+class Seen:
+    """The newest reports."""
+
+    tracking: TrackingReport | None = None
+    motion: LiveMotionReport | None = None
+    recorder: RecorderReport | None = None
+
+
+@dataclass(slots=True)
+class Conductor:
+    """Where the run is. turn: counts changes. ended: why it is over, "" while it is not. done: the path is printed."""
+
+    task: Task
+    stage: Stage = Stage.CHECK
+    reason: str = ""
+    turn: int = 0
+    ended: str = ""
+    done: bool = False
+    laid: Laid | None = None
+    answer: Answer | None = None
+    checks: tuple[Check, ...] = ()
+    _since: float = field(default=float("nan"))
+    _asked: float = field(default=float("-inf"))
+    _begun: bool = False
+    _homed: bool = False
+    _armed: bool = False  # since it was last asked for
+    _after: Stage = Stage.APPROACH  # the stage that homing leads to
+
+    @property
+    def offers(self) -> tuple[Wish, ...]:
+        """What would be followed now."""
+        return OFFERS.get(self.stage, ())
+
+    def __call__(self, now: float, seen: Seen, requests: Sequence[Request]) -> Orders:
+        """One look at all there is, at `now`, s."""
+        if np.isnan(self._since):
+            self._since = now
+        orders: Orders = []
+        for request in requests:
+            orders += self._asked_for(request, now)
+        self._check(seen, now)
+        if not self.ended:
+            orders += self._go_on(seen, now)
+        return orders
+
+    def end(self, reason: str, now: float, done: bool = False) -> Orders:
+        """End the run; the arm is stopped where it may still move."""
+        if self.ended:
+            return []
+        self.ended, self.done = reason, done
+        self._to(Stage.DONE if done else Stage.FAILED, reason, now)
+        return [] if done else [Order.STOP]
+
+    # -- what is asked for
+
+    def _asked_for(self, request: Request, now: float) -> Orders:
+        why = refusal(request.wish, request.turn, self.offers, self.turn)
+        self.answer = Answer(request.number, request.wish, not why, why)
+        return [] if why else self._follow(request.wish, now)
+
+    def _follow(self, wish: Wish, now: float) -> Orders:
+        if wish is Wish.STOP:
+            if self.stage in RUNNING:
+                self._to(Stage.STOPPED, "by the operator", now)
+            return [Order.STOP]
+        if wish is Wish.END:
+            return self.end("ended by the operator", now)
+        if wish is Wish.CONFIRM:
+            self._to(Stage.READY, "", now)
+        elif wish is Wish.AGAIN:
+            self.laid = None
+            self._to(Stage.CHECK, "", now)
+        elif wish is Wish.START:
+            return self._home(Stage.APPROACH, now)
+        elif wish is Wish.PAUSE:
+            self._to(Stage.PAUSED, "by the operator", now)
+            return [Pace.PAUSE]
+        elif wish is Wish.HOME:
+            return [Pace.PAUSE, *self._home(Stage.STOPPED, now)]
+        elif wish is Wish.RESUME:
+            resting = self.stage is Stage.STOPPED
+            self._to(Stage.APPROACH, "", now)
+            self._asked, self._armed = now, not resting
+            return [Pace.RESUME, *([Order.ARM] if resting else [])]
+        return []
+
+    def _home(self, after: Stage, now: float) -> Orders:
+        self._after, self._homed, self._asked = after, False, now
+        self._to(Stage.HOMING, "", now)
+        return [*([Order.AT_HOME] if self.task.stands_home and not self._begun else []), Order.HOME]
+
+    # -- what happens
+
+    def _check(self, seen: Seen, now: float) -> None:
+        task = self.task
+        cameras, calibration = checklist.camera_checks(seen.tracking, now)
+        arm, path = checklist.arm_check(seen.motion, task.stands_home), checklist.path_check(task.path, task.start)
+        reach, recorder = checklist.reach_check(self.laid), checklist.recorder_check(seen.recorder)
+        self.checks = cameras, calibration, arm, path, reach, recorder
+
+    def _go_on(self, seen: Seen, now: float) -> Orders:
+        tracking, motion = seen.tracking, seen.motion
+        if tracking is not None and tracking.ended:
+            return self.end(f"the cameras: {tracking.ended}", now)
+        if seen.recorder is not None and seen.recorder.failed:
+            return self.end(seen.recorder.failed, now)
+        if self.stage is Stage.CHECK:
+            return self._checking(now)
+        if tracking is None or motion is None:
+            return []
+        if self.stage in (Stage.FIND, Stage.CONFIRM, Stage.READY):
+            return self._finding(tracking, now)
+        if self.stage in RUNNING:
+            if orders := self._faults(tracking, motion, now):
+                return orders
+            if self.stage is Stage.HOMING:
+                return self._homing(motion, now)
+            return self._printing(motion, now)
+        if self.stage is Stage.STOPPED and self.task.unattended:
+            return self.end(f"stopped: {self.reason}", now)
+        return []
+
+    def _checking(self, now: float) -> Orders:
+        verdicts = {check.name: check for check in self.checks if check.name != "reach"}
+        waits = [check for check in verdicts.values() if check.verdict in (Verdict.FAIL, Verdict.BUSY)]
+        if not waits:
+            self._to(Stage.FIND, "", now)
+        elif self.task.unattended and now - self._since > max(self.task.patience, SOUGHT):
+            return self.end(f"the check failed: {waits[0].name}: {waits[0].found}", now)
+        return []
+
+    def _finding(self, tracking: TrackingReport, now: float) -> Orders:
+        task = self.task
+        if self.stage is Stage.FIND:
+            if tracking.surface_from_path is None or tracking.pose is None or not tracking.pose.state.measured:
+                if task.unattended and now - self._since > SOUGHT:
+                    why = "no pictures" if tracking.pose is None else tracking.pose.reason
+                    return self.end(f"the surface was not found: {why}", now)
+                return []
+            self.laid = laid_on(task.path, tracking.surface_from_path, tracking.pose, task.profile, task.place)
+            if self.laid.unreachable:
+                return self.end(f"out of reach: {self.laid.unreachable}", now) if task.unattended else []
+            self._to(Stage.CONFIRM, "", now)
+        if task.unattended:
+            return self._home(Stage.APPROACH, now)
+        return []
+
+    def _faults(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
+        status = motion.tick.status
+        if status.state is ArmState.UNPLUGGED:
+            return self.end(f"the arm is unplugged: {status.reason}", now)
+        if tracking.pose is not None and (age := now - tracking.pose.stamp) > self.task.patience:
+            return self.end(f"no pictures for {age:.1f} s", now)
+        if status.state is ArmState.ARMED:
+            self._armed = True
+        elif status.state is ArmState.STOPPED and self._armed and self.stage is not Stage.HOMING:
+            self._to(Stage.STOPPED, status.reason, now)
+        return []
+
+    def _homing(self, motion: LiveMotionReport, now: float) -> Orders:
+        """Home, then the path, then armed: in this order, each once the one before is done."""
+        status = motion.tick.status
+        if status.state is ArmState.ARMED:
+            self._homed = True
+        if not self._homed or status.state is ArmState.ARMED:
+            if now - self._since > HOME_PATIENCE:
+                return self.end(f"the arm did not come home: {motion.tick.answer or status.reason}", now)
+            if not self._homed and now - self._asked > ASK_AGAIN:
+                self._asked = now
+                return [Order.HOME]
+            return []
+        if self._after is Stage.DONE:
+            return self.end("the path is printed", now, done=True)
+        self._to(self._after, "at home", now)
+        if self._after is Stage.STOPPED:
+            return []
+        self._asked, self._armed = now, False
+        return [*self._begin(motion), Pace.RESUME, Order.ARM]
+
+    def _begin(self, motion: LiveMotionReport) -> Orders:
+        if self._begun:
+            return []
+        assert self.laid is not None
+        self._begun = True
+        task, laid, status = self.task, self.laid, motion.tick.status
+        path = laid.path if task.lift is None else lifted(laid.path, task.lift)
+        lag = task.profile.lag
+        if 0 < status.lag < LONGEST_LAG:  # measured from set-point to answer, NaN where it does not answer
+            lag = status.lag + task.profile.frame_time
+        return [Begin(path, laid.profile.arm, lag, task.start, fingerprint(task.path))]
+
+    def _printing(self, motion: LiveMotionReport, now: float) -> Orders:
+        progress = motion.progress
+        if self.stage is Stage.STOPPED:
+            return []
+        if not self._armed:
+            return self._arm_again(motion, now)
+        if progress is None or self.stage is Stage.PAUSED:
+            return []
+        if progress.phase is Phase.FINISHED:
+            return self._home(Stage.DONE, now)
+        if self.stage is Stage.APPROACH and progress.phase is Phase.PRINTING:
+            self._to(Stage.PRINT, "", now)
+        return []
+
+    def _arm_again(self, motion: LiveMotionReport, now: float) -> Orders:
+        """An arm that still moved when it was to be armed is asked again, for a while."""
+        if now - self._since > ARM_PATIENCE:
+            self._to(Stage.STOPPED, motion.tick.answer or motion.tick.status.reason, now)
+            return []
+        if now - self._asked < ASK_AGAIN:
+            return []
+        self._asked = now
+        return [Order.ARM]
+
+    def _to(self, stage: Stage, reason: str, now: float) -> None:
+        if (stage, reason) != (self.stage, self.reason):
+            self.turn += 1
+        self.stage, self.reason, self._since = stage, reason, now

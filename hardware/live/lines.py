@@ -1,0 +1,87 @@
+"""The processes of a run and what joins them, as the conducting process holds them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path as File
+
+from estimation.errors import StillbedError
+from hardware.clock import WallClock
+from hardware.live.bodies import move, move_virtually, record, show, track
+from hardware.live.crew import CONTEXT, Crew
+from hardware.live.frame_ring import FrameRing
+from hardware.live.outbox import Outbox
+from hardware.live.place import Place
+from hardware.live.prepared import Prepared
+from hardware.live.records import Handed, LiveMotionReport, RecorderReport, TrackingReport
+from hardware.live.settings import VIRTUAL
+from hardware.newest import Newest
+
+LOOK = 0.02  # s between looks for it
+READY = 60.0  # s in which a virtual arm's device must be there, on a busy machine
+
+
+@dataclass(slots=True)
+class Lines:
+    """What joins the processes. url: of the arm's port. lifeline, arm_line: nothing is ever said on them; they end
+    with us."""
+
+    crew: Crew
+    url: str
+    place: Place
+    tracking: Newest[TrackingReport]
+    motion: Newest[LiveMotionReport]
+    recorder: Newest[RecorderReport]
+    orders: Connection
+    lifeline: Connection
+    arm_line: Connection
+    outbox: Outbox
+
+    def end(self) -> None:
+        """End the processes in the order in which nobody misses anybody: the arm's first, the recorder last."""
+        self.crew.end("motion")
+        self.lifeline.close()
+        self.crew.end("tracking")
+        self.crew.end("feed", 1.0)
+        self.outbox.close()
+        self.crew.end("recorder", 30.0)
+        self.crew.end("arm", 0.1)
+
+    def close(self) -> None:
+        """Leave no process behind."""
+        for name in list(self.crew.members):
+            self.crew.kill(name)
+
+
+def started(prepared: Prepared, folder: File) -> Lines:
+    """Start all processes. folder: for a virtual arm's device."""
+    crew, url = Crew(), prepared.settings.arm
+    arm_line = CONTEXT.Pipe(duplex=False)
+    if url == VIRTUAL:
+        url = str(folder / "arm")
+        _start_arm(crew, prepared, File(url), arm_line[0])
+    place, ring = Place(), FrameRing([camera.size for camera in prepared.rig.cameras])
+    poses, tracking, motion = Newest[Handed](), Newest[TrackingReport](), Newest[LiveMotionReport]()
+    recorder = Newest[RecorderReport]()
+    senders = [CONTEXT.Pipe(duplex=False) for _ in range(3)]
+    lifeline, words, orders = (CONTEXT.Pipe(duplex=False) for _ in range(3))
+    crew.start("recorder", record, (prepared, [end for end, _ in senders], recorder))
+    crew.start("motion", move, (prepared, url, place, poses, motion, orders[0], senders[0][1]))
+    if not prepared.live:
+        crew.start("feed", show, (prepared, WallClock().now(), ring, words[1]))
+    crew.start("tracking", track, (prepared, ring, words[0], poses, tracking, motion, senders[1][1], lifeline[0]))
+    return Lines(
+        crew, url, place, tracking, motion, recorder, orders[1], lifeline[1], arm_line[1], Outbox(senders[2][1])
+    )
+
+
+def _start_arm(crew: Crew, prepared: Prepared, link: File, lifeline: Connection) -> None:
+    """Start a virtual arm, and wait for its device."""
+    crew.start("arm", move_virtually, (prepared, link, lifeline))
+    clock = WallClock()
+    until = clock.now() + READY
+    while not link.is_symlink():
+        if not crew.alive("arm") or clock.now() > until:
+            raise StillbedError("the virtual arm did not start")
+        clock.wait_until(clock.now() + LOOK)

@@ -1,0 +1,63 @@
+"""The motion of a live run: holds until a path is begun, then a MotionStep that can be paused, or begun at home."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from estimation.pose import SurfacePose
+from hardware.arm_profile import ArmProfile
+from hardware.live.place import Place
+from hardware.live.records import Begin
+from hardware.motion import MotionStep, bytes_from_command
+from planning.command import Command, Hold
+from planning.progress import Progress
+
+PAUSED = "paused by the operator"
+WAITING = "no path was confirmed yet"
+
+
+class LiveMotion:
+    """What a MotionLoop asks. asked: whether the last call asked planner and guard."""
+
+    last: Command
+
+    def __init__(self, profile: ArmProfile, place: Place) -> None:
+        self._profile, self._place = profile, place
+        self._step: MotionStep | None = None
+        self._begun: Begin | None = None
+        self.paused = False
+        self.asked = False
+
+    def begin(self, order: Begin) -> None:
+        """Print this path from now on."""
+        self._begun = order
+        self._make(order.start)
+
+    def homed(self) -> None:
+        """The arm stands at home: the motion begins from there, at the same place of the path."""
+        if self._step is not None:
+            self._make(self._step.progress.fraction)
+
+    @property
+    def progress(self) -> Progress | None:
+        """How far the print is; None before a path was begun."""
+        return None if self._step is None else self._step.progress
+
+    def __call__(self, pose: SurfacePose | None, now: float) -> bytes:
+        """The frame of the tick at `now`, s."""
+        self.asked = self._step is not None
+        if self._step is None:
+            self.last = Hold(now, self._profile.limits.pause, WAITING)
+            return bytes_from_command(self.last, self._profile.dialect)
+        frame = self._step(None if self.paused else pose, now)
+        self.last = self._step.last
+        if self.paused and isinstance(self.last, Hold):
+            self.last = replace(self.last, reason=PAUSED)
+        self._place.fraction = self._step.progress.fraction
+        return frame
+
+    def _make(self, start: float) -> None:
+        assert self._begun is not None
+        profile = replace(self._profile, arm=self._begun.arm, lag=self._begun.lag)
+        self._step = MotionStep(self._begun.path, profile, start)
+        self._place.fraction = start

@@ -1,0 +1,172 @@
+"""The body of the motion process of a live run: arm, MotionLoop, reports, and what is recorded of them.
+
+Loads nothing that holds Python's lock for long: no gtsam, cv2, open3d or onnxruntime.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+from collections import deque
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path as File
+from types import FrameType
+
+from estimation.pose import SurfacePose
+from hardware.arm import Arm
+from hardware.arm_port import Device
+from hardware.arm_profile import ArmProfile
+from hardware.arm_status import ArmEvent
+from hardware.bookmark_file import keep_bookmark
+from hardware.clock import WallClock
+from hardware.link_settings import LinkSettings
+from hardware.live.children import settle
+from hardware.live.histograms import Histograms
+from hardware.live.motion import LiveMotion
+from hardware.live.outbox import Outbox
+from hardware.live.place import Place
+from hardware.live.records import Begin, Handed, LiveMotionReport, Pace, Span, TickEntry, WireEntry
+from hardware.live.tap import Tap
+from hardware.motion_loop import MotionLoop, Order, Tick
+from hardware.newest import Newest
+from hardware.priority import ask_for_real_time
+
+EVENTS = 50  # of the last ones that a report holds
+SECOND_BYTE = 1  # of a frame: which instruction it is
+MOVE = ord("1")
+FRAMES_TO_WIRE = "frames handed over to move on the wire"
+EXPOSURE_TO_WIRE = "exposure to move on the wire"
+LATE = "tick late"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveMotionPlan:
+    """On which arm is printed. url: of its port. bookmark: where the place is kept if whoever conducts the run is gone.
+
+    real_time: ask for that priority. cores: to run on, all without any.
+    """
+
+    profile: ArmProfile
+    url: str
+    bookmark: File
+    settings: LinkSettings = field(default_factory=LinkSettings)
+    real_time: bool = True
+    cores: tuple[int, ...] = ()
+
+
+class _Orders:
+    """Takes the orders; those of a live run are followed here, those of the arm are passed on."""
+
+    def __init__(self, connection: Connection, motion: LiveMotion) -> None:
+        self._connection, self._motion = connection, motion
+        self.alone, self.fingerprint = False, ""
+        self._ended = False
+        signal.signal(signal.SIGTERM, self._end)
+
+    def __call__(self) -> list[Order]:
+        taken: list[Order] = []
+        try:
+            while self._connection.poll():
+                order = self._connection.recv()
+                if isinstance(order, Order):
+                    taken.append(order)
+                else:
+                    self._follow(order)
+        except (EOFError, OSError):
+            self.alone = True
+        return [*taken, Order.QUIT] if self.alone or self._ended else taken
+
+    def _follow(self, order: Begin | Pace) -> None:
+        if isinstance(order, Begin):
+            self.fingerprint = order.fingerprint
+            self._motion.begin(order)
+        else:
+            self._motion.paused = order is Pace.PAUSE
+
+    def _end(self, number: int, frame: FrameType | None) -> None:
+        self._ended = True
+
+
+class _Watch:
+    """Measures the way from frames to the wire, records what passes, reports each tick."""
+
+    def __init__(
+        self, plan: LiveMotionPlan, poses: Newest[Handed], reports: Newest[LiveMotionReport], outbox: Outbox
+    ) -> None:
+        self._poses, self._reports, self._outbox = poses, reports, outbox
+        self._clock = WallClock()
+        self.times = Histograms()
+        self._priority = ask_for_real_time() if plan.real_time else "nothing asked for"
+        self._events: deque[ArmEvent] = deque(maxlen=EVENTS)
+        self._given: Handed | None = None  # the newest pose that was looked at
+        self._first = False  # whether no move made of it went out yet
+        self.loop: MotionLoop | None = None
+        self.motion: LiveMotion | None = None
+
+    def pose(self) -> SurfacePose | None:
+        """The newest pose there is."""
+        handed = self._poses.get()
+        if handed is not self._given:
+            self._given, self._first = handed, True
+        return None if handed is None else handed.pose
+
+    def heard(self, data: bytes, sent: bool) -> None:
+        """Bytes passed the port."""
+        now = self._clock.now()
+        if sent and self._first and self._given is not None and len(data) > 1 and data[SECOND_BYTE] == MOVE:
+            self._first = False
+            self.times.add(FRAMES_TO_WIRE, now - self._given.handed)
+            self.times.add(EXPOSURE_TO_WIRE, now - self._given.pose.stamp)
+        self._outbox.put(WireEntry(now, data, sent))
+
+    def told(self, tick: Tick) -> None:
+        """A tick is done."""
+        loop, motion = self.loop, self.motion
+        assert loop is not None and motion is not None
+        self._events.extend(loop.arm.events())
+        progress, late = motion.progress, loop.lateness
+        if progress is not None:
+            stamp = math.nan if self._given is None else self._given.pose.stamp
+            asked = motion.asked and motion.last.stamp == tick.stamp
+            place = progress.fraction, progress.phase
+            self._outbox.put(TickEntry(tick.stamp, stamp, asked, tick.command, tick.frame, *place))
+        spans = (*self.times.spans(), Span(LATE, late.count, late.percentile(50), late.percentile(99), late.most))
+        stops = loop.arm.stops
+        self._reports.put(
+            LiveMotionReport(
+                *(tick, progress, motion.paused, tuple(self._events), spans, loop.skipped, len(stops)),
+                *(stops[-1] if stops else None, self._outbox.dropped, self._priority),
+            )
+        )
+
+
+def live_motion_process(
+    plan: LiveMotionPlan,
+    place: Place,
+    poses: Newest[Handed],
+    reports: Newest[LiveMotionReport],
+    orders: Connection,
+    record: Connection,
+) -> None:
+    """Follow orders until told to QUIT, or until whoever gives them is gone; then the arm is stopped."""
+    settle("motion", plan.cores)
+    clock, device, outbox = WallClock(), Device(plan.url, plan.profile.baud), Outbox(record)
+    motion, watch = LiveMotion(plan.profile, place), _Watch(plan, poses, reports, outbox)
+    told = _Orders(orders, motion)
+    try:
+        arm = Arm(Tap(device, watch.heard), plan.profile, clock.now(), plan.settings)
+        watch.motion = motion
+        loop = watch.loop = MotionLoop(motion, arm, clock, watch.pose, told, watch.told, motion.homed)
+        try:
+            loop.run()
+        finally:
+            watch.loop = None
+            arm.close()
+    finally:
+        device.release()
+        if told.alone and told.fingerprint:
+            keep_bookmark(plan.bookmark, told.fingerprint, place.fraction)
+        for entry in watch.times.entries(clock.now()):
+            outbox.put(entry)
+        outbox.close()

@@ -1,0 +1,146 @@
+"""What a run needs before its processes start: files read and checked, a scenario rendered, an earlier run taken up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from pathlib import Path as File
+from typing import Any
+
+from estimation.errors import InputError, StillbedError
+from estimation.rig import Rig
+from hardware.arm_file import read_arm
+from hardware.arm_profile import ArmProfile
+from hardware.bookmark_file import read_start
+from hardware.live.beside import Beside, Found, read_found
+from hardware.live.conductor import Task
+from hardware.live.crew import CONTEXT
+from hardware.live.settings import VIRTUAL, LiveSettings, check_settings, overridden, read_settings
+from hardware.mcap_walk import ChunkOf, parse, walk
+from hardware.messages import rig_from_message
+from hardware.path_file import read_path
+from hardware.rig_file import read_rig
+
+RIG_FILE = "rig.toml"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """settings: as used. session: whose pictures are shown (to and fro for ever where `again`), or live cameras.
+
+    virtual: what a virtual arm is like, None for one that answers. found: where an earlier run's path lies, None of a
+    new run. notes: what one should know all the time.
+    """
+
+    settings: LiveSettings
+    session: File
+    rig: Rig
+    again: bool
+    virtual: File | None
+    task: Task
+    found: Found | None
+    beside: Beside
+    notes: tuple[str, ...]
+
+    @property
+    def live(self) -> bool:
+        """Whether cameras are looked through, rather than a recorded session shown."""
+        return self.session.suffix == ".toml"
+
+
+def prepare(settings: LiveSettings, where: object, force: bool) -> Prepared:
+    """A new run. InputError where a file makes no sense or the recording exists and `force` is not set."""
+    settings = check_settings(settings, where)
+    assert settings.record is not None
+    beside = Beside(settings.record)
+    if settings.record.exists() and not force:
+        raise InputError(settings.record, "--record", "a file that exists", "a new file, or --force")
+    if not settings.record.parent.is_dir():
+        raise InputError(settings.record, "--record", "no such folder", "a file in a folder that exists")
+    for file in (beside.progress, beside.surface):
+        file.unlink(missing_ok=True)
+    return _prepared(settings, beside, None)
+
+
+def prepare_again(record: File, flags: dict[str, Any]) -> Prepared:
+    """The run that goes on where the one recorded in `record` stopped, with its settings and what `flags` overrides."""
+    beside = Beside(record)
+    if not record.exists():
+        raise InputError(record, "--resume", "no such file", "the recording of a run")
+    settings = overridden(read_settings(beside.session), flags)
+    found = read_found(beside.surface) if beside.surface.exists() else None
+    again = beside.next()
+    prepared = _prepared(check_settings(replace(settings, record=again.record), beside.session), again, found)
+    path = prepared.task.path
+    start = read_start(beside.progress, path) if beside.progress.exists() else 0.0
+    if start >= len(path) - 1:
+        raise InputError(beside.progress, "fraction", start, f"below {len(path) - 1}: the path is printed")
+    profile = prepared.task.profile
+    if found is not None:
+        profile = replace(profile, arm=replace(profile.arm, arm_from_base=found.arm_from_base))
+    task = replace(prepared.task, start=start, profile=profile, place=prepared.task.place and found is None)
+    return replace(prepared, task=task)
+
+
+def _prepared(settings: LiveSettings, beside: Beside, found: Found | None) -> Prepared:
+    notes = [f"dry run, {settings.lift:g} mm above the path"] if settings.dry_run else []
+    scenario, session, profile, path = settings.simulated, settings.rig, settings.profile, settings.path
+    virtual: File | None = None
+    if scenario is not None:
+        rendered = _rendered(scenario)
+        session, virtual = rendered / "session.mcap", rendered / "virtual_arm.pickle"
+        profile, path = profile or rendered / "arm.toml", path or rendered / "path.csv"
+        notes.append("simulated: pictures rendered before, shown in real time; the arm is not in them")
+    assert session is not None and path is not None
+    task = Task(
+        path=read_path(path),
+        profile=ArmProfile() if profile is None else read_arm(profile),
+        place=profile is None,
+        stands_home=settings.stands_home or settings.arm == VIRTUAL,
+        lift=settings.lift if settings.dry_run else None,
+        unattended=settings.unattended,
+        patience=settings.patience,
+    )
+    rig = rig_of(session)
+    again = scenario is not None
+    return Prepared(settings, session, rig, again, virtual, task, found, beside, tuple(notes))
+
+
+def rig_of(session: File) -> Rig:
+    """The cameras of a session folder, a recording or a rig file, without a look at its pictures."""
+    if session.is_dir():
+        return read_rig(session / RIG_FILE).rig
+    if session.suffix == ".toml":
+        return read_rig(session).rig
+    for part in walk(session):
+        if isinstance(part, ChunkOf):
+            for stored in part.messages:
+                if stored.topic == "/rig":
+                    return rig_from_message(f"{session} /rig", parse(session, stored))
+    raise InputError(session, "/rig", "no message", "a recording of stillbed's")
+
+
+def _rendered(scenario: File) -> File:
+    """The folder of the scenario's pre-rendered session; rendering is done by a process that ends before the run."""
+    answer, theirs = CONTEXT.Pipe(duplex=False)
+    process = CONTEXT.Process(target=_render, args=(scenario, theirs))
+    process.start()
+    theirs.close()
+    try:
+        folder, wrong = answer.recv()
+    except EOFError:
+        raise StillbedError(f"{scenario}: rendering ended before it was done") from None
+    finally:
+        process.join()
+    if wrong:
+        raise StillbedError(wrong)
+    return File(folder)
+
+
+def _render(scenario: File, answer: Connection) -> None:
+    from hardware.live.prerender import cache_folder, prerender  # loads all of the simulator
+
+    try:
+        answer.send((str(prerender(scenario, cache_folder()).folder), ""))
+    except StillbedError as error:
+        answer.send(("", str(error)))

@@ -1,0 +1,191 @@
+"""Pictures of a scenario, rendered before a live run shows them in real time: small machines cannot do both at once.
+
+A cache folder holds one session for each scenario: session.mcap with exact truth, path.csv as laid onto the true
+surface, arm.toml as the motion knows the arm, virtual_arm.pickle as it is, and
+scenario.toml. The nozzle and what it prints are not in the pictures,
+as nobody knows beforehand where they will be.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from estimation.observations import no_observations
+from estimation.pose import SurfacePose, identity_pose
+from estimation.se3 import Array
+from estimation.trajectory import Trajectory
+from hardware.arm_file import write_arm
+from hardware.clock import WallClock
+from hardware.path_file import read_path, write_path
+from hardware.progress import Progress
+from hardware.recording import Recorder
+from hardware.schemas import WARNING
+from hardware.simulator.cameras import Shot
+from hardware.simulator.laying import laid
+from hardware.simulator.nozzle_log import NozzleLog
+from hardware.simulator.scenario import Scenario
+from hardware.simulator.scenario_file import read_scenario
+from hardware.simulator.scene_table import scene_from_table
+from hardware.simulator.simulate import regions
+from hardware.simulator.truth import Truth
+from hardware.simulator.world import World
+from hardware.tum import rows_from_trajectory
+from perception.frames import FrameSet, PrintHead
+from perception.tracking import StepReport, trusting_report
+from planning.command import Command
+from planning.progress import Progress as Print
+
+VERSION = "3"  # of what the cache holds: another one is rendered anew
+DIGITS = 9  # of a truth's stamp: exposures of one instant are one
+
+
+@dataclass(frozen=True, slots=True)
+class Rendered:
+    """A pre-rendered session in its cache folder."""
+
+    folder: Path
+
+    @property
+    def session(self) -> Path:
+        """The recording of the pictures, with exact truth."""
+        return self.folder / "session.mcap"
+
+    @property
+    def path(self) -> Path:
+        """The checkpoints in the true surface frame."""
+        return self.folder / "path.csv"
+
+    @property
+    def arm(self) -> Path:
+        """What the motion knows of the arm."""
+        return self.folder / "arm.toml"
+
+    @property
+    def scenario(self) -> Path:
+        """The scenario's file, where it was read."""
+        return Path((self.folder / "scenario").read_text(encoding="utf-8"))
+
+
+def cache_folder() -> Path:
+    """Where pre-rendered sessions are kept, as the XDG rules have it."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stillbed"
+
+
+def cached(file: Path, cache: Path) -> Rendered:
+    """Where the session of a scenario lies or will lie; another text of scenario or path is another folder."""
+    text = file.read_bytes() + _path_bytes(file) + VERSION.encode()
+    return Rendered(cache / f"{file.stem}-{hashlib.sha256(text).hexdigest()[:12]}")
+
+
+def _path_bytes(file: Path) -> bytes:
+    """The bytes of the path that a scenario names, none where it names none that can be read."""
+    import tomllib
+
+    try:
+        named = str(tomllib.loads(file.read_text(encoding="utf-8"))["path"])
+        return (file.parent / named).read_bytes()
+    except (OSError, ValueError, KeyError, TypeError):
+        return b""
+
+
+def prerender(file: Path, cache: Path, threads: int = 2) -> Rendered:
+    """The session of the scenario in `file`, rendered unless it is there; a run cut short leaves nothing in its place.
+
+    InputError for a scenario that makes no sense.
+    """
+    scenario = read_scenario(file)
+    rendered = cached(file, cache)
+    if (rendered.folder / "scenario").exists():
+        return rendered
+    beside = rendered.folder.with_name(f"{rendered.folder.name}.{os.getpid()}")
+    beside.mkdir(parents=True)
+    try:
+        _render(replace(scenario, nozzle=False, beads=False), beside, threads)
+        (beside / "scenario").write_text(str(file.resolve()), encoding="utf-8")
+        shutil.rmtree(rendered.folder, ignore_errors=True)
+        beside.rename(rendered.folder)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+    return rendered
+
+
+def _render(scenario: Scenario, out: Path, threads: int) -> None:
+    scene = scene_from_table(scenario.file, scenario.scene, scenario.file.parent, scenario.seed)
+    path = read_path(scenario.path)
+    if scenario.clearance is not None:
+        path = laid(path, scene.shape, scenario.clearance, scenario.path)
+    truth = Truth(scenario.rest, scenario.motion, scene.deformation, scenario.strain, scene.shape.surface_from_grid)
+    write_path(out / "path.csv", path)
+    (out / "virtual_arm.pickle").write_bytes(pickle.dumps((scenario.arm, scenario.faults)))
+    write_arm(out / "arm.toml", scenario.profile, "what the motion knew of the arm")
+    shutil.copyfile(scenario.file, out / "scenario.toml")
+    with (
+        Recorder(out / "session.mcap", scenario.told_rig) as recorder,
+        Progress("pre-render", "frame sets", WallClock().now) as progress,
+    ):
+        for roi in regions(scenario, scene, truth):
+            recorder.write(roi)
+        sink = _Pictures(recorder, truth)
+        World(scenario, scene, path, truth, _Blind(len(scenario.rig)), {}, sink, WallClock(), threads).run(progress)
+        sink.finish()
+
+
+class _Blind:
+    """Sees no surface: nothing is tracked, so nothing is printed."""
+
+    def __init__(self, cameras: int) -> None:
+        self._cameras = cameras
+        self.last: StepReport
+
+    def __call__(self, frames: FrameSet) -> SurfacePose:
+        none = np.zeros(self._cameras, np.int64)
+        self.last = trusting_report(no_observations(frames.stamp), none, np.zeros(0))
+        return identity_pose(frames.stamp, "nobody looks")
+
+    def idle(self) -> None:
+        """Nothing to do."""
+
+
+class _Pictures:
+    """Records pictures and the truth at their exposures."""
+
+    def __init__(self, recorder: Recorder, truth: Truth) -> None:
+        self._recorder, self._truth = recorder, truth
+        self._exposed: list[float] = []
+
+    def picture(self, shot: Shot, kind: str, data: bytes) -> None:
+        """A picture has arrived."""
+        self._recorder.encoded_frame(shot.camera, shot.stamp, kind, data)
+        self._exposed.append(shot.exposed)
+
+    def finish(self) -> None:
+        """Write the truth, now that its instants can be put in order."""
+        stamps = np.unique(np.round(self._exposed, DIGITS))
+        trajectory = Trajectory(stamps, self._truth.base_from_surface(stamps), exact=True)
+        for row in rows_from_trajectory(trajectory):
+            self._recorder.truth_row(row, exact=True)
+
+    def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
+        """Nobody looks."""
+
+    def command(self, command: Command, progress: Print, frame: bytes, received: bytes) -> None:
+        """Nothing is printed."""
+
+    def head(self, stamp: float, head: PrintHead) -> None:
+        """There is none in the pictures."""
+
+    def rows(self, log: NozzleLog) -> None:
+        """Nothing is printed."""
+
+    def registered(self, truth_from_estimate: Array) -> None:
+        """Nothing is registered."""
+
+    def event(self, stamp: float, text: str, level: int = WARNING) -> None:
+        """What goes wrong with a picture is part of the scenario."""

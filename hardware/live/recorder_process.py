@@ -1,0 +1,157 @@
+"""The body of the recorder's process: takes what the others give, writes it, and never makes anybody wait."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+
+import numpy as np
+
+from estimation.errors import StillbedError
+from estimation.rig import Rig
+from estimation.trajectory import Trajectory
+from hardware.clock import ProcessorClock, WallClock
+from hardware.heads import row_from_head
+from hardware.live.children import settle
+from hardware.live.records import (
+    Entry,
+    EventEntry,
+    LatencyEntry,
+    PoseEntry,
+    RecorderReport,
+    RigEntry,
+    RoiEntry,
+    ScanEntry,
+    SetEntry,
+    TickEntry,
+    UsedEntry,
+    WireEntry,
+)
+from hardware.newest import Newest
+from hardware.recording import Recorder
+from hardware.tum import rows_from_trajectory
+
+QUIET = 0.2  # s without anything new after which what is there goes to the disk
+NICE = 10  # below all that moves the arm
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderPlan:
+    """Where to write. jpeg_quality: 0 to 100 of pictures that come as arrays, None to keep them exactly."""
+
+    file: Path
+    jpeg_quality: int | None
+    overwrite: bool
+    cores: tuple[int, ...] = ()
+
+
+def recorder_process(plan: RecorderPlan, senders: Sequence[Connection], reports: Newest[RecorderReport]) -> None:
+    """Record until all senders have closed their end; a fault of the disk ends it, said in the last report."""
+    settle("recorder", plan.cores, NICE)
+    writer = _Writer(plan, reports)
+    try:
+        writer.run(list(senders))
+    except StillbedError as error:
+        writer.tell(str(error))
+    finally:
+        try:
+            writer.close()
+        except StillbedError as error:
+            writer.tell(str(error))
+
+
+class _Writer:
+    """Writes entries once the rig is known, and what came before it then."""
+
+    def __init__(self, plan: RecorderPlan, reports: Newest[RecorderReport]) -> None:
+        self._plan, self._reports = plan, reports
+        self._clock, self._processor = WallClock(), ProcessorClock()
+        self._begin = self._clock.now(), self._processor.now()
+        self._recorder: Recorder | None = None
+        self._early: list[Entry] = []
+        self._failed = ""
+        self._said = 0.0
+
+    def run(self, senders: list[Connection]) -> None:
+        """Take entries until nobody is left to give any."""
+        while senders:
+            ready = wait(senders, QUIET)
+            if not ready and self._recorder is not None:
+                self._recorder.flush()
+            for sender in ready:
+                assert isinstance(sender, Connection)
+                try:
+                    self.write(pickle.loads(sender.recv_bytes()))
+                except (EOFError, ConnectionError):
+                    senders.remove(sender)
+            if self._clock.now() > self._said + QUIET:
+                self.tell()
+
+    def write(self, entry: Entry) -> None:
+        """Write one entry."""
+        if isinstance(entry, RigEntry):
+            self._open(entry.rig)
+        elif self._recorder is None:
+            self._early.append(entry)
+        else:
+            _write(self._recorder, entry)
+
+    def _open(self, rig: Rig) -> None:
+        plan = self._plan
+        self._recorder = Recorder(plan.file, rig, plan.jpeg_quality, plan.overwrite, compress=False)
+        early, self._early = self._early, []
+        for entry in early:
+            _write(self._recorder, entry)
+
+    def tell(self, failed: str = "") -> None:
+        """Say how it fares."""
+        now, spent = self._clock.now(), self._processor.now()
+        self._failed, self._said = self._failed or failed, now
+        share = (spent - self._begin[1]) / max(now - self._begin[0], 1e-3)
+        size = self._plan.file.stat().st_size if self._recorder is not None and self._plan.file.exists() else 0
+        self._reports.put(RecorderReport(now, size, share, self._failed))
+
+    def close(self) -> None:
+        """Close the file, and say so."""
+        if self._recorder is not None:
+            self._recorder.close()
+        self.tell()
+
+
+def _write(recorder: Recorder, entry: Entry) -> None:
+    if isinstance(entry, SetEntry):
+        for camera, (kind, data) in entry.encoded.items():
+            recorder.encoded_frame(camera, entry.stamps[camera], kind, data)
+        for frame in entry.frames:
+            recorder.frame(frame)
+    elif isinstance(entry, PoseEntry):
+        _write_pose(recorder, entry)
+    elif isinstance(entry, TickEntry):
+        recorder.write(entry.command)
+        recorder.tick(entry.stamp, entry.pose_stamp, entry.asked, entry.fraction, entry.phase.value, entry.frame)
+    elif isinstance(entry, WireEntry):
+        (recorder.sent if entry.sent else recorder.received)(entry.stamp, entry.data)
+    elif isinstance(entry, EventEntry):
+        recorder.event(entry.stamp, entry.text, entry.level, entry.name)
+    elif isinstance(entry, LatencyEntry):
+        recorder.latency(entry.stamp, entry.stage, entry.width, entry.counts, entry.most)
+    elif isinstance(entry, UsedEntry):
+        recorder.attach(entry.name, entry.text.encode())
+    elif isinstance(entry, ScanEntry):
+        recorder.surface(entry.file)
+    elif isinstance(entry, RoiEntry):
+        recorder.write(entry.roi)
+
+
+def _write_pose(recorder: Recorder, entry: PoseEntry) -> None:
+    stamp = entry.pose.stamp
+    if entry.truth is not None:
+        known = Trajectory(np.array([stamp]), entry.truth[None], exact=True)
+        recorder.truth_row(rows_from_trajectory(known)[0], exact=True)
+    if entry.head is not None:
+        recorder.head_row(row_from_head(stamp, entry.head), entry.head.extruding)
+    recorder.write(entry.observations)
+    recorder.write(entry.pose)

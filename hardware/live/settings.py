@@ -1,0 +1,189 @@
+"""session.toml: everything that a live run is told, in one file that is checked as a whole; flags override it.
+
+`stillbed init FOLDER` writes one with a comment for each key; every run writes the one that it used beside its
+recording. Files in it are relative to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from estimation.errors import InputError
+from hardware import checks
+
+VIRTUAL = "virtual"  # the arm that needs no device
+HIGHEST = 100.0  # mm of a dry run: above, the arm leaves the room that was looked at
+LONGEST = 600.0  # s of patience
+CORES = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class LiveSettings:
+    """What a run is told.
+
+    rig: session folder, MCAP or rig.toml whose cameras are used; simulated: a scenario instead. path: checkpoints; of
+    a scenario, its own. arm: device, URL of pyserial's or "virtual". profile: arm file. record: the recording.
+    jpeg_quality: of pictures that come unencoded; 0 keeps them exactly. dry_run: nothing is extruded, the
+    nozzle `lift` mm higher. unattended: nobody confirms. stands_home: the operator says that the arm does. pause_frame:
+    the arm knows the frame that stops it. page: serve the operator's page. patience: s without pictures that end the
+    run. real_time: ask for that priority. cores_*: to run on, all without any.
+    """
+
+    rig: Path | None = None
+    simulated: Path | None = None
+    path: Path | None = None
+    arm: str = ""
+    profile: Path | None = None
+    record: Path | None = None
+    jpeg_quality: int = 90  # three cameras' exact pictures take three cores to encode
+    dry_run: bool = False
+    lift: float = 10.0  # above a wound's rim, below what a hand would be put under
+    unattended: bool = False
+    stands_home: bool = False
+    pause_frame: bool = True
+    page: bool = True
+    patience: float = 10.0  # somebody finds a loose cable in that
+    real_time: bool = True
+    cores_tracking: tuple[int, ...] = ()
+    cores_motion: tuple[int, ...] = ()
+    cores_recorder: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """One key of the file: its table and name there, the setting it is, what it means, and an example."""
+
+    table: str
+    name: str
+    setting: str
+    about: str
+    example: str
+
+
+KEYS = (
+    Key(
+        "cameras", "rig", "rig", "session folder, recording or rig.toml: which cameras, where they stand", '"rig.toml"'
+    ),
+    Key(
+        "cameras", "simulated", "simulated", "a scenario instead, rendered once and then shown in real time", '"x.toml"'
+    ),
+    Key("cameras", "patience_s", "patience", "without pictures, after which the run ends; 1 to 600", "10.0"),
+    Key("print", "path", "path", "checkpoints on the surface; a scenario has its own", '"path.csv"'),
+    Key("print", "dry_run", "dry_run", "nothing is extruded, and the nozzle stays above", "false"),
+    Key("print", "lift_mm", "lift", "how far above, in a dry run; 0 to 100", "10.0"),
+    Key("print", "unattended", "unattended", "nobody confirms the path and the start", "false"),
+    Key("arm", "device", "arm", 'path of a port, URL of pyserial\'s, or "virtual"', '"/dev/ttyUSB0"'),
+    Key("arm", "profile", "profile", "arm file: place, limits, dialect, lag, tool", '"arm.toml"'),
+    Key("arm", "stands_home", "stands_home", "an arm that does not answer stands at its home now", "false"),
+    Key("arm", "pause_frame", "pause_frame", "its controller knows the frame that stops it at once", "true"),
+    Key("arm", "real_time", "real_time", "ask the system for real-time priority", "true"),
+    Key("record", "file", "record", "the recording; what else a run leaves stands beside it", '"run.mcap"'),
+    Key("record", "jpeg_quality", "jpeg_quality", "of pictures that come unencoded, 1 to 100; 0: exact", "90"),
+    Key("page", "serve", "page", "the operator's page in the browser", "true"),
+    Key("cores", "tracking", "cores_tracking", "processor cores to run on; left out: all", "[0]"),
+    Key("cores", "motion", "cores_motion", "", "[1]"),
+    Key("cores", "recorder", "cores_recorder", "", "[0]"),
+)
+FILES = ("rig", "simulated", "path", "profile", "record")
+SWITCHES = ("dry_run", "unattended", "stands_home", "pause_frame", "page", "real_time")
+TABLES = tuple(dict.fromkeys(key.table for key in KEYS))
+OPENING = "# A live run of stillbed: `stillbed live session.toml`. Lines that begin with # are examples.\n"
+
+
+def read_settings(file: Path) -> LiveSettings:
+    """The settings in a session.toml; InputError names the key that makes no sense."""
+    tables = checks.read_toml(file)
+    checks.check_keys(file, "", tables, (), TABLES)
+    given: dict[str, Any] = {}
+    for name in TABLES:
+        table = tables.get(name, {})
+        if not isinstance(table, dict):
+            raise InputError(file, name, table, f"a table [{name}]")
+        checks.check_keys(file, f"{name}.", table, (), [key.name for key in KEYS if key.table == name])
+        for key in KEYS:
+            if key.table == name and key.name in table:
+                given[key.setting] = _value(file, key, table[key.name])
+    return LiveSettings(**given)
+
+
+def _value(file: Path, key: Key, value: object) -> Any:
+    where = f"{key.table}.{key.name}"
+    if key.setting in FILES:
+        return file.parent / checks.text(file, where, value)
+    if key.setting in SWITCHES:
+        if not isinstance(value, bool):
+            raise InputError(file, where, value, "true or false")
+        return value
+    if key.setting.startswith("cores"):
+        if not (isinstance(value, list) and all(isinstance(core, int) and 0 <= core < CORES for core in value)):
+            raise InputError(file, where, value, "a list of core numbers, such as [0]")
+        return tuple(value)
+    if key.setting == "arm":
+        return checks.text(file, where, value)
+    if key.setting == "jpeg_quality":
+        return checks.integer(file, where, value, 0)
+    return checks.number(file, where, value)
+
+
+def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
+    """The settings themselves, if a run can be made of them; InputError names what is missing or out of range."""
+    s = settings
+    if (s.rig is None) == (s.simulated is None):
+        raise InputError(where, "cameras", "both" if s.rig else "neither", "one of rig and simulated")
+    if s.path is None and s.simulated is None:
+        raise InputError(where, "print.path", "missing", "the file of the checkpoints")
+    if not s.arm and s.simulated is None:
+        raise InputError(where, "arm.device", "missing", 'a device, or "virtual"')
+    if s.record is None or s.record.suffix != ".mcap":
+        raise InputError(where, "record.file", s.record or "missing", "a file that ends in .mcap")
+    if not 0 <= s.lift <= HIGHEST:
+        raise InputError(where, "print.lift_mm", s.lift, f"0 to {HIGHEST:g} mm")
+    if not 1 <= s.patience <= LONGEST:
+        raise InputError(where, "cameras.patience_s", s.patience, f"1 to {LONGEST:g} s")
+    if not 0 <= s.jpeg_quality <= 100:
+        raise InputError(where, "record.jpeg_quality", s.jpeg_quality, "0 to 100")
+    for name in ("rig", "simulated", "path", "profile"):
+        file = getattr(s, name)
+        if file is not None and not file.exists():
+            raise InputError(where, name, file, "a file that exists")
+    return replace(s, arm=s.arm or VIRTUAL)
+
+
+def settings_text(settings: LiveSettings | None = None) -> str:
+    """A session.toml: of these settings, with whole paths, or one of comments and examples to begin with."""
+    default, lines = LiveSettings(), [OPENING]
+    for table in TABLES:
+        lines.append(f"[{table}]")
+        for key in (key for key in KEYS if key.table == table):
+            value = getattr(settings or default, key.setting)
+            shown = _shown(value)
+            remark = f"  # {key.about}" if key.about else ""
+            if shown is None:
+                lines.append(f"# {key.name} = {key.example}{remark}")
+            else:
+                lines.append(f"{key.name} = {shown}{remark}")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _shown(value: object) -> str | None:
+    """A value as TOML writes it; None for one that is left out."""
+    if value is None or value in ("", ()):
+        return None
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return str(list(value))
+    if isinstance(value, Path):
+        value = str(value.resolve())
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return repr(value)
+
+
+def overridden(settings: LiveSettings, flags: dict[str, Any]) -> LiveSettings:
+    """The settings with what was given on the command line; None was not given."""
+    names = {f.name for f in fields(LiveSettings)}
+    return replace(settings, **{name: value for name, value in flags.items() if name in names and value is not None})

@@ -1,0 +1,82 @@
+"""The body of a virtual arm's process: serves a pseudo-terminal, and leaves what was executed for whoever judges it."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import threading
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+
+from hardware.arm_profile import ArmProfile
+from hardware.clock import WallClock
+from hardware.live.children import settle
+from hardware.priority import ask_for_real_time
+from hardware.simulator.arm_faults import ArmFault
+from hardware.simulator.arm_settings import ArmSettings, Replies
+from hardware.simulator.port import run_virtual_arm
+
+AFTERWARDS = 2.0  # s that the arm goes on without whoever conducted the run: it has to come to rest by itself
+STEP = 0.002  # s between rows of what was executed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VirtualArmPlan:
+    """link: to the device. executed: file for the motion. kept: what the arm is like, as `prerender` keeps it.
+
+    Without that it is one that answers.
+    """
+
+    link: Path
+    executed: Path
+    profile: ArmProfile
+    kept: Path | None
+    real_time: bool
+
+
+class _Since:
+    """A clock that remembers its first instant."""
+
+    def __init__(self) -> None:
+        self._clock = WallClock()
+        self.begun: float | None = None
+
+    def now(self) -> float:
+        """Instant, s."""
+        now = self._clock.now()
+        self.begun = now if self.begun is None else self.begun
+        return now
+
+    def wait_until(self, instant: float) -> None:
+        """Sleep until `instant`, s."""
+        self._clock.wait_until(instant)
+
+
+def virtual_arm_process(plan: VirtualArmPlan, lifeline: Connection) -> None:
+    """Serve until SIGTERM or the end of the lifeline, then write what was executed: stamps (N,) s and axes (N, 6)."""
+    settle("arm")
+    settings, faults = ArmSettings(replies=Replies.STREAM), tuple[ArmFault, ...]()
+    if plan.kept is not None:
+        settings, faults = pickle.loads(plan.kept.read_bytes())
+    if plan.real_time:
+        ask_for_real_time()  # a real controller shares no core with us
+    clock, stop = _Since(), threading.Event()
+    threading.Thread(target=_end_with, args=(lifeline, stop), daemon=True).start()
+    with redirect_stdout(io.StringIO()):
+        arm = run_virtual_arm(settings, plan.profile, faults, plan.link, clock=clock, stop=stop)
+    assert clock.begun is not None
+    stamps = np.arange(0.0, arm.now, STEP)
+    axes = arm.axes_at(stamps) if len(stamps) else np.zeros((0, 6))
+    with plan.executed.open("wb") as file:
+        np.savez(file, stamps=stamps + clock.begun, axes=axes, ignored=len(arm.ignored), frames=arm.frames)
+
+
+def _end_with(lifeline: Connection, stop: threading.Event) -> None:
+    """Set `stop` some time after the other end of a line, on which nothing is ever said, is gone."""
+    lifeline.poll(None)
+    stop.wait(AFTERWARDS)
+    stop.set()

@@ -1,0 +1,172 @@
+"""Live runs for tests: a small session rendered once, runs under a terminal of their own, and what they left."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from hardware.clock import WallClock
+from hardware.live.beside import Beside
+from hardware.mcap_walk import ChunkOf, parse, walk
+from hardware.session import Session, open_session
+
+ROOT = Path(__file__).parents[1]
+CLOCK = WallClock()
+PATIENCE = 90.0  # s: a busy machine takes most of a minute to start six processes
+SCENARIO = """
+title = "Small"
+seconds = 2.7
+seed = 3
+path = "path.csv"
+clearance_mm = 0.4
+bead_mm = 1.0
+[scene]
+body = "chest"
+wound = false
+texel_mm = 0.3
+[[motion]]
+kind = "breathing"
+amplitude_mm = 2.0
+rate_hz = 0.4
+[rig]
+size = [320, 180]
+focal_px = 275
+[cameras]
+fps = 20.0
+"""
+
+PATH = """x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,speed_mm_s,material,temperature_c,layer,extrude
+-6,-2,0,0,0,0,5,1,20,0,0
+6,-2,0,0,0,0,5,1,20,0,1
+6,0,0,0,0,0,5,1,20,0,1
+-6,0,0,0,0,0,5,1,20,0,1
+-6,2,0,0,0,0,5,1,20,0,1
+6,2,0,0,0,0,5,1,20,0,1
+"""  # 40 mm: 8 s
+
+
+class Running:
+    """`stillbed live` with a terminal; `said` grows as it speaks."""
+
+    def __init__(self, *arguments: str, cache: Path, limits: Callable[[], None] | None = None) -> None:
+        self.keys, theirs = pty.openpty()
+        environment = os.environ | {"XDG_CACHE_HOME": str(cache), "OPENBLAS_NUM_THREADS": "1"}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "hardware.cli", "live", *arguments],
+            cwd=ROOT,
+            env=environment,
+            stdin=theirs,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            preexec_fn=limits,
+        )
+        os.close(theirs)
+        self.said = ""
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def press(self, key: str) -> None:
+        """Press a key."""
+        os.write(self.keys, key.encode())
+
+    def wait_for(self, pattern: str, after: int = 0) -> int:
+        """Wait until it said so, beyond the first `after` characters; where that ended."""
+        until = CLOCK.now() + PATIENCE
+        while CLOCK.now() < until:
+            if found := re.compile(pattern).search(self.said, after):
+                return found.end()
+            if self.process.poll() is not None:
+                self._reader.join(1.0)
+                if found := re.compile(pattern).search(self.said, after):
+                    return found.end()
+                break
+            CLOCK.wait_until(CLOCK.now() + 0.01)
+        raise AssertionError(f"{pattern!r} was not said:\n{self.said}")
+
+    def pid(self, name: str) -> int:
+        """The process of that name among its children."""
+        for stat in Path("/proc").glob("[0-9]*/stat"):
+            try:
+                text = stat.read_text()
+            except OSError:
+                continue
+            if f"(sb-{name})" in text and int(text.rsplit(")", 1)[1].split()[1]) == self.process.pid:
+                return int(stat.parent.name)
+        raise AssertionError(f"no process {name}")
+
+    def kill(self, name: str, number: int = signal.SIGKILL) -> float:
+        """Kill a child; the instant, s."""
+        pid = self.pid(name)
+        now = CLOCK.now()
+        os.kill(pid, number)
+        return now
+
+    def end(self) -> int:
+        """Wait for its end; the exit code."""
+        code = self.process.wait(PATIENCE)
+        self._reader.join(5.0)
+        if self.keys >= 0:
+            os.close(self.keys)
+        return code
+
+    def close(self) -> None:
+        """Leave nothing behind, whatever a test did."""
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.said += line
+
+
+def executed(record: Path) -> tuple[np.ndarray, np.ndarray]:
+    """What the virtual arm of a run did: stamps (N,) s, axes (N, 6)."""
+    until = CLOCK.now() + PATIENCE
+    file = Beside(record).executed
+    while not file.exists() and CLOCK.now() < until:
+        CLOCK.wait_until(CLOCK.now() + 0.05)
+    CLOCK.wait_until(CLOCK.now() + 0.2)
+    found = np.load(file)
+    return found["stamps"], found["axes"]
+
+
+def rests(record: Path, since: float, within: float) -> bool:
+    """Whether the arm stands still from `within` s after `since`, s, on, and moved before."""
+    stamps, axes = executed(record)
+    after = axes[stamps > since + within]
+    before = axes[(stamps > since - 0.5) & (stamps <= since)]
+    assert len(after) and len(before)
+    return bool(np.ptp(after[:, :3], axis=0).max() < 0.05 and np.ptp(before[:, :3], axis=0).max() > 0.05)
+
+
+def closed(record: Path) -> Session:
+    """A recording, once whoever writes it has closed it."""
+    until = CLOCK.now() + PATIENCE
+    while (session := open_session(record)).damage and CLOCK.now() < until:
+        CLOCK.wait_until(CLOCK.now() + 0.2)
+    assert not session.damage
+    return session
+
+
+def messages(record: Path, topic: str) -> list[dict[str, object]]:
+    """All messages of a topic, in the order of the file, up to its damage if there is any."""
+    return [
+        parse(record, stored)
+        for part in walk(record)
+        if isinstance(part, ChunkOf)
+        for stored in part.messages
+        if stored.topic == topic
+    ]
