@@ -14,6 +14,7 @@ tool_mm = [[0, 0.5], [12.7, 0.5], [27, 4.8]]  # height above the tip and radius 
 [limits]                                      # as in planning/limits.py; arrays are X Y Z in mm, A B C in degrees
 speed = [150, 150, 150, 120, 120, 120]
 turn = 2.4
+[[no_go]]                                     # optional, see hardware/no_go_table.py
 [kinematics]                                  # optional, see hardware/kinematics_table.py
 """
 
@@ -29,6 +30,7 @@ from estimation.se3 import Array
 from hardware import checks
 from hardware.arm_profile import ArmProfile, at_baud
 from hardware.kinematics_table import kinematics_from_table, kinematics_lines
+from hardware.no_go_table import no_go_lines, zones_from_tables
 from hardware.protocol import Dialect
 from perception.tool_profile import check_profile
 from planning.kinematics import SimpleArm
@@ -47,9 +49,10 @@ KEYS = (
     "lag_s",
     "tool_mm",
     "limits",
+    "no_go",
     "kinematics",
 )
-LIMITS = tuple(f.name for f in fields(Limits))
+LIMITS = tuple(f.name for f in fields(Limits) if f.name != "zones")
 _AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
 _ANGLES = ("turn", "surface_turn")  # single numbers in rad
 _SHAPES: dict[str, tuple[int | None, ...]] = {"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3)}
@@ -76,7 +79,7 @@ def read_arm(path: str | Path) -> ArmProfile:
                 given["home_mm_deg"] * _TO_RAD if "home_mm_deg" in given else default.arm.home,
                 *kinematics_from_table(path, table.get("kinematics")),
             ),
-            limits=_limits(path, table.get("limits", {})),
+            limits=_limits(path, table.get("limits", {}), table.get("no_go")),
             dialect=_dialect(path, table),
             baud=default.baud,
             tick=checks.number(path, "tick_s", table.get("tick_s", default.tick)),
@@ -107,6 +110,7 @@ def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
         "",
         "[limits] # X Y Z in mm, A B C in degrees",
         *(f"{name} = {checks.toml_numbers(getattr(limits, name) / _unit(name))}" for name in LIMITS),
+        *no_go_lines(limits.zones),
         *kinematics_lines(arm),
     ]
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -124,7 +128,7 @@ def _unit(name: str) -> Array:
     return _TO_RAD if name in _AXES else np.asarray(np.deg2rad(1.0) if name in _ANGLES else 1.0)
 
 
-def _limits(path: Path, table: object) -> Limits:
+def _limits(path: Path, table: object, zones: object) -> Limits:
     if not isinstance(table, dict):
         raise InputError(path, "limits", table, "a table [limits]")
     checks.check_keys(path, "limits.", table, (), LIMITS)
@@ -132,7 +136,8 @@ def _limits(path: Path, table: object) -> Limits:
     for name, value in table.items():
         number = checks.numbers(path, f"limits.{name}", value, (6,) if name in _AXES else ()) * _unit(name)
         given[name] = number if name in _AXES else float(number)
-    return Limits(**given)  # type: ignore[arg-type]
+    found = () if zones is None else zones_from_tables(path, zones)
+    return Limits(**given, zones=found)  # type: ignore[arg-type]
 
 
 def _dialect(path: Path, table: checks.Table) -> Dialect:

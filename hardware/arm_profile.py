@@ -13,7 +13,7 @@ from hardware.protocol import LENGTH, THESIS, Dialect
 from perception.tool_profile import SYRINGE, check_profile
 from planning.follow import LEAD
 from planning.joints import JointModel
-from planning.kinematics import SimpleArm, joints_from_axes
+from planning.kinematics import SimpleArm, joints_from_axes, nozzle_from_axes
 from planning.limits import Limits
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
@@ -51,6 +51,10 @@ class ArmProfile:
         if (arm.home < limits.low).any() or (arm.home > limits.high).any():
             allowed = f"within {limits.low.tolist()} and {limits.high.tolist()}"
             raise InputError("arm profile", "home", arm.home.tolist(), allowed)
+        tip = nozzle_from_axes(arm, arm.home)[:3, 3] if limits.zones else np.zeros(3)
+        for zone in limits.zones:
+            if zone.depth(tip) > 0:
+                raise InputError("arm profile", "home", arm.home.tolist(), f"outside the no-go zone {zone.name!r}")
         if arm.jointed is not None:
             _check_joints(arm, arm.jointed, limits)
 

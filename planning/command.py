@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -35,6 +36,43 @@ class Hold:
     stamp: float
     duration: float
     reason: str
+
+
+class Code(StrEnum):
+    """Why the guard refused a command; these words do not change. docs/motion.md says what each is."""
+
+    NOT_FINITE = "not_finite"
+    ORDER = "order"
+    FEED = "feed"
+    WORKSPACE = "workspace"
+    NO_GO = "no_go"
+    JUMP = "jump"
+    TURN = "turn"
+    AXIS_SPEED = "axis_speed"
+    POSTURE = "posture"
+    JOINT_RANGE = "joint_range"
+    JOINT_SPEED = "joint_speed"
+    NO_POSE = "no_pose"
+    POSE_NOT_FINITE = "pose_not_finite"
+    TRACK_STATE = "track_state"
+    POSE_AGE = "pose_age"
+    SURFACE_SPEED = "surface_speed"
+    SURFACE_TURN = "surface_turn"
+    POSE_ERROR = "pose_error"
+    WATCHDOG = "watchdog"
+    STOP_DISTANCE = "stop_distance"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal(Hold):
+    """The hold that the guard puts in a command's place. got: the number that breaks `limit`, in mm, s and rad.
+
+    NaN where what is wrong is no number.
+    """
+
+    code: Code
+    got: float
+    limit: float
 
 
 Command = Move | Hold

@@ -7,13 +7,14 @@ judges itself; without such a pose only a stop may follow: no extrusion, and at 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from planning.command import Command, Hold, Move
+from planning.command import Code, Command, Move, Refusal
 from planning.kinematics import SimpleArm, joints_from_axes, nozzle_from_axes
 from planning.limits import Limits
 
@@ -46,97 +47,143 @@ class Guard:
         return self._axes
 
     def __call__(self, command: Command, pose: SurfacePose | None, now: float) -> Command:
-        """The command itself, or a hold that says which limit it breaks. pose: the newest at `now`, s."""
+        """The command itself, or a Refusal that says which limit it breaks. pose: the newest at `now`, s."""
         doubt = self._doubt(pose, now)
-        reason = self._order(command, now)
-        if not reason and not doubt:
+        breach = self._order(command, now)
+        if not breach and not doubt:
             self._trusted_at, self._trusted_axes = now, self._axes
-        if not reason and isinstance(command, Move):
-            reason = self._reach(command) or self._motion(command) or self._joints(command)
-            reason = reason or (self._stopping(command, doubt) if doubt else "")
-        if reason:
-            return Hold(now, self._limits.pause, f"refused: {reason}")
+        if not breach and isinstance(command, Move):
+            breach = self._reach(command) or self._motion(command) or self._joints(command) or self._no_go(command)
+            breach = breach or (self._stopping(command, doubt) if doubt else None)
+        if breach:
+            return Refusal(now, self._limits.pause, f"refused: {breach.words}", breach.code, breach.got, breach.limit)
         self._stamp = now
         if isinstance(command, Move):
             self._axes = command.axes.copy()
         return command
 
-    def _order(self, command: Command, now: float) -> str:
+    def _order(self, command: Command, now: float) -> Breach | None:
         if not math.isfinite(now) or command.stamp != now:
-            return f"command of {command.stamp} s at {now} s"
+            return Breach(Code.ORDER, command.stamp, now, f"command of {command.stamp} s at {now} s")
         if now <= self._stamp:
-            return f"stamp {now} s is not after {self._stamp} s"
-        return ""
+            return Breach(Code.ORDER, now, self._stamp, f"stamp {now} s is not after {self._stamp} s")
+        return None
 
-    def _reach(self, move: Move) -> str:
+    def _reach(self, move: Move) -> Breach | None:
         if move.axes.shape != (6,) or not np.isfinite(move.axes).all():
-            return f"axes {move.axes.tolist()} are not 6 finite numbers"
-        if not 0 < move.feed <= self._limits.feed:
-            return f"feed {move.feed:g} mm/s, allowed 0 < feed <= {self._limits.feed:g}"
+            words = f"axes {move.axes.tolist()} are not 6 finite numbers"
+            return Breach(Code.NOT_FINITE, math.nan, math.nan, words)
+        limit = self._limits.feed
+        if not 0 < move.feed <= limit:
+            words = f"feed {move.feed:g} mm/s, allowed 0 < feed <= {limit:g}"
+            code = Code.FEED if math.isfinite(move.feed) else Code.NOT_FINITE
+            return Breach(code, move.feed, limit if move.feed > 0 else 0.0, words)
         for i, (value, low, high) in enumerate(zip(move.axes, self._limits.low, self._limits.high, strict=True)):
             if not low <= value <= high:
-                return f"{AXES[i]} = {_shown(i, value)}, allowed {_shown(i, low)} to {_shown(i, high)}"
-        return ""
+                words = f"{AXES[i]} = {_shown(i, value)}, allowed {_shown(i, low)} to {_shown(i, high)}"
+                return Breach(Code.WORKSPACE, value, low if value < low else high, words)
+        return None
 
-    def _motion(self, move: Move) -> str:
+    def _motion(self, move: Move) -> Breach | None:
         limits, step = self._limits, np.abs(move.axes - self._axes)
         jump = math.hypot(*step[:LINEAR])
         if jump > limits.jump:
-            return f"jump of {jump:.3f} mm, limit {limits.jump:g} mm"
+            return Breach(Code.JUMP, jump, limits.jump, f"jump of {jump:.3f} mm, limit {limits.jump:g} mm")
         if (turn := float(step[LINEAR:].max())) > limits.turn:
-            return f"turn of {np.rad2deg(turn):.3f} degrees, limit {np.rad2deg(limits.turn):g} degrees"
+            words = f"turn of {np.rad2deg(turn):.3f} degrees, limit {np.rad2deg(limits.turn):g} degrees"
+            return Breach(Code.TURN, turn, limits.turn, words)
         for i, (speed, limit) in enumerate(zip(step / self._tick, limits.speed, strict=True)):
             if speed > limit:
-                return f"{AXES[i]} at {_shown(i, speed)}/s, limit {_shown(i, limit)}/s"
-        return ""
+                words = f"{AXES[i]} at {_shown(i, speed)}/s, limit {_shown(i, limit)}/s"
+                return Breach(Code.AXIS_SPEED, speed, limit, words)
+        return None
 
-    def _joints(self, move: Move) -> str:
-        """What the joints of an arm that is sent its last three cannot do, "" for one whose controller sees to them."""
+    def _joints(self, move: Move) -> Breach | None:
+        """What the joints of an arm that is sent its last three cannot do; the other kind's controller sees to them."""
         if (model := self._arm.jointed) is None:
-            return ""
+            return None
         before, after = joints_from_axes(model, np.stack([self._axes, move.axes]))
         if not np.isfinite(after).all():
-            return "the arm has no posture for these axes"
+            return Breach(Code.POSTURE, math.nan, math.nan, "the arm has no posture for these axes")
         for i, (value, low, high) in enumerate(zip(after, model.low, model.high, strict=True)):
             if not low <= value <= high:
-                return f"J{i + 1} = {_degrees(value)}, allowed {_degrees(low)} to {_degrees(high)}"
+                words = f"J{i + 1} = {_degrees(value)}, allowed {_degrees(low)} to {_degrees(high)}"
+                return Breach(Code.JOINT_RANGE, value, low if value < low else high, words)
         for i, (speed, limit) in enumerate(zip(np.abs(after - before) / self._tick, model.speed, strict=True)):
             if not speed <= limit:
-                return f"J{i + 1} at {_degrees(speed)}/s, limit {_degrees(limit)}/s"
-        return ""
+                words = f"J{i + 1} at {_degrees(speed)}/s, limit {_degrees(limit)}/s"
+                return Breach(Code.JOINT_SPEED, speed, limit, words)
+        return None
 
-    def _stopping(self, move: Move, doubt: str) -> str:
+    def _no_go(self, move: Move) -> Breach | None:
+        """Whether the tip's straight way there touches a zone; it always begins outside."""
+        if not self._limits.zones:
+            return None
+        start, end = nozzle_from_axes(self._arm, np.stack([self._axes, move.axes]))[:, :3, 3]
+        for zone in self._limits.zones:
+            if (depth := zone.met(start, end)) > 0:
+                return Breach(Code.NO_GO, depth, 0.0, f"{depth:.3f} mm inside the no-go zone {zone.name!r}")
+        return None
+
+    def _stopping(self, move: Move, doubt: Breach) -> Breach | None:
         limits = self._limits
         if move.extrude:
-            return f"extrusion while {doubt}"
+            return doubt._replace(words=f"extrusion while {doubt.words}")
         if (since := move.stamp - self._trusted_at) > limits.stop_time:
-            return f"still moving after {since:.3f} s, limit {limits.stop_time:g} s, while {doubt}"
+            words = f"still moving after {since:.3f} s, limit {limits.stop_time:g} s, while {doubt.words}"
+            return Breach(Code.WATCHDOG, since, limits.stop_time, words)
         if (way := math.hypot(*(move.axes - self._trusted_axes)[:LINEAR])) > limits.stop_distance:
-            return f"stops only after {way:.2f} mm, limit {limits.stop_distance:g} mm, while {doubt}"
-        return ""
+            words = f"stops only after {way:.2f} mm, limit {limits.stop_distance:g} mm, while {doubt.words}"
+            return Breach(Code.STOP_DISTANCE, way, limits.stop_distance, words)
+        return None
 
-    def _doubt(self, pose: SurfacePose | None, now: float) -> str:
-        """What is wrong with the pose, "" if it may be followed."""
-        limits = self._limits
+    def _doubt(self, pose: SurfacePose | None, now: float) -> Breach | None:
+        """What is wrong with the pose, None if it may be followed."""
+        limits, nothing = self._limits, (math.nan, math.nan)
         if pose is None:
-            return "there is no pose"
+            return Breach(Code.NO_POSE, *nothing, "there is no pose")
         if not np.isfinite(np.concatenate([np.ravel(a) for a in _numbers(pose)])).all():
-            return "the pose is not finite"
+            return Breach(Code.POSE_NOT_FINITE, *nothing, "the pose is not finite")
         if not pose.state.measured:
-            return f"the surface is {pose.state.value}"
+            return Breach(Code.TRACK_STATE, *nothing, f"the surface is {pose.state.value}")
         if not 0 <= (age := now - pose.stamp) <= limits.pose_age:
-            return f"the pose is {age:.3f} s old, limit {limits.pose_age:g} s"
-        nozzle = nozzle_from_axes(self._arm, self._axes)[:3, 3]
-        place = np.clip(se3.inverse(pose.base_from_surface)[:3] @ np.append(nozzle, 1.0), *self._zone)
+            limit = limits.pose_age if age > 0 else 0.0
+            return Breach(Code.POSE_AGE, age, limit, f"the pose is {age:.3f} s old, limit {limits.pose_age:g} s")
+        place = self._place(pose)
+        return self._fast(pose, place) or self._unsure(pose, place, age)
+
+    def _fast(self, pose: SurfacePose, place: Array) -> Breach | None:
+        limits = self._limits
         speed = math.hypot(*(pose.twist[3:] + np.cross(pose.twist[:3], place)))
-        if speed > limits.surface_speed:
-            return f"the surface moves at {speed:.2f} mm/s, limit {limits.surface_speed:g} mm/s"
-        if (turn := math.hypot(*pose.twist[:3])) > limits.surface_turn:
-            return f"the surface turns at {np.rad2deg(turn):.2f} degrees/s, limit {np.rad2deg(limits.surface_turn):g}"
-        error = _error(pose, place, age + self._tick + self._lag)
-        if not error <= limits.pose_error:
-            return f"the place under the nozzle is known to {error:.3f} mm, limit {limits.pose_error:g} mm"
-        return ""
+        if speed > (limit := limits.surface_speed):
+            words = f"the surface moves at {speed:.2f} mm/s, limit {limit:g} mm/s"
+            return Breach(Code.SURFACE_SPEED, speed, limit, words)
+        if (turn := math.hypot(*pose.twist[:3])) > (limit := limits.surface_turn):
+            words = f"the surface turns at {np.rad2deg(turn):.2f} degrees/s, limit {np.rad2deg(limit):g}"
+            return Breach(Code.SURFACE_TURN, turn, limit, words)
+        return None
+
+    def _unsure(self, pose: SurfacePose, place: Array, age: float) -> Breach | None:
+        error, limit = _error(pose, place, age + self._tick + self._lag), self._limits.pose_error
+        if error <= limit:
+            return None
+        words = f"the place under the nozzle is known to {error:.3f} mm, limit {limit:g} mm"
+        return Breach(Code.POSE_ERROR, error, limit, words)
+
+    def _place(self, pose: SurfacePose) -> Array:
+        """The place of the zone that is nearest the nozzle (3,), in the surface frame, mm."""
+        nozzle = nozzle_from_axes(self._arm, self._axes)[:3, 3]
+        place: Array = np.clip(se3.inverse(pose.base_from_surface)[:3] @ np.append(nozzle, 1.0), *self._zone)
+        return place
+
+
+class Breach(NamedTuple):
+    """A limit that is broken. got, limit: as `Refusal` has them. words: for a person."""
+
+    code: Code
+    got: float
+    limit: float
+    words: str
 
 
 def _numbers(pose: SurfacePose) -> tuple[Array | float, ...]:

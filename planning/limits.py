@@ -8,6 +8,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from planning.no_go import NoGo
 
 MARGIN = np.array([5.0, 5, 5, *np.deg2rad([2, 2, 2])])  # that targets keep from the bounds: braking needs room
 JOINT_MARGIN = float(np.deg2rad(2))  # that joints keep from the ends of their ranges
@@ -24,8 +25,9 @@ class Limits:
     speed, acceleration, jerk: (6,) per axis and s, s^2, s^3. The planner stays within all three, the guard checks
     the speed. jump: mm, and turn: rad, of one tick. low, high: (6,) where the axes may be. feed: mm/s.
     pose_age: s. pose_error: mm, one standard deviation of the place under the nozzle. surface_speed: mm/s, there.
-    surface_turn: rad/s. stop_time: s, and stop_distance: mm, within which the arm comes to rest once it
-    has no pose to trust. on_path: mm that the nozzle may be off its place and still print. pause: s of one hold.
+    surface_turn: rad/s. stop_time: s, and stop_distance: mm, within which the arm comes to rest once it has no pose to
+    trust. zones: where the nozzle's tip must not be. on_path: mm that the nozzle may be off its place and still print.
+    pause: s of one hold.
     """
 
     speed: Array = field(default_factory=lambda: _six(150.0, 120.0))  # public drivers run the arm at 167 mm/s
@@ -43,6 +45,7 @@ class Limits:
     stop_time: float = 0.4  # from 150 mm/s under the limits above: 0.15 s
     stop_distance: float = 15.0  # from 150 mm/s under the limits above: 11.3 mm
     on_path: float = 0.5  # half a bead
+    zones: tuple[NoGo, ...] = ()  # in the base frame: none is known before somebody has measured it
     pause: float = 0.001  # thesis 6.3: pauses of 1 ms, repeated
 
     def per_tick(self, tick: float) -> Array:
@@ -50,7 +53,7 @@ class Limits:
         return np.minimum(self.speed, np.repeat([self.jump / 3**0.5, self.turn], 3) / tick)
 
     def __post_init__(self) -> None:
-        for name in (f.name for f in fields(self)):
+        for name in (f.name for f in fields(self) if f.name != "zones"):
             value: Array = np.asarray(getattr(self, name), float)
             shape = (6,) if name in ("speed", "acceleration", "jerk", "low", "high") else ()
             if value.shape != shape or not np.isfinite(value).all():

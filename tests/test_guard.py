@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.warp import Warp
-from planning.command import Command, Hold, Move
+from planning.command import Code, Command, Hold, Move, Refusal
 from planning.guard import Guard
 from planning.kinematics import SimpleArm
 from planning.limits import Limits
@@ -286,3 +287,43 @@ def test_a_warp_adds_its_own_doubt_and_what_grows_of_it() -> None:
     assert refused(judged(move(axes(0.5)), warped(0.2501, 0.0)), "is known to 0.500")
     assert refused(judged(move(axes(0.5)), warped(0.2499, 0.02)), "is known to 0.500")  # one tick ahead
     assert refused(judged(move(axes(0.5)), warped(np.nan, 0.0)), "not finite")
+
+
+REFUSED: list[tuple[Code, Move, SurfacePose | None, float, float]] = [
+    (Code.ORDER, move(axes(0.5), 0.5), pose(1.0), 0.5, 1.0),
+    (Code.NOT_FINITE, move(axes(np.nan)), pose(1.0), np.nan, np.nan),
+    (Code.FEED, move(axes(0.5), feed=250.5), pose(1.0), 250.5, 250.0),
+    (Code.WORKSPACE, move(axes(257)), pose(1.0), 257.0, 256.0),
+    (Code.JUMP, move(axes(65)), pose(1.0), 65.0, 64.0),
+    (Code.TURN, move(axes(0, 0, 0, 1.25)), pose(1.0), 1.25, 1.0),
+    (Code.AXIS_SPEED, move(axes(3)), pose(1.0), 192.0, 128.0),
+    (Code.NO_POSE, move(axes(0.5), extrude=True), None, np.nan, np.nan),
+    (Code.POSE_NOT_FINITE, move(axes(0.5), extrude=True), pose(1.0, twist=np.full(6, np.inf)), np.nan, np.nan),
+    (Code.TRACK_STATE, move(axes(0.5), extrude=True), pose(1.0, state=TrackState.LOST), np.nan, np.nan),
+    (Code.POSE_AGE, move(axes(0.5), extrude=True), pose(0.5), 0.5, 0.25),
+    (Code.SURFACE_SPEED, move(axes(0.5), extrude=True), pose(1.0, twist=axes(0, 0, 0, 51)), 51.0, 50.0),
+    (Code.SURFACE_TURN, move(axes(0.5), extrude=True), pose(1.0, twist=axes(1.5)), 1.5, 0.75),
+    (Code.POSE_ERROR, move(axes(0.5), extrude=True), pose(1.0, covariance=np.diag([0.0, 0, 0, 1, 0, 0])), 1.0, 0.5),
+    (Code.STOP_DISTANCE, move(axes(5), 1.25), None, 5.0, 4.0),
+    (Code.WATCHDOG, move(axes(0.5), 1.75), None, 0.75, 0.5),
+]
+
+
+@pytest.mark.parametrize(("code", "command", "seen", "got", "limit"), REFUSED, ids=[r[0] for r in REFUSED])
+def test_a_refusal_has_its_code_the_number_and_the_limit(
+    code: Code, command: Move, seen: SurfacePose | None, got: float, limit: float
+) -> None:
+    fast = code in (Code.WORKSPACE, Code.JUMP, Code.TURN, Code.STOP_DISTANCE)
+    limits = replace(WIDE, speed=np.full(6, 1e9 if fast else 128.0), turn=1.0)
+    guard = Guard(limits, ARM, TICK)
+    first = 1.0 if command.stamp != 1.0 else 0.9
+    assert isinstance(guard(Hold(first, 0.001, "here"), pose(first), first), Hold)
+    answer = guard(command, seen, command.stamp)
+    assert isinstance(answer, Refusal) and answer.code is code
+    assert (answer.got, answer.limit) == pytest.approx((got, limit), nan_ok=True)
+    assert answer.reason.startswith("refused: ")
+
+
+def test_every_code_is_documented() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "motion.md").read_text(encoding="utf-8")
+    assert [code for code in Code if f"`{code}`" not in text] == []

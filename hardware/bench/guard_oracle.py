@@ -18,6 +18,7 @@ from estimation.se3 import Array
 from planning.joints import arm_from_nozzle
 from planning.kinematics import SimpleArm, joints_from_axes
 from planning.limits import Limits
+from planning.no_go import NoGo
 
 Flags = NDArray[np.bool_]
 Verdicts = NDArray[np.int_]
@@ -25,6 +26,8 @@ Verdicts = NDArray[np.int_]
 ROUNDING = 1e-12  # of a limit
 COARSE = 1e-5  # of one whose number is differentiated by steps
 SMALL = 1e-5  # rad and mm, or s, of these steps
+CLOSER = 40  # thirds: 1e-7 of a way
+NEAR = 1e-6  # mm, of a zone's surface
 REACHED = 1e-6  # mm and rad: joints that bring the nozzle where it shall be
 
 
@@ -63,7 +66,8 @@ def judge(log: Log, rules: Rules) -> NDArray[np.int_]:
     order, worth = _order(log), _worth(log, before, rules)
     stopping = _stopping(log, order, worth, before, rules.limits)
     trust = np.where(worth > 0, 1, np.where((worth == 0) & (stopping < 0), 0, stopping))
-    moves = np.minimum.reduce([_reach(log, rules), _motion(log, before, rules), _joints(log, before, rules), trust])
+    parts = [_reach(log, rules), _motion(log, before, rules), _joints(log, before, rules), _zones(log, before, rules)]
+    moves = np.minimum.reduce([*parts, trust])
     verdict = np.minimum(order, np.where(log.holds, 1, moves))
     wrong = log.passed & (verdict < 0), ~log.passed & (verdict > 0)
     return np.array([len(verdict), log.passed.sum(), wrong[0].sum(), wrong[1].sum()])
@@ -127,6 +131,39 @@ def _joints(log: Log, before: Array, rules: Rules) -> Verdicts:
     inside = _exactly(_every((after >= model.low) & (after <= model.high)))
     speed = _within(np.abs(after - start), model.speed * rules.tick).min(axis=1)
     return np.where(known & (off < REACHED), np.minimum(inside, speed), -1)
+
+
+def _zones(log: Log, before: Array, rules: Rules) -> Verdicts:
+    """Verdicts on the tip's straight ways: how far outside is convex along each, so thirds close in on its least."""
+    finite = _every(np.isfinite(log.axes))
+    start, end = (
+        np.linalg.solve(rules.arm.arm_from_base, np.column_stack([axes[:, :3], np.ones(len(axes))]).T)[:3].T
+        for axes in (before, np.where(finite[:, None], log.axes, before))
+    )
+    verdict = np.ones(len(start), int)
+    for zone in rules.limits.zones:
+        low, high = np.zeros(len(start)), np.ones(len(start))
+        for _ in range(CLOSER):
+            left, right = low + (high - low) / 3, high - (high - low) / 3
+            nearer = _outside(zone, _between(start, end, left)) < _outside(zone, _between(start, end, right))
+            low, high = np.where(nearer, low, left), np.where(nearer, right, high)
+        shares = (np.zeros(len(start)), (low + high) / 2, np.ones(len(start)))
+        least = np.min([_outside(zone, _between(start, end, share)) for share in shares], axis=0)
+        verdict = np.minimum(verdict, np.where(least > NEAR, 1, np.where(least > -NEAR, 0, -1)))
+    return np.where(finite, verdict, -1)
+
+
+def _between(start: Array, end: Array, share: Array) -> Array:
+    return start + share[:, None] * (end - start)
+
+
+def _outside(zone: NoGo, places: Array) -> Array:
+    """How far outside a zone places (N, 3) are, mm, along its farthest face; negative inside."""
+    faces = (places[:, None] * zone.normals).sum(axis=2) - zone.offsets
+    along = places - zone.axis[0]
+    axis = zone.axis[1] - zone.axis[0]
+    off = along - np.outer(along @ axis / (axis @ axis), axis)
+    return np.asarray(np.maximum(faces.max(axis=1), np.sqrt((off**2).sum(axis=1)) - zone.radius))
 
 
 def _stopping(log: Log, order: Verdicts, worth: Verdicts, before: Array, limits: Limits) -> Verdicts:

@@ -28,6 +28,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--minutes", type=float, default=0.0, metavar="M", help="of real time on a pty; default none")
     parser.add_argument("--commands", type=int, default=100_000, metavar="N", help="random ones before the guard")
     parser.add_argument("--baud", type=int, default=115_200, metavar="B", help="of the line in virtual time")
+    parser.add_argument("--only", choices=("guard",), help="the guard alone")
     parser.add_argument("--seed", type=int, default=0, help="of the first run")
     parser.add_argument(
         "--busy", type=int, default=1, metavar="N", help="processes that saturate a core each; default 1"
@@ -38,6 +39,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> list[Figure]:
     """The figures of all parts that were asked for."""
     figures: list[Figure] = []
+    if options.only == "guard":
+        options.hours = options.minutes = 0.0
     if options.hours > 0:
         figures += soak_figures(soaked(options.hours, options.seed, options.baud))
     if options.minutes > 0:

@@ -16,6 +16,7 @@ from planning.command import Command, Hold, Move
 from planning.guard import Guard
 from planning.kinematics import SimpleArm
 from planning.limits import Limits
+from planning.no_go import NoGo, box, cylinder, half_space
 
 CHUNK = 10_000  # commands of one run
 ZONE = np.array([[-20.0, -20, -1], [20, 20, 5]])
@@ -57,7 +58,17 @@ def jointed() -> Rules:
 
 def boxed(limits: Limits) -> Limits:
     """The limits with bounds so near home that random steps meet them."""
-    return replace(limits, low=SimpleArm().home - BOX, high=SimpleArm().home + BOX)
+    home = SimpleArm().home
+    return replace(limits, low=home - BOX, high=home + BOX, zones=zones_about(home[:3]))
+
+
+def zones_about(home: Array) -> tuple[NoGo, ...]:
+    """One zone of each kind about a place (3,), mm, that steps there meet: a bed below, a block and a post."""
+    return (
+        half_space("bed", np.array([0.1, 0, 1.0]), home - [0, 0, 9]),
+        box("block", home + [5, 4, 2], home + [9, 8, 9]),
+        cylinder("post", home - [7, 6, 20], home - [7, 6, -20], 1.5),
+    )
 
 
 def random_log(seed: int, count: int, rules: Rules, guard: Guard | None = None) -> Log:
