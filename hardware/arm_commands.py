@@ -31,6 +31,7 @@ def add_arm(commands: Commands) -> None:
     real.add_argument("--home", action="store_true", help="go home, slowly: up, across, down")
     real.add_argument("--jog", nargs="+", metavar="AXIS=BY", help="go by so many mm or degrees: X=+5 B=-2.5")
     real.add_argument("--stands", metavar="WHERE", help="where an arm that does not answer stands: X,Y,Z,A,B,C or home")
+    real.add_argument("--origin", metavar="X,Y,Z", help="mm in machine axes: send G54, and what comes after from there")
     real.add_argument("--yes", action="store_true", help="somebody sees that nobody is within the arm's reach")
     real.add_argument("--no-pause-frame", action="store_true", help="its controller knows no frame that stops it")
     virtual = command.add_argument_group("a virtual arm")
@@ -63,7 +64,7 @@ def _serve(arguments: argparse.Namespace, profile: Any) -> None:
 
 
 def _connect(arguments: argparse.Namespace, profile: Any) -> int:
-    from hardware.arm_console import Request, axes_from_text, jog_from_text, run_arm
+    from hardware.arm_console import Request, axes_from_text, jog_from_text, origin_from_text, run_arm
     from hardware.arm_port import Device
     from hardware.arm_status import ArmState
     from hardware.clock import WallClock
@@ -74,6 +75,7 @@ def _connect(arguments: argparse.Namespace, profile: Any) -> int:
         home=arguments.home,
         jog=None if arguments.jog is None else jog_from_text(arguments.jog),
         stands=None if arguments.stands is None else axes_from_text(arguments.stands, profile.arm.home),
+        origin=None if arguments.origin is None else origin_from_text(arguments.origin),
         confirmed=arguments.yes,
     )
     settings = LinkSettings(pause_frame=not arguments.no_pause_frame)

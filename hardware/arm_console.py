@@ -27,19 +27,21 @@ _UNITS = np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
 @dataclass(frozen=True, slots=True, eq=False)
 class Request:
     """What is asked of an arm. seconds: to listen, infinite until interrupted. home: go there. jog: (6,) to go by, mm
-    and rad. stands: (6,) where it stands, for one that does not answer. Both moves need `confirmed`.
+    and rad. origin: (3,) mm, to be its work origin, before a move. stands: (6,) where it stands, for one that does not
+    answer. All that is sent needs `confirmed`.
     """
 
     seconds: float = 5.0
     home: bool = False
     jog: Array | None = None
+    origin: Array | None = None
     stands: Array | None = None
     confirmed: bool = False
 
     @property
     def moves(self) -> bool:
-        """Whether the arm is to move."""
-        return self.home or self.jog is not None
+        """Whether anything is to be sent."""
+        return self.home or self.jog is not None or self.origin is not None
 
 
 def run_arm(
@@ -118,6 +120,15 @@ def axes_from_text(text: str, home: Array) -> Array:
     return np.asarray(numbers / _UNITS)
 
 
+def origin_from_text(text: str) -> Array:
+    """A work origin (3,), mm in machine axes, from X,Y,Z."""
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    return checks.numbers("command line", "--origin", values, (3,), "mm")
+
+
 class _Console:
     """Lets time pass for an arm, and says what it does."""
 
@@ -146,7 +157,11 @@ def _move(console: _Console, request: Request) -> None:
     if not reason and request.jog is not None:
         assert arm.target is not None
         target = arm.target + request.jog
-    reason = reason or arm.go(target, clock.now(), lift=request.home)
+    if not reason and request.origin is not None:
+        reason = arm.set_origin(request.origin, clock.now())
+        console.watch(SETTLE)
+    if request.home or request.jog is not None:
+        reason = reason or arm.go(target, clock.now(), lift=request.home)
     if reason:
         raise InputError("arm", "move", reason, "an arm that is armed, knows where it stands and may go there")
     console.watch(float("inf"), lambda now: arm.state is not ArmState.ARMED or arm.arrived(now))

@@ -50,8 +50,10 @@ def _zone(where: object, table: checks.Table) -> NoGo:
 
 
 def _plane(zone: NoGo) -> Array:
-    return zone.normals.repeat(2, axis=0) * [[1.0], [zone.offsets[0]]]
+    plane: Array = zone.normals.repeat(2, axis=0) * [[1.0], [zone.offsets[0]]]
+    return plane
 
 
 def _corners(zone: NoGo) -> Array:
-    return (zone.offsets.reshape(2, 3) * [[1.0], [-1.0]])[::-1]
+    corners: Array = (zone.offsets.reshape(2, 3) * [[1.0], [-1.0]])[::-1]
+    return corners

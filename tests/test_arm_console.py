@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from hardware.arm_console import Request, axes_from_text, findings, jog_from_text, run_arm
+from hardware.arm_console import Request, axes_from_text, findings, jog_from_text, origin_from_text, run_arm
 from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmState, ArmStatus
 from hardware.cli import main
@@ -72,9 +72,22 @@ def test_a_jog_goes_by_so_much_and_not_out_of_bounds() -> None:
         asked(Request(jog=jog_from_text(["X=1000"]), confirmed=True))
 
 
+def test_an_origin_is_sent_when_confirmed_and_moves_stay_in_machine_axes() -> None:
+    origin = origin_from_text("200,210.5,90")
+    with pytest.raises(InputError, match="--yes"):
+        asked(Request(origin=origin))
+    status, arm, _ = asked(Request(origin=origin, confirmed=True))
+    assert arm.origin == pytest.approx([200, 210.5, 90]) and status.state is ArmState.DISARMED
+    assert arm.axes_at(np.array([arm.now]))[0] == pytest.approx(AWAY)
+    _, arm, _ = asked(Request(origin=origin, home=True, confirmed=True))
+    assert arm.axes_at(np.array([arm.now]))[0] == pytest.approx(HOME, abs=1e-3)
+    with pytest.raises(InputError, match="--origin"):
+        origin_from_text("1,2")
+
+
 def test_a_fault_on_the_way_stops_it() -> None:
     status, arm, lines = asked(Request(home=True, confirmed=True), fault="stall 9s at 2s")
-    assert status.state is ArmState.STOPPED and "off its way" in status.reason
+    assert status.state is ArmState.STOPPED and "later on its way" in status.reason
     assert any("stopped" in line for line in lines) and arm.frames < 150
 
 
