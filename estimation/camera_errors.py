@@ -84,6 +84,7 @@ class CameraErrors:
         start = np.diag(np.repeat([self.OFFSET**2, self.SHIFT**2, self.SHIFT**2], n))
         self._covariance = self._free @ start @ self._free
         self._offset = np.zeros(n)
+        self._delays: Delays | None = None  # as of the last `learn`: asked for many times a frame set
         self._jitter = Variance(0.005, 3e-4, 1e-3)  # s: USB cameras; no stamp is better
         self._unrest = Variance(0.05, 0.005, 0.01)  # px, of a camera's shift from frame to frame
 
@@ -109,8 +110,10 @@ class CameraErrors:
     @property
     def delays(self) -> Delays:
         """What is expected of the next frame set."""
-        n = self._count
-        return Delays(self.offset, self._covariance[:n, :n] + self._jitter.value * np.eye(n))
+        if self._delays is None:
+            n = self._count
+            self._delays = Delays(self.offset, self._covariance[:n, :n] + self._jitter.value * np.eye(n))
+        return self._delays
 
     @property
     def unrest(self) -> float:
@@ -143,7 +146,7 @@ class CameraErrors:
         gain = self._covariance @ np.linalg.inv(eye + told @ self._covariance)
         self._mean = self._free @ (self._mean + gain @ (blurred.T @ found.pull) / self.CAREFUL)
         self._covariance = self._free @ ((gain + gain.T) / 2) @ self._free
-        self._offset = self._clear_offset()
+        self._offset, self._delays = self._clear_offset(), None
 
     def _clear_offset(self) -> Array:
         """The offsets (C,), s, as far as chance does not explain them."""

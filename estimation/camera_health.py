@@ -27,6 +27,7 @@ class HealthSettings:
     away: float = 0.08  # s, and also two frame sets, that a camera may miss: drivers drop frames every day
     leave_share: float = 0.3  # of the tracks a camera usually has: with fewer it is missed
     least_share: float = 0.15  # where no camera has as many, the few may be what covers the rest: no measurement
+    whole_share: float = 0.8  # of all its usual tracks: of a blurred picture half of them are found
     enter_share: float = 1.5  # times what is asked of a camera that counts is asked of one that is to count again
 
 
@@ -83,6 +84,14 @@ class CameraHealth:
         seen = np.isfinite(off) & ~np.isin(np.arange(len(off)), list(odd))
         together = bool(seen.any() and (off > self.settings.back * allowed)[seen].all())
         return np.where(seen & together, off, 0.0)
+
+    def blurred(self, used: NDArray[np.int64], off: Array, allowed: Array, odd: Collection[int]) -> bool:
+        """Whether all cameras stand off together, with fewer tracks than usual: a surface that bends keeps its tracks.
+
+        used: (C,) tracks that carry the pose. The rest as for `doubted`.
+        """
+        fewer = used.sum() < self.settings.whole_share * self._tracks.sum()
+        return bool(fewer and self.doubted(off, allowed, odd).any())
 
     def update(
         self, stamp: float, used: NDArray[np.int64], least: float, off: Array, allowed: Array, odd: Collection[int]

@@ -2,8 +2,9 @@
 
 Which camera is odd, where a landmark is looked for and what gets into the window is decided by covariances that hold
 from the first frame set on, when little is known of the cameras: too wide later on, and decided well by. Claims learn.
-What the first pose is off by is claimed smaller once the images are known to rest, what lasts in the tracks' errors and
-what patches seen from elsewhere do is added. After trouble the narrow claim waits until all has been well for a second.
+What the first pose is off by, and what the window has averaged since, is claimed smaller once the images are known to
+rest and the tracks to scatter less; what lasts in the tracks' errors and what patches seen from elsewhere do is added.
+After trouble the narrow claim waits until all has been well for a second.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from estimation.averaged import Averaged
 from estimation.camera_errors import CameraErrors
 from estimation.first_pose import FirstPose
 from estimation.fit import Fit
@@ -42,8 +44,13 @@ class Claim:
         self._tracks.learn(seen, fit.solution, seen.sigma)
         self._straying.learn(fit.solution.shared, cameras.shift, self._tracks.lasting * fit.scatter)
 
-    def measured(self, pose: SurfacePose, fit: Fit, cameras: CameraErrors, first: Array | None) -> SurfacePose:
-        """The pose of an accepted fit as it is given out. first: (6, 6), what was believed of the first pose."""
+    def measured(
+        self, pose: SurfacePose, fit: Fit, cameras: CameraErrors, first: Array | None, averaged: Array
+    ) -> SurfacePose:
+        """The pose of an accepted fit as it is given out.
+
+        first: (6, 6), what was believed of the first pose. averaged: (6, 6), the window's part of `pose.covariance`.
+        """
         self._watch(pose, fit)
         if self._first is None and first is not None:
             self._begin(first, fit, cameras)
@@ -54,7 +61,9 @@ class Claim:
         if self._first is None or pose.stamp - self._trouble < WARY:  # the first pose itself is among these
             return _widened(pose, self._more)
         known, believed = self._first
-        return _widened(pose, self._more + known.covariance(cameras, self._tracks) - believed)
+        first_less = known.covariance(cameras, self._tracks) - believed
+        window_less = Averaged(averaged, fit, cameras.unrest).covariance(self._tracks, cameras.unrest) - averaged
+        return _widened(pose, self._more + first_less + window_less)
 
     def missed(self, pose: SurfacePose) -> SurfacePose:
         """A pose that is only predicted, as it is given out."""

@@ -75,6 +75,7 @@ class Estimator:
         self._predictor = Predictor()
         self._pose: SurfacePose | None = None  # as decisions are made by it
         self._given: SurfacePose | None = None  # as it is claimed
+        self._ahead: tuple[SurfacePose, SurfacePose] | None = None  # the pose, and as last predicted from it
         self._measured: SurfacePose | None = None  # the last one that was
         self._caveat = ""
         self._view = 0  # landmarks of the first view: what is added later is not all seen at once
@@ -109,7 +110,9 @@ class Estimator:
     def expected(self, stamp: float) -> SurfacePose:
         """The pose that is expected at `stamp`, as doubtful as it is searched for. Only after the first map."""
         assert self._pose is not None
-        return self._pose.predict(stamp)
+        if self._ahead is None or self._ahead[0] is not self._pose or self._ahead[1].stamp != stamp:
+            self._ahead = self._pose, self._pose.predict(stamp)
+        return self._ahead[1]
 
     def predict(self, stamp: float) -> Array:
         """Where the surface is expected at `stamp`: (4, 4). Only after the first map."""
@@ -133,14 +136,13 @@ class Estimator:
         seen, moved = self._together(observations, points, start, twist)
         allowed = self.health.allowed(np.full(len(self.rig), moved))
         shared = self.cameras.shared(twist)
-        solution, odd = self._solve(seen, points, start, scales, shared, allowed)
+        solution, odd, off = self._solve(seen, points, start, scales, shared, allowed)
         inlier = solution.weights > 0.2
         used = np.bincount(seen.camera[inlier], minlength=len(self.rig))
         known = fit_covariance(seen, solution, shared, self._map_error, self._warp)
         found = int((~np.isin(seen.camera, list(odd))).sum())
         claimed = known.noise + known.smear + known.lasting
         reason = self._judge(found, used, claimed, disorder(seen, solution, inlier))
-        off = standing_off(seen, solution, len(self.rig), self._camera_least())
         apart = self.health.doubted(off, allowed, odd)
         if not reason and self._pose is not None:
             torn = bool(apart.any()) and not self.health.clear(used)
@@ -169,22 +171,21 @@ class Estimator:
         scales: tuple[float, ...],
         shared: Shared,
         allowed: Array,
-    ) -> tuple[PoseFit, frozenset[int]]:
-        """The pose of all cameras that agree with each other, and those that are left out of it."""
+    ) -> tuple[PoseFit, frozenset[int], Array]:
+        """The pose of all cameras that agree with each other, those left out of it, and how far, px, each is off it."""
         odd, least = self.health.left_out, self._camera_least()
         solution = solve_with(self.rig, seen, points, start, scales, odd, shared)
-        if self._pose is None or not self.confirmed:  # a bent first map sets cameras apart
-            return solution, odd
-        most = self.settings.health.out * allowed
         off = standing_off(seen, solution, len(self.rig), least)
-        expected = self.expected(seen.stamp)
+        if self._pose is None or not self.confirmed:  # a bent first map sets cameras apart
+            return solution, odd, off
+        most, expected = self.settings.health.out * allowed, self.expected(seen.stamp)
         apart = any(off[c] > most[c] for c in range(len(self.rig)) if c not in odd)
         if apart or surprise(solution, expected) > SURER:  # what moved may be a camera, though the others follow it
             left, within = (1, np.inf) if apart else (2, SURER)
             found = odd_ones(self.rig, seen, points, odd, most, least, expected, shared, left, within)
             if found is not None:
-                return found[1], found[0]
-        return solution, odd
+                return found[1], found[0], standing_off(seen, found[1], len(self.rig), least)
+        return solution, odd, off
 
     def _twist(self, stamp: float, start: Array) -> tuple[Array, Array]:
         """Velocity (6,) at `stamp` and its variance (6,): the window's and the chord's to `start`, as each is known."""
@@ -256,8 +257,9 @@ class Estimator:
         return self._enter(stamp, base_from_surface, covariance, *nothing, *self._states.begin(stamp))
 
     def sound(self, fit: Fit) -> bool:
-        """Whether map, warp and clocks may learn from a fit: what a blurred or bumped camera shows would bend them."""
-        return not fit.odd and self.health.clear(fit.used)
+        """Whether map, warp and clocks may learn from a fit: what blurred or bumped cameras show would bend them."""
+        blurred = self.health.blurred(fit.used, fit.off, fit.allowed, fit.odd)
+        return not fit.odd and self.health.clear(fit.used) and not blurred
 
     def carriers(self, fit: Fit) -> NDArray[np.int64]:
         """The cameras that carry a fit, by number."""
@@ -312,7 +314,9 @@ class Estimator:
         )
         state, reason = self._states.measured(fit.stamp, seen)
         pose = self._enter(fit.stamp, fit.solution.base_from_surface, fit.noise, fit.smear, lasting, state, reason)
-        self._given = self._claim.measured(pose, fit, self.cameras, self._first)
+        assert self._smoother.newest is not None
+        averaged = self._smoother.newest.covariance
+        self._given = self._claim.measured(pose, fit, self.cameras, self._first, averaged)
         return self._given
 
     def _calibration(self, fit: Fit) -> Array:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from estimation import se3
+from estimation.compiled import NEW, compiled
 from estimation.se3 import Array
 
+FARTHEST = -0.9  # cosine of a turn: beyond, its axis is lost in rounding
 APART = 0.01  # s: poses nearer to the one before replace it, so that a faster camera keeps no shorter memory
 
 
@@ -57,29 +59,38 @@ class History:
 
 
 def _moves(a: Array, b: Array) -> Array:
-    """log(inverse(a) @ b) (..., 6), in a third of the general function's time for turns below half a turn."""
-    back = np.swapaxes(a[:, :3, :3], -1, -2)
-    turn = back @ b[..., :3, :3]
-    shift = (back @ (b[..., :3, 3] - a[:, :3, 3])[..., None])[..., 0]
-    cosine = (turn[..., 0, 0] + turn[..., 1, 1] + turn[..., 2, 2] - 1) / 2
-    if cosine.min() < -0.9:
-        return se3.log(se3.make(turn, shift))
-    axis = (turn[..., _OVER, _UNDER] - turn[..., _UNDER, _OVER]) / 2
-    sine = np.sqrt((axis**2).sum(-1))
-    angle = np.arctan2(sine, cosine)
-    near = angle < 1e-4
-    safe = np.where(near, 1.0, sine)
-    stretch = np.where(near, 1.0, angle / safe)
-    left = (1 - angle * (1 + cosine) / (2 * safe)) / np.where(near, 1.0, angle) ** 2
-    bend = np.where(angle < 0.05, 1 / 12 + angle**2 / 720, left)
-    vector = stretch[..., None] * axis
-    across = _cross(vector, shift)
-    return np.concatenate([vector, shift - across / 2 + bend[..., None] * _cross(vector, across)], axis=-1)
+    """log(inverse(a) @ b) (2, N, 6) of poses a (N, 4, 4) and b (2, N, 4, 4), compiled for turns below half a turn."""
+    vectors, within = _short_moves(np.require(a, float, NEW), np.require(b, float, NEW))
+    return vectors if within else np.asarray(se3.log(se3.inverse(a) @ b))
 
 
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
-_OVER, _UNDER = _LAST, _NEXT  # of a skew matrix: rows and columns of its vector
-
-
-def _cross(a: Array, b: Array) -> Array:
-    return np.asarray(a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT])
+@compiled("Tuple((f8[:,:,::1], b1))(f8[:,:,::1], f8[:,:,:,::1])")
+def _short_moves(a: Array, b: Array) -> tuple[Array, bool]:
+    """As `_moves`, and whether no turn came near half a turn, where this is not exact."""
+    vectors, within = np.empty((2, len(a), 6)), True
+    turn, shift = np.empty((3, 3)), np.empty(3)
+    for end in range(2):
+        for n in range(len(a)):
+            here, there = a[n], b[end, n]
+            for i in range(3):
+                shift[i] = 0.0
+                for k in range(3):
+                    shift[i] += here[k, i] * (there[k, 3] - here[k, 3])
+                for j in range(3):
+                    turn[i, j] = here[0, i] * there[0, j] + here[1, i] * there[1, j] + here[2, i] * there[2, j]
+            cosine = (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1) / 2
+            within = within and cosine >= FARTHEST
+            x, y, z = (turn[2, 1] - turn[1, 2]) / 2, (turn[0, 2] - turn[2, 0]) / 2, (turn[1, 0] - turn[0, 1]) / 2
+            sine = np.sqrt(x * x + y * y + z * z)
+            angle = np.arctan2(sine, cosine)
+            stretch = angle / sine if angle >= 1e-4 else 1.0
+            small = 1 / 12 + angle**2 / 720
+            bend = small if angle < 0.05 else (1 - angle * (1 + cosine) / (2 * sine)) / angle**2
+            x, y, z = stretch * x, stretch * y, stretch * z
+            u, v, w = y * shift[2] - z * shift[1], z * shift[0] - x * shift[2], x * shift[1] - y * shift[0]
+            out = vectors[end, n]
+            out[0], out[1], out[2] = x, y, z
+            out[3] = shift[0] - u / 2 + bend * (y * w - z * v)
+            out[4] = shift[1] - v / 2 + bend * (z * u - x * w)
+            out[5] = shift[2] - w / 2 + bend * (x * v - y * u)
+    return vectors, within

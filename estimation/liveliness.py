@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimation.compiled import compiled
 from estimation.se3 import Array
 
 STEP = 10**0.5  # between densities of the grid: closer ones cannot be told apart in a second
@@ -44,15 +45,36 @@ class Liveliness:
         """Take a measured pose: moved (6,) from the measured pose before it, variance (6,) of the new one."""
         if np.isinf(self._var).any():
             self._var = np.tile(variance[:, None], (1, self._grid.shape[1]))
-        dt, q, r = seconds, self._grid, variance[:, None]
-        ahead = self._off + self._rate * dt - moved[:, None]  # predicted minus measured
-        var = self._var + 2 * dt * self._cross + dt**2 * self._rate_var + q * dt**3 / 3
-        cross = self._cross + dt * self._rate_var + q * dt**2 / 2
-        rate_var = self._rate_var + q * dt
-        total = var + r
-        one = -0.5 * (np.log(total) + (TAILS + 1) * np.log1p(ahead**2 / (TAILS * total)))
-        keep = np.exp(-dt / MEMORY)
-        self._score = keep * self._score + one
-        gain, gain_rate = var / total, cross / total
-        self._off, self._rate = ahead * (1 - gain), self._rate - gain_rate * ahead
-        self._var, self._cross, self._rate_var = var * (1 - gain), cross * (1 - gain), rate_var - gain_rate * cross
+        filters = self._off, self._rate, self._var, self._cross, self._rate_var
+        keep = float(np.exp(-seconds / MEMORY))
+        _advance(self._grid, self._score, *filters, moved, variance.copy(), float(seconds), keep)
+
+
+@compiled(f"void({', '.join(['f8[:,::1]'] * 7)}, f8[::1], f8[::1], f8, f8)")
+def _advance(
+    grid: Array,
+    score: Array,
+    off: Array,
+    rate: Array,
+    var: Array,
+    cross: Array,
+    rate_var: Array,
+    moved: Array,
+    variance: Array,
+    dt: float,
+    keep: float,
+) -> None:
+    """Predict all filters (6, K) by dt, s, score them by the pose that was measured, and update them, in place."""
+    for i in range(grid.shape[0]):
+        for k in range(grid.shape[1]):
+            q = grid[i, k]
+            ahead = off[i, k] + rate[i, k] * dt - moved[i]  # predicted minus measured
+            spread = var[i, k] + 2 * dt * cross[i, k] + dt**2 * rate_var[i, k] + q * dt**3 / 3
+            both = cross[i, k] + dt * rate_var[i, k] + q * dt**2 / 2
+            total = spread + variance[i]
+            one = -0.5 * (np.log(total) + (TAILS + 1) * np.log1p(ahead**2 / (TAILS * total)))
+            score[i, k] = keep * score[i, k] + one
+            gain, gain_rate = spread / total, both / total
+            off[i, k], rate[i, k] = ahead * (1 - gain), rate[i, k] - gain_rate * ahead
+            rate_var[i, k] += q * dt - gain_rate * both
+            var[i, k], cross[i, k] = spread * (1 - gain), both * (1 - gain)

@@ -50,11 +50,13 @@ class MotionDetector:
     def __init__(self, centre: Array, settings: MotionSettings | None = None) -> None:
         """centre: (3,) mm, surface frame, the place whose shift counts."""
         self.settings = settings or MotionSettings()
-        self._centre = centre.copy()
+        self._centre, self._at_centre = centre.copy(), np.hstack([-se3.hat(centre), np.eye(3)])
+        self._wanted = np.array([self.settings.turned, self.settings.moved])
+        self._least = (SURE * self._wanted[:, None, None]) ** 2 * np.eye(3)
         self._anchor: Array | None = None  # the first base_from_surface, from which turns and shifts are counted
         self._stamps: deque[float] = deque(maxlen=HISTORY)
         self._states = _Rows()  # turn, rad, and shift, mm
-        self._claims: deque[Array] = deque(maxlen=REST)  # (2, 3, 3) covariances of them
+        self._claims = _Rows(3)  # (2, 3, 3) covariances of them
         self._rest: Array | None = None  # (2, 3)
         self._noise = _Noise(self.settings)
         self._motion = SurfaceMotion()
@@ -84,22 +86,19 @@ class MotionDetector:
     def _state(self, anchor: Array, base_from_surface: Array) -> Array:
         """Turn and shift of the centre (2, 3) since the anchor, in the anchor's own axes."""
         back = anchor[:3, :3].T
-        turn = se3.log_rotation(back @ base_from_surface[:3, :3])
+        turn = se3.log(se3.inverse(anchor) @ base_from_surface)[:3]
         there, here = (t[:3, :3] @ self._centre + t[:3, 3] for t in (anchor, base_from_surface))
         return np.stack([turn, back @ (here - there)])
 
     def _claim(self, anchor: Array, base_from_surface: Array, covariance: Array) -> Array:
         """Covariances (2, 3, 3) of turn and shift, as the pose's own says."""
         turn = anchor[:3, :3].T @ base_from_surface[:3, :3]
-        at_centre = np.hstack([-se3.hat(self._centre), np.eye(3)])
-        both = np.stack([covariance[:3, :3], at_centre @ covariance @ at_centre.T])
-        least = (SURE * np.array([self.settings.turned, self.settings.moved])) ** 2
-        return np.asarray(turn @ both @ turn.T + least[:, None, None] * np.eye(3))
+        both = np.stack([covariance[:3, :3], self._at_centre @ covariance @ self._at_centre.T])
+        return np.asarray(turn @ both @ turn.T + self._least)
 
     def _sizes(self, states: Array) -> Array:
         """Lengths (..., 2) of turns and shifts (..., 2, 3), in parts of what must be flagged."""
-        wanted = np.array([self.settings.turned, self.settings.moved])
-        return np.asarray(np.linalg.norm(states, axis=-1) / wanted)
+        return np.asarray(np.sqrt((states * states).sum(-1)) / self._wanted)
 
     # -- moving: until it settles
 
@@ -108,12 +107,12 @@ class MotionDetector:
         if len(self._claims) < REST:
             return self._tell(moving=True, onset=self._motion.onset)
         newest = self._states.newest(REST)
-        claim = np.mean(self._claims, 0)
+        claim = self._claims.newest(REST).mean(0)
         rest = newest.mean(0)
         away = newest.reshape(-1, BLOCK, 2, 3).mean(1) - rest
         white = self._noise.white(newest, claim)
         spread = 3.5 * np.sqrt(white * np.trace(claim, axis1=1, axis2=2) / BLOCK)
-        allowed = np.maximum(self.settings.settled, spread / [self.settings.turned, self.settings.moved])
+        allowed = np.maximum(self.settings.settled, spread / self._wanted)
         if (self._sizes(away).max(0) > allowed).any():
             return self._tell(moving=True, onset=self._motion.onset)
         self._rest = rest
@@ -125,7 +124,7 @@ class MotionDetector:
     def _watch(self) -> None:
         assert self._rest is not None
         newest = self._states.newest(REST)
-        claim = np.mean(list(self._claims)[-AVERAGED[0] :], 0)
+        claim = self._claims.newest(AVERAGED[0]).mean(0)
         for count in AVERAGED:
             part = newest[-count:] - self._rest
             kind = self._moved(part, claim, count)
@@ -166,10 +165,17 @@ class MotionDetector:
 
 
 class _Rows:
-    """The newest HISTORY arrays (2, 3), in one piece."""
+    """The newest HISTORY arrays (2, 3), or of more axes, in one piece."""
 
-    def __init__(self) -> None:
-        self._room = np.empty((8 * HISTORY, 2, 3))
+    def __init__(self, *more: int) -> None:
+        """more: lengths of the axes after those."""
+        self._room = np.empty((8 * HISTORY, 2, 3, *more))
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def clear(self) -> None:
         self._count = 0
 
     def append(self, row: Array) -> None:
@@ -180,7 +186,7 @@ class _Rows:
         self._count += 1
 
     def newest(self, count: int) -> Array:
-        """The last `count` (M, 2, 3), or as many as there are."""
+        """The last `count` (M, 2, 3, ...), or as many as there are."""
         return self._room[max(self._count - min(count, HISTORY), 0) : self._count]
 
 

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.compiled import NEW
-from estimation.median import median
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.track_loops import gram_by_camera, project_tracks, shared_residuals
+from estimation.track_loops import gram_by_camera, project_tracks, shared_residuals, weights_of
 
 Index = NDArray[np.int64]
 
@@ -118,7 +117,7 @@ def solve_pose(
     iterations: at the last scale, three at those before. tolerance: rad and mm, the last step's largest entry. shared:
     what each camera's tracks may be off by together.
     """
-    pose, unit, precision = start, 1.0, 1 / sigma**2
+    pose, unit, precision = start, 1.0, np.require(1 / sigma**2, float, NEW)
     camera, points = np.require(camera, np.int64, NEW), np.require(points, float, NEW)
     predicted, depth, jacobian = project(rig, camera, pose, points)
     residual = predicted - pixels
@@ -127,11 +126,8 @@ def solve_pose(
     information = np.zeros((6, 6))
     for widening in scales:
         for iteration in range(iterations if widening == scales[-1] else 3):
-            squared = (residual * residual).sum(1) * precision
-            front = depth > 0
-            if iteration < 3:
-                unit = float(np.sqrt(max(median(squared[front]) / 1.386, 1.0))) if front.any() else 1.0
-            weight = np.where(front, (1 + squared / (gate * unit * widening) ** 2) ** -2, 0.0)
+            anew = 0.0 if iteration < 3 else unit
+            weight, unit = weights_of(residual, precision, depth, gate * widening, anew)
             if common is None:
                 whole = gram_by_camera(len(rig), camera, jacobian, residual, weight * precision, np.zeros(6)).sum(0)
                 information, gradient = whole[:6, :6], whole[:6, 9]
@@ -172,6 +168,7 @@ class _Common:
         self._own = np.zeros((3, n, 3, n))
         each = np.arange(n)
         self._own[:, each, :, each] = grams[:, 6:9, 6:9]
+        self._found: SharedFit | None = None
         return self._whole[:, :6], self._whole[:, 9]
 
     def explained(self, jacobian: Array, anew: bool) -> Array:
@@ -185,9 +182,14 @@ class _Common:
 
     def found(self) -> SharedFit:
         """Of the last `normal` (Schur complement)."""
+        if self._found is None:
+            self._found = self._find()
+        return self._found
+
+    def _find(self) -> SharedFit:
         pose = self._whole[:, :6]
         information = pose + (1e-9 * np.trace(pose) + 1e-12) * np.eye(6)
-        solved = np.linalg.solve(information, np.c_[self._cross, self._whole[:, 9]])
+        solved = np.linalg.solve(information, np.concatenate([self._cross, self._whole[:, 9:]], axis=1))
         own = self._own.reshape(self._cross.shape[1], -1) - self._cross.T @ solved[:, :-1]
         return SharedFit((own + own.T) / 2, -(self._right - self._cross.T @ solved[:, -1]))
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from estimation.compiled import compiled
 from estimation.se3 import Array
 
+MEDIAN = 1.386  # of the squared length of two normal entries, in their variance
 COLUMNS = 10  # of a track's row: six of the pose, its camera's delay and two shifts, its residual
 
 
@@ -114,3 +115,65 @@ def pulls(
                 for b in range(3):
                     by_landmark[a, landmark[i], b] += weighted * row[3 + b]
     return by_landmark, by_camera
+
+
+@compiled("Tuple((f8[::1], f8))(f8[:,::1], f8[::1], f8[::1], f8, f8)")
+def weights_of(residual: Array, precision: Array, depth: Array, gate: float, unit: float) -> tuple[Array, float]:
+    """Geman-McClure's weights (N,), zero behind the camera, and the unit of residuals, in sigmas, that they hold for.
+
+    residual: (N, 2) px. precision: (N,) px^-2. depth: (N,) mm. gate: units at which a weight is a quarter. unit: 0
+    where it is to be found: by the median residual of what is in front, one at least.
+    """
+    squared = np.empty(len(depth))
+    front = 0
+    for i in range(len(depth)):
+        squared[i] = (residual[i, 0] * residual[i, 0] + residual[i, 1] * residual[i, 1]) * precision[i]
+        front += depth[i] > 0
+    if unit == 0.0:
+        unit = 1.0
+        if front > 0:
+            middle = np.sort(squared[depth > 0])[front // 2] / MEDIAN
+            unit = np.sqrt(max(middle, 1.0))
+    weight = np.zeros(len(depth))
+    for i in range(len(depth)):
+        if depth[i] > 0:
+            beside = 1.0 + squared[i] / (gate * unit) ** 2
+            weight[i] = 1.0 / (beside * beside)
+    return weight, unit
+
+
+@compiled("f8[:,::1](i8, i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[::1], f8[::1])")
+def rows_of_modes(
+    cameras: int,
+    camera: NDArray[np.int64],
+    landmark: NDArray[np.int64],
+    jacobian: Array,
+    residual: Array,
+    root: Array,
+    modes: Array,
+    error: Array,
+    twist: Array,
+) -> Array:
+    """Rows (2N, M + 6 + C + 1) of the regression on modes, pose and delays, each times its track's `root` (N,), px^-1.
+
+    modes: (L, 3, M) mm of each landmark, rows `landmark` (N,). error: (M,), modes that the residuals (N, 2) px hold and
+    the points do not. The last column is what is left. The rest as in `gram_by_camera`.
+    """
+    count = modes.shape[2]
+    rows = np.zeros((2 * len(camera), count + 7 + cameras))
+    for i in range(len(camera)):
+        own = modes[landmark[i]]
+        for k in range(2):
+            row, along, left = rows[2 * i + k], 0.0, -residual[i, k]
+            for m in range(count):
+                moved = 0.0
+                for a in range(3):
+                    moved += jacobian[i, k, 3 + a] * own[a, m]
+                row[m] = root[i] * moved
+                left -= moved * error[m]
+            for a in range(6):
+                row[count + a] = root[i] * jacobian[i, k, a]
+                along += jacobian[i, k, a] * twist[a]
+            row[count + 6 + camera[i]] = root[i] * along
+            row[count + 6 + cameras] = root[i] * left
+    return rows

@@ -11,10 +11,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.compiled import NEW
 from estimation.observations import Observations
 from estimation.pose_solver import PoseFit
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
+from estimation.track_loops import rows_of_modes
 from estimation.warp import Warp
 from estimation.warp_modes import WarpModes, modes_from_map
 
@@ -174,14 +176,12 @@ def _seen(
 ) -> tuple[Array, Array]:
     """Information (M, M) and gradient (M,) of both vectors' sum about the predicted one, pose and delays solved for."""
     count, cameras = len(modes.share), int(observations.camera.max()) + 1
-    weight = fit.weights / (sigma * fit.scale) ** 2
-    root = np.sqrt(weight)[:, None, None]
-    moved = fit.jacobians[:, :, 3:] @ modes.landmarks[observations.track]  # (N, 2, M)
-    residual = -fit.residuals - moved @ state[count:]  # the fit's points hold the deformation, but not the map's error
-    late = np.zeros((len(weight), 2, cameras))
-    late[np.arange(len(weight)), :, observations.camera] = fit.jacobians @ twist
-    whole = np.concatenate([moved, fit.jacobians, late, residual[..., None]], -1) * root
-    whole = whole.reshape(-1, whole.shape[-1])
+    root = np.sqrt(fit.weights) / (sigma * fit.scale)
+    row, camera = np.require(observations.track, np.int64, NEW), np.require(observations.camera, np.int64, NEW)
+    seen = np.require(fit.jacobians, float, NEW), np.require(fit.residuals, float, NEW)
+    # the fit's points hold the deformation, but not the map's error
+    landmarks = np.require(modes.landmarks, float, NEW)
+    whole = rows_of_modes(cameras, camera, row, *seen, root, landmarks, state[count:].copy(), twist)
     normal = whole.T @ whole
     own, other = slice(0, count), slice(count, count + 6 + cameras)
     held = normal[other, other] + np.diag([1e-9] * 6 + [1 / max(skew, 1e-4) ** 2] * cameras)

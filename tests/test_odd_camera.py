@@ -11,6 +11,7 @@ from test_estimator import LANDMARKS, RIG, begun, follow, look
 from estimation import se3
 from estimation.estimator import Estimator
 from estimation.observations import Observations
+from estimation.odd_camera import SURER, surprise
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.look import observations
@@ -71,3 +72,27 @@ def test_one_camera_against_the_others_and_the_motion_is_no_measurement() -> Non
     for cameras, there, measured in (((0, 1, 2), far, False), ((0,), far, True), ((0, 1, 2), breathing(NEXT), True)):
         seen = look(lambda stamp, pose=there: pose, NEXT, 1, cameras=cameras)  # type: ignore[misc]
         assert estimator.fit(seen, there).measured is measured
+
+
+def by_chance(share: float, reach: float) -> Observations:
+    """A part of the next frame set's tracks, each found anywhere within `reach` px: a covered or blurred surface."""
+    seen, draw = look(breathing, NEXT, 1), np.random.default_rng(5)
+    kept = np.concatenate([np.flatnonzero(seen.camera == c)[:: round(1 / share)] for c in range(len(RIG))])
+    pixels = seen.pixels[kept] + draw.uniform(-reach, reach, (len(kept), 2))
+    return Observations(NEXT, seen.camera[kept], seen.track[kept], pixels, seen.sigma[kept])
+
+
+@pytest.mark.parametrize(("reach", "measured"), [(0.0, True), (5.0, False)])
+def test_few_tracks_that_stand_off_are_no_measurement_though_nothing_surprises(reach: float, measured: bool) -> None:
+    estimator = followed()
+    fit = estimator.fit(by_chance(0.2, reach), estimator.predict(NEXT))
+    assert surprise(fit.solution, estimator.expected(NEXT)) < SURER
+    assert fit.measured is measured
+
+
+@pytest.mark.parametrize(("share", "reach", "sound"), [(1.0, 5.0, True), (0.5, 5.0, False), (0.5, 0.0, True)])
+def test_shape_and_clocks_learn_nothing_of_half_the_tracks_where_all_stand_off(
+    share: float, reach: float, sound: bool
+) -> None:
+    estimator = followed()
+    assert estimator.sound(estimator.fit(by_chance(share, reach), estimator.predict(NEXT))) is sound

@@ -47,14 +47,20 @@ def make_pictures(
     seed: int, period: int = PERIOD, size: tuple[int, int] = (640, 360), focal: float = 560.0
 ) -> Pictures:
     """Render the loops of one scene, some 20 s for the default."""
+    rig, scene, near = looped(seed, period, size, focal)
+    return Pictures(rig, scene, near, PictureLoop(scene, rig, near.poses @ ELSEWHERE, seed + 1))
+
+
+def looped(
+    seed: int, period: int = PERIOD, size: tuple[int, int] = (640, 360), focal: float = 560.0
+) -> tuple[Rig, Scene, PictureLoop]:
+    """Cameras, a scene, and the loop of its pictures at the nearer place: `period` frame sets."""
     rng = np.random.default_rng([seed, 61])
     rig = arc_rig(size=size, focal=focal)
     shape = with_wound(cylinder((80.0, 60.0), float(rng.uniform(50, 120))), WOUND, seed)
     scene = Scene(shape, Look(texel=0.2, wetness=0.3, drape=False), seed=seed)
     poses = closed_motion(period, REST, rng, lively=period / PERIOD)  # at one speed, however short the loop
-    return Pictures(
-        rig, scene, PictureLoop(scene, rig, poses, seed), PictureLoop(scene, rig, poses @ ELSEWHERE, seed + 1)
-    )
+    return rig, scene, PictureLoop(scene, rig, poses, seed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

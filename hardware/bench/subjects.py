@@ -38,6 +38,7 @@ Subjects = Mapping[str, Subject]
 
 SUBJECTS: Subjects = {
     "cameras": Subject("hardware.bench.cameras", "frames of live cameras put into sets: complete, wrong, waited for"),
+    "consistency": Subject("hardware.bench.consistency", "poses from pictures: are errors as large as is claimed?"),
     "estimator": Subject("hardware.bench.estimator", "the estimator on synthetic tracks: accuracy, honesty, time"),
     "fill": Subject("hardware.bench.fill", "beads laid into contours and random wounds: coverage and time"),
     "latency": Subject("hardware.bench.latency", "from three decoded frames to the pose, by wall clock and processor"),
