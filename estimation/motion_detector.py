@@ -20,6 +20,7 @@ from estimation.pose import SurfaceMotion
 from estimation.se3 import Array
 
 AVERAGED = (2, 4, 8)  # newest poses looked at together; one alone may be a glitch
+BEFORE = 16  # poses before the newest ones, against which a step is seen too: what lasts in the noise is alike in both
 REST = 32  # poses, a second of three cameras, whose mean is the place of rest
 BLOCK = 8  # poses: a part of them, whose mean must lie near that of all
 SURE = 0.01  # of what must be flagged: no pose is known better
@@ -125,24 +126,26 @@ class MotionDetector:
         assert self._rest is not None
         newest = self._states.newest(REST)
         claim = self._claims.newest(AVERAGED[0]).mean(0)
-        for count in AVERAGED:
-            part = newest[-count:] - self._rest
-            kind = self._moved(part, claim, count)
-            if kind is not None:
+        away = self._sizes(newest[-AVERAGED[0] :].mean(0) - self._rest) > self.settings.flagged
+        looks = [(count, self._rest, self._noise.variance(count)) for count in AVERAGED]
+        for count, since, variance in [*looks, (AVERAGED[0], _before(newest), self._noise.step)]:
+            part = newest[-count:] - since
+            kind = self._moved(part, claim, variance)
+            if kind is not None and (since is self._rest or away[kind]):  # not where those before hold a wrong pose
                 self._claims.clear()  # rest is a second of poses that are all later
-                return self._tell(moving=True, onset=self._onset(part.mean(0), kind))
+                return self._tell(moving=True, onset=self._onset(since, part.mean(0), kind))
         self._noise.learn(newest, claim)
         return self._tell(moving=False, onset=self._motion.onset)
 
-    def _moved(self, part: Array, claim: Array, count: int) -> int | None:
+    def _moved(self, part: Array, claim: Array, variance: Array) -> int | None:
         """0 where the newest poses' mean has turned, 1 where it has shifted, None where it is at rest.
 
-        part: (count, 2, 3) since rest.
+        part: (count, 2, 3) since rest, or since just before. variance: (2,) of their mean, in parts of the claim.
         """
-        mean = part.mean(0)
+        count, mean = len(part), part.mean(0)
         sizes = self._sizes(mean)
         for kind in np.flatnonzero(sizes > self.settings.flagged):
-            spread = claim[kind] * self._noise.variance(count, int(kind))
+            spread = claim[kind] * variance[kind]
             halves = part[:, kind].reshape(2, -1, 3).sum(1) / (count / 2)
             along = halves @ mean[kind] / (mean[kind] @ mean[kind])
             least = min(self.settings.agree, self.settings.flagged / sizes[kind])
@@ -150,10 +153,9 @@ class MotionDetector:
                 return int(kind)
         return None
 
-    def _onset(self, moved: Array, kind: int) -> float:
+    def _onset(self, since: Array, moved: Array, kind: int) -> float:
         """Stamp of the first pose of the movement: from it on all have gone a quarter of the way."""
-        assert self._rest is not None
-        along = (self._states.newest(HISTORY)[:, kind] - self._rest[kind]) @ moved[kind] / (moved[kind] @ moved[kind])
+        along = (self._states.newest(HISTORY)[:, kind] - since[kind]) @ moved[kind] / (moved[kind] @ moved[kind])
         before = np.flatnonzero(along < 0.25)
         return self._stamps[int(before[-1]) + 1 if len(before) else 0]
 
@@ -162,6 +164,11 @@ class MotionDetector:
         newest = self._states.newest(AVERAGED[0]).mean(0) - since
         turned, moved = np.linalg.norm(newest, axis=1).tolist()
         self._motion = SurfaceMotion(moving, onset, moved, turned)
+
+
+def _before(newest: Array) -> Array:
+    """The mean (2, 3) of the poses just before the newest ones."""
+    return np.asarray(newest[-BEFORE - AVERAGED[0] : -AVERAGED[0]].mean(0))
 
 
 class _Rows:
@@ -201,6 +208,7 @@ class _Noise:
     def __init__(self, settings: MotionSettings) -> None:
         self._settings = settings
         self._sum = np.ones((len(self.COUNTS), 2)) / np.array(self.COUNTS)[:, None]
+        self._step = np.full(2, 1 / AVERAGED[0] + 1 / BEFORE)  # of the newest poses' mean since just before
         self._weight = 0.0
         self._mean = np.zeros((2, 3))  # of the last seconds: noise is counted from here, not from the place of rest
 
@@ -216,6 +224,7 @@ class _Noise:
             return
         both = np.maximum(white, self._parts(states - self._mean, claim))
         self._sum = np.maximum(both, self.LEAST) / np.array(self.COUNTS)[:, None]
+        self._step = np.maximum(both, self.LEAST) * (1 / AVERAGED[0] + 1 / BEFORE)
         self._weight = self.TRUST
 
     def learn(self, newest: Array, claim: Array) -> None:
@@ -226,10 +235,17 @@ class _Noise:
         seen = np.minimum(seen, self.MOST * self._sum)
         self._weight = min(self._weight + 1, self._settings.memory)
         self._sum = self._sum + (seen - self._sum) / self._weight
+        step = self._parts((newest[-AVERAGED[0] :].mean(0) - _before(newest))[None], claim)
+        self._step = self._step + (np.minimum(step, self.MOST * self._step) - self._step) / self._weight
 
-    def variance(self, count: int, kind: int) -> float:
-        """Of a mean of `count` poses against the place of rest, in parts of one pose's claim."""
-        return float(self._sum[self.COUNTS.index(count), kind] + self._sum[-1, kind])
+    def variance(self, count: int) -> Array:
+        """(2,) of a mean of `count` poses against the place of rest, in parts of one pose's claim."""
+        return np.asarray(self._sum[self.COUNTS.index(count)] + self._sum[-1])
+
+    @property
+    def step(self) -> Array:
+        """(2,) of the newest poses' mean since just before, likewise."""
+        return self._step
 
     @staticmethod
     def _parts(away: Array, claim: Array) -> Array:
