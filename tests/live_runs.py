@@ -105,6 +105,18 @@ class Running:
                 return int(stat.parent.name)
         raise AssertionError(f"no process {name}")
 
+    def page(self) -> int:
+        """The process of the operator's page: the child that has no name of a run's."""
+        for folder in Path("/proc").glob("[0-9]*"):
+            try:
+                stat, line = (folder / "stat").read_text(), (folder / "cmdline").read_bytes()
+            except OSError:
+                continue
+            ours = int(stat.rsplit(")", 1)[1].split()[1]) == self.process.pid
+            if ours and b"spawn_main" in line and "(sb-" not in stat:
+                return int(folder.name)
+        raise AssertionError("no page")
+
     def kill(self, name: str, number: int = signal.SIGKILL) -> float:
         """Kill a child; the instant, s."""
         pid = self.pid(name)

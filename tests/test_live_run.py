@@ -158,6 +158,25 @@ def test_a_closed_terminal_ends_the_run_in_order(start: Start, cache: Path, tmp_
     assert rests(record, now, 0.5) and not open_session(record).damage
 
 
+def test_a_page_that_is_killed_leaves_the_arm_waiting_for_the_operator(cache: Path, tmp_path: Path) -> None:
+    run = Running("--simulated", str(cache / "small.toml"), "--record", str(tmp_path / "run.mcap"), cache=cache)
+    try:
+        at = run.wait_for("confirm")
+        run.press("y")
+        at = run.wait_for("ready", at)
+        run.press("s")
+        at = run.wait_for(r"\nprint\n", at)
+        CLOCK.wait_until(CLOCK.now() + 1.0)
+        os.kill(run.page(), signal.SIGKILL)
+        at = run.wait_for("paused: the operator's page was lost", at)
+        run.press("r")
+        run.wait_for(r"\nprint\n", at)
+        run.press("q")
+        assert run.end() == 1
+    finally:
+        run.close()
+
+
 def test_an_arm_that_is_unplugged_ends_the_run_and_says_so(start: Start, cache: Path, tmp_path: Path) -> None:
     record = tmp_path / "run.mcap"
     run = begun(start, cache, record)

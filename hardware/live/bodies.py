@@ -11,6 +11,7 @@ from hardware.live.place import Place
 from hardware.live.prepared import Prepared
 from hardware.live.records import Handed, LiveMotionReport, RecorderReport, TrackingReport
 from hardware.newest import Newest
+from hardware.operator.link import OperatorLink
 
 
 def show(prepared: Prepared, begin: float, ring: FrameRing, words: Connection) -> None:
@@ -37,6 +38,7 @@ def track(
     poses: Newest[Handed],
     reports: Newest[TrackingReport],
     motion: Newest[LiveMotionReport],
+    link: OperatorLink,
     sender: Connection,
     lifeline: Connection,
 ) -> None:
@@ -54,7 +56,7 @@ def track(
         surface_from_path=None if found is None else found.surface_from_path,
         cores=settings.cores_tracking,
     )
-    tracking_process(plan, TrackingLines(ring, words, poses, reports, motion, sender, lifeline))
+    tracking_process(plan, TrackingLines(ring, words, poses, reports, motion, link, sender, lifeline))
 
 
 def move(
@@ -64,6 +66,7 @@ def move(
     poses: Newest[Handed],
     reports: Newest[LiveMotionReport],
     orders: Connection,
+    link: OperatorLink,
     sender: Connection,
 ) -> None:
     """Plan the motion, and send it to the arm at `url`."""
@@ -71,9 +74,9 @@ def move(
     from hardware.live.motion_process import LiveMotionPlan, live_motion_process
 
     settings, profile = prepared.settings, prepared.task.profile
-    link = LinkSettings(pause_frame=settings.pause_frame)
-    plan = LiveMotionPlan(profile, url, prepared.beside.progress, link, settings.real_time, settings.cores_motion)
-    live_motion_process(plan, place, poses, reports, orders, sender)
+    line = LinkSettings(pause_frame=settings.pause_frame)
+    plan = LiveMotionPlan(profile, url, prepared.beside.progress, line, settings.real_time, settings.cores_motion)
+    live_motion_process(plan, place, poses, reports, orders, link.requests, sender)
 
 
 def move_virtually(prepared: Prepared, link: File, lifeline: Connection) -> None:

@@ -129,6 +129,11 @@ class Conductor:
         self._to(Stage.DONE if done else Stage.FAILED, reason, now)
         return [] if done else [Order.STOP]
 
+    def pause(self, reason: str, now: float) -> Orders:
+        """Have the nozzle brake and wait."""
+        self._to(Stage.PAUSED, reason, now)
+        return [Pace.PAUSE]
+
     # -- what is asked for
 
     def _asked_for(self, request: Request, now: float) -> Orders:
@@ -151,8 +156,7 @@ class Conductor:
         elif wish is Wish.START:
             return self._home(Stage.APPROACH, now)
         elif wish is Wish.PAUSE:
-            self._to(Stage.PAUSED, "by the operator", now)
-            return [Pace.PAUSE]
+            return self.pause("by the operator", now)
         elif wish is Wish.HOME:
             return [Pace.PAUSE, *self._home(Stage.STOPPED, now)]
         elif wish is Wish.RESUME:

@@ -17,6 +17,7 @@ from hardware.live.prepared import Prepared
 from hardware.live.records import Handed, LiveMotionReport, RecorderReport, TrackingReport
 from hardware.live.settings import VIRTUAL
 from hardware.newest import Newest
+from hardware.operator.link import OperatorLink
 
 LOOK = 0.02  # s between looks for it
 READY = 60.0  # s in which a virtual arm's device must be there, on a busy machine
@@ -37,6 +38,7 @@ class Lines:
     lifeline: Connection
     arm_line: Connection
     outbox: Outbox
+    link: OperatorLink
 
     def end(self) -> None:
         """End the processes in the order in which nobody misses anybody: the arm's first, the recorder last."""
@@ -55,25 +57,34 @@ class Lines:
 
 
 def started(prepared: Prepared, folder: File) -> Lines:
-    """Start all processes. folder: for a virtual arm's device."""
-    crew, url = Crew(), prepared.settings.arm
+    """Start all processes, or none. folder: for a virtual arm's device."""
+    crew = Crew()
+    try:
+        return _started(crew, prepared, folder)
+    except BaseException:
+        for name in list(crew.members):
+            crew.kill(name)
+        raise
+
+
+def _started(crew: Crew, prepared: Prepared, folder: File) -> Lines:
+    url = prepared.settings.arm
     arm_line = CONTEXT.Pipe(duplex=False)
     if url == VIRTUAL:
         url = str(folder / "arm")
         _start_arm(crew, prepared, File(url), arm_line[0])
     place, ring = Place(), FrameRing([camera.size for camera in prepared.rig.cameras])
     poses, tracking, motion = Newest[Handed](), Newest[TrackingReport](), Newest[LiveMotionReport]()
-    recorder = Newest[RecorderReport]()
+    recorder, link = Newest[RecorderReport](), OperatorLink()
     senders = [CONTEXT.Pipe(duplex=False) for _ in range(3)]
     lifeline, words, orders = (CONTEXT.Pipe(duplex=False) for _ in range(3))
     crew.start("recorder", record, (prepared, [end for end, _ in senders], recorder))
-    crew.start("motion", move, (prepared, url, place, poses, motion, orders[0], senders[0][1]))
+    crew.start("motion", move, (prepared, url, place, poses, motion, orders[0], link, senders[0][1]))
     if not prepared.live:
         crew.start("feed", show, (prepared, WallClock().now(), ring, words[1]))
-    crew.start("tracking", track, (prepared, ring, words[0], poses, tracking, motion, senders[1][1], lifeline[0]))
-    return Lines(
-        crew, url, place, tracking, motion, recorder, orders[1], lifeline[1], arm_line[1], Outbox(senders[2][1])
-    )
+    crew.start("tracking", track, (prepared, ring, words[0], poses, tracking, motion, link, senders[1][1], lifeline[0]))
+    ends = orders[1], lifeline[1], arm_line[1], Outbox(senders[2][1])
+    return Lines(crew, url, place, tracking, motion, recorder, *ends, link)
 
 
 def _start_arm(crew: Crew, prepared: Prepared, link: File, lifeline: Connection) -> None:

@@ -24,20 +24,19 @@ from hardware.link_settings import LinkSettings
 from hardware.live.children import settle
 from hardware.live.histograms import Histograms
 from hardware.live.motion import LiveMotion
+from hardware.live.motion_names import EXPOSURE_TO_WIRE, FRAMES_TO_WIRE, LATE
 from hardware.live.outbox import Outbox
 from hardware.live.place import Place
 from hardware.live.records import Begin, Handed, LiveMotionReport, Pace, Span, TickEntry, WireEntry
 from hardware.live.tap import Tap
 from hardware.motion_loop import MotionLoop, Order, Tick
 from hardware.newest import Newest
+from hardware.operator.request import RequestLine
 from hardware.priority import ask_for_real_time
 
 EVENTS = 50  # of the last ones that a report holds
 SECOND_BYTE = 1  # of a frame: which instruction it is
 MOVE = ord("1")
-FRAMES_TO_WIRE = "frames handed over to move on the wire"
-EXPOSURE_TO_WIRE = "exposure to move on the wire"
-LATE = "tick late"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,14 +57,18 @@ class LiveMotionPlan:
 class _Orders:
     """Takes the orders; those of a live run are followed here, those of the arm are passed on."""
 
-    def __init__(self, connection: Connection, motion: LiveMotion) -> None:
-        self._connection, self._motion = connection, motion
+    def __init__(self, connection: Connection, motion: LiveMotion, wishes: RequestLine) -> None:
+        self._connection, self._motion, self._wishes = connection, motion, wishes
+        self._stopped = wishes.last_stop
         self.alone, self.fingerprint = False, ""
         self._ended = False
         signal.signal(signal.SIGTERM, self._end)
 
     def __call__(self) -> list[Order]:
         taken: list[Order] = []
+        if (stop := self._wishes.last_stop) != self._stopped:  # the page's stop takes no way through the conductor
+            self._stopped = stop
+            taken.append(Order.STOP)
         try:
             while self._connection.poll():
                 order = self._connection.recv()
@@ -147,13 +150,14 @@ def live_motion_process(
     poses: Newest[Handed],
     reports: Newest[LiveMotionReport],
     orders: Connection,
+    wishes: RequestLine,
     record: Connection,
 ) -> None:
     """Follow orders until told to QUIT, or until whoever gives them is gone; then the arm is stopped."""
     settle("motion", plan.cores)
     clock, device, outbox = WallClock(), Device(plan.url, plan.profile.baud), Outbox(record)
     motion, watch = LiveMotion(plan.profile, place), _Watch(plan, poses, reports, outbox)
-    told = _Orders(orders, motion)
+    told = _Orders(orders, motion, wishes)
     try:
         arm = Arm(Tap(device, watch.heard), plan.profile, clock.now(), plan.settings)
         watch.motion = motion

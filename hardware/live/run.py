@@ -24,13 +24,18 @@ from hardware.live.conductor import Conductor, Orders, Seen
 from hardware.live.console import HELP, Console
 from hardware.live.halting import halt
 from hardware.live.keeper import Keeper
+from hardware.live.laid import Laid
 from hardware.live.lines import started
 from hardware.live.prepared import Prepared
 from hardware.live.records import Begin, EventEntry, UsedEntry
 from hardware.live.settings import settings_text
 from hardware.live.tally import Tally
+from hardware.live.view import Viewer
 from hardware.motion_loop import Order
-from hardware.operator.request import Request
+from hardware.operator.process import OperatorPage
+from hardware.operator.request import Request, Wish
+from hardware.operator.scene import scene_from
+from hardware.operator.settings import OperatorSettings
 from hardware.operator.view import Stage, Verdict
 from hardware.schemas import INFO, WARNING
 from planning.progress import fingerprint
@@ -39,6 +44,7 @@ if TYPE_CHECKING:
     from hardware.live.outcome import Outcome
 
 LOOK = 0.02  # s between looks while nothing happens
+SHOW = 0.15  # s between views for the page
 SAY = 5.0  # s between lines
 AT_REST = 1.0  # s that the arm gets to say that it is at rest
 HUNG = 2.0  # s without a word of the motion process, after which it is ended and the arm stopped for it
@@ -53,13 +59,15 @@ class LiveRun:
         self._prepared, self._console, self._clock = prepared, console, WallClock()
         self._conductor, self._tally, self._seen = Conductor(prepared.task), Tally(), Seen()
         self._signal = 0
+        self._viewer, self._viewed = Viewer(prepared), -1e9
+        self._page: OperatorPage | None = None
         self._stopped_at: list[float] = []  # s, decisions whose frame is not on the wire yet
         self._stops, self._requests = 0, 0
         self._stage = Stage.CHECK
         self._said = self._heard = -1e9
         self._found = prepared.found is not None
         self._halted = False
-        self._shown = ""
+        self._laid: Laid | None = None  # as the page shows it
 
     def __call__(self) -> Outcome:
         """Run to the end; what came of it. Files are whole and all processes have ended on return."""
@@ -71,6 +79,7 @@ class LiveRun:
             lines.outbox.put(UsedEntry("session.toml", settings_text(prepared.settings)))
             keeper = Keeper(prepared.beside.progress, fingerprint(prepared.task.path), lines.place)
             stack.callback(keeper.close)
+            self._open_page(stack)
             for note in prepared.notes:
                 self._console.say(note)
             while not self._conductor.ended:
@@ -91,7 +100,7 @@ class LiveRun:
         ready = wait([wake, *self._lines.crew.sentinels(), *self._terminal()], LOOK)
         if wake in ready:
             wake.recv(64)
-        requests = self._keys(ready)
+        requests = self._keys(ready) + self._lines.link.requests.take()
         seen, lines, now = self._seen, self._lines, self._clock.now()
         seen.tracking, seen.motion, seen.recorder = lines.tracking.get(), lines.motion.get(), lines.recorder.get()
         self._count_stops(now)
@@ -100,6 +109,7 @@ class LiveRun:
         self._give(orders)
         self._tally.look(now, conductor.stage, seen, None if conductor.laid is None else conductor.laid.profile.arm)
         self._note_surface()
+        self._show(now)
         self._tell(now)
 
     def _terminal(self) -> list[int]:
@@ -110,7 +120,7 @@ class LiveRun:
             return []
         found = []
         for wish in self._console.wishes():
-            self._requests += 1
+            self._requests -= 1  # the page's count upwards
             found.append(Request(self._requests, wish, self._conductor.turn))
         return found
 
@@ -169,11 +179,37 @@ class LiveRun:
             self._tally.times.add("stop decided to on the wire", motion.stop[1] - self._stopped_at[0])
         self._stopped_at.clear()
 
-    # -- what it says
+    # -- what it shows and says
+
+    def _open_page(self, stack: ExitStack) -> None:
+        if not self._prepared.settings.page:
+            return
+        link = self._lines.link
+        self._page = OperatorPage(link, OperatorSettings())
+        stack.callback(self._page.close)
+        self._page.tend(self._clock.now())
+        link.scene.put(scene_from(self._prepared.rig))
+        self._console.say(f"open {self._page.address} to see and operate the run")
+
+    def _show(self, now: float) -> None:
+        """The page's view, and the page itself: where it died, whoever looked at it sees nothing, so the arm waits."""
+        page, conductor = self._page, self._conductor
+        if page is None or now < self._viewed + SHOW:
+            return
+        self._viewed = now
+        if page.process is not None and not page.process.is_alive():
+            self._say("the operator's page has ended, and is started again", WARNING)
+            if Wish.PAUSE in conductor.offers and not self._prepared.task.unattended:
+                self._give(conductor.pause("the operator's page was lost", now))
+        page.tend(now)
+        self._lines.link.views.put(self._viewer(now, conductor, self._seen, self._tally))
 
     def _note_surface(self) -> None:
         """Keep where the path lies as soon as that is known, for a run that resumes."""
         tracking, laid, prepared = self._seen.tracking, self._conductor.laid, self._prepared
+        if laid is not self._laid and laid is not None:
+            self._laid = laid
+            self._lines.link.scene.put(scene_from(prepared.rig, laid.path))
         if self._found or laid is None or tracking is None or tracking.surface_from_path is None:
             return
         self._found = True

@@ -42,6 +42,7 @@ class Tally:
     times: Histograms = field(default_factory=Histograms)
     errors: np.ndarray = field(default_factory=lambda: np.zeros(ERROR_BINS, np.int64))
     most_error: float = 0.0
+    last_error: float = float("nan")
     _looked: float = float("nan")
     _ticked: float = float("nan")
     _sets: int = 0
@@ -106,4 +107,4 @@ class Tally:
         nozzle = se3.inverse(pose.base_from_surface) @ nozzle_from_axes(arm, move.axes)
         error = float(then.error_at(nozzle[None, :3, 3])[0])
         self.errors[min(int(error / ERROR_BIN), ERROR_BINS - 1)] += 1
-        self.most_error = max(self.most_error, error)
+        self.most_error, self.last_error = max(self.most_error, error), error

@@ -42,6 +42,8 @@ from hardware.live.records import (
     TrackingReport,
 )
 from hardware.newest import Newest
+from hardware.operator.link import OperatorLink
+from hardware.operator.taker import PictureTaker, Shot
 from hardware.session import Session, open_session
 from hardware.track import Step
 from hardware.tracker import tracker
@@ -83,6 +85,7 @@ class TrackingLines:
     poses: Newest[Handed]
     reports: Newest[TrackingReport]
     motion: Newest[LiveMotionReport]
+    link: OperatorLink
     record: Connection
     lifeline: Connection
 
@@ -152,6 +155,7 @@ class _Tracking:
         known, self._source = _opened(plan, lines)
         stack.callback(self._source.close)
         self._known = known
+        self._pictures = PictureTaker(lines.link.pictures, lines.link.requests)
         names = tuple(camera.name for camera in known.rig.cameras)
         self.report = TrackingReport(self._clock.now(), names, surface_from_path=plan.surface_from_path)
         lines.reports.put(self.report)
@@ -190,6 +194,7 @@ class _Tracking:
         self._count(arrived, pose, start, put)
         self._register(pose, arrived)
         self._report(arrived, pose)
+        self._show(frames, pose)
         self._record(arrived, frames, pose)
         self._step.idle()
         self._source.learn(self._step.last.offsets)
@@ -233,6 +238,14 @@ class _Tracking:
             used=tuple(int(n) for n in self._step.last.used),
         )
         self._lines.reports.put(self.report)
+
+    def _show(self, frames: FrameSet, pose: SurfacePose) -> None:
+        """Offer the pictures to the page, where anybody has it open."""
+        if not self._lines.link.requests.windows:
+            return
+        seen, names = self._step.last.observations, self.report.cameras
+        shots = [Shot(names[f.camera], f.image, tracks=seen.pixels[seen.camera == f.camera]) for f in frames.frames]
+        self._pictures.offer(frames.stamp, shots, pose.base_from_surface if pose.state.measured else None)
 
     def _record(self, arrived: Arrived, frames: FrameSet, pose: SurfacePose) -> None:
         stamps = {frame.camera: frame.stamp for frame in frames.frames}
