@@ -13,7 +13,6 @@ from estimation import se3
 from estimation.se3 import Array
 
 SHORT = 0.01  # s: what is left of a forecast that is shorter says no more than the velocity there
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # the axes after each and before each
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,14 +80,9 @@ def body_rate(increment: Array, rate: Array) -> Array:
 
 def _bracket(a: Array, b: Array) -> Array:
     """The Lie bracket of tangent vectors (..., 6)."""
-    turn = _cross(a[..., :3], b[..., :3])
-    shift = _cross(a[..., :3], b[..., 3:]) + _cross(a[..., 3:], b[..., :3])
+    turn = se3.cross(a[..., :3], b[..., :3])
+    shift = se3.cross(a[..., :3], b[..., 3:]) + se3.cross(a[..., 3:], b[..., :3])
     return np.concatenate([turn, shift], axis=-1)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """numpy's `cross` of vectors (..., 3) in a third of its time, which several times a frame is worth having."""
-    return np.asarray(a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT])
 
 
 def radius(covariance: Array, share: float = 0.9) -> Array:

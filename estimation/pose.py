@@ -137,6 +137,15 @@ class SurfacePose:
         spread = self._spread(points_surface)
         return np.asarray(np.sqrt(np.linalg.eigvalsh(spread)[:, -1]))
 
+    def error_ahead(self, stamp: float, points_surface: Array) -> Array:
+        """What `predict(stamp).error_at(points)` is, without all else that a prediction holds."""
+        dt = stamp - self.stamp
+        if self.forecast is None or not 0 < dt <= self.forecast.end:
+            return self.predict(stamp).error_at(points_surface)
+        covariance = self.forecast.covariance(self.covariance, dt)
+        warp = None if self.warp is None else self.warp.later(dt)
+        return replace(self, covariance=covariance, warp=warp).error_at(points_surface)
+
     def radius_at(self, points_surface: Array, share: float = 0.9) -> Array:
         """Radius (N,), mm, about points (N, 3), surface frame, that holds their true places in `share` of cases."""
         return radius(self._spread(points_surface), share)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # the axes after each and before each
 _SMALL = 1e-4  # rad: below, the fourth-order series is exact to 1e-16 relative
 
 
@@ -23,6 +24,11 @@ def hat(v: ArrayLike) -> Array:
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
     return out
+
+
+def cross(a: Array, b: Array) -> Array:
+    """numpy's `cross` of vectors (..., 3) in a third of its time, which several times a frame is worth having."""
+    return np.asarray(a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT])
 
 
 def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
@@ -60,10 +66,11 @@ def exp(xi: ArrayLike) -> Array:
     if xi.ndim == 1:
         return _exp_one(xi)
     w, v = xi[..., :3], xi[..., 3:]
-    _, c, d = _coefficients(np.linalg.norm(w, axis=-1))
+    s, c, d = (k[..., None, None] for k in _coefficients(np.linalg.norm(w, axis=-1)))
     h = hat(w)
-    left = np.eye(3) + c[..., None, None] * h + d[..., None, None] * (h @ h)
-    return make(exp_rotation(w), (left @ v[..., None])[..., 0])
+    square = h @ h
+    left = np.eye(3) + c * h + d * square
+    return make(np.eye(3) + s * h + c * square, (left @ v[..., None])[..., 0])
 
 
 def _exp_one(xi: Array) -> Array:
@@ -239,7 +246,7 @@ def rotation_from_euler(angles: ArrayLike) -> Array:
     order in which its angles are recovered (Eq. 4.3), for column vectors.
     """
     angles = np.asarray(angles, float)
-    (sa, sb, sg), (ca, cb, cg) = (np.moveaxis(f(angles), -1, 0) for f in (np.sin, np.cos))
+    (sa, sb, sg), (ca, cb, cg) = ([f(angles)[..., k] for k in range(3)] for f in (np.sin, np.cos))
     out = np.empty((*angles.shape, 3))
     out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = cg * cb, cg * sb * sa - sg * ca, cg * sb * ca + sg * sa
     out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = sg * cb, sg * sb * sa + cg * ca, sg * sb * ca - cg * sa

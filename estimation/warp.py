@@ -60,7 +60,7 @@ class Warp:
         places = transforms[:, :3, 3]
         bell = bells(places, self.control, self.reach)
         slope = -bell[..., None] * (places[:, None] - self.control) / self.reach**2  # (N, K, 3)
-        turn = 0.5 * np.cross(slope, self.coefficients).sum(1)
+        turn = 0.5 * se3.cross(slope, self.coefficients).sum(1)
         return se3.make(se3.exp_rotation(turn) @ transforms[:, :3, :3], places + bell @ self.coefficients)
 
     def uncarry(self, transforms: Array) -> Array:
@@ -73,8 +73,8 @@ class Warp:
         """Covariance (N, 3, 3), mm^2, of the displacement of points (N, 3)."""
         bell = bells(points, self.control, self.reach)
         count = len(self.control)
-        blocks = self.covariance.reshape(count, 3, count, 3)
-        return np.asarray(np.einsum("nk,kilj,nl->nij", bell, blocks, bell, optimize=True))
+        weighted = (bell @ self.covariance.reshape(count, -1)).reshape(-1, 3, count, 3)
+        return np.asarray((bell[:, None, None] @ weighted)[:, :, 0])  # matrix products: einsum plans each call anew
 
 
 def bells(points: Array, control: Array, reach: float) -> Array:

@@ -104,14 +104,14 @@ class Planner:
         base_from_nozzle = nozzle_from_axes(self._arm, self._follower.position)
         low, high = self._zone
         place = np.clip((se3.inverse(pose.base_from_surface) @ base_from_nozzle)[:3, 3], low, high)
-        turn, speed = pose.twist[:3], pose.twist[3:] + np.cross(pose.twist[:3], place)
+        turn, speed = pose.twist[:3], pose.twist[3:] + se3.cross(pose.twist[:3], place)
         if np.linalg.norm(speed) > SHARE * limits.surface_speed:
             return f"surface moves at {np.linalg.norm(speed):.1f} mm/s, limit {limits.surface_speed:g} mm/s"
         if np.linalg.norm(turn) > SHARE * limits.surface_turn:
             turn_deg, limit_deg = np.rad2deg(np.linalg.norm(turn)), np.rad2deg(limits.surface_turn)
             return f"surface turns at {turn_deg:.1f} degrees/s, limit {limit_deg:g} degrees/s"
         with np.errstate(invalid="ignore"):  # of a matrix that is no covariance: NaN, which is too much
-            error = float(pose.predict(then).error_at(place[None])[0])
+            error = float(pose.error_ahead(then, place[None])[0])
         if not error <= SHARE * limits.pose_error:
             return f"the place under the nozzle is known to {error:.3f} mm, limit {limits.pose_error:g} mm"
         return ""
@@ -270,7 +270,7 @@ class Planner:
 
 def _late(pose: SurfacePose, lag: float) -> SurfacePose:
     """The pose that an arm late by `lag` s will meet, under the stamp at which it is planned for."""
-    return replace(pose.predict(pose.stamp + lag), stamp=pose.stamp)
+    return replace(pose.predict(pose.stamp + lag), stamp=pose.stamp) if lag else pose
 
 
 def _finite(pose: SurfacePose) -> bool:

@@ -20,7 +20,7 @@ from planning.fill.fill import fill
 from planning.fill.order import ordered
 from planning.fill.pace import SHARP, Pace, hops, spent, turning
 from planning.fill.pattern import KINDS, Kind, Pattern
-from planning.fill.region import Region, around, region_of
+from planning.fill.region import Region, around, region_of, roughness
 
 PACE = Pace()
 WOUNDS = st.integers(0, 10**6).map(lambda seed: random_wound(np.random.default_rng(seed))[1])
@@ -45,6 +45,19 @@ def test_middle_lines_stay_inside_and_widths_within_what_the_nozzle_lays(wound: 
 def test_a_wound_is_covered_once_and_nothing_beside_it(wound: Region) -> None:
     found = coverage(fill(wound, Pattern(), PACE), wound)
     assert found.covered > 0.985 and found.double < 0.05 and found.over < 0.003
+
+
+@pytest.mark.parametrize("number", [571, 217, 759])
+def test_rough_narrow_wounds_are_covered_to_99_percent(number: int) -> None:
+    wound = random_wound(np.random.default_rng([1, number]))[1]
+    found = coverage(fill(wound, Pattern(), PACE), wound)
+    assert found.covered >= 0.99 and found.double <= 0.05 and found.over < 0.002
+
+
+def test_a_contour_without_roughness_is_followed_by_beads_of_the_nominal_width() -> None:
+    assert roughness(box(0, 0, 30, 20).buffer(2.0), 0.4) < 1e-4
+    outermost = fill(box(0, 0, 30, 20).buffer(2.0), Pattern("contour"), PACE)[0]
+    assert np.allclose(outermost.width, 0.4)
 
 
 @few

@@ -15,7 +15,7 @@ BESIDE = 0.8  # spacings from a line's middle to a gap that it can widen into
 DENSE = 0.15  # spacings from point to point along a gap
 DEEPEST = 0.5  # spacings by which a line widens at most: a corner of 50 degrees is that deep
 SOUNDINGS = 8  # places across that depth at which it is asked whether the corner lies open
-CALM = 3  # roundings of width and way, each over two points: else the way turns sharply
+CALM = 2  # roundings of width and way, each over two points: else the way turns sharply
 FINE = 0.01  # spacings: less is no widening
 
 
@@ -27,11 +27,11 @@ def widened(ring: Bead, gaps: NDArray[np.object_], fit: Fit) -> Bead:
     near = gaps[shapely.dwithin(line, gaps, BESIDE * spacing)]
     if not len(near):
         return ring
-    ring = _denser(ring, near, spacing)
+    ring = denser(ring, near, spacing)
     inward = _inward(ring.points)
     depths = (np.arange(SOUNDINGS) + 0.5) * deepest / SOUNDINGS
     sounded = ring.points[:, None] + inward[:, None] * (ring.width[:, None] / 2 + depths)[..., None]  # (N, S, 2)
-    open_there = shapely.contains_xy(_prepared(near), sounded[..., 0], sounded[..., 1])
+    open_there = shapely.contains_xy(prepared(near), sounded[..., 0], sounded[..., 1])
     more: Array = open_there.sum(axis=1) * (deepest / SOUNDINGS)
     more[np.abs(ring.width - spacing) > 1e-9] = 0.0
     more = _calm(more[:, None], np.ones(len(more)))[:, 0]
@@ -41,7 +41,8 @@ def widened(ring: Bead, gaps: NDArray[np.object_], fit: Fit) -> Bead:
     return Bead(lines[:, :2], lines[:, 2])
 
 
-def _prepared(shapes: NDArray[np.object_]) -> BaseGeometry:
+def prepared(shapes: NDArray[np.object_]) -> BaseGeometry:
+    """Polygons (G,) as one, made ready for many questions."""
     whole = shapely.multipolygons(shapes)
     shapely.prepare(whole)
     return whole
@@ -65,7 +66,7 @@ def _calm(values: Array, where: Array) -> Array:
     return np.concatenate([values, values[:1]])
 
 
-def _denser(ring: Bead, near: NDArray[np.object_], spacing: float) -> Bead:
+def denser(ring: Bead, near: NDArray[np.object_], spacing: float) -> Bead:
     """The same line with points close together where it passes gaps."""
     along = ring.along
     extra = np.linspace(0, along[-1], int(along[-1] / (DENSE * spacing)) + 2)[1:-1]

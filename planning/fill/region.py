@@ -44,6 +44,12 @@ def around(region: Region, bumps: Region, clearance: float) -> Region:
     return only_areas(shapely.difference(region, shapely.buffer(bumps, clearance)))
 
 
+def roughness(region: Region, width: float) -> float:
+    """Share of the area that a disc `width` mm wide does not reach: corners, and what is narrower."""
+    radius = width / 2
+    return 1 - float(shapely.buffer(shapely.buffer(region, -radius), radius).area / region.area)
+
+
 def only_areas(shape: BaseGeometry) -> Region:
     """The areas of whatever a shapely operation returned; lines and points have none."""
     return MultiPolygon(areas(shape))

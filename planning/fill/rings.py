@@ -8,7 +8,7 @@ left open there.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -21,7 +21,7 @@ from planning.fill.bead import Bead, even
 from planning.fill.corners import widened
 from planning.fill.coverage import covered_by
 from planning.fill.fit import Fit
-from planning.fill.region import Region, minus, points_of
+from planning.fill.region import Region, minus, points_of, roughness
 from planning.fill.strokes import strokes
 
 SAMPLED = 0.25  # spacings from point to point of the boundary whose medial axis is sought
@@ -32,6 +32,7 @@ SLIVER = 0.02  # spacings squared: a smaller loop is a dot
 FINE = 0.003  # spacings: to which lines are simplified; offsets of offsets double their points each time
 FACING = 0.15  # spacings: a line's point nearer to or farther from a disc's rim faces another disc
 HAIR = 0.01  # spacings: a narrower opening between two lines is none
+LOST = 0.003  # of the area: what the corners of the outermost line may lose before it is made narrower
 SMALLEST = 0.04  # spacings squared: of a gap worth filling, as in a corner of 110 degrees
 
 
@@ -45,24 +46,34 @@ class Level:
 
 def ring_levels(region: Region, fit: Fit, most: int | None = None) -> tuple[list[Level], Region]:
     """Levels of closed lines from the contour inwards, at most so many, and the region that they leave."""
-    spacing = fit.spacing
-    axis = axis_of(region, SAMPLED * spacing)
+    fit = _following(region, fit)
+    axis = axis_of(region, SAMPLED * fit.spacing)
     thin = strokes(axis, shapely.boundary(region), fit, most)
     levels: list[Level] = []
     left = region
     while not left.is_empty and (most is None or len(levels) < most):
+        here = fit.at(len(levels))
+        spacing = here.spacing
         own = [bead for k, bead in thin if k == len(levels)]
-        middle = _middle(left, own, fit, (ROUND if levels else OUTERMOST) * spacing)
+        middle = _middle(left, own, here, (ROUND if levels else OUTERMOST) * spacing)
         gaps = _gaps(left, middle, own, spacing)
-        own += _dots(gaps, fit)
+        own += dots(gaps, here)
         if levels and len(gaps):
             outer = levels[-1]
-            levels[-1] = Level([widened(ring, gaps, fit) for ring in outer.rings], outer.single)
-        between = _between(axis, len(levels), fit)
+            before = fit.at(len(levels) - 1)
+            levels[-1] = Level([widened(ring, gaps, before) for ring in outer.rings], outer.single)
+        between = _between(axis, fit.outside(len(levels)), here)
         rings = shapely.get_rings(shapely.get_parts(_simple(middle, spacing)))
-        levels.append(Level([_shared(ring, between, fit) for ring in rings], own))
+        levels.append(Level([_shared(ring, between, here) for ring in rings], own))
         left = _simple(shapely.buffer(left, -spacing), spacing)
     return levels, left
+
+
+def _following(region: Region, fit: Fit) -> Fit:
+    """The fit whose outermost line is so narrow that it follows a rough contour."""
+    lost = roughness(region, fit.spacing)
+    share = math.sqrt(LOST / max(lost, LOST))  # what rounded corners lose grows with the square of their radius
+    return replace(fit, outermost=max(share * fit.spacing, 2 * fit.one))
 
 
 def _simple(region: Region, spacing: float) -> Region:
@@ -97,7 +108,7 @@ def _gaps(left: Region, middle: Region, single: list[Bead], spacing: float) -> N
     return np.asarray(gaps[shapely.area(gaps) > SMALLEST * spacing**2])
 
 
-def _dots(gaps: NDArray[np.object_], fit: Fit) -> list[Bead]:
+def dots(gaps: NDArray[np.object_], fit: Fit) -> list[Bead]:
     """A short bead in the middle of each gap that is wide enough for one."""
     large = gaps[shapely.area(gaps) > np.pi * fit.one**2]
     dots = []
@@ -110,9 +121,9 @@ def _dots(gaps: NDArray[np.object_], fit: Fit) -> list[Bead]:
     return dots
 
 
-def _between(axis: Axis, level: int, fit: Fit) -> Axis:
+def _between(axis: Axis, outside: float, fit: Fit) -> Axis:
     """The part of an axis that only two lines of a level pass, one on each side; radii less what is outside them."""
-    radii = axis.radii - level * fit.spacing
+    radii = axis.radii - outside
     two = (radii >= fit.two) & (radii < fit.three)
     return Axis(axis.middles[two], radii[two], axis.edges[:0])
 

@@ -46,8 +46,8 @@ def strokes(axis: Axis, edge: BaseGeometry, fit: Fit, levels: int | None = None)
 
     edge: the boundary that the axis belongs to; no bead reaches over it.
     """
-    level = np.floor((axis.radii - fit.one) / fit.spacing).astype(int)
-    single = (axis.radii - level * fit.spacing < fit.two) & (level >= 0)
+    level = fit.level(axis.radii)
+    single = (axis.radii - fit.outside(level) < fit.two) & (level >= 0)
     if levels is not None:
         single &= level < levels
     a, b = axis.edges.T
@@ -57,7 +57,7 @@ def strokes(axis: Axis, edge: BaseGeometry, fit: Fit, levels: int | None = None)
         points = _smooth(axis.middles[path], fit.spacing)
         if len(points):
             inner = int(level[path[0]])
-            radius = shapely.distance(edge, shapely.points(points)) - fit.spacing * inner
+            radius = shapely.distance(edge, shapely.points(points)) - float(fit.outside(inner))
             bead = _clear(Bead(points, 2 * np.clip(radius, fit.one, fit.two)), fit)
             if bead is not None:
                 found.append((inner, bead))

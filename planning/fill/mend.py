@@ -1,0 +1,75 @@
+"""Beads widened over the small gaps that a rough or narrow region leaves between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.ndimage import convolve1d, maximum_filter1d
+
+from estimation.se3 import Array
+from planning.fill.bead import Bead
+from planning.fill.corners import denser, prepared
+from planning.fill.coverage import covered_by
+from planning.fill.fit import Fit
+from planning.fill.order import Run
+from planning.fill.region import Region, minus
+from planning.fill.rings import dots
+
+FAR = 0.2  # spacings beyond a bead's edge up to which it is asked whether it lies open
+SOUNDINGS = 12  # places in that
+SMALLEST = 0.004  # spacings squared: a smaller gap is none
+EVEN = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16  # weights over neighbours: else the way turns sharply
+
+
+def mended(runs: Sequence[Run], region: Region, fit: Fit) -> list[Run]:
+    """Runs, each bead widened over the gaps that are nearest to it, and dots in those that are wide enough for one.
+
+    What lies open at the contour stays so.
+    """
+    beads = [bead for run in runs for bead in run]
+    gaps = shapely.get_parts(minus(region, covered_by(beads)))
+    gaps = gaps[shapely.area(gaps) > SMALLEST * fit.spacing**2]
+    gaps = gaps[~shapely.intersects(gaps, shapely.boundary(region))]
+    if not len(gaps):
+        return list(runs)
+    lines = np.array([shapely.linestrings(bead.points) for bead in beads], dtype=object)
+    nearest = shapely.distance(gaps[:, None], lines[None]).argmin(axis=1)
+    better = iter([_over(bead, gaps[nearest == i], fit) for i, bead in enumerate(beads)])
+    return [[next(better) for _ in run] for run in runs] + [[dot] for dot in dots(gaps, fit)]
+
+
+def _over(bead: Bead, gaps: NDArray[np.object_], fit: Fit) -> Bead:
+    """A bead widened to either side where a gap begins at its edge; its ends stay."""
+    if not len(gaps):
+        return bead
+    bead = denser(bead, gaps, fit.spacing)
+    left, own = _left(bead.points), prepared(gaps)
+    depths = (np.arange(SOUNDINGS) + 0.5) * FAR * fit.spacing / SOUNDINGS
+    more = np.stack([_open(bead, side * left, depths, own) for side in (1.0, -1.0)])  # (2, N)
+    more *= np.minimum(np.maximum(fit.most - bead.width, 0.0) / np.maximum(more.sum(axis=0), 1e-12), 1.0)
+    points = bead.points + left * ((more[0] - more[1]) / 2)[:, None]
+    return Bead(points, bead.width + more.sum(axis=0))
+
+
+def _open(bead: Bead, way: Array, depths: Array, gaps: shapely.Geometry) -> Array:
+    """How far (N,), mm, gaps reach from a bead's edge along `way` (N, 2), evened out along the bead."""
+    at = bead.points[:, None] + way[:, None] * (bead.width[:, None] / 2 + depths)[..., None]  # (N, S, 2)
+    reach = np.where(shapely.contains_xy(gaps, at[..., 0], at[..., 1]), depths, 0.0).max(axis=1)
+    mode = "wrap" if bead.closed else "nearest"
+    inner = reach[:-1] if bead.closed else reach
+    inner = convolve1d(maximum_filter1d(inner, 3, mode=mode), EVEN, mode=mode)
+    return np.append(inner, inner[0]) if bead.closed else np.asarray(inner)
+
+
+def _left(points: Array) -> Array:
+    """Unit normals (N, 2) of a line (N, 2), to its left; of a closed one the same at both ends."""
+    step = np.diff(points, axis=0)
+    step /= np.maximum(np.linalg.norm(step, axis=1), 1e-9)[:, None]
+    closed = np.abs(points[0] - points[-1]).max() < 1e-9
+    before, after = (step[-1:], step[:1]) if closed else (step[:1], step[-1:])
+    along = np.concatenate([before, step]) + np.concatenate([step, after])
+    along /= np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+    return np.stack([-along[:, 1], along[:, 0]], axis=1)
