@@ -10,8 +10,8 @@ from scipy.ndimage import maximum_filter1d
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from planning.curve import Curve
-from planning.grid import Grid
 from planning.kinematics import SimpleArm, limited_axes
+from planning.stations import Stations
 
 STEP = 0.05  # mm along the path, and
 PAUSE = 0.02  # s, over which derivatives are taken: a tick, and what a tool goes in one at the slowest
@@ -34,7 +34,7 @@ class Demand:
     acceleration: Array
 
 
-def demand(arm: SimpleArm, pose: SurfacePose, curve: Curve, grid: Grid, begin: float) -> Demand:
+def demand(arm: SimpleArm, pose: SurfacePose, curve: Curve, grid: Stations, begin: float) -> Demand:
     """What the curve asks where the surface moves as `pose` predicts, the grid being entered at `begin`, s.
 
     X Y Z change along the curve by its own derivatives, blends included, all else by differences.

@@ -30,11 +30,6 @@ def joints_from_nozzle(model: JointModel, arm_from_nozzle: Array, signs: Array |
     return _wound(model, np.concatenate([first, last], -1))
 
 
-def all_postures(model: JointModel, arm_from_nozzle: Array) -> Array:
-    """Joints (8, ..., 6), rad, in each of POSTURES."""
-    return np.stack([joints_from_nozzle(model, arm_from_nozzle, signs) for signs in POSTURES])
-
-
 def joints_from_tip(model: JointModel, tip: Array, wrist: Array) -> Array:
     """Joints (..., 6), rad, that bring the nozzle's tip to `tip` (..., 3), mm, arm frame, the last three being `wrist`.
 

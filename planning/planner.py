@@ -22,13 +22,13 @@ from planning.command import Command, Hold, Move, feed_for
 from planning.curve import Curve, curve_through
 from planning.demand import Demand, demand
 from planning.follow import LEAD, Follower
-from planning.grid import Grid, grid_on
 from planning.kinematics import SimpleArm, axes_from_nozzle, joints_from_axes, limits_of, nozzle_from_axes
 from planning.legs import CORNER, SWERVE, Leg, entry, exit_from
 from planning.limits import JOINT_MARGIN, MARGIN, Limits
 from planning.path import Path, check_path
 from planning.progress import Phase, Progress, check_start
 from planning.retime import Timing, retime
+from planning.stations import Stations, stations_on
 
 HORIZON = 1.0  # s of path timed at once: any speed can be stopped in it
 RENEW = 0.5  # s of it left when the next is timed; a horizon ends at rest, and the surface is foreseen for 0.5 s
@@ -179,12 +179,12 @@ class Planner:
         self._leg = replace(leg, timing=timing)
         return ""
 
-    def _ask(self, pose: SurfacePose, curve: Curve, place: float, begin: float) -> tuple[Grid, Demand]:
+    def _ask(self, pose: SurfacePose, curve: Curve, place: float, begin: float) -> tuple[Stations, Demand]:
         """The next horizon from `place`, mm, passed at `begin`, s, and what it asks of the axes."""
-        grid = grid_on(curve, place, curve.after(place, HORIZON))
+        grid = stations_on(curve, place, curve.after(place, HORIZON))
         return grid, demand(self._arm, pose, curve, grid, begin)
 
-    def _timed(self, grid: Grid, asked: Demand, speed: float, begin: float) -> Timing | str:
+    def _timed(self, grid: Stations, asked: Demand, speed: float, begin: float) -> Timing | str:
         self.horizons += 1
         return retime(grid, asked, speed, begin, self._bounds)
 

@@ -27,7 +27,7 @@ from toppra.solverwrapper import seidelWrapper
 
 from estimation.se3 import Array
 from planning.demand import Demand
-from planning.grid import Grid
+from planning.stations import Stations
 
 logging.getLogger("toppra").setLevel(logging.CRITICAL)  # its failures are handled here, not printed
 
@@ -73,7 +73,7 @@ class Timing:
         return np.asarray((self.speeds[i + 1] - self.speeds[i]) / (self.times[i + 1] - self.times[i]))
 
 
-def retime(grid: Grid, asked: Demand, speed: float, begin: float, limits: tuple[Array, Array]) -> Timing | str:
+def retime(grid: Stations, asked: Demand, speed: float, begin: float, limits: tuple[Array, Array]) -> Timing | str:
     """The fastest timing along the grid that begins at `begin`, s, with `speed`, mm/s, and ends at rest.
 
     limits: speed and acceleration (D,) of what `asked` is about. The grid's speeds hold everywhere, not at its points
@@ -99,7 +99,7 @@ def retime(grid: Grid, asked: Demand, speed: float, begin: float, limits: tuple[
     return Timing(times, grid.places, np.asarray(speeds))
 
 
-def _speeds(grid: Grid, asked: Demand, limit: Array, carried: float, change: float) -> Array:
+def _speeds(grid: Stations, asked: Demand, limit: Array, carried: float, change: float) -> Array:
     """Speed (M,), mm/s, that tool and axes bear; from `carried` down no faster than by `change`, mm/s^2."""
     left = np.clip(TOTAL * limit - asked.speed, LEAST * limit, PATH_SPEED * limit)
     axes = (left / np.maximum(np.abs(asked.first), 1e-12)).min(axis=1)

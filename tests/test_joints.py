@@ -11,11 +11,16 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
-from planning.inverse import POSTURES, all_postures, joints_from_nozzle, joints_from_tip
-from planning.joints import arm_from_nozzle, distance, jacobian
+from planning.inverse import POSTURES, joints_from_nozzle, joints_from_tip
+from planning.joints import JointModel, arm_from_nozzle, distance, jacobian
 from tests.arms import random_joints, random_model
 
 SEEDS = st.integers(0, 100_000)
+
+
+def all_postures(model: JointModel, wanted: np.ndarray) -> np.ndarray:
+    """Joints (8, ..., 6), rad, in each of POSTURES."""
+    return np.stack([joints_from_nozzle(model, wanted, signs) for signs in POSTURES])
 
 
 @given(SEEDS)

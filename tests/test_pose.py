@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation import se3
+from estimation.forecast import Forecast
 from estimation.pose import SurfacePose, TrackState
 
 
@@ -107,3 +110,14 @@ def test_the_error_at_a_point_is_that_of_samples() -> None:
 
 def test_only_tracking_and_degraded_are_measured() -> None:
     assert [s for s in TrackState if s.measured] == [TrackState.TRACKING, TrackState.DEGRADED]
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(-0.3, 0.8))
+def test_the_error_ahead_is_that_of_the_prediction(seed: int, dt: float) -> None:
+    start, places = pose(seed), np.array([[0.0, 0, 0], [30.0, -20, 5]])
+    if seed % 2:
+        steps = np.array([0.1, 0.3, 0.5])
+        grown = [(1 + k) * start.covariance for k in steps]
+        start = replace(start, forecast=Forecast(steps, steps[:, None] * start.twist, np.stack(grown)))
+    then = start.stamp + dt
+    assert np.allclose(start.error_ahead(then, places), start.predict(then).error_at(places))

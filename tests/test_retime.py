@@ -11,11 +11,11 @@ from estimation import se3
 from hardware.bench.random_runs import Swing, random_path
 from planning.curve import Curve, curve_through
 from planning.demand import Demand, demand
-from planning.grid import grid_on
 from planning.kinematics import SimpleArm, axes_from_nozzle
 from planning.legs import CORNER, SWERVE
 from planning.limits import Limits
 from planning.retime import RISE, TOTAL, Timing, retime
+from planning.stations import stations_on
 from tests.moving import Motion, pose_at, raster, still
 
 ARM, LIMITS = SimpleArm(), Limits()
@@ -29,7 +29,7 @@ def curve_of(seed: int) -> Curve:
 
 
 def timed(curve: Curve, start: float, end: float, speed: float = 0.0, motion: Motion = still) -> Timing:
-    grid = grid_on(curve, start, end)
+    grid = stations_on(curve, start, end)
     timing = retime(grid, demand(ARM, pose_at(motion, 10.0), curve, grid, 10.0), speed, 10.0, BOUNDS)
     assert isinstance(timing, Timing), timing
     return timing
@@ -57,7 +57,7 @@ def test_no_stretch_and_no_corner_is_passed_faster_than_it_may_be(seed: int) -> 
 def test_path_and_surface_together_keep_the_axes_limits(seed: int, swing: tuple[float, float, float]) -> None:
     """Judged by differences of the axes asked for, with the surface moving as it was foreseen."""
     curve, pose = curve_of(seed), pose_at(Swing(*swing).at, 10.4)
-    grid = grid_on(curve, 0.0, curve.after(0.0, 2.0))
+    grid = stations_on(curve, 0.0, curve.after(0.0, 2.0))
     timing = retime(grid, demand(ARM, pose, curve, grid, 10.4), 0.0, 10.4, BOUNDS)
     assert isinstance(timing, Timing)
     step = 0.02
@@ -71,7 +71,7 @@ def test_path_and_surface_together_keep_the_axes_limits(seed: int, swing: tuple[
 def test_a_surface_that_takes_most_of_an_axis_leaves_the_path_little() -> None:
     """X may do 150 mm/s; a surface that asks 115 of TOTAL * 150 leaves 5 to a path that would go at 40."""
     curve = curve_through(raster(size=40, lines=2).surface_from_nozzle, np.full(3, 40.0), CORNER, SWERVE)
-    grid = grid_on(curve, 0.0, 35.0)
+    grid = stations_on(curve, 0.0, 35.0)
     asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     taken = np.zeros_like(asked.speed)
     taken[:, 0] = TOTAL * LIMITS.speed[0] - 5.0
@@ -84,7 +84,7 @@ def test_a_surface_that_takes_most_of_an_axis_leaves_the_path_little() -> None:
 
 def test_a_surface_faster_than_an_axis_slows_the_path_and_does_not_stop_it() -> None:
     curve = curve_through(raster().surface_from_nozzle, np.full(5, 40.0), CORNER, SWERVE)
-    grid = grid_on(curve, 0.0, 8.0)
+    grid = stations_on(curve, 0.0, 8.0)
     asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     much = np.full_like(asked.speed, 1e4)
     timing = retime(grid, Demand(asked.axes, asked.first, asked.second, much, much), 0.0, 10.0, BOUNDS)
@@ -97,7 +97,7 @@ def test_a_surface_faster_than_an_axis_slows_the_path_and_does_not_stop_it() -> 
 def test_a_speed_carried_into_narrower_limits_is_brought_down_and_not_refused(seed: int) -> None:
     draw = np.random.default_rng(seed)
     curve = curve_through(raster(size=60, lines=2).surface_from_nozzle, np.full(3, 30.0), CORNER, SWERVE)
-    grid = grid_on(curve, 10.0, 55.0)
+    grid = stations_on(curve, 10.0, 55.0)
     asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     taken = np.broadcast_to(draw.uniform(0, 2) * LIMITS.speed, asked.speed.shape)
     timing = retime(grid, Demand(asked.axes, asked.first, asked.second, taken, asked.acceleration), 30.0, 10.0, BOUNDS)
@@ -120,7 +120,7 @@ def test_the_demand_of_a_surface_is_its_axes_own_speed_and_acceleration() -> Non
     swing = Swing(10.0, 0.1, 0.25)
     pose = pose_at(swing.at, 10.0)
     curve = curve_through(raster().surface_from_nozzle, np.full(5, 5.0), CORNER, SWERVE)
-    grid = grid_on(curve, 0.0, 4.0)
+    grid = stations_on(curve, 0.0, 4.0)
     asked = demand(ARM, pose, curve, grid, 10.0)
     fixed = curve.poses(grid.places[:1])
     before, after = (axes_from_nozzle(ARM, pose.base_at(np.array([10.0 + h])) @ fixed)[0] for h in (-1e-3, 1e-3))
@@ -132,7 +132,7 @@ def test_the_demand_of_a_surface_is_its_axes_own_speed_and_acceleration() -> Non
 
 def test_two_places_that_are_one_have_no_timing_and_say_so() -> None:
     curve = curve_through(se3.make(np.eye(3), np.array([[0.0, 0, 0], [1, 0, 0]])), np.array([5.0]), CORNER, SWERVE)
-    grid = grid_on(curve, 0.0, 1.0)
+    grid = stations_on(curve, 0.0, 1.0)
     asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     reason = retime(
         grid, Demand(asked.axes, asked.first * np.nan, asked.second, asked.speed, asked.acceleration), 0.0, 1.0, BOUNDS

@@ -14,7 +14,7 @@ POINTS = 30  # evenly spread grid points of one horizon: toppra takes some 20 us
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grid:
+class Stations:
     """Grid points on a stretch of a curve, rising.
 
     places: (M,) mm. allowed: (M,) mm/s that the stretches and corners on both sides bear. cruise: (M,) mm/s that the
@@ -32,7 +32,7 @@ class Grid:
         return np.concatenate([[0.0], np.cumsum(2 * np.diff(self.places) / pace)])
 
 
-def grid_on(curve: Curve, start: float, end: float) -> Grid:
+def stations_on(curve: Curve, start: float, end: float) -> Stations:
     """Grid points from `start` to `end`, mm: evenly spread, and where there is room bounds and middle of each blend."""
     places = _places(curve, start, end)
     first, last = curve.stretch(places[:-1]), curve.stretch(np.nextafter(places[1:], 0.0))
@@ -40,7 +40,7 @@ def grid_on(curve: Curve, start: float, end: float) -> Grid:
     before = np.searchsorted(curve.knots + curve.half, places[:-1], "right")  # the first blend not yet passed
     beyond = np.searchsorted(curve.knots - curve.half, places[1:], "left") - 1  # the last one begun
     corner = np.where(beyond >= before, _least(curve.corner, before, np.maximum(beyond, before)), np.inf)
-    return Grid(places, _at_points(np.minimum(between, corner)), _at_points(between))
+    return Stations(places, _at_points(np.minimum(between, corner)), _at_points(between))
 
 
 def _places(curve: Curve, start: float, end: float) -> Array:
