@@ -24,6 +24,7 @@ from hardware.plan_order import Wishes, check_out, order_of
 from hardware.plan_page import Story, material_text, page_text
 from hardware.ply_file import write_ply
 from hardware.progress import Progress, duration
+from hardware.reach import with_feasible
 from hardware.scan_units import in_mm
 from planning.layers.figures import LayerFigures, Total, figures_of, total_of
 from planning.layers.flat_wound import flat_wound
@@ -42,6 +43,7 @@ LAYER_COLUMNS = (
     "gap_over_a_bead_mm2", "runs", "checkpoints", "printed_mm", "travelled_mm", "time_s", "volume_mm3",
 )  # fmt: skip
 ASLANT_DEG = 35.0  # off the normal: a bead is then pushed aside by a fifth of its width, as the tip is no point
+NOT_ASKED = "arm: none was asked, so there is no column `feasible`; --arm ARM.toml asks one, or stillbed reach later"
 REPAIRED_STEP = 0.5  # mm between the vertices of the repaired scan that is written
 
 
@@ -50,7 +52,7 @@ class Request:
     """What is to be planned and written. scan: mesh or contour; example: a built-in body instead.
 
     outline: of the wound on the scan. unit: of the scan's numbers. flip: it was scanned inside out. session: in whose
-    pictures the scan is to be found.
+    pictures the scan is to be found. arm: whose joints are asked about each checkpoint.
     """
 
     out: Path
@@ -63,6 +65,7 @@ class Request:
     session: Path | None = None
     pictures: bool = True
     force: bool = False
+    arm: Path | None = None
     wishes: Wishes = field(default_factory=Wishes)
 
 
@@ -85,8 +88,9 @@ def run_plan(request: Request) -> str:
     subject = _subject(request, flat)
     with _progress("plan", "layers") as progress:
         plan = make_plan(subject.wound, order, subject.name, progress)
-    check_path(plan.path)
-    _whole(request.out, lambda file: write_path(file, plan.path))
+    path, told = (plan.path, NOT_ASKED) if request.arm is None else with_feasible(plan.path, request.arm)
+    check_path(path)
+    _whole(request.out, lambda file: write_path(file, path))
     if request.gcode is not None:
         _whole(request.gcode, lambda file: file.write_text(gcode_text(plan.path), encoding="utf-8"))
     with _progress("measure", "layers") as progress:
@@ -96,7 +100,7 @@ def run_plan(request: Request) -> str:
     if request.pictures:
         written += _pictures(request, plan, subject, layers, total)
     placed = [] if request.session is None else _placed(request.session, request.out, plan)
-    return "\n".join([_told(plan, subject, total, request.out, written), *placed])
+    return "\n".join([_told(plan, subject, total, request.out, written), told, *placed])
 
 
 def planned_scan(vertices: Array, triangles: Index, step: float, where: object, flip: bool = False) -> Subject:

@@ -46,6 +46,11 @@ def add_plan(commands: Commands) -> None:
         "--session", type=Path, metavar="SESSION",
         help="also lay the scan into this session's first pictures, and say how well it fits the wound they show",
     )  # fmt: skip
+    command.add_argument(
+        "--arm", type=Path, metavar="ARM.toml",
+        help="ask this arm's joints about each checkpoint and write the column `feasible`; without, there is none, and "
+        "`stillbed reach` adds it",
+    )  # fmt: skip
     command.add_argument("--no-pictures", action="store_true", help="write neither pictures nor the report")
     command.add_argument("--force", action="store_true", help="overwrite PATH.csv and what stands beside it")
     _add_scan(command)
@@ -142,6 +147,7 @@ def _plan(arguments: argparse.Namespace) -> None:
                 a.session,
                 not a.no_pictures,
                 a.force,
+                a.arm,
                 wishes,
             )
         )

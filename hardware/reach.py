@@ -52,20 +52,35 @@ class Answer:
 
 def run_reach(path: File, arm: File, question: Question, out: File | None = None, force: bool = False) -> Answer:
     """Ask the arm in file `arm` about the path in file `path`; with `out` path.csv, reach.csv and reach.html there."""
-    checkpoints, profile = read_path(path), read_arm(arm)
-    model = profile.arm.joints
-    if model is None:
-        raise InputError(arm, "kinematics", "missing", "a table [kinematics]: data/arms has examples")
-    motion = Motion(question.amplitude_mm, float(np.deg2rad(question.turn_deg)), question.rate_hz)
-    place = _place(question)
-    spin = best_spin(model, place, checkpoints, motion) if question.spin else np.zeros(len(checkpoints))
-    found = _within(profile, place, checkpoints, motion, at_spin(model, place, checkpoints, motion, spin))
-    text = reach_text(model, found, best_posture(model, place, checkpoints, motion), question)
+    checkpoints = read_path(path)
+    model, motion, found = _asked(checkpoints, arm, question)
+    text = reach_text(model, found, best_posture(model, _place(question), checkpoints, motion), question)
     if out is not None:
         prepare_out(out, force)
         _write(out, marked(checkpoints, found), found)
         (out / "reach.html").write_text(reach_page(path.name, model.name, text, checkpoints, found), encoding="utf-8")
     return Answer(text, bool(found.feasible.all()))
+
+
+def with_feasible(path: Path, arm: File) -> tuple[Path, str]:
+    """The path with the column `feasible` as the arm in a file has it, over a surface at rest, and that in words."""
+    model, _, found = _asked(path, arm, Question())
+    count = f"{int(found.feasible.sum())} of {len(path)} checkpoints can be printed, the surface at rest"
+    return marked(path, found), f"arm {model.name}: {count}; how, and on a moving one: stillbed reach"
+
+
+def _asked(path: Path, arm: File, question: Question) -> tuple[JointModel, Motion, Reach]:
+    """The arm's model, the surface's motion, and what the path asks of the one over the other."""
+    profile = read_arm(arm)
+    model = profile.arm.joints
+    if model is None:
+        raise InputError(arm, "kinematics", "missing", "a table [kinematics]: data/arms has examples")
+    motion, place = (
+        Motion(question.amplitude_mm, float(np.deg2rad(question.turn_deg)), question.rate_hz),
+        _place(question),
+    )
+    spin = best_spin(model, place, path, motion) if question.spin else np.zeros(len(path))
+    return model, motion, _within(profile, place, path, motion, at_spin(model, place, path, motion, spin))
 
 
 def marked(path: Path, found: Reach) -> Path:
