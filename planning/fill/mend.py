@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.ndimage import convolve1d, maximum_filter1d
+from scipy.ndimage import convolve1d
 
 from estimation.se3 import Array
 from planning.fill.bead import Bead
@@ -20,8 +20,8 @@ from planning.fill.rings import dots
 
 FAR = 0.2  # spacings beyond a bead's edge up to which it is asked whether it lies open
 SOUNDINGS = 12  # places in that
-SMALLEST = 0.004  # spacings squared: a smaller gap is none
-EVEN = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16  # weights over neighbours: else the way turns sharply
+SMALLEST = 0.0015  # spacings squared: a smaller gap is none
+EVEN = np.array([1.0, 2.0, 1.0]) / 4  # weights over neighbours: else the way turns sharply
 
 
 def mended(runs: Sequence[Run], region: Region, fit: Fit) -> list[Run]:
@@ -59,8 +59,7 @@ def _open(bead: Bead, way: Array, depths: Array, gaps: shapely.Geometry) -> Arra
     at = bead.points[:, None] + way[:, None] * (bead.width[:, None] / 2 + depths)[..., None]  # (N, S, 2)
     reach = np.where(shapely.contains_xy(gaps, at[..., 0], at[..., 1]), depths, 0.0).max(axis=1)
     mode = "wrap" if bead.closed else "nearest"
-    inner = reach[:-1] if bead.closed else reach
-    inner = convolve1d(maximum_filter1d(inner, 3, mode=mode), EVEN, mode=mode)
+    inner = convolve1d(reach[:-1] if bead.closed else reach, EVEN, mode=mode)
     return np.append(inner, inner[0]) if bead.closed else np.asarray(inner)
 
 

@@ -62,7 +62,7 @@ def ring_levels(region: Region, fit: Fit, most: int | None = None) -> tuple[list
             outer = levels[-1]
             before = fit.at(len(levels) - 1)
             levels[-1] = Level([widened(ring, gaps, before) for ring in outer.rings], outer.single)
-        between = _between(axis, fit.outside(len(levels)), here)
+        between = _between(axis, float(fit.outside(len(levels))), here)
         rings = shapely.get_rings(shapely.get_parts(_simple(middle, spacing)))
         levels.append(Level([_shared(ring, between, here) for ring in rings], own))
         left = _simple(shapely.buffer(left, -spacing), spacing)
