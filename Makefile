@@ -1,4 +1,4 @@
-# make demo | test | check | format | outages: each makes .venv and installs what it needs; a second time costs nothing.
+# make demo | test | check | format | outages | browser: each makes .venv and installs what it needs; a second time costs nothing.
 
 PYTHON ?= python3
 BIN    := .venv/bin
@@ -6,7 +6,7 @@ STAMP  := .venv/.installed
 DEMO   := demo
 APT    := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0
 
-.PHONY: demo test check format install outages
+.PHONY: demo test check format install outages browser
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
@@ -23,6 +23,10 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest tests/test_floors.py
+
+# The operator's page is tested in Chromium; where there is none those tests are skipped, and say so.
+browser:
+	@$(call apt,chromium,command -v chromium || command -v chromium-browser || command -v google-chrome)
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import re
+import select
 import shutil
+import socket
 import ssl
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -100,6 +103,39 @@ def test_without_the_token_nothing_is_there(page: Served, name: str) -> None:
 @pytest.mark.parametrize("name", ["nothing", "..%2f..%2fetc%2fpasswd", "../gate.py", "%2e%2e/gate.py", "page.js/x"])
 def test_nothing_but_the_pages_files_is_served(page: Served, name: str) -> None:
     assert get(page.address + name)[0] in (403, 404)
+
+
+RAW = {
+    "no words": b"\x00\xff" * 200,
+    "long": b"GET /" + b"a" * 9000 + b" HTTP/1.1\r\n\r\n",
+    "length": b"POST /x/stop HTTP/1.1\r\nHost: x\r\nContent-Length: -3\r\n\r\n",
+    "large": b"POST /x/stop HTTP/1.1\r\nHost: x\r\nContent-Length: 99999999999\r\n\r\n",
+    "address": b"GET http://[::1/ HTTP/1.1\r\nHost: x\r\n\r\n",
+    "star": b"OPTIONS * HTTP/1.1\r\nHost: x\r\n\r\n",
+    "connect": b"CONNECT a:80 HTTP/1.1\r\nHost: x\r\n\r\n",
+    "two slashes": b"GET //x/ HTTP/1.1\r\nHost: x\r\n\r\n",
+}
+
+
+@pytest.mark.parametrize("what", RAW)
+def test_what_is_no_request_is_refused_and_harms_nobody(page: Served, what: str) -> None:
+    with socket.create_connection(("127.0.0.1", page.listener.getsockname()[1]), timeout=10) as raw:
+        raw.sendall(RAW[what])
+        assert raw.recv(12)[-3:] in (b"400", b"403")
+    assert get(page.address)[0] == 200
+
+
+def test_connections_that_say_nothing_do_not_keep_others_out(page: Served) -> None:
+    place = ("127.0.0.1", page.listener.getsockname()[1])
+    idle = [socket.create_connection(place, timeout=10) for _ in range(200)]
+    closed, end = 0, time.monotonic() + 20
+    while closed < 200 - 40 and time.monotonic() < end:
+        closed = sum(bool(select.select([each], [], [], 0)[0]) for each in idle)
+        time.sleep(0.05)
+    assert 200 - 40 <= closed < 200
+    assert get(page.address)[0] == 200
+    for each in idle:
+        each.close()
 
 
 def test_a_stop_without_a_socket_is_taken_from_the_own_page_alone(page: Served) -> None:

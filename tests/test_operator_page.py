@@ -295,6 +295,20 @@ def test_the_browser_images_points_as_the_estimator_does(run: Run) -> None:
     assert np.allclose(found[1], distort(CAMERA, ideal), atol=1e-9)
 
 
+def test_a_picture_that_stands_still_says_how_old_it_is_while_the_others_go_on(run: Run) -> None:
+    page = run.open()
+    jpeg = encode(np.full((36, 64, 3), 128, np.uint8), 90)[1]
+    run.served.link.pictures.put(Pictures(1.0, tuple(CameraPicture(f"camera{k}", jpeg) for k in range(2))))
+    page.until('document.querySelector("[data-camera=camera0] canvas").dataset.drawn')
+    for stamp in range(2, 30):
+        run.served.link.pictures.put(Pictures(float(stamp), (CameraPicture("camera1", jpeg),)))
+        if page.js('document.querySelector("[data-camera=camera0]").classList.contains("still")'):
+            break
+        page.js("new Promise((done) => setTimeout(done, 100))")
+    assert "s old" in page.text("[data-camera=camera0]")
+    assert page.text("[data-camera=camera1] figcaption span") == "camera1"
+
+
 def test_printed_path_and_path_to_come_are_drawn_where_they_lie_in_the_picture(run: Run) -> None:
     page = run.open((1440, 900))
     above = np.diag([1.0, -1.0, -1.0, 1.0])

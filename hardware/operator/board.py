@@ -17,7 +17,10 @@ ROWS = 1200  # of it: at 20 views per second, which is more than the board looks
 
 
 class Board:
-    """Reads the link, never writes to it. view: the newest, None before the first. gone: the run has ended."""
+    """Reads the link, never writes to it. view: the newest, None before the first. gone: the run has ended.
+
+    refused: requests that were turned away.
+    """
 
     def __init__(self, link: OperatorLink) -> None:
         self._link = link
@@ -26,7 +29,7 @@ class Board:
         self._since = nan
         self._course: deque[tuple[float, float, float, float, bool]] = deque(maxlen=ROWS)
         self.view: OperatorView | None = None
-        self.gone = False
+        self.gone, self.refused = False, 0
         self.view_text, self.scene_text, self.pictures_bytes = "null", "", b""
         self.news = asyncio.Event()  # set, and replaced, when there is something new
 

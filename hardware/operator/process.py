@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import multiprocessing
 import os
 import signal
@@ -74,6 +75,8 @@ def operator_process(
     """Serve the page until told to end (SIGTERM) or until the run is gone; Ctrl-C is the run's business."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(NICENESS)
+    for name in ("aiohttp", "asyncio"):  # what strangers send is theirs: it is counted, and not written on the terminal
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     asyncio.run(_until_the_end(link, settings, listener, limits or Limits()))
 
 

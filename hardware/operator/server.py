@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import ssl
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from importlib.resources import files
 from socket import socket as Listener
 
@@ -20,6 +20,7 @@ from hardware.operator.settings import Limits, OperatorSettings
 from hardware.operator.window import Window
 
 LOOK = 0.04  # s: how soon what the run puts out is seen
+STRANGERS = 32  # connections that are no windows: a browser keeps six
 FULL = 1013  # close code: try again later
 KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 
@@ -32,7 +33,7 @@ class OperatorServer:
     def __init__(self, link: OperatorLink, settings: OperatorSettings, port: int, limits: Limits) -> None:
         self._link, self._settings, self._limits, self._clock = link, settings, limits, WallClock()
         self._gate, self._headers = Gate(settings, port), answer_headers(settings, port)
-        self._windows: set[Window] = set()
+        self._windows: dict[Window, asyncio.BaseTransport | None] = {}
         self._files = page_files()
         self.board = Board(link)
 
@@ -48,17 +49,21 @@ class OperatorServer:
         )
         return made
 
-    async def look(self) -> None:
-        """Keep the board up to date for ever."""
+    async def look(self, connections: Callable[[], Sequence[web.RequestHandler]]) -> None:
+        """Keep the board up to date for ever, and connections few. connections: all there are, the oldest first."""
         while True:
             self._link.requests.windows = len(self._windows)
+            self.board.refused = sum(self._gate.refused.values())
             self.board.look(self._clock.now(), bool(self._windows))
+            own = set(self._windows.values())
+            for handler in [each for each in connections() if each.transport not in own][:-STRANGERS]:
+                handler.force_close()
             await asyncio.sleep(LOOK)
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         changes = request.method != "GET" or "Upgrade" in request.headers
-        token = request.path.split("/")[1]
+        token = request.path.partition("/")[2].partition("/")[0]
         if reason := self._gate.refusal(token, request.headers, changes):
             return web.Response(status=403, text=f"refused: {reason}\n", headers=self._own_headers())
         try:
@@ -90,11 +95,11 @@ class OperatorServer:
             await socket.close(code=FULL, message=b"too many windows")
             return socket
         window = Window(socket, self.board, self._link.requests, self._limits, self._clock)
-        self._windows.add(window)
+        self._windows[window] = request.transport
         try:
             await window.run()
         finally:
-            self._windows.discard(window)
+            del self._windows[window]
         return socket
 
 
@@ -111,7 +116,9 @@ async def serve(
     runner = web.AppRunner(server.application(), access_log=None, keepalive_timeout=10.0, shutdown_timeout=0.5)
     await runner.setup()
     await web.SockSite(runner, listener, ssl_context=_encryption(settings)).start()
-    looking = asyncio.create_task(server.look())
+    assert runner.server is not None
+    handlers = runner.server
+    looking = asyncio.create_task(server.look(lambda: handlers.connections))
     done = asyncio.create_task(ended.wait())
     await asyncio.wait({looking, done}, return_when=asyncio.FIRST_COMPLETED)
     link.requests.windows = 0

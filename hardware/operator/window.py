@@ -105,7 +105,7 @@ class Window:
     def _status(self) -> str:
         age = self._board.age(self._clock.now())
         kind, stale = "gone" if self._board.gone else "view", self._limits.stale
-        head = text(kind=kind, bundle=self._bundle, age=age, stale=stale)
+        head = text(kind=kind, bundle=self._bundle, age=age, stale=stale, refused=self._board.refused)
         return f'{head[:-1]},"view":{self._board.view_text}}}'
 
     async def _put(self, message: str | bytes) -> None:

@@ -1,6 +1,8 @@
 // One camera's live picture with what was found in it: outline, tracks, the path where it will lie, the nozzle.
 import { drawPath, Lens } from "./lens.js";
 
+const OLD = 1500; // ms: they come five times a second
+
 export class CameraPane {
   constructor(name, chosen) {
     this.name = name;
@@ -24,7 +26,13 @@ export class CameraPane {
   }
   show(image, found) {
     if (this.image) this.image.close();
-    [this.image, this.found] = [image, found];
+    [this.image, this.found, this.since] = [image, found, performance.now()];
+  }
+  // a picture that stands still must not be taken for a live one
+  tick() {
+    const age = this.image ? performance.now() - this.since : 0, old = age > OLD;
+    this.root.classList.toggle("still", old);
+    this.title.textContent = old ? `${this.name}, ${(age / 1000).toFixed(0)} s old` : this.name;
   }
   fares(view) {
     this.root.dataset.verdict = view ? view.verdict : "";

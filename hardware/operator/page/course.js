@@ -30,7 +30,11 @@ export class Course {
     const most = Math.max(limit === null ? 0.5 : 2 * limit, 0.1);
     const x = (stamp) => left + (w - left) * (1 - (now - stamp) / SPAN), y = (mm) => (h - foot) * (1 - Math.min(mm, most) / most) + 1;
     g.fillStyle = "rgb(217 131 36 / .22)";
-    for (let i = 1; i < rows.length; i++) if (rows[i][4]) g.fillRect(x(rows[i - 1][0]), 0, x(rows[i][0]) - x(rows[i - 1][0]) + 0.5, h - foot);
+    for (let i = 0; i < rows.length; i++) {
+      const first = i;
+      while (i < rows.length && rows[i][4]) i++;
+      if (i > first) g.fillRect(x(rows[first][0]), 0, x(rows[Math.min(i, rows.length - 1)][0]) - x(rows[first][0]), h - foot);
+    }
     g.strokeStyle = "#e3e2dc";
     g.lineWidth = ratio;
     g.strokeRect(left, 1, w - left - 1, h - foot);

@@ -9,7 +9,7 @@ import { ACTIVITIES, duration, figure, milliseconds, STAGES, TRACKING, upper, VE
 const LARGE = ["find", "confirm"]; // stages in which the pictures are what matters
 const CHECKED = ["check", "find", "confirm", "ready", "failed"];
 const by = (id) => document.getElementById(id);
-const state = { view: null, scene: null, poses: null, age: Infinity, since: 0, stale: 1, gone: false, full: false, chosen: null, large: null };
+const state = { view: null, scene: null, poses: null, age: Infinity, since: 0, stale: 1, refused: 0, gone: false, full: false, chosen: null, large: null };
 const panes = new Map();
 const course = new Course(document.querySelector("#course canvas"));
 const space = new SceneView(by("scene"));
@@ -26,7 +26,7 @@ async function hear(message) {
 function view(message) {
   state.gone = message.kind === "gone";
   state.full = false;
-  state.stale = message.stale;
+  [state.stale, state.refused] = [message.stale, message.refused];
   state.age = message.age === null ? Infinity : message.age;
   state.since = performance.now();
   state.view = message.view;
@@ -77,7 +77,7 @@ function show() {
   const seen = state.view, age = state.age + (performance.now() - state.since) / 1000;
   const news = state.full ? "full" : state.gone ? "gone" : !line.connected ? "lost" : !seen ? "wait" : age > state.stale ? "old" : "live";
   document.body.dataset.news = news;
-  by("news").textContent = { live: "live", wait: "waiting", old: "old", gone: "ended", lost: "not connected", full: "too many windows" }[news];
+  by("news").textContent = (state.refused ? `${state.refused} refused · ` : "") + { live: "live", wait: "waiting", old: "old", gone: "ended", lost: "not connected", full: "too many windows" }[news];
   alarm(news, age);
   if (seen) stage(seen);
   buttons.show(seen, news === "live");
@@ -109,7 +109,8 @@ function stage(seen) {
   const about = STAGES[seen.stage], holds = held(seen);
   by("chip").textContent = holds ? "Holding" : about.word;
   document.body.dataset.tone = holds ? "hold" : about.tone;
-  by("question").textContent = seen.question || (holds ? "Holding until it is safe to print." : about.say);
+  const same = seen.question.toLowerCase() === about.word.toLowerCase(); // it stands beside it already
+  by("question").textContent = (!same && seen.question) || (holds ? "Holding until it is safe to print." : about.say);
   by("reason").textContent = upper((holds && seen.motion.reason) || seen.reason);
   by("notes").replaceChildren(...seen.notes.map((note) => text("span", note)));
   document.body.dataset.large = (state.large ?? LARGE.includes(seen.stage)) ? "yes" : "no";
@@ -208,6 +209,7 @@ window.addEventListener("resize", refresh);
 const line = new Line(hear);
 const buttons = new Buttons((wish, turn) => line.ask(wish, turn));
 setInterval(() => {
+  for (const each of panes.values()) each.tick();
   show();
   buttons.tick();
 }, 200);

@@ -6,7 +6,7 @@ export const STAGES = {
   confirm: { word: "Confirm", tone: "wait", say: "Does the path lie where it should in every picture?" },
   ready: { word: "Ready", tone: "wait", say: "Ready to print. The arm waits." },
   approach: { word: "Approach", tone: "good", say: "The nozzle goes to the wound." },
-  print: { word: "Printing", tone: "good", say: "Printing." },
+  print: { word: "Printing", tone: "good", say: "The path is being printed." },
   paused: { word: "Paused", tone: "hold", say: "Paused. The arm stands and can go on." },
   stopped: { word: "Stopped", tone: "bad", say: "Stopped. Nothing is sent to the arm." },
   homing: { word: "Going home", tone: "good", say: "The arm goes home." },
