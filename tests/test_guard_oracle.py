@@ -11,7 +11,7 @@ import pytest
 from estimation.pose import SurfacePose, TrackState
 from hardware.bench.guard_oracle import Rules, judge
 from hardware.bench.link_guard import REST, jointed, random_log, simple
-from planning.command import Move
+from planning.command import Code, Move, Refusal
 from planning.guard import Guard
 from planning.kinematics import joints_from_axes
 from planning.limits import Limits
@@ -87,8 +87,10 @@ def standing(rules: Rules, **changes: np.ndarray) -> tuple[Guard, Move, np.ndarr
     return guard, Move(1.0, axes, 50.0, 0, False), before, after
 
 
-def passes(guard: Guard, move: Move) -> bool:
-    return guard(move, SurfacePose(1.0, REST, np.zeros((6, 6)), np.zeros(6), TrackState.TRACKING), 1.0) is move
+def code_of(guard: Guard, move: Move) -> Code | None:
+    """Why the guard refuses a move, None where it lets it pass."""
+    answer = guard(move, SurfacePose(1.0, REST, np.zeros((6, 6)), np.zeros(6), TrackState.TRACKING), 1.0)
+    return answer.code if isinstance(answer, Refusal) else None
 
 
 @pytest.mark.parametrize("joint", range(6))
@@ -105,11 +107,11 @@ def test_the_range_and_speed_of_each_joint_are_met_and_broken_by_next_to_nothing
         limit = getattr(model, name).copy()
         limit[joint] = exact - beyond
         guard, move, _, _ = standing(rules, **{name: limit})
-        assert passes(guard, move), name
+        assert code_of(guard, move) is None, name
         limit = limit.copy()
         limit[joint] = exact + beyond
         guard, move, _, _ = standing(rules, **{name: limit})
-        assert not passes(guard, move), name
+        assert code_of(guard, move) is (Code.JOINT_SPEED if name == "speed" else Code.JOINT_RANGE)
 
 
 def test_the_oracle_finds_a_guard_that_does_not_look_at_the_joints() -> None:

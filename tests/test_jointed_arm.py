@@ -16,7 +16,7 @@ from estimation.se3 import Array
 from hardware.arm_file import read_arm, write_arm
 from hardware.arm_profile import ArmProfile
 from hardware.bench.planner import Tally, bench_arm, follow
-from planning.command import Hold, Move
+from planning.command import Code, Hold, Move, Refusal
 from planning.guard import Guard
 from planning.kinematics import axes_from_nozzle, joints_from_axes, nozzle_from_axes
 from planning.path import Path
@@ -91,7 +91,7 @@ def test_the_guard_refuses_a_place_that_the_posture_does_not_reach() -> None:
     guard = Guard(replace(limits, low=low, high=high), settings_.arm, TICK)
     move = Move(10.0, settings_.arm.home + [900.0, 0, 0, 0, 0, 0], 10.0, 0, False)
     refused = guard(move, pose_at(breathing, 10.0), 10.0)
-    assert isinstance(refused, Hold) and "no posture" in refused.reason
+    assert isinstance(refused, Refusal) and "no posture" in refused.reason and refused.code is Code.POSTURE
 
 
 def test_the_guard_knows_each_joints_own_speed() -> None:
@@ -101,7 +101,8 @@ def test_the_guard_knows_each_joints_own_speed() -> None:
     slow = replace(settings_.arm, joints=replace(model, speed=np.append([0.05] * 3, model.speed[3:])))
     guard = Guard(settings_.limits, slow, TICK)
     refused = guard(Move(10.0, slow.home + [1.0, 0, 0, 0, 0, 0], 50.0, 0, False), pose_at(breathing, 10.0), 10.0)
-    assert isinstance(refused, Hold) and refused.reason.startswith("refused: J")
+    assert isinstance(refused, Refusal) and refused.reason.startswith("refused: J")
+    assert refused.code is Code.JOINT_SPEED and refused.got > refused.limit == 0.05
 
 
 def test_both_arm_files_come_back_as_written(tmp_path: Folder) -> None:
