@@ -12,13 +12,14 @@ from browser import Browser, Page, executable
 from operator_page import OFFERED, Served, full_view
 
 from estimation import se3
+from estimation.pose import TrackState
 from estimation.rig import Camera, distort, pixels_from_points
 from hardware.images import encode
 from hardware.operator.pictures import CameraPicture, Pictures
 from hardware.operator.request import Request, Wish
 from hardware.operator.scene import Scene
 from hardware.operator.settings import Limits
-from hardware.operator.view import Activity, Answer, OperatorView, Stage
+from hardware.operator.view import Activity, Answer, OperatorView, Stage, Verdict
 
 CHROMIUM = executable()
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
@@ -198,14 +199,22 @@ def test_a_reloaded_window_shows_the_same_and_knows_the_last_minute(run: Run) ->
 def test_state_and_why_and_all_figures_are_there_in_words(run: Run) -> None:
     page = run.open()
     motion = replace(run.view.motion, activity=Activity.HOLDING, error=0.62, reason="the surface moves too fast")
-    run.show(motion=motion, notes=("dry run",))
+    run.show(motion=motion, notes=("dry run",), events=("one", "camera1 was late", "it is back"))
     body = "".join(page.js("document.body.innerText").split())
     for words in (
         "Holding", "The surface moves too fast", "Good", "three cameras agree", "0.62 mm", "limit 0.5", "0.19 mm",
         "18 ms", "14 / 27 ms", "31 ms", "0.052 mm", "35.2 %", "checkpoint 1204 of 3420", "layer 3 of 12",
-        "12 min 34 s left", "30 Hz", "60 tracks", "dry run", "live",
+        "12 min 34 s left", "30 Hz", "60 tracks", "dry run", "live", "6.0 mm/s", "camera1 was late", "it is back",
     ):  # fmt: skip
         assert words.replace(" ", "") in body, words
+
+
+def test_the_page_has_words_for_all_that_a_view_can_say(run: Run) -> None:
+    page = run.open()
+    kinds = {"STAGES": Stage, "TRACKING": TrackState, "ACTIVITIES": Activity, "WISHES": Wish, "VERDICTS": Verdict}
+    for name, kind in kinds.items():
+        known = page.js(f'import("./words.js").then((words) => Object.keys(words.{name}))')
+        assert set(known) == {each.value for each in kind}
 
 
 def test_a_failed_check_says_what_to_do(run: Run) -> None:

@@ -7,6 +7,7 @@ import { Line } from "./socket.js";
 import { ACTIVITIES, duration, figure, milliseconds, STAGES, TRACKING, upper, VERDICTS } from "./words.js";
 
 const LARGE = ["find", "confirm"]; // stages in which the pictures are what matters
+const EVENTS = 2; // of the last ones that there is room for
 const CHECKED = ["check", "find", "confirm", "ready", "failed"];
 const by = (id) => document.getElementById(id);
 const state = { view: null, scene: null, poses: null, age: Infinity, since: 0, stale: 1, refused: 0, gone: false, full: false, chosen: null, large: null };
@@ -86,6 +87,7 @@ function show() {
     states(seen);
     tiles(seen);
     progress(seen);
+    events(seen.events);
     for (const camera of seen.cameras) pane(camera.name).fares(camera);
   }
   refresh();
@@ -157,7 +159,15 @@ function states(seen) {
   const none = { word: "–", tone: "" }, { tracking, motion } = seen;
   put("tracking", tracking ? TRACKING[tracking.state] : none, tracking ? tracking.reason : "");
   const arm = motion && motion.arm ? `arm ${motion.arm}` : "";
-  put("motion", motion ? ACTIVITIES[motion.activity] : none, [held(seen) ? "" : motion && motion.reason, arm].filter(Boolean).join(" · "));
+  const speed = motion && motion.speed !== null && motion.activity !== "resting" ? `${motion.speed.toFixed(1)} mm/s` : "";
+  const words = [held(seen) ? "" : motion && motion.reason, speed, arm];
+  put("motion", motion ? ACTIVITIES[motion.activity] : none, words.filter(Boolean).join(" · "));
+}
+
+function events(all) {
+  const list = by("events"), wanted = all.slice(-EVENTS);
+  list.hidden = !wanted.length;
+  if (list.textContent !== wanted.join("")) list.replaceChildren(...wanted.map((words) => text("li", words)));
 }
 
 function tiles(seen) {
@@ -203,6 +213,13 @@ function refresh() {
     course.draw();
   });
 }
+
+// a screen that goes dark in the middle of a print helps nobody; browsers ask for a touch first
+async function stayAwake() {
+  if (document.visibilityState === "visible" && navigator.wakeLock) await navigator.wakeLock.request("screen").catch(() => {});
+}
+document.addEventListener("visibilitychange", stayAwake);
+document.addEventListener("pointerdown", stayAwake, { once: true });
 
 space.changed = refresh;
 window.addEventListener("resize", refresh);
