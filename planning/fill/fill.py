@@ -18,6 +18,7 @@ from planning.fill.pace import Pace, hops, spent
 from planning.fill.pattern import Pattern
 from planning.fill.region import Region, checked, roughness
 from planning.fill.rings import Level, ring_levels
+from planning.fill.scan import Boundary, boundary_of
 from planning.fill.spiral import apart, nests, wound
 from planning.fill.zigzag import raster_lines, zigzag_lines
 
@@ -25,7 +26,7 @@ INTO_RIM = 0.1  # spacings by which lines run into the rim of hybrid, whose roun
 CORNER = 0.05  # spacings by which corners are cut: what that leaves open is less than a hundredth of a bead
 ROUGH = 0.001  # of the area, lost in corners of the contour: below, gaps come to half a percent at most
 
-Lines = Callable[[Region, float, float], tuple[list[Array], float]]
+Lines = Callable[[Boundary, float, float], tuple[list[Array], float]]
 
 
 def fill(region: Region, pattern: Pattern, pace: Pace) -> list[Bead]:
@@ -86,8 +87,8 @@ def _lines(region: Region, pattern: Pattern, pace: Pace) -> list[Bead]:
     middle = shapely.buffer(region, -pattern.width / 2)
     if middle.is_empty:
         return []
-    corner = _corner(region, pattern)
-    found = [_placed(lay(middle, angle, pattern.spacing), pattern, corner) for angle in _angles(pattern)]
+    corner, boundary = _corner(region, pattern), boundary_of(middle)
+    found = [_placed(lay(boundary, angle, pattern.spacing), pattern, corner) for angle in _angles(pattern)]
     if pattern.angle == "shorter":  # the printed line and the way between its parts, thesis 5.3
         return [_cut(b, pattern) for b in min(found, key=lambda way: sum(bead.length for bead in way) + hops(way))]
     return min(([_cut(bead, pattern) for bead in way] for way in found), key=lambda way: spent(way, pace).seconds)

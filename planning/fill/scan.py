@@ -16,6 +16,15 @@ INWARD = 1e-6  # share of the height by which the outermost lines stay off the t
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Boundary:
+    """vertices: (M, 2) mm, ring after ring, without repeats. ring_start, ring_end: (M,) of each vertex's ring."""
+
+    vertices: Array
+    ring_start: NDArray[np.intp]
+    ring_end: NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Crossings:
     """Where scan lines cross a boundary, by line and then by x: two by two they bound a stretch inside.
 
@@ -40,23 +49,28 @@ def turned(points: Array, angle: float) -> Array:
     return np.asarray(points @ np.array([[c, s], [-s, c]]))
 
 
-def crossings(region: Region, angle: float, spacing: float) -> tuple[Crossings, float]:
-    """Crossings of lines at an angle with the boundary of a region, and the distance of the lines, mm.
-
-    The outermost lines touch the region; the distance divides its height evenly and is about `spacing`, rather less.
-    """
+def boundary_of(region: Region) -> Boundary:
+    """The boundary of a region; one serves lines at all angles."""
     points, ring = shapely.get_coordinates(shapely.get_rings(shapely.get_parts(region)), return_index=True)
     last = np.append(np.flatnonzero(ring[1:] != ring[:-1]), len(ring) - 1)
     start = np.concatenate([[0], last[:-1] + 1])
     kept = np.ones(len(points), bool)
     kept[last] = False  # a ring repeats its first point
     count = last - start
-    ring_start, ring_end = (np.repeat(v, count) for v in (np.cumsum(count) - count, np.cumsum(count)))
-    vertices = turned(points[kept], -angle)
+    end = np.cumsum(count)
+    return Boundary(points[kept], np.repeat(end - count, count), np.repeat(end, count))
+
+
+def crossings(boundary: Boundary, angle: float, spacing: float) -> tuple[Crossings, float]:
+    """Crossings of lines at an angle with a boundary, and the distance of the lines, mm.
+
+    The outermost lines touch the region; the distance divides its height evenly and is about `spacing`, rather less.
+    """
+    vertices = turned(boundary.vertices, -angle)
     low, high = float(vertices[:, 1].min()), float(vertices[:, 1].max())
     lines = max(1, int(np.ceil((high - low) / spacing - STRETCH))) + 1
     step = (high - low) / (lines - 1)
-    found = _crossed(vertices, ring_start, ring_end, low, step, lines)
+    found = _crossed(vertices, boundary.ring_start, boundary.ring_end, low, step, lines)
     return found, step
 
 

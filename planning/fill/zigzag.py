@@ -5,20 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.se3 import Array
-from planning.fill.region import Region
-from planning.fill.scan import Crossings, crossings, turned
+from planning.fill.scan import Boundary, Crossings, crossings, turned
 
 
-def raster_lines(middle: Region, angle: float, spacing: float) -> tuple[list[Array], float]:
+def raster_lines(middle: Boundary, angle: float, spacing: float) -> tuple[list[Array], float]:
     """Lines (2, 2) at an angle, rad, all in one direction, and how far apart they are, mm.
 
-    middle: the region that middle lines of beads may reach.
+    middle: the boundary of what middle lines of beads may reach.
     """
     found, step = crossings(middle, angle, spacing)
     return list(turned(found.points, angle).reshape(-1, 2, 2)), step
 
 
-def zigzag_lines(middle: Region, angle: float, spacing: float) -> tuple[list[Array], float]:
+def zigzag_lines(middle: Boundary, angle: float, spacing: float) -> tuple[list[Array], float]:
     """Lines (N, 2) at an angle, rad, there and back, and how far apart their straight parts are, mm.
 
     The end of a line is joined to the start of the next one by the boundary between them, where that boundary meets no
