@@ -182,12 +182,15 @@ def _add_replay(commands: Commands) -> None:
         "run tracking and motion on a session under a simulated clock",
         "Run tracking and motion on a recorded session under a simulated clock, as a live run would, without an arm.\n"
         "Writes commands.csv, frames.bin, the bytes the arm would get, and arm.toml, what was assumed of the arm.\n"
-        "Same input, same bytes. A recording knows no arm: without --arm the default one is placed so that the first\n"
-        "surface lies under its home.",
+        "Same input, same bytes. Without --path, the recording of a live run is replayed as it was: from its poses\n"
+        "and ticks planner and guard decide anew, and each frame is compared. Any other recording knows no arm:\n"
+        "without --arm the default one is placed so that the first surface lies under its home.",
         "stillbed replay sessions/monday --path data/paths/square_10mm.csv -o out/replay",
     )
     command.add_argument("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
-    command.add_argument("--path", type=Path, required=True, metavar="PATH.csv", help="checkpoints on the surface")
+    command.add_argument(
+        "--path", type=Path, metavar="PATH.csv", help="checkpoints on the surface; left out: those of a recorded run"
+    )
     command.add_argument("--arm", type=Path, metavar="ARM.toml", help="the arm's place, limits and dialect of the link")
     command.add_argument("--resume", type=Path, metavar="PROGRESS.toml", help="go on where an earlier run stopped")
     command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
@@ -243,7 +246,7 @@ def _track(arguments: argparse.Namespace) -> None:
     print(run_track(a.session, a.out, a.record, a.force, a.method, tool, a.prefilter, a.wound))
 
 
-def _replay(arguments: argparse.Namespace) -> None:
+def _replay(arguments: argparse.Namespace) -> int | None:
     from hardware.arm_file import read_arm
     from hardware.bookmark_file import read_start
     from hardware.out_folder import prepare_out
@@ -251,6 +254,8 @@ def _replay(arguments: argparse.Namespace) -> None:
     from hardware.replay import replay_session
     from hardware.session import open_session
 
+    if arguments.path is None:
+        return _replay_run(arguments)
     session = open_session(arguments.session)
     path = read_path(arguments.path)  # what is wrong with it is told before anything is made
     if arguments.resume is not None:
@@ -262,6 +267,18 @@ def _replay(arguments: argparse.Namespace) -> None:
     rows = (arguments.out / "commands.csv").read_text(encoding="utf-8").splitlines()[1:]
     moves = sum(row.split(",", 2)[1] == "move" for row in rows)
     print(f"{moves} moves and {len(rows) - moves} holds: commands.csv and frames.bin in {arguments.out}")
+    return None
+
+
+def _replay_run(arguments: argparse.Namespace) -> int:
+    from hardware.live.replayed import write_replay
+    from hardware.out_folder import prepare_out
+
+    prepare_out(arguments.out, arguments.force)
+    count, other = write_replay(arguments.session, arguments.out)
+    same = "all as they were given" if not other else f"{other} of them not as they were given"
+    print(f"{count} frames, {same}: commands.csv and frames.bin in {arguments.out}")
+    return MISSED if other else 0
 
 
 def _import(arguments: argparse.Namespace) -> None:

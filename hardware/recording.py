@@ -173,11 +173,22 @@ class Recorder:
         log_time = self._log_time(stamp)
         self._message("/events", stamp, messages.message_from_event(stamp, level, text, name, log_time))
 
-    def tick(self, stamp: float, pose_stamp: float, asked: bool, fraction: float, phase: str, frame: bytes) -> None:
-        """Write a tick of the motion: s, the stamp of the pose it had (NaN: none), whether planner and guard were
-        asked, the place on the path counted in checkpoints, what the nozzle does, and the frame that was given.
+    def tick(
+        self,
+        stamp: float,
+        pose_stamp: float,
+        asked: bool,
+        begun: float,
+        fraction: float,
+        phase: str,
+        frame: bytes,
+    ) -> None:
+        """Write a tick of the motion: s, the stamp of the pose it was given (NaN: none), whether planner and guard were
+        asked, where on the path they were begun anew before it (NaN: they were not), the place on the path, what the
+        nozzle does, and the frame that they gave. Places count checkpoints.
         """
-        self._message("/tick", stamp, messages.message_from_tick(stamp, pose_stamp, asked, fraction, phase, frame))
+        given = messages.message_from_tick(stamp, pose_stamp, asked, begun, fraction, phase, frame)
+        self._message("/tick", stamp, given)
 
     def latency(self, stamp: float, stage: str, width: float, counts: NDArray[np.int64], most: float) -> None:
         """Write how long a stage took until `stamp`, s: counts (N,) in bins of `width` s, and the largest, s."""

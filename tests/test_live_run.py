@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import resource
@@ -17,6 +18,7 @@ from hardware.bookmark_file import read_start
 from hardware.clock import WallClock
 from hardware.live.beside import Beside
 from hardware.live.prerender import prerender
+from hardware.live.replayed import replay_run
 from hardware.path_file import read_path
 from hardware.session import open_session
 from tests.live_runs import PATH, SCENARIO, Running, closed, messages, rests
@@ -109,6 +111,12 @@ def test_stopped_in_the_terminal_it_rests_goes_on_and_a_signal_ends_it_for_anoth
     resumed.wait_for(r"the path is printed")
     assert resumed.end() == 0
     printed_once(record, tmp_path / "run-2.mcap")
+    for file in (record, tmp_path / "run-2.mcap"):  # with a stop, a pause and a way home in the first
+        ticks = list(replay_run(file))
+        assert len(ticks) > 100 and all(tick.frame == tick.recorded for tick in ticks)
+        wire = b"".join(base64.b64decode(str(m["data"])) for m in messages(file, "/arm/sent"))
+        moves = [tick.frame for tick in ticks if tick.frame[1:2] == b"1"]
+        assert np.mean([move in wire for move in moves]) > 0.95
 
 
 @pytest.mark.parametrize("name", ["motion", "tracking", "recorder"])

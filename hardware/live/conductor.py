@@ -7,7 +7,7 @@ with orders for the motion process.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -269,7 +269,7 @@ class Conductor:
         lag = task.profile.lag
         if 0 < status.lag < LONGEST_LAG:  # measured from set-point to answer, NaN where it does not answer
             lag = status.lag + task.profile.frame_time
-        return [Begin(path, laid.profile.arm, lag, task.start, fingerprint(task.path))]
+        return [Begin(path, replace(laid.profile, lag=lag), task.start, fingerprint(task.path))]
 
     def _printing(self, motion: LiveMotionReport, now: float) -> Orders:
         progress = motion.progress

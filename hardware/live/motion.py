@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from estimation.pose import SurfacePose
@@ -17,7 +18,10 @@ WAITING = "no path was confirmed yet"
 
 
 class LiveMotion:
-    """What a MotionLoop asks. asked: whether the last call asked planner and guard."""
+    """What a MotionLoop asks. asked: whether planner and guard were, in the last call; frame: that they gave.
+
+    begun: where on the path they were begun anew since somebody last took note, counted in checkpoints; NaN: nowhere.
+    """
 
     last: Command
 
@@ -25,8 +29,8 @@ class LiveMotion:
         self._profile, self._place = profile, place
         self._step: MotionStep | None = None
         self._begun: Begin | None = None
-        self.paused = False
-        self.asked = False
+        self.paused = self.asked = False
+        self.begun, self.frame = math.nan, b""
 
     def begin(self, order: Begin) -> None:
         """Print this path from now on."""
@@ -49,15 +53,14 @@ class LiveMotion:
         if self._step is None:
             self.last = Hold(now, self._profile.limits.pause, WAITING)
             return bytes_from_command(self.last, self._profile.dialect)
-        frame = self._step(None if self.paused else pose, now)
+        self.frame = self._step(None if self.paused else pose, now)
         self.last = self._step.last
         if self.paused and isinstance(self.last, Hold):
             self.last = replace(self.last, reason=PAUSED)
         self._place.fraction = self._step.progress.fraction
-        return frame
+        return self.frame
 
     def _make(self, start: float) -> None:
         assert self._begun is not None
-        profile = replace(self._profile, arm=self._begun.arm, lag=self._begun.lag)
-        self._step = MotionStep(self._begun.path, profile, start)
-        self._place.fraction = start
+        self._step = MotionStep(self._begun.path, self._begun.profile, start)
+        self._place.fraction = self.begun = start

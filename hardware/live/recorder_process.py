@@ -131,7 +131,8 @@ def _write(recorder: Recorder, entry: Entry) -> None:
         _write_pose(recorder, entry)
     elif isinstance(entry, TickEntry):
         recorder.write(entry.command)
-        recorder.tick(entry.stamp, entry.pose_stamp, entry.asked, entry.fraction, entry.phase.value, entry.frame)
+        given = entry.pose_stamp, entry.asked, entry.begun
+        recorder.tick(entry.stamp, *given, entry.fraction, entry.phase.value, entry.frame)
     elif isinstance(entry, WireEntry):
         (recorder.sent if entry.sent else recorder.received)(entry.stamp, entry.data)
     elif isinstance(entry, EventEntry):

@@ -14,12 +14,12 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.rig import Rig
 from estimation.se3 import Array
+from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmEvent
 from hardware.live.arrived import Encoded
 from hardware.motion_loop import Tick
 from perception.frames import Frame, PrintHead, Roi
 from planning.command import Command
-from planning.kinematics import SimpleArm
 from planning.path import Path
 from planning.progress import Phase, Progress
 
@@ -72,13 +72,12 @@ class TrackingReport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Begin:
-    """The order to print. path: in the tracker's surface frame. arm: where it stands. lag: s. start: counted in
-    checkpoints. fingerprint: of the path as its file has it.
+    """The order to print. path: in the tracker's surface frame. profile: of the arm, its place and lag as they are
+    now known. start: counted in checkpoints. fingerprint: of the path as its file has it.
     """
 
     path: Path
-    arm: SimpleArm
-    lag: float
+    profile: ArmProfile
     start: float
     fingerprint: str
 
@@ -166,14 +165,16 @@ class PoseEntry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TickEntry:
-    """A tick of the motion: s, the stamp of the pose that it had (NaN: none), what it decided and the frame it gave.
+    """A tick of the motion: s, the stamp of the pose that it was given (NaN: none), and what the loop came to.
 
-    asked: whether planner and guard were asked. fraction, phase: how far the print then is.
+    asked: whether planner and guard were asked, and the frame that they then gave. begun: where on the path they were
+    begun anew before it, counted in checkpoints (NaN: they were not). fraction, phase: how far the print then is.
     """
 
     stamp: float
     pose_stamp: float
     asked: bool
+    begun: float
     command: Command
     frame: bytes
     fraction: float

@@ -24,6 +24,7 @@ from hardware.live.conductor import Conductor, Orders, Seen
 from hardware.live.console import HELP, Console
 from hardware.live.halting import halt
 from hardware.live.keeper import Keeper
+from hardware.live.kept import kept_begin
 from hardware.live.laid import Laid
 from hardware.live.lines import started
 from hardware.live.prepared import Prepared
@@ -31,12 +32,13 @@ from hardware.live.records import Begin, EventEntry, UsedEntry
 from hardware.live.settings import settings_text
 from hardware.live.tally import Tally
 from hardware.live.view import Viewer
+from hardware.live.words import status_line
 from hardware.motion_loop import Order
 from hardware.operator.process import OperatorPage
 from hardware.operator.request import Request, Wish
 from hardware.operator.scene import scene_from
 from hardware.operator.settings import OperatorSettings
-from hardware.operator.view import Stage, Verdict
+from hardware.operator.view import Stage
 from hardware.schemas import INFO, WARNING
 from planning.progress import fingerprint
 
@@ -164,10 +166,19 @@ class LiveRun:
         for order in orders:
             if order is Order.STOP:
                 self._stopped_at.append(self._clock.now())
+            if isinstance(order, Begin):
+                order = self._noted(order)
             with suppress(OSError):  # nobody is there: seen by its end
                 self._lines.orders.send(order)
-            if isinstance(order, Begin):
-                self._say(f"begun at checkpoint {order.start:.2f}, the arm's lag taken as {1000 * order.lag:.0f} ms")
+
+    def _noted(self, order: Begin) -> Begin:
+        """The order as a recording keeps it, to the last digit, so that a replay of that gives the same bytes."""
+        kept, order = kept_begin(order)
+        for name, text in kept.items():
+            self._lines.outbox.put(UsedEntry(name, text))
+        lag = 1000 * order.profile.lag
+        self._say(f"begun at checkpoint {order.start:.2f}, the arm's lag taken as {lag:.0f} ms")
+        return order
 
     def _count_stops(self, now: float) -> None:
         """How long a stop took from the decision to the end of its frame on the wire."""
@@ -230,23 +241,7 @@ class LiveRun:
             self._said = now
         elif now > self._said + SAY:
             self._said = now
-            self._console.say(self._line())
-
-    def _line(self) -> str:
-        conductor, motion = self._conductor, self._seen.motion
-        if conductor.stage is Stage.CHECK:
-            waits = [check for check in conductor.checks if check.verdict in (Verdict.BUSY, Verdict.FAIL)]
-            return "check: " + "; ".join(f"{check.name}: {check.found}" for check in waits if check.name != "reach")
-        state = (
-            "no pose"
-            if self._seen.tracking is None or self._seen.tracking.pose is None
-            else (f"{self._seen.tracking.pose.state.value}")
-        )
-        if motion is None or motion.progress is None:
-            return f"{conductor.stage.value}: {state}"
-        progress, reason = motion.progress, getattr(motion.tick.command, "reason", "")
-        held = f", holds: {reason}" if reason else ""
-        return f"{conductor.stage.value}: {progress.fraction:.1f} of {progress.total - 1} checkpoints, {state}{held}"
+            self._console.say(status_line(conductor, self._seen))
 
     def _say(self, text: str, level: int = INFO) -> None:
         self._console.say(text)

@@ -1,0 +1,34 @@
+"""What a run used, as texts in its recording: what is read of them is what was used, so a replay has the same."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path as File
+
+from hardware.arm_file import read_arm, write_arm
+from hardware.arm_profile import ArmProfile
+from hardware.live.records import Begin
+from hardware.path_file import read_path, write_path
+from planning.path import Path
+
+PATH, ARM = "path.csv", "arm.toml"
+
+
+def kept_begin(order: Begin) -> tuple[dict[str, str], Begin]:
+    """Path and arm of an order as texts, and the order with what is read of those texts."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_path(File(folder) / PATH, order.path)
+        write_arm(File(folder) / ARM, order.profile, "as a live run used it")
+        texts = {name: (File(folder) / name).read_text(encoding="utf-8") for name in (PATH, ARM)}
+    path, profile = used(texts)
+    return texts, replace(order, path=path, profile=profile)
+
+
+def used(texts: Mapping[str, str]) -> tuple[Path, ArmProfile]:
+    """Path and arm of the texts."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name in (PATH, ARM):
+            (File(folder) / name).write_text(texts[name], encoding="utf-8")
+        return read_path(File(folder) / PATH), read_arm(File(folder) / ARM)

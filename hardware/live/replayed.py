@@ -1,0 +1,88 @@
+"""The replay of a recorded run's motion: planner and guard decide anew, and give the same bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path as File
+
+from estimation.errors import InputError
+from estimation.pose import SurfacePose
+from hardware.live.kept import ARM, PATH, used
+from hardware.mcap_walk import Attached, ChunkOf, parse, walk
+from hardware.messages import Message, bytes_from_message, pose_from_message
+from hardware.motion import MotionStep
+from hardware.replay import CommandWriter
+from planning.command import Command
+
+
+@dataclass(slots=True)
+class _Run:
+    """What a recording says of a run's motion."""
+
+    texts: dict[str, str] = field(default_factory=dict)
+    poses: dict[float, SurfacePose] = field(default_factory=dict)
+    ticks: list[Message] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replayed:
+    """One tick: s, what was decided anew, the frame of that, and the frame that the run gave."""
+
+    stamp: float
+    command: Command
+    frame: bytes
+    recorded: bytes
+
+
+def is_run(record: File) -> bool:
+    """Whether a file is the recording of a live run that began to print."""
+    if record.suffix != ".mcap" or not record.is_file():
+        return False
+    return any(isinstance(part, Attached) and part.name == PATH for part in walk(record))
+
+
+def replay_run(record: File) -> Iterator[Replayed]:
+    """Every tick of a recorded run in which planner and guard were asked, decided anew from the recorded poses."""
+    run = _read(record)
+    if PATH not in run.texts or ARM not in run.texts:
+        raise InputError(record, "recording", "no path", "the recording of a run that began to print")
+    path, profile = used(run.texts)
+    step: MotionStep | None = None
+    for tick in sorted(run.ticks, key=lambda tick: float(tick["stamp"])):
+        if tick["begun"]:
+            step = MotionStep(path, profile, float(tick["begun"][0]))
+        if step is None or not tick["asked"]:
+            continue
+        stamp = tick["pose_stamp"]
+        if stamp and stamp[0] not in run.poses:
+            raise InputError(record, "/tick: pose_stamp", stamp[0], "a pose that is recorded")
+        now = float(tick["stamp"])
+        frame = step(run.poses[stamp[0]] if stamp else None, now)
+        yield Replayed(now, step.last, frame, bytes_from_message({"data": tick["frame"]}))
+
+
+def _read(record: File) -> _Run:
+    run = _Run()
+    for part in walk(record):
+        if isinstance(part, Attached):
+            run.texts[part.name] = part.data.decode("utf-8", "replace")
+        elif isinstance(part, ChunkOf):
+            for stored in part.messages:
+                if stored.topic == "/tick":
+                    run.ticks.append(parse(record, stored))
+                elif stored.topic == "/pose":
+                    pose = pose_from_message(parse(record, stored))
+                    run.poses[pose.stamp] = pose
+    return run
+
+
+def write_replay(record: File, out: File) -> tuple[int, int]:
+    """Replay a run into commands.csv and frames.bin of the folder `out`: how many frames, how many not as recorded."""
+    count = other = 0
+    with CommandWriter(out) as writer:
+        for tick in replay_run(record):
+            writer.write(tick.command, tick.frame)
+            count += 1
+            other += tick.frame != tick.recorded
+    return count, other

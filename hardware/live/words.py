@@ -1,0 +1,21 @@
+"""A run in one line, for the terminal."""
+
+from __future__ import annotations
+
+from hardware.live.conductor import Conductor, Seen
+from hardware.operator.view import Stage, Verdict
+from planning.command import Hold
+
+
+def status_line(conductor: Conductor, seen: Seen) -> str:
+    """Stage, place, state of the surface and why the nozzle stands; in the check, what is waited for."""
+    if conductor.stage is Stage.CHECK:
+        waits = [c for c in conductor.checks if c.verdict in (Verdict.BUSY, Verdict.FAIL) and c.name != "reach"]
+        return "check: " + "; ".join(f"{check.name}: {check.found}" for check in waits)
+    pose = None if seen.tracking is None else seen.tracking.pose
+    state = "no pose" if pose is None else pose.state.value
+    if seen.motion is None or seen.motion.progress is None:
+        return f"{conductor.stage.value}: {state}"
+    progress, command = seen.motion.progress, seen.motion.tick.command
+    held = f", holds: {command.reason}" if isinstance(command, Hold) else ""
+    return f"{conductor.stage.value}: {progress.fraction:.1f} of {progress.total - 1} checkpoints, {state}{held}"
