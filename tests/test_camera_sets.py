@@ -102,3 +102,24 @@ def test_how_far_a_camera_is_out_of_step_is_told() -> None:
         for camera, phase in enumerate((0.0, 0.3)):
             gathering.add(frame(camera, 1 + (k + phase) * PERIOD))
     assert gathering.behind == pytest.approx([-0.15 * PERIOD, 0.15 * PERIOD], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("phases", "errors"),
+    [((0.0, 0.33, 0.66), (0.0, 0.0, 0.0)), ((0.0, 0.3, 0.6), (0.0, 0.005, -0.005)), ((0.0, 0.0, 0.0), tuple(OFFSETS))],
+)
+def test_what_is_learned_of_sets_and_told_back_shifts_them_once_at_most(
+    phases: tuple[float, ...], errors: tuple[float, ...]
+) -> None:
+    gathering, learned = Gathering(3, PERIOD), np.zeros(3)
+    shots = [frame(c, 10 + (k + phase) * PERIOD + 1e-4 * c) for k in range(900) for c, phase in enumerate(phases)]
+    spread: list[np.ndarray] = []
+    for shot in sorted(shots, key=lambda shot: shot.now):
+        for one in gathering.add(shot):
+            if len(one.frames) == 3:
+                spread.append(np.array([f.stamp for f in one.frames]) - one.stamp)
+                late = spread[-1] + errors  # when they really exposed, beside the mean of all
+                learned += (late - late.mean() - learned) / 150
+            gathering.learn(learned)
+    assert len(spread) >= 880
+    assert (np.abs(np.diff(spread, axis=0)).max(axis=1) > 0.002).sum() <= 1

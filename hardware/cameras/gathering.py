@@ -53,6 +53,14 @@ class Gathering:
         assert values.shape == (len(self._periods),) and np.isfinite(values).all(), offsets
         self._offsets = values
 
+    def learn(self, learned: Sequence[float] | Array) -> None:
+        """How much later than its set's stamp each camera exposes, (C,) s, as the estimator learns it.
+
+        Cameras out of step are so by their stamps already: taken for an error of their clocks, that would count twice
+        and shift the sets to and fro.
+        """
+        self.set_offsets(np.asarray(learned, float) - self._behind)
+
     @property
     def behind(self) -> Array:
         """How much later than its set's stamp each camera is stamped, (C,) s, usually."""

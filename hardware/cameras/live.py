@@ -112,10 +112,15 @@ class LiveCameras:
         """How much later than its own stamps each camera exposes beyond its rig's offset, (C,) s.
 
         Frames are paired by it from now on; their stamps stay as they are, so that whoever learns from them does not
-        learn from itself. The estimator learns offsets from the stamps of sets: theirs are `learned - behind()`.
+        learn from itself.
         """
         with self._changed:
             self._gathering.set_offsets(offsets)
+
+    def learn(self, learned: Sequence[float] | Array) -> None:
+        """Pair by what the estimator has learned: how much later than its set's stamp each camera exposes, (C,) s."""
+        with self._changed:
+            self._gathering.learn(learned)
 
     def behind(self) -> Array:
         """How much later than its set's stamp each camera is stamped, (C,) s, usually: cameras may be out of step."""

@@ -35,8 +35,8 @@ class CameraSource:
         return Arrived(frames, handed=now, dropped=dropped)
 
     def learn(self, offsets: Array) -> None:
-        """Pair frames as the cameras really expose: (C,) s later than stamped."""
-        self._cameras.set_offsets(offsets)
+        """Pair frames as the cameras really expose: (C,) s later than their sets are stamped."""
+        self._cameras.learn(offsets)
 
     def close(self) -> None:
         """Let the cameras go."""
