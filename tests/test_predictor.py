@@ -124,7 +124,7 @@ def test_a_short_outage_or_a_wild_jump_leaves_forecasts_finite(stamps: Array) ->
             assert np.linalg.eigvalsh(forecast.covariances).min() > 0
 
 
-@pytest.mark.parametrize("memory", [0.5, 0.9])
+@pytest.mark.parametrize("memory", [0.5, pytest.param(0.9, marks=pytest.mark.slow)])
 def test_ninety_percent_intervals_hold_ninety_percent(memory: float) -> None:
     draw = np.random.default_rng(5)
     count = 1500
