@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hardware.images import decode
 from hardware.newest import Newest
 from hardware.operator.pictures import CAPACITY, Pictures
 from hardware.operator.request import RequestLine
-from hardware.operator.taker import PERIOD, WIDTH, PictureTaker, Shot
+from hardware.operator.taker import PERIOD, WIDTH, PictureTaker, Shot, crop_around
 
 
 def shot(width: int = 1280, height: int = 720) -> Shot:
@@ -40,6 +42,39 @@ def test_a_picture_is_small_and_says_what_the_shot_said() -> None:
     assert image.shape == (360, WIDTH, 3) and found.stamp == 3.5
     assert np.abs(image[100, 100].astype(int) - [40, 60, 200]).max() < 12 and image[100, 600].max() < 12
     assert picture.camera == "camera0" and picture.outline[0][1, 1] == 4.0 and picture.tracks[0, 0] == 5.0
+
+
+PLACES = st.tuples(st.floats(0, 1279), st.floats(0, 719), st.floats(1, 900))
+
+
+@given(PLACES)
+def test_the_near_picture_holds_what_was_found_lies_within_the_image_and_has_its_proportions(
+    place: tuple[float, float, float],
+) -> None:
+    x, y, spread = place
+    tracks = np.array([x, y]) + spread * np.random.default_rng(1).uniform(-0.5, 0.5, (200, 2))
+    tracks = np.clip(tracks, 0, [1279, 719])
+    image = np.zeros((720, 1280), np.uint8)
+    crop = crop_around(Shot("camera0", image, tracks=tracks), None)
+    left, top, width, height = crop or (0, 0, 1280, 720)
+    assert min(left, top) >= 0 and left + width <= 1280 and top + height <= 720
+    assert abs(width / height - 16 / 9) < 0.05 and width >= 1280 / 8
+    inside = ((tracks >= [left, top]) & (tracks <= [left + width, top + height])).all(axis=1)
+    assert inside.mean() > 0.9
+
+
+def test_the_near_picture_rests_while_the_wound_breathes_and_follows_it_when_it_leaves() -> None:
+    image = np.zeros((720, 1280), np.uint8)
+    tracks = np.random.default_rng(1).uniform([500, 300], [700, 420], (100, 2))
+
+    def around(shift: float, present: tuple[int, int, int, int] | None) -> tuple[int, int, int, int] | None:
+        return crop_around(Shot("camera0", image, tracks=tracks + [shift, 0]), present)
+
+    first = around(0, None)
+    assert first is not None and around(20, first) == first and around(-20, first) == first
+    moved = around(200, first)
+    assert moved is not None and moved != first and moved[0] > first[0] + 150
+    assert crop_around(Shot("camera0", image), first) == first
 
 
 def test_nothing_is_taken_while_nobody_looks_nor_sooner_than_is_due() -> None:

@@ -87,9 +87,15 @@ def test_arrays_and_their_holes_become_lists_and_nulls() -> None:
 
 def test_pictures_stand_behind_a_head_that_tells_their_lengths() -> None:
     polygon = np.array([[1.25, 2.0], [3.0, 4.0]])
-    pictures = Pictures(1.5, (CameraPicture("a", b"first", (polygon,)), CameraPicture("b", b"second!")), np.eye(4))
+    pictures = Pictures(
+        1.5,
+        (CameraPicture("a", b"first", (polygon,)), CameraPicture("b", b"second!", near=b"it", crop=(1, 2, 3, 4))),
+        np.eye(4),
+    )
     data = pictures_bytes(pictures)
     size = int.from_bytes(data[:4], "little")
     head = json.loads(data[4 : 4 + size])
-    assert [each["size"] for each in head["pictures"]] == [5, 7] and data[4 + size :] == b"firstsecond!"
+    assert [each["size"] for each in head["pictures"]] == [5, 7] and data[4 + size :] == b"firstsecond!it"
+    assert [each["near"] for each in head["pictures"]] == [0, 2]
+    assert [each["crop"] for each in head["pictures"]] == [None, [1, 2, 3, 4]]
     assert head["pictures"][0]["outline"] == [[1.2, 2.0, 3.0, 4.0]] and head["base_from_surface"] == np.eye(4).tolist()

@@ -59,7 +59,7 @@ def scene_text(scene: Scene) -> str:
 
 
 def pictures_bytes(pictures: Pictures) -> bytes:
-    """Length of the head (4 bytes, little-endian), the head as JSON, and the JPEGs one after the other."""
+    """Length of the head (4 bytes, little-endian), the head as JSON, each camera's JPEGs: the whole, the near one."""
     head = text(
         stamp=pictures.stamp,
         base_from_surface=pictures.base_from_surface,
@@ -67,10 +67,12 @@ def pictures_bytes(pictures: Pictures) -> bytes:
             {
                 "camera": each.camera,
                 "size": len(each.jpeg),
+                "near": len(each.near),
+                "crop": each.crop,
                 "outline": [np.round(polygon, PIXEL).ravel() for polygon in each.outline],
                 "tracks": np.round(each.tracks, PIXEL).ravel(),
             }
             for each in pictures.pictures
         ],
     ).encode()
-    return b"".join([_SIZE.pack(len(head)), head, *(each.jpeg for each in pictures.pictures)])
+    return b"".join([_SIZE.pack(len(head)), head, *(each.jpeg + each.near for each in pictures.pictures)])

@@ -12,7 +12,7 @@ import numpy as np
 
 from estimation.se3 import Array
 
-CAPACITY = 1 << 20  # bytes: three pictures of 640 px take 150 kB with all that lies over them
+CAPACITY = 1 << 20  # bytes: three pictures of 640 px, and near ones, take 250 kB with all that lies over them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,12 +20,15 @@ class CameraPicture:
     """One camera's picture. jpeg: of any size; all pixels are those of the camera's own size.
 
     outline: of the wound, polygons (K, 2) px of the image as it is. tracks: (M, 2) px, undistorted as in Observations.
+    near: JPEG of the part `crop` (x, y, width, height px) around what was found, b"" and None where nothing was.
     """
 
     camera: str
     jpeg: bytes
     outline: tuple[Array, ...] = ()
     tracks: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    near: bytes = b""
+    crop: tuple[int, int, int, int] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,7 +23,12 @@ from perception.frames import Image
 
 WIDTH = 640  # px: three side by side fill a screen
 QUALITY = 75  # 35 kB each; the path's edges are drawn by the browser and do not suffer
+NEAR_WIDTH = 480  # px, of the part around the wound: seldom more than the camera has there
+MARGIN = 1.4  # of that part over what was found: breathing stays inside
+FEWEST = 8  # points that say where the wound is
 PERIOD = 0.2  # s: breathing looks smooth, and 3 % of a core is not missed
+
+Crop = tuple[int, int, int, int]  # x, y, width, height px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +47,7 @@ class PictureTaker:
     def __init__(self, pictures: Newest[Pictures], requests: RequestLine, clock: Clock | None = None) -> None:
         self._pictures, self._requests, self._clock = pictures, requests, clock or WallClock()
         self._due = float("-inf")
+        self._crops: dict[str, Crop] = {}
         self._waiting: tuple[float, Sequence[Shot], Array | None] | None = None
         self._changed, self._ended = Condition(), False
         self.made = self.dropped = 0
@@ -79,7 +85,7 @@ class PictureTaker:
                 if self._ended or self._waiting is None:
                     return
                 stamp, shots, pose = self._waiting
-            self._put(Pictures(stamp, tuple(map(_picture, shots)), pose))
+            self._put(Pictures(stamp, tuple(map(self._picture, shots)), pose))
             with self._changed:
                 self._waiting = None
 
@@ -90,6 +96,36 @@ class PictureTaker:
         except InputError:  # larger than their place: the next ones may be smaller
             self.dropped += 1
 
+    def _picture(self, shot: Shot) -> CameraPicture:
+        crop = crop_around(shot, self._crops.get(shot.camera))
+        whole, near = small_jpeg(shot.image, WIDTH, QUALITY), b""
+        if crop is not None:
+            self._crops[shot.camera] = crop
+            x, y, width, height = crop
+            near = small_jpeg(shot.image[y : y + height, x : x + width], NEAR_WIDTH, QUALITY)
+        return CameraPicture(shot.camera, whole, shot.outline, shot.tracks, near, crop)
 
-def _picture(shot: Shot) -> CameraPicture:
-    return CameraPicture(shot.camera, small_jpeg(shot.image, WIDTH, QUALITY), shot.outline, shot.tracks)
+
+def crop_around(shot: Shot, present: Crop | None) -> Crop | None:
+    """The part of an image around outline and tracks, of its own proportions; None where that is all of it.
+
+    present: what was shown before; it stays while all is in it and not much less would do, so that the view rests.
+    """
+    found = np.concatenate([*shot.outline, shot.tracks])
+    if len(found) < FEWEST:
+        return present
+    low, high = np.percentile(found, [2, 98], axis=0)  # single tracks may lie anywhere
+    height, width = shot.image.shape[:2]
+    wanted = MARGIN * max(high[0] - low[0], (high[1] - low[1]) * width / height, width / 8)
+    if present is not None and wanted > present[2] / 2 and _holds(present, low, high):
+        return present
+    if wanted >= width:
+        return None
+    size = np.array([round(wanted), round(wanted * height / width)])
+    corner = np.clip(np.round((low + high - size) / 2), 0, [width, height] - size).astype(int)
+    return int(corner[0]), int(corner[1]), int(size[0]), int(size[1])
+
+
+def _holds(crop: Crop, low: Array, high: Array) -> bool:
+    corner, size = np.array(crop[:2]), np.array(crop[2:])
+    return bool((low >= corner).all() and (high <= corner + size).all())

@@ -93,7 +93,8 @@ export class Buttons {
     }
     const again = this.bar.querySelector("[data-wish=again]");
     again.textContent = (view && AGAIN[view.stage]) || WISHES.again;
-    if (this.asking && (!live || before !== this.turn())) this.drop();
+    if (this.asking && before !== this.turn()) this.drop();
+    document.getElementById("sure-yes").disabled = !live;
     this.settle();
   }
   showGo(offers) {

@@ -17,16 +17,16 @@ export class CameraPane {
     caption.append(this.title, this.fare);
     this.root.append(this.canvas, caption);
     this.root.addEventListener("click", () => chosen(name));
-    this.image = this.found = this.lens = null;
+    this.image = this.close = this.found = this.lens = null;
     this.title.textContent = name;
     this.fare.hidden = true;
   }
   see(camera) {
     this.lens = new Lens(camera);
   }
-  show(image, found) {
-    if (this.image) this.image.close();
-    [this.image, this.found, this.since] = [image, found, performance.now()];
+  show(image, close, found) {
+    for (const each of [this.image, this.close]) if (each) each.close();
+    [this.image, this.close, this.found, this.since] = [image, close, found, performance.now()];
   }
   // a picture that stands still must not be taken for a live one
   tick() {
@@ -45,7 +45,7 @@ export class CameraPane {
     this.fare.textContent = parts.join(" · ");
     this.fare.hidden = !parts.length;
   }
-  draw(scene, pose, fraction, base_from_nozzle) {
+  draw(scene, pose, fraction, base_from_nozzle, near) {
     const ratio = window.devicePixelRatio || 1, w = Math.round(this.canvas.clientWidth * ratio), h = Math.round(this.canvas.clientHeight * ratio);
     if (!w || !h) return;
     if (this.canvas.width !== w || this.canvas.height !== h) [this.canvas.width, this.canvas.height] = [w, h];
@@ -54,27 +54,33 @@ export class CameraPane {
     g.clearRect(0, 0, w, h);
     const size = this.lens ? this.lens.camera.size : this.image ? [this.image.width, this.image.height] : null;
     if (!size) return;
-    const scale = Math.min(w / size[0], h / size[1]), x0 = (w - scale * size[0]) / 2, y0 = (h - scale * size[1]) / 2;
+    const crop = near && this.close && this.found.crop, [left, top, across, down] = crop || [0, 0, ...size];
+    const scale = Math.min(w / across, h / down), x0 = (w - scale * across) / 2, y0 = (h - scale * down) / 2;
     this.canvas.dataset.drawn = !this.image ? "" : scene && pose && this.lens ? "path" : "picture";
-    if (this.image) g.drawImage(this.image, x0, y0, scale * size[0], scale * size[1]);
+    if (this.image) g.drawImage(crop ? this.close : this.image, x0, y0, scale * across, scale * down);
     if (!this.lens) return;
     g.save();
     g.beginPath();
-    g.rect(x0, y0, scale * size[0], scale * size[1]);
+    g.rect(x0, y0, scale * across, scale * down);
     g.clip();
-    const on = (p) => p && [x0 + scale * (p[0] + 0.5), y0 + scale * (p[1] + 0.5)];
+    const on = (p) => p && [x0 + scale * (p[0] - left + 0.5), y0 + scale * (p[1] - top + 0.5)];
     this.found && this.overlay(g, on, ratio);
     if (scene && pose) {
       const pixel = this.lens.from(pose);
-      const line = Math.min(Math.max(w / ratio / 260, 1), 3) * ratio; // thin where the picture is small
+      const line = this.line(on(pixel(0, 0, 0)), on(pixel(1, 0, 0)), on(pixel(0, 1, 0)), ratio);
       const here = drawPath(g, scene, fraction, (x, y, z) => on(pixel(x, y, z)), {
-        halo: { colour: "rgb(10 18 28 / .45)", width: 2.2 * line }, next: { colour: "#9fdcff", width: 0.9 * line },
+        halo: line > ratio && { colour: "rgb(10 18 28 / .45)", width: 2.2 * line }, next: { colour: "#9fdcff", width: 0.9 * line },
         done: { colour: "#3ddc84", width: 1.4 * line },
       });
       if (here) this.ring(g, here, ratio);
     }
     if (base_from_nozzle) this.nozzle(g, on, base_from_nozzle, ratio);
     g.restore();
+  }
+  // width of the path's line: a third of a millimetre of the surface, so that neighbours stay apart
+  line(middle, right, up, ratio) {
+    const long = (p) => (p && middle ? Math.hypot(p[0] - middle[0], p[1] - middle[1]) : 0);
+    return Math.min(Math.max(0.33 * Math.max(long(right), long(up)), 0.7 * ratio), 3 * ratio);
   }
   overlay(g, on, ratio) {
     g.lineJoin = "round";

@@ -10,7 +10,7 @@ const LARGE = ["find", "confirm"]; // stages in which the pictures are what matt
 const EVENTS = 2; // of the last ones that there is room for
 const CHECKED = ["check", "find", "confirm", "ready", "failed"];
 const by = (id) => document.getElementById(id);
-const state = { view: null, scene: null, poses: null, age: Infinity, since: 0, stale: 1, refused: 0, gone: false, full: false, chosen: null, large: null };
+const state = { view: null, scene: null, poses: null, age: Infinity, since: 0, stale: 1, refused: 0, gone: false, full: false, chosen: null, large: null, near: true };
 const panes = new Map();
 const course = new Course(document.querySelector("#course canvas"));
 const space = new SceneView(by("scene"));
@@ -46,13 +46,14 @@ function scene(message) {
 async function pictures(data) {
   const size = new DataView(data).getUint32(0, true), head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size)));
   let offset = 4 + size;
-  const decoded = head.pictures.map((each) => {
-    const bytes = new Blob([new Uint8Array(data, offset, each.size)], { type: "image/jpeg" });
-    offset += each.size;
-    return createImageBitmap(bytes).catch(() => null);
-  });
-  const images = await Promise.all(decoded);
-  head.pictures.forEach((each, k) => images[k] && pane(each.camera).show(images[k], each));
+  const image = (size) => {
+    const bytes = new Blob([new Uint8Array(data, offset, size)], { type: "image/jpeg" });
+    offset += size;
+    return size ? createImageBitmap(bytes).catch(() => null) : null;
+  };
+  const images = await Promise.all(head.pictures.flatMap((each) => [image(each.size), image(each.near)]));
+  head.pictures.forEach((each, k) => images[2 * k] && pane(each.camera).show(images[2 * k], images[2 * k + 1], each));
+  by("closer").hidden = !head.pictures.some((each) => each.crop);
   state.poses = head.base_from_surface;
   refresh();
 }
@@ -114,7 +115,11 @@ function stage(seen) {
   const same = seen.question.toLowerCase() === about.word.toLowerCase(); // it stands beside it already
   by("question").textContent = (!same && seen.question) || (holds ? "Holding until it is safe to print." : about.say);
   by("reason").textContent = upper((holds && seen.motion.reason) || seen.reason);
-  by("notes").replaceChildren(...seen.notes.map((note) => text("span", note)));
+  by("notes").replaceChildren(...seen.notes.map((note) => {
+    const made = text("span", note.split(/[:;]/)[0]); // the rest is told to whoever points at it
+    made.title = note;
+    return made;
+  }));
   document.body.dataset.large = (state.large ?? LARGE.includes(seen.stage)) ? "yes" : "no";
   const names = [...panes.keys()];
   for (const [name, each] of panes) each.root.classList.toggle("chosen", name === (state.chosen ?? names[0]));
@@ -158,10 +163,15 @@ function states(seen) {
   };
   const none = { word: "–", tone: "" }, { tracking, motion } = seen;
   put("tracking", tracking ? TRACKING[tracking.state] : none, tracking ? tracking.reason : "");
-  const arm = motion && motion.arm ? `arm ${motion.arm}` : "";
-  const speed = motion && motion.speed !== null && motion.activity !== "resting" ? `${motion.speed.toFixed(1)} mm/s` : "";
-  const words = [held(seen) ? "" : motion && motion.reason, speed, arm];
-  put("motion", motion ? ACTIVITIES[motion.activity] : none, words.filter(Boolean).join(" · "));
+  put("motion", motion ? ACTIVITIES[motion.activity] : none, motion ? doing(seen) : "");
+}
+
+// what the nozzle does, in words: why it stands, or how fast it goes
+function doing(seen) {
+  const motion = seen.motion;
+  if (motion.activity === "resting") return motion.arm ? `arm ${motion.arm}` : motion.reason;
+  const speed = motion.speed ? `${motion.speed.toFixed(1)} mm/s` : "", arm = motion.arm.split(":")[0];
+  return [held(seen) ? "" : motion.reason, speed, arm && `arm ${arm}`].filter(Boolean).join(" · ");
 }
 
 function events(all) {
@@ -179,7 +189,7 @@ function tiles(seen) {
     box.classList.toggle("over", Boolean(over));
   };
   const beyond = (value, limit) => value !== null && limit !== null && value > limit;
-  put("error", figure(motion && motion.error, 2), "mm", motion && motion.limit !== null ? `error to come, limit ${motion.limit}` : "error to come", motion && beyond(motion.error, motion.limit));
+  put("error", figure(motion && motion.error, 2), motion && motion.limit !== null ? `mm, limit ${motion.limit}` : "mm", "predicted error", motion && beyond(motion.error, motion.limit));
   put("truth", figure(motion && motion.true_error, 2), "mm", "true error", motion && beyond(motion.true_error, motion.limit));
   document.querySelector("[data-tile=truth]").hidden = !motion || motion.true_error === null;
   put("sigma", figure(tracking && tracking.sigma, 3), "mm", "uncertainty");
@@ -208,7 +218,7 @@ function refresh() {
     due = false;
     const seen = state.view, fraction = seen && seen.progress ? seen.progress.fraction : -1;
     const nozzle = seen && seen.motion && seen.motion.base_from_nozzle;
-    for (const each of panes.values()) each.draw(state.scene, state.poses, fraction, nozzle);
+    for (const each of panes.values()) each.draw(state.scene, state.poses, fraction, nozzle, state.near);
     space.draw(seen, fraction);
     course.draw();
   });
@@ -221,6 +231,11 @@ async function stayAwake() {
 document.addEventListener("visibilitychange", stayAwake);
 document.addEventListener("pointerdown", stayAwake, { once: true });
 
+for (const button of by("closer").querySelectorAll("button")) button.addEventListener("click", () => {
+  state.near = button.dataset.near === "yes";
+  for (const each of by("closer").querySelectorAll("button")) each.setAttribute("aria-pressed", String(each === button));
+  refresh();
+});
 space.changed = refresh;
 window.addEventListener("resize", refresh);
 const line = new Line(hear);

@@ -2,7 +2,7 @@
 import { drawPath, moved } from "./lens.js";
 
 const SIGMAS = 20; // the uncertainty is drawn so many times as large: 0.05 mm would not be seen
-const TOOL = { long: 26, wide: 3.2 }; // mm
+const TOOL = { long: 0.55, wide: 0.06 }; // shares of what the view near the wound reaches
 const PYRAMID = 0.2; // of a camera, as a share of what the view reaches
 
 export class SceneView {
@@ -184,10 +184,10 @@ export class SceneView {
     }
   }
   tool(g, place, pose) {
-    const tip = place(moved(pose, 0, 0, 0)), rim = [];
+    const tip = place(moved(pose, 0, 0, 0)), rim = [], long = TOOL.long * this.reach.near, wide = TOOL.wide * this.reach.near;
     for (let k = 0; k < 16; k++) {
       const a = (k * Math.PI) / 8;
-      rim.push(place(moved(pose, TOOL.wide * Math.cos(a), TOOL.wide * Math.sin(a), TOOL.long)));
+      rim.push(place(moved(pose, wide * Math.cos(a), wide * Math.sin(a), long)));
     }
     const sides = rim.map((p, k) => [p, rim[(k + 1) % 16], k]).sort((p, q) => p[0][2] - q[0][2]);
     for (const [p, q, k] of sides) {
