@@ -1,0 +1,172 @@
+"""`stillbed bench live`: whole runs in real time before pre-rendered cameras with the virtual arm, all processes in it.
+
+Rendering takes ten times as long as the pictures last, so they are rendered once and shown by a process of their own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hardware.bench.figure import Figure, at_least, at_most
+from hardware.bench.live_kills import kill_figures
+from hardware.bench.live_session import LiveSession
+from hardware.clock import WallClock
+from hardware.live.beside import Beside
+from hardware.live.judge import judge_run
+from hardware.live.motion_names import EXPOSURE_TO_WIRE, FRAMES_TO_WIRE, LATE
+from hardware.live.prerender import cache_folder, prerender
+from hardware.path_file import read_path, write_path
+from planning.path import Path as Toolpath
+from planning.path import lengths
+
+SCENARIO = Path("data/live/calm.toml")
+STOP_EVERY = 8.0  # s between stops of the run that is stopped again and again
+WEIGH_EVERY = 2.0  # s between looks at the memory
+SETTLED = 0.3  # share of a run after which its memory counts: key frames are full then
+STOP = "stop decided to on the wire"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """How long, how many, before what."""
+    parser.add_argument("--minutes", type=float, default=1.0, metavar="M", help="of printing; default 1")
+    parser.add_argument("--stops", type=int, default=3, metavar="N", help="in a run of their own; default 3")
+    parser.add_argument("--kills", type=int, default=0, metavar="N", help="of random processes; default none")
+    parser.add_argument("--seed", type=int, default=0, help="of what is killed when")
+    parser.add_argument("--scenario", type=Path, default=SCENARIO, metavar="SCENARIO.toml", help="which world")
+
+
+def run(options: argparse.Namespace) -> list[Figure]:
+    """The figures of all runs that were asked for."""
+    rendered = prerender(options.scenario, cache_folder())
+    with tempfile.TemporaryDirectory(prefix="stillbed-live-") as name:
+        folder = Path(name)
+        long = folder / "long.csv"
+        write_path(long, to_and_fro(read_path(rendered.path), 60 * options.minutes))
+        figures = _printing(options, folder, long, rendered.arm)
+        if options.stops:
+            figures += _stopping(options, folder, long)
+        if options.kills:
+            figures += kill_figures(options.scenario, folder, rendered.path, options.kills, options.seed)
+    return figures
+
+
+def to_and_fro(path: Toolpath, seconds: float) -> Toolpath:
+    """The path printed again and again, there and back, for so long."""
+    once = float(np.sum(lengths(path.surface_from_nozzle) / path.speed[1:]))
+    count, there = len(path), np.arange(len(path))
+    order = list(there)
+    while len(order) < seconds / once * count:
+        order += list(there[-2::-1] if order[-1] == count - 1 else there[1:])
+    index = np.array(order[: max(int(seconds / once * count), 2)])
+    return replace(
+        path,
+        surface_from_nozzle=path.surface_from_nozzle[index],
+        speed=path.speed[index],
+        material=path.material[index],
+        temperature=path.temperature[index],
+        layer=path.layer[index],
+        extrude=path.extrude[np.maximum(index, 1)],
+        extra={},
+    )
+
+
+def _printing(options: argparse.Namespace, folder: Path, path: Path, arm: Path) -> list[Figure]:
+    record, clock = folder / "print.mcap", WallClock()
+    run = LiveSession(_arguments(options.scenario, record, path))
+    load = []
+    try:
+        begun = run.wait_for("\nprint\n")
+        while begun >= 0 and run.process.poll() is None:
+            run.weigh()
+            load.append(os.getloadavg()[0])
+            clock.wait_until(clock.now() + WEIGH_EVERY)
+        run.end()
+    finally:
+        run.close()
+    found: dict[str, Any] = json.loads(Beside(record).summary.read_text(encoding="utf-8"))
+    error = judge_run(record, path, arm)
+    note = f"load {np.mean(load or [np.nan]):.1f} on {os.cpu_count()} cores"
+    name = f"live {options.minutes:g} min"
+    return [*_latencies(name, found, note), *_errors(name, found, error), *_burden(name, found, run.memory)]
+
+
+def _latencies(name: str, found: dict[str, Any], note: str) -> list[Figure]:
+    times = found["latency_ms"]
+    wire, exposure, late = (times.get(stage, {}) for stage in (FRAMES_TO_WIRE, EXPOSURE_TO_WIRE, LATE))
+    return [
+        Figure(f"{name}: frames to wire, median", _of(wire, "p50"), "ms", at_most(20), "thesis: 180 ms", note),
+        Figure(f"{name}: frames to wire, 99 %", _of(wire, "p99"), "ms", at_most(35)),
+        Figure(f"{name}: frames to wire, largest", _of(wire, "max"), "ms", at_most(60)),
+        Figure(f"{name}: exposure to wire, median", _of(exposure, "p50"), "ms"),
+        Figure(f"{name}: tracking, median", _of(times.get("tracking", {}), "p50"), "ms"),
+        Figure(f"{name}: tick late, 99 %", _of(late, "p99"), "ms", at_most(3)),
+    ]
+
+
+def _errors(name: str, found: dict[str, Any], error: Any) -> list[Figure]:
+    done = f"ended: {found['ended']}"
+    return [
+        Figure(f"{name}: nozzle error, 95 %", error.figure(95), "mm", at_most(0.5), "", done),
+        Figure(f"{name}: nozzle error, largest", error.figure(100), "mm", at_most(1.0)),
+        Figure(f"{name}: duty", 100 * error.duty, "%", at_least(80)),
+        Figure(f"{name}: frame sets left out", found["frame_sets_dropped"], "", None, "", f"of {found['frame_sets']}"),
+    ]
+
+
+def _burden(name: str, found: dict[str, Any], memory: Sequence[tuple[float, float]]) -> list[Figure]:
+    share = found["recorder_share_of_core"]
+    settled = np.array(memory[int(SETTLED * len(memory)) :])
+    slope = np.polyfit(settled[:, 0], settled[:, 1], 1)[0] * 3600 if len(settled) > 5 else np.nan
+    size = settled[-1, 1] if len(settled) else np.nan
+    return [
+        Figure(
+            f"{name}: recorder", 100 * (share or np.nan) / 2, "%", at_most(3), "", "of two cores, its start included"
+        ),
+        Figure(f"{name}: not recorded", found["unrecorded"], "", at_most(0)),
+        Figure(f"{name}: memory grows", slope, "MB/h", at_most(5), "", "a short run tells little; pictures kept count"),
+        Figure(f"{name}: memory", size, "MB"),
+    ]
+
+
+def _stopping(options: argparse.Namespace, folder: Path, path: Path) -> list[Figure]:
+    record, clock = folder / "stop.mcap", WallClock()
+    run = LiveSession(_arguments(options.scenario, record, path)[:-1])  # attended
+    try:
+        at = run.wait_for("confirm")
+        run.press("y")
+        at = run.wait_for("ready", at)
+        run.press("s")
+        for _ in range(options.stops):
+            at = run.wait_for("\nprint\n", max(at, 0) - 1)
+            clock.wait_until(clock.now() + STOP_EVERY / 4)
+            run.press(" ")
+            at = run.wait_for("stopped: by the operator\n", max(at, 0))
+            clock.wait_until(clock.now() + STOP_EVERY / 8)
+            run.press("r")
+        run.press("q")
+        run.end()
+    finally:
+        run.close()
+    found = json.loads(Beside(record).summary.read_text(encoding="utf-8"))["latency_ms"].get(STOP, {})
+    note = f"{found.get('count', 0)} stops by the terminal"
+    return [
+        Figure("stop decided to on the wire, 99 %", _of(found, "p99"), "ms", at_most(10), "", note),
+        Figure("stop decided to on the wire, largest", _of(found, "max"), "ms"),
+    ]
+
+
+def _arguments(scenario: Path, record: Path, path: Path) -> list[str]:
+    return ["--simulated", str(scenario), "--record", str(record), "--path", str(path), "--no-page", "--yes"]
+
+
+def _of(span: dict[str, Any], key: str) -> float:
+    return float(span[key]) if span.get(key) is not None else float("nan")

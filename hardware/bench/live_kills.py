@@ -1,0 +1,105 @@
+"""Random processes of a run killed at random instants: is the arm at rest, and does the next run go on where it was?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from estimation.errors import InputError
+from hardware.bench.figure import Figure, at_most
+from hardware.bench.live_session import LiveSession
+from hardware.clock import WallClock
+from hardware.live.beside import Beside
+from hardware.live.judge import printed
+from hardware.progress import Progress
+from hardware.session import open_session
+
+VICTIMS = ("run", "tracking", "motion", "recorder", "feed")
+LONGEST = 6.0  # s of printing before a kill
+WITHIN = 0.5  # s after a kill in which the arm must have come to rest: noticed in 0.1, queued for 0.05, its servo
+STILL = 0.05  # mm
+ENDED = 60.0  # s in which the others must have ended
+EXECUTED = 30.0  # s in which the virtual arm has written what it did
+
+
+@dataclass(slots=True)
+class Kills:
+    """What came of them. restless, stuck: arms that moved on, runs that did not print again. lost, doubled: in
+    checkpoints, of each resumed run. unread: s before the kill from which the recording cannot be read.
+    """
+
+    count: int = 0
+    restless: int = 0
+    stuck: int = 0
+    lost: list[float] = field(default_factory=list)
+    doubled: list[float] = field(default_factory=list)
+    unread: list[float] = field(default_factory=list)
+
+
+def kill_figures(scenario: Path, folder: Path, path: Path, count: int, seed: int) -> list[Figure]:
+    """Kill `count` processes, each in the run that resumes the one before; after a finished print a new one begins."""
+    rng, clock, kills = np.random.default_rng(seed), WallClock(), Kills()
+    record: Path | None = None
+    place = float("nan")
+    with Progress("kills", "kills", clock.now) as progress:
+        for number in range(count):
+            fresh = record is None
+            if record is None:
+                record, place = folder / f"kill{number}.mcap", float("nan")
+                arguments = ["--simulated", str(scenario), "--path", str(path), "--record", str(record)]
+            else:
+                arguments = ["--resume", str(record)]
+                record = Beside(record).next().record
+            run = LiveSession([*arguments, "--no-page", "--yes"])
+            place = _kill(run, record, kills, rng, None if fresh else place)
+            record = record if np.isfinite(place) else None
+            progress(number + 1, count)
+    name = f"{kills.count} kills"
+    return [
+        Figure(f"{name}: arms not at rest after {WITHIN:g} s", kills.restless, "", at_most(0)),
+        Figure(f"{name}: runs that did not print again", kills.stuck, "", at_most(0)),
+        Figure(f"{name}: most left out", max(kills.lost, default=np.nan), "checkpoints", at_most(1)),
+        Figure(f"{name}: most printed twice", max(kills.doubled, default=np.nan), "checkpoints", at_most(0)),
+        Figure(f"{name}: recording ends before the kill, most", max(kills.unread, default=np.nan), "s", at_most(1)),
+    ]
+
+
+def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator, before: float | None) -> float:
+    """Kill one process of a run; the last place that it extruded, NaN where there is none to go on from."""
+    clock = WallClock()
+    try:
+        if run.wait_for("\nprint\n") < 0:
+            kills.stuck += 1
+            return float("nan")
+        clock.wait_until(clock.now() + rng.uniform(0, LONGEST))
+        now = run.kill(str(rng.choice(VICTIMS)))
+        run.end(ENDED)
+    finally:
+        run.close()
+    if not np.isfinite(now) or "the path is printed" in run.said:
+        return float("nan")
+    kills.count += 1
+    kills.restless += not _rests(record, now)
+    first, last = printed(record)
+    if before is not None and np.isfinite(first):
+        kills.lost.append(max(first - before, 0.0))
+        kills.doubled.append(max(before - first, 0.0))
+    try:
+        kills.unread.append(max(now - open_session(record).sets[-1][0].stamp, 0.0))
+    except InputError:
+        kills.unread.append(float("inf"))
+    return last if np.isfinite(last) else before if before is not None else float("nan")
+
+
+def _rests(record: Path, killed: float) -> bool:
+    """Whether the virtual arm stood still from WITHIN after the kill on."""
+    clock, file = WallClock(), Beside(record).executed
+    until = clock.now() + EXECUTED
+    while not file.exists() and clock.now() < until:
+        clock.wait_until(clock.now() + 0.1)
+    clock.wait_until(clock.now() + 0.3)
+    with np.load(file) as executed:
+        after = executed["axes"][executed["stamps"] > killed + WITHIN]
+    return bool(len(after) and np.ptp(after[:, :3], axis=0).max() < STILL)

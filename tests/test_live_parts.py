@@ -1,0 +1,385 @@
+"""Parts of a live run: stages, settings, what goes between processes, what is shown when, what is kept beside."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from multiprocessing import Pipe
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from estimation import se3
+from estimation.errors import InputError
+from estimation.pose import SurfacePose, TrackState
+from estimation.trajectory import Trajectory
+from hardware.arm_profile import BENCH, ArmProfile
+from hardware.arm_status import ArmState, ArmStatus
+from hardware.bookmark_file import keep_bookmark, read_start
+from hardware.live.arrived import SourceEnded
+from hardware.live.beside import Beside, Found, read_found, write_found
+from hardware.live.conductor import Conductor, Seen, Task
+from hardware.live.feed import schedule, turns
+from hardware.live.frame_ring import SLOTS, FrameRing, RingSource
+from hardware.live.kept import kept_begin
+from hardware.live.laid import laid_on, lifted
+from hardware.live.outbox import Outbox
+from hardware.live.records import (
+    Begin,
+    EventEntry,
+    LiveMotionReport,
+    Pace,
+    RecorderReport,
+    SetEntry,
+    TrackingReport,
+)
+from hardware.live.settings import LiveSettings, check_settings, overridden, read_settings, settings_text
+from hardware.motion_loop import Order, Tick
+from hardware.operator.request import Request, Wish
+from hardware.operator.view import Stage
+from perception.frames import Frame, FrameSet
+from planning.command import Hold
+from planning.progress import Phase, Progress, fingerprint
+from tests.moving import raster
+
+PROFILE = ArmProfile()
+SURFACE = SurfacePose(0.0, BENCH, np.eye(6) * 1e-6, np.zeros(6), TrackState.TRACKING)
+
+
+# -- stages
+
+
+class Staged:
+    """A conductor with the reports that it is given; time goes on by `look`."""
+
+    def __init__(self, **task: object) -> None:
+        self.conductor = Conductor(Task(raster(), PROFILE, stands_home=True, **task))  # type: ignore[arg-type]
+        self.now, self.arm, self.phase = 0.0, ArmState.DISARMED, None
+        self.seen, self.pose = Seen(recorder=RecorderReport(0.0, 0, 0.0, "")), SURFACE
+        self.ended, self.asked = "", 0
+        self.orders: list[object] = []
+
+    def look(self, *wishes: Wish, seconds: float = 0.1) -> Stage:
+        self.now += seconds
+        asked = []
+        for wish in wishes:
+            self.asked += 1
+            asked.append(Request(self.asked, wish, self.conductor.turn))
+        pose = replace(self.pose, stamp=self.now)
+        self.seen.tracking = TrackingReport(
+            self.now, ("a", "b"), (0, 1), pose, np.eye(4), 0.0, 5, ended=self.ended, used=(50, 50)
+        )
+        nan = float("nan")
+        status = ArmStatus(self.now, self.arm, "why", PROFILE.arm.home, None, 0.0, nan, nan, 0.0, 0, 0, 0, 0)
+        tick = Tick(self.now, Hold(self.now, 0.001, "x"), b"", 0.0, status, "")
+        progress = None if self.phase is None else Progress(self.phase, 1, 6, 1.0, 9.0, 1.0)
+        self.seen.motion = LiveMotionReport(tick, progress, False, (), (), 0, 0, None, 0, "ordinary")
+        self.orders += self.conductor(self.now, self.seen, asked)
+        return self.conductor.stage
+
+    def to_print(self) -> None:
+        """Lead it to where it prints."""
+        self.look(seconds=0.0)
+        self.look()
+        self.look(Wish.CONFIRM)
+        self.look(Wish.START)
+        self.arm = ArmState.ARMED
+        self.look()
+        self.arm = ArmState.DISARMED
+        self.look()
+        self.arm, self.phase = ArmState.ARMED, Phase.PRINTING
+        self.look()
+        assert self.look() is Stage.PRINT
+
+
+def test_stages_follow_each_other_and_the_arm_is_armed_only_after_it_went_home() -> None:
+    run = Staged()
+    run.to_print()
+    kinds = [order if isinstance(order, Order | Pace) else "begin" for order in run.orders]
+    assert kinds == [Order.AT_HOME, Order.HOME, "begin", Pace.RESUME, Order.ARM]
+    run.phase = Phase.FINISHED
+    assert run.look() is Stage.HOMING
+    run.look()
+    run.arm = ArmState.DISARMED
+    assert run.look() is Stage.DONE and run.conductor.done
+
+
+def test_nothing_moves_before_it_was_confirmed_and_started() -> None:
+    run = Staged()
+    for _ in range(50):
+        assert run.look() in (Stage.CHECK, Stage.FIND, Stage.CONFIRM)
+    run.look(Wish.START, Wish.RESUME, Wish.HOME)
+    assert not run.orders
+    run.look(Wish.CONFIRM)
+    assert not run.orders and run.conductor.stage is Stage.READY
+
+
+@pytest.mark.parametrize("stage", [Stage.CHECK, Stage.CONFIRM, Stage.PRINT, Stage.PAUSED, Stage.HOMING])
+def test_a_stop_is_always_ordered_whatever_the_window_showed(stage: Stage) -> None:
+    run = Staged()
+    run.to_print()
+    run.conductor.stage = stage
+    orders = run.conductor(run.now, run.seen, [Request(1, Wish.STOP, -7)])
+    assert orders[0] is Order.STOP
+
+
+def test_a_wish_from_before_a_stop_lets_nothing_go_on() -> None:
+    run = Staged()
+    run.to_print()
+    turn = run.conductor.turn
+    run.arm = ArmState.STOPPED
+    run.look(Wish.STOP)
+    run.orders.clear()
+    run.conductor(run.now, run.seen, [Request(9, Wish.RESUME, turn)])
+    assert run.conductor.stage is Stage.STOPPED and not run.orders
+    assert run.conductor.answer is not None and not run.conductor.answer.followed
+
+
+def test_an_arm_that_stops_by_itself_is_not_armed_again_unasked() -> None:
+    run = Staged()
+    run.to_print()
+    run.orders.clear()
+    run.arm = ArmState.STOPPED
+    for _ in range(100):
+        assert run.look() is Stage.STOPPED
+    assert not run.orders and run.conductor.reason == "why"
+    run.look(Wish.RESUME)
+    assert run.orders == [Pace.RESUME, Order.ARM]
+
+
+def test_what_goes_on_by_itself_ends_where_nobody_is_there_to_resume() -> None:
+    run = Staged(unattended=True)
+    for _ in range(4):
+        run.look()
+    run.arm = ArmState.ARMED
+    run.look()
+    run.arm = ArmState.DISARMED
+    run.look()
+    run.arm, run.phase = ArmState.ARMED, Phase.PRINTING
+    run.look()
+    run.arm = ArmState.STOPPED
+    run.look()
+    run.look()
+    assert run.conductor.ended == "stopped: why" and run.orders[-1] is Order.STOP
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"), [("cameras", "no more"), ("arm", "unplugged"), ("recorder", "disk"), ("age", "no pictures")]
+)
+def test_what_ends_a_run_stops_the_arm_and_says_so(fault: str, words: str) -> None:
+    run = Staged(patience=2.0)
+    run.to_print()
+    if fault == "cameras":
+        run.ended = "no more"
+    elif fault == "arm":
+        run.arm = ArmState.UNPLUGGED
+    elif fault == "recorder":
+        run.seen.recorder = RecorderReport(0.0, 0, 0.0, "the disk is full")
+    else:
+        assert run.seen.tracking is not None
+        run.conductor(run.now + 2.1, run.seen, [])
+        run.look(seconds=0.0)
+    run.look()
+    assert words in run.conductor.ended and run.conductor.stage is Stage.FAILED
+    if fault != "age":
+        assert run.orders[-1] is Order.STOP
+
+
+def test_a_path_out_of_reach_is_told_and_not_begun() -> None:
+    run = Staged(unattended=True)
+    run.pose = replace(SURFACE, base_from_surface=se3.make(np.eye(3), np.array([900.0, 0, 0])))
+    for _ in range(4):
+        run.look()
+    assert "out of reach: checkpoint 0: X" in run.conductor.ended
+    assert run.orders == [Order.STOP]
+
+
+def test_a_dry_run_extrudes_nothing_and_stays_above_along_the_tool() -> None:
+    path = raster()
+    dry = lifted(path, 7.0)
+    assert not dry.extrude.any()
+    up = np.einsum("nij,nj->ni", path.surface_from_nozzle[:, :3, :3], np.tile([0, 0, 7.0], (len(path), 1)))
+    assert dry.surface_from_nozzle[:, :3, 3] == pytest.approx(path.surface_from_nozzle[:, :3, 3] + up)
+
+
+def test_an_arm_that_has_no_place_is_put_where_the_surface_lies_below_its_home() -> None:
+    pose = replace(SURFACE, base_from_surface=se3.make(se3.exp_rotation([0.3, 0.2, 0.1]), np.array([9.0, 8, 700])))
+    assert laid_on(raster(), np.eye(4), pose, PROFILE, place=False).unreachable
+    assert not laid_on(raster(), np.eye(4), pose, PROFILE, place=True).unreachable
+
+
+# -- settings
+
+
+def test_the_session_file_that_init_writes_is_read_back_as_the_defaults(tmp_path: Path) -> None:
+    (tmp_path / "session.toml").write_text(settings_text())
+    assert read_settings(tmp_path / "session.toml") == LiveSettings()
+
+
+def test_what_a_run_used_is_read_back_as_it_was(tmp_path: Path) -> None:
+    used = LiveSettings(
+        rig=tmp_path / "rig", path=tmp_path / 'a "b".csv', arm="virtual", record=tmp_path / "x.mcap", jpeg_quality=0,
+        dry_run=True, lift=3.25, unattended=True, patience=2.5, cores_motion=(1,),
+    )  # fmt: skip
+    (tmp_path / "session.toml").write_text(settings_text(used))
+    assert read_settings(tmp_path / "session.toml") == used
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"rig": None}, "one of rig and simulated"),
+        ({"path": None}, "print.path"),
+        ({"arm": ""}, "arm.device"),
+        ({"record": Path("x.bag")}, "ends in .mcap"),
+        ({"lift": -1e-9}, "0 to 100 mm"),
+        ({"lift": 100.1}, "0 to 100 mm"),
+        ({"patience": 0.99}, "1 to 600 s"),
+        ({"jpeg_quality": 101}, "0 to 100"),
+        ({"path": Path("nowhere.csv")}, "a file that exists"),
+    ],
+)
+def test_settings_that_make_no_sense_are_named(change: dict[str, object], words: str, tmp_path: Path) -> None:
+    for name in ("rig.toml", "path.csv"):
+        (tmp_path / name).touch()
+    good = LiveSettings(
+        rig=tmp_path / "rig.toml", path=tmp_path / "path.csv", arm="virtual", record=tmp_path / "x.mcap"
+    )
+    check_settings(good, "here")
+    with pytest.raises(InputError, match=words):
+        check_settings(replace(good, **change), "here")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("text", ["[arm]\nspeed = 3", "[arms]", "[print]\ndry_run = 1", '[cores]\nmotion = ["a"]'])
+def test_a_key_that_nobody_reads_or_of_a_wrong_kind_is_an_error(text: str, tmp_path: Path) -> None:
+    (tmp_path / "session.toml").write_text(text)
+    with pytest.raises(InputError):
+        read_settings(tmp_path / "session.toml")
+
+
+def test_flags_override_and_what_was_not_given_does_not() -> None:
+    assert overridden(LiveSettings(lift=3.0, arm="a"), {"lift": None, "arm": "b"}) == LiveSettings(lift=3.0, arm="b")
+
+
+# -- between processes
+
+
+def frames(count: int) -> FrameSet:
+    images = [np.full((6, 8, 3), 10 * camera + count, np.uint8) for camera in range(2)]
+    return FrameSet(float(count), tuple(Frame(c, float(count), image) for c, image in enumerate(images)))
+
+
+def test_the_newest_of_the_frames_is_taken_whole_and_the_others_are_counted() -> None:
+    ours, theirs = Pipe(duplex=False)
+    ring = FrameRing([(8, 6), (8, 6)])
+    source = RingSource(ring, ours)
+    for count in (1, 2, 3):
+        theirs.send(ring.put(frames(count), {0: ("jpeg", bytes([count] * 5))}, 10.0 + count, 0.5))
+    arrived = source.take(0.1)
+    assert arrived is not None and arrived.dropped == 2 and arrived.handed == 13.0 and arrived.source == 0.5
+    for got, sent in zip(arrived.frames.frames, frames(3).frames, strict=True):
+        assert np.array_equal(got.image, sent.image) and got.stamp == 3.0
+    assert arrived.encoded == {0: ("jpeg", b"\x03" * 5)}
+    assert source.take(0.0) is None
+    theirs.send("over")
+    with pytest.raises(SourceEnded, match="over"):
+        source.take(0.1)
+    theirs.close()
+    with pytest.raises(SourceEnded):
+        source.take(0.1)
+
+
+def test_frames_that_were_written_over_meanwhile_are_not_taken() -> None:
+    ring = FrameRing([(8, 6), (8, 6)])
+    word = ring.put(frames(1), {}, 0.0, 0.0)
+    assert ring.take(word) is not None
+    for count in range(SLOTS):
+        ring.put(frames(count + 2), {}, 0.0, 0.0)
+    assert ring.take(word) is None
+
+
+def test_a_recorder_that_takes_nothing_holds_up_nobody_and_what_finds_no_room_is_counted() -> None:
+    ours, theirs = Pipe(duplex=False)
+    box = Outbox(theirs)
+    picture = SetEntry({0: 0.0}, {0: ("jpeg", bytes(4_000_000))})
+    for _ in range(20):
+        box.put(picture)
+    assert 5 <= box.dropped <= 11
+    before = box.dropped
+    box.put(EventEntry(1.0, "small", 2, "x"))
+    assert box.dropped == before  # pictures leave room for what is small
+    found = list[int]()
+    reader = threading.Thread(target=lambda: found.extend(_lengths(ours)))
+    reader.start()
+    box.close()
+    reader.join(10)
+    assert len(found) == 21 - before and found[-1] < 1000
+    box.put(picture)
+
+
+def _lengths(connection: object) -> list[int]:
+    taken = []
+    try:
+        while True:
+            taken.append(len(connection.recv_bytes()))  # type: ignore[attr-defined]
+    except EOFError:
+        return taken
+
+
+# -- what is shown when
+
+
+@given(st.integers(20, 200), st.integers(0, 2**31))
+def test_a_session_shown_to_and_fro_is_smooth_where_it_turns(count: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    stamps = np.cumsum(rng.uniform(0.02, 0.05, count))
+    places = np.sin(2 * np.pi * stamps / stamps[-1] * 4 + rng.uniform(0, 6))
+    truth = Trajectory(stamps, se3.make(np.eye(3), np.outer(places, [0, 0, 3.0])), True)
+    first, last = turns(truth, stamps)
+    assert 0 <= first < last < count
+    shown = schedule(stamps, 100.0, (first, last))
+    showings = [next(shown) for _ in range(4 * count)]
+    live, index = np.array([s.live for s in showings]), np.array([s.index for s in showings])
+    assert (np.diff(live) > 0).all() and live[0] == 100.0
+    assert set(np.abs(np.diff(index))) == {1} and index.min() == first and index.max() == last
+    assert np.diff(live) == pytest.approx(np.abs(np.diff(stamps[index])))
+
+
+def test_a_session_without_truth_is_shown_once() -> None:
+    stamps = np.array([3.0, 3.1, 3.3])
+    shown = list(schedule(stamps, 50.0, None))
+    assert [s.index for s in shown] == [0, 1, 2] and [s.live for s in shown] == pytest.approx([50.0, 50.1, 50.3])
+
+
+# -- what is kept
+
+
+def test_the_place_of_a_path_is_kept_and_read_back(tmp_path: Path) -> None:
+    path = raster()
+    keep_bookmark(tmp_path / "x.toml", fingerprint(path), 3.0625)
+    assert read_start(tmp_path / "x.toml", path) == 3.0625
+    with pytest.raises(InputError):
+        read_start(tmp_path / "x.toml", lifted(path, 1.0))
+
+
+def test_where_the_path_lies_is_kept_to_the_last_digit(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").touch()
+    pose = se3.make(se3.exp_rotation([0.1, 0.2, 0.3]), np.array([1 / 3, 2 / 3, 1e-9]))
+    write_found(tmp_path / "x.toml", Found(tmp_path / "run.mcap", 1 / 7, pose, se3.inverse(pose)))
+    found = read_found(tmp_path / "x.toml")
+    assert (found.surface_from_path == pose).all() and (found.arm_from_base == se3.inverse(pose)).all()
+    assert found.until == 1 / 7
+    assert Beside(tmp_path / "run.mcap").next().record == tmp_path / "run-2.mcap"
+
+
+def test_what_is_begun_is_what_the_recording_holds() -> None:
+    begin = Begin(raster(), replace(PROFILE, lag=0.1 / 3), 0.0, "x")
+    texts, used = kept_begin(begin)
+    again, same = kept_begin(used)
+    assert used.profile.lag == begin.profile.lag
+    assert (same.path.surface_from_nozzle == used.path.surface_from_nozzle).all()
+    assert used.path.surface_from_nozzle == pytest.approx(begin.path.surface_from_nozzle, abs=1e-12)
+    assert set(texts) == set(again)
