@@ -27,6 +27,7 @@ from hardware.live.frame_ring import SLOTS, FrameRing, RingSource
 from hardware.live.kept import kept_begin
 from hardware.live.laid import laid_on, lifted
 from hardware.live.outbox import Outbox
+from hardware.live.prepared import prepare, prepare_again
 from hardware.live.records import (
     Begin,
     EventEntry,
@@ -40,6 +41,7 @@ from hardware.live.settings import LiveSettings, check_settings, overridden, rea
 from hardware.motion_loop import Order, Tick
 from hardware.operator.request import Request, Wish
 from hardware.operator.view import Stage
+from hardware.path_file import write_path
 from perception.frames import Frame, FrameSet
 from planning.command import Hold
 from planning.progress import Phase, Progress, fingerprint
@@ -57,7 +59,8 @@ class Staged:
 
     def __init__(self, **task: object) -> None:
         self.conductor = Conductor(Task(raster(), PROFILE, stands_home=True, **task))  # type: ignore[arg-type]
-        self.now, self.arm, self.phase = 0.0, ArmState.DISARMED, None
+        self.now, self.arm = 0.0, ArmState.DISARMED
+        self.phase: Phase | None = None
         self.seen, self.pose = Seen(recorder=RecorderReport(0.0, 0, 0.0, "")), SURFACE
         self.ended, self.asked = "", 0
         self.orders: list[object] = []
@@ -373,6 +376,30 @@ def test_where_the_path_lies_is_kept_to_the_last_digit(tmp_path: Path) -> None:
     assert (found.surface_from_path == pose).all() and (found.arm_from_base == se3.inverse(pose)).all()
     assert found.until == 1 / 7
     assert Beside(tmp_path / "run.mcap").next().record == tmp_path / "run-2.mcap"
+    assert Beside(tmp_path / "run-2.mcap").next().record == tmp_path / "run-3.mcap"
+
+
+def test_a_run_that_resumes_one_that_resumed_knows_what_the_first_one_found(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(
+        '[[camera]]\nname = "a"\nsource = "usb:1"\nsize = [8, 6]\nmatrix = [[9, 0, 4], [0, 9, 3], [0, 0, 1]]\n'
+        "distortion = [0, 0, 0, 0, 0]\nbase_from_camera = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    )
+    write_path(tmp_path / "path.csv", raster())
+    record, names = tmp_path / "run.mcap", ("rig.toml", "path.csv")
+    rig, path = (tmp_path / name for name in names)
+    first = prepare(LiveSettings(rig=rig, path=path, arm="virtual", record=record), "here", False)
+    first.beside.session.write_text(settings_text(first.settings))
+    place = se3.make(np.eye(3), np.array([1.0, 2, 3]))
+    write_found(first.beside.surface, Found(rig, 5.0, place, se3.inverse(place)))
+    keep_bookmark(first.beside.progress, fingerprint(first.task.path), 2.5)
+    for _ in range(3):
+        record.touch()
+        again = prepare_again(record, {})
+        assert again.task.start == 2.5 and again.found is not None and again.found.map == rig
+        assert (again.task.profile.arm.arm_from_base == se3.inverse(place)).all() and not again.task.place
+        record = again.beside.record
+        again.beside.session.write_text(settings_text(again.settings))
+    assert record.name == "run-4.mcap"
 
 
 def test_what_is_begun_is_what_the_recording_holds() -> None:

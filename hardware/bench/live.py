@@ -21,7 +21,7 @@ from hardware.bench.live_kills import kill_figures
 from hardware.bench.live_session import LiveSession
 from hardware.clock import WallClock
 from hardware.live.beside import Beside
-from hardware.live.judge import judge_run
+from hardware.live.judge import TrueError, judge_run
 from hardware.live.motion_names import EXPOSURE_TO_WIRE, FRAMES_TO_WIRE, LATE
 from hardware.live.prerender import cache_folder, prerender
 from hardware.path_file import read_path, write_path
@@ -112,12 +112,13 @@ def _latencies(name: str, found: dict[str, Any], note: str) -> list[Figure]:
     ]
 
 
-def _errors(name: str, found: dict[str, Any], error: Any) -> list[Figure]:
+def _errors(name: str, found: dict[str, Any], error: TrueError) -> list[Figure]:
     done = f"ended: {found['ended']}"
     return [
         Figure(f"{name}: nozzle error, 95 %", error.figure(95), "mm", at_most(0.5), "", done),
         Figure(f"{name}: nozzle error, largest", error.figure(100), "mm", at_most(1.0)),
         Figure(f"{name}: duty", 100 * error.duty, "%", at_least(80)),
+        Figure(f"{name}: most queued in the arm", 1000 * error.deepest, "ms", at_most(50), "", "more: the arm stalled"),
         Figure(f"{name}: frame sets left out", found["frame_sets_dropped"], "", None, "", f"of {found['frame_sets']}"),
     ]
 

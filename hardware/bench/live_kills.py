@@ -10,6 +10,7 @@ import numpy as np
 from estimation.errors import InputError
 from hardware.bench.figure import Figure, at_most
 from hardware.bench.live_session import LiveSession
+from hardware.checks import read_toml
 from hardware.clock import WallClock
 from hardware.live.beside import Beside
 from hardware.live.judge import printed
@@ -74,7 +75,8 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
             kills.stuck += 1
             return float("nan")
         clock.wait_until(clock.now() + rng.uniform(0, LONGEST))
-        now = run.kill(str(rng.choice(VICTIMS)))
+        victim = str(rng.choice(VICTIMS))
+        now = run.kill(victim)
         run.end(ENDED)
     finally:
         run.close()
@@ -90,6 +92,8 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
         kills.unread.append(max(now - open_session(record).sets[-1][0].stamp, 0.0))
     except InputError:
         kills.unread.append(float("inf"))
+    if victim == "recorder":  # its recording ends before the arm did: what is kept of the place is all that is known
+        last = float(read_toml(Beside(record).progress)["fraction"])
     return last if np.isfinite(last) else before if before is not None else float("nan")
 
 

@@ -8,6 +8,7 @@ run.report.html, run.summary.json
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,7 +58,8 @@ class Beside:
 
     def next(self) -> Beside:
         """The recording of the run that resumes this one: the next name that is free."""
-        stem, number = self.record.stem, 2
+        named = re.fullmatch(r"(.+)-([0-9]+)", self.record.stem)
+        stem, number = (named[1], int(named[2]) + 1) if named else (self.record.stem, 2)
         while (file := self.record.with_name(f"{stem}-{number}.mcap")).exists():
             number += 1
         return Beside(file)

@@ -67,6 +67,7 @@ def move(
     reports: Newest[LiveMotionReport],
     orders: Connection,
     link: OperatorLink,
+    trouble: Newest[str],
     sender: Connection,
 ) -> None:
     """Plan the motion, and send it to the arm at `url`."""
@@ -76,7 +77,7 @@ def move(
     settings, profile = prepared.settings, prepared.task.profile
     line = LinkSettings(pause_frame=settings.pause_frame)
     plan = LiveMotionPlan(profile, url, prepared.beside.progress, line, settings.real_time, settings.cores_motion)
-    live_motion_process(plan, place, poses, reports, orders, link.requests, sender)
+    live_motion_process(plan, place, poses, reports, orders, link.requests, trouble, sender)
 
 
 def move_virtually(prepared: Prepared, link: File, lifeline: Connection) -> None:

@@ -16,6 +16,7 @@ from hardware.arm_status import ArmState
 from hardware.live import checklist
 from hardware.live.laid import Laid, laid_on, lifted
 from hardware.live.records import Begin, LiveMotionReport, Pace, RecorderReport, TrackingReport
+from hardware.live.stages import OFFERS, RUNNING
 from hardware.motion_loop import Order
 from hardware.operator.request import Request, Wish, refusal
 from hardware.operator.view import Answer, Check, Stage, Verdict
@@ -28,32 +29,6 @@ HOME_PATIENCE, ARM_PATIENCE = 60.0, 5.0  # s: across the whole room at 20 mm/s; 
 ASK_AGAIN = 0.3  # s between orders to an arm that was not ready for the last one
 LONGEST_LAG = 0.3  # s: a lag measured beyond this is no servo's
 SOUGHT = 180.0  # s in which all must be found, or nobody looks any longer where nobody watches
-MOVING = (Stage.APPROACH, Stage.PRINT, Stage.HOMING)
-RUNNING = (*MOVING, Stage.PAUSED)
-OFFERS = {
-    Stage.CHECK: (Wish.END,),
-    Stage.FIND: (Wish.END,),
-    Stage.CONFIRM: (Wish.CONFIRM, Wish.AGAIN, Wish.END),
-    Stage.READY: (Wish.START, Wish.AGAIN, Wish.END),
-    Stage.APPROACH: (Wish.PAUSE, Wish.HOME, Wish.END),
-    Stage.PRINT: (Wish.PAUSE, Wish.HOME, Wish.END),
-    Stage.PAUSED: (Wish.RESUME, Wish.HOME, Wish.END),
-    Stage.STOPPED: (Wish.RESUME, Wish.HOME, Wish.END),
-    Stage.HOMING: (Wish.END,),
-}
-QUESTIONS = {
-    Stage.CHECK: "Checking cameras, arm, path and recording",
-    Stage.FIND: "Looking for the wound and laying the path on it",
-    Stage.CONFIRM: "Does the path lie where it should be printed?",
-    Stage.READY: "Is nobody within the arm's reach? Then it may start",
-    Stage.APPROACH: "The nozzle goes to where printing begins",
-    Stage.PRINT: "Printing",
-    Stage.PAUSED: "Paused: resume, go home, or end",
-    Stage.STOPPED: "Stopped: resume, go home, or end",
-    Stage.HOMING: "The arm goes home",
-    Stage.DONE: "The path is printed",
-    Stage.FAILED: "The run has ended",
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,6 +74,7 @@ class Conductor:
     checks: tuple[Check, ...] = ()
     _since: float = field(default=float("nan"))
     _asked: float = field(default=float("-inf"))
+    _failing: float = field(default=float("inf"))  # s, since when a check has failed
     _begun: bool = False
     _homed: bool = False
     _armed: bool = False  # since it was last asked for
@@ -207,8 +183,12 @@ class Conductor:
         waits = [check for check in verdicts.values() if check.verdict in (Verdict.FAIL, Verdict.BUSY)]
         if not waits:
             self._to(Stage.FIND, "", now)
-        elif self.task.unattended and now - self._since > max(self.task.patience, SOUGHT):
-            return self.end(f"the check failed: {waits[0].name}: {waits[0].found}", now)
+            return []
+        fails = [check for check in waits if check.verdict is Verdict.FAIL]
+        self._failing = min(self._failing, now) if fails else float("inf")
+        late = now - self._failing > self.task.patience or now - self._since > SOUGHT
+        if self.task.unattended and late:
+            return self.end(f"the check failed: {(fails or waits)[0].name}: {(fails or waits)[0].found}", now)
         return []
 
     def _finding(self, tracking: TrackingReport, now: float) -> Orders:

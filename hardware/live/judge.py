@@ -35,11 +35,13 @@ TOPICS = ("/tick", "/move", "/hold", "/truth")
 class TrueError:
     """distance: (N,) mm, nozzle to its place, of each extruding millisecond. duty: share of the time due in which
     material left; NaN where none was due. printed: (2,) the first and last place extruded, counted in checkpoints.
+    deepest: s of motion that the arm ever had queued: an arm that was held up itself is late ever after.
     """
 
     distance: Array
     duty: float
     printed: tuple[float, float]
+    deepest: float
 
     def figure(self, share: float) -> float:
         """Error, mm, that `share` percent do not exceed; NaN of none."""
@@ -77,7 +79,7 @@ def judge_run(record: File, path: File, arm: File) -> TrueError:
     for command, progress in commands:
         ledger.write(command, progress)
     with np.load(Beside(record).executed) as executed:
-        stamps, axes = executed["stamps"], executed["axes"]
+        stamps, axes, deepest = executed["stamps"], executed["axes"], float(executed["deepest"])
     first, last = commands[0][0].stamp, min(ledger.known_until, float(stamps[-1]))
 
     def at(times: Array) -> Array:
@@ -92,7 +94,8 @@ def judge_run(record: File, path: File, arm: File) -> TrueError:
         errors.append(np.linalg.norm(off, axis=1))
         extruding += int(log.extrude.sum())
         due += int((np.isfinite(log.place) & (log.place > 0) & (log.stamps < finished)).sum())
-    return TrueError(np.concatenate(errors), extruding / due if due else float("nan"), printed(record))
+    duty = extruding / due if due else float("nan")
+    return TrueError(np.concatenate(errors), duty, printed(record), deepest)
 
 
 def printed(record: File) -> tuple[float, float]:

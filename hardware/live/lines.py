@@ -20,13 +20,14 @@ from hardware.newest import Newest
 from hardware.operator.link import OperatorLink
 
 LOOK = 0.02  # s between looks for it
+TROUBLE = 4096  # bytes of a sentence that says what is wrong with the arm
 READY = 60.0  # s in which a virtual arm's device must be there, on a busy machine
 
 
 @dataclass(slots=True)
 class Lines:
     """What joins the processes. url: of the arm's port. lifeline, arm_line: nothing is ever said on them; they end
-    with us."""
+    with us. trouble: why the arm cannot be used at all."""
 
     crew: Crew
     url: str
@@ -39,6 +40,7 @@ class Lines:
     arm_line: Connection
     outbox: Outbox
     link: OperatorLink
+    trouble: Newest[str]
 
     def end(self) -> None:
         """End the processes in the order in which nobody misses anybody: the arm's first, the recorder last."""
@@ -75,16 +77,16 @@ def _started(crew: Crew, prepared: Prepared, folder: File) -> Lines:
         _start_arm(crew, prepared, File(url), arm_line[0])
     place, ring = Place(), FrameRing([camera.size for camera in prepared.rig.cameras])
     poses, tracking, motion = Newest[Handed](), Newest[TrackingReport](), Newest[LiveMotionReport]()
-    recorder, link = Newest[RecorderReport](), OperatorLink()
+    recorder, link, trouble = Newest[RecorderReport](), OperatorLink(), Newest[str](TROUBLE)
     senders = [CONTEXT.Pipe(duplex=False) for _ in range(3)]
     lifeline, words, orders = (CONTEXT.Pipe(duplex=False) for _ in range(3))
     crew.start("recorder", record, (prepared, [end for end, _ in senders], recorder))
-    crew.start("motion", move, (prepared, url, place, poses, motion, orders[0], link, senders[0][1]))
+    crew.start("motion", move, (prepared, url, place, poses, motion, orders[0], link, trouble, senders[0][1]))
     if not prepared.live:
         crew.start("feed", show, (prepared, WallClock().now(), ring, words[1]))
     crew.start("tracking", track, (prepared, ring, words[0], poses, tracking, motion, link, senders[1][1], lifeline[0]))
     ends = orders[1], lifeline[1], arm_line[1], Outbox(senders[2][1])
-    return Lines(crew, url, place, tracking, motion, recorder, *ends, link)
+    return Lines(crew, url, place, tracking, motion, recorder, *ends, link, trouble)
 
 
 def _start_arm(crew: Crew, prepared: Prepared, link: File, lifeline: Connection) -> None:

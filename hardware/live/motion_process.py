@@ -13,6 +13,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path as File
 from types import FrameType
 
+from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from hardware.arm import Arm
 from hardware.arm_port import Device
@@ -152,9 +153,13 @@ def live_motion_process(
     reports: Newest[LiveMotionReport],
     orders: Connection,
     wishes: RequestLine,
+    trouble: Newest[str],
     record: Connection,
 ) -> None:
-    """Follow orders until told to QUIT, or until whoever gives them is gone; then the arm is stopped."""
+    """Follow orders until told to QUIT, or until whoever gives them is gone; then the arm is stopped.
+
+    trouble: is told why the arm cannot be used at all.
+    """
     settle("motion", plan.cores)
     clock, device, outbox = WallClock(), Device(plan.url, plan.profile.baud), Outbox(record)
     motion, watch = LiveMotion(plan.profile, place), _Watch(plan, poses, reports, outbox)
@@ -168,6 +173,8 @@ def live_motion_process(
         finally:
             watch.loop = None
             arm.close()
+    except InputError as error:
+        trouble.put(str(error))
     finally:
         device.release()
         if told.alone and told.fingerprint:

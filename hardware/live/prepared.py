@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path as File
@@ -75,6 +76,9 @@ def prepare_again(record: File, flags: dict[str, Any]) -> Prepared:
     start = read_start(beside.progress, path) if beside.progress.exists() else 0.0
     if start >= len(path) - 1:
         raise InputError(beside.progress, "fraction", start, f"below {len(path) - 1}: the path is printed")
+    for earlier, later in ((beside.progress, again.progress), (beside.surface, again.surface)):
+        if earlier.exists():  # before it comes as far itself, this run is where that one was
+            shutil.copyfile(earlier, later)
     profile = prepared.task.profile
     if found is not None:
         profile = replace(profile, arm=replace(profile.arm, arm_from_base=found.arm_from_base))

@@ -132,6 +132,8 @@ class LiveRun:
         if self._signal:
             return conductor.end(f"ended: {ENDED_BY[signal.Signals(self._signal)]}", now)
         for name in crew.dead():
+            if name == MOTION and (trouble := self._lines.trouble.get()):
+                return conductor.end(trouble, now)
             if name == MOTION:
                 self._halt()
             ended = self._lines.tracking.get()

@@ -9,7 +9,6 @@ import signal
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
@@ -41,11 +40,11 @@ from hardware.live.records import (
     SetEntry,
     TrackingReport,
 )
+from hardware.live.remembered import remember, true_pose
 from hardware.newest import Newest
 from hardware.operator.link import OperatorLink
 from hardware.operator.taker import PictureTaker, Shot
 from hardware.session import Session, open_session
-from hardware.track import Step
 from hardware.tracker import tracker
 from perception.frames import FrameSet, PrintHead, Roi
 from perception.tracking import STAGES
@@ -157,7 +156,7 @@ class _Tracking:
         self._known = known
         self._pictures = PictureTaker(lines.link.pictures, lines.link.requests)
         names = tuple(camera.name for camera in known.rig.cameras)
-        self.report = TrackingReport(self._clock.now(), names, surface_from_path=plan.surface_from_path)
+        self.report = TrackingReport(self._clock.now(), names)
         lines.reports.put(self.report)
         first = None if plan.earlier is None else open_session(plan.earlier)
         rois = known.roi if first is None else first.roi
@@ -165,8 +164,9 @@ class _Tracking:
         at_once = tuple(replace(roi, stamp=-np.inf) for roi in rois)
         follows = tracker(known.rig, at_once, known.surface, self._clock.now, plan.profile.tool)
         self._step = stack.enter_context(follows)
-        if first is not None:
-            _remember(self._step, first, plan.until, self._clock.now())
+        if first is not None and plan.earlier is not None and plan.surface_from_path is not None:
+            moved = remember(self._step, plan.earlier, first, plan.until, self._clock.now())
+            self.report = replace(self.report, surface_from_path=moved @ plan.surface_from_path)
 
     def _give(self, known: _Known, rois: Sequence[Roi]) -> None:
         """Tell the recorder what is known before the first picture."""
@@ -257,24 +257,6 @@ class _Tracking:
             self._told = now
             for entry in self.times.entries(now):
                 self._outbox.put(entry)
-
-
-def true_pose(truth: Trajectory, stamp: float) -> Array:
-    """base_from_surface (4, 4) at `stamp`, s, between the truth's own stamps."""
-    after = int(np.clip(np.searchsorted(truth.stamps, stamp), 1, len(truth) - 1))
-    before, span = after - 1, truth.stamps[after] - truth.stamps[after - 1]
-    share = (stamp - truth.stamps[before]) / span
-    return np.asarray(se3.interpolate(truth.base_from_surface[before], truth.base_from_surface[after], share))
-
-
-def _remember(step: Step, session: Session, until: float, now: float) -> None:
-    """Show the step what an earlier run saw first: it makes the same map, in the same surface frame, once more."""
-    sets = takewhile(lambda frames: frames.stamp <= until, session.frame_sets())
-    shift = now - until - 1.0  # its stamps end a second ago: the clock may have begun anew since
-    for frames in sets:
-        shown = tuple(replace(frame, stamp=frame.stamp + shift) for frame in frames.frames)
-        step(FrameSet(frames.stamp + shift, shown, frames.head))
-        step.idle()
 
 
 class _Heads:

@@ -72,7 +72,7 @@ def virtual_arm_process(plan: VirtualArmPlan, lifeline: Connection) -> None:
     stamps = np.arange(0.0, arm.now, STEP)
     axes = arm.axes_at(stamps) if len(stamps) else np.zeros((0, 6))
     with plan.executed.open("wb") as file:
-        np.savez(file, stamps=stamps + clock.begun, axes=axes, ignored=len(arm.ignored), frames=arm.frames)
+        np.savez(file, stamps=stamps + clock.begun, axes=axes, deepest=arm.deepest)
 
 
 def _end_with(lifeline: Connection, stop: threading.Event) -> None:
