@@ -140,7 +140,7 @@ class Estimator:
         inlier = solution.weights > 0.2
         used = np.bincount(seen.camera[inlier], minlength=len(self.rig))
         known = fit_covariance(seen, solution, shared, self._map_error, self._warp)
-        found = int((~np.isin(seen.camera, list(odd))).sum()) if odd else len(seen)
+        found = int((~np.isin(seen.camera, list(odd))).sum())
         claimed = known.noise + known.smear + known.lasting
         reason = self._judge(found, used, claimed, disorder(seen, solution, inlier))
         apart = self.health.doubted(off, allowed, odd)
@@ -213,7 +213,7 @@ class Estimator:
         )
         at_once, _, jacobians = project(self.rig, camera, start, points)
         sigma = self._own_doubt.widened(sigma, observations.track, jacobians)
-        velocity = (jacobians.reshape(-1, 6) @ twist).reshape(-1, 2)
+        velocity = jacobians @ twist
         if self.cameras.offset.any():
             pixels = pixels + at_once - project(self.rig, camera, self.as_exposed(start, twist), points)[0]
         smear = self.cameras.delays.sigma * float(np.sqrt(median((velocity**2).sum(1))))

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.compiled import NEW
 from estimation.observations import Observations
 from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, Shared
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.track_loops import pulls, sums_of_scatter
+from estimation.track_loops import pulls
 from estimation.warp_filter import WarpFilter
 
 CLAIMED = 20.0  # residuals as which the sigmas claimed count
@@ -52,12 +51,6 @@ class MapError:
         self._position = np.full(count, -1)
         self._block = np.zeros((0, 0))
 
-    def rows_of(self, track: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The landmarks (K,) among `track` (N,), ascending, and which of them each is (N,)."""
-        held = np.zeros(len(self._position), np.int64)
-        held[track] = 1
-        return np.flatnonzero(held), (np.cumsum(held) - 1)[track]
-
     def through(self, rows: NDArray[np.int64], pull: Array) -> Array:
         """Covariance (6, 6) of the sum of the landmarks' pulls (6, K, 3), of rows (K,), ascending."""
         if (self._position[rows] < 0).any() or len(self._block) > 3 * self.ROOM * len(rows):
@@ -79,17 +72,18 @@ def scatter(seen: Observations, solution: PoseFit) -> float:
     errors of the size claimed. Tracks of clean pictures are two or three times better than they claim, and where some
     are worse without being outliers, their weights alone would say too little. What is claimed counts as some tracks.
     """
-    residual, sigma = np.require(solution.residuals, float, NEW), np.require(seen.sigma, float, NEW)
-    used = np.require(solution.weights, float, NEW)
-    weights, tilt, pulled, count = sums_of_scatter(residual, sigma * solution.scale, used, GATE)
-    told = 2 * weights - 6
+    root = seen.sigma * solution.scale
+    square = (solution.residuals**2).sum(1) / root**2
+    used = solution.weights > 0
+    weight = (1 + square[used] / GATE**2) ** -2
+    told = weight.sum() * 2 - 6
     if told <= 0:
         return 1.0
-    slope = tilt / count
+    slope = float(np.mean(weight * (1 - 2 * square[used] / (GATE**2 + square[used]))))
     if slope <= LEAST_SLOPE:
         return 1.0
-    pull = pulled / count / 2 * (2 * weights / told)
-    found = EFFICIENCY * weights / count * pull / slope**2
+    pull = float(np.mean(weight**2 * square[used])) / 2 * (2 * weight.sum() / told)
+    found = EFFICIENCY * float(weight.mean()) * pull / slope**2
     return float((CLAIMED + told * found) / (CLAIMED + told))
 
 
@@ -104,7 +98,7 @@ def fit_covariance(
     information = solution.information + 1e-9 * np.eye(6) * np.trace(solution.information)
     noise = np.linalg.pinv(information, hermitian=True)
     weight = EFFICIENCY * solution.weights / (seen.sigma * solution.scale) ** 2
-    rows, landmark = map_error.rows_of(seen.track)
+    rows, landmark = np.unique(seen.track, return_inverse=True)
     cameras = len(shared.shift)
     camera = np.ascontiguousarray(seen.camera)
     by_landmark, by_camera = pulls(cameras, len(rows), camera, landmark, solution.jacobians, weight, shared.twist)

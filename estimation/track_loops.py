@@ -177,23 +177,3 @@ def rows_of_modes(
             row[count + 6 + camera[i]] = root[i] * along
             row[count + 6 + cameras] = root[i] * left
     return rows
-
-
-@compiled("Tuple((f8, f8, f8, i8))(f8[:,::1], f8[::1], f8[::1], f8)")
-def sums_of_scatter(residual: Array, root: Array, used: Array, gate: float) -> tuple[float, float, float, int]:
-    """Over tracks with weight in `used` (N,): the sums of weights, of their slopes and of squared pulls; how many.
-
-    residual: (N, 2) px. root: (N,) px, one sigma. gate: as in `weights_of`, for a unit of one.
-    """
-    weights = slopes = pulled = 0.0
-    count = 0
-    for i in range(len(root)):
-        if used[i] > 0:
-            square = (residual[i, 0] * residual[i, 0] + residual[i, 1] * residual[i, 1]) / (root[i] * root[i])
-            beside = 1.0 + square / (gate * gate)
-            weight = 1.0 / (beside * beside)
-            weights += weight
-            slopes += weight * (1 - 2 * square / (gate * gate + square))
-            pulled += weight * weight * square
-            count += 1
-    return weights, slopes, pulled, count

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from estimation.errors import StillbedError
 from hardware.arm_commands import add_arm
 from hardware.bench.command import add_bench
+from hardware.calibration.commands import add_calibrate
 from hardware.cameras.command import add_cameras
 from hardware.live.command import add_init, add_live
 from hardware.methods import MAP, METHODS
@@ -91,6 +92,7 @@ def parser() -> argparse.ArgumentParser:
     add_live(commands)
     add_init(commands)
     _add_replay(commands)
+    add_calibrate(commands)
     add_reach(commands)
     add_arm(commands)
     add_cameras(commands)

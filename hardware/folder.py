@@ -91,9 +91,12 @@ class FolderReader:
             video.close()
 
 
-def open_folder(folder: Path) -> Session:
-    """Open a session folder; InputError says which file of it is wrong, and how."""
-    rig_file = read_rig(folder / "rig.toml")
+def open_folder(folder: Path, rig_file: RigFile | None = None) -> Session:
+    """Open a session folder; InputError says which file of it is wrong, and how.
+
+    rig_file: instead of what its rig.toml says, where that is not calibrated yet.
+    """
+    rig_file = read_rig(folder / "rig.toml") if rig_file is None else rig_file
     rig = rig_file.rig
     cameras = tuple(_files(folder, c, s) for c, s in zip(rig.cameras, rig_file.sources, strict=True))
     stamps = read_frames(folder / "frames.csv", rig)

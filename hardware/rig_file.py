@@ -63,6 +63,29 @@ def read_rig(path: str | Path) -> RigFile:
     return RigFile(rig, sources, None if surface is None else checks.text(path, "surface", surface))
 
 
+def read_uncalibrated(path: Path) -> RigFile:
+    """A rig.toml that says of each camera only `name`, `size` and where its images are; the rest is a stand-in."""
+    table = checks.read_toml(path)
+    checks.check_keys(path, "", table, ["camera"], ["surface"])
+    entries = checks.tables(path, "camera", table.get("camera"))
+    for number, entry in enumerate(entries):
+        checks.check_keys(path, f"camera[{number}].", entry, ("name", "size"), ("video", "images"))
+        size = checks.numbers(path, f"camera[{number}].size", entry["size"], (2,), "[width, height] in px")
+        f, middle = float(size.max()), (size - 1) / 2
+        entry["matrix"] = [[f, 0.0, float(middle[0])], [0.0, f, float(middle[1])], [0.0, 0.0, 1.0]]
+        entry["distortion"] = [0.0] * 5
+        entry["base_from_camera"] = se3.make(np.eye(3), [NEAREST_RIG * number, 0.0, 0.0]).tolist()
+    rig = rig_from_table(path, table, ("video", "images"))
+    return RigFile(rig, tuple(_source(path, entry) for entry in entries), None)
+
+
+def is_calibrated(path: Path) -> bool:
+    """Whether every camera of a rig.toml has a lens and a place."""
+    table = checks.read_toml(path)
+    entries = checks.tables(path, "camera", table.get("camera"))
+    return any("matrix" in entry or "base_from_camera" in entry for entry in entries)
+
+
 def rig_from_table(where: object, table: Table, also: Sequence[str] = ()) -> Rig:
     """The rig in a table with a `camera` list (rig.toml's or a recording's); `also`: further keys a camera may have."""
     cameras: list[Camera] = []

@@ -32,7 +32,19 @@ from tests.started import ROOT, started
 from tests.worlds import IDEAL, SMALL, write_scenario
 
 CLOCK = WallClock()
-COMMANDS = ([], ["simulate"], ["track"], ["plan"], ["replay"], ["arm"], ["cameras"], ["import"], ["export"], ["bench"])
+COMMANDS = (
+    [],
+    ["simulate"],
+    ["track"],
+    ["plan"],
+    ["replay"],
+    ["arm"],
+    ["cameras"],
+    ["calibrate"],
+    ["import"],
+    ["export"],
+    ["bench"],
+)
 
 
 def stillbed(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.camera_calibration.homography import LEAST, plane_blunders
-from estimation.camera_calibration.lens_fit import LEAST_CORNERS, LensFit, Undetermined, fit_lens
+from estimation.camera_calibration.lens_fit import LEAST_CORNERS, LensFit, Undetermined, fit_lens, with_lens
 from estimation.camera_calibration.lens_model import matrix_of
 from estimation.camera_calibration.model_choice import Choice, ModelScore, choose
 from estimation.camera_calibration.plausible import check_doubt, check_lens, check_neighbours
@@ -24,6 +24,8 @@ FEWEST = 10  # views of a camera: eight leave a distortion model to chance, and 
 OUTLIER = 6.0  # sigmas; and
 OUTLIER_PX = 0.5  # px at least: a corner this near is none that was found wrong
 WRONG_SHARE = 0.5  # of a view's corners, beyond which all of it is dropped
+FIRST_SIGMA = 0.3  # px, of a corner, until the residuals tell it
+RAYLEIGH = 1.18  # median length of a vector whose two entries are normal, in their sigmas
 FINEST = 0.02  # px: no corner is found better, whatever the residuals of a few say
 WORST_FIT = 2.0  # px, of a camera's own views: beyond, the board's drawing is not what hung before it
 JITTER_ROUNDS = 6
@@ -56,14 +58,14 @@ class Calibration:
         return np.asarray(self.fit.covariance[rows, rows])
 
 
-def calibrate(views: Views, say: Say | None = None) -> Calibration:
+def calibrate(views: Views, say: Say | None = None, known: Array | None = None) -> Calibration:
     """The rig that the views tell.
 
     Undetermined where they do not tell it, Implausible where what they tell is no camera; both name camera and figure.
-    say: told what is being done.
+    say: told what is being done. known: lenses (C, 9) that are taken as they are; places and clocks alone are sought.
     """
     tell = say or _silent
-    views, choices, dropped = lenses(views, tell)
+    views, choices, dropped = lenses(views, tell, known)
     names, models = views.names, tuple(choice.fit.model for choice in choices)
     camera_from_board = np.full((len(views), 4, 4), np.nan)
     for c, choice in enumerate(choices):
@@ -72,7 +74,7 @@ def calibrate(views: Views, say: Say | None = None) -> Calibration:
     base_from_camera, base_from_board = first_rig(views, camera_from_board)
     nothing = np.zeros(len(names)), np.zeros(len(views))
     state = RigState(np.stack([c.fit.lens for c in choices]), base_from_camera, *nothing, base_from_board)
-    views, fit, jitter, more = adjust(views, state, models)
+    views, fit, jitter, more = adjust(views, state, models, known is not None)
     for c, name in enumerate(names):
         check_lens(name, views.sizes[c], fit.state.lens[c])
         check_doubt(name, fit.state.lens[c], fit.covariance[OWN * c : OWN * c + 9, OWN * c : OWN * c + 9])
@@ -81,7 +83,7 @@ def calibrate(views: Views, say: Say | None = None) -> Calibration:
     return Calibration(rig_of(views, fit.state), fit, views, models, scores, jitter, dropped + more)
 
 
-def lenses(views: Views, say: Say) -> tuple[Views, list[Choice], int]:
+def lenses(views: Views, say: Say, known: Array | None = None) -> tuple[Views, list[Choice], int]:
     """The views that are used, with their measured sigmas, each camera's lens by itself, and corners dropped."""
     kept, sigma, choices = np.zeros(len(views), bool), views.sigma.copy(), []
     first = plane_blunders(views)
@@ -92,44 +94,62 @@ def lenses(views: Views, say: Say) -> tuple[Views, list[Choice], int]:
         rows = np.flatnonzero((views.camera == c) & (views.seen.sum(1) >= LEAST_CORNERS))
         _check_number(name, len(rows))
         own = views.only(rows)
-        choice, out = _chosen(own)
+        own, choice, out = _chosen(own) if known is None else _given(own, known[c])
         good = own.without(out).seen.sum(1) >= np.maximum(LEAST_CORNERS, WRONG_SHARE * own.seen.sum(1))
         _check_number(name, int(good.sum()))
         dropped += int(out.sum())
         pixels[rows] = own.without(out).pixels
         own = own.without(out).only(good)
-        fit = fit_lens(own, choice.fit.model, (choice.fit.lens, choice.fit.camera_from_board[good]))
+        begin = choice.fit.lens, choice.fit.camera_from_board[good]
+        fit = fit_lens(own, choice.fit.model, begin) if known is None else with_lens(own, known[c])
         _check_fit(name, own, fit)
         check_lens(name, own.sizes[c], fit.lens)
         choices.append(Choice(fit, choice.scores))
         kept[rows[good]] = True
-        sigma[rows] = np.maximum(views.sigma[rows] * fit.scale, FINEST)
+        sigma[rows[good]] = np.maximum(own.sigma * fit.scale, FINEST)
     views = replace(views, pixels=pixels, sigma=sigma)
     return views.only(kept), choices, dropped
 
 
-def _chosen(own: Views) -> tuple[Choice, NDArray[np.bool_]]:
-    """The model and lens of one camera's views, and which corners (V, P) are blunders."""
+def _chosen(own: Views) -> tuple[Views, Choice, NDArray[np.bool_]]:
+    """One camera's views with their own spread, their model and lens, and which corners (V, P) are blunders."""
+    own = replace(own, sigma=np.full(len(own), FIRST_SIGMA))
     rough = fit_lens(own, "k1 k2")
+    usual = float(np.nanmedian(np.linalg.norm(rough.residuals, axis=-1))) / RAYLEIGH
+    own = replace(own, sigma=np.full(len(own), max(usual, FINEST)))
+    rough = fit_lens(own, "k1 k2", (rough.lens, rough.camera_from_board))
     out = blunders(own, rough.residuals, rough.scale)
     out &= (~out & own.seen).sum(1, keepdims=True) >= LEAST  # a view that is wrong as a whole is dropped as a whole
-    return choose(own.without(out)), out
+    return own, choose(own.without(out)), out
+
+
+def _given(own: Views, lens: Array) -> tuple[Views, Choice, NDArray[np.bool_]]:
+    """As `_chosen`, with a lens (9,) that is known."""
+    rough = with_lens(replace(own, sigma=np.full(len(own), FIRST_SIGMA)), lens)
+    usual = float(np.nanmedian(np.linalg.norm(rough.residuals, axis=-1))) / RAYLEIGH
+    own = replace(own, sigma=np.full(len(own), max(usual, FINEST)))
+    fit = with_lens(own, lens)
+    out = blunders(own, fit.residuals, fit.scale)
+    out &= (~out & own.seen).sum(1, keepdims=True) >= LEAST
+    return own, Choice(fit, ()), out
 
 
 def blunders(views: Views, residuals: Array, scale: float) -> NDArray[np.bool_]:
     """(V, P) which corners are not where the rest says; their spread is told by the median, which they do not pull."""
     away = np.linalg.norm(residuals, axis=-1)
-    usual = min(scale * float(np.median(views.sigma)), float(np.nanmedian(away)) / 1.18)
+    usual = min(scale * float(np.median(views.sigma)), float(np.nanmedian(away)) / RAYLEIGH)
     return np.asarray(np.nan_to_num(away) > max(OUTLIER * usual, OUTLIER_PX))
 
 
-def adjust(views: Views, state: RigState, models: tuple[str, ...]) -> tuple[Views, RigFit, float, int]:
+def adjust(
+    views: Views, state: RigState, models: tuple[str, ...], held: bool = False
+) -> tuple[Views, RigFit, float, int]:
     """The joint adjustment: views without blunders, fit, jitter (s) and how many corners were dropped.
 
     Where instants in common leave more than the cameras' own residuals, single pictures are late by amounts of their
     own; how much is found by expectation maximisation.
     """
-    free = free_numbers(models)
+    free = free_numbers(models, held)
     fit = fit_rig(views, state, free, 0.0)
     jitter = 0.0
     if fit.scale > UNEXPLAINED and len(models) > 1:

@@ -13,14 +13,12 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.camera_calibration.homography import focal, homographies, poses
 from estimation.camera_calibration.least_squares import damped, huber, minimise
-from estimation.camera_calibration.lens_model import MODELS, image
+from estimation.camera_calibration.lens_model import MODELS, belief, image
 from estimation.camera_calibration.views import Views
 from estimation.errors import StillbedError
 from estimation.se3 import Array
 
 LEAST_CORNERS = 6  # in a view: four fix its pose and leave nothing to tell a wrong one by
-CENTRE = 0.1  # of the image's longer side: one sigma by which the axis is believed to miss its middle
-SKEWED = 0.01  # one sigma of fx / fy, as a logarithm: pixels are square
 
 
 class Undetermined(StillbedError):
@@ -76,10 +74,9 @@ def fit_lens(views: Views, model: str, begin: tuple[Array, Array] | None = None)
     free = MODELS[model]
     lens, camera_from_board = start(views) if begin is None else begin
     lens = np.where(np.isin(np.arange(9), free), lens, 0.0)
-    held = _belief(views)
 
     def normal(state: _State) -> _Normal:
-        return _equations(views, state, held)
+        return _equations(views, state)
 
     def moved(state: _State, at: _Normal, damping: float) -> _State | None:
         return _step(state, at, damping, free)
@@ -91,32 +88,15 @@ def fit_lens(views: Views, model: str, begin: tuple[Array, Array] | None = None)
 def fit_poses(views: Views, lens: Array, camera_from_board: Array) -> tuple[Array, Array]:
     """Poses (V, 4, 4) with the lens held, and residuals (V, P, 2) px."""
     nothing = np.zeros(0, np.int64)
-    held = np.zeros((9, 9)), lens
     state, at = minimise(
         _State(lens, camera_from_board),
-        lambda state: _equations(views, state, held),
+        lambda state: _equations(views, state),
         lambda state, at, damping: _step(state, at, damping, nothing),
     )
     return state.poses, at.residuals
 
 
-def _belief(views: Views) -> tuple[Array, Array]:
-    """Information (9, 9) about a lens before any view, and the lens (9,) it is about: hardly any, but never none."""
-    size = np.array(views.sizes[int(views.camera[0])], float)
-    about = np.array([0, 0, *(size - 1) / 2, 0, 0, 0, 0, 0])
-    information = np.zeros(9)
-    information[2:4] = 1 / (CENTRE * size.max()) ** 2
-    return np.diag(information), about
-
-
-def _square(lens: Array) -> tuple[float, Array]:
-    """ln(fx / fy) in sigmas, and its slope (9,)."""
-    slope = np.zeros(9)
-    slope[:2] = 1 / lens[0], -1 / lens[1]
-    return float(np.log(lens[0] / lens[1])) / SKEWED, slope / SKEWED
-
-
-def _equations(views: Views, state: _State, held: tuple[Array, Array]) -> _Normal:
+def _equations(views: Views, state: _State) -> _Normal:
     if not (state.lens[:2] > 1).all():
         return _nowhere(views)
     points = se3.transform_points(state.poses, views.points)  # (V, P, 3)
@@ -133,15 +113,14 @@ def _equations(views: Views, state: _State, held: tuple[Array, Array]) -> _Norma
     count = len(views)
     a, b = by_lens.reshape(count, -1, 9), by_pose.reshape(count, -1, 6)
     w, r = np.repeat(weight, 2, axis=1)[..., None], residuals.reshape(count, -1, 1)
-    off, (skew, skew_slope) = state.lens - held[1], _square(state.lens)
-    belief = held[0] @ off
+    known = belief(views.sizes[int(views.camera[0])], state.lens)
     return _Normal(
-        float(cost[seen].sum() + off @ belief + skew**2),
+        float(cost[seen].sum()) + known.cost,
         np.where(seen[..., None], residuals, np.nan),
-        (np.swapaxes(a, 1, 2) @ (w * a)).sum(0) + held[0] + np.outer(skew_slope, skew_slope),
+        (np.swapaxes(a, 1, 2) @ (w * a)).sum(0) + known.information,
         np.swapaxes(a, 1, 2) @ (w * b),
         np.swapaxes(b, 1, 2) @ (w * b),
-        (np.swapaxes(a, 1, 2) @ (w * r)).sum((0, 2)) + belief + skew * skew_slope,
+        (np.swapaxes(a, 1, 2) @ (w * r)).sum((0, 2)) + known.slope,
         (np.swapaxes(b, 1, 2) @ (w * r))[..., 0],
     )
 
@@ -183,6 +162,15 @@ def _covariance(at: _Normal, free: NDArray[np.int64]) -> Array:
     except np.linalg.LinAlgError:
         out[free, free] = np.inf
     return out
+
+
+def with_lens(views: Views, lens: Array) -> LensFit:
+    """One camera's views with the lens (9,) as given; its model is called by the numbers that are not zero."""
+    f = np.full(len(views), float(np.sqrt(lens[0] * lens[1])))
+    camera_from_board, residuals = fit_poses(views, lens, poses(homographies(views), f))
+    model = next(name for name, free in MODELS.items() if not lens[np.setdiff1d(np.arange(9), free)].any())
+    found = _Normal(0.0, residuals, *[np.zeros(0)] * 5)
+    return LensFit(model, lens, np.zeros((9, 9)), camera_from_board, residuals, _scale(views, found, 0))
 
 
 def _scale(views: Views, at: _Normal, free: int) -> float:

@@ -15,16 +15,19 @@ from estimation.se3 import Array
 
 FOLDS = 4
 BLOCKS = 12  # stretches of neighbouring views that are held out as one: neighbours look alike
-WORTH = 1.0  # standard errors of the gain by which a model must beat every simpler one
+USUAL = "k1 k2"  # what any webcam is given: a number left out is claimed to be zero, one kept has its doubt stated
+WORTH = 1.0  # standard errors by which another model must beat the usual one
 
 
 @dataclass(frozen=True, slots=True)
 class ModelScore:
-    """One model's root mean square error on held-out views, px, and the standard error of its gain on the best."""
+    """One model's root mean square error on held-out views, px; by how much it is ahead of the usual model's mean
+    square, px^2, and the standard error of that.
+    """
 
     model: str
     held_out: float
-    behind: float
+    ahead: float
     doubt: float
 
 
@@ -37,7 +40,7 @@ class Choice:
 
 
 def choose(views: Views) -> Choice:
-    """The simplest model whose held-out error is not clearly above the best one's; one camera's views.
+    """The usual model, or the one that beats it clearly on views held out; one camera's views.
 
     Models whose fit no lens can have are passed over, unless all are.
     """
@@ -45,9 +48,10 @@ def choose(views: Views) -> Choice:
     fits = _fits(views)
     errors = {model: _held_out(views, fits[model], folds) for model in MODELS}
     possible = [model for model in MODELS if _is_possible(views, fits[model].lens)] or list(MODELS)
-    best = min(possible, key=lambda model: float(errors[model].mean()))
-    scores = tuple(_score(model, errors[model], errors[best]) for model in MODELS)
-    chosen = next(s.model for s in scores if s.model in possible and s.behind <= WORTH * s.doubt)
+    usual = USUAL if USUAL in possible else possible[0]
+    scores = tuple(_score(model, errors[model], errors[usual]) for model in MODELS)
+    better = [s for s in scores if s.model in possible and s.ahead > WORTH * s.doubt]
+    chosen = max(better, key=lambda s: s.ahead).model if better else usual
     return Choice(fits[chosen], scores)
 
 
@@ -87,8 +91,8 @@ def _held_out(views: Views, whole: LensFit, folds: NDArray[np.int64]) -> Array:
     return out
 
 
-def _score(model: str, errors: Array, best: Array) -> ModelScore:
-    behind = errors - best
+def _score(model: str, errors: Array, usual: Array) -> ModelScore:
+    ahead = usual - errors
     return ModelScore(
-        model, float(np.sqrt(errors.mean() / 2)), float(behind.mean()), float(behind.std() / np.sqrt(len(behind)))
+        model, float(np.sqrt(errors.mean() / 2)), float(ahead.mean()), float(ahead.std() / np.sqrt(len(ahead)))
     )

@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve
 from estimation import se3
 from estimation.camera_calibration.board_motion import WIDTH, Stencils, carried, stencils
 from estimation.camera_calibration.least_squares import damped, huber, minimise
-from estimation.camera_calibration.lens_model import MODELS, image
+from estimation.camera_calibration.lens_model import MODELS, belief, image
 from estimation.camera_calibration.views import Views
 from estimation.se3 import Array
 
@@ -89,11 +89,14 @@ def instant_stamps(views: Views) -> Array:
     return np.asarray(first + np.bincount(views.instant, views.stamp - first) / np.bincount(views.instant))
 
 
-def free_numbers(models: tuple[str, ...]) -> NDArray[np.bool_]:
-    """(16 C,) what is sought with these distortion models: the first camera's place is the base."""
+def free_numbers(models: tuple[str, ...], held: bool = False) -> NDArray[np.bool_]:
+    """(16 C,) what is sought with these distortion models: the first camera's place is the base.
+
+    held: whether the lenses are known and only places and offsets are sought.
+    """
     free = np.zeros((len(models), OWN), bool)
     for c, model in enumerate(models):
-        free[c, MODELS[model]] = True
+        free[c, MODELS[model]] = not held
         free[c, 9:15] = c > 0
         free[c, OFFSET] = len(models) > 1
     return free.ravel()
@@ -118,7 +121,9 @@ def _equations(problem: Problem, state: RigState) -> _Normal:
     board = carried(state.base_from_board, problem.who, views.instant, delay)
     camera_from_base = se3.inverse(state.base_from_camera)[camera]
     points = se3.transform_points(camera_from_base @ board.pose, views.points)
-    infinite = bool((points[..., 2][seen] < 1.0).any()) or not bool((state.lens[:, :2] > 1).all())
+    if not (state.lens[:, :2] > 1).all():
+        state = replace(state, lens=np.maximum(state.lens, [1, 1, *[-np.inf] * 7]))
+    infinite = bool((points[..., 2][seen] < 1.0).any()) or bool((state.lens[:, :2] <= 1).any())
     points[..., 2] = np.where(seen & (points[..., 2] >= 1.0), points[..., 2], 1.0)
     pixels, by_lens, by_point = image(state.lens[camera][:, None], points)
     residuals = np.where(seen[..., None], pixels - np.nan_to_num(views.pixels), 0.0)
@@ -171,6 +176,11 @@ def _assembled(
     mean = state.offset.sum() / MEAN**2
     matrix[np.ix_(offsets, offsets)] += 1 / MEAN**2 + np.eye(cameras) / FAR**2
     slope[offsets] += mean + state.offset / FAR**2
+    for c in range(cameras):
+        known, lens = belief(views.sizes[c], state.lens[c]), slice(OWN * c, OWN * c + 9)
+        matrix[lens, lens] += known.information
+        slope[lens] += known.slope
+        cost += known.cost
     cost += float(mean * state.offset.sum() + (state.offset**2).sum() / FAR**2)
     return _Normal(cost, matrix, slope, residuals, pace, jitter_slope, own, cross, places)
 

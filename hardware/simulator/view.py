@@ -78,7 +78,7 @@ class View:
         if not (held.x0 <= box.x0 and held.y0 <= box.y0 and held.x1 >= box.x1 and held.y1 >= box.y1):
             held = Box(box.x0 - SPARE, box.y0 - SPARE, box.x1 + SPARE, box.y1 + SPARE)
             x, y = ((np.arange((b - a) * SAMPLES) + 0.5) / SAMPLES + a - 0.5 for a, b in (held[::2], held[1::2]))
-            self._rays, self._box = Rays(*_rays(self.camera, x, y)), held
+            self._rays, self._box = Rays(*rays_at(self.camera, x, y)), held
         rows = slice((box.y0 - held.y0) * SAMPLES, (box.y1 - held.y0) * SAMPLES)
         columns = slice((box.x0 - held.x0) * SAMPLES, (box.x1 - held.x0) * SAMPLES)
         return Rays(self._rays.x[rows, columns], self._rays.y[rows, columns])
@@ -87,11 +87,11 @@ class View:
         """Rays through the middles of squares of `step` px over the whole image."""
         if step not in self._coarse:
             x, y = (np.arange(0.0, n, step) + (step - 1) / 2 for n in self.whole[2:])
-            self._coarse[step] = Rays(*_rays(self.camera, x, y))
+            self._coarse[step] = Rays(*rays_at(self.camera, x, y))
         return self._coarse[step]
 
 
-def _rays(camera: Camera, x: Array, y: Array) -> NDArray[np.float32]:
+def rays_at(camera: Camera, x: Array, y: Array) -> NDArray[np.float32]:
     """Tangents (2, H, W) at the pixels x (W,) by y (H,)."""
     nodes = [np.arange(v[0] - 2 * NODES, v[-1] + 3 * NODES, NODES) for v in (x, y)]
     pixels = np.stack(np.meshgrid(*nodes), -1)

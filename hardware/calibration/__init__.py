@@ -1,0 +1,1 @@
+"""Calibrating cameras and arm: recordings in, rig files, reports and verdicts out."""

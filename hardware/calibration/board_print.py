@@ -1,0 +1,174 @@
+"""A calibration board as a page to print at true scale, SVG or PDF, with a ruler to check it by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.calibration.board_file import read_board, write_board
+from perception.boards.board import Board, black, grid_of
+
+PAGES = {"A5": (148, 210), "A4": (210, 297), "A3": (297, 420), "A2": (420, 594), "letter": (215.9, 279.4)}
+MARGIN = 10.0  # mm that no printer prints on, and of white around the board
+FOOT = 16.0  # mm below the board for the ruler and the words
+RULER = 100.0  # mm, or half of that on a small page
+POINT = 72 / 25.4  # a PDF's units a mm
+
+
+@dataclass(frozen=True, slots=True)
+class Print:
+    """What is to be printed; squares: columns and rows, or None for as many as fit the page."""
+
+    kind: str = "charuco"
+    squares: tuple[int, int] | None = None
+    square: float = 25.0
+    marker: float = 0.75
+    dictionary: str = "4X4_50"
+    inverted: bool = False
+    page: str = "A4"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawing:
+    """A page. size: (W, H) mm. ink: (N, 4) black rectangles x y w h, mm from the top left. words: what stands where."""
+
+    size: tuple[float, float]
+    ink: Array
+    words: tuple[tuple[float, float, str], ...]
+
+
+def write_print(out: Path, wish: Print) -> str:
+    """Write the page, and board.toml beside it; returns what was written, in words."""
+    if out.suffix not in (".svg", ".pdf"):
+        raise InputError(out, "--out", out.name, "a file that ends in .svg or .pdf")
+    board, size = board_of(wish), page_size(wish)
+    made = drawing(board, size)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_bytes(svg(made).encode() if out.suffix == ".svg" else pdf(made))
+    beside = out.with_suffix(".toml")
+    write_board(beside, board)
+    read_board(beside)  # what was wished is told to be wrong as it would be when read
+    return f"{out}: {board}, on {size[0]:g} x {size[1]:g} mm; {beside} describes it. Print at 100 %, measure the ruler."
+
+
+def page_size(wish: Print) -> tuple[float, float]:
+    """(W, H) mm of the page."""
+    if wish.page in PAGES:
+        return PAGES[wish.page]
+    words = wish.page.lower().split("x")
+    try:
+        width, height = (float(word) for word in words)
+    except ValueError:
+        raise InputError("--page", "size", wish.page, f"{', '.join(PAGES)}, or WxH in mm") from None
+    return width, height
+
+
+def board_of(wish: Print) -> Board:
+    """The board that is wished for; InputError where it does not fit its page."""
+    width, height = page_size(wish)
+    room = np.array([width - 2 * MARGIN, height - 2 * MARGIN - FOOT])
+    if not wish.square > 0:
+        raise InputError("--square-mm", "square", wish.square, "> 0 mm")
+    fits = np.floor(room / wish.square + 1e-9).astype(int)
+    if wish.squares is None and wish.kind == "chessboard" and fits.sum() % 2 == 0:
+        fits[1] -= 1
+    squares = (int(fits[0]), int(fits[1])) if wish.squares is None else wish.squares
+    board = Board(wish.kind, squares, wish.square, wish.marker, wish.dictionary, wish.inverted)
+    if min(squares) < 3 or (np.array(board.size) > room + 1e-6).any():
+        got = f"{squares[0]} x {squares[1]} of {wish.square:g} mm"
+        raise InputError("--squares", "board", got, f"3 x 3 to {fits[0]} x {fits[1]} squares on {wish.page}")
+    if not grid_of(board):
+        raise InputError("--marker", "share", wish.marker, "a share that whole bits of a marker make, as 0.75 or 0.6")
+    return board
+
+
+def drawing(board: Board, size: tuple[float, float]) -> Drawing:
+    """The page: board, ruler and words."""
+    cells, edge = black(board)
+    left, top = (size[0] - board.size[0]) / 2, MARGIN
+    ink = _rectangles(cells) * edge + [left, top, 0, 0]
+    if board.inverted:  # white squares at the rim need ink around them
+        rim = 0.2 * board.square
+        w, h = board.size
+        frame = [[-rim, -rim, w + 2 * rim, rim], [-rim, h, w + 2 * rim, rim], [-rim, 0, rim, h], [w, 0, rim, h]]
+        ink = np.vstack([ink, np.array(frame) + [left, top, 0, 0]])
+    below = top + board.size[1] + 6
+    long = RULER if size[0] >= RULER + 2 * MARGIN else RULER / 2
+    start = (size[0] - long) / 2
+    ticks = [[start + x - 0.15, below, 0.3, 4 if x % 10 == 0 else 2] for x in np.arange(0, long + 1, 5)]
+    ink = np.vstack([ink, [[start, below, long, 0.3]], ticks])
+    words = (
+        (start + long + 2, below + 3.5, f"{long:g} mm"),
+        (MARGIN, below + 8.0, f"{board}. Print at 100 %: the ruler must be {long:g} mm long."),
+        (
+            MARGIN,
+            below + 11.0,
+            "If it is not, write the measured square_mm into board.toml. Mount the sheet on glass, flat.",
+        ),
+    )
+    return Drawing(size, ink, words)
+
+
+def _rectangles(cells: NDArray[np.bool_]) -> Array:
+    """Rectangles (N, 4) x y w h, in cells, that cover the True ones of (H, W): runs along x, joined down y."""
+    open_runs: dict[tuple[int, int], list[float]] = {}
+    out: list[list[float]] = []
+    for y, row in enumerate(np.vstack([cells, np.zeros_like(cells[:1])])):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
+        runs = {(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)}
+        for run in [r for r in open_runs if r not in runs]:
+            out.append(open_runs.pop(run))
+        for a, b in sorted(runs):
+            made = open_runs.setdefault((a, b), [a, y, b - a, 0])
+            made[3] += 1
+    return np.array(out, float).reshape(-1, 4)
+
+
+def svg(made: Drawing) -> str:
+    """The page as SVG in mm."""
+    w, h = made.size
+    path = "".join(f"M{x:.4f} {y:.4f}h{a:.4f}v{b:.4f}h{-a:.4f}z" for x, y, a, b in made.ink)
+    words = "".join(f'<text x="{x:.2f}" y="{y:.2f}">{escape(text)}</text>' for x, y, text in made.words)
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{w:g}mm" height="{h:g}mm" viewBox="0 0 {w:g} {h:g}">'
+        f'<rect width="{w:g}" height="{h:g}" fill="#fff"/><path fill="#000" shape-rendering="crispEdges" d="{path}"/>'
+        f'<g font-family="sans-serif" font-size="2.6">{words}</g></svg>\n'
+    )
+
+
+def pdf(made: Drawing) -> bytes:
+    """The page as PDF 1.4: one content stream of rectangles filled as one, and text in Helvetica."""
+    w, h = (side * POINT for side in made.size)
+    boxes = "\n".join(
+        f"{x * POINT:.4f} {h - (y + b) * POINT:.4f} {a * POINT:.4f} {b * POINT:.4f} re" for x, y, a, b in made.ink
+    )
+    text = "\n".join(
+        f"BT /F1 7.4 Tf {x * POINT:.3f} {h - y * POINT:.3f} Td ({_plain(t)}) Tj ET" for x, y, t in made.words
+    )
+    stream = f"0 g\n{boxes}\nf\n{text}\n".encode("latin-1")
+    parts = [
+        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {w:.4f} {h:.4f}] /Contents 4 0 R "
+        "/Resources << /Font << /F1 5 0 R >> >> >>".encode(),
+        b"<< /Length %d >>\nstream\n%s\nendstream" % (len(stream), stream),
+        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
+    ]
+    out, places = b"%PDF-1.4\n", []
+    for number, part in enumerate(parts, 1):
+        places.append(len(out))
+        out += b"%d 0 obj\n%s\nendobj\n" % (number, part)
+    table = b"".join(b"%010d 00000 n \n" % place for place in places)
+    count = len(parts) + 1
+    tail = b"trailer << /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (count, len(out))
+    return out + b"xref\n0 %d\n0000000000 65535 f \n%s" % (count, table) + tail
+
+
+def _plain(text: str) -> str:
+    return text.replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")

@@ -1,0 +1,94 @@
+"""`stillbed calibrate`: its command line; what does the work is loaded when it is asked for."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+Commands = Any  # argparse's own type for this is private
+
+FAILED = 1  # exit code of a calibration that is not good enough
+
+
+def add_calibrate(commands: Commands) -> None:
+    """Add the sub-command `calibrate`."""
+    command: argparse.ArgumentParser = commands.add_parser(
+        "calibrate",
+        help="calibrate the cameras from a printed board: board, cameras",
+        description="Print a board, wave it before the cameras, and get a rig that says how far it can be trusted.",
+        epilog="example:\n  stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parts = command.add_subparsers(metavar="WHAT", required=True)
+    _add_board(parts)
+    _add_cameras(parts)
+
+
+def _add_board(parts: Commands) -> None:
+    part = parts.add_parser("board", help="a printable board at true scale, with a ruler to check the print by")
+    part.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="X.pdf", help=".pdf or .svg; board.toml beside it"
+    )
+    part.add_argument("--kind", choices=("charuco", "chessboard"), default="charuco", help="default charuco")
+    part.add_argument("--squares", type=_pair, metavar="CxR", help="columns x rows; default: as many as fit the page")
+    part.add_argument("--square-mm", type=float, default=25.0, metavar="MM", help="edge of a square; default 25")
+    part.add_argument("--marker", type=float, default=0.75, metavar="SHARE", help="of a square's edge; default 0.75")
+    part.add_argument("--dictionary", default="4X4_50", metavar="NAME", help="of the markers; default 4X4_50")
+    part.add_argument("--inverted", action="store_true", help="exchange black and white")
+    part.add_argument("--page", default="A4", metavar="SIZE", help="A5, A4, A3, A2, letter, or WxH in mm; default A4")
+    part.set_defaults(run=_board)
+
+
+def _add_cameras(parts: Commands) -> None:
+    part = parts.add_parser("cameras", help="lenses, places and clock offsets from a recording of the waved board")
+    part.add_argument("session", type=Path, metavar="SESSION", help="session folder or .mcap; its rig may lack lenses")
+    part.add_argument("--board", type=Path, required=True, metavar="board.toml", help="the board as it was printed")
+    part.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write; report beside it"
+    )
+    part.add_argument("--limit-mm", type=float, default=0.1, metavar="MM", help="predicted error to pass; default 0.1")
+    part.add_argument(
+        "--distance-mm", type=_distance, metavar="A,B,MM", help="two cameras and how far apart they are, to check scale"
+    )
+    part.add_argument(
+        "--keep-lenses", action="store_true", help="take the session's lenses; seek places and clocks only"
+    )
+    part.add_argument("--new-rig", action="store_true", help="do not compare with the session's own rig")
+    part.set_defaults(run=_cameras)
+
+
+def _pair(text: str) -> tuple[int, int]:
+    words = text.lower().split("x")
+    if len(words) != 2:
+        raise argparse.ArgumentTypeError(f"{text!r}, needed is COLUMNSxROWS, as 7x10")
+    return int(words[0]), int(words[1])
+
+
+def _distance(text: str) -> tuple[str, str, float]:
+    words = text.split(",")
+    if len(words) != 3:
+        raise argparse.ArgumentTypeError(f"{text!r}, needed is CAMERA,CAMERA,MM")
+    return words[0], words[1], float(words[2])
+
+
+def _board(arguments: argparse.Namespace) -> int:
+    from hardware.calibration.board_print import Print, write_print
+
+    a = arguments
+    wish = Print(a.kind, a.squares, a.square_mm, a.marker, a.dictionary, a.inverted, a.page)
+    print(write_print(a.out, wish))
+    return 0
+
+
+def _cameras(arguments: argparse.Namespace) -> int:
+    from hardware.calibration.run import Wishes, run_calibration
+    from hardware.clock import WallClock
+    from hardware.progress import Progress
+
+    a = arguments
+    wishes = Wishes(a.limit_mm, a.distance_mm, a.keep_lenses, a.new_rig)
+    with Progress("corners", "frame sets", WallClock().now) as progress:
+        outcome = run_calibration(a.session, a.board, a.out, wishes, progress)
+    print(outcome.text)
+    return 0 if outcome.verdict.passed else FAILED

@@ -1,0 +1,97 @@
+"""What is wrong with a recording or a board file, told from the pictures: each wrong thing by its name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from estimation.camera_calibration.calibrate import FEWEST
+from estimation.errors import InputError
+from hardware.session import FrameRef, Session
+from perception.boards.board import DICTIONARIES, Board
+from perception.boards.collection import BLURRED, CornerTable
+from perception.boards.corners import LEAST, CornerFinder
+from perception.frames import Image
+
+TRIED = 5  # pictures that other boards are looked for in
+MARKER = 0.08  # of the marker's edge, between printed and found: thresholds shrink markers by 4 %
+STRANGE = 0.1  # of the pictures, that one unknown marker is seen in
+
+
+def check_table(table: CornerTable, board: Board, board_file: Path, session: Session) -> None:
+    """InputError that names what is wrong, where the corners found show that something is."""
+    _check_strangers(table, board, board_file)
+    _check_markers(table, board, board_file)
+    for c, camera in enumerate(session.rig.cameras):
+        views = int((table.camera == c).sum())
+        where = f"camera {camera.name}"
+        if views < FEWEST:
+            allowed = f"{FEWEST} or more of its {table.looked[c]} pictures; {why_unseen(session, c, board)}"
+            raise InputError(where, "pictures that show the board", views, allowed)
+        blur = float(np.median(table.blur[table.camera == c]))
+        if blur > BLURRED:
+            allowed = f"{BLURRED:g} px or less: focus the lens, more light, slower hands"
+            raise InputError(where, "blur of the edges", f"{blur:.1f} px", allowed)
+
+
+def _check_strangers(table: CornerTable, board: Board, board_file: Path) -> None:
+    ids, counts = np.unique(table.strangers, return_counts=True)
+    often = ids[counts > max(STRANGE * table.looked.sum() / len(table.looked), 3)]
+    if len(often):
+        got = f"{board.squares[0]} x {board.squares[1]}, markers 0 to {board.markers() - 1}"
+        seen = ", ".join(str(i) for i in often[:6])
+        raise InputError(board_file, "squares", got, f"those of the board that was held: it has markers {seen} too")
+
+
+def _check_markers(table: CornerTable, board: Board, board_file: Path) -> None:
+    known = table.marker[np.isfinite(table.marker)]
+    if len(known) < FEWEST:
+        return
+    found = float(np.median(known))
+    if abs(found / board.marker - 1) > MARKER:
+        raise InputError(board_file, "marker", board.marker, f"what the pictures show: about {found:.2f} of a square")
+
+
+def why_unseen(session: Session, camera: int, board: Board) -> str:
+    """Why a camera does not show the board, as far as other boards and mirrors tell."""
+    pictures = _pictures(session, camera)
+    if not pictures:
+        return "it has no pictures"
+    known = CornerFinder(board)
+    for words, other in _others(board).items():
+        finder = CornerFinder(other)
+        if sum(finder(picture).count >= LEAST for picture in pictures) > len(pictures) // 2:
+            return f"they show another board: {words}"
+    if sum(known(np.ascontiguousarray(p[:, ::-1])).count >= LEAST for p in pictures) > len(pictures) // 2:
+        return "they are mirrored: switch the camera's mirroring off"
+    if max(float(picture.std()) for picture in pictures) < 5:
+        return "they are of one grey, as behind a cover"
+    return "none of them shows a board that is known; is it in view, sharp and lit?"
+
+
+def _pictures(session: Session, camera: int) -> list[Image]:
+    refs: list[FrameRef] = [ref for refs in session.sets for ref in refs if ref.camera == camera]
+    chosen = refs[:: max(len(refs) // TRIED, 1)][:TRIED]
+    reader = session.store.open()
+    try:
+        return [reader.read(ref) for ref in chosen]
+    finally:
+        reader.close()
+
+
+def _others(board: Board) -> dict[str, Board]:
+    """Boards that are easily taken for this one, by what differs."""
+    columns, rows = board.squares
+    out = {
+        "black and white exchanged (`inverted`)": replace(board, inverted=not board.inverted),
+        f"{rows} x {columns} squares": replace(board, squares=(rows, columns)),
+        "the other layout (`legacy`)": replace(board, legacy=not board.legacy),
+    }
+    if board.kind == "charuco":
+        size = board.dictionary.split("_")[1]
+        for name in DICTIONARIES:
+            if name.endswith(f"_{size}") and name != board.dictionary:
+                out[f"dictionary {name}"] = replace(board, dictionary=name)
+    return out

@@ -1,0 +1,1 @@
+"""Printed calibration boards: what is drawn on them, and their corners in a picture."""

@@ -1,0 +1,333 @@
+"""`stillbed calibrate`: boards drawn and found again, a rendered recording calibrated, wrong inputs by name."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from board_session import BOARD, LENSES, OFFSETS, rendered, small_rig
+
+from estimation import se3
+from estimation.camera_calibration.calibrate import rebased
+from estimation.errors import InputError, StillbedError
+from estimation.rig import Rig, pixels_from_points
+from hardware.calibration.against_given import check_against, check_distance
+from hardware.calibration.board_file import read_board, write_board
+from hardware.calibration.board_print import Print, board_of, drawing, pdf, svg, write_print
+from hardware.calibration.collect import collect
+from hardware.calibration.corner_file import content_key, read_corners, write_corners
+from hardware.calibration.run import Outcome, Wishes, run_calibration
+from hardware.calibration.source import open_source
+from hardware.calibration.suspicion import check_table
+from hardware.cli import main
+from hardware.progress import silent
+from hardware.rig_file import read_rig
+from hardware.simulator.board_picture import BoardView
+from perception.boards.board import Board, black, charuco
+from perception.boards.collection import thinned, usable
+from perception.boards.corners import CornerFinder
+from perception.boards.undistorted import undistorted, whole_view
+from perception.frames import Image
+
+POSE = se3.exp(np.array([0.3, -0.25, 0.2, 0.0, 0.0, 0.0])) @ se3.make(np.eye(3), [-108.0, -135.0, 0.0])
+POSE = se3.make(np.eye(3), [0.0, 0.0, 620.0]) @ POSE
+CHESS = Board("chessboard", (7, 10), 25.0)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rendered(tmp_path_factory.mktemp("board") / "session")
+
+
+@pytest.fixture(scope="module")
+def board_file(session: Path) -> Path:
+    write_board(session.parent / "board.toml", BOARD)
+    return session.parent / "board.toml"
+
+
+@pytest.fixture(scope="module")
+def outcome(session: Path, board_file: Path) -> Outcome:
+    return run_calibration(session, board_file, session.parent / "rig.toml", Wishes(), silent)
+
+
+def seen(board: Board, as_board: Board | None = None, change: Callable[[Image], Image] = lambda image: image) -> int:
+    picture = BoardView(small_rig().cameras[0], board).picture(POSE, 0.6, 1.5, np.random.default_rng(0))
+    return CornerFinder(as_board or board)(np.ascontiguousarray(change(picture))).count
+
+
+@pytest.mark.parametrize(
+    "board", [BOARD, replace(BOARD, legacy=True), replace(BOARD, squares=(5, 4)), Board()], ids=str
+)
+def test_what_is_drawn_is_what_opencv_draws(board: Board) -> None:
+    ink, _ = black(board)
+    drawn = charuco(board).generateImage((ink.shape[1] * 8, ink.shape[0] * 8))
+    assert np.array_equal(np.kron(ink, np.ones((8, 8))) > 0, drawn < 128)
+
+
+@pytest.mark.parametrize("board", [BOARD, replace(BOARD, inverted=True), CHESS, replace(CHESS, inverted=True)], ids=str)
+def test_corners_are_found_where_they_are(board: Board) -> None:
+    camera = small_rig().cameras[0]
+    middle = POSE @ se3.make(np.eye(3), BOARD.corners.mean(0) - board.corners.mean(0))
+    picture = BoardView(camera, board).picture(middle, 0.6, 1.5, np.random.default_rng(0))
+    found = CornerFinder(board)(picture)
+    true = pixels_from_points(camera, se3.transform_points(middle, board.corners))[0]
+    assert found.count == len(board.corners)
+    assert np.sqrt(np.mean((found.pixels - true) ** 2)) < 0.15
+    assert 0.4 < found.blur < 1.5
+
+
+def test_a_board_is_not_taken_for_another_nor_seen_in_a_mirror() -> None:
+    assert seen(BOARD) == 12
+    assert seen(BOARD, replace(BOARD, inverted=True)) == 0
+    assert seen(BOARD, replace(BOARD, dictionary="5X5_50")) == 0
+    assert seen(BOARD, change=lambda image: image[:, ::-1]) == 0
+    assert seen(BOARD, change=lambda image: np.rot90(image)) == 12
+
+
+def test_a_blurred_picture_is_told_to_be_so() -> None:
+    view, rng = BoardView(small_rig().cameras[0], BOARD), np.random.default_rng(0)
+    blur = [CornerFinder(BOARD)(view.picture(POSE, sigma, 1.5, rng)).blur for sigma in (0.6, 1.0, 1.5)]
+    assert blur[0] < blur[1] < blur[2]
+
+
+def test_board_files_come_back_and_wrong_ones_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "board.toml"
+    for board in (BOARD, CHESS, replace(BOARD, inverted=True, legacy=True)):
+        write_board(path, board)
+        assert read_board(path) == board
+    for text, named in (
+        ('kind = "dots"', "kind"),
+        ('kind = "charuco"\nsquares = [4.5, 5]', "squares"),
+        ('kind = "charuco"\nsquares = [4, 5]\nsquare_mm = 0', "square_mm"),
+        ('kind = "charuco"\nsquares = [4, 5]\nsquare_mm = 54\ndictionary = "4X4_51"', "dictionary"),
+        ('kind = "charuco"\nsquares = [30, 30]\nsquare_mm = 5', "dictionary"),
+        ('kind = "chessboard"\nsquares = [8, 8]\nsquare_mm = 5', "squares"),
+    ):
+        lines = (
+            text
+            if "square_mm" in text
+            else text + ("" if "squares" in text else "\nsquares = [4, 5]") + "\nsquare_mm = 5"
+        )
+        path.write_text(lines)
+        with pytest.raises(InputError, match=named):
+            read_board(path)
+
+
+@pytest.mark.parametrize("wish", [Print(), Print(inverted=True), Print("chessboard", page="A3", square=30)], ids=str)
+def test_a_print_has_the_boards_true_size_and_a_ruler(wish: Print) -> None:
+    board = board_of(wish)
+    made = drawing(board, (297.0, 420.0))
+    area = float((made.ink[:, 2] * made.ink[:, 3]).sum())
+    ink, cell = black(board)
+    rim = 0.2 * board.square * 2 * (sum(board.size) + 0.4 * board.square) if board.inverted else 0.0
+    assert area == pytest.approx(ink.sum() * cell**2 + rim + 30.0 + 11 * 1.2 + 10 * 0.6, rel=1e-6)
+    assert 'width="297mm" height="420mm"' in svg(made)
+    text = pdf(made).decode("latin-1")
+    assert re.search(r"/MediaBox \[0 0 841\.88\d+ 1190\.5\d+\]", text)
+    start = int(text.rsplit("startxref\n", 1)[1].split()[0])
+    assert text[start:].startswith("xref")
+
+
+def test_a_printed_svg_shows_the_board_that_its_file_describes(tmp_path: Path) -> None:
+    write_print(tmp_path / "b.svg", Print(squares=(4, 5), square=30.0))
+    board = read_board(tmp_path / "b.toml")
+    picture = np.full((297 * 4, 210 * 4), 255, np.uint8)
+    for x, y, w, h in drawing(board, (210.0, 297.0)).ink * 4:
+        picture[round(y) : round(y + h), round(x) : round(x + w)] = 0
+    assert CornerFinder(board)(picture).count == 12
+
+
+def test_a_board_that_does_not_fit_its_page_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"3 x 3 to 7 x 10 squares on A4"):
+        write_print(tmp_path / "b.pdf", Print(squares=(9, 12)))
+
+
+def test_a_recording_gives_its_rig_back(outcome: Outcome) -> None:
+    found, rig = outcome.calibration, small_rig()
+    for camera, lens, offset in zip(found.rig.cameras, LENSES, OFFSETS, strict=True):
+        assert camera.matrix[0, 0] == pytest.approx(lens[0], rel=0.01)
+        assert camera.clock_offset == pytest.approx(offset, abs=1e-3)
+    for camera, true in zip(found.rig.cameras, rig.cameras, strict=True):
+        off = se3.log(se3.inverse(true.base_from_camera) @ camera.base_from_camera)
+        assert np.degrees(np.linalg.norm(off[:3])) < 1.0
+        assert np.linalg.norm(off[3:]) < 12
+
+
+def test_the_files_that_are_written_can_be_read(outcome: Outcome, session: Path) -> None:
+    written = read_rig(session.parent / "rig.toml")
+    for a, b in zip(written.rig.cameras, outcome.calibration.rig.cameras, strict=True):
+        assert np.array_equal(a.matrix, b.matrix) and a.clock_offset == b.clock_offset
+    figures = json.loads((session.parent / "rig.json").read_text())
+    assert np.shape(figures["covariance"]) == (48, 48)
+    assert figures["cameras"][0]["sigma"]["fx"] > 0
+    report = (session.parent / "rig.report.html").read_text()
+    for words in ("Verdict", "Predicted error", "mm per pixel at the board", "data:image/jpeg", "Calibration failed"):
+        assert words in report
+    assert "FAIL" in outcome.text and "tilt the board" in outcome.text
+
+
+def test_the_command_ends_with_the_verdict(session: Path, board_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["calibrate", "cameras", str(session), "--board", str(board_file), "-o", str(session.parent / "rig.toml")]
+    assert main(command) == 1
+    assert main([*command, "--limit-mm", "5"]) == 0
+    assert "PASS" in capsys.readouterr().out
+
+
+def test_corners_are_looked_for_once_and_a_damaged_file_again(session: Path, outcome: Outcome, tmp_path: Path) -> None:
+    source, store = open_source(session), tmp_path / "x.npz"
+    key = content_key(source.session, BOARD)
+    table = read_corners(session.parent / "rig.corners.npz", key)
+    assert table is not None and table.done == len(source.session)
+    write_corners(store, key, replace(table, done=0))
+    assert read_corners(store, "another") is None
+    whole = store.read_bytes()
+    store.write_bytes(whole[: len(whole) // 2])
+    assert read_corners(store, key) is None
+    store.write_bytes(b"")
+    assert read_corners(store, key) is None
+    asked: list[int] = []
+    write_corners(store, key, replace(table, done=len(source.session) - 1))
+    again = collect(source.session, BOARD, store, lambda done, total: asked.append(done))
+    assert asked == [len(source.session)] and again.done == len(source.session)
+
+
+def test_long_recordings_are_thinned_in_runs() -> None:
+    instant = np.repeat(np.arange(1000), 2)
+    kept = thinned(instant, np.ones(2000, bool))
+    chosen = np.unique(instant[kept])
+    assert len(chosen) <= 250
+    assert (np.diff(chosen) == 1).mean() > 0.8
+
+
+def test_undistorted_pictures_keep_every_pixel() -> None:
+    camera = small_rig().cameras[0]
+    assert undistorted(camera, np.zeros((480, 640, 3), np.uint8)).shape == (480, 640, 3)
+    assert whole_view(camera)[0, 0] < camera.matrix[0, 0]
+
+
+# -- wrong inputs: each named, none accepted
+
+
+def changed(session: Path, out: Path, change: Callable[[str, Image], Image], cameras: str = "abc") -> Path:
+    """The session with its pictures changed."""
+    shutil.copytree(session, out)
+    for path in sorted(out.glob("?/*.png")):
+        if path.parent.name in cameras:
+            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            cv2.imwrite(str(path), np.ascontiguousarray(change(path.parent.name, np.asarray(image, np.uint8))))
+    return out
+
+
+def refused(session: Path, tmp_path: Path, board: Board, words: str) -> None:
+    write_board(tmp_path / "board.toml", board)
+    with pytest.raises(StillbedError, match=words):
+        run_calibration(session, tmp_path / "board.toml", tmp_path / "rig.toml", Wishes(), silent)
+    assert not (tmp_path / "rig.toml").exists()
+
+
+def test_a_wrong_dictionary_is_named(session: Path, tmp_path: Path) -> None:
+    refused(session, tmp_path, replace(BOARD, dictionary="6X6_50"), "camera a: .* dictionary 4X4_50")
+
+
+def test_an_inverted_print_is_named(session: Path, tmp_path: Path) -> None:
+    refused(session, tmp_path, replace(BOARD, inverted=True), r"camera a: .* black and white exchanged \(`inverted`\)")
+
+
+def test_the_wrong_way_round_is_named(session: Path, tmp_path: Path) -> None:
+    refused(session, tmp_path, replace(BOARD, squares=(5, 4)), "camera a: .* another board: 4 x 5|markers")
+
+
+def test_a_smaller_board_than_the_one_that_was_held_is_named(session: Path, tmp_path: Path) -> None:
+    refused(
+        session,
+        tmp_path,
+        replace(BOARD, squares=(3, 4)),
+        "board.toml: squares = .*3 x 4.*it has markers 6, 7, 8, 9 too",
+    )
+
+
+def test_a_wrong_marker_is_named(session: Path, tmp_path: Path) -> None:
+    refused(session, tmp_path, replace(BOARD, marker=0.6), r"board.toml: marker = 0.6, allowed what the pictures show")
+
+
+def test_a_covered_camera_is_named(session: Path, tmp_path: Path) -> None:
+    dark = changed(session, tmp_path / "s", lambda name, image: np.full_like(image, 12), "b")
+    refused(dark, tmp_path, BOARD, "camera b: pictures that show the board = 0, .* one grey")
+
+
+def test_a_mirrored_camera_is_named(session: Path, tmp_path: Path) -> None:
+    mirrored = changed(session, tmp_path / "s", lambda name, image: image[:, ::-1], "c")
+    refused(mirrored, tmp_path, BOARD, "camera c: .* mirrored")
+
+
+def test_a_picture_turned_by_90_degrees_is_named(session: Path, tmp_path: Path) -> None:
+    turned = changed(session, tmp_path / "s", lambda name, image: np.rot90(image), "b")
+    refused(turned, tmp_path, BOARD, "480 x 640 px', allowed 640 x 480 px")
+
+
+def test_blur_is_named(session: Path, tmp_path: Path) -> None:
+    blurred = changed(session, tmp_path / "s", lambda name, image: cv2.GaussianBlur(image, (0, 0), 7.0), "a")
+    refused(blurred, tmp_path, BOARD, "camera a: .*(blur|sharp)")
+
+
+def test_a_truncated_recording_is_named(session: Path, tmp_path: Path) -> None:
+    shutil.copytree(session, tmp_path / "s")
+    sorted((tmp_path / "s" / "b").glob("*.png"))[-1].unlink()
+    refused(tmp_path / "s", tmp_path, BOARD, "number of frames of camera 'b' = 14, allowed 13")
+
+
+def test_too_few_pictures_are_named(session: Path) -> None:
+    source = open_source(session)
+    short = replace(source.session, sets=source.session.sets[:6])
+    with pytest.raises(InputError, match="camera a: pictures that show the board = 6, allowed 10 or more"):
+        check_table(collect(short, BOARD, None, silent), BOARD, Path("board.toml"), short)
+
+
+def exchanged(rig: Rig) -> Rig:
+    a, b, c = rig.cameras
+    return Rig((a, replace(c, name=b.name), replace(b, name=c.name)))
+
+
+def test_swapped_cameras_and_turned_ones_are_named_against_the_rig_they_had(outcome: Outcome) -> None:
+    rig = outcome.calibration.rig
+    check_against(rig, small_rig(), Path("board.toml"), 54.0)
+    check_against(rebased(rig, se3.exp(np.array([1.0, 0.5, 0.2, 9.0, 9.0, 9.0]))), small_rig(), Path("b.toml"), 54.0)
+    with pytest.raises(InputError, match="b and c are swapped"):
+        check_against(exchanged(rig), small_rig(), Path("board.toml"), 54.0)
+    a, b, c = rig.cameras
+    upside_down = replace(b, base_from_camera=b.base_from_camera @ se3.make(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)))
+    with pytest.raises(InputError, match="the picture of b is turned by 180 degrees"):
+        check_against(Rig((a, upside_down, c)), small_rig(), Path("board.toml"), 54.0)
+
+
+def test_a_wrong_square_is_named_by_the_rig_or_by_a_measured_distance_and_by_nothing_else(outcome: Outcome) -> None:
+    rig = outcome.calibration.rig
+    places = [
+        np.block([[c.base_from_camera[:3, :3], 0.8 * c.base_from_camera[:3, 3:]], [np.eye(4)[3:]]]) for c in rig.cameras
+    ]
+    small = Rig(tuple(replace(c, base_from_camera=place) for c, place in zip(rig.cameras, places, strict=True)))
+    with pytest.raises(InputError, match=r"board.toml: square_mm = .43.2 mm., allowed about 5\d(\.\d)? mm"):
+        check_against(small, small_rig(), Path("board.toml"), 43.2)
+    apart = float(np.linalg.norm(small_rig().cameras[1].base_from_camera[:3, 3]))
+    check_distance(rig, "a", "b", apart, Path("board.toml"), 54.0)
+    with pytest.raises(InputError, match=r"board.toml: square_mm = .43.2 mm, which puts a and b"):
+        check_distance(small, "a", "b", apart, Path("board.toml"), 43.2)
+
+
+def test_a_rig_without_lenses_is_enough_to_begin_with(session: Path, tmp_path: Path, outcome: Outcome) -> None:
+    shutil.copytree(session, tmp_path / "s")
+    lines = [f'[[camera]]\nname = "{n}"\nimages = "{n}/*"\nsize = [640, 480]\n' for n in "abc"]
+    (tmp_path / "s" / "rig.toml").write_text("\n".join(lines))
+    source = open_source(tmp_path / "s")
+    assert source.given is None and [c.name for c in source.session.rig.cameras] == ["a", "b", "c"]
+    views, _ = usable(
+        collect(open_source(session).session, BOARD, None, silent), BOARD, ("a", "b", "c"), ((640, 480),) * 3
+    )
+    assert len(views) == len(outcome.calibration.views)
