@@ -44,7 +44,7 @@ class Browser:
         self._waiting: dict[int, asyncio.Future[Any]] = {}
         self.wait(self._connect())
 
-    def wait(self, work: Coroutine[Any, Any, T], timeout: float = 30.0) -> T:
+    def wait(self, work: Coroutine[Any, Any, T], timeout: float = 90.0) -> T:
         """The result of some work in the browser's loop."""
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(timeout)
 

@@ -257,8 +257,9 @@ def test_old_news_are_greyed_and_said_to_be_old_and_stop_still_stops(browser: Br
 
 def test_a_window_says_when_the_run_is_gone_and_comes_back_by_itself(run: Run) -> None:
     page = run.open()
+    run.served.put(replace(run.view, stamp=99.0, stage=Stage.DONE))
     run.served.end()
-    page.until('document.body.dataset.news === "gone"')
+    page.until('document.body.dataset.news === "gone" && document.body.dataset.stage === "done"')
     assert "has ended" in page.text("#alarm")
     page.until("performance.now() > 0")
     run.served.begin()

@@ -60,6 +60,12 @@ class OperatorServer:
                 handler.force_close()
             await asyncio.sleep(LOOK)
 
+    def last_look(self) -> None:
+        """Show what the run said last, and that it is gone."""
+        self.board.look(self._clock.now(), False)
+        self._link.requests.windows = 0
+        self.board.gone = True
+
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         changes = request.method != "GET" or "Upgrade" in request.headers
@@ -121,8 +127,7 @@ async def serve(
     looking = asyncio.create_task(server.look(lambda: handlers.connections))
     done = asyncio.create_task(ended.wait())
     await asyncio.wait({looking, done}, return_when=asyncio.FIRST_COMPLETED)
-    link.requests.windows = 0
-    server.board.gone = True
+    server.last_look()
     server.board.tell()
     await asyncio.sleep(FAREWELL)
     await runner.cleanup()

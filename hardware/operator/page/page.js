@@ -162,7 +162,7 @@ function states(seen) {
     row.querySelector("span").textContent = words;
   };
   const none = { word: "–", tone: "" }, { tracking, motion } = seen;
-  put("tracking", tracking ? TRACKING[tracking.state] : none, tracking ? tracking.reason : "");
+  put("tracking", tracking ? TRACKING[tracking.state] : none, tracking ? tracking.reason || `${tracking.tracks} tracks` : "");
   put("motion", motion ? ACTIVITIES[motion.activity] : none, motion ? doing(seen) : "");
 }
 
