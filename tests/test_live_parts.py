@@ -280,7 +280,7 @@ def test_the_newest_of_the_frames_is_taken_whole_and_the_others_are_counted() ->
     ring = FrameRing([(8, 6), (8, 6)])
     source = RingSource(ring, ours)
     for count in (1, 2, 3):
-        theirs.send(ring.put(frames(count), {0: ("jpeg", bytes([count] * 5))}, 10.0 + count, 0.5))
+        theirs.send(ring.put(frames(count), {0: ("jpeg", bytes([count] * 5))}, lambda: 13.0, 0.5))
     arrived = source.take(0.1)
     assert arrived is not None and arrived.dropped == 2 and arrived.handed == 13.0 and arrived.source == 0.5
     for got, sent in zip(arrived.frames.frames, frames(3).frames, strict=True):
@@ -297,10 +297,10 @@ def test_the_newest_of_the_frames_is_taken_whole_and_the_others_are_counted() ->
 
 def test_frames_that_were_written_over_meanwhile_are_not_taken() -> None:
     ring = FrameRing([(8, 6), (8, 6)])
-    word = ring.put(frames(1), {}, 0.0, 0.0)
+    word = ring.put(frames(1), {}, lambda: 0.0, 0.0)
     assert ring.take(word) is not None
     for count in range(SLOTS):
-        ring.put(frames(count + 2), {}, 0.0, 0.0)
+        ring.put(frames(count + 2), {}, lambda: 0.0, 0.0)
     assert ring.take(word) is None
 
 

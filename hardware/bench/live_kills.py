@@ -17,6 +17,7 @@ from hardware.live.judge import printed
 from hardware.progress import Progress
 from hardware.session import open_session
 
+NOTICED = ("tracking", "motion", "recorder")  # by the process that conducts; the feed's end is the cameras'
 VICTIMS = ("run", "tracking", "motion", "recorder", "feed")
 LONGEST = 6.0  # s of printing before a kill
 WITHIN = 0.5  # s after a kill in which the arm must have come to rest: noticed in 0.1, queued for 0.05, its servo
@@ -27,8 +28,11 @@ EXECUTED = 30.0  # s in which the virtual arm has written what it did
 
 @dataclass(slots=True)
 class Kills:
-    """What came of them. restless, stuck: arms that moved on, runs that did not print again. lost, doubled: in
-    checkpoints, of each resumed run. unread: s before the kill from which the recording cannot be read.
+    """What came of them.
+
+    restless, stuck: arms that moved on, runs that did not print again. lost, doubled: in checkpoints, of each resumed
+    run. unread: s before the kill from which the recording cannot be read. noticed: s until the conducting process
+    said so.
     """
 
     count: int = 0
@@ -37,6 +41,7 @@ class Kills:
     lost: list[float] = field(default_factory=list)
     doubled: list[float] = field(default_factory=list)
     unread: list[float] = field(default_factory=list)
+    noticed: list[float] = field(default_factory=list)
 
 
 def kill_figures(scenario: Path, folder: Path, path: Path, count: int, seed: int) -> list[Figure]:
@@ -63,8 +68,15 @@ def kill_figures(scenario: Path, folder: Path, path: Path, count: int, seed: int
         Figure(f"{name}: runs that did not print again", kills.stuck, "", at_most(0)),
         Figure(f"{name}: most left out", max(kills.lost, default=np.nan), "checkpoints", at_most(1)),
         Figure(f"{name}: most printed twice", max(kills.doubled, default=np.nan), "checkpoints", at_most(0)),
+        Figure(
+            f"{name}: death of a process noticed, most", 1000 * max(kills.noticed, default=np.nan), "ms", at_most(100)
+        ),
         Figure(f"{name}: recording ends before the kill, most", max(kills.unread, default=np.nan), "s", at_most(1)),
     ]
+
+
+def _most(seconds: list[float]) -> float:
+    return 1000 * max(seconds, default=float("nan"))
 
 
 def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator, before: float | None) -> float:
@@ -77,6 +89,8 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
         clock.wait_until(clock.now() + rng.uniform(0, LONGEST))
         victim = str(rng.choice(VICTIMS))
         now = run.kill(victim)
+        if victim in NOTICED and run.wait_for("was killed", patience=ENDED) >= 0:
+            kills.noticed.append(clock.now() - now)
         run.end(ENDED)
     finally:
         run.close()

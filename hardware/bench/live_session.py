@@ -14,7 +14,7 @@ from hardware.clock import WallClock
 
 NAME = "(sb-"  # of the processes of a run, as the system tells it
 STARTED = 300.0  # s in which a run must have begun to print, on a busy machine
-LOOK = 0.02  # s
+LOOK = 0.005  # s
 
 
 class LiveSession:

@@ -101,7 +101,7 @@ def _show(session: Session, plan: FeedPlan, ring: FrameRing, words: Connection) 
         head = session.heads.at(anchor)
         whole = FrameSet(frame_set(shown).stamp, tuple(shown), head)
         clock.wait_until(due)
-        words.send(ring.put(whole, encoded, clock.now(), anchor))
+        words.send(ring.put(whole, encoded, clock.now, anchor))
 
 
 def _live(stamp: float, anchor: float, showing: Showing) -> float:

@@ -6,7 +6,7 @@ counts those that it never saw.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
@@ -60,8 +60,8 @@ class FrameRing:
         self._counts: Any = RawArray("Q", SLOTS)
         self._count = 0  # of the writer
 
-    def put(self, frames: FrameSet, encoded: dict[int, Encoded], handed: float, source: float) -> Word:
-        """Write a set over the oldest one; what is to be told of it."""
+    def put(self, frames: FrameSet, encoded: dict[int, Encoded], now: Callable[[], float], source: float) -> Word:
+        """Write a set over the oldest one; what is to be told of it. now: asked once the pixels are there, s."""
         self._count += 1
         slot = self._count % SLOTS
         memory = np.frombuffer(self._memory, np.uint8)
@@ -77,7 +77,7 @@ class FrameRing:
             memory[start : start + len(data)] = np.frombuffer(data, np.uint8)
             parts.append(Part(frame.camera, frame.stamp, frame.image.shape, kind, len(data)))
         self._counts[slot] = self._count
-        return Word(self._count, handed, source, tuple(parts), frames.head)
+        return Word(self._count, now(), source, tuple(parts), frames.head)
 
     def take(self, word: Word) -> tuple[FrameSet, dict[int, Encoded]] | None:
         """A copy of a set that was told of; None where it is written over already."""

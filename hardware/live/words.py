@@ -14,6 +14,8 @@ def status_line(conductor: Conductor, seen: Seen) -> str:
         return "check: " + "; ".join(f"{check.name}: {check.found}" for check in waits)
     pose = None if seen.tracking is None else seen.tracking.pose
     state = "no pose" if pose is None else pose.state.value
+    if conductor.stage is Stage.FIND and conductor.laid is not None:
+        return f"find: out of reach: {conductor.laid.unreachable}"
     if seen.motion is None or seen.motion.progress is None:
         return f"{conductor.stage.value}: {state}"
     progress, command = seen.motion.progress, seen.motion.tick.command
