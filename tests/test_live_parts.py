@@ -204,6 +204,7 @@ def test_a_dry_run_extrudes_nothing_and_stays_above_along_the_tool() -> None:
     path = raster()
     dry = lifted(path, 7.0)
     assert not dry.extrude.any()
+    assert Task(path, PROFILE).fingerprint == fingerprint(path) and not Task(path, PROFILE, lift=7.0).fingerprint
     up = np.einsum("nij,nj->ni", path.surface_from_nozzle[:, :3, :3], np.tile([0, 0, 7.0], (len(path), 1)))
     assert dry.surface_from_nozzle[:, :3, 3] == pytest.approx(path.surface_from_nozzle[:, :3, 3] + up)
 

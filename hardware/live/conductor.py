@@ -49,6 +49,11 @@ class Task:
     unattended: bool = False
     patience: float = 10.0
 
+    @property
+    def fingerprint(self) -> str:
+        """Of the path as its file has it; "" in a dry run, which prints nothing that need not be printed again."""
+        return fingerprint(self.path) if self.lift is None else ""
+
 
 @dataclass(slots=True)
 class Seen:
@@ -249,7 +254,7 @@ class Conductor:
         lag = task.profile.lag
         if 0 < status.lag < LONGEST_LAG:  # measured from set-point to answer, NaN where it does not answer
             lag = status.lag + task.profile.frame_time
-        return [Begin(path, replace(laid.profile, lag=lag), task.start, fingerprint(task.path))]
+        return [Begin(path, replace(laid.profile, lag=lag), task.start, task.fingerprint)]
 
     def _printing(self, motion: LiveMotionReport, now: float) -> Orders:
         progress = motion.progress

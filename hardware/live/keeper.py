@@ -16,6 +16,7 @@ class Keeper:
     """Writes progress.toml whenever the place has changed. failed: what the disk said, "" if nothing."""
 
     def __init__(self, file: Path, fingerprint: str, place: Place) -> None:
+        """fingerprint: of the path; "" for a dry run, of which no place is kept."""
         self.failed = ""
         self._file, self._fingerprint, self._place = file, fingerprint, place
         self._written = math.nan
@@ -35,7 +36,7 @@ class Keeper:
 
     def _write(self) -> None:
         fraction = self._place.fraction
-        if math.isnan(fraction) or fraction == self._written:
+        if not self._fingerprint or math.isnan(fraction) or fraction == self._written:
             return
         try:
             keep_bookmark(self._file, self._fingerprint, fraction)

@@ -44,8 +44,10 @@ class Outcome:
         lines = [self.conductor.ended]
         if not self.conductor.done:
             place = self.fraction if self.fraction == self.fraction else self.prepared.task.start
-            lines.append(f"{place:.2f} of {total} checkpoints are printed; the arm is at rest")
-            lines.append(f"go on with: stillbed live --resume {beside.record}")
+            dry = self.prepared.task.lift is not None
+            done = "were passed by, none printed" if dry else "are printed"
+            lines.append(f"{place:.2f} of {total} checkpoints {done}; the arm is at rest")
+            lines += [] if dry else [f"go on with: stillbed live --resume {beside.record}"]
         return "\n".join([*lines, f"report: {beside.report}"])
 
     def write(self) -> None:

@@ -40,7 +40,6 @@ from hardware.operator.scene import scene_from
 from hardware.operator.settings import OperatorSettings
 from hardware.operator.view import Stage
 from hardware.schemas import INFO, WARNING
-from planning.progress import fingerprint
 
 if TYPE_CHECKING:
     from hardware.live.outcome import Outcome
@@ -79,7 +78,7 @@ class LiveRun:
             stack.callback(lines.close)
             prepared.beside.session.write_text(settings_text(prepared.settings), encoding="utf-8")
             lines.outbox.put(UsedEntry("session.toml", settings_text(prepared.settings)))
-            keeper = Keeper(prepared.beside.progress, fingerprint(prepared.task.path), lines.place)
+            keeper = Keeper(prepared.beside.progress, prepared.task.fingerprint, lines.place)
             stack.callback(keeper.close)
             self._open_page(stack)
             for note in prepared.notes:
