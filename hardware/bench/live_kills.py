@@ -21,6 +21,7 @@ NOTICED = ("tracking", "motion", "recorder")  # by the process that conducts; th
 VICTIMS = ("run", "tracking", "motion", "recorder", "feed")
 LONGEST = 6.0  # s of printing before a kill
 WITHIN = 0.5  # s after a kill in which the arm must have come to rest: noticed in 0.1, queued for 0.05, its servo
+SHORTEST = 0.05  # s of rest that are looked at
 STILL = 0.05  # mm
 ENDED = 60.0  # s in which the others must have ended
 EXECUTED = 30.0  # s in which the virtual arm has written what it did
@@ -119,5 +120,6 @@ def _rests(record: Path, killed: float) -> bool:
         clock.wait_until(clock.now() + 0.1)
     clock.wait_until(clock.now() + 0.3)
     with np.load(file) as executed:
-        after = executed["axes"][executed["stamps"] > killed + WITHIN]
-    return bool(len(after) and np.ptp(after[:, :3], axis=0).max() < STILL)
+        stamps, axes = executed["stamps"], executed["axes"]
+    after = axes[stamps > min(killed + WITHIN, stamps[-1] - SHORTEST)]  # a run may have ended all before
+    return bool(np.ptp(after[:, :3], axis=0).max() < STILL)

@@ -14,11 +14,11 @@ from hardware.newest import Newest
 from hardware.operator.link import OperatorLink
 
 
-def show(prepared: Prepared, begin: float, ring: FrameRing, words: Connection) -> None:
-    """Show a recorded session from `begin`, s, on, as cameras would."""
+def show(prepared: Prepared, ring: FrameRing, words: Connection) -> None:
+    """Show a recorded session, as cameras would."""
     from hardware.live.feed import FeedPlan, feed_process
 
-    feed_process(FeedPlan(prepared.session, begin, prepared.again), ring, words)
+    feed_process(FeedPlan(prepared.session, prepared.again), ring, words)
 
 
 def record(prepared: Prepared, senders: Sequence[Connection], reports: Newest[RecorderReport]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from multiprocessing import parent_process
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -26,16 +27,16 @@ from perception.frames import Frame, FrameSet
 from perception.pairing import frame_set
 
 TRANSPORT = 0.025  # s from the middle of an exposure to the picture in the computer, as a scenario has it
+LOOK = 0.02  # s between looks whether anybody wants to see it
 ENDS = 0.25  # share of a session at each end in which a turn is looked for
 KEPT = 2**30  # bytes of encoded pictures that are kept for a session shown again and again
 
 
 @dataclass(frozen=True, slots=True)
 class FeedPlan:
-    """What is shown. session: folder or MCAP. begin: s, when its first set is exposed. again: whether it never ends."""
+    """What is shown. session: folder or MCAP. again: whether it never ends."""
 
     session: Path
-    begin: float
     again: bool
 
 
@@ -88,10 +89,11 @@ def feed_process(plan: FeedPlan, ring: FrameRing, words: Connection) -> None:
 
 def _show(session: Session, plan: FeedPlan, ring: FrameRing, words: Connection) -> None:
     clock, pictures = WallClock(), _Pictures(session, plan.again)
+    _wait_until_wanted(ring, clock)
     stamps = np.array([np.mean([ref.stamp for ref in refs]) for refs in session.sets])
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     between = turns(session.truth, stamps) if plan.again and session.truth is not None else None
-    for showing in schedule(stamps, plan.begin, between):
+    for showing in schedule(stamps, clock.now(), between):
         due = showing.live + TRANSPORT
         if clock.now() > due + period:
             continue  # as a camera whose host is late loses a frame
@@ -102,6 +104,13 @@ def _show(session: Session, plan: FeedPlan, ring: FrameRing, words: Connection) 
         whole = FrameSet(frame_set(shown).stamp, tuple(shown), head)
         clock.wait_until(due)
         words.send(ring.put(whole, encoded, clock.now, anchor))
+
+
+def _wait_until_wanted(ring: FrameRing, clock: WallClock) -> None:
+    """A session that is shown once begins when the tracker is ready for it."""
+    parent = parent_process()
+    while not ring.wanted and (parent is None or parent.is_alive()):
+        clock.wait_until(clock.now() + LOOK)
 
 
 def _live(stamp: float, anchor: float, showing: Showing) -> float:

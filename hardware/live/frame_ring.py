@@ -58,6 +58,7 @@ class FrameRing:
         self._slot = sum(self._pixels) + sum(self._stored)
         self._memory: Any = RawArray("B", self._slot * SLOTS)
         self._counts: Any = RawArray("Q", SLOTS)
+        self._wanted: Any = RawArray("B", 1)
         self._count = 0  # of the writer
 
     def put(self, frames: FrameSet, encoded: dict[int, Encoded], now: Callable[[], float], source: float) -> Word:
@@ -94,6 +95,15 @@ class FrameRing:
         whole = replace(frame_set(frames), head=word.head)
         return (whole, encoded) if self._counts[slot] == word.count else None
 
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody has begun to ask for frames."""
+        return bool(self._wanted[0])
+
+    def want(self) -> None:
+        """Let the other side know that frames are asked for."""
+        self._wanted[0] = 1
+
     def _start(self, slot: int, camera: int) -> int:
         before = sum(self._pixels[:camera]) + sum(self._stored[:camera])
         return slot * self._slot + before
@@ -108,6 +118,7 @@ class RingSource:
     def take(self, patience: float) -> Arrived | None:
         """The newest set, waiting `patience` s for one; None where none came. SourceEnded once there will be none."""
         word = None
+        self._ring.want()
         try:
             if self._words.poll(patience):
                 word = self._words.recv()

@@ -83,7 +83,7 @@ def _started(crew: Crew, prepared: Prepared, folder: File) -> Lines:
     crew.start("recorder", record, (prepared, [end for end, _ in senders], recorder))
     crew.start("motion", move, (prepared, url, place, poses, motion, orders[0], link, trouble, senders[0][1]))
     if not prepared.live:
-        crew.start("feed", show, (prepared, WallClock().now(), ring, words[1]))
+        crew.start("feed", show, (prepared, ring, words[1]))
     crew.start("tracking", track, (prepared, ring, words[0], poses, tracking, motion, link, senders[1][1], lifeline[0]))
     ends = orders[1], lifeline[1], arm_line[1], Outbox(senders[2][1])
     return Lines(crew, url, place, tracking, motion, recorder, *ends, link, trouble)
