@@ -19,6 +19,7 @@ from hardware.clock import WallClock
 from hardware.contour_file import read_contour
 from hardware.gcode_file import gcode_text
 from hardware.path_file import write_path
+from hardware.plan_findings import NOT_ASKED, bump_facts, bumps_text, bumpy, findings_rows, notes_of
 from hardware.plan_layer_picture import bounds_of, layer_svg, len_text
 from hardware.plan_order import Wishes, check_out, order_of
 from hardware.plan_page import Story, material_text, page_text
@@ -42,8 +43,6 @@ LAYER_COLUMNS = (
     "layer", "tissue", "material", "area_mm2", "covered", "double", "over", "gap_mm2", "gap_over_half_a_bead_mm2",
     "gap_over_a_bead_mm2", "runs", "checkpoints", "printed_mm", "travelled_mm", "time_s", "volume_mm3",
 )  # fmt: skip
-ASLANT_DEG = 35.0  # off the normal: a bead is then pushed aside by a fifth of its width, as the tip is no point
-NOT_ASKED = "arm: none was asked, so there is no column `feasible`; --arm ARM.toml asks one, or stillbed reach later"
 REPAIRED_STEP = 0.5  # mm between the vertices of the repaired scan that is written
 
 
@@ -88,7 +87,7 @@ def run_plan(request: Request) -> str:
     subject = _subject(request, flat)
     with _progress("plan", "layers") as progress:
         plan = make_plan(subject.wound, order, subject.name, progress)
-    path, told = (plan.path, NOT_ASKED) if request.arm is None else with_feasible(plan.path, request.arm)
+    path, arm = (plan.path, NOT_ASKED) if request.arm is None else with_feasible(plan.path, request.arm)
     check_path(path)
     _whole(request.out, lambda file: write_path(file, path))
     if request.gcode is not None:
@@ -96,11 +95,11 @@ def run_plan(request: Request) -> str:
     with _progress("measure", "layers") as progress:
         layers = figures_of(plan, progress)
     total = total_of(layers)
-    written = [request.out.name, *_tables(request, plan, subject, layers, total)]
+    written = [request.out.name, *_tables(request, plan, subject, layers, total, arm)]
     if request.pictures:
-        written += _pictures(request, plan, subject, layers, total)
+        written += _pictures(request, plan, subject, layers, total, arm)
     placed = [] if request.session is None else _placed(request.session, request.out, plan)
-    return "\n".join([_told(plan, subject, total, request.out, written), told, *placed])
+    return "\n".join([_told(plan, subject, total, request.out, written), arm, *placed])
 
 
 def planned_scan(vertices: Array, triangles: Index, step: float, where: object, flip: bool = False) -> Subject:
@@ -161,7 +160,7 @@ def _whole(file: Path, write: Callable[[Path], object]) -> None:
 
 
 def _tables(
-    request: Request, plan: Plan, subject: Subject, layers: Sequence[LayerFigures], total: Total
+    request: Request, plan: Plan, subject: Subject, layers: Sequence[LayerFigures], total: Total, arm: str
 ) -> list[str]:  # fmt: skip
     """Write the coverage of each layer, the summary, and the scan as it was repaired; their names."""
     stem = request.out.with_suffix("")
@@ -171,6 +170,7 @@ def _tables(
         "checkpoints": len(plan.path), "mode": plan.order.mode, "missing_tissues": plan.stack.missing,
         "wound": asdict(plan.wound.findings), "total": asdict(total),
         "repairs": None if subject.repairs is None else asdict(subject.repairs), "settings": asdict(request.wishes),
+        "bumps": bump_facts(plan), "feasible": arm,
         "surface_from_plane": plan.wound.surface_from_plane.tolist(),
     }  # fmt: skip
     _whole(summary, lambda file: file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8"))
@@ -206,7 +206,7 @@ def _surface(wound: Wound) -> tuple[Array, Index]:
 
 
 def _pictures(
-    request: Request, plan: Plan, subject: Subject, layers: Sequence[LayerFigures], total: Total
+    request: Request, plan: Plan, subject: Subject, layers: Sequence[LayerFigures], total: Total, arm: str
 ) -> list[str]:  # fmt: skip
     """Write a picture of each layer and the report; their names."""
     stem = request.out.with_suffix("")
@@ -220,50 +220,11 @@ def _pictures(
             name = f"layer_{figures.number + 1:03d}.svg"
             (folder / name).write_text(drawn[-1], encoding="utf-8")
             progress(i + 1, len(layers))
-    story = Story(
-        subject.name, findings_rows(plan), [] if subject.repairs is None else subject.repairs.rows(),
-        request.wishes.rows(), notes_of(plan),
-    )  # fmt: skip
+    repairs = [] if subject.repairs is None else subject.repairs.rows()
+    findings = [*findings_rows(plan), ("feasible", arm)]
+    story = Story(subject.name, findings, repairs, request.wishes.rows(), notes_of(plan))
     _whole(report, lambda file: file.write_text(page_text(plan, layers, total, story, drawn), encoding="utf-8"))
     return [f"{folder.name}/ ({len(drawn)} pictures)", report.name]
-
-
-def findings_rows(plan: Plan) -> list[tuple[str, str]]:
-    """What the wound is like, in words."""
-    f = plan.wound.findings
-    low_tilt, high_tilt = (np.rad2deg(t.departure) for t in (plan.ground.low, plan.ground.high))
-    rows = [
-        ("outline", "given" if f.given else f"found: where the scan is {f.level:.2f} mm deep"),
-        ("area over which it is open", f"{f.area:.1f} mm²"),
-        ("greatest depth under the restored skin", f"{f.depth:.2f} mm"),
-        ("volume up to the restored skin", f"{f.volume:.0f} mm³"),
-        ("volume of the beads", f"{plan.points.volume.sum():.0f} mm³"),
-    ]
-    if not f.noise and not f.scatter:
-        return rows
-    return rows + [
-        ("noise of the scan", f"{f.noise:.3f} mm, smoothed over {f.smoothing:.2f} mm"),
-        ("skin around off the restored surface", f"{f.scatter:.3f} mm"),
-        ("guessed in holes of the scan", f"{f.closed:.1f} mm²"),
-        ("hidden under overhangs", f"{f.hidden:.1f} mm²"),
-        ("tool off the normal, at worst, first and last layer", f"{low_tilt:.1f}°, {high_tilt:.1f}°"),
-    ]
-
-
-def notes_of(plan: Plan) -> list[str]:
-    """What somebody should look at before printing."""
-    notes = list(plan.wound.findings.notes)
-    if plan.stack.missing:
-        notes.append(f"not printed, as the wound is not deep enough: {', '.join(plan.stack.missing)}")
-    off_deg = max(np.rad2deg(t.departure) for t in (plan.ground.low, plan.ground.high))
-    if off_deg > ASLANT_DEG:
-        notes.append(
-            f"the tool stands up to {off_deg:.0f} degrees off the normal, as its limits ask for: on the steepest walls"
-        )
-    empty = sum(not layer.beads for layer in plan.layers)
-    if empty:
-        notes.append(f"{empty} of {len(plan.layers)} layers have no room for a bead and are left out")
-    return notes
 
 
 def _told(plan: Plan, subject: Subject, total: Total, out: Path, written: Sequence[str]) -> str:
@@ -277,6 +238,7 @@ def _told(plan: Plan, subject: Subject, total: Total, out: Path, written: Sequen
         f"{total.gap:.2f} mm^2 open",
         "ink: " + ", ".join(f"{volume / 1000:.3f} ml of {material_text(name)}" for name, volume in total.volume),
     ]
+    lines += [f"bumps: {bumps_text(plan)}"] if bumpy(plan) else []
     done = [] if subject.repairs is None else [f"{n} {what}" for what, n in subject.repairs.rows()[2:] if n]
     if done:
         lines.append("scan: " + ", ".join(done))

@@ -85,6 +85,15 @@ def _add_layers(command: argparse.ArgumentParser) -> None:
         "--material", default="1,2,3", metavar="M[,M,M]", help="of all, or of each default tissue; default 1,2,3"
     )
     group.add_argument("--layer-height", type=float, metavar="MM", help="about; default: as wide as a bead")
+    group.add_argument(
+        "--bump", type=float, metavar="MM",
+        help="bumps of the bed that stand over a layer by this at most are gone over, higher ones round; default half "
+        "a layer, so that the layer above still has room over them",
+    )  # fmt: skip
+    group.add_argument(
+        "--bump-clearance", type=float, metavar="MM",
+        help="left free around bumps that are gone round; default half a bead, room for a needle's outside",
+    )  # fmt: skip
     group.add_argument("--temperature", type=float, default=20.0, metavar="C", help="degrees C; default 20")
 
 
@@ -132,7 +141,7 @@ def _plan(arguments: argparse.Namespace) -> None:
     wishes = Wishes(
         a.material, tuple(a.tissue), a.layers, a.layer_height, a.pattern, a.angle, a.parallel, a.bead,
         a.overlap_percent, a.inset, a.rims, a.speed, a.travel, a.temperature, a.spacing, a.chord, a.lift, a.wait,
-        a.sideways, a.tilt_deg, a.turning_deg_mm, a.spin_deg,
+        a.sideways, a.tilt_deg, a.turning_deg_mm, a.spin_deg, a.bump, a.bump_clearance,
     )  # fmt: skip
     print(
         run_plan(

@@ -25,6 +25,8 @@ text { font: 13px "Inter", "Segoe UI", "DejaVu Sans", system-ui, sans-serif; fil
 .bead { fill: none; stroke: #2a6f97; opacity: .55; stroke-linecap: round; stroke-linejoin: round; }
 .core { fill: none; stroke: #174a68; stroke-width: .7; vector-effect: non-scaling-stroke; stroke-linejoin: round; }
 .travel { fill: none; stroke: #e06c00; stroke-width: 1.8; vector-effect: non-scaling-stroke; stroke-dasharray: 4 3; }
+.around { fill: #8a5a3c; stroke: #5b3822; stroke-width: 1; vector-effect: non-scaling-stroke; }
+.over { fill: none; stroke: #5b3822; stroke-width: 1.8; vector-effect: non-scaling-stroke; stroke-dasharray: 2 2; }
 .gap { fill: #d3232f; } .start { fill: #2f9e5b; stroke: #fff; stroke-width: 1.5; }
 .end { fill: #1c2430; stroke: #fff; stroke-width: 1.5; } .bar { stroke: #1c2430; stroke-width: 2; fill: none; }
 """
@@ -41,6 +43,7 @@ def layer_svg(layer: PlannedLayer, figures: LayerFigures, bounds: tuple[float, f
         f'<path class="region" fill-rule="evenodd" d="{_areas(layer.region)}"/>',
         *_beads(layer.beads),
         f'<path class="gap" fill-rule="evenodd" d="{_areas(figures.coverage.gaps)}"/>',
+        *_bumps(layer),
         f'<path class="travel" d="{_travels(layer.beads)}"/>',
     ]
     ends = np.array([layer.beads[0].points[0], layer.beads[-1].points[-1]])
@@ -52,7 +55,7 @@ def layer_svg(layer: PlannedLayer, figures: LayerFigures, bounds: tuple[float, f
         f'<g transform="{turn}">{"".join(drawn)}</g>'
         f'<rect class="end" x="{ends[1, 0] - 5:.1f}" y="{ends[1, 1] - 5:.1f}" width="10" height="10"/>'
         f'<circle class="start" cx="{ends[0, 0]:.1f}" cy="{ends[0, 1]:.1f}" r="6.5"/>'
-        f"{_captions(title, figures, scale, height)}</svg>"
+        f"{_captions(title, layer, figures, scale, height)}</svg>"
     )
 
 
@@ -64,7 +67,7 @@ def bounds_of(layers: Iterable[PlannedLayer]) -> tuple[float, float, float, floa
     return float(low_x), float(low_y), float(high_x), float(high_y)
 
 
-def _captions(title: str, figures: LayerFigures, scale: float, height: float) -> str:
+def _captions(title: str, layer: PlannedLayer, figures: LayerFigures, scale: float, height: float) -> str:
     facts = (
         f"{figures.coverage.covered:.2%} covered, {figures.coverage.double:.2%} twice, {figures.gap:.2f} mm² open · "
         f"{len_text(figures.printed)} of bead in {figures.beads} runs, {len_text(figures.travelled)} of travel"
@@ -72,6 +75,8 @@ def _captions(title: str, figures: LayerFigures, scale: float, height: float) ->
     bar = round_step(60 / scale)
     at = height - 16
     keys = f"{bar:g} mm · beads at their true width · red: open · dashed: travel · green: start · black: end"
+    keys += "" if layer.around.is_empty else " · brown: bump, gone round"
+    keys += "" if layer.over.is_empty else " · dotted: bump, gone over"
     return (
         f'<text x="{MARGIN}" y="21" font-weight="600">{escape(title)}</text>'
         f'<text class="soft" x="{WIDTH - MARGIN}" y="21" text-anchor="end">{escape(facts)}</text>'
@@ -92,6 +97,16 @@ def _areas(shape: shapely.Geometry) -> str:
 
 def _line(points: Array) -> str:
     return "M" + "L".join(f"{x:.3f} {y:.3f}" for x, y in points.tolist())
+
+
+def _bumps(layer: PlannedLayer) -> list[str]:
+    """Bumps that are gone round, as areas, and those that are gone over, as outlines on the beads."""
+    shapes = {"around": layer.around, "over": layer.over}
+    return [
+        f'<path class="{name}" fill-rule="evenodd" d="{_areas(shape)}"/>'
+        for name, shape in shapes.items()
+        if not shape.is_empty
+    ]
 
 
 def _travels(beads: tuple[Bead, ...]) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from planning.fill.pattern import Kind, Pattern
+from planning.layers.bumps import Passing
 from planning.layers.checkpoints import Way
 from planning.layers.plan import Order
 from planning.layers.stack import Mode
@@ -52,6 +53,8 @@ class Wishes:
     tilt_deg: float = 30.0
     turning_deg_mm: float = 5.0
     spin_deg: float = 0.0
+    bump: float | None = None
+    bump_clearance: float | None = None
 
     def rows(self) -> list[tuple[str, str]]:
         """Each setting and its value, as text."""
@@ -71,13 +74,15 @@ def order_of(wishes: Wishes, flat: bool) -> Order:
     )  # fmt: skip
     tool = ToolLimits(*(math.radians(v) for v in (w.tilt_deg, w.turning_deg_mm, w.spin_deg)))
     way = Way(w.spacing, w.chord, w.sideways, travel=w.travel, lift=w.lift, wait=w.wait, tool=tool)
-    return Order(_tissues(w, flat), pattern, "skin" if flat else cast(Mode, w.layers), way, not w.parallel)
+    mode: Mode = "skin" if flat else cast(Mode, w.layers)
+    return Order(_tissues(w, flat), pattern, mode, way, not w.parallel, Passing(w.bump, w.bump_clearance))
 
 
 RANGES = (
     ("layer_height", 0.02, 20), ("overlap_percent", 0, 90), ("speed", 0.1, FASTEST), ("travel", 0.1, FASTEST),
     ("temperature", COLDEST, HOTTEST), ("spacing", 0.05, 50), ("chord", 0.001, 1), ("lift", 0, 50), ("wait", 0, 3600),
     ("sideways", 1, 100_000), ("tilt_deg", 0, 60), ("turning_deg_mm", 0.01, 90), ("spin_deg", -360, 360),
+    ("bump", 0, 20), ("bump_clearance", 0, 20),
 )  # fmt: skip
 
 

@@ -69,7 +69,7 @@ def test_layers_lie_inside_the_outline_and_over_the_bed(mode: Mode) -> None:
     below = np.full(len(nodes), -np.inf)
     for layer in stack.layers:
         assert layer.region.difference(shapely.buffer(wound.outline, 1e-6)).area < 1e-6
-        top = stack.tops(nodes, np.full(len(nodes), layer.share))
+        top = stack.tops(nodes, np.full(len(nodes), layer.number))
         assert (top > below)[within].all()
         below = top
         inside = shapely.contains_xy(layer.region, nodes[:, 0], nodes[:, 1])

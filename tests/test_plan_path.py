@@ -51,8 +51,7 @@ def test_where_ink_flows_the_tip_is_on_its_layer_inside_the_outline(mode: Mode) 
     plan = plan_of(mode)
     laid = plan.points.extrude
     tip = plan.points.tip[laid]
-    shares = np.array([layer.share for layer in plan.stack.layers])
-    assert np.allclose(tip[:, 2], plan.stack.tops(tip[:, :2], shares[plan.points.layer[laid]]))
+    assert np.allclose(tip[:, 2], plan.stack.tops(tip[:, :2], plan.points.layer[laid]))
     assert shapely.contains_xy(shapely.buffer(plan.wound.outline, 0.05), tip[:, 0], tip[:, 1]).all()
 
 

@@ -42,30 +42,30 @@ def coverage(beads: Sequence[Bead], region: Region) -> Coverage:
     return Coverage((union.area - over) / area, over / area, (laid - union.area) / area, gaps)
 
 
-def covered_by(beads: Sequence[Bead]) -> BaseGeometry:
-    """The area that beads cover."""
-    return shapely.union_all([shape for bead in beads for shape in _shapes(bead)])
+def covered_by(beads: Sequence[Bead], arc: int = 16) -> BaseGeometry:
+    """The area that beads cover. arc: edges that each quarter of a disc is drawn with."""
+    return shapely.union_all([shape for bead in beads for shape in _shapes(bead, arc)])
 
 
-def _shapes(bead: Bead) -> list[BaseGeometry]:
+def _shapes(bead: Bead, arc: int) -> list[BaseGeometry]:
     """Areas that together are a bead's: stretches of one width as a whole, and each step on which the width changes."""
     change = np.abs(np.diff(bead.width)) > 1e-9
     ends = np.concatenate([[0], np.flatnonzero(np.diff(change)) + 1, [len(change)]])
     found: list[BaseGeometry] = []
     for a, b in pairwise(ends.tolist()):
         if change[a]:
-            found += _tapered(bead.points[a : b + 1], bead.width[a : b + 1])
+            found += _tapered(bead.points[a : b + 1], bead.width[a : b + 1], arc)
         else:
             cuts = [*range(a, b, PIECE), b]
             lines = [shapely.linestrings(bead.points[i : j + 1]) for i, j in pairwise(cuts)]
-            found += shapely.buffer(lines, bead.width[a] / 2).tolist()
+            found += shapely.buffer(lines, bead.width[a] / 2, quad_segs=arc).tolist()
     return found
 
 
-def _tapered(points: Array, width: Array) -> list[BaseGeometry]:
+def _tapered(points: Array, width: Array, arc: int) -> list[BaseGeometry]:
     step = np.diff(points, axis=0)
     side = np.stack([-step[:, 1], step[:, 0]], axis=1)
     side /= 2 * np.maximum(np.linalg.norm(step, axis=1), 1e-12)[:, None]
     a, b = side * width[:-1, None], side * width[1:, None]
     corners = np.stack([points[:-1] + a, points[:-1] - a, points[1:] - b, points[1:] + b], axis=1)
-    return [*shapely.polygons(corners), *shapely.buffer(shapely.points(points), width / 2)]
+    return [*shapely.polygons(corners), *shapely.buffer(shapely.points(points), width / 2, quad_segs=arc)]

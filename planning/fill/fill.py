@@ -10,6 +10,7 @@ import shapely
 
 from estimation.se3 import Array
 from planning.fill.bead import Bead, even
+from planning.fill.coverage import covered_by
 from planning.fill.ease import eased
 from planning.fill.fit import fit_of
 from planning.fill.mend import mended
@@ -25,6 +26,8 @@ from planning.fill.zigzag import raster_lines, zigzag_lines
 INTO_RIM = 0.1  # spacings by which lines run into the rim of hybrid, whose round ends leave gaps else
 CORNER = 0.05  # spacings by which corners are cut: what that leaves open is less than a hundredth of a bead
 ROUGH = 0.001  # of the area, lost in corners of the contour: below, gaps come to half a percent at most
+TWICE = 5  # mm2 laid twice are as bad as one left open, as the limits of both are: 5 and 1 % of a wound
+AS_GOOD = 0.001  # of what is covered: less is no difference
 
 Lines = Callable[[Boundary, float, float], tuple[list[Array], float]]
 
@@ -40,10 +43,11 @@ def fill(region: Region, pattern: Pattern, pace: Pace) -> list[Bead]:
     if pattern.kind in ("zigzag", "raster"):
         return _lines(region, pattern, pace)
     hybrid = pattern.kind == "hybrid"
-    levels, core = _levels(region, pattern, pattern.rims if hybrid else None)
-    runs = _runs(levels, pattern, pace)
+    lost = roughness(region, pattern.spacing)
+    levels, core = _levels(region, lost, pattern, pattern.rims if hybrid else None)
+    runs = _runs(levels, lost, pattern, pace)
     if not hybrid:
-        return ordered(_mended(runs, region, pattern), corner)
+        return ordered(_mended(runs, region, lost, pattern), corner)
     return ordered(runs, corner) + _lines(shapely.buffer(core, INTO_RIM * pattern.spacing), pattern, pace)
 
 
@@ -54,26 +58,48 @@ def _corner(region: Region, pattern: Pattern) -> Array:
     return np.array([right if x > 0 else left, high if y > 0 else low])
 
 
-def _mended(runs: list[Run], region: Region, pattern: Pattern) -> list[Run]:
+def _mended(runs: list[Run], region: Region, lost: float, pattern: Pattern) -> list[Run]:
     """Runs without gaps between them where the region is rough or narrow; elsewhere it would be lost time."""
-    fit = fit_of(pattern)
-    if roughness(region, fit.spacing) < ROUGH:
+    if lost < ROUGH:
         return runs
-    return [[eased(bead, CORNER * pattern.spacing) for bead in run] for run in mended(runs, region, fit)]
+    better = mended(runs, region, fit_of(pattern))
+    return [[eased(bead, CORNER * pattern.spacing) for bead in run] for run in better]
 
 
-def _levels(region: Region, pattern: Pattern, most: int | None = None) -> tuple[list[Level], Region]:
-    return ring_levels(shapely.buffer(region, (pattern.spacing - pattern.width) / 2), fit_of(pattern), most)
+def _levels(region: Region, lost: float, pattern: Pattern, most: int | None = None) -> tuple[list[Level], Region]:
+    reached = shapely.buffer(region, (pattern.spacing - pattern.width) / 2) if pattern.overlap else region
+    return ring_levels(reached, lost, fit_of(pattern), most)
 
 
-def _runs(levels: list[Level], pattern: Pattern, pace: Pace) -> list[Run]:
-    start, s = np.array(pattern.start), pattern.spacing
-    joins = {"contour": [apart], "spiral": [wound]}.get(pattern.kind, [apart, wound])
-    runs = []
-    for nest in nests([level.rings for level in levels], s):
-        ways = [[_laid(bead, pattern) for bead in way(nest, s, start, pattern.seam)] for way in joins]
-        runs.append(min(ways, key=lambda run: spent(run, pace).seconds))
+def _runs(levels: list[Level], lost: float, pattern: Pattern, pace: Pace) -> list[Run]:
+    nested = nests([level.rings for level in levels], pattern.spacing)
+    runs = [_nest_run(nest, lost, pattern, pace) for nest in nested]
     return runs + [[_laid(bead, pattern)] for level in levels for bead in level.single]
+
+
+def _nest_run(nest: list[Bead], lost: float, pattern: Pattern, pace: Pace) -> Run:
+    """A nest's lines one by one, or joined: as the pattern says, or whichever is faster and fills as well."""
+    start = np.array(pattern.start)
+    if pattern.kind != "spiral":
+        closed = [_laid(bead, pattern) for bead in apart(nest, start, pattern.seam)]
+        if pattern.kind == "contour":
+            return closed
+    joined = [_laid(bead, pattern) for bead in wound(nest, pattern.spacing, start, pattern.seam)]
+    if pattern.kind == "spiral":
+        return joined
+    slower = spent(joined, pace).seconds >= spent(closed, pace).seconds
+    return closed if slower or (lost >= ROUGH and _worse(joined, closed)) else joined
+
+
+def _worse(joined: Run, closed: Run) -> bool:
+    """Whether a spiral fills worse than the closed lines that it joins: where these lie unevenly, ramps between them
+    leave open or lay twice what they do not, more or less as the spiral happens to begin."""
+    covered, laid = (
+        np.array([value(run) for run in (joined, closed)])
+        for value in (lambda run: covered_by(run).area, lambda run: sum(bead.laid for bead in run))
+    )
+    twice = laid - covered
+    return bool(covered[1] - covered[0] + (twice[0] - twice[1]) / TWICE > AS_GOOD * covered[1])
 
 
 def _laid(bead: Bead, pattern: Pattern) -> Bead:

@@ -21,7 +21,7 @@ from planning.fill.bead import Bead, even
 from planning.fill.corners import widened
 from planning.fill.coverage import covered_by
 from planning.fill.fit import Fit
-from planning.fill.region import Region, minus, points_of, roughness
+from planning.fill.region import Region, minus, points_of
 from planning.fill.strokes import strokes
 
 SAMPLED = 0.25  # spacings from point to point of the boundary whose medial axis is sought
@@ -33,6 +33,7 @@ FINE = 0.003  # spacings: to which lines are simplified; offsets of offsets doub
 FACING = 0.15  # spacings: a line's point nearer to or farther from a disc's rim faces another disc
 HAIR = 0.01  # spacings: a narrower opening between two lines is none
 LOST = 0.003  # of the area: what the corners of the outermost line may lose before it is made narrower
+ARC = 8  # edges of a quarter circle: off by a thousandth of a bead at most, less than FINE
 SMALLEST = 0.04  # spacings squared: of a gap worth filling, as in a corner of 110 degrees
 
 
@@ -44,9 +45,12 @@ class Level:
     single: list[Bead]
 
 
-def ring_levels(region: Region, fit: Fit, most: int | None = None) -> tuple[list[Level], Region]:
-    """Levels of closed lines from the contour inwards, at most so many, and the region that they leave."""
-    fit = _following(region, fit)
+def ring_levels(region: Region, lost: float, fit: Fit, most: int | None = None) -> tuple[list[Level], Region]:
+    """Levels of closed lines from the contour inwards, at most so many, and the region that they leave.
+
+    lost: the region's roughness for one spacing.
+    """
+    fit = _following(lost, fit)
     axis = axis_of(region, SAMPLED * fit.spacing)
     thin = strokes(axis, shapely.boundary(region), fit, most)
     levels: list[Level] = []
@@ -65,13 +69,12 @@ def ring_levels(region: Region, fit: Fit, most: int | None = None) -> tuple[list
         between = _between(axis, float(fit.outside(len(levels))), here)
         rings = shapely.get_rings(shapely.get_parts(_simple(middle, spacing)))
         levels.append(Level([_shared(ring, between, here) for ring in rings], own))
-        left = _simple(shapely.buffer(left, -spacing), spacing)
+        left = _simple(shapely.buffer(left, -spacing, quad_segs=ARC), spacing)
     return levels, left
 
 
-def _following(region: Region, fit: Fit) -> Fit:
-    """The fit whose outermost line is so narrow that it follows a rough contour."""
-    lost = roughness(region, fit.spacing)
+def _following(lost: float, fit: Fit) -> Fit:
+    """The fit whose outermost line is so narrow that it follows a contour in whose corners so much is lost."""
     share = math.sqrt(LOST / max(lost, LOST))  # what rounded corners lose grows with the square of their radius
     return replace(fit, outermost=max(share * fit.spacing, 2 * fit.one))
 
@@ -84,15 +87,17 @@ def _simple(region: Region, spacing: float) -> Region:
 def _middle(left: Region, single: list[Bead], fit: Fit, radius: float) -> Region:
     """What lies inside the middle lines of the next level, corners rounded; tongues for single beads are cut off."""
     spacing = fit.spacing
-    middle = shapely.buffer(shapely.buffer(left, -spacing / 2 - radius), radius, quad_segs=4)
+    middle = shapely.buffer(shapely.buffer(left, -spacing / 2 - radius, quad_segs=ARC), radius, quad_segs=4)
     if single:
         lean = max(fit.two - spacing / 2, radius)
-        wide = shapely.buffer(shapely.buffer(middle, -lean), lean + HAIR * spacing)  # not edge upon edge: that is slow
+        wide = shapely.buffer(
+            shapely.buffer(middle, -lean, quad_segs=ARC), lean + HAIR * spacing, quad_segs=ARC
+        )  # not edge upon edge: that is slow
         rest = shapely.get_parts(minus(middle, wide))
         lines = shapely.multilinestrings([shapely.linestrings(bead.points) for bead in single])
         shapely.prepare(lines)
         middle = minus(middle, shapely.union_all(rest[shapely.intersects(lines, rest)]))
-        middle = shapely.buffer(shapely.buffer(middle, -radius), radius, quad_segs=4)
+        middle = shapely.buffer(shapely.buffer(middle, -radius, quad_segs=4), radius, quad_segs=4)
     parts = shapely.get_parts(middle)
     return shapely.multipolygons(parts[shapely.area(parts) > SLIVER * spacing**2])
 
@@ -104,7 +109,7 @@ def _gaps(left: Region, middle: Region, single: list[Bead], spacing: float) -> N
     if left.area - reached.area + beyond < SMALLEST * spacing**2:
         return np.empty(0, object)
     gaps = minus(left, reached)
-    gaps = shapely.get_parts(minus(gaps, covered_by(single)) if single else gaps)
+    gaps = shapely.get_parts(minus(gaps, covered_by(single, ARC)) if single else gaps)
     return np.asarray(gaps[shapely.area(gaps) > SMALLEST * spacing**2])
 
 

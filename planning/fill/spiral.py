@@ -45,19 +45,19 @@ def nests(levels: list[list[Bead]], spacing: float) -> list[list[Bead]]:
     return done + [nest for nest, _ in open_nests]
 
 
-def apart(nest: list[Bead], spacing: float, start: Array, seam: float) -> Run:
+def apart(nest: list[Bead], start: Array, seam: float) -> Run:
     """The lines of a nest one by one, outermost first, begun near the side that `start` (2,) points to.
 
     seam: share of the outermost line by which the run begins later.
     """
-    return _begun(nest, _inwards(nest, _wanted(nest[0], start, seam)), spacing)
+    return _begun(nest, _inwards(nest, _wanted(nest[0], start, seam)))
 
 
 def wound(nest: list[Bead], spacing: float, start: Array, seam: float) -> Run:
     """The same lines joined inwards wherever one begins beside the one before."""
-    turned = apart(nest, spacing, start, seam)
+    turned = apart(nest, start, seam)
     if any(_far(outer, inner, spacing) for outer, inner in pairwise(turned)):
-        turned = _begun(nest, _outwards(nest, _wanted(nest[0], start, seam), spacing), spacing)
+        turned = _begun(nest, _outwards(nest, _wanted(nest[0], start, seam), spacing))
     runs: list[list[Bead]] = [[turned[0]]]
     closing: list[Bead] = []  # what the last line of a run lacks beside the ramp that led to it
     for outer, inner in pairwise(turned):
@@ -115,19 +115,11 @@ def _outwards(nest: list[Bead], wanted: Array, spacing: float) -> list[float]:
     return [float(arc[best]) for arc in arcs[::-1]]
 
 
-def _begun(nest: list[Bead], arcs: list[float], spacing: float) -> list[Bead]:
-    """The lines begun at these lengths, all in one sense."""
-    found: list[Bead] = []
-    for ring, arc in zip(nest, arcs, strict=True):
-        turned = ring.turned(arc)
-        found.append(turned.reversed if found and _against(found[-1], turned, spacing) else turned)
-    return found
-
-
-def _against(outer: Bead, inner: Bead, spacing: float) -> bool:
-    """Whether two lines leave their starts in opposite directions."""
-    a, b = (ring.at(np.array([0.0, min(spacing, ring.length / 4)]))[:, :2] for ring in (outer, inner))
-    return bool((a[1] - a[0]) @ (b[1] - b[0]) < 0)
+def _begun(nest: list[Bead], arcs: list[float]) -> list[Bead]:
+    """The lines begun at these lengths, all in the sense of the first."""
+    sense = [shapely.is_ccw(shapely.linearrings(ring.points)) for ring in nest]
+    found = [ring.turned(arc) for ring, arc in zip(nest, arcs, strict=True)]
+    return [ring if way == sense[0] else ring.reversed for ring, way in zip(found, sense, strict=True)]
 
 
 def _ramp(outer: Bead, inner: Bead, length: float) -> Bead:

@@ -107,7 +107,7 @@ def laid(ground: Ground, beads: Sequence[Bead], layer_of: Index, way: Way) -> La
     runs = spaced(runs, spacing_over(np.maximum(bent, np.r_[bent[:1], bent[:-1]]), way.spacing, way.chord))
     layer = layer_of[runs.bead]
     xy = ground.chart.to_plane(runs.points)
-    tip = np.column_stack([xy, stack.tops(xy, shares[layer])])
+    tip = np.column_stack([xy, stack.tops(xy, layer)])
     tilt = ground.mixed(np.stack([ground.low.values, ground.high.values], axis=2), xy, shares[layer])
     height = stack.bead_heights(xy, layer) * at(ground.chart.grid, ground.chart.cosine, xy)
     area = (runs.width + np.r_[runs.width[:1], runs.width[:-1]]) / 2 * runs.steps
@@ -154,9 +154,8 @@ def _over(ground: Ground, printed: Laid, a: Index, b: Index, part: Array, lift: 
     tilt = printed.tilt[a] + part[:, None] * (printed.tilt[b] - printed.tilt[a])
     foot = printed.tip[a] + part[:, None] * (printed.tip[b] - printed.tip[a])
     inner = (part > 0) & (part < 1)
-    shares = np.array([layer.share for layer in ground.stack.layers])
     top = np.maximum(
-        at(ground.stack.grid, ground.ceiling, foot[:, :2]), ground.stack.tops(foot[:, :2], shares[printed.layer[b]])
+        at(ground.stack.grid, ground.ceiling, foot[:, :2]), ground.stack.tops(foot[:, :2], printed.layer[b])
     )
     foot[inner, 2] = np.maximum(foot[inner, 2], top[inner])
     up = rotations(tilt, 0.0)[:, :, 2]

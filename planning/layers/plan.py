@@ -15,6 +15,7 @@ from planning.fill.coverage import Coverage, coverage
 from planning.fill.fill import fill
 from planning.fill.pace import Pace, spent
 from planning.fill.pattern import Pattern
+from planning.layers.bumps import Passing
 from planning.layers.chart import Chart, flat, unrolled
 from planning.layers.checkpoints import Ground, Laid, Way, ceiling, curvature, laid, path_of
 from planning.layers.contour import as_multi
@@ -35,22 +36,29 @@ LINED = ("zigzag", "raster", "hybrid")  # patterns with straight lines, whose an
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What is asked for. mode: how layers lie. crossed: every second layer's lines across the others'."""
+    """What is asked for. mode: how layers lie. crossed: every second layer's lines across the others'. passing: how
+    bumps of the bed are passed."""
 
     tissues: tuple[Tissue, ...]
     pattern: Pattern = field(default_factory=Pattern)
     mode: Mode = "skin"
     way: Way = field(default_factory=Way)
     crossed: bool = True
+    passing: Passing = field(default_factory=Passing)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedLayer:
-    """One layer as it is printed. region: in the chart, mm. beads: in the chart, mm, in order."""
+    """One layer as it is printed. region: in the chart, mm. beads: in the chart, mm, in order.
+
+    over, around: bumps in the chart, mm, that it goes over, and that it goes round.
+    """
 
     layer: Layer
     region: MultiPolygon
     beads: tuple[Bead, ...]
+    over: MultiPolygon
+    around: MultiPolygon
 
     @property
     def coverage(self) -> Coverage:
@@ -74,7 +82,7 @@ class Plan:
 
 def make_plan(wound: Wound, order: Order, where: object = "plan", report: Report = lambda done, total: None) -> Plan:
     """The plan of a wound; InputError where no bead finds room in it."""
-    stack = stack_in(wound, order.tissues, order.mode, order.pattern.width)
+    stack = stack_in(wound, order.tissues, order.mode, order.pattern.width, order.passing)
     chart = flat(wound.grid) if order.mode == "horizontal" else unrolled(wound.grid, wound.skin)
     order = replace(order, pattern=_turned(stack, chart, order))
     planned = []
@@ -99,7 +107,7 @@ def _turned(stack: Stack, chart: Chart, order: Order) -> Pattern:
     if not isinstance(pattern.angle, str) or pattern.kind not in LINED:
         return pattern
     layer = max(stack.layers, key=lambda layer: layer.region.area)
-    region, pace = _charted(layer, chart), _pace(layer, order)
+    region, pace = _charted(layer.region, chart), _pace(layer, order)
     turns = (
         [0.0, np.pi / 2] if pattern.angle == "shorter" else [np.pi * k / pattern.angles for k in range(pattern.angles)]
     )
@@ -112,8 +120,8 @@ def _turned(stack: Stack, chart: Chart, order: Order) -> Pattern:
     return min(tried, key=lambda t: t[1].seconds)[0]
 
 
-def _charted(layer: Layer, chart: Chart) -> MultiPolygon:
-    return as_multi(shapely.make_valid(shapely.transform(layer.region, chart.from_plane)))
+def _charted(shape: MultiPolygon, chart: Chart) -> MultiPolygon:
+    return shape if shape.is_empty else as_multi(shapely.make_valid(shapely.transform(shape, chart.from_plane)))
 
 
 def _pace(layer: Layer, order: Order) -> Pace:
@@ -121,12 +129,12 @@ def _pace(layer: Layer, order: Order) -> Pace:
 
 
 def _filled(layer: Layer, chart: Chart, order: Order) -> PlannedLayer:
-    region = _charted(layer, chart)
+    region = _charted(layer.region, chart)
     pattern = replace(order.pattern, seam=(order.pattern.seam + GOLDEN * layer.number) % 1.0)
     if order.crossed and layer.number % 2 and not isinstance(pattern.angle, str):
         pattern = replace(pattern, angle=pattern.angle + np.pi / 2)
     beads = () if region.is_empty else tuple(fill(region, pattern, _pace(layer, order)))
-    return PlannedLayer(layer, region, beads)
+    return PlannedLayer(layer, region, beads, _charted(layer.bumps.over, chart), _charted(layer.bumps.around, chart))
 
 
 def _ground(wound: Wound, stack: Stack, chart: Chart, way: Way) -> Ground:

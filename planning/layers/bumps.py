@@ -1,0 +1,115 @@
+"""Bumps of the scanned bed that stand over a layer: low ones are gone over, high ones round (thesis 5.2, Fig. 5.5).
+
+What joins the skin around the wound is its wall and no bump: a layer ends there anyway.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from scipy.ndimage import label, maximum
+from shapely import MultiPolygon
+
+from estimation.scan import Index
+from estimation.se3 import Array
+from planning.layers.contour import region
+from planning.layers.grid import Grid, Mask
+
+TOUCHING = np.ones((3, 3), int)  # nodes joined across corners too, so that no outline runs between them
+OVER = (
+    0.5  # of a layer's height that a bump may stand over its top: the layer over it keeps three tenths of its own there
+)
+MOST_OVER = 0.6  # the same at most: the layer over it then keeps a fifth, the thinnest bead
+CLEAR = 0.5  # of a bead beside a high bump: a needle is about twice as thick as its bead (22 G: 0.41 in, 0.72 mm out)
+
+
+@dataclass(frozen=True, slots=True)
+class Passing:
+    """How bumps are passed. over: mm above a layer's top up to which one is gone over; clearance: mm that is kept
+    around a higher one. None: OVER of the layer's height, CLEAR of a bead. Over MOST_OVER none is gone over."""
+
+    over: float | None = None
+    clearance: float | None = None
+
+    def limit(self, height: float) -> float:
+        """mm above the top of a layer `height` mm high."""
+        return OVER * height if self.over is None else min(self.over, MOST_OVER * height)
+
+    def clear(self, width: float) -> float:
+        """mm around bumps, for beads `width` mm wide."""
+        return CLEAR * width if self.clearance is None else self.clearance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bumps:
+    """The bumps of one layer, in the plane, mm. over: where the bed is over the layer's middle and gone over. around:
+    where it stands too high above the layer's top. highest: mm above the top, of all; 0 where there is none."""
+
+    over: MultiPolygon
+    around: MultiPolygon
+    highest: float
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A layer that bumps may stand over. height: mm. limit: mm above its top up to which one is gone over. level: it
+    does not follow the bed by itself."""
+
+    height: float
+    limit: float
+    level: bool
+
+
+USUAL = Passing()
+NONE = Bumps(MultiPolygon(), MultiPolygon(), 0.0)
+
+
+def within(grid: Grid, outline: MultiPolygon) -> Mask:
+    """(H, W) which nodes lie inside an outline, islands of skin in it too: where what rises may be a bump."""
+    whole = shapely.union_all([shapely.Polygon(part.exterior) for part in outline.geoms])
+    return np.asarray(shapely.contains_xy(whole, grid.nodes[..., 0], grid.nodes[..., 1]))
+
+
+def bumps_in(grid: Grid, inside: Mask, rise: Array, step: Step, slack: float) -> Bumps:
+    """The bumps of a layer over whose top the bed rises by `rise` (H, W) mm.
+
+    inside: where bumps are looked for. slack: mm, of outlines.
+    """
+    grid, inside, rise = _window(grid, inside, rise)
+    low, peaks = _bumps(rise > -step.height / 2, inside, rise, step.limit if step.level else -np.inf)
+    high, tops = _bumps(rise > step.limit, inside, rise, np.inf)
+    if not len(peaks) and not len(tops):
+        return NONE
+    over = _shapes(grid, low, rise + step.height / 2, slack)
+    return Bumps(over, _shapes(grid, high, rise - step.limit, slack), float(np.concatenate([peaks, tops]).max()))
+
+
+def _window(grid: Grid, inside: Mask, values: Array) -> tuple[Grid, Mask, Array]:
+    """The part of a grid that holds all nodes inside and one more around."""
+    rows, columns = (np.flatnonzero(inside.any(axis=k)) for k in (1, 0))
+    top, left = max(rows[0] - 1, 0), max(columns[0] - 1, 0)
+    part = slice(top, rows[-1] + 2), slice(left, columns[-1] + 2)
+    inside, values = inside[part], values[part]
+    return Grid(grid.step, grid.origin + grid.step * np.array([left, top]), inside.shape), inside, values
+
+
+def _bumps(raised: Mask, inside: Mask, rise: Array, limit: float) -> tuple[Mask, Array]:
+    """The nodes (H, W) of joined raised ones that stay in the wound and rise to `limit` at most; the peaks (K,)."""
+    if not (raised & inside).any():
+        return np.zeros_like(raised), np.empty(0)
+    labelled: tuple[Index, int] = label(raised, TOUCHING)
+    pieces, count = labelled
+    walls = np.zeros(count + 1, bool)
+    walls[pieces[~inside]] = True
+    peaks = np.asarray(maximum(rise, pieces, np.arange(1, count + 1)))
+    chosen = np.flatnonzero((peaks <= limit) & ~walls[1:])
+    return np.isin(pieces, chosen + 1), peaks[chosen]
+
+
+def _shapes(grid: Grid, own: Mask, values: Array, slack: float) -> MultiPolygon:
+    """Where values (H, W) are positive at the nodes `own` and beside them."""
+    if not own.any():
+        return MultiPolygon()
+    return region(grid, np.where(own | (values <= 0), values, -np.abs(values)), 0.0, slack)
