@@ -32,7 +32,7 @@ def pit(x: Array, y: Array, bump: float, radius: float, place: Array = PLACE) ->
     """A round wound with steep walls and, on its flat bed, a bump with a flat top."""
     far = np.hypot(x, y)
     bed = -DEEP * np.clip((FLOOR + 2.0 - far) / 2.0, 0, 1)
-    return bed + bump * np.clip((radius + 1.0 - np.hypot(x - place[0], y - place[1])) / 1.0, 0, 1)
+    return np.asarray(bed + bump * np.clip((radius + 1.0 - np.hypot(x - place[0], y - place[1])) / 1.0, 0, 1))
 
 
 def wound_with(bump: float, radius: float = 1.5, place: Array = PLACE) -> Wound:
