@@ -54,6 +54,18 @@ def test_rough_narrow_wounds_are_covered_to_99_percent(number: int) -> None:
     assert found.covered >= 0.99 and found.double <= 0.05 and found.over < 0.002
 
 
+def test_gaps_of_a_rough_wound_are_not_closed_by_laying_more_than_5_percent_twice() -> None:
+    wound = random_wound(np.random.default_rng([7, 379]))[1]
+    assert coverage(fill(wound, Pattern(), PACE), wound).double < 0.048
+
+
+def test_a_rough_narrow_wound_is_covered_alike_however_it_is_turned() -> None:
+    wound = random_wound(np.random.default_rng([1, 880]))[1]
+    aside = shapely.affinity.rotate(wound, 40, origin=(0, 0))
+    one, other = (coverage(fill(w, Pattern(), PACE), w).covered for w in (wound, aside))
+    assert abs(one - other) < 0.001
+
+
 def test_a_contour_without_roughness_is_followed_by_beads_of_the_nominal_width() -> None:
     assert roughness(box(0, 0, 30, 20).buffer(2.0), 0.4) < 1e-4
     outermost = fill(box(0, 0, 30, 20).buffer(2.0), Pattern("contour"), PACE)[0]

@@ -94,11 +94,8 @@ def _nest_run(nest: list[Bead], lost: float, pattern: Pattern, pace: Pace) -> Ru
 def _worse(joined: Run, closed: Run) -> bool:
     """Whether a spiral fills worse than the closed lines that it joins: where these lie unevenly, ramps between them
     leave open or lay twice what they do not, more or less as the spiral happens to begin."""
-    covered, laid = (
-        np.array([value(run) for run in (joined, closed)])
-        for value in (lambda run: covered_by(run).area, lambda run: sum(bead.laid for bead in run))
-    )
-    twice = laid - covered
+    covered = [covered_by(run).area for run in (joined, closed)]
+    twice = [sum(bead.laid for bead in run) - area for run, area in zip((joined, closed), covered, strict=True)]
     return bool(covered[1] - covered[0] + (twice[0] - twice[1]) / TWICE > AS_GOOD * covered[1])
 
 
