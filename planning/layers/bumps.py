@@ -69,6 +69,7 @@ NONE = Bumps(MultiPolygon(), MultiPolygon(), 0.0)
 def within(grid: Grid, outline: MultiPolygon) -> Mask:
     """(H, W) which nodes lie inside an outline, islands of skin in it too: where what rises may be a bump."""
     whole = shapely.union_all([shapely.Polygon(part.exterior) for part in outline.geoms])
+    shapely.prepare(whole)
     return np.asarray(shapely.contains_xy(whole, grid.nodes[..., 0], grid.nodes[..., 1]))
 
 
