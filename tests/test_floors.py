@@ -42,6 +42,7 @@ OWNERS = {  # library: the files that may import it
     "time": ("hardware/clock.py",),
     "toppra": ("planning/*.py",),
     "torch": ("perception/training/*.py",),
+    "yaml": ("hardware/calibration/formats/*.py",),
 }
 ABSENT = {"time", "pytest"}  # the standard library's; and pytest loads its plugin itself
 FREE = {"numpy", "scipy"}  # arrays are everywhere
@@ -93,7 +94,7 @@ def test_every_dependency_is_imported_by_someone_and_declared() -> None:
     import tomllib
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    packages = {"opencv-python-headless": "cv2", "open3d-cpu": "open3d", "pyserial": "serial"}
+    packages = {"opencv-python-headless": "cv2", "open3d-cpu": "open3d", "pyserial": "serial", "pyyaml": "yaml"}
     declared = {line.split(">")[0] for line in project["dependencies"] + project["optional-dependencies"]["train"]}
     declared = {packages.get(name, name) for name in declared}
     assert set.union(*map(roots, FILES)) & {*OWNERS, *FREE} - ABSENT <= declared

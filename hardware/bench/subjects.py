@@ -37,6 +37,9 @@ class Subject:
 Subjects = Mapping[str, Subject]
 
 SUBJECTS: Subjects = {
+    "calibration": Subject(
+        "hardware.bench.calibration", "cameras calibrated from rendered boards, beside the exact rig"
+    ),
     "cameras": Subject("hardware.bench.cameras", "frames of live cameras put into sets: complete, wrong, waited for"),
     "consistency": Subject("hardware.bench.consistency", "poses from pictures: are errors as large as is claimed?"),
     "estimator": Subject("hardware.bench.estimator", "the estimator on synthetic tracks: accuracy, honesty, time"),

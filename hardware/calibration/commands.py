@@ -8,6 +8,12 @@ from typing import Any
 
 Commands = Any  # argparse's own type for this is private
 
+FORMATS = {
+    "opencv": "a YAML per camera",
+    "ros": "camera_info, a YAML per camera",
+    "kalibr": "camchain.yaml",
+    "anipose": "aniposelib's and caliscope's TOML, mm",
+}
 FAILED = 1  # exit code of a calibration that is not good enough
 
 
@@ -15,7 +21,7 @@ def add_calibrate(commands: Commands) -> None:
     """Add the sub-command `calibrate`."""
     command: argparse.ArgumentParser = commands.add_parser(
         "calibrate",
-        help="calibrate the cameras from a printed board: board, cameras",
+        help="calibrate the cameras from a printed board: board, cameras, import, export",
         description="Print a board, wave it before the cameras, and get a rig that says how far it can be trusted.",
         epilog="example:\n  stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -23,6 +29,8 @@ def add_calibrate(commands: Commands) -> None:
     parts = command.add_subparsers(metavar="WHAT", required=True)
     _add_board(parts)
     _add_cameras(parts)
+    _add_import(parts)
+    _add_export(parts)
 
 
 def _add_board(parts: Commands) -> None:
@@ -56,6 +64,26 @@ def _add_cameras(parts: Commands) -> None:
     )
     part.add_argument("--new-rig", action="store_true", help="do not compare with the session's own rig")
     part.set_defaults(run=_cameras)
+
+
+def _add_import(parts: Commands) -> None:
+    part = parts.add_parser("import", help="a rig.toml from another program's calibration")
+    part.add_argument("file", type=Path, metavar="FILE", help="its file, or folder of a file per camera")
+    part.add_argument(
+        "--format", choices=FORMATS, required=True, help="; ".join(f"{k}: {v}" for k, v in FORMATS.items())
+    )
+    part.add_argument("-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write")
+    part.set_defaults(run=_import)
+
+
+def _add_export(parts: Commands) -> None:
+    part = parts.add_parser("export", help="a rig.toml in another program's format")
+    part.add_argument("rig", type=Path, metavar="rig.toml", help="a calibrated rig")
+    part.add_argument(
+        "--format", choices=FORMATS, required=True, help="; ".join(f"{k}: {v}" for k, v in FORMATS.items())
+    )
+    part.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="file, or folder, to write")
+    part.set_defaults(run=_export)
 
 
 def _pair(text: str) -> tuple[int, int]:
@@ -92,3 +120,23 @@ def _cameras(arguments: argparse.Namespace) -> int:
         outcome = run_calibration(a.session, a.board, a.out, wishes, progress)
     print(outcome.text)
     return 0 if outcome.verdict.passed else FAILED
+
+
+def _import(arguments: argparse.Namespace) -> int:
+    from hardware.calibration.formats import formats
+    from hardware.rig_file import write_rig
+
+    rig = formats()[arguments.format].read(arguments.file)
+    write_rig(arguments.out, rig, [None] * len(rig))
+    print(f"{arguments.out}: {', '.join(c.name for c in rig.cameras)}; where their images are is to be added")
+    return 0
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from hardware.calibration.formats import formats
+    from hardware.rig_file import read_rig
+
+    rig = read_rig(arguments.rig).rig
+    formats()[arguments.format].write(arguments.out, rig)
+    print(f"{arguments.out}: {', '.join(c.name for c in rig.cameras)}")
+    return 0
