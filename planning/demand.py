@@ -10,7 +10,7 @@ from scipy.ndimage import maximum_filter1d
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from planning.curve import Curve
-from planning.kinematics import SimpleArm, limited_axes
+from planning.kinematics import SimpleArm, limited_axes, most_change
 from planning.stations import Stations
 
 STEP = 0.05  # mm along the path, and
@@ -23,13 +23,16 @@ class Demand:
     """At grid points (M,) of a curve, for the D numbers that the limits bind (`limited_axes`).
 
     axes: (M, D), there when each point is passed at the soonest. first, second: (M, D), derivatives by mm along the
-    curve. speed, acceleration: (M, D), mm or rad per s and s^2, the
-    largest that the surface's predicted motion alone asks about each point.
+    curve, the first beside a corner as large as it may be on any side. bend: (M, D), by how much the first changes a mm
+    within any corner beside each point, at most, and swerve: (M, D), over all of them. speed, acceleration: (M, D), mm
+    or rad per s and s^2, the largest that the surface's predicted motion alone asks about each point.
     """
 
     axes: Array
     first: Array
     second: Array
+    bend: Array
+    swerve: Array
     speed: Array
     acceleration: Array
 
@@ -44,16 +47,19 @@ def demand(arm: SimpleArm, pose: SurfacePose, curve: Curve, grid: Stations, begi
     nozzle = curve.poses(np.concatenate([places - STEP, places, places + STEP]))
     if pose.warp is not None:
         nozzle = pose.warp.carry(nozzle)
-    base = pose.base_at(np.concatenate([times - PAUSE, times, times + PAUSE]))
-    now = base[count : 2 * count]
-    along = limited_axes(arm, np.concatenate([now, now, now]) @ nozzle).reshape(3, count, -1)
-    over = limited_axes(arm, base @ np.tile(nozzle[count : 2 * count], (3, 1, 1))).reshape(3, count, -1)
-    first, second = _differences(along, STEP)
-    turn = (arm.arm_from_base @ now)[:, :3, :3]
+    base = pose.base_at(np.concatenate([times - PAUSE, times, times + PAUSE])).reshape(3, count, 4, 4)
+    nozzle, now = nozzle.reshape(3, count, 4, 4), base[1]
+    asked = limited_axes(arm, np.stack([now @ nozzle, base @ nozzle[1]])).reshape(2, 3, count, -1)
+    first, second = _differences(asked[0], STEP)
+    turn = arm.arm_from_base[:3, :3] @ now[:, :3, :3]
     first[:, :3] = (turn @ curve.slope(places)[..., None])[..., 0]
     second[:, :3] = (turn @ curve.curvature(places)[..., None])[..., 0]
-    moved = [maximum_filter1d(np.abs(part), 2 * AROUND + 1, axis=0) for part in _differences(over, PAUSE)]
-    return Demand(along[1], first, second, *moved)
+    moved = maximum_filter1d(np.abs(np.stack(_differences(asked[1], PAUSE))), 2 * AROUND + 1, axis=1)
+    by_move, by_turn = most_change(arm, asked[0, 1])
+    bend = by_move * grid.bend[:, None] + by_turn * grid.swing[:, None]
+    most = by_move + by_turn * grid.spin[:, None]
+    first = np.where(bend > 0, np.copysign(np.maximum(np.abs(first), most), first), first)
+    return Demand(asked[0, 1], first, second, bend, 2 * most, *moved)
 
 
 def _differences(values: Array, step: float) -> tuple[Array, Array]:

@@ -23,9 +23,11 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from planning.inverse import joints_from_nozzle, joints_from_tip
-from planning.joints import JointModel
+from planning.joints import JointModel, jacobian
 from planning.joints import arm_from_nozzle as arm_from_joints
 from planning.limits import Limits
+
+FLAT = 1e-6  # so much is added to what is divided by in a singularity
 
 
 class Angles(Enum):
@@ -103,6 +105,23 @@ def limited_axes(arm: SimpleArm, base_from_nozzle: Array) -> Array:
     arm_from_nozzle = arm.arm_from_base @ base_from_nozzle
     joints = joints_from_nozzle(arm.jointed, arm_from_nozzle)
     return np.concatenate([arm_from_nozzle[..., :3, 3], joints[..., 3:], joints[..., :3]], axis=-1)
+
+
+def most_change(arm: SimpleArm, limited: Array) -> tuple[Array, Array]:
+    """By how much each of `limited_axes` (..., D) changes at most as the tip moves, per mm, and turns, per rad."""
+    if arm.jointed is None:
+        steep = 1 / np.maximum(np.abs(np.cos(limited[..., 4:5])), FLAT)  # of A and C, as B nears the gimbal lock
+        none, one = np.zeros_like(steep), np.ones_like(steep)
+        moved = np.broadcast_to([1.0, 1, 1, 0, 0, 0], limited.shape)
+        return moved, np.concatenate([none, none, none, steep, one, steep], axis=-1)
+    matrix = jacobian(arm.jointed, limited[..., [6, 7, 8, 3, 4, 5]])
+    inverse = np.linalg.inv(matrix + FLAT * np.eye(6))
+    turned, moved = (np.linalg.norm(inverse[..., part], axis=-1) for part in (slice(3), slice(3, 6)))
+    moved, turned = (
+        np.concatenate([tip, of[..., 3:], of[..., :3]], axis=-1)
+        for tip, of in ((np.ones_like(moved[..., :3]), moved), (np.zeros_like(turned[..., :3]), turned))
+    )
+    return moved, turned
 
 
 def limits_of(arm: SimpleArm, limits: Limits) -> tuple[Array, Array]:

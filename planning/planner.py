@@ -31,7 +31,8 @@ from planning.retime import Timing, retime
 from planning.stations import Stations, stations_on
 
 HORIZON = 1.0  # s of path timed at once: any speed can be stopped in it
-RENEW = 0.5  # s of it left when the next is timed; a horizon ends at rest, and the surface is foreseen for 0.5 s
+RENEW = 0.5  # s of it left when the next is timed, after HORIZON at the latest; it ends at rest, and the surface is
+# foreseen for half a second
 STALL = 3.0  # ticks without a call after which the arm has come to rest by itself
 SHARE = 0.98  # of what the guard tolerates of a pose: the planner brakes before the guard would cut
 
@@ -127,9 +128,10 @@ class Planner:
         off = np.linalg.norm(self._follower.position[:3] - self._asked[1][0, :3]) > self._limits.on_path
         if off and leg.phase is Phase.PRINTING:
             return self._begin(pose, now)
-        if now < leg.timing.end - RENEW:
+        left = leg.timing.end - now
+        if left > RENEW and now < leg.timing.times[0] + HORIZON:
             return ""
-        if leg.timing.places[-1] < leg.curve.length:
+        if leg.timing.places[-1] < leg.curve.length or left > RENEW:
             return self._renew(pose, leg, now)
         if now < leg.timing.end or (off and leg.phase is Phase.ENTERING):
             return ""
@@ -177,6 +179,7 @@ class Planner:
         if isinstance(timing, str):
             return timing if now >= leg.timing.end else ""
         self._leg = replace(leg, timing=timing)
+        self._asked = self._leg, self._asked[1]  # for this tick: old and new timing are one at its start
         return ""
 
     def _ask(self, pose: SurfacePose, curve: Curve, place: float, begin: float) -> tuple[Stations, Demand]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from estimation.se3 import Array
 from planning.curve import Curve
 
+SHORTEST_BLEND = 1e-9  # mm: beside a checkpoint where nothing changes there is none
 POINTS = 30  # evenly spread grid points of one horizon: toppra takes some 20 us for each
 
 
@@ -18,12 +19,16 @@ class Stations:
     """Grid points on a stretch of a curve, rising.
 
     places: (M,) mm. allowed: (M,) mm/s that the stretches and corners on both sides bear. cruise: (M,) mm/s that the
-    stretches alone bear.
+    stretches alone bear. bend: (M,) 1/mm and swing: (M,) rad/mm^2, by which direction and spin change within any corner
+    on both sides, at most; spin: (M,) rad/mm, the largest there.
     """
 
     places: Array
     allowed: Array
     cruise: Array
+    bend: Array
+    swing: Array
+    spin: Array
 
     @property
     def due(self) -> Array:
@@ -36,11 +41,23 @@ def stations_on(curve: Curve, start: float, end: float) -> Stations:
     """Grid points from `start` to `end`, mm: evenly spread, and where there is room bounds and middle of each blend."""
     places = _places(curve, start, end)
     first, last = curve.stretch(places[:-1]), curve.stretch(np.nextafter(places[1:], 0.0))
-    between = _least(curve.speed, first, last)
     before = np.searchsorted(curve.knots + curve.half, places[:-1], "right")  # the first blend not yet passed
     beyond = np.searchsorted(curve.knots - curve.half, places[1:], "left") - 1  # the last one begun
-    corner = np.where(beyond >= before, _least(curve.corner, before, np.maximum(beyond, before)), np.inf)
-    return Stations(places, _at_points(np.minimum(between, corner)), _at_points(between))
+    part = slice(int(min(first[0], before[0])), int(max(last[-1], beyond[-1])) + 2)
+    stretches, corners = (first - part.start, last - part.start), (before - part.start, beyond - part.start)
+    cruise = _at_points(_largest(1 / curve.speed[part], *stretches))
+    slowest = _at_points(_largest(1 / curve.corner[part], *corners))
+    within = 2 * np.maximum(curve.half[part], SHORTEST_BLEND)
+    bend, swing = (np.linalg.norm(change[part], axis=1) / within for change in (curve.bend, curve.swing))
+    spin = np.linalg.norm(curve.spin[part], axis=1)
+    return Stations(
+        places,
+        1 / np.maximum(cruise, slowest),
+        1 / cruise,
+        _at_points(_largest(bend, *corners)),
+        _at_points(_largest(swing, *corners)),
+        _at_points(_largest(spin, *stretches)),
+    )
 
 
 def _places(curve: Curve, start: float, end: float) -> Array:
@@ -56,12 +73,13 @@ def _places(curve: Curve, start: float, end: float) -> Array:
     return np.asarray(points)
 
 
-def _least(values: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
-    """The least (M,) of values[first : last + 1] for each pair of (M,); beyond the end of values there is no limit."""
-    ends = np.stack([first, last + 1], 1).ravel()
-    return np.asarray(np.minimum.reduceat(np.append(values, [np.inf, np.inf]), ends)[::2])
+def _largest(values: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
+    """The largest (M,) of values[first : last + 1], none below 0, for each pair of (M,); 0 where there is none."""
+    padded = np.concatenate([values, [0.0, 0.0]])
+    ends = np.stack([np.minimum(first, len(values)), np.maximum(last, first) + 1], 1).ravel()
+    return np.where(last >= first, np.maximum.reduceat(padded, np.minimum(ends, len(values) + 1))[::2], 0.0)
 
 
 def _at_points(between: Array) -> Array:
-    """What (M,) grid points bear where their intervals bear (M-1,)."""
-    return np.concatenate([between[:1], np.minimum(between[:-1], between[1:]), between[-1:]])
+    """The largest (M,) on both sides of grid points of (M-1,) in the intervals between them."""
+    return np.concatenate([between[:1], np.maximum(between[:-1], between[1:]), between[-1:]])

@@ -176,13 +176,28 @@ def test_the_curve_passes_near_each_checkpoint_and_never_outruns_its_length(seed
     at_knots = curve.poses(curve.knots)
     off = np.linalg.norm(at_knots[:, :3, 3] - path.surface_from_nozzle[:, :3, 3], axis=1)
     assert off.max() <= 0.05 + 1e-9
-    assert np.abs(at_knots[:, :3, :3] - path.surface_from_nozzle[:, :3, :3]).max() < 1e-9
+    turned = np.swapaxes(path.surface_from_nozzle[:, :3, :3], -1, -2) @ at_knots[:, :3, :3]
+    assert LEVER * se3.angle_of(turned).max() <= 0.05 + 1e-9
     s = steps(curve.length)
     assert np.linalg.norm(curve.slope(s), axis=1).max() <= 1 + 1e-12
     places = curve.poses(s)[:, :3, 3]
     assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() <= s[1] * (1 + 1e-9)
     middle = (s[1:] + s[:-1]) / 2
     assert np.abs(np.diff(places, axis=0) / s[1] - curve.slope(middle)).max() < 2 * s[1] / curve.half[1:-1].min()
+
+
+@given(st.integers(0, 10_000))
+def test_the_tool_turns_at_a_rate_without_steps_and_never_faster_than_between_checkpoints(seed: int) -> None:
+    path = wandering(seed)
+    curve = curve_through(path.surface_from_nozzle, path.speed[1:], 0.05, 4.0)
+    ends = np.concatenate([curve.knots - curve.half, curve.knots, curve.knots + curve.half])[:, None]
+    h = 1e-6
+    s = (ends[(ends > 3 * h) & (ends < curve.length - 3 * h)][:, None] + h * np.array([-2, -1, 0, 1, 2])).ravel()
+    rotations = curve.poses(s)[:, :3, :3].reshape(-1, 5, 3, 3)
+    rate = se3.log_rotation(np.swapaxes(rotations[:, :-1], -1, -2) @ rotations[:, 1:]) / h
+    change = np.linalg.norm(curve.swing, axis=1)[1:-1] / (2 * curve.half[1:-1])
+    assert np.linalg.norm(np.diff(rate, axis=1), axis=-1).max() < 2 * h * change.max() + 1e-8
+    assert np.linalg.norm(rate, axis=-1).max() <= np.linalg.norm(curve.spin, axis=1).max() + 1e-8
 
 
 @given(st.integers(0, 10_000), st.floats(0.02, 0.3))

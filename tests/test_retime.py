@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
+from estimation.pose import SurfacePose
 from hardware.bench.random_runs import Swing, random_path
 from planning.curve import Curve, curve_through
-from planning.demand import Demand, demand
+from planning.demand import demand
 from planning.kinematics import SimpleArm, axes_from_nozzle
 from planning.legs import CORNER, SWERVE
 from planning.limits import Limits
-from planning.retime import RISE, TOTAL, Timing, retime
+from planning.retime import PATH_SPEED, RISE, TOTAL, Timing, retime
 from planning.stations import stations_on
 from tests.moving import Motion, pose_at, raster, still
 
 ARM, LIMITS = SimpleArm(), Limits()
 BOUNDS = LIMITS.speed, LIMITS.acceleration
+STEP = 0.02  # s, a tick
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -52,20 +56,41 @@ def test_no_stretch_and_no_corner_is_passed_faster_than_it_may_be(seed: int) -> 
     assert timing.at(np.array([-1.0, 10.0, timing.end, 1e9])) == pytest.approx(places[[0, 0, -1, -1]])
 
 
+def most_of_the_limits(curve: Curve, timing: Timing, pose: SurfacePose, end: float) -> tuple[float, float]:
+    """The largest shares of speed and acceleration limits up to `end`, s, by differences of the axes asked for."""
+    t = np.arange(timing.times[0], min(timing.end, end), STEP)
+    axes = axes_from_nozzle(ARM, pose.base_at(t) @ curve.poses(timing.at(t)))
+    speed, acceleration = (np.abs(np.diff(axes, n, axis=0)) / STEP**n / BOUNDS[n - 1] for n in (1, 2))
+    return float(speed.max(initial=0.0)), float(acceleration.max(initial=0.0))
+
+
 @settings(max_examples=20)
-@given(SEEDS, st.sampled_from([(5.0, 0.05, 0.3), (12.0, 0.1, 0.5), (20.0, 0.0, 0.3)]))
-def test_path_and_surface_together_keep_the_axes_limits(seed: int, swing: tuple[float, float, float]) -> None:
-    """Judged by differences of the axes asked for, with the surface moving as it was foreseen."""
+@given(SEEDS, st.sampled_from([(5.0, 0.05, 0.3), (12.0, 0.1, 0.5), (20.0, 0.0, 0.3)]), st.floats(0, 0.9))
+@example(577, (5.0, 0.05, 0.3), 0.0)
+def test_path_and_surface_together_keep_the_axes_limits(
+    seed: int, swing: tuple[float, float, float], share: float
+) -> None:
+    """As long as a surface is foreseen at all, and with the surface moving so."""
     curve, pose = curve_of(seed), pose_at(Swing(*swing).at, 10.4)
-    grid = stations_on(curve, 0.0, curve.after(0.0, 2.0))
+    start = share * curve.length
+    grid = stations_on(curve, start, curve.after(start, 2.0))
     timing = retime(grid, demand(ARM, pose, curve, grid, 10.4), 0.0, 10.4, BOUNDS)
     assert isinstance(timing, Timing)
-    step = 0.02
-    t = np.arange(10.4, timing.end, step)
-    axes = axes_from_nozzle(ARM, pose.base_at(t) @ curve.poses(timing.at(t)))
-    speed, acceleration = np.abs(np.diff(axes, axis=0)) / step, np.abs(np.diff(axes, 2, axis=0)) / step**2
-    assert (speed <= LIMITS.speed).all()
-    assert (acceleration <= LIMITS.acceleration).all()
+    speed, acceleration = most_of_the_limits(curve, timing, pose, 12.4)
+    assert speed <= 1
+    assert acceleration <= 1
+
+
+@settings(max_examples=20)
+@given(SEEDS)
+@example(577)  # at a checkpoint the tool turns back at 13 mm/s: 3.9 times the limit of B when turns had no blends
+@example(378562)
+def test_the_path_alone_keeps_well_within_the_axes_limits_at_all_its_corners(seed: int) -> None:
+    curve = curve_of(seed)
+    timing = timed(curve, 0.0, curve.after(0.0, 2.0))
+    speed, acceleration = most_of_the_limits(curve, timing, pose_at(still, 10.0), np.inf)
+    assert speed <= PATH_SPEED * 1.01
+    assert acceleration <= TOTAL
 
 
 def test_a_surface_that_takes_most_of_an_axis_leaves_the_path_little() -> None:
@@ -75,7 +100,7 @@ def test_a_surface_that_takes_most_of_an_axis_leaves_the_path_little() -> None:
     asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     taken = np.zeros_like(asked.speed)
     taken[:, 0] = TOTAL * LIMITS.speed[0] - 5.0
-    slow = retime(grid, Demand(asked.axes, asked.first, asked.second, taken, asked.acceleration), 0.0, 10.0, BOUNDS)
+    slow = retime(grid, replace(asked, speed=taken), 0.0, 10.0, BOUNDS)
     free = retime(grid, asked, 0.0, 10.0, BOUNDS)
     assert isinstance(slow, Timing) and isinstance(free, Timing)
     assert slow.speeds.max() == pytest.approx(5.0, rel=1e-3)
@@ -87,7 +112,7 @@ def test_a_surface_faster_than_an_axis_slows_the_path_and_does_not_stop_it() -> 
     grid = stations_on(curve, 0.0, 8.0)
     asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     much = np.full_like(asked.speed, 1e4)
-    timing = retime(grid, Demand(asked.axes, asked.first, asked.second, much, much), 0.0, 10.0, BOUNDS)
+    timing = retime(grid, replace(asked, speed=much, acceleration=much), 0.0, 10.0, BOUNDS)
     assert isinstance(timing, Timing)
     assert 0 < timing.speeds.max() <= 3.001
 
@@ -100,7 +125,7 @@ def test_a_speed_carried_into_narrower_limits_is_brought_down_and_not_refused(se
     grid = stations_on(curve, 10.0, 55.0)
     asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     taken = np.broadcast_to(draw.uniform(0, 2) * LIMITS.speed, asked.speed.shape)
-    timing = retime(grid, Demand(asked.axes, asked.first, asked.second, taken, asked.acceleration), 30.0, 10.0, BOUNDS)
+    timing = retime(grid, replace(asked, speed=taken), 30.0, 10.0, BOUNDS)
     assert isinstance(timing, Timing)
     assert timing.speeds[0] == pytest.approx(30.0, rel=0.002)
     slowing = -np.diff(timing.speeds**2) / (2 * np.diff(timing.places))
@@ -134,7 +159,5 @@ def test_two_places_that_are_one_have_no_timing_and_say_so() -> None:
     curve = curve_through(se3.make(np.eye(3), np.array([[0.0, 0, 0], [1, 0, 0]])), np.array([5.0]), CORNER, SWERVE)
     grid = stations_on(curve, 0.0, 1.0)
     asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
-    reason = retime(
-        grid, Demand(asked.axes, asked.first * np.nan, asked.second, asked.speed, asked.acceleration), 0.0, 1.0, BOUNDS
-    )
+    reason = retime(grid, replace(asked, first=asked.first * np.nan), 0.0, 1.0, BOUNDS)
     assert isinstance(reason, str) and "no timing from 0.00 to 1.00 mm" in reason
