@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,14 +53,13 @@ def run_train(options: argparse.Namespace) -> str:
     from perception.training.choosing import chosen_settings
     from perception.training.curves import draw_curves
     from perception.training.export import export
-    from perception.training.loop import THESIS, Recipe, Schedule, Source, train
+    from perception.training.loop import THESIS, THESIS_SCHEDULE, Recipe, Schedule, Source, train
     from perception.training.networks import made, size_of
 
     parts = _parts(options)
     network = made(options.network, options.seed)
-    recipe = THESIS if options.network == "thesis" else Recipe()
-    usual = Schedule(seed=options.seed, threads=options.threads)
-    schedule = usual if options.rounds is None else Schedule(options.rounds, seed=options.seed, threads=options.threads)
+    recipe, usual = (THESIS, THESIS_SCHEDULE) if options.network == "thesis" else (Recipe(), Schedule())
+    schedule = replace(usual, rounds=options.rounds or usual.rounds, seed=options.seed, threads=options.threads)
     weights = np.r_[np.ones(len(parts.trained)), np.full(len(parts.others), OTHERS)]
     source = Source([pyramid(each) for each in (*parts.trained, *parts.others)], weights)
     with _progress("train", "steps") as said:
