@@ -60,7 +60,7 @@ def add_train(commands: Commands) -> None:
         default="wound",
         help="thesis: the U-Net of its 3.3; shape: no network, but what segment --method shape needs, X.toml",
     )
-    command.add_argument("--rounds", type=int, metavar="N", help="of 250 steps (thesis: 100); more is better and longer")
+    command.add_argument("--rounds", type=int, metavar="N", help="of 250 steps (thesis: 100); more take longer")
     command.add_argument("--rendered", type=int, default=120, metavar="N", help="rendered pictures to add")
     command.add_argument("--hold-out", type=int, default=160, metavar="N", help="pictures to judge by, in groups")
     command.add_argument("--threads", type=int, default=1, metavar="N", help="of torch")
