@@ -8,7 +8,8 @@ import os
 import resource
 import signal
 from collections.abc import Callable, Iterator
-from itertools import pairwise
+from dataclasses import replace
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,11 @@ from hardware.bookmark_file import read_start
 from hardware.clock import WallClock
 from hardware.live.beside import Beside
 from hardware.live.prerender import prerender
+from hardware.live.remembered import recorded_poses
 from hardware.live.replayed import replay_run
 from hardware.path_file import read_path
 from hardware.session import open_session
+from hardware.tracker import tracker
 from tests.live_runs import PATH, SCENARIO, Running, closed, messages, rests
 
 CLOCK = WallClock()
@@ -77,6 +80,17 @@ def printed_once(*records: Path) -> None:
         assert after[0] - before[1] <= 1.0 + 1e-9
 
 
+def retracked_alike(record: Path, count: int) -> None:
+    """That the first sets of a recording, tracked anew, give the very poses that it holds."""
+    session, poses = open_session(record), {pose.stamp: pose for pose in recorded_poses(record)}
+    rois = [replace(roi, stamp=-np.inf) for roi in session.roi]
+    with tracker(session.rig, rois) as step:
+        for frames in islice(session.frame_sets(), count):
+            pose, recorded = step(frames), poses[frames.stamp]
+            step.idle()
+            assert (pose.base_from_surface == recorded.base_from_surface).all() and pose.state is recorded.state
+
+
 def test_stopped_in_the_terminal_it_rests_goes_on_and_a_signal_ends_it_for_another_run_to_resume(
     start: Start, cache: Path, tmp_path: Path
 ) -> None:
@@ -117,6 +131,7 @@ def test_stopped_in_the_terminal_it_rests_goes_on_and_a_signal_ends_it_for_anoth
         wire = b"".join(base64.b64decode(str(m["data"])) for m in messages(file, "/arm/sent"))
         moves = [tick.frame for tick in ticks if tick.frame[1:2] == b"1"]
         assert np.mean([move in wire for move in moves]) > 0.95
+    retracked_alike(record, 20)
 
 
 @pytest.mark.parametrize("name", ["motion", "tracking", "recorder"])

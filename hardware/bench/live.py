@@ -32,12 +32,14 @@ SCENARIO = Path("data/live/calm.toml")
 STOP_EVERY = 8.0  # s between stops of the run that is stopped again and again
 WEIGH_EVERY = 2.0  # s between looks at the memory
 SETTLED = 0.3  # share of a run after which its memory counts: key frames are full then
+HOMING = "\nhoming\n"  # what a run says once its path is printed
+KILLED = 90.0  # s of a path that is printed by runs which are killed after some seconds each
 STOP = "stop decided to on the wire"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """How long, how many, before what."""
-    parser.add_argument("--minutes", type=float, default=1.0, metavar="M", help="of printing; default 1")
+    parser.add_argument("--minutes", type=float, default=1.0, metavar="M", help="of printing; 0: none; default 1")
     parser.add_argument("--stops", type=int, default=3, metavar="N", help="in a run of their own; default 3")
     parser.add_argument("--kills", type=int, default=0, metavar="N", help="of random processes; default none")
     parser.add_argument("--seed", type=int, default=0, help="of what is killed when")
@@ -48,14 +50,17 @@ def run(options: argparse.Namespace) -> list[Figure]:
     """The figures of all runs that were asked for."""
     rendered = prerender(options.scenario, cache_folder())
     with tempfile.TemporaryDirectory(prefix="stillbed-live-") as name:
-        folder = Path(name)
+        folder, figures = Path(name), list[Figure]()
         long = folder / "long.csv"
-        write_path(long, to_and_fro(read_path(rendered.path), 60 * options.minutes))
-        figures = _printing(options, folder, long, rendered.arm)
+        write_path(long, to_and_fro(read_path(rendered.path), 60 * (options.minutes or 1.0)))
+        if options.minutes:
+            figures = _printing(options, folder, long, rendered.arm)
         if options.stops:
             figures += _stopping(options, folder, long)
         if options.kills:
-            figures += kill_figures(options.scenario, folder, rendered.path, options.kills, options.seed)
+            killed = folder / "killed.csv"
+            write_path(killed, to_and_fro(read_path(rendered.path), KILLED))
+            figures += kill_figures(options.scenario, folder, killed, options.kills, options.seed)
     return figures
 
 
@@ -85,7 +90,7 @@ def _printing(options: argparse.Namespace, folder: Path, path: Path, arm: Path) 
     load = []
     try:
         begun = run.wait_for("\nprint\n")
-        while begun >= 0 and run.process.poll() is None:
+        while begun >= 0 and run.process.poll() is None and run.said.find(HOMING, begun) < 0:
             run.weigh()
             load.append(os.getloadavg()[0])
             clock.wait_until(clock.now() + WEIGH_EVERY)
