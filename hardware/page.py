@@ -49,6 +49,11 @@ def line_key(style: str, words: str) -> str:
     return f'<span><svg viewBox="0 0 18 10"><path class="{style}" d="M0 5H18"/></svg>{escape(words)}</span>'
 
 
+def dot_key(style: str, words: str) -> str:
+    """An entry of a legend: a dot in a CSS class, and what it is."""
+    return f'<span><svg viewBox="0 0 18 10"><circle class="{style}" cx="9" cy="5" r="4"/></svg>{escape(words)}</span>'
+
+
 def area_key(style: str, words: str) -> str:
     """An entry of a legend: a patch in a CSS class, and what it is."""
     patch = f'<svg viewBox="0 0 18 10"><rect class="{style}" width="18" height="10" rx="2"/></svg>'

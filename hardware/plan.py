@@ -221,7 +221,7 @@ def _pictures(
             (folder / name).write_text(drawn[-1], encoding="utf-8")
             progress(i + 1, len(layers))
     repairs = [] if subject.repairs is None else subject.repairs.rows()
-    findings = [*findings_rows(plan), ("feasible", arm)]
+    findings = [*findings_rows(plan), ("what an arm can print", arm)]
     story = Story(subject.name, findings, repairs, request.wishes.rows(), notes_of(plan))
     _whole(report, lambda file: file.write_text(page_text(plan, layers, total, story, drawn), encoding="utf-8"))
     return [f"{folder.name}/ ({len(drawn)} pictures)", report.name]

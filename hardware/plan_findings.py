@@ -9,7 +9,7 @@ import numpy as np
 from planning.layers.plan import Plan, PlannedLayer
 
 ASLANT_DEG = 35.0  # off the normal: a bead is then pushed aside by a fifth of its width, as the tip is no point
-NOT_ASKED = "no arm was asked, so there is no column `feasible`; --arm ARM.toml asks one, or stillbed reach later"
+NOT_ASKED = "no arm was asked, so there is no column feasible; --arm ARM.toml asks one, stillbed reach one later"
 
 
 def findings_rows(plan: Plan) -> list[tuple[str, str]]:

@@ -58,7 +58,17 @@ class Wishes:
 
     def rows(self) -> list[tuple[str, str]]:
         """Each setting and its value, as text."""
-        return [(f.name.replace("_", " "), str(getattr(self, f.name))) for f in fields(self)]
+        return [(f.name.replace("_", " "), self._text(f.name)) for f in fields(self)]
+
+    def _text(self, name: str) -> str:
+        value = getattr(self, name)
+        if value is None or value == ():
+            return UNSAID[name]
+        if isinstance(value, bool):
+            return "yes" if value else "no"
+        return (
+            "; ".join(value) if isinstance(value, tuple) else f"{value:g}" if isinstance(value, float) else str(value)
+        )
 
 
 def order_of(wishes: Wishes, flat: bool) -> Order:
@@ -78,6 +88,10 @@ def order_of(wishes: Wishes, flat: bool) -> Order:
     return Order(_tissues(w, flat), pattern, mode, way, not w.parallel, Passing(w.bump, w.bump_clearance))
 
 
+UNSAID = {
+    "tissues": "hypodermis=rest, dermis=1.6, epidermis=0.4", "layer_height": "as wide as a bead",
+    "bump": "half a layer", "bump_clearance": "half a bead",
+}  # fmt: skip
 RANGES = (
     ("layer_height", 0.02, 20), ("overlap_percent", 0, 90), ("speed", 0.1, FASTEST), ("travel", 0.1, FASTEST),
     ("temperature", COLDEST, HOTTEST), ("spacing", 0.05, 50), ("chord", 0.001, 1), ("lift", 0, 50), ("wait", 0, 3600),

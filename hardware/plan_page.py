@@ -46,7 +46,7 @@ CONTROLS = """<canvas id="plan-canvas" role="img" aria-label="the beads in three
 <label><input id="plan-bed" type="checkbox" checked> wound bed</label>
 <label><input id="plan-skin" type="checkbox"> restored skin</label>
 <label><input id="plan-tool" type="checkbox" checked> tool</label></div><div id="plan-words"></div>"""
-CHOOSER = """<div class="plan-bar"><input id="layer-at" type="range" min="1" max="{count}" value="1"
+CHOOSER = """<div class="plan-bar"><input id="layer-at" type="range" min="1" max="{count}" value="{count}"
  aria-label="layer"><span id="layer-words"></span></div>{pictures}
 <script>(function () {{
   const pictures = document.querySelectorAll(".layer-picture"), at = document.getElementById("layer-at");

@@ -8,12 +8,12 @@ import numpy as np
 
 from estimation.se3 import Array
 from hardware.chart import Plot, spanning
-from hardware.page import document, figures_table, legend, line_key, section
+from hardware.page import document, dot_key, figures_table, legend, line_key, section
 from planning.path import Path
 from planning.reach import REASONS, Reach
 
 WIDTH = 900  # px
-GOOD, BAD = "estimate", "off"  # classes of report.css
+GOOD, BAD, WAY = "estimate", "off", "aside"  # classes of report.css
 
 
 def reach_page(path_name: str, arm: str, text: str, path: Path, found: Reach) -> str:
@@ -36,10 +36,10 @@ def _above(path: Path, found: Reach) -> str:
     half = max(float(np.ptp(places, axis=0).max()) / 2, 1.0) * 1.08
     box = [(float(m - half), float(m + half)) for m in middle]
     plot = Plot(WIDTH, WIDTH * 2 // 3, (box[0][0] - half / 2, box[0][1] + half / 2), box[1], label="y, mm")
-    plot.line(places[:, 0], places[:, 1], "truth")
-    for style, rows in ((GOOD, found.feasible), (BAD, ~found.feasible)):
-        plot.dots(places[rows, 0], places[rows, 1], style, 2.4)
-    keys = [line_key(GOOD, "can be printed"), line_key(BAD, "cannot"), line_key("truth", "path")]
+    plot.line(places[:, 0], places[:, 1], WAY)
+    for style, rows, radius in ((GOOD, found.feasible, 1.6), (BAD, ~found.feasible, 4.0)):
+        plot.dots(places[rows, 0], places[rows, 1], style, radius)
+    keys = [dot_key(GOOD, "can be printed"), dot_key(BAD, "cannot"), line_key(WAY, "path")]
     return legend(keys) + plot.svg()
 
 

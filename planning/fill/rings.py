@@ -108,9 +108,20 @@ def _gaps(left: Region, middle: Region, single: list[Bead], spacing: float) -> N
     beyond = HAIR * spacing * reached.length  # by so much its area is larger than the beads' own (Steiner's formula)
     if left.area - reached.area + beyond < SMALLEST * spacing**2:
         return np.empty(0, object)
-    gaps = minus(left, reached)
-    gaps = shapely.get_parts(minus(gaps, covered_by(single, ARC)) if single else gaps)
-    return np.asarray(gaps[shapely.area(gaps) > SMALLEST * spacing**2])
+    gaps = _large(minus(left, reached), spacing)
+    if not single or not len(gaps):
+        return gaps
+    lines = np.array([shapely.linestrings(bead.points) for bead in single], dtype=object)
+    reach = np.array([bead.width.max() / 2 for bead in single])
+    far = shapely.distance(lines[:, None], gaps[None])  # to gaps (S, G)
+    own = [bead for bead, near in zip(single, far.min(axis=1) < reach, strict=True) if near]
+    return _large(minus(shapely.multipolygons(gaps), covered_by(own, ARC)), spacing) if own else gaps
+
+
+def _large(gaps: BaseGeometry, spacing: float) -> NDArray[np.object_]:
+    """The parts of gaps that are worth filling."""
+    parts = shapely.get_parts(gaps)
+    return np.asarray(parts[shapely.area(parts) > SMALLEST * spacing**2])
 
 
 def dots(gaps: NDArray[np.object_], fit: Fit) -> list[Bead]:

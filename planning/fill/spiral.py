@@ -117,7 +117,8 @@ def _outwards(nest: list[Bead], wanted: Array, spacing: float) -> list[float]:
 
 def _begun(nest: list[Bead], arcs: list[float]) -> list[Bead]:
     """The lines begun at these lengths, all in the sense of the first."""
-    sense = [shapely.is_ccw(shapely.linearrings(ring.points)) for ring in nest]
+    number = np.repeat(np.arange(len(nest)), [len(ring.points) for ring in nest])
+    sense = shapely.is_ccw(shapely.linearrings(np.concatenate([ring.points for ring in nest]), indices=number))
     found = [ring.turned(arc) for ring, arc in zip(nest, arcs, strict=True)]
     return [ring if way == sense[0] else ring.reversed for ring, way in zip(found, sense, strict=True)]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from scipy.ndimage import label, maximum
+from scipy.ndimage import label
 from shapely import MultiPolygon
 
 from estimation.scan import Index
@@ -104,13 +104,17 @@ def _bumps(raised: Mask, inside: Mask, rise: Array, limit: float) -> tuple[Mask,
     pieces, count = labelled
     walls = np.zeros(count + 1, bool)
     walls[pieces[~inside]] = True
-    peaks = np.asarray(maximum(rise, pieces, np.arange(1, count + 1)))
-    chosen = np.flatnonzero((peaks <= limit) & ~walls[1:])
-    return np.isin(pieces, chosen + 1), peaks[chosen]
+    peaks = np.full(count + 1, -np.inf)
+    np.maximum.at(peaks, pieces.ravel(), rise.ravel())
+    chosen = (peaks <= limit) & ~walls
+    chosen[0] = False  # what is not raised
+    return chosen[pieces], peaks[chosen]
 
 
 def _shapes(grid: Grid, own: Mask, values: Array, slack: float) -> MultiPolygon:
     """Where values (H, W) are positive at the nodes `own` and beside them."""
     if not own.any():
         return MultiPolygon()
-    return region(grid, np.where(own | (values <= 0), values, -np.abs(values)), 0.0, slack)
+    found = region(grid, np.where(own | (values <= 0), values, -np.abs(values)), 0.0, slack)
+    shapely.prepare(found)
+    return found
