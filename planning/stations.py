@@ -38,7 +38,7 @@ class Stations:
 
 
 def stations_on(curve: Curve, start: float, end: float) -> Stations:
-    """Grid points from `start` to `end`, mm: evenly spread, and where there is room bounds and middle of each blend."""
+    """Grid points from `start` to `end`, mm: evenly spread, and where there is room the ends of each blend."""
     places = _places(curve, start, end)
     first, last = curve.stretch(places[:-1]), curve.stretch(np.nextafter(places[1:], 0.0))
     before = np.searchsorted(curve.knots + curve.half, places[:-1], "right")  # the first blend not yet passed
@@ -66,7 +66,7 @@ def _places(curve: Curve, start: float, end: float) -> Array:
     if inside.sum() > POINTS // 3:
         return even
     knots, half = curve.knots[inside], curve.half[inside]
-    points = np.concatenate([even, knots - half, knots, knots + half])
+    points = np.concatenate([even, knots - half, knots + half])
     points = np.unique(points[(points >= start) & (points <= end)])
     points = points[np.concatenate([[True], np.diff(points) > 1e-6])]
     points[-1] = end
