@@ -15,6 +15,7 @@ from hardware.simulator.lag import lag_of
 from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.scenario_file import read_scenario
 from hardware.simulator.world import REST
+from planning.command import HASTE
 from planning.progress import Phase
 from tests.worlds import HEADER, IDEAL, Heard, errors, heard, inner, world_of, write_path, write_scenario
 
@@ -29,6 +30,9 @@ def difference(log: NozzleLog) -> Array:
     return np.asarray((log.base_from_nozzle - log.base_from_target)[:, :3, 3])
 
 
+EARLY = (1 - HASTE) * 0.02  # s by which a move ends before the next begins, and the nozzle is ahead
+
+
 # -- the measuring is right
 
 
@@ -41,11 +45,12 @@ def test_with_a_perfect_tracker_no_delay_and_an_ideal_arm_every_printed_row_is_w
     log = heard(file).log
     assert log.extrude.sum() > 900
     assert errors(file, log).distance[log.extrude].max() < 0.005
-    assert np.rad2deg(errors(file, log).angle[log.extrude].max()) < 0.001
+    turning = np.linalg.norm([4.0, -3.0, 5.0]) if motion == [TURNING] else 0.0  # deg/s
+    assert np.rad2deg(errors(file, log).angle[log.extrude].max()) < 0.001 + EARLY * turning
 
 
 @pytest.mark.parametrize("motion", [[], [STEADY], [TURNING]], ids=["still", "moving", "turning"])
-def test_at_printing_speed_even_starting_and_stopping_cost_no_more_than_6_um(
+def test_at_printing_speed_even_starting_and_stopping_cost_no_more_than_8_um(
     motion: list[object], tmp_path: Path
 ) -> None:
     file = write_scenario(tmp_path, IDEAL, motion=motion, seconds=3.0)
@@ -53,7 +58,7 @@ def test_at_printing_speed_even_starting_and_stopping_cost_no_more_than_6_um(
     distance = errors(file, log).distance
     assert inner(log).sum() > 1000
     assert distance[inner(log)].max() < 0.005
-    assert distance[log.extrude].max() < 0.006
+    assert distance[log.extrude].max() < 0.008
 
 
 def late_arm(arm: dict[str, object], **more: object) -> dict[str, object]:
@@ -80,7 +85,8 @@ def test_a_delay_that_the_motion_does_not_know_costs_speed_times_delay(
     velocity = BASE_FROM_REST[:3, :3] @ (VELOCITY + [SPEED, 0, 0])  # the surface's and, on it, the path's own
     off = difference(log)[inner(log)]
     assert len(off) > 800
-    assert np.linalg.norm(off + velocity * delay, axis=1).max() < 0.01 * np.linalg.norm(velocity) * abs(delay)
+    slack = 0.01 * abs(delay) + EARLY
+    assert np.linalg.norm(off + velocity * delay, axis=1).max() < slack * np.linalg.norm(velocity)
 
 
 @pytest.mark.parametrize(
@@ -106,7 +112,8 @@ def test_a_hidden_clock_offset_costs_the_speed_of_the_surface_alone(offset: floa
     log = heard(file).log
     wanted = BASE_FROM_REST[:3, :3] @ VELOCITY * offset  # what is stamped t was seen at t + offset
     off = difference(log)[inner(log)]
-    assert np.linalg.norm(off - wanted, axis=1).max() < 0.01 * np.linalg.norm(wanted)
+    early = EARLY * np.linalg.norm(VELOCITY + [SPEED, 0, 0])
+    assert np.linalg.norm(off - wanted, axis=1).max() < 0.01 * np.linalg.norm(wanted) + early
 
 
 @pytest.mark.parametrize("planted", ["rig_offset_mm", "arm_offset_mm"])
@@ -115,7 +122,8 @@ def test_a_planted_offset_comes_out_as_that_offset(planted: str, motion: list[ob
     offset = [0.2, -0.1, 0.3]
     file = write_scenario(tmp_path, IDEAL, planted={planted: offset}, motion=motion, seconds=2.5)
     log = heard(file).log
-    assert np.abs(difference(log)[inner(log)] - offset).max() < 1e-3
+    early = EARLY * np.linalg.norm((VELOCITY if motion else np.zeros(3)) + [SPEED, 0, 0])
+    assert np.abs(difference(log)[inner(log)] - offset).max() < 1e-3 + early
 
 
 def test_the_lag_that_is_reported_is_the_one_that_was_planted(tmp_path: Path) -> None:
@@ -243,18 +251,26 @@ def with_faults(folder: Path, *faults: str) -> tuple[Heard, NozzleLog]:
     return sink, sink.log
 
 
-def test_an_arm_that_stalls_is_late_by_as_much_from_then_on(tmp_path: Path) -> None:
+def worked_off(since: Array) -> Array:
+    """By how much less late, s, an arm is some time after a fault, s: moves leave a fiftieth of each tick free."""
+    return np.asarray((1 / HASTE - 1) * since)
+
+
+def test_an_arm_that_stalls_is_late_by_as_much_and_works_it_off(tmp_path: Path) -> None:
     _, log = with_faults(tmp_path, "stall 300ms at 1s")
     distance = np.linalg.norm(difference(log), axis=1)
     steady = inner(log)
     assert distance[steady & (log.stamps < 1.0)].max() < 0.005
-    assert distance[steady & (log.stamps > 1.35)] == pytest.approx(0.3 * SPEED, rel=0.01)
+    after = steady & (log.stamps > 1.35)
+    assert distance[after] == pytest.approx((0.3 - worked_off(log.stamps[after] - 1.3)) * SPEED, rel=0.01)
 
 
 def test_a_slow_arm_falls_behind(tmp_path: Path) -> None:
     _, log = with_faults(tmp_path, "slow 50% at 1s for 0.4s")
     distance = np.linalg.norm(difference(log), axis=1)
-    assert distance[inner(log) & (log.stamps > 1.45)] == pytest.approx(0.2 * SPEED, rel=0.02)
+    after = inner(log) & (log.stamps > 1.45)
+    late = 0.4 - 0.5 * 0.4 / HASTE - worked_off(log.stamps[after] - 1.4)
+    assert distance[after] == pytest.approx(late * SPEED, rel=0.02)
 
 
 def test_a_lost_frame_is_an_error_for_a_moment(tmp_path: Path) -> None:
