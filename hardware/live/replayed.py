@@ -35,13 +35,6 @@ class Replayed:
     recorded: bytes
 
 
-def is_run(record: File) -> bool:
-    """Whether a file is the recording of a live run that began to print."""
-    if record.suffix != ".mcap" or not record.is_file():
-        return False
-    return any(isinstance(part, Attached) and part.name == PATH for part in walk(record))
-
-
 def replay_run(record: File) -> Iterator[Replayed]:
     """Every tick of a recorded run in which planner and guard were asked, decided anew from the recorded poses."""
     run = _read(record)
