@@ -140,6 +140,11 @@ class Device:
         self._lock = None
 
 
+def serial_ports() -> list[tuple[str, str]]:
+    """The serial ports that the system shows now, as (device, what it calls itself); none that leads nowhere."""
+    return [(port.device, port.description or "unnamed") for port in list_ports.comports() if port.hwid != "n/a"]
+
+
 Identity = tuple[int, int, str]  # vendor, product, serial number or place on the bus
 
 

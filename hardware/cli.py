@@ -16,6 +16,7 @@ from hardware.arm_commands import add_arm
 from hardware.bench.command import add_bench
 from hardware.calibration.commands import add_calibrate
 from hardware.cameras.command import add_cameras
+from hardware.doctor.command import add_doctor
 from hardware.live.command import add_init, add_live
 from hardware.methods import MAP, METHODS
 from hardware.plan_commands import add_plan
@@ -100,6 +101,7 @@ def parser() -> argparse.ArgumentParser:
     _add_export(commands)
     add_train(commands)
     add_bench(commands)
+    add_doctor(commands)
     return top
 
 

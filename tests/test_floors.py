@@ -30,6 +30,7 @@ OWNERS = {  # library: the files that may import it
     "onnx": ("perception/training/*.py",),
     "onnxruntime": ("perception/*.py",),
     "open3d": ("hardware/mesh_file.py",),
+    "packaging": ("hardware/doctor/libraries.py",),
     "pytest": ("estimation/synthetic/plugin.py",),
     "ruckig": ("planning/*.py",),
     "serial": ("hardware/*.py",),

@@ -28,6 +28,11 @@ FILE_FPS = 30.0  # Hz, where neither the container nor rig.toml tells a rate
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # an unplugged camera is told in our words
 
 
+def reads_videos() -> bool:
+    """Whether this OpenCV was built with FFmpeg, which reads recorded videos and streams."""
+    return bool(cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG))
+
+
 class Capture(Protocol):
     """An open camera. ends: whether it comes to an end, as a file does. clocked: `position` may be the machine's."""
 
