@@ -1,4 +1,4 @@
-"""Parts of a live run: stages, settings, what goes between processes, what is shown when, what is kept beside."""
+"""Parts of a live run: settings, what goes between processes, what is shown when, what is kept beside."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.trajectory import Trajectory
 from hardware.arm_profile import BENCH, ArmProfile
-from hardware.arm_status import ArmState, ArmStatus
 from hardware.bookmark_file import keep_bookmark, read_start
 from hardware.live.arrived import SourceEnded
 from hardware.live.beside import Beside, Found, read_found, write_found
-from hardware.live.conductor import Conductor, Seen, Task
+from hardware.live.conductor import Task
 from hardware.live.feed import schedule, turns
 from hardware.live.frame_ring import SLOTS, FrameRing, RingSource
 from hardware.live.kept import kept_begin
@@ -31,173 +30,16 @@ from hardware.live.prepared import prepare, prepare_again
 from hardware.live.records import (
     Begin,
     EventEntry,
-    LiveMotionReport,
-    Pace,
-    RecorderReport,
     SetEntry,
-    TrackingReport,
 )
 from hardware.live.settings import LiveSettings, check_settings, overridden, read_settings, settings_text
-from hardware.motion_loop import Order, Tick
-from hardware.operator.request import Request, Wish
-from hardware.operator.view import Stage
 from hardware.path_file import write_path
 from perception.frames import Frame, FrameSet
-from planning.command import Hold
-from planning.progress import Phase, Progress, fingerprint
+from planning.progress import fingerprint
 from tests.moving import raster
 
 PROFILE = ArmProfile()
 SURFACE = SurfacePose(0.0, BENCH, np.eye(6) * 1e-6, np.zeros(6), TrackState.TRACKING)
-
-
-# -- stages
-
-
-class Staged:
-    """A conductor with the reports that it is given; time goes on by `look`."""
-
-    def __init__(self, **task: object) -> None:
-        self.conductor = Conductor(Task(raster(), PROFILE, stands_home=True, **task))  # type: ignore[arg-type]
-        self.now, self.arm = 0.0, ArmState.DISARMED
-        self.phase: Phase | None = None
-        self.seen, self.pose = Seen(recorder=RecorderReport(0.0, 0, 0.0, "")), SURFACE
-        self.ended, self.asked = "", 0
-        self.orders: list[object] = []
-
-    def look(self, *wishes: Wish, seconds: float = 0.1) -> Stage:
-        self.now += seconds
-        asked = []
-        for wish in wishes:
-            self.asked += 1
-            asked.append(Request(self.asked, wish, self.conductor.turn))
-        pose = replace(self.pose, stamp=self.now)
-        self.seen.tracking = TrackingReport(
-            self.now, ("a", "b"), (0, 1), pose, np.eye(4), 0.0, 5, ended=self.ended, used=(50, 50)
-        )
-        nan = float("nan")
-        status = ArmStatus(self.now, self.arm, "why", PROFILE.arm.home, None, 0.0, nan, nan, 0.0, 0, 0, 0, 0)
-        tick = Tick(self.now, Hold(self.now, 0.001, "x"), b"", 0.0, status, "")
-        progress = None if self.phase is None else Progress(self.phase, 1, 6, 1.0, 9.0, 1.0)
-        self.seen.motion = LiveMotionReport(tick, progress, False, (), (), 0, 0, None, 0, "ordinary")
-        self.orders += self.conductor(self.now, self.seen, asked)
-        return self.conductor.stage
-
-    def to_print(self) -> None:
-        """Lead it to where it prints."""
-        self.look(seconds=0.0)
-        self.look()
-        self.look(Wish.CONFIRM)
-        self.look(Wish.START)
-        self.arm = ArmState.ARMED
-        self.look()
-        self.arm = ArmState.DISARMED
-        self.look()
-        self.arm, self.phase = ArmState.ARMED, Phase.PRINTING
-        self.look()
-        assert self.look() is Stage.PRINT
-
-
-def test_stages_follow_each_other_and_the_arm_is_armed_only_after_it_went_home() -> None:
-    run = Staged()
-    run.to_print()
-    kinds = [order if isinstance(order, Order | Pace) else "begin" for order in run.orders]
-    assert kinds == [Order.AT_HOME, Order.HOME, "begin", Pace.RESUME, Order.ARM]
-    run.phase = Phase.FINISHED
-    assert run.look() is Stage.HOMING
-    run.look()
-    run.arm = ArmState.DISARMED
-    assert run.look() is Stage.DONE and run.conductor.done
-
-
-def test_nothing_moves_before_it_was_confirmed_and_started() -> None:
-    run = Staged()
-    for _ in range(50):
-        assert run.look() in (Stage.CHECK, Stage.FIND, Stage.CONFIRM)
-    run.look(Wish.START, Wish.RESUME, Wish.HOME)
-    assert not run.orders
-    run.look(Wish.CONFIRM)
-    assert not run.orders and run.conductor.stage is Stage.READY
-
-
-@pytest.mark.parametrize("stage", [Stage.CHECK, Stage.CONFIRM, Stage.PRINT, Stage.PAUSED, Stage.HOMING])
-def test_a_stop_is_always_ordered_whatever_the_window_showed(stage: Stage) -> None:
-    run = Staged()
-    run.to_print()
-    run.conductor.stage = stage
-    orders = run.conductor(run.now, run.seen, [Request(1, Wish.STOP, -7)])
-    assert orders[0] is Order.STOP
-
-
-def test_a_wish_from_before_a_stop_lets_nothing_go_on() -> None:
-    run = Staged()
-    run.to_print()
-    turn = run.conductor.turn
-    run.arm = ArmState.STOPPED
-    run.look(Wish.STOP)
-    run.orders.clear()
-    run.conductor(run.now, run.seen, [Request(9, Wish.RESUME, turn)])
-    assert run.conductor.stage is Stage.STOPPED and not run.orders
-    assert run.conductor.answer is not None and not run.conductor.answer.followed
-
-
-def test_an_arm_that_stops_by_itself_is_not_armed_again_unasked() -> None:
-    run = Staged()
-    run.to_print()
-    run.orders.clear()
-    run.arm = ArmState.STOPPED
-    for _ in range(100):
-        assert run.look() is Stage.STOPPED
-    assert not run.orders and run.conductor.reason == "why"
-    run.look(Wish.RESUME)
-    assert run.orders == [Pace.RESUME, Order.ARM]
-
-
-def test_what_goes_on_by_itself_ends_where_nobody_is_there_to_resume() -> None:
-    run = Staged(unattended=True)
-    for _ in range(4):
-        run.look()
-    run.arm = ArmState.ARMED
-    run.look()
-    run.arm = ArmState.DISARMED
-    run.look()
-    run.arm, run.phase = ArmState.ARMED, Phase.PRINTING
-    run.look()
-    run.arm = ArmState.STOPPED
-    run.look()
-    run.look()
-    assert run.conductor.ended == "stopped: why" and run.orders[-1] is Order.STOP
-
-
-@pytest.mark.parametrize(
-    ("fault", "words"), [("cameras", "no more"), ("arm", "unplugged"), ("recorder", "disk"), ("age", "no pictures")]
-)
-def test_what_ends_a_run_stops_the_arm_and_says_so(fault: str, words: str) -> None:
-    run = Staged(patience=2.0)
-    run.to_print()
-    if fault == "cameras":
-        run.ended = "no more"
-    elif fault == "arm":
-        run.arm = ArmState.UNPLUGGED
-    elif fault == "recorder":
-        run.seen.recorder = RecorderReport(0.0, 0, 0.0, "the disk is full")
-    else:
-        assert run.seen.tracking is not None
-        run.conductor(run.now + 2.1, run.seen, [])
-        run.look(seconds=0.0)
-    run.look()
-    assert words in run.conductor.ended and run.conductor.stage is Stage.FAILED
-    if fault != "age":
-        assert run.orders[-1] is Order.STOP
-
-
-def test_a_path_out_of_reach_is_told_and_not_begun() -> None:
-    run = Staged(unattended=True)
-    run.pose = replace(SURFACE, base_from_surface=se3.make(np.eye(3), np.array([900.0, 0, 0])))
-    for _ in range(4):
-        run.look()
-    assert "out of reach: checkpoint 0: X" in run.conductor.ended
-    assert run.orders == [Order.STOP]
 
 
 def test_a_dry_run_extrudes_nothing_and_stays_above_along_the_tool() -> None:

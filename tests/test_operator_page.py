@@ -124,16 +124,31 @@ def test_the_space_bar_stops_whatever_is_focused_and_presses_nothing_else(run: R
     assert run.served.link.requests.take() == []
 
 
-def test_a_question_whether_one_is_sure_is_dropped_when_the_run_has_changed(run: Run) -> None:
+def test_a_question_whether_one_is_sure_is_dropped_in_words_when_the_run_has_changed(run: Run) -> None:
     page = run.open()
     page.click('[data-wish="home"]')
     page.until('!document.getElementById("sure").hidden')
     run.show(stage=Stage.STOPPED)
     page.until('document.getElementById("sure").hidden')
+    assert page.text("#toast") == "Home was not asked: the run has changed meanwhile."
     page.click('[data-wish="end"]')
     page.click("#sure-no")
     page.until('document.getElementById("sure").hidden')
     assert run.served.link.requests.take() == []
+
+
+def test_the_end_of_a_run_that_changes_meanwhile_is_still_asked_for(run: Run) -> None:
+    page = run.open()
+    page.click('[data-wish="end"]')
+    page.until('!document.getElementById("sure").hidden')
+    view = run.show(stage=Stage.APPROACH)
+    page.click("#sure-yes")
+    (request,) = run.served.taken()
+    assert request.wish is Wish.END and request.turn < view.turn
+    page.click('[data-wish="end"]')
+    page.until('!document.getElementById("sure").hidden')
+    run.show(stage=Stage.DONE, offers=())
+    page.until('document.getElementById("sure").hidden')
 
 
 def test_a_button_that_has_just_come_to_mean_something_else_is_not_pressed_by_a_second_tap(run: Run) -> None:

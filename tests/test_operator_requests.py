@@ -74,8 +74,8 @@ def test_a_page_that_is_killed_while_it_asks_leaves_a_line_that_still_works() ->
 
 
 @pytest.mark.parametrize("wish", list(Wish))
-def test_a_window_that_shows_what_is_no_longer_so_may_only_stop_and_pause(wish: Wish) -> None:
-    assert (refusal(wish, 3, list(Wish), 4) == "") == (wish in (Wish.STOP, Wish.PAUSE))
+def test_a_window_that_shows_what_is_no_longer_so_may_only_stop_pause_and_end(wish: Wish) -> None:
+    assert (refusal(wish, 3, list(Wish), 4) == "") == (wish in (Wish.STOP, Wish.PAUSE, Wish.END))
     assert refusal(wish, 4, list(Wish), 4) == ""
 
 

@@ -28,6 +28,8 @@ Orders = list[Order | Pace | Begin]
 HOME_PATIENCE, ARM_PATIENCE = 60.0, 5.0  # s: across the whole room at 20 mm/s; until a stopped arm is at rest
 ASK_AGAIN = 0.3  # s between orders to an arm that was not ready for the last one
 LONGEST_LAG = 0.3  # s: a lag measured beyond this is no servo's
+BACK = "the arm is back: resume, or go home first"
+BACK_SOMEWHERE = "the arm is back and does not say where it stands: move it to its home by hand, then ask for Home"
 SOUGHT = 180.0  # s in which all must be found, or nobody looks any longer where nobody watches
 
 
@@ -36,8 +38,8 @@ class Task:
     """What is to be printed, and how. path: in its own frame; start: counted in checkpoints, where it goes on.
 
     place: put the arm where the surface lies below its home. stands_home: the operator says that the arm does.
-    lift: mm, of a dry run; None for a real one. unattended: nobody confirms and nobody resumes. patience: s, without
-    pictures or without an arm, after which the run ends.
+    lift: mm, of a dry run; None for a real one. unattended: nobody confirms and nobody resumes: what stops such a run
+    ends it. patience: s, without pictures, after which the arm is stopped.
     """
 
     path: Path
@@ -81,6 +83,9 @@ class Conductor:
     _asked: float = field(default=float("-inf"))
     _failing: float = field(default=float("inf"))  # s, since when a check has failed
     _begun: bool = False
+    _told: bool = False  # where it stands: by the operator, who looks at it when it goes home
+    _away: bool = False  # unplugged
+    _answers: bool = False
     _homed: bool = False
     _armed: bool = False  # since it was last asked for
     _after: Stage = Stage.APPROACH  # the stage that homing leads to
@@ -102,13 +107,13 @@ class Conductor:
             orders += self._go_on(seen, now)
         return orders
 
-    def end(self, reason: str, now: float, done: bool = False) -> Orders:
-        """End the run; the arm is stopped where it may still move."""
+    def end(self, reason: str, now: float, stage: Stage = Stage.FAILED) -> Orders:
+        """End the run; the arm is stopped where it may still move. stage: DONE, ENDED or FAILED."""
         if self.ended:
             return []
-        self.ended, self.done = reason, done
-        self._to(Stage.DONE if done else Stage.FAILED, reason, now)
-        return [] if done else [Order.STOP]
+        self.ended, self.done = reason, stage is Stage.DONE
+        self._to(stage, reason, now)
+        return [] if self.done else [Order.STOP]
 
     def pause(self, reason: str, now: float) -> Orders:
         """Have the nozzle brake and wait."""
@@ -128,7 +133,7 @@ class Conductor:
                 self._to(Stage.STOPPED, "by the operator", now)
             return [Order.STOP]
         if wish is Wish.END:
-            return self.end("ended by the operator", now)
+            return self.end("ended by the operator", now, Stage.ENDED)
         if wish is Wish.CONFIRM:
             self._to(Stage.READY, "", now)
         elif wish is Wish.AGAIN:
@@ -150,7 +155,8 @@ class Conductor:
     def _home(self, after: Stage, now: float) -> Orders:
         self._after, self._homed, self._asked = after, False, now
         self._to(Stage.HOMING, "", now)
-        return [*([Order.AT_HOME] if self.task.stands_home and not self._begun else []), Order.HOME]
+        said, self._told = self.task.stands_home and not self._told, True
+        return [*([Order.AT_HOME] if said else []), Order.HOME]
 
     # -- what happens
 
@@ -173,6 +179,7 @@ class Conductor:
             return []
         if self.stage in (Stage.FIND, Stage.CONFIRM, Stage.READY):
             return self._finding(tracking, now)
+        self._answers |= motion.tick.status.answers > 0
         if self.stage in RUNNING:
             if orders := self._faults(tracking, motion, now):
                 return orders
@@ -181,6 +188,7 @@ class Conductor:
             return self._printing(motion, now)
         if self.stage is Stage.STOPPED and self.task.unattended:
             return self.end(f"stopped: {self.reason}", now)
+        self._came_back(motion, now)
         return []
 
     def _checking(self, now: float) -> Orders:
@@ -215,9 +223,10 @@ class Conductor:
     def _faults(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
         status = motion.tick.status
         if status.state is ArmState.UNPLUGGED:
-            return self.end(f"the arm is unplugged: {status.reason}", now)
+            self._away = True
+            return self._stop(f"the arm is unplugged: {status.reason}: plug it in", now)
         if tracking.pose is not None and (age := now - tracking.pose.stamp) > self.task.patience:
-            return self.end(f"no pictures for {age:.1f} s", now)
+            return self._stop(f"no pictures for {age:.1f} s", now)
         if status.state is ArmState.ARMED:
             self._armed = True
         elif status.state is ArmState.STOPPED and self._armed and self.stage is not Stage.HOMING:
@@ -229,6 +238,8 @@ class Conductor:
         status = motion.tick.status
         if status.state is ArmState.ARMED:
             self._homed = True
+        elif self._homed and status.state is ArmState.STOPPED:
+            return self._stop(status.reason, now)
         if not self._homed or status.state is ArmState.ARMED:
             if now - self._since > HOME_PATIENCE:
                 return self.end(f"the arm did not come home: {motion.tick.answer or status.reason}", now)
@@ -237,7 +248,7 @@ class Conductor:
                 return [Order.HOME]
             return []
         if self._after is Stage.DONE:
-            return self.end("the path is printed", now, done=True)
+            return self.end("the path is printed", now, Stage.DONE)
         self._to(self._after, "at home", now)
         if self._after is Stage.STOPPED:
             return []
@@ -279,6 +290,19 @@ class Conductor:
             return []
         self._asked = now
         return [Order.ARM]
+
+    def _stop(self, reason: str, now: float) -> Orders:
+        """The arm stops and waits for the operator."""
+        self._to(Stage.STOPPED, reason, now)
+        return [Order.STOP]
+
+    def _came_back(self, motion: LiveMotionReport, now: float) -> None:
+        """Say so once an arm that was unplugged is there again, and what is then asked of the operator."""
+        status = motion.tick.status
+        if self._away and status.state is not ArmState.UNPLUGGED:
+            self._away = False
+            self._told = self._answers
+            self._to(Stage.STOPPED, BACK if self._answers else BACK_SOMEWHERE, now)
 
     def _to(self, stage: Stage, reason: str, now: float) -> None:
         if (stage, reason) != (self.stage, self.reason):

@@ -53,14 +53,14 @@ class Crew:
         return [member.sentinel for member in self.members.values() if member.is_alive()]
 
     def end(self, name: str, patience: float = LAST_WORDS) -> None:
-        """Ask a process to end, wait, and then end it, with all that it has started."""
+        """Wait `patience` s for a process to end, ask it to, and then end it, with all that it has started."""
         member = self.members.get(name)
         if member is None:
             return
         member.join(0 if not member.is_alive() else patience)
         if member.is_alive():
             member.terminate()
-            member.join(patience)
+            member.join(LAST_WORDS)
         self.kill(name)
 
     def kill(self, name: str) -> None:

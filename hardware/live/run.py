@@ -86,6 +86,7 @@ class LiveRun:
             while not self._conductor.ended:
                 self._look(wake, keeper)
             self._come_to_rest(wake)
+            self._say_farewell()
             self._shut_down()
         from hardware.live.outcome import Outcome  # loads what reports need, once the arm is at rest
 
@@ -129,7 +130,7 @@ class LiveRun:
         """What ends a run from outside the stages: a signal, a process that is gone or hangs, a bookmark not kept."""
         conductor, crew = self._conductor, self._lines.crew
         if self._signal:
-            return conductor.end(f"ended: {ENDED_BY[signal.Signals(self._signal)]}", now)
+            return conductor.end(f"ended: {ENDED_BY[signal.Signals(self._signal)]}", now, Stage.ENDED)
         for name in crew.dead():
             if name == MOTION and (trouble := self._lines.trouble.get()):
                 return conductor.end(trouble, now)
@@ -262,6 +263,14 @@ class LiveRun:
             if status.state is not ArmState.ARMED and not status.in_flight > 0 and status.stamp > now - 2 * LOOK:
                 return
             wait([wake, *self._lines.crew.sentinels()], LOOK / 4)
+
+    def _say_farewell(self) -> None:
+        """Show on the page how the run ended; then it goes, so that nothing looks as if it could be asked."""
+        if self._page is None:
+            return
+        now = self._clock.now()
+        self._lines.link.views.put(self._viewer(now, self._conductor, self._seen, self._tally))
+        self._page.close()
 
     def _shut_down(self) -> None:
         lines = self._lines

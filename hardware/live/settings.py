@@ -27,8 +27,8 @@ class LiveSettings:
     a scenario, its own. arm: device, URL of pyserial's or "virtual". profile: arm file. record: the recording.
     jpeg_quality: of pictures that come unencoded; 0 keeps them exactly. dry_run: nothing is extruded, the
     nozzle `lift` mm higher. unattended: nobody confirms. stands_home: the operator says that the arm does. pause_frame:
-    the arm knows the frame that stops it. page: serve the operator's page. patience: s without pictures that end the
-    run. real_time: ask for that priority. cores_*: to run on, all without any.
+    the arm knows the frame that stops it. page: serve the operator's page. patience: s without pictures that stop
+    the arm. real_time: ask for that priority. cores_*: to run on, all without any.
     """
 
     rig: Path | None = None
@@ -69,7 +69,7 @@ KEYS = (
     Key(
         "cameras", "simulated", "simulated", "a scenario instead, rendered once and then shown in real time", '"x.toml"'
     ),
-    Key("cameras", "patience_s", "patience", "without pictures, after which the run ends; 1 to 600", "10.0"),
+    Key("cameras", "patience_s", "patience", "without pictures, after which the arm is stopped; 1 to 600", "10.0"),
     Key("print", "path", "path", "checkpoints on the surface; a scenario has its own", '"path.csv"'),
     Key("print", "dry_run", "dry_run", "nothing is extruded, and the nozzle stays above", "false"),
     Key("print", "lift_mm", "lift", "how far above, in a dry run; 0 to 100", "10.0"),

@@ -28,5 +28,6 @@ QUESTIONS = {
     Stage.STOPPED: "Stopped: resume, go home, or end",
     Stage.HOMING: "The arm goes home",
     Stage.DONE: "The path is printed",
-    Stage.FAILED: "The run has ended",
+    Stage.ENDED: "The run was ended; what is left can be resumed",
+    Stage.FAILED: "The run cannot go on; what is left can be resumed",
 }

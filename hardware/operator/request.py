@@ -29,7 +29,7 @@ class Wish(StrEnum):
     END = "end"  # end the run, and write its report
 
 
-ALWAYS = frozenset({Wish.STOP, Wish.PAUSE})  # lead towards rest: right whatever the asking window showed
+ALWAYS = frozenset({Wish.STOP, Wish.PAUSE, Wish.END})  # lead towards rest: right whatever the asking window showed
 
 SLOTS = 16  # requests that wait; the run takes them every few ms and a hand gives a few in a second
 _RECORD = struct.Struct("=QQBI")  # number, turn, wish, check sum
@@ -50,7 +50,7 @@ def refusal(wish: Wish, turn: int, offers: Collection[Wish], present: int) -> st
     """Why a wish cannot be followed, "" if it can.
 
     turn: of the view it was asked under; present: of the newest view, which `offers` wishes. A window that shows an
-    older turn may stop or pause, and nothing else: it cannot let a run go on that another window has stopped since.
+    older turn may stop, pause or end, and nothing else: it cannot let a run go on that another window has stopped.
     """
     if wish is Wish.STOP:
         return ""

@@ -28,6 +28,7 @@ class Stage(StrEnum):
     STOPPED = "stopped"  # by the operator or by a fault; nothing is sent to the arm
     HOMING = "homing"  # the arm goes home
     DONE = "done"  # the path is printed
+    ENDED = "ended"  # somebody ended the run; the arm is at rest
     FAILED = "failed"  # the run cannot go on; the arm is at rest
 
 

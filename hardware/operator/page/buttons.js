@@ -93,7 +93,10 @@ export class Buttons {
     }
     const again = this.bar.querySelector("[data-wish=again]");
     again.textContent = (view && AGAIN[view.stage]) || WISHES.again;
-    if (this.asking && before !== this.turn()) this.drop();
+    if (this.asking && before !== this.turn() && !(this.asking.wish === "end" && offers.includes("end"))) {
+      this.say(`${upper(WISHES[this.asking.wish])} was not asked: the run has changed meanwhile.`, true);
+      this.drop();
+    }
     document.getElementById("sure-yes").disabled = !live;
     this.settle();
   }

@@ -11,6 +11,7 @@ export const STAGES = {
   stopped: { word: "Stopped", tone: "bad", say: "Stopped. Nothing is sent to the arm." },
   homing: { word: "Going home", tone: "good", say: "The arm goes home." },
   done: { word: "Done", tone: "good", say: "The path is printed." },
+  ended: { word: "Finished", tone: "wait", say: "The run was ended. The arm is at rest." },
   failed: { word: "Failed", tone: "bad", say: "The run cannot go on. The arm is at rest." },
 };
 export const TRACKING = {

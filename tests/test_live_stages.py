@@ -1,0 +1,226 @@
+"""The stages of a live run: what leads from one to the next, what ends it, and what waits for the operator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimation import se3
+from estimation.pose import SurfacePose, TrackState
+from hardware.arm_profile import BENCH, ArmProfile
+from hardware.arm_status import ArmState, ArmStatus
+from hardware.live.conductor import Conductor, Seen, Task
+from hardware.live.records import LiveMotionReport, Pace, RecorderReport, TrackingReport
+from hardware.motion_loop import Order, Tick
+from hardware.operator.request import Request, Wish
+from hardware.operator.view import Stage
+from planning.command import Hold
+from planning.progress import Phase, Progress
+from tests.moving import raster
+
+PROFILE = ArmProfile()
+SURFACE = SurfacePose(0.0, BENCH, np.eye(6) * 1e-6, np.zeros(6), TrackState.TRACKING)
+
+
+class Staged:
+    """A conductor with the reports that it is given; time goes on by `look`."""
+
+    def __init__(self, **task: object) -> None:
+        self.conductor = Conductor(Task(raster(), PROFILE, stands_home=True, **task))  # type: ignore[arg-type]
+        self.now, self.arm = 0.0, ArmState.DISARMED
+        self.phase: Phase | None = None
+        self.seen, self.pose = Seen(recorder=RecorderReport(0.0, 0, 0.0, "")), SURFACE
+        self.ended, self.asked, self.answers = "", 0, 0
+        self.orders: list[object] = []
+
+    def look(self, *wishes: Wish, seconds: float = 0.1) -> Stage:
+        self.now += seconds
+        asked = []
+        for wish in wishes:
+            self.asked += 1
+            asked.append(Request(self.asked, wish, self.conductor.turn))
+        pose = replace(self.pose, stamp=self.now)
+        self.seen.tracking = TrackingReport(
+            self.now, ("a", "b"), (0, 1), pose, np.eye(4), 0.0, 5, ended=self.ended, used=(50, 50)
+        )
+        nan = float("nan")
+        status = ArmStatus(self.now, self.arm, "why", PROFILE.arm.home, None, 0.0, nan, nan, 0.0, 0, 0, self.answers, 0)
+        tick = Tick(self.now, Hold(self.now, 0.001, "x"), b"", 0.0, status, "")
+        progress = None if self.phase is None else Progress(self.phase, 1, 6, 1.0, 9.0, 1.0)
+        self.seen.motion = LiveMotionReport(tick, progress, False, (), (), 0, 0, None, 0, "ordinary")
+        self.orders += self.conductor(self.now, self.seen, asked)
+        return self.conductor.stage
+
+    def to_print(self) -> None:
+        """Lead it to where it prints."""
+        self.look(seconds=0.0)
+        self.look()
+        self.look(Wish.CONFIRM)
+        self.look(Wish.START)
+        self.arm = ArmState.ARMED
+        self.look()
+        self.arm = ArmState.DISARMED
+        self.look()
+        self.arm, self.phase = ArmState.ARMED, Phase.PRINTING
+        self.look()
+        assert self.look() is Stage.PRINT
+
+
+def test_stages_follow_each_other_and_the_arm_is_armed_only_after_it_went_home() -> None:
+    run = Staged()
+    run.to_print()
+    kinds = [order if isinstance(order, Order | Pace) else "begin" for order in run.orders]
+    assert kinds == [Order.AT_HOME, Order.HOME, "begin", Pace.RESUME, Order.ARM]
+    run.phase = Phase.FINISHED
+    assert run.look() is Stage.HOMING
+    run.look()
+    run.arm = ArmState.DISARMED
+    assert run.look() is Stage.DONE and run.conductor.done
+
+
+def test_nothing_moves_before_it_was_confirmed_and_started() -> None:
+    run = Staged()
+    for _ in range(50):
+        assert run.look() in (Stage.CHECK, Stage.FIND, Stage.CONFIRM)
+    run.look(Wish.START, Wish.RESUME, Wish.HOME)
+    assert not run.orders
+    run.look(Wish.CONFIRM)
+    assert not run.orders and run.conductor.stage is Stage.READY
+
+
+@pytest.mark.parametrize("stage", [Stage.CHECK, Stage.CONFIRM, Stage.PRINT, Stage.PAUSED, Stage.HOMING])
+def test_a_stop_is_always_ordered_whatever_the_window_showed(stage: Stage) -> None:
+    run = Staged()
+    run.to_print()
+    run.conductor.stage = stage
+    orders = run.conductor(run.now, run.seen, [Request(1, Wish.STOP, -7)])
+    assert orders[0] is Order.STOP
+
+
+def test_a_wish_from_before_a_stop_lets_nothing_go_on() -> None:
+    run = Staged()
+    run.to_print()
+    turn = run.conductor.turn
+    run.arm = ArmState.STOPPED
+    run.look(Wish.STOP)
+    run.orders.clear()
+    run.conductor(run.now, run.seen, [Request(9, Wish.RESUME, turn)])
+    assert run.conductor.stage is Stage.STOPPED and not run.orders
+    assert run.conductor.answer is not None and not run.conductor.answer.followed
+
+
+def test_an_arm_that_stops_by_itself_is_not_armed_again_unasked() -> None:
+    run = Staged()
+    run.to_print()
+    run.orders.clear()
+    run.arm = ArmState.STOPPED
+    for _ in range(100):
+        assert run.look() is Stage.STOPPED
+    assert not run.orders and run.conductor.reason == "why"
+    run.look(Wish.RESUME)
+    assert run.orders == [Pace.RESUME, Order.ARM]
+
+
+def test_what_goes_on_by_itself_ends_where_nobody_is_there_to_resume() -> None:
+    run = Staged(unattended=True)
+    for _ in range(4):
+        run.look()
+    run.arm = ArmState.ARMED
+    run.look()
+    run.arm = ArmState.DISARMED
+    run.look()
+    run.arm, run.phase = ArmState.ARMED, Phase.PRINTING
+    run.look()
+    run.arm = ArmState.STOPPED
+    run.look()
+    run.look()
+    assert run.conductor.ended == "stopped: why" and run.orders[-1] is Order.STOP
+
+
+@pytest.mark.parametrize(("fault", "words"), [("cameras", "no more"), ("recorder", "disk")])
+def test_what_ends_a_run_stops_the_arm_and_says_so(fault: str, words: str) -> None:
+    run = Staged()
+    run.to_print()
+    if fault == "cameras":
+        run.ended = "no more"
+    else:
+        run.seen.recorder = RecorderReport(0.0, 0, 0.0, "the disk is full")
+    run.look()
+    assert words in run.conductor.ended and run.conductor.stage is Stage.FAILED
+    assert run.orders[-1] is Order.STOP
+
+
+def test_whoever_ends_a_run_is_not_told_that_it_failed() -> None:
+    run = Staged()
+    run.to_print()
+    assert run.look(Wish.END) is Stage.ENDED and run.orders[-1] is Order.STOP and not run.conductor.done
+
+
+def test_pictures_that_do_not_come_stop_the_arm_until_somebody_resumes() -> None:
+    run = Staged(patience=2.0)
+    run.to_print()
+    run.orders.clear()
+    assert run.conductor(run.now + 2.1, run.seen, []) == [Order.STOP]
+    assert run.conductor.stage is Stage.STOPPED and "no pictures for 2.1 s" in run.conductor.reason
+    run.now += 2.1
+    run.arm = ArmState.STOPPED
+    for _ in range(20):
+        assert run.look() is Stage.STOPPED
+    run.look(Wish.RESUME)
+    run.arm = ArmState.ARMED
+    run.look()
+    assert run.look() is Stage.PRINT and not run.conductor.ended
+
+
+@pytest.mark.parametrize("answers", [0, 5])
+def test_an_arm_that_is_unplugged_is_waited_for_and_says_where_it_stands_or_is_told(answers: int) -> None:
+    run = Staged()
+    run.answers = answers
+    run.to_print()
+    run.orders.clear()
+    run.arm = ArmState.UNPLUGGED
+    for _ in range(200):
+        assert run.look() is Stage.STOPPED and "plug it in" in run.conductor.reason
+    run.arm = ArmState.DISARMED
+    run.look()
+    assert set(run.orders) == {Order.STOP} and not run.conductor.ended
+    assert ("by hand" in run.conductor.reason) == (not answers)
+    run.orders.clear()
+    run.look(Wish.HOME)
+    assert run.orders == [Pace.PAUSE, *([] if answers else [Order.AT_HOME]), Order.HOME]
+
+
+def test_an_arm_that_is_unplugged_ends_a_run_that_nobody_attends() -> None:
+    run = Staged(unattended=True)
+    for _ in range(4):
+        run.look()
+    run.arm = ArmState.UNPLUGGED
+    run.look()
+    run.look()
+    assert "unplugged" in run.conductor.ended and run.orders[-1] is Order.STOP
+
+
+def test_an_arm_that_stops_on_its_way_home_is_not_taken_to_be_there() -> None:
+    run = Staged()
+    run.look(seconds=0.0)
+    run.look()
+    run.look(Wish.CONFIRM)
+    run.look(Wish.START)
+    run.arm = ArmState.ARMED
+    run.look()
+    run.orders.clear()
+    run.arm = ArmState.STOPPED
+    for _ in range(20):
+        assert run.look() is Stage.STOPPED
+    assert run.conductor.reason == "why" and set(run.orders) <= {Order.STOP}
+
+
+def test_a_path_out_of_reach_is_told_and_not_begun() -> None:
+    run = Staged(unattended=True)
+    run.pose = replace(SURFACE, base_from_surface=se3.make(np.eye(3), np.array([900.0, 0, 0])))
+    for _ in range(4):
+        run.look()
+    assert "out of reach: checkpoint 0: X" in run.conductor.ended
+    assert run.orders == [Order.STOP]
