@@ -108,7 +108,13 @@ def test_the_top_level_holds_the_floors_and_little_else() -> None:
 
 
 def test_docs_and_data_hold_nothing_importable() -> None:
-    assert not [path for folder in ("docs", "data") for path in (ROOT / folder).rglob("*.py")]
+    found = {path for folder in ("docs", "data") for path in (ROOT / folder).rglob("*.py")}
+    assert found == set((ROOT / "docs/examples").glob("*.py"))  # which are programs to read and run
+
+
+def test_examples_are_short_enough_to_read_at_once() -> None:
+    for file in (ROOT / "docs/examples").glob("*.py"):
+        assert len(file.read_text(encoding="utf-8").splitlines()) < 60, file.name
 
 
 def test_the_motion_process_loads_none_of_the_heavy_libraries() -> None:
