@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from perception.shipped import named_path
+
 Commands = Any  # argparse's own type for this is private
 
 
@@ -24,7 +26,7 @@ def add_arm(commands: Commands) -> None:
     which = command.add_mutually_exclusive_group(required=True)
     which.add_argument("device", nargs="?", metavar="DEVICE", help="a path, or a URL of pyserial's such as socket://")
     which.add_argument("--virtual", action="store_true", help="serve a virtual arm on a pseudo-terminal")
-    command.add_argument("--arm", type=Path, metavar="ARM.toml", help="its home, limits, dialect and baud rate")
+    command.add_argument("--arm", type=named_path, metavar="ARM.toml", help="its home, limits, dialect and baud rate")
     real = command.add_argument_group("an arm on a port")
     real.add_argument("--seconds", type=float, default=5.0, metavar="S", help="to listen; default 5")
     real.add_argument("--watch", action="store_true", help="listen until Ctrl-C")

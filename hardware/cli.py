@@ -22,6 +22,7 @@ from hardware.methods import MAP, METHODS
 from hardware.plan_commands import add_plan
 from hardware.reach_command import add_reach
 from hardware.wound_commands import add_segment, add_train
+from perception.shipped import named_path
 
 if TYPE_CHECKING:
     from hardware.progress import Progress
@@ -143,7 +144,9 @@ def _add_simulate(commands: Commands) -> None:
         "report.html. Exit code 0 where the scenario's own limits are met, 1 where they are not.",
         "stillbed simulate data/scenarios/breathing_calm.toml -o out/calm",
     )
-    command.add_argument("scenario", type=Path, metavar="SCENARIO.toml", help="what is simulated; see data/scenarios")
+    command.add_argument(
+        "scenario", type=named_path, metavar="SCENARIO.toml", help="what is simulated; see data/scenarios"
+    )
     command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
     command.add_argument("--trace", type=Path, metavar="FILE", help="a recorded motion, TUM or CSV, instead of its own")
     command.add_argument("--threads", type=int, default=2, metavar="N", help="threads that render; results do not vary")
@@ -166,7 +169,7 @@ def _add_track(commands: Commands) -> None:
     command.add_argument(
         "--method", choices=METHODS, default=MAP, help="; ".join(f"{name}: {what}" for name, what in METHODS.items())
     )
-    command.add_argument("--arm", type=Path, metavar="ARM.toml", help="what tool hangs on the session's arm")
+    command.add_argument("--arm", type=named_path, metavar="ARM.toml", help="what tool hangs on the session's arm")
     command.add_argument(
         "--prefilter",
         choices=("none", "bilateral"),
@@ -193,9 +196,14 @@ def _add_replay(commands: Commands) -> None:
     )
     command.add_argument("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
     command.add_argument(
-        "--path", type=Path, metavar="PATH.csv", help="checkpoints on the surface; left out: those of a recorded run"
+        "--path",
+        type=named_path,
+        metavar="PATH.csv",
+        help="checkpoints on the surface; left out: those of a recorded run",
     )
-    command.add_argument("--arm", type=Path, metavar="ARM.toml", help="the arm's place, limits and dialect of the link")
+    command.add_argument(
+        "--arm", type=named_path, metavar="ARM.toml", help="the arm's place, limits and dialect of the link"
+    )
     command.add_argument("--resume", type=Path, metavar="PROGRESS.toml", help="go on where an earlier run stopped")
     command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
     command.add_argument("--force", action="store_true", help="write into a folder that is not empty")

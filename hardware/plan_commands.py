@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from perception.shipped import named_path
+
 Commands = Any  # argparse's own type for this is private
 
 TEXT = """\
@@ -47,7 +49,7 @@ def add_plan(commands: Commands) -> None:
         help="also lay the scan into this session's first pictures, and say how well it fits the wound they show",
     )  # fmt: skip
     command.add_argument(
-        "--arm", type=Path, metavar="ARM.toml",
+        "--arm", type=named_path, metavar="ARM.toml",
         help="ask this arm's joints about each checkpoint and write the column `feasible`; without, there is none, and "
         "`stillbed reach` adds it",
     )  # fmt: skip

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from perception.shipped import named_path
+
 Commands = Any  # argparse's own type for this is private
 
 UNREACHED = 1  # exit code where a checkpoint cannot be printed
@@ -23,8 +25,8 @@ def add_reach(commands: Commands) -> None:
         epilog="example:\n  stillbed reach data/paths/wound_raster.csv --arm data/arms/s6h4d.toml --amplitude-mm 10",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    command.add_argument("path", type=Path, metavar="PATH.csv", help="checkpoints on the surface")
-    command.add_argument("--arm", type=Path, required=True, metavar="ARM.toml", help="with a table [kinematics]")
+    command.add_argument("path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
+    command.add_argument("--arm", type=named_path, required=True, metavar="ARM.toml", help="with a table [kinematics]")
     command.add_argument(
         "--surface",
         type=_six,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import sysconfig
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from perception.coarse_to_fine import Looks
+from perception.shipped import shipped_file
 
 MODEL = "wound"
 REFERENCE = "thesis_unet"
@@ -65,12 +65,8 @@ class WoundNetwork:
 
 
 def shipped(name: str = MODEL, suffix: str = ".onnx") -> Path:
-    """A file that comes with stillbed; InputError where the installation lacks it."""
-    places = (Path(__file__).parents[1] / "data" / "models", Path(sysconfig.get_path("data")) / "share/stillbed/models")
-    for place in places:
-        if (place / f"{name}{suffix}").is_file():
-            return place / f"{name}{suffix}"
-    raise InputError(places[0] / f"{name}{suffix}", "model", "no such file", "an installation with its data")
+    """A model that comes with stillbed; InputError where the installation lacks it."""
+    return shipped_file("models", f"{name}{suffix}")
 
 
 def read_settings(file: Path, found: str) -> Settings:

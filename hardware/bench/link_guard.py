@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.bench.figure import Figure, at_most
 from hardware.bench.guard_oracle import Log, Rules, judge
+from perception.shipped import shipped_file
 from planning.command import Command, Hold, Move
 from planning.guard import Guard
 from planning.kinematics import SimpleArm
@@ -52,7 +52,7 @@ def jointed() -> Rules:
     """An arm that is sent its last three joints."""
     from hardware.arm_file import read_arm
 
-    profile = read_arm(Path(__file__).parents[2] / "data" / "arms" / "six_axis.toml")
+    profile = read_arm(shipped_file("arms", "six_axis.toml"))
     return Rules(profile.arm, boxed(profile.limits), ZONE, TICK, LAG)
 
 

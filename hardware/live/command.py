@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from perception.shipped import named_path
+
 FLAGS = (
     *("rig", "simulated", "path", "arm", "profile", "record"),
     *("dry_run", "lift", "stands_home", "jpeg_quality"),
@@ -31,10 +33,12 @@ def add_live(commands: Commands) -> None:
     command.add_argument("settings", nargs="?", type=Path, metavar="session.toml", help="see stillbed init")
     where = command.add_argument_group("what is printed where")
     where.add_argument("--rig", type=Path, metavar="RIG", help="rig.toml of cameras, or a session shown in real time")
-    where.add_argument("--simulated", type=Path, metavar="SCENARIO.toml", help="a scenario, rendered before the run")
-    where.add_argument("--path", type=Path, metavar="PATH.csv", help="checkpoints on the surface")
+    where.add_argument(
+        "--simulated", type=named_path, metavar="SCENARIO.toml", help="a scenario, rendered before the run"
+    )
+    where.add_argument("--path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
     where.add_argument("--arm", metavar="DEVICE", help='a path, a URL of pyserial\'s, or "virtual"')
-    where.add_argument("--profile", type=Path, metavar="ARM.toml", help="the arm's place, limits, dialect, lag")
+    where.add_argument("--profile", type=named_path, metavar="ARM.toml", help="the arm's place, limits, dialect, lag")
     where.add_argument("--record", type=Path, metavar="X.mcap", help="the recording; other files stand beside it")
     how = command.add_argument_group("how")
     how.add_argument("--resume", type=Path, metavar="X.mcap", help="go on where the run recorded there stopped")
