@@ -18,6 +18,7 @@ from hardware.arm import Arm
 from hardware.arm_status import ArmState, ArmStatus
 from hardware.clock import Clock
 from hardware.lateness import Lateness
+from hardware.rhythm import Rhythm
 from planning.command import Command, Hold, Move
 
 FAREWELL = 0.05  # s in which the last frame, which stops the arm, goes out
@@ -46,7 +47,10 @@ class Order(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tick:
-    """What one tick did. stamp: s. frame: the bytes sent, none of a hold by the link. late: s behind its instant."""
+    """What one tick did.
+
+    stamp: s, for which it was made. frame: the bytes sent, none of a hold by the link. late: s behind its instant.
+    """
 
     stamp: float
     command: Command
@@ -76,17 +80,21 @@ class MotionLoop:
         orders: Callable[[], Sequence[Order]],
         tell: Callable[[Tick], None] = nobody,
         homed: Callable[[], None] = nothing,
+        rhythm: Rhythm | None = None,
     ) -> None:
         """pose: the newest there is. orders: those that have come since the last call. tell: is told of each tick.
 
-        homed: is told when the arm has gone home, so that the motion begins from there.
+        homed: is told when the arm has gone home, so that the motion begins from there. rhythm: of the ticks; without
+        one they run freely, the profile's tick and the link's ease apart.
         """
         self.motion, self.arm = motion, arm
         self.lateness = Lateness()
         self.skipped = 0
         self._clock, self._pose, self._orders, self._tell, self._homed = clock, pose, orders, tell, homed
         profile, settings = arm.profile, arm.settings
-        self._period, self._pause, self._look = profile.tick * (1 + settings.ease), profile.limits.pause, settings.poll
+        self._pause, self._look = profile.limits.pause, settings.poll
+        self._rhythm = Rhythm(profile.tick, settings.ease, clock.now()) if rhythm is None else rhythm
+        self._given: SurfacePose | None = None  # to the last tick
         self._left_off: Array = profile.arm.home  # where planner and guard take the arm to be
         self._homing = False
         self._answer = ""
@@ -94,19 +102,18 @@ class MotionLoop:
 
     def run(self, until: float = float("inf")) -> None:
         """Go on until `until`, s, or until an order ends it; whatever ends it, the arm is stopped."""
-        start, ticks = self._clock.now(), 0
+        rhythm = self._rhythm
+        rhythm.due = self._clock.now()
         try:
             while not self._quit and (now := self._clock.now()) < until:
                 self._obey(now)
                 self.arm.poll(now)
-                if (late := now - (start + ticks * self._period)) >= 0:
-                    self._tick(now, late)
-                    ticks += 1
-                    if (missed := int((self._clock.now() - start) / self._period) - ticks) > 0:
-                        self.skipped += missed
-                        ticks += missed
-                due = start + ticks * self._period
-                self._clock.wait_until(min(due, self._clock.now() + self._look))
+                pose = self._pose()
+                if now >= rhythm.opens(pose is not self._given):
+                    self._given = pose
+                    self._tick(pose, now, max(now, rhythm.due))
+                    self.skipped += rhythm.made(self._clock.now())
+                self._clock.wait_until(min(rhythm.due, self._clock.now() + self._look))
         finally:
             self._end()
 
@@ -147,16 +154,18 @@ class MotionLoop:
             self._homing = True
         return ""
 
-    def _tick(self, now: float, late: float) -> None:
+    def _tick(self, pose: SurfacePose | None, now: float, instant: float) -> None:
+        """Made at `now`, s, for `instant`, s, which is later where its pose came early."""
+        late = max(now - self._rhythm.due, 0.0)
         self.lateness.add(late)
         frame = b""
         if reason := "the arm goes home" if self._homing else self.arm.hold(now):
-            command: Command = Hold(now, self._pause, reason)
+            command: Command = Hold(instant, self._pause, reason)
         else:
-            frame = self.motion(self._pose(), now)
+            frame = self.motion(pose, instant)
             command = self.motion.last
             if isinstance(command, Move):
                 self._left_off = command.axes
             if reason := self.arm.send(frame, now):
-                frame, command = b"", Hold(now, self._pause, reason)
-        self._tell(Tick(now, command, frame, late, self.arm.status(now), self._answer))
+                frame, command = b"", Hold(instant, self._pause, reason)
+        self._tell(Tick(instant, command, frame, late, self.arm.status(now), self._answer))

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import serial
+from hypothesis import given
+from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from hardware.arm_profile import ArmProfile
@@ -21,7 +23,7 @@ from hardware.clock import WallClock
 from hardware.replies import ReplyKind, reply_stream
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.controller import VirtualArm
-from hardware.simulator.port import run_virtual_arm
+from hardware.simulator.port import PERIOD, _spread, run_virtual_arm
 from hardware.simulator.pty_link import PtyLink
 from tests.virtual_arm import IDEAL, move
 
@@ -148,3 +150,16 @@ def test_bytes_go_through_a_pty_unchanged_and_at_once() -> None:
         every = bytes(range(256)) * 2
         assert link.transfer(every) == every
         assert link.transfer(b"") == b""
+
+
+@given(st.binary(max_size=200), st.floats(0.0, 5.0), st.floats(0.0, 2.0))
+def test_what_came_while_the_machine_held_the_arm_up_is_taken_as_if_it_came_evenly(
+    data: bytes, before: float, late: float
+) -> None:
+    parts = list(_spread(data, before, before + late))
+    assert b"".join(part for part, _ in parts) == data
+    instants = np.array([before, *(instant for _, instant in parts)])
+    assert (np.diff(instants) >= 0).all() and instants[-1] == pytest.approx(before + late)
+    assert np.diff(instants).max() <= 1.5 * PERIOD + 1e-9
+    sizes = [len(part) for part, _ in parts]
+    assert max(sizes) - min(sizes) <= 1

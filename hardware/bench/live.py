@@ -123,7 +123,8 @@ def _errors(name: str, found: dict[str, Any], error: TrueError) -> list[Figure]:
         Figure(f"{name}: nozzle error, 95 %", error.figure(95), "mm", at_most(0.5), "", done),
         Figure(f"{name}: nozzle error, largest", error.figure(100), "mm", at_most(1.0)),
         Figure(f"{name}: duty", 100 * error.duty, "%", at_least(80)),
-        Figure(f"{name}: most queued in the arm", 1000 * error.deepest, "ms", at_most(50), "", "more: the arm stalled"),
+        Figure(f"{name}: most queued in the arm", 1000 * error.deepest, "ms", at_most(50)),
+        Figure(f"{name}: virtual arm held up by the machine, longest", 1000 * error.held_up, "ms"),
         Figure(f"{name}: frame sets left out", found["frame_sets_dropped"], "", None, "", f"of {found['frame_sets']}"),
     ]
 

@@ -20,6 +20,7 @@ from hardware.live.stages import OFFERS, RUNNING
 from hardware.motion_loop import Order
 from hardware.operator.request import Request, Wish, refusal
 from hardware.operator.view import Answer, Check, Stage, Verdict
+from hardware.rhythm import tick_in_step
 from planning.path import Path
 from planning.progress import Phase, fingerprint
 
@@ -184,7 +185,7 @@ class Conductor:
             if orders := self._faults(tracking, motion, now):
                 return orders
             if self.stage is Stage.HOMING:
-                return self._homing(motion, now)
+                return self._homing(tracking, motion, now)
             return self._printing(motion, now)
         if self.stage is Stage.STOPPED and self.task.unattended:
             return self.end(f"stopped: {self.reason}", now)
@@ -233,7 +234,7 @@ class Conductor:
             self._to(Stage.STOPPED, status.reason, now)
         return []
 
-    def _homing(self, motion: LiveMotionReport, now: float) -> Orders:
+    def _homing(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
         """Home, then the path, then armed: in this order, each once the one before is done."""
         status = motion.tick.status
         if status.state is ArmState.ARMED:
@@ -253,9 +254,10 @@ class Conductor:
         if self._after is Stage.STOPPED:
             return []
         self._asked, self._armed = now, False
-        return [*self._begin(motion), Pace.RESUME, Order.ARM]
+        return [*self._begin(tracking.interval, motion), Pace.RESUME, Order.ARM]
 
-    def _begin(self, motion: LiveMotionReport) -> Orders:
+    def _begin(self, interval: float, motion: LiveMotionReport) -> Orders:
+        """interval: s between two poses, with which the ticks are to be in step."""
         if self._begun:
             return []
         assert self.laid is not None
@@ -265,7 +267,8 @@ class Conductor:
         lag = task.profile.lag
         if 0 < status.lag < LONGEST_LAG:  # measured from set-point to answer, NaN where it does not answer
             lag = status.lag + task.profile.frame_time
-        return [Begin(path, replace(laid.profile, lag=lag), task.start, task.fingerprint)]
+        tick = tick_in_step(laid.profile.tick, interval, max(laid.profile.tick / 2, 2 * laid.profile.frame_time))
+        return [Begin(path, replace(laid.profile, lag=lag, tick=tick), task.start, task.fingerprint)]
 
     def _printing(self, motion: LiveMotionReport, now: float) -> Orders:
         progress = motion.progress

@@ -29,6 +29,8 @@ from perception.pairing import frame_set
 TRANSPORT = 0.025  # s from the middle of an exposure to the picture in the computer, as a scenario has it
 LOOK = 0.02  # s between looks whether anybody wants to see it
 ENDS = 0.25  # share of a session at each end in which a turn is looked for
+EARLY = 1.5  # times what decoding took, before a set is due
+FORGET = 0.9  # of what it took, from set to set
 KEPT = 2**30  # bytes of encoded pictures that are kept for a session shown again and again
 
 
@@ -93,12 +95,16 @@ def _show(session: Session, plan: FeedPlan, ring: FrameRing, words: Connection) 
     stamps = np.array([np.mean([ref.stamp for ref in refs]) for refs in session.sets])
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     between = turns(session.truth, stamps) if plan.again and session.truth is not None else None
+    spent = period  # s that decoding a set took
     for showing in schedule(stamps, clock.now(), between):
         due = showing.live + TRANSPORT
         if clock.now() > due + period:
             continue  # as a camera whose host is late loses a frame
         refs, anchor = session.sets[showing.index], float(stamps[showing.index])
+        clock.wait_until(due - EARLY * spent)  # not before: while the set before is tracked, cores are wanted there
+        begun = clock.now()
         encoded, frames = pictures.decoded(refs)
+        spent = max(clock.now() - begun, FORGET * spent)
         shown = [replace(f, stamp=_live(f.stamp, anchor, showing)) for f in frames]
         head = session.heads.at(anchor)
         whole = FrameSet(frame_set(shown).stamp, tuple(shown), head)

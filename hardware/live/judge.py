@@ -18,6 +18,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm_file import read_arm
 from hardware.live.beside import Beside
+from hardware.live.kept import used_in
 from hardware.mcap_walk import ChunkOf, parse, walk
 from hardware.messages import Message, row_from_message
 from hardware.path_file import read_path
@@ -35,13 +36,15 @@ TOPICS = ("/tick", "/move", "/hold", "/truth")
 class TrueError:
     """distance: (N,) mm, nozzle to its place, of each extruding millisecond. duty: share of the time due in which
     material left; NaN where none was due. printed: (2,) the first and last place extruded, counted in checkpoints.
-    deepest: s of motion that the arm ever had queued: an arm that was held up itself is late ever after.
+    deepest: s of motion that the arm ever had queued. held_up: s that a busy machine kept the virtual arm from its line
+    at most.
     """
 
     distance: Array
     duty: float
     printed: tuple[float, float]
     deepest: float
+    held_up: float
 
     def figure(self, share: float) -> float:
         """Error, mm, that `share` percent do not exceed; NaN of none."""
@@ -72,14 +75,15 @@ def judge_run(record: File, path: File, arm: File) -> TrueError:
     found = _read(record)
     if not found["/tick"] or len(found["/truth"]) < 2:
         raise InputError(record, "recording", "no ticks or no truth", "a run before pre-rendered pictures")
-    profile = read_arm(arm)
+    true, profile = read_arm(arm), used_in(record)[1]  # ticks and lag are as the run took them
     truth = Truth(np.eye(4), _Between(_rising([row_from_message(m) for m in found["/truth"]])))
-    ledger = Ledger(read_path(path), profile.arm, truth, profile.tick, profile.lag)
+    ledger = Ledger(read_path(path), true.arm, truth, profile.tick, profile.lag)
     commands = _commands(found)
     for command, progress in commands:
         ledger.write(command, progress)
     with np.load(Beside(record).executed) as executed:
-        stamps, axes, deepest = executed["stamps"], executed["axes"], float(executed["deepest"])
+        stamps, axes = executed["stamps"], executed["axes"]
+        deepest, held_up = float(executed["deepest"]), float(executed["held_up"])
     first, last = commands[0][0].stamp, min(ledger.known_until, float(stamps[-1]))
 
     def at(times: Array) -> Array:
@@ -95,7 +99,7 @@ def judge_run(record: File, path: File, arm: File) -> TrueError:
         extruding += int(log.extrude.sum())
         due += int((np.isfinite(log.place) & (log.place > 0) & (log.stamps < finished)).sum())
     duty = extruding / due if due else float("nan")
-    return TrueError(np.concatenate(errors), duty, printed(record), deepest)
+    return TrueError(np.concatenate(errors), duty, printed(record), deepest, held_up)
 
 
 def printed(record: File) -> tuple[float, float]:

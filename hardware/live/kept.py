@@ -7,9 +7,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path as File
 
+from estimation.errors import InputError
 from hardware.arm_file import read_arm, write_arm
 from hardware.arm_profile import ArmProfile
 from hardware.live.records import Begin
+from hardware.mcap_walk import Attached, walk
 from hardware.path_file import read_path, write_path
 from planning.path import Path
 
@@ -22,12 +24,20 @@ def kept_begin(order: Begin) -> tuple[dict[str, str], Begin]:
         write_path(File(folder) / PATH, order.path)
         write_arm(File(folder) / ARM, order.profile, "as a live run used it")
         texts = {name: (File(folder) / name).read_text(encoding="utf-8") for name in (PATH, ARM)}
-    path, profile = used(texts)
+    path, profile = used(texts, File("kept"))
     return texts, replace(order, path=path, profile=profile)
 
 
-def used(texts: Mapping[str, str]) -> tuple[Path, ArmProfile]:
-    """Path and arm of the texts."""
+def used_in(record: File) -> tuple[Path, ArmProfile]:
+    """Path and arm that a recorded run used; InputError where it did not begin to print."""
+    attached = (part for part in walk(record) if isinstance(part, Attached))
+    return used({part.name: part.data.decode("utf-8", "replace") for part in attached}, record)
+
+
+def used(texts: Mapping[str, str], record: File) -> tuple[Path, ArmProfile]:
+    """Path and arm of the texts of a recording; InputError where they are not there."""
+    if PATH not in texts or ARM not in texts:
+        raise InputError(record, "recording", "no path", "the recording of a run that began to print")
     with tempfile.TemporaryDirectory() as folder:
         for name in (PATH, ARM):
             (File(folder) / name).write_text(texts[name], encoding="utf-8")

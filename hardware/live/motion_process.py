@@ -34,6 +34,7 @@ from hardware.motion_loop import MotionLoop, Order, Tick
 from hardware.newest import Newest
 from hardware.operator.request import RequestLine
 from hardware.priority import ask_for_real_time
+from hardware.rhythm import InStep
 
 EVENTS = 50  # of the last ones that a report holds
 SECOND_BYTE = 1  # of a frame: which instruction it is
@@ -58,8 +59,8 @@ class LiveMotionPlan:
 class _Orders:
     """Takes the orders; those of a live run are followed here, those of the arm are passed on."""
 
-    def __init__(self, connection: Connection, motion: LiveMotion, wishes: RequestLine) -> None:
-        self._connection, self._motion, self._wishes = connection, motion, wishes
+    def __init__(self, connection: Connection, motion: LiveMotion, wishes: RequestLine, rhythm: InStep) -> None:
+        self._connection, self._motion, self._wishes, self._rhythm = connection, motion, wishes, rhythm
         self._stopped = wishes.last_stop
         self.alone, self.fingerprint = False, ""
         self._ended = False
@@ -83,7 +84,7 @@ class _Orders:
 
     def _follow(self, order: Begin | Pace) -> None:
         if isinstance(order, Begin):
-            self.fingerprint = order.fingerprint
+            self.fingerprint, self._rhythm.tick = order.fingerprint, order.profile.tick
             self._motion.begin(order)
         else:
             self._motion.paused = order is Pace.PAUSE
@@ -96,9 +97,14 @@ class _Watch:
     """Measures the way from frames to the wire, records what passes, reports each tick."""
 
     def __init__(
-        self, plan: LiveMotionPlan, poses: Newest[Handed], reports: Newest[LiveMotionReport], outbox: Outbox
+        self,
+        plan: LiveMotionPlan,
+        poses: Newest[Handed],
+        reports: Newest[LiveMotionReport],
+        outbox: Outbox,
+        rhythm: InStep,
     ) -> None:
-        self._poses, self._reports, self._outbox = poses, reports, outbox
+        self._poses, self._reports, self._outbox, self._rhythm = poses, reports, outbox, rhythm
         self._clock = WallClock()
         self.times = Histograms()
         self._priority = ask_for_real_time() if plan.real_time else "nothing asked for"
@@ -113,6 +119,8 @@ class _Watch:
         handed = self._poses.get()
         if handed is not self._given:
             self._given, self._first = handed, True
+            if handed is not None:
+                self._rhythm.arrived(handed.put)
         return None if handed is None else handed.pose
 
     def heard(self, data: bytes, sent: bool) -> None:
@@ -162,12 +170,13 @@ def live_motion_process(
     """
     settle("motion", plan.cores)
     clock, device, outbox = WallClock(), Device(plan.url, plan.profile.baud), Outbox(record)
-    motion, watch = LiveMotion(plan.profile, place), _Watch(plan, poses, reports, outbox)
-    told = _Orders(orders, motion, wishes)
+    rhythm = InStep(plan.profile.tick, plan.settings.ease, clock.now())
+    motion, watch = LiveMotion(plan.profile, place), _Watch(plan, poses, reports, outbox, rhythm)
+    told = _Orders(orders, motion, wishes, rhythm)
     try:
         arm = Arm(Tap(device, watch.heard), plan.profile, clock.now(), plan.settings)
         watch.motion = motion
-        loop = watch.loop = MotionLoop(motion, arm, clock, watch.pose, told, watch.told, motion.homed)
+        loop = watch.loop = MotionLoop(motion, arm, clock, watch.pose, told, watch.told, motion.homed, rhythm)
         try:
             loop.run()
         finally:

@@ -50,9 +50,9 @@ class TrackingReport:
 
     stamp: s, when it said so. cameras: their names. seen: cameras in the last set. pose: the newest. surface_from_path:
     (4, 4), where the path lies on the tracker's surface; None until that is known. registered: stamp, s, of the pose
-    that told. sets, dropped: taken, and left out as a newer one was there. unrecorded: sets that found the recorder
-    busy. spans: of its stages. used: tracks by camera. ended: why there will be no more, "" while there are. wrong:
-    whether that was wrong input.
+    that told. sets, dropped: taken, and left out as a newer one was there. interval: s between two sets, NaN until
+    known. unrecorded: sets that found the recorder busy. spans: of its stages. used: tracks by camera. ended: why there
+    will be no more, "" while there are. wrong: whether that was wrong input.
     """
 
     stamp: float
@@ -63,6 +63,7 @@ class TrackingReport:
     registered: float = float("nan")
     sets: int = 0
     dropped: int = 0
+    interval: float = float("nan")
     unrecorded: int = 0
     spans: tuple[Span, ...] = ()
     used: tuple[int, ...] = ()

@@ -8,7 +8,7 @@ from pathlib import Path as File
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
-from hardware.live.kept import ARM, PATH, used
+from hardware.live.kept import used
 from hardware.mcap_walk import Attached, ChunkOf, parse, walk
 from hardware.messages import Message, bytes_from_message, pose_from_message
 from hardware.motion import MotionStep
@@ -38,9 +38,7 @@ class Replayed:
 def replay_run(record: File) -> Iterator[Replayed]:
     """Every tick of a recorded run in which planner and guard were asked, decided anew from the recorded poses."""
     run = _read(record)
-    if PATH not in run.texts or ARM not in run.texts:
-        raise InputError(record, "recording", "no path", "the recording of a run that began to print")
-    path, profile = used(run.texts)
+    path, profile = used(run.texts, record)
     step: MotionStep | None = None
     for tick in sorted(run.ticks, key=lambda tick: float(tick["stamp"])):
         if tick["begun"]:

@@ -6,11 +6,13 @@ It may stall or die at any instant: the pose that the motion has grows old, and 
 from __future__ import annotations
 
 import signal
+from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
+from statistics import median
 from types import FrameType
 
 import numpy as np
@@ -53,6 +55,7 @@ RIG = ".toml"  # of a file that names live cameras
 PATIENCE = 0.1  # s of a wait for frames, after which it looks who else is still there
 WAITED, TRACKED, POSED = "frames wait for the tracker", "tracking", "frames handed over to pose"
 EXPOSED = "exposure to frames handed over"
+INTERVALS = 31  # of which the middle one counts: a second of them
 HISTOGRAMS = 30.0  # s between histograms in the recording
 
 
@@ -157,6 +160,7 @@ class _Tracking:
         self._pictures = PictureTaker(lines.link.pictures, lines.link.requests)
         names = tuple(camera.name for camera in known.rig.cameras)
         self.report = TrackingReport(self._clock.now(), names)
+        self._before, self._intervals = np.nan, deque[float](maxlen=INTERVALS)
         lines.reports.put(self.report)
         first = None if plan.earlier is None else open_session(plan.earlier)
         rois = known.roi if first is None else first.roi
@@ -233,11 +237,20 @@ class _Tracking:
             pose=pose,
             sets=report.sets + 1,
             dropped=report.dropped + arrived.dropped,
+            interval=self._interval(arrived),
             unrecorded=self._outbox.dropped,
             spans=self.times.spans(),
             used=tuple(int(n) for n in self._step.last.used),
         )
         self._lines.reports.put(self.report)
+
+    def _interval(self, arrived: Arrived) -> float:
+        """The time between two sets, s, those that nobody took included; NaN before the second."""
+        stamp = arrived.frames.stamp
+        if not np.isnan(self._before):
+            self._intervals.append((stamp - self._before) / (1 + arrived.dropped))
+        self._before = stamp
+        return median(self._intervals) if self._intervals else float("nan")
 
     def _show(self, frames: FrameSet, pose: SurfacePose) -> None:
         """Offer the pictures to the page, where anybody has it open."""

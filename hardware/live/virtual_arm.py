@@ -39,16 +39,18 @@ class VirtualArmPlan:
 
 
 class _Since:
-    """A clock that remembers its first instant."""
+    """A clock that remembers its first instant, and the longest time that the arm did not look at it, s."""
 
     def __init__(self) -> None:
         self._clock = WallClock()
         self.begun: float | None = None
+        self.longest, self._last = 0.0, float("inf")
 
     def now(self) -> float:
         """Instant, s."""
         now = self._clock.now()
         self.begun = now if self.begun is None else self.begun
+        self.longest, self._last = max(self.longest, now - self._last), now
         return now
 
     def wait_until(self, instant: float) -> None:
@@ -72,7 +74,7 @@ def virtual_arm_process(plan: VirtualArmPlan, lifeline: Connection) -> None:
     stamps = np.arange(0.0, arm.now, STEP)
     axes = arm.axes_at(stamps) if len(stamps) else np.zeros((0, 6))
     with plan.executed.open("wb") as file:
-        np.savez(file, stamps=stamps + clock.begun, axes=axes, deepest=arm.deepest)
+        np.savez(file, stamps=stamps + clock.begun, axes=axes, deepest=arm.deepest, held_up=clock.longest)
 
 
 def _end_with(lifeline: Connection, stop: threading.Event) -> None:

@@ -103,9 +103,21 @@ def _serve(port: int, arm: VirtualArm, rate: float, clock: Clock, stop: threadin
         with suppress(BlockingIOError):
             data = os.read(port, int(allowed))
         allowed -= len(data)
-        arm.receive(data, now)
+        for part, instant in _spread(data, arm.now, now):
+            arm.receive(part, instant)
         with suppress(BlockingIOError):
             os.write(port, arm.transmit(now))
+
+
+def _spread(data: bytes, before: float, now: float) -> Iterator[tuple[bytes, float]]:
+    """Bytes with the instants, s, at which they came: evenly since the last look, where the machine held this one up.
+
+    A controller has a core of its own; one that took them all at once now would be late with all that follows.
+    """
+    looks, size = max(round((now - before) / PERIOD), 1), len(data)
+    for look in range(looks):
+        instant = before + (now - before) * (look + 1) / looks
+        yield data[size * look // looks : size * (look + 1) // looks], instant
 
 
 @contextmanager

@@ -1,0 +1,98 @@
+"""Ticks run in step with poses where these come regularly, freely where not, and never faster than the arm moves."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hardware.rhythm import EARLY, EASE, InStep, Rhythm, tick_in_step
+
+LOOK = 0.002  # s between looks of the loop
+
+
+def waits(tick: float, arrivals: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How long each pose waited for its tick, the instants for which ticks were made, and when they were."""
+    rhythm, now, seen, taken, waited, instants, made = InStep(tick, 0.005, 0.0), 0.0, 0, 0, [], [], []
+    while now < seconds:
+        if (newest := int(np.searchsorted(arrivals, now, "right"))) > seen:
+            rhythm.arrived(arrivals[newest - 1])
+            seen = newest
+        if now >= rhythm.opens(seen > taken):
+            if seen > taken:
+                waited.append(now - arrivals[seen - 1])
+                taken = seen
+            instants.append(max(now, rhythm.due))
+            made.append(now)
+            rhythm.made(now)
+        now = min(max(rhythm.opens(False), now + 1e-6), now + LOOK)
+    return np.array(waited), np.array(instants), np.array(made)
+
+
+@pytest.mark.parametrize("rate", [20.0, 25.0, 29.97, 30.0, 50.0, 60.0])
+@pytest.mark.parametrize("begin", [0.0, 0.004, 0.011])
+def test_poses_that_come_regularly_wait_for_no_tick(rate: float, begin: float) -> None:
+    jitter = np.random.default_rng(1).uniform(-0.002, 0.002, 2000)
+    arrivals = begin + np.arange(2000) / rate + jitter
+    waited, instants, _ = waits(tick_in_step(0.02, 1 / rate, 0.01), np.sort(arrivals), 12.0)
+    settled = waited[len(waited) // 4 :]
+    assert settled.max() <= LOOK + 1e-5  # the loop looks no more often
+    even = np.diff(instants[len(instants) // 4 :])
+    assert even.std() < 0.02 * even.mean()
+
+
+def test_a_pose_that_is_late_now_and_then_is_taken_half_a_tick_later_at_most() -> None:
+    rng = np.random.default_rng(2)
+    late = np.where(rng.random(600) < 0.1, rng.uniform(0.0, 0.015, 600), 0.0)
+    waited, _, _ = waits(tick_in_step(0.02, 1 / 30, 0.01), np.sort(np.arange(600) / 30 + late), 18.0)
+    assert waited[100:].max() <= (1 - EARLY) * 0.0165 + LOOK
+    assert waited[100:].mean() < LOOK
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_between_two_ticks_the_arm_has_time_for_its_move_and_rests_hardly(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    arrivals = np.cumsum(rng.uniform(0.01, 0.08, 400))
+    _, instants, made = waits(0.0165, arrivals, 15.0)
+    for before, after in pairwise(instants):
+        assert 1 + EASE[0] <= (after - before) / 0.0165 + 1e-9
+        assert after - before <= 0.0165 * (1 + EASE[1]) + LOOK
+    assert (instants - made).max() <= EARLY * 0.0165 + 1e-9
+
+
+def test_poses_that_come_at_random_leave_ticks_as_they_were() -> None:
+    rhythm, rng, free = InStep(0.0165, 0.005, 0.0), np.random.default_rng(3), 0
+    for _ in range(500):
+        rhythm.arrived(rhythm.due - rng.uniform(0, 0.0165))
+        before = rhythm.due
+        rhythm.made(before)
+        free += rhythm.due - before == pytest.approx(0.0165 * 1.005)
+    assert free > 450
+
+
+@given(st.floats(1e-3, 0.5), st.floats(0.005, 0.05))
+def test_a_tick_in_step_is_no_longer_than_allowed_and_goes_into_the_interval(interval: float, longest: float) -> None:
+    tick = tick_in_step(longest, interval, longest / 2)
+    assert longest / 2 <= tick <= longest
+    if tick != longest:
+        ratio = 0.99 * interval / tick if interval > tick else tick / (0.99 * interval)
+        assert ratio == pytest.approx(round(ratio), abs=1e-6)
+
+
+@pytest.mark.parametrize("interval", [float("nan"), 0.0, -1.0])
+def test_without_an_interval_a_tick_is_as_long_as_it_may_be(interval: float) -> None:
+    assert tick_in_step(0.02, interval, 0.01) == 0.02
+
+
+def test_a_line_that_carries_no_shorter_tick_keeps_its_own() -> None:
+    assert tick_in_step(0.05, 1 / 30, 0.05) == 0.05
+
+
+def test_ticks_whose_time_has_passed_are_left_out() -> None:
+    rhythm = Rhythm(0.02, 0.0, 0.0)
+    assert rhythm.made(0.001) == 0 and rhythm.due == pytest.approx(0.02)
+    assert rhythm.made(0.055) == 0 and rhythm.due == pytest.approx(0.04)
+    assert rhythm.made(0.105) == 2 and rhythm.due == pytest.approx(0.1)
