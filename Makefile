@@ -1,4 +1,4 @@
-# make demo | test | slow | check | format | outages | browser: each makes .venv and installs what it needs; a second time costs nothing.
+# make demo | test | slow | bench | check | format | outages | browser: each makes .venv and installs what it needs; a second time costs nothing.
 
 PYTHON ?= python3
 BIN    := .venv/bin
@@ -6,7 +6,7 @@ STAMP  := .venv/.installed
 DEMO   := demo
 APT    := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0
 
-.PHONY: demo test slow check format install outages browser
+.PHONY: demo test slow bench check format install outages browser
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
@@ -17,6 +17,9 @@ test: $(STAMP)
 
 slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --numprocesses 2 --dist loadfile
+
+bench: $(STAMP)
+	$(BIN)/stillbed bench --all
 
 outages: $(STAMP)
 	$(BIN)/stillbed bench outages --count 1000 --seed 1 -o out/outages --force

@@ -1,0 +1,100 @@
+"""All subjects in one go: figures come back as they were saved, what failed is told, what became worse is named."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from estimation.errors import InputError
+from hardware.bench import whole
+from hardware.bench.command import subject_parser
+from hardware.bench.figure import Figure, Target, at_least, at_most
+from hardware.bench.machine import this_machine
+from hardware.bench.saved import save, saved_figures, whole_table
+from hardware.bench.subjects import SUBJECTS
+from hardware.bench.whole import PARTS, Measured, Part, measure_all, read_whole, regressions, summary
+
+FIGURES = [
+    Figure("error", 0.02, "mm", at_most(0.03), "thesis", "a note"),
+    Figure("nees", 1.1, "", Target(0.8, 1.25)),
+    Figure("inside", 0.97, "", at_least(0.93)),
+    Figure("missing", math.nan, "s", at_most(1.0)),
+    Figure("tracks", 300.0),
+]
+
+
+def test_what_is_saved_comes_back(tmp_path: Path) -> None:
+    save(tmp_path, "toy", {}, FIGURES, this_machine())
+    again = saved_figures(tmp_path / "figures.json")
+    assert [f for f in again if f.what != "missing"] == [f for f in FIGURES if f.what != "missing"]
+    assert math.isnan(again[3].value) and again[3].verdict == "MISSED"
+
+
+@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.subject)
+def test_each_part_is_a_subject_with_options_that_it_has(part: Part) -> None:
+    for options in (part.options, part.quick or ()):
+        subject_parser(part.subject, SUBJECTS[part.subject]).parse_args(list(options))
+
+
+def test_all_parts_are_measured_and_a_failed_one_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    parts = (Part("planner", ("--updates", "20"), ("--updates", "20")), Part("prediction", (), ()), Part("plan"))
+    done = measure_all(tmp_path, True, parts)
+    assert [one.subject for one in done] == ["planner", "prediction"]  # the quick look leaves `plan` out
+    assert any(f.what == "uncaught errors" and f.verdict == "met" for f in done[0].figures)
+    assert "stillbed bench prediction" in done[1].trouble and "no figures" in summary(done)
+    assert "1 of 2: planner --updates 20" in capsys.readouterr().out
+    assert ("planner", "uncaught errors") in read_whole(tmp_path / "figures.json")
+
+
+def test_what_was_measured_of_the_same_code_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = replace(this_machine(), commit="abc")
+    monkeypatch.setattr(whole, "this_machine", lambda: machine)
+    (tmp_path / "plan").mkdir()
+    save(tmp_path / "plan", "plan", {}, FIGURES[:1], machine)
+    (tmp_path / "plan/options.json").write_text(json.dumps(["abc", "--body", "foot"]))
+    (done,) = measure_all(tmp_path, False, [Part("plan", ("--body", "foot"))])
+    assert done.figures == (FIGURES[0],)
+    assert whole._kept(tmp_path / "plan", ["--body", "chest"], machine) is None
+    other = replace(machine, commit="abd")
+    assert whole._kept(tmp_path / "plan", ["--body", "foot"], other) is None
+
+
+def table(tmp_path: Path, figures: list[Figure]) -> Path:
+    file = tmp_path / "before.json"
+    file.write_text(json.dumps(whole_table({"toy": figures}, this_machine())))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "told"),
+    [
+        (0.020, 0.0235, False),  # within what machines vary by
+        (0.020, 0.0245, True),
+        (0.029, 0.031, True),  # met no more
+        (0.040, 0.045, False),
+        (0.040, 0.049, True),
+        (0.020, 0.010, False),
+    ],
+)
+def test_what_became_worse_is_named(before: float, now: float, told: bool, tmp_path: Path) -> None:
+    file = table(tmp_path, [Figure("error", before, "mm", at_most(0.03))])
+    text = regressions([Measured("toy", (Figure("error", now, "mm", at_most(0.03)),))], file)
+    assert ("error" in text) == told and f": {int(told)}" in text
+
+
+def test_worse_has_a_side(tmp_path: Path) -> None:
+    file = table(tmp_path, [Figure("inside", 0.97, "", at_least(0.93)), Figure("nees", 1.05, "", Target(0.8, 1.25))])
+    found = (Figure("inside", 0.99, "", at_least(0.93)), Figure("nees", 0.7, "", Target(0.8, 1.25)))
+    text = regressions([Measured("toy", found)], file)
+    assert "nees 1.05 -> 0.7" in text and "inside" not in text
+
+
+def test_a_file_that_is_no_table_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text('{"subjects": [1]}')
+    for file in (tmp_path / "x.json", tmp_path / "none.json"):
+        with pytest.raises(InputError, match="bench --all"):
+            read_whole(file)
