@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from estimation import se3
 from estimation.se3 import Array
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 SHORT = 0.01  # s: what is left of a forecast that is shorter says no more than the velocity there
 
@@ -63,6 +66,8 @@ class Forecast:
 @lru_cache(maxsize=8)
 def _basis(horizons: tuple[float, ...]) -> tuple[CubicSpline, CubicSpline]:
     """What each horizon's increment adds along the curve, and to its slope."""
+    from scipy.interpolate import CubicSpline  # half a second, which processes that only pass poses on need not spend
+
     count = len(horizons)
     curve = CubicSpline([0.0, *horizons], np.concatenate([np.zeros((1, count)), np.eye(count)]))
     return curve, curve.derivative()

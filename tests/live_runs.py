@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
 import re
@@ -9,7 +10,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -57,11 +59,17 @@ PATH = """x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,speed_mm_s,material,temper
 class Running:
     """`stillbed live` with a terminal; `said` grows as it speaks."""
 
-    def __init__(self, *arguments: str, cache: Path, limits: Callable[[], None] | None = None) -> None:
+    def __init__(
+        self,
+        *arguments: str,
+        cache: Path,
+        limits: Callable[[], None] | None = None,
+        program: Sequence[str] = ("hardware.cli", "live"),
+    ) -> None:
         self.keys, theirs = pty.openpty()
         environment = os.environ | {"XDG_CACHE_HOME": str(cache), "OPENBLAS_NUM_THREADS": "1"}
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "hardware.cli", "live", *arguments],
+            [sys.executable, "-m", *program, *arguments],
             cwd=ROOT,
             env=environment,
             stdin=theirs,
@@ -182,3 +190,21 @@ def messages(record: Path, topic: str) -> list[dict[str, object]]:
         for stored in part.messages
         if stored.topic == topic
     ]
+
+
+def summary(record: Path) -> dict[str, object]:
+    found: dict[str, object] = json.loads(Beside(record).summary.read_text())
+    return found
+
+
+def printed_once(*records: Path) -> None:
+    """That no stretch of the path was extruded in two of the runs, and that hardly any was left out between them."""
+    spans = []
+    for record in records:
+        extruding = {m["stamp"]: m["extrude"] for m in messages(record, "/move")}
+        places = [float(str(m["fraction"])) for m in messages(record, "/tick") if extruding.get(m["stamp"])]
+        assert places
+        spans.append((min(places), max(places)))
+    for before, after in pairwise(spans):
+        assert after[0] >= before[1] - 1e-9
+        assert after[0] - before[1] <= 1.0 + 1e-9

@@ -11,8 +11,8 @@ import pytest
 from browser import Browser, Page, executable
 
 from hardware.clock import WallClock
-from hardware.live.prerender import prerender
-from tests.live_runs import PATH, SCENARIO, Running, closed, executed, messages
+from tests.light_live import HOME, prepare_files
+from tests.live_runs import Running, closed, executed, messages
 
 CLOCK = WallClock()
 CHROMIUM = executable()
@@ -22,11 +22,8 @@ SETTLED = 0.3  # s after which what was sent before has been carried out
 
 @pytest.fixture
 def run(tmp_path: Path) -> Iterator[Running]:
-    (tmp_path / "small.toml").write_text(SCENARIO)
-    (tmp_path / "path.csv").write_text(PATH)
-    prerender(tmp_path / "small.toml", tmp_path / "stillbed", threads=1)
-    simulated, record = str(tmp_path / "small.toml"), str(tmp_path / "run.mcap")
-    made = Running("--simulated", simulated, "--record", record, cache=tmp_path)
+    prepare_files(tmp_path)
+    made = Running("--page", cache=tmp_path, program=("tests.light_live", str(tmp_path), str(tmp_path / "run.mcap")))
     yield made
     made.close()
 
@@ -62,26 +59,30 @@ def moves_sent(record: Path) -> np.ndarray:
     return np.array([float(str(m["stamp"])) for m in sent if base64.b64decode(str(m["data"]))[1:2] == b"1"])
 
 
-def test_confirmed_started_paused_resumed_and_stopped_from_the_page(
-    run: Running, browser: Browser, tmp_path: Path
-) -> None:
+def test_every_button_does_what_it_says_and_the_end_is_told(run: Running, browser: Browser, tmp_path: Path) -> None:
     end = run.wait_for(r"open http://\S+")
     page = browser.page(run.said[:end].rsplit(" ", 1)[1])
     confirmed = press(page, "confirm", '["ready"]')
     started = press(page, "start", '["homing", "approach", "print"]', sure=True)
-    page.until('document.body.dataset.stage === "print"', timeout=60)
-    CLOCK.wait_until(CLOCK.now() + 1.0)
+    prints(page)
     paused = press(page, "pause", '["paused"]')
-    CLOCK.wait_until(CLOCK.now() + 1.0)
-    pause_ends = CLOCK.now()
+    pause_ends = later(1.0)
     press(page, "resume", '["approach", "print"]')
-    page.until('document.body.dataset.stage === "print"', timeout=60)
-    CLOCK.wait_until(CLOCK.now() + 1.0)
+    prints(page)
+    homing = press(page, "home", '["homing", "stopped"]', sure=True)
+    page.until('document.body.dataset.stage === "stopped"', timeout=60)
+    home = CLOCK.now()
+    home_ends = later(0.5)
+    press(page, "resume", '["approach", "print"]', sure=True)
+    prints(page)
     stopped = press(page, "stop", '["stopped"]')
-    CLOCK.wait_until(CLOCK.now() + 1.0)
-    stop_ends = CLOCK.now()
-    run.process.terminate()
-    run.end()
+    stop_ends = later(1.0)
+    press(page, "resume", '["approach", "print"]', sure=True)
+    prints(page)
+    ended = press(page, "end", '["ended"]', sure=True)
+    page.until('document.body.dataset.news === "gone"', timeout=60)
+    assert page.text("#chip") == "Finished" and "by the operator" in page.text("#reason")
+    assert run.end() == 1 and "ended: ended by the operator" in run.said
     record = tmp_path / "run.mcap"
     closed(record)
     moves = moves_sent(record)
@@ -92,8 +93,25 @@ def test_confirmed_started_paused_resumed_and_stopped_from_the_page(
     assert between(0.0, confirmed) == 0
     assert between(started, paused) > 20
     assert between(paused + SETTLED, pause_ends) == 0
-    assert between(pause_ends, stopped) > 20
+    assert between(pause_ends, homing) > 20
+    assert between(homing, home) > 5 and between(home + SETTLED, home_ends) == 0
+    assert between(home_ends, stopped) > 20
     assert between(stopped + SETTLED, stop_ends) == 0
+    assert between(stop_ends, ended) > 20 and between(ended + SETTLED, np.inf) == 0
     stamps, axes = executed(record)
-    still = axes[(stamps > stopped + SETTLED) & (stamps < stop_ends)]
-    assert len(still) and np.ptp(still, axis=0).max() < 0.05
+    for begin, end in ((stopped, stop_ends), (home, home_ends), (ended, np.inf)):
+        still = axes[(stamps > begin + SETTLED) & (stamps < end)]
+        assert not len(still) or np.ptp(still, axis=0).max() < 0.05
+    at_home = axes[(stamps > home + SETTLED) & (stamps < home_ends)]
+    assert np.abs(at_home[:, 2] - HOME).max() < 0.1
+
+
+def prints(page: Page) -> None:
+    page.until('document.body.dataset.stage === "print"', timeout=60)
+    later(0.8)
+
+
+def later(seconds: float) -> float:
+    """Wait; the instant, s."""
+    CLOCK.wait_until(CLOCK.now() + seconds)
+    return CLOCK.now()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path as File
 
 from estimation.errors import StillbedError
 from hardware.clock import WallClock
-from hardware.live.bodies import move, move_virtually, record, show, track
+from hardware.live.bodies import move, move_virtually, record, show
 from hardware.live.crew import CONTEXT, Crew
 from hardware.live.frame_ring import FrameRing
 from hardware.live.outbox import Outbox
@@ -18,6 +19,8 @@ from hardware.live.records import Handed, LiveMotionReport, RecorderReport, Trac
 from hardware.live.settings import VIRTUAL
 from hardware.newest import Newest
 from hardware.operator.link import OperatorLink
+
+Body = Callable[..., None]
 
 LOOK = 0.02  # s between looks for it
 TROUBLE = 4096  # bytes of a sentence that says what is wrong with the arm
@@ -58,18 +61,18 @@ class Lines:
             self.crew.kill(name)
 
 
-def started(prepared: Prepared, folder: File) -> Lines:
-    """Start all processes, or none. folder: for a virtual arm's device."""
+def started(prepared: Prepared, folder: File, tracker: Body) -> Lines:
+    """Start all processes, or none. folder: for a virtual arm's device. tracker: what the tracking process does."""
     crew = Crew()
     try:
-        return _started(crew, prepared, folder)
+        return _started(crew, prepared, folder, tracker)
     except BaseException:
         for name in list(crew.members):
             crew.kill(name)
         raise
 
 
-def _started(crew: Crew, prepared: Prepared, folder: File) -> Lines:
+def _started(crew: Crew, prepared: Prepared, folder: File, tracker: Body) -> Lines:
     url = prepared.settings.arm
     arm_line = CONTEXT.Pipe(duplex=False)
     if url == VIRTUAL:
@@ -84,7 +87,8 @@ def _started(crew: Crew, prepared: Prepared, folder: File) -> Lines:
     crew.start("motion", move, (prepared, url, place, poses, motion, orders[0], link, trouble, senders[0][1]))
     if not prepared.live:
         crew.start("feed", show, (prepared, ring, words[1]))
-    crew.start("tracking", track, (prepared, ring, words[0], poses, tracking, motion, link, senders[1][1], lifeline[0]))
+    told = prepared, ring, words[0], poses, tracking, motion, link, senders[1][1], lifeline[0]
+    crew.start("tracking", tracker, told)
     ends = orders[1], lifeline[1], arm_line[1], Outbox(senders[2][1])
     return Lines(crew, url, place, tracking, motion, recorder, *ends, link, trouble)
 

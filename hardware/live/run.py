@@ -6,6 +6,7 @@ orders. It does nothing that takes long, so that a stop waits for nothing here.
 
 from __future__ import annotations
 
+import importlib
 import signal
 import socket
 import tempfile
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING
 from hardware.arm_status import ArmState
 from hardware.clock import WallClock
 from hardware.live.beside import Found, write_found
+from hardware.live.bodies import track
 from hardware.live.checklist import table
 from hardware.live.conductor import Conductor, Orders, Seen
 from hardware.live.console import HELP, Console
@@ -26,7 +28,7 @@ from hardware.live.halting import halt
 from hardware.live.keeper import Keeper
 from hardware.live.kept import kept_begin
 from hardware.live.laid import Laid
-from hardware.live.lines import started
+from hardware.live.lines import Body, started
 from hardware.live.prepared import Prepared
 from hardware.live.records import Begin, EventEntry, UsedEntry
 from hardware.live.settings import settings_text
@@ -56,15 +58,17 @@ MOTION, TRACKING, RECORDER = "motion", "tracking", "recorder"
 class LiveRun:
     """One run from its check to its report."""
 
-    def __init__(self, prepared: Prepared, console: Console) -> None:
+    def __init__(self, prepared: Prepared, console: Console, tracker: Body = track) -> None:
+        """tracker: what the tracking process does; given what `hardware.live.bodies.track` is given."""
         self._prepared, self._console, self._clock = prepared, console, WallClock()
+        self._tracker = tracker
         self._conductor, self._tally, self._seen = Conductor(prepared.task), Tally(), Seen()
         self._signal = 0
         self._viewer, self._viewed = Viewer(prepared), -1e9
         self._page: OperatorPage | None = None
         self._stopped_at: list[float] = []  # s, decisions whose frame is not on the wire yet
         self._stops, self._requests = 0, 0
-        self._stage = Stage.CHECK
+        self._turn = 0  # that was told last
         self._said = self._heard = -1e9
         self._found = prepared.found is not None
         self._halted = False
@@ -74,13 +78,14 @@ class LiveRun:
         """Run to the end; what came of it. Files are whole and all processes have ended on return."""
         prepared = self._prepared
         with tempfile.TemporaryDirectory() as folder, _wakened(self) as wake, ExitStack() as stack:
-            lines = self._lines = started(prepared, File(folder))
+            lines = self._lines = started(prepared, File(folder), self._tracker)
             stack.callback(lines.close)
             prepared.beside.session.write_text(settings_text(prepared.settings), encoding="utf-8")
             lines.outbox.put(UsedEntry("session.toml", settings_text(prepared.settings)))
             keeper = Keeper(prepared.beside.progress, prepared.task.fingerprint, lines.place)
             stack.callback(keeper.close)
             self._open_page(stack)
+            importlib.import_module("scipy.interpolate")  # predicting takes it; now nobody waits for this process
             for note in prepared.notes:
                 self._console.say(note)
             while not self._conductor.ended:
@@ -232,8 +237,8 @@ class LiveRun:
 
     def _tell(self, now: float) -> None:
         conductor = self._conductor
-        if conductor.stage is not self._stage:
-            self._stage = conductor.stage
+        if conductor.turn != self._turn:
+            self._turn = conductor.turn
             self._say(f"{conductor.stage.value}{': ' + conductor.reason if conductor.reason else ''}")
             if conductor.stage is Stage.FIND:
                 self._console.say(table(conductor.checks))

@@ -1,0 +1,113 @@
+"""A live run for tests whose tracker needs no pictures: `python -m tests.light_live FOLDER RECORD [FLAG ...]`.
+
+All else is as in any run: its processes, the arm's line, the recording, keys, signals and the page. It begins to print
+within seconds, as nothing is rendered, decoded or tracked.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+import zlib
+from pathlib import Path
+from typing import Any
+
+RATE = 30.0  # frame sets a second
+AGE = 0.03  # s of a pose when it comes
+HOME = 65.0  # mm of Z: the surface lies at 50
+SIZE = (16, 12)  # px
+RIG = """[[camera]]
+name = "{name}"
+source = "usb:{name}"
+size = [16, 12]
+matrix = [[20, 0, 8], [0, 20, 6], [0, 0, 1]]
+distortion = [0, 0, 0, 0, 0]
+base_from_camera = [[1, 0, 0, {x}], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+"""
+
+
+def prepare_files(folder: Path, lines: int = 40, speed: float = 5.0) -> None:
+    """rig.toml, path.csv and arm.toml of a run over a surface that breathes a little, 15 mm below the arm's home."""
+    from dataclasses import replace
+
+    from hardware.arm_file import write_arm
+    from hardware.arm_profile import ArmProfile
+    from hardware.path_file import write_path
+    from tests.moving import raster
+
+    (folder / "rig.toml").write_text("".join(RIG.format(name=name, x=x) for name, x in (("a", 0), ("b", 100))))
+    write_path(folder / "path.csv", raster(lines=lines, speed=speed))
+    profile = ArmProfile()
+    home = profile.arm.home.copy()
+    home[2] = HOME
+    write_arm(folder / "arm.toml", replace(profile, arm=replace(profile.arm, home=home)), "near the surface")
+
+
+def track_nothing(
+    prepared: Any, ring: Any, words: Any, poses: Any, reports: Any, motion: Any, link: Any, sender: Any, lifeline: Any
+) -> None:
+    """The body of a tracking process that knows where the surface is."""
+    import numpy as np
+
+    from estimation.observations import no_observations
+    from hardware.clock import WallClock
+    from hardware.live.children import gone, settle
+    from hardware.live.outbox import Outbox
+    from hardware.live.records import Handed, PoseEntry, RigEntry, SetEntry, TrackingReport
+    from tests.moving import breathing, pose_at
+
+    settle("tracking")
+    clock, outbox, picture = WallClock(), Outbox(sender), png()
+    outbox.put(RigEntry(prepared.rig))
+    names = tuple(camera.name for camera in prepared.rig.cameras)
+    begin = due = clock.now()
+    while not gone(lifeline):
+        due += 1 / RATE
+        clock.wait_until(due)
+        stamp, sets = due - AGE, round((due - begin) * RATE)
+        pose = pose_at(lambda t: breathing(t, height=1.0, tilt=0.005), stamp)
+        poses.put(Handed(pose, due - AGE / 2, clock.now()))
+        known = np.eye(4), begin
+        reports.put(TrackingReport(clock.now(), names, (0, 1), pose, *known, sets, 0, 1 / RATE, used=(50, 50)))
+        outbox.put(SetEntry({0: stamp, 1: stamp}, {0: ("png", picture), 1: ("png", picture)}))
+        outbox.put(PoseEntry(pose, no_observations(stamp)))
+    outbox.close()
+
+
+def png() -> bytes:
+    """A grey picture."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    rows = (b"\0" + b"\x80" * SIZE[0]) * SIZE[1]
+    head = struct.pack(">IIBBBBB", *SIZE, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+def main(folder: Path, record: Path, *flags: str) -> int:
+    """Run; the exit code is the run's."""
+    from hardware.live.console import Console
+    from hardware.live.prepared import prepare, prepare_again
+    from hardware.live.run import LiveRun
+    from hardware.live.settings import LiveSettings
+
+    if "--resume" in flags:
+        prepared = prepare_again(record, {"unattended": "--yes" in flags})
+    else:
+        rig, path, profile = (folder / name for name in ("rig.toml", "path.csv", "arm.toml"))
+        device = next((flag for flag in flags if not flag.startswith("--")), "virtual")
+        more = {"unattended": "--yes" in flags, "page": "--page" in flags, "stands_home": True}
+        given = LiveSettings(rig=rig, path=path, arm=device, profile=profile, record=record, **more)
+        prepared = prepare(given, "the test", False)
+    with Console() as console:
+        outcome = LiveRun(prepared, console, track_nothing)()
+        outcome.write()
+        console.say(outcome.words)
+    return outcome.code
+
+
+if __name__ == "__main__":
+    import tests.light_live as itself  # its processes import it by this name
+
+    sys.exit(itself.main(Path(sys.argv[1]), Path(sys.argv[2]), *sys.argv[3:]))

@@ -1,0 +1,172 @@
+"""`stillbed live` before rendered pictures: what test_live_run.py shows of a light run holds of a whole one."""
+
+from __future__ import annotations
+
+import base64
+import os
+import resource
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hardware.bookmark_file import read_start
+from hardware.clock import WallClock
+from hardware.live.beside import Beside
+from hardware.live.prerender import prerender
+from hardware.live.remembered import recorded_poses
+from hardware.live.replayed import replay_run
+from hardware.path_file import read_path
+from hardware.session import open_session
+from hardware.tracker import tracker
+from tests.live_runs import PATH, SCENARIO, Running, closed, messages, printed_once, rests, summary
+
+pytestmark = pytest.mark.slow
+CLOCK = WallClock()
+Start = Callable[..., Running]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scenario, rendered into a cache of its own."""
+    folder = tmp_path_factory.mktemp("live")
+    (folder / "small.toml").write_text(SCENARIO)
+    (folder / "path.csv").write_text(PATH)
+    prerender(folder / "small.toml", folder / "stillbed", threads=1)
+    return folder
+
+
+@pytest.fixture
+def start(cache: Path) -> Iterator[Start]:
+    """Starts runs, and leaves none behind."""
+    running: list[Running] = []
+
+    def started(*arguments: object, limits: Callable[[], None] | None = None) -> Running:
+        running.append(Running(*map(str, arguments), "--no-page", cache=cache, limits=limits))
+        return running[-1]
+
+    yield started
+    for run in running:
+        run.close()
+
+
+def begun(start: Start, cache: Path, record: Path, **more: Callable[[], None]) -> Running:
+    """A run that prints."""
+    run = start("--simulated", cache / "small.toml", "--record", record, "--yes", **more)
+    run.wait_for(r"\nprint\n")
+    CLOCK.wait_until(CLOCK.now() + 1.5)
+    return run
+
+
+def retracked_alike(record: Path, count: int) -> None:
+    """That the first sets of a recording, tracked anew, give the very poses that it holds."""
+    session, poses = open_session(record), {pose.stamp: pose for pose in recorded_poses(record)}
+    rois = [replace(roi, stamp=-np.inf) for roi in session.roi]
+    with tracker(session.rig, rois) as step:
+        for frames in islice(session.frame_sets(), count):
+            pose, recorded = step(frames), poses[frames.stamp]
+            step.idle()
+            assert (pose.base_from_surface == recorded.base_from_surface).all() and pose.state is recorded.state
+
+
+def test_stopped_in_the_terminal_it_rests_goes_on_and_a_signal_ends_it_for_another_run_to_resume(
+    start: Start, cache: Path, tmp_path: Path
+) -> None:
+    record = tmp_path / "run.mcap"
+    run = start("--simulated", cache / "small.toml", "--record", record)
+    at = run.wait_for(r"confirm")
+    run.press("y")
+    at = run.wait_for(r"ready", at)
+    run.press("s")
+    at = run.wait_for(r"\nprint\n", at)
+    CLOCK.wait_until(CLOCK.now() + 1.0)
+    run.press(" ")
+    at = run.wait_for(r"stopped: by the operator", at)
+    CLOCK.wait_until(CLOCK.now() + 1.0)
+    run.press("r")
+    at = run.wait_for(r"\nprint\n", at)
+    run.press("p")
+    at = run.wait_for(r"paused", at)
+    run.press("h")
+    at = run.wait_for(r"stopped: at home", at)
+    run.press("r")
+    at = run.wait_for(r"\nprint\n", at)
+    CLOCK.wait_until(CLOCK.now() + 1.0)
+    os.kill(run.process.pid, signal.SIGTERM)
+    assert run.end() == 128 + signal.SIGTERM
+    assert "go on with: stillbed live --resume" in run.said
+    found = summary(record)
+    stops = found["latency_ms"]["stop decided to on the wire"]  # type: ignore[index,call-overload]
+    assert stops["count"] >= 2
+    resumed = start("--resume", record, "--yes")
+    resumed.wait_for(r"\nprint\n")
+    resumed.wait_for(r"the path is printed")
+    assert resumed.end() == 0
+    printed_once(record, tmp_path / "run-2.mcap")
+    for file in (record, tmp_path / "run-2.mcap"):  # with a stop, a pause and a way home in the first
+        ticks = list(replay_run(file))
+        assert len(ticks) > 100 and all(tick.frame == tick.recorded for tick in ticks)
+        wire = b"".join(base64.b64decode(str(m["data"])) for m in messages(file, "/arm/sent"))
+        moves = [tick.frame for tick in ticks if tick.frame[1:2] == b"1"]
+        assert np.mean([move in wire for move in moves]) > 0.95
+    retracked_alike(record, 20)
+
+
+@pytest.mark.parametrize("name", ["motion", "tracking"])
+def test_a_process_that_is_killed_is_noticed_the_arm_rests_and_the_place_is_kept(
+    name: str, start: Start, cache: Path, tmp_path: Path
+) -> None:
+    record = tmp_path / "run.mcap"
+    run = begun(start, cache, record)
+    killed = run.kill(name)
+    run.wait_for(f"the {name} process was killed by SIGKILL")
+    assert run.end() == 1
+    assert rests(record, killed, 0.5)
+    session = open_session(record)
+    assert killed - session.sets[-1][0].stamp < 1.0
+    path = read_path(next((cache / "stillbed").glob("small-*")) / "path.csv")
+    ticks = messages(record, "/tick")
+    kept = read_start(Beside(record).progress, path)
+    assert kept >= float(str(ticks[-1]["fraction"])) - 1e-9
+    assert kept - float(str(ticks[-1]["fraction"])) < 1.0
+
+
+def test_the_conducting_process_killed_leaves_an_arm_at_rest_and_a_whole_recording(
+    start: Start, cache: Path, tmp_path: Path
+) -> None:
+    record = tmp_path / "run.mcap"
+    run = begun(start, cache, record)
+    killed = CLOCK.now()
+    run.process.kill()
+    assert rests(record, killed, 0.5)
+    session = closed(record)
+    assert killed - session.sets[-1][0].stamp < 0.5
+    ticks = messages(record, "/tick")
+    path = read_path(next((cache / "stillbed").glob("small-*")) / "path.csv")
+    assert read_start(Beside(record).progress, path) == pytest.approx(float(str(ticks[-1]["fraction"])), abs=0.2)
+
+
+def test_cameras_that_end_end_the_run_with_the_arm_at_rest(start: Start, cache: Path, tmp_path: Path) -> None:
+    record = tmp_path / "run.mcap"
+    run = begun(start, cache, record)
+    now = run.kill("feed")
+    run.wait_for("the cameras have ended")
+    assert run.end() == 1
+    assert rests(record, now, 0.6)
+
+
+def test_a_full_disk_ends_the_run_and_what_was_written_stays(start: Start, cache: Path, tmp_path: Path) -> None:
+    record = tmp_path / "run.mcap"
+    most = 6_000_000  # bytes of any file: what a disk says of them is another word, but comes by the same way
+    run = start(
+        *("--simulated", cache / "small.toml", "--record", record, "--yes"),
+        limits=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most)),
+    )
+    run.wait_for("recording stopped")
+    assert run.end() == 1
+    assert len(open_session(record)) > 20
+    assert np.isfinite([ref.stamp for refs in open_session(record).sets for ref in refs]).all()
