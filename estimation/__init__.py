@@ -5,3 +5,21 @@ Conventions, written once. Lengths mm, time s, angles rad, pixels px. A transfor
 Frames: `base` (fixed; the robot's once registered), `camera`, `surface`, `nozzle`. A tangent vector is
 [rx ry rz tx ty tz] and perturbs on the right: `T @ exp(xi)`, which is GTSAM's own order and side.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from estimation.smoothing.smooth import smooth
+
+__all__ = ["smooth"]
+
+
+def __getattr__(name: str) -> Any:
+    """`from estimation import smooth`: loaded when it is asked for, since planning needs nothing of it."""
+    if name == "smooth":
+        from estimation.smoothing.smooth import smooth
+
+        return smooth
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

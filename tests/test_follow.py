@@ -9,9 +9,9 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.state_machine import StateSettings
-from estimation.synthetic.first_map import triangulated
 from estimation.synthetic.follow import Follower, Mapping, beginning, follow
 from estimation.synthetic.world import World, synthetic_world
+from estimation.triangulated import triangulated
 from hardware.bench.pooled import pooled
 
 

@@ -21,8 +21,8 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.state_machine import StateSettings
 from estimation.synthetic.bound import filtered_bound, pose_bound, pose_information
-from estimation.synthetic.first_map import Triangulated, triangulated
 from estimation.synthetic.world import World
+from estimation.triangulated import Triangulated, triangulated
 
 LEAST = StateSettings().first + 3  # frame sets: the map's, those averaged into the first pose, and two to be judged
 Mapping = Literal["told", "seen"]  # the world's own map; or one that is triangulated from the first look and refined
