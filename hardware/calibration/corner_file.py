@@ -13,7 +13,7 @@ from hardware.session import Session
 from perception.boards.board import Board
 from perception.boards.collection import CornerTable
 
-VERSION = 2  # of how corners are looked for: other ones are other corners
+VERSION = 3  # of how corners are looked for: other ones are other corners
 BLOCK = 1 << 20  # bytes read at once
 
 

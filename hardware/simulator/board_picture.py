@@ -16,6 +16,7 @@ from perception.frames import Image
 SAMPLES = 3  # per pixel and axis: edges lie true to a hundredth of a pixel
 PAPER = 0.5  # of a square, white around the print
 LIGHT, DARK, WALL = 205.0, 38.0, 120.0  # grey levels of paper, ink and what is behind
+FINER = 8  # parts of a cell along its edge; between two the light is interpolated, which keeps edges from stepping
 ROOM = 12  # px around the board that are drawn
 
 
@@ -24,8 +25,13 @@ class BoardView:
 
     def __init__(self, camera: Camera, board: Board) -> None:
         self.camera, self._board = camera, board
-        ink, self._cell = black(board)
-        self._ink = np.where(ink, DARK, LIGHT).astype(np.float32)
+        ink, cell = black(board)
+        rim = round(PAPER * board.square / cell * FINER)
+        drawn = np.kron(np.where(ink, DARK, LIGHT), np.ones((FINER, FINER)))
+        paper = DARK if board.inverted else LIGHT
+        self._drawing = np.pad(drawn, rim, constant_values=paper).astype(np.float32)
+        scale, shift = FINER / cell, rim - 0.5  # cells' middles are whole numbers
+        self._drawing_from_board = np.array([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]])
 
     def picture(self, base_from_board: Array, blur: float, noise: float, rng: np.random.Generator) -> Image:
         """The image (H, W) grey of the board at a pose (4, 4); blur: px, noise: grey levels, one sigma each."""
@@ -56,22 +62,9 @@ class BoardView:
     def _patch(self, base_from_board: Array, box: tuple[int, int, int, int]) -> Field:
         x0, y0, x1, y1 = box
         x, y = ((np.arange((b - a) * SAMPLES) + 0.5) / SAMPLES - 0.5 + a for a, b in ((x0, x1), (y0, y1)))
-        rays = np.moveaxis(rays_at(self.camera, x, y), 0, -1)
+        u, v = rays_at(self.camera, x, y)
         camera_from_board = se3.inverse(self.camera.base_from_camera) @ base_from_board
-        plane = np.linalg.inv(camera_from_board[:3, [0, 1, 3]])
-        flat = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) @ plane.T.astype(np.float32)
-        board = flat[..., :2] / flat[..., 2:]
-        light = self._seen(board)
+        drawing_from_ray = self._drawing_from_board @ np.linalg.inv(camera_from_board[:3, [0, 1, 3]])
+        across, down, depth = (a * u + b * v + c for a, b, c in drawing_from_ray.astype(np.float32))
+        light = cv2.remap(self._drawing, across / depth, down / depth, cv2.INTER_LINEAR, borderValue=WALL)
         return np.asarray(cv2.resize(light, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA), np.float32)
-
-    def _seen(self, board: Field) -> Field:
-        """What is at places (H, W, 2), mm, of the board's plane."""
-        rows, columns = self._ink.shape
-        cell = np.floor(board / self._cell).astype(int)
-        inside = (cell >= 0).all(-1) & (cell[..., 0] < columns) & (cell[..., 1] < rows)
-        rim = PAPER * self._board.square
-        paper = (board >= -rim).all(-1) & (board < np.array(self._board.size) + rim).all(-1)
-        blank = DARK if self._board.inverted else LIGHT
-        light = np.where(paper, blank, WALL).astype(np.float32)
-        light[inside] = self._ink[cell[inside, 1], cell[inside, 0]]
-        return light

@@ -6,17 +6,19 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation.se3 import Array
 from perception.boards.board import Board, charuco
 from perception.frames import Image
 
 LEAST = 4  # corners: fewer do not fix a plane
-STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-4)
+STEPS, DONE = 10, 1e-3  # most steps of a corner's refinement; px that are not worth another one
 WINDOW = (2, 9)  # px, half: smaller holds no edge, larger meets the next corner of what is far away
-ROOM = 0.35  # of the distance to the next corner, half of the window at most
-CLEAR = 0.9  # of the white between a corner and the markers beside it: a marker in the window pulls by 0.1 px
-FINEST = 0.02  # px
+REACH = 0.4  # of a square, that is looked at along an edge: beyond half, the next corner's edges begin
+HALVES = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])  # of a square, to both sides along both axes
+FRINGE, NARROWEST = 2.0, 1.5  # px about an edge that its blur fills: between the window and the markers; in it
+FINEST = 0.01  # px; rendered pictures without noise leave as much
 STEP = 2.5066  # sqrt(2 pi): a step blurred by one sigma rises by 1 / (2.5066 sigma) a pixel
 
 
@@ -110,18 +112,71 @@ def _first_is_dark(grey: Image, grid: Array) -> bool:
 
 
 def _refined(board: Board, grey: Image, pixels: Array) -> tuple[Array, int]:
-    """The corners to fractions of a pixel, and half the window that was looked at, px."""
+    """The corners to fractions of a pixel, and half the window that was looked at, px.
+
+    Where the gradients about a corner are all square to the way there (Foerstner and Guelch 1987), as OpenCV's
+    cornerSubPix has it, but of the two edges alone: a window in the board's own axes keeps clear of the markers and is
+    still long along the edges.
+    """
     seen = np.flatnonzero(np.isfinite(pixels[:, 0]))
-    room = ROOM if board.kind == "chessboard" else CLEAR * (1 - board.marker) / 2
-    window = int(np.clip(room * _spacing(board, pixels), *WINDOW))
-    at = np.ascontiguousarray(pixels[seen], np.float32).reshape(-1, 1, 2)
-    fine = cv2.cornerSubPix(grey, at.copy(), (window, window), (-1, -1), STEPS).reshape(-1, 2).astype(float)
-    height, width = grey.shape
-    near = np.linalg.norm(fine - pixels[seen], axis=1) < max(window / 2, 1.5)
-    inside = (fine >= window + 1).all(1) & (fine <= np.array([width, height]) - window - 2).all(1)
-    out = np.full_like(pixels, np.nan)
-    out[seen[near & inside]] = fine[near & inside]
-    return out, window
+    half = int(np.clip(REACH * _spacing(board, pixels), *WINDOW))
+    turn = _squares_from_pixels(board, pixels)
+    out, known = np.full_like(pixels, np.nan), np.isfinite(turn).all((1, 2))
+    seen, at, turn = seen[known], pixels[seen[known]], turn[known]
+    size = np.array(grey.shape[::-1])
+    for _ in range(STEPS):
+        near = np.round(at).astype(int)
+        inside = (near >= half + 1).all(1) & (near <= size - half - 2).all(1)
+        seen, at, near, turn = seen[inside], at[inside], near[inside], turn[inside]
+        if not len(seen):
+            break
+        slopes, places = _slopes(grey, near, half)
+        weight = _weights(board, places - at[:, None], turn, half)
+        tensor = np.einsum("np,npi,npj->nij", weight, slopes, slopes) + np.eye(2)
+        pull = np.einsum("np,npi,np->ni", weight, slopes, (slopes * (places - at[:, None])).sum(-1))
+        step = np.linalg.solve(tensor, pull[..., None])[..., 0]
+        at = at + step
+        kept = np.linalg.norm(at - pixels[seen], axis=1) < max(half / 2, 1.5)
+        seen, at, turn, step = seen[kept], at[kept], turn[kept], step[kept]
+        if np.abs(step).max(initial=0.0) < DONE:
+            break
+    out[seen] = at
+    return out, half
+
+
+def _slopes(grey: Image, near: NDArray[np.int64], half: int) -> tuple[Array, Array]:
+    """Grey levels per pixel (N, K, 2) in windows about pixels (N, 2), and where they are (N, K, 2)."""
+    y, x = np.mgrid[-half - 1 : half + 2, -half - 1 : half + 2]
+    part = grey[near[:, 1, None, None] + y, near[:, 0, None, None] + x].astype(float)
+    gx, gy = (part[:, 1:-1, 2:] - part[:, 1:-1, :-2]) / 2, (part[:, 2:, 1:-1] - part[:, :-2, 1:-1]) / 2
+    places = np.stack([x[1:-1, 1:-1].ravel(), y[1:-1, 1:-1].ravel()], -1) + near[:, None]
+    return np.stack([gx, gy], -1).reshape(len(near), -1, 2), places
+
+
+def _weights(board: Board, away: Array, squares_from_pixels: Array, half: int) -> Array:
+    """(N, K) what gradients `away` (N, K, 2), px, from a corner are worth: those of its own edges, less far out."""
+    along = np.abs(away @ np.swapaxes(squares_from_pixels, 1, 2))  # in squares, along the board's two axes
+    per_pixel = np.linalg.norm(squares_from_pixels, axis=-1)[:, None]  # (N, 1, 2) squares, square to the edges
+    white = (1 - board.marker) / 2 if board.kind == "charuco" else REACH
+    room = np.maximum(white / per_pixel - FRINGE, NARROWEST)
+    edges = (along / per_pixel < room).any(-1) & (along < REACH).all(-1)
+    return np.where(edges, np.exp(-(away**2).sum(-1) / half**2), 0.0)
+
+
+def _squares_from_pixels(board: Board, pixels: Array) -> Array:
+    """(N, 2, 2) squares along the board's axes per pixel about each corner that is seen, by the plane of all of them.
+
+    nan where they tell no plane.
+    """
+    seen = np.isfinite(pixels[:, 0])
+    squares = board.corners[seen, :2] / board.square
+    plane = cv2.findHomography(squares, pixels[seen])[0]
+    if plane is None:
+        return np.full((len(squares), 2, 2), np.nan)
+    ends = [cv2.perspectiveTransform((squares + e)[:, None], plane)[:, 0] for e in HALVES]
+    across = np.stack([ends[0] - ends[1], ends[2] - ends[3]], -1)
+    flat = np.abs(np.linalg.det(across)) < 1.0  # px^2 of a square
+    return np.where(flat[:, None, None], np.nan, np.linalg.inv(np.where(flat[:, None, None], np.eye(2), across)))
 
 
 def _spacing(board: Board, pixels: Array) -> float:
@@ -130,28 +185,26 @@ def _spacing(board: Board, pixels: Array) -> float:
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
     found = np.concatenate(steps)
     found = found[np.isfinite(found)]
-    return float(found.min()) if len(found) else float(WINDOW[0]) / ROOM
+    return float(found.min()) if len(found) else float(WINDOW[0]) / REACH
 
 
-def _quality(board: Board, grey: Image, pixels: Array, window: int) -> tuple[float, float]:
+def _quality(board: Board, grey: Image, pixels: Array, half: int) -> tuple[float, float]:
     """sigma and blur as `Found` has them."""
     seen = np.flatnonzero(np.isfinite(pixels[:, 0]))
-    if not len(seen):
+    if len(seen) < LEAST:
         return 0.0, 0.0
-    axes = _axes(board, pixels)
-    sigmas, blurs = [], []
-    noise = _noise(grey, pixels[seen])
-    for at in pixels[seen]:
-        x, y = np.round(at).astype(int)
-        part = grey[y - window - 1 : y + window + 2, x - window - 1 : x + window + 2].astype(np.float32)
-        gx, gy = (part[1:-1, 2:] - part[1:-1, :-2]) / 2, (part[2:, 1:-1] - part[:-2, 1:-1]) / 2
-        slopes = np.stack([gx.ravel(), gy.ravel()], 1)
-        tensor = slopes.T @ slopes + np.eye(2)
-        sigmas.append(noise * np.sqrt(np.trace(np.linalg.inv(tensor)) / 2))
-        contrast = float(np.percentile(part, 95) - np.percentile(part, 5))
-        steepest = min(float(np.percentile(np.abs(slopes @ axis), 98)) for axis in axes)
-        blurs.append(contrast / max(steepest, 1e-3) / STEP)
-    return max(float(np.median(sigmas)), FINEST), float(np.median(blurs))
+    at = pixels[seen]
+    near = np.round(at).astype(int)
+    slopes, places = _slopes(grey, near, half)
+    weight = _weights(board, places - at[:, None], _squares_from_pixels(board, pixels), half)
+    tensor, spread = (np.einsum("np,npi,npj->nij", w, slopes, slopes) for w in (weight, weight**2))
+    inverse = np.linalg.inv(tensor + np.eye(2))
+    sigma = _noise(grey, at) * np.sqrt(np.trace(inverse @ spread @ inverse, axis1=1, axis2=2) / 2)
+    y, x = np.mgrid[-half - 1 : half + 2, -half - 1 : half + 2].reshape(2, -1)
+    levels = np.percentile(grey[near[:, 1, None] + y, near[:, 0, None] + x], [5, 95], axis=1)
+    steepest = np.percentile(np.abs(slopes @ _axes(board, pixels).T), 98, axis=1).min(1)
+    blur = (levels[1] - levels[0]) / np.maximum(steepest, 1e-3) / STEP
+    return max(float(np.median(sigma)), FINEST), float(np.median(blur))
 
 
 def _axes(board: Board, pixels: Array) -> Array:
