@@ -17,6 +17,7 @@ from hardware import checks
 from hardware.checks import Table
 
 CAMERA_KEYS = ("name", "size", "matrix", "distortion", "base_from_camera")
+SIGMA_KEY = "lens_sigma"  # one standard deviation of fx fy cx cy k1 k2 p1 p2 k3, where a calibration told it
 RECORDED_KEYS = ("video", "images")  # where a recorded session's images are
 LIVE_KEYS = (
     "source",
@@ -45,11 +46,15 @@ class ImageSource:
 
 @dataclass(frozen=True, slots=True)
 class RigFile:
-    """What rig.toml says. sources: one per camera, None where none is named. surface: the scan's file, if named."""
+    """What rig.toml says. sources: one per camera, None where none is named. surface: the scan's file, if named.
+
+    lens_sigma: per camera one standard deviation (9,) of fx fy cx cy k1 k2 p1 p2 k3, None where it is not told.
+    """
 
     rig: Rig
     sources: tuple[ImageSource | None, ...]
     surface: str | None
+    lens_sigma: tuple[Array | None, ...]
 
 
 def read_rig(path: str | Path) -> RigFile:
@@ -60,7 +65,8 @@ def read_rig(path: str | Path) -> RigFile:
     surface = table.get("surface")
     rig = rig_from_table(path, table, (*RECORDED_KEYS, *LIVE_KEYS))
     sources = tuple(_source(path, camera) for camera in table["camera"])
-    return RigFile(rig, sources, None if surface is None else checks.text(path, "surface", surface))
+    sigmas = tuple(_lens_sigma(path, camera) for camera in table["camera"])
+    return RigFile(rig, sources, None if surface is None else checks.text(path, "surface", surface), sigmas)
 
 
 def read_uncalibrated(path: Path) -> RigFile:
@@ -76,7 +82,7 @@ def read_uncalibrated(path: Path) -> RigFile:
         entry["distortion"] = [0.0] * 5
         entry["base_from_camera"] = se3.make(np.eye(3), [NEAREST_RIG * number, 0.0, 0.0]).tolist()
     rig = rig_from_table(path, table, ("video", "images"))
-    return RigFile(rig, tuple(_source(path, entry) for entry in entries), None)
+    return RigFile(rig, tuple(_source(path, entry) for entry in entries), None, (None,) * len(rig))
 
 
 def is_calibrated(path: Path) -> bool:
@@ -114,10 +120,16 @@ def table_from_rig(rig: Rig) -> Table:
     }
 
 
-def write_rig(path: str | Path, rig: Rig, sources: Sequence[ImageSource | None]) -> None:
-    """Write a rig.toml that `read_rig` reads back to the same rig, bit by bit."""
+def write_rig(
+    path: str | Path,
+    rig: Rig,
+    sources: Sequence[ImageSource | None],
+    lens_sigma: Sequence[Array | None] | None = None,
+) -> None:
+    """Write a rig.toml that `read_rig` reads back to the same rig, bit by bit. lens_sigma: (9,) per camera, or None."""
+    sigmas = [None] * len(rig) if lens_sigma is None else lens_sigma
     blocks = ["# mm, px; base_from_camera carries camera coordinates (x right, y down, z into the scene) to the base\n"]
-    for camera, source in zip(rig.cameras, sources, strict=True):
+    for camera, source, sigma in zip(rig.cameras, sources, sigmas, strict=True):
         lines = ["[[camera]]", f"name = {json.dumps(camera.name, ensure_ascii=False)}"]
         if source is not None:
             lines.append(f"{source.kind} = {json.dumps(source.pattern, ensure_ascii=False)}")
@@ -127,6 +139,8 @@ def write_rig(path: str | Path, rig: Rig, sources: Sequence[ImageSource | None])
         lines.append(f"base_from_camera = {checks.toml_numbers(camera.base_from_camera)}")
         if camera.clock_offset:
             lines.append(f"clock_offset_s = {float(camera.clock_offset)!r}")
+        if sigma is not None:
+            lines.append(f"{SIGMA_KEY} = {checks.toml_numbers(sigma)}")
         blocks.append("\n".join(lines) + "\n")
     Path(path).write_text("\n".join(blocks), encoding="utf-8")
 
@@ -139,8 +153,19 @@ def _source(path: Path, camera: Table) -> ImageSource | None:
     return ImageSource(named[0], checks.text(path, f"camera {name!r}: {named[0]}", camera[named[0]])) if named else None
 
 
+def _lens_sigma(path: Path, camera: Table) -> Array | None:
+    if SIGMA_KEY not in camera:
+        return None
+    key = f"camera {camera['name']!r}: {SIGMA_KEY}"
+    allowed = "nine numbers of 0 or more, for fx fy cx cy k1 k2 p1 p2 k3"
+    sigma = checks.numbers(path, key, camera[SIGMA_KEY], (9,), allowed)
+    if (sigma < 0).any():
+        raise InputError(path, key, camera[SIGMA_KEY], allowed)
+    return sigma
+
+
 def _camera(where: object, key: str, entry: Table, also: Sequence[str]) -> Camera:
-    checks.check_keys(where, f"{key}.", entry, CAMERA_KEYS, [*also, "clock_offset_s"])
+    checks.check_keys(where, f"{key}.", entry, CAMERA_KEYS, [*also, "clock_offset_s", SIGMA_KEY])
     name = _name(where, f"{key}.name", entry["name"])
     key = f"camera {name!r}: "
     size = checks.numbers(where, key + "size", entry["size"], (2,), "[width, height] in px")

@@ -9,7 +9,7 @@ import pytest
 
 from estimation import se3
 from estimation.camera_calibration.calibrate import Calibration, calibrate, rebased
-from estimation.camera_calibration.lens_model import lens_of
+from estimation.camera_calibration.lens_model import KnownLenses, lens_of
 from estimation.camera_calibration.views import Views
 from estimation.rig import Rig
 from hardware.calibration.collect import collect
@@ -47,7 +47,7 @@ def test_with_the_lenses_that_are_given_the_cameras_stand_where_they_are_given(
     recording: tuple[str, Views, Rig],
 ) -> None:
     name, views, rig = recording
-    found = calibrate(views, known=np.stack([lens_of(c) for c in rig.cameras]))
+    found = calibrate(views, known=KnownLenses(np.stack([lens_of(c) for c in rig.cameras]), np.zeros((3, 9))))
     assert residual(found) < 0.25
     millimetres, degrees = apart(found, rebased(rig, np.eye(4)))
     # webcams_b's own rig puts the axis of cam_0 33 px from where webcams_a's does; it is no better known than that

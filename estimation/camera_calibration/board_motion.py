@@ -1,7 +1,8 @@
 """Where the board was between the frame sets: a smooth motion through their poses, and its derivatives.
 
-About each instant the motion is the exponential of the polynomial through the logarithms of up to two neighbours on
-either side (Lagrange's, fourth order): nothing to be tuned, and a pose moves with its neighbours' alone.
+About each instant the motion is the exponential of the polynomial through the logarithms of up to four neighbours, two
+on either side where there are two (Lagrange's, fourth order): nothing to be tuned, and a pose moves with its
+neighbours' alone.
 """
 
 from __future__ import annotations
@@ -39,18 +40,11 @@ def stencils(stamps: Array) -> Stencils:
     """The neighbours of instants with the rising stamps (S,), s."""
     count = len(stamps)
     neighbours, times = np.repeat(np.arange(count)[:, None], WIDTH, 1), np.full((count, WIDTH), np.nan)
-    near = np.append(np.diff(stamps) <= REACH, False)  # near[i]: i and i + 1 belong together
-    for i in range(count):
-        column = 0
-        for side in (-1, 1):
-            j = i
-            for _ in range(SIDES):
-                link = j if side > 0 else j - 1
-                if link < 0 or not near[link]:
-                    break
-                j += side
-                neighbours[i, column], times[i, column] = j, stamps[j] - stamps[i]
-                column += 1
+    for run in np.split(np.arange(count), np.flatnonzero(np.diff(stamps) > REACH) + 1):
+        for k, i in enumerate(run):
+            first = min(max(k - SIDES, 0), max(len(run) - WIDTH - 1, 0))  # at a run's ends more of the other side
+            others = np.delete(run[first : first + WIDTH + 1], k - first)
+            neighbours[i, : len(others)], times[i, : len(others)] = others, stamps[others] - stamps[i]
     return Stencils(neighbours, times)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.camera_calibration.homography import LEAST, plane_blunders
 from estimation.camera_calibration.lens_fit import LEAST_CORNERS, LensFit, Undetermined, fit_lens, with_lens
-from estimation.camera_calibration.lens_model import matrix_of
+from estimation.camera_calibration.lens_model import MODELS, KnownLenses, matrix_of
 from estimation.camera_calibration.model_choice import Choice, ModelScore, choose
 from estimation.camera_calibration.plausible import check_doubt, check_lens, check_neighbours
-from estimation.camera_calibration.rig_fit import OWN, RigFit, RigState, fit_rig, free_numbers
+from estimation.camera_calibration.rig_fit import OWN, RigFit, RigState, Rival, fit_rig, free_numbers, with_rivals
 from estimation.camera_calibration.rig_start import first_rig
 from estimation.camera_calibration.views import Views
 from estimation.rig import Camera, Rig
@@ -58,11 +58,11 @@ class Calibration:
         return np.asarray(self.fit.covariance[rows, rows])
 
 
-def calibrate(views: Views, say: Say | None = None, known: Array | None = None) -> Calibration:
+def calibrate(views: Views, say: Say | None = None, known: KnownLenses | None = None) -> Calibration:
     """The rig that the views tell.
 
     Undetermined where they do not tell it, Implausible where what they tell is no camera; both name camera and figure.
-    say: told what is being done. known: lenses (C, 9) that are taken as they are; places and clocks alone are sought.
+    say: told what is being done. known: lenses that are taken as they are, or within what they are said to be off by.
     """
     tell = say or _silent
     views, choices, dropped = lenses(views, tell, known)
@@ -74,7 +74,7 @@ def calibrate(views: Views, say: Say | None = None, known: Array | None = None) 
     base_from_camera, base_from_board = first_rig(views, camera_from_board)
     nothing = np.zeros(len(names)), np.zeros(len(views))
     state = RigState(np.stack([c.fit.lens for c in choices]), base_from_camera, *nothing, base_from_board)
-    views, fit, jitter, more = adjust(views, state, models, known is not None)
+    views, fit, jitter, more = adjust(views, state, choices, known)
     for c, name in enumerate(names):
         check_lens(name, views.sizes[c], fit.state.lens[c])
         check_doubt(name, fit.state.lens[c], fit.covariance[OWN * c : OWN * c + 9, OWN * c : OWN * c + 9])
@@ -83,7 +83,7 @@ def calibrate(views: Views, say: Say | None = None, known: Array | None = None) 
     return Calibration(rig_of(views, fit.state), fit, views, models, scores, jitter, dropped + more)
 
 
-def lenses(views: Views, say: Say, known: Array | None = None) -> tuple[Views, list[Choice], int]:
+def lenses(views: Views, say: Say, known: KnownLenses | None = None) -> tuple[Views, list[Choice], int]:
     """The views that are used, with their measured sigmas, each camera's lens by itself, and corners dropped."""
     kept, sigma, choices = np.zeros(len(views), bool), views.sigma.copy(), []
     first = plane_blunders(views)
@@ -94,17 +94,17 @@ def lenses(views: Views, say: Say, known: Array | None = None) -> tuple[Views, l
         rows = np.flatnonzero((views.camera == c) & (views.seen.sum(1) >= LEAST_CORNERS))
         _check_number(name, len(rows))
         own = views.only(rows)
-        own, choice, out = _chosen(own) if known is None else _given(own, known[c])
+        own, choice, out = _chosen(own) if known is None else _given(own, known.lens[c])
         good = own.without(out).seen.sum(1) >= np.maximum(LEAST_CORNERS, WRONG_SHARE * own.seen.sum(1))
         _check_number(name, int(good.sum()))
         dropped += int(out.sum())
         pixels[rows] = own.without(out).pixels
         own = own.without(out).only(good)
         begin = choice.fit.lens, choice.fit.camera_from_board[good]
-        fit = fit_lens(own, choice.fit.model, begin) if known is None else with_lens(own, known[c])
+        fit = fit_lens(own, choice.fit.model, begin) if known is None else with_lens(own, known.lens[c])
         _check_fit(name, own, fit)
         check_lens(name, own.sizes[c], fit.lens)
-        choices.append(Choice(fit, choice.scores))
+        choices.append(replace(choice, fit=fit))
         kept[rows[good]] = True
         sigma[rows[good]] = np.maximum(own.sigma * fit.scale, FINEST)
     views = replace(views, pixels=pixels, sigma=sigma)
@@ -142,20 +142,20 @@ def blunders(views: Views, residuals: Array, scale: float) -> NDArray[np.bool_]:
 
 
 def adjust(
-    views: Views, state: RigState, models: tuple[str, ...], held: bool = False
+    views: Views, state: RigState, choices: Sequence[Choice], known: KnownLenses | None = None
 ) -> tuple[Views, RigFit, float, int]:
     """The joint adjustment: views without blunders, fit, jitter (s) and how many corners were dropped.
 
     Where instants in common leave more than the cameras' own residuals, single pictures are late by amounts of their
     own; how much is found by expectation maximisation.
     """
-    free = free_numbers(models, held)
-    fit = fit_rig(views, state, free, 0.0)
+    free = free_numbers(tuple(choice.fit.model for choice in choices), known)
+    fit = fit_rig(views, state, free, 0.0, known)
     jitter = 0.0
-    if fit.scale > UNEXPLAINED and len(models) > 1:
+    if fit.scale > UNEXPLAINED and len(choices) > 1:
         jitter = first_jitter(views, fit)
         for _ in range(JITTER_ROUNDS if jitter > LEAST_JITTER else 0):
-            fit = fit_rig(views, fit.state, free, jitter)
+            fit = fit_rig(views, fit.state, free, jitter, known)
             jitter = _jitter(views, fit, jitter)
         jitter = jitter if jitter > LEAST_JITTER else 0.0
     out = blunders(views, fit.residuals, fit.scale)
@@ -165,9 +165,19 @@ def adjust(
     state = replace(
         fit.state, jitter=fit.state.jitter[kept] * (jitter > 0), base_from_board=fit.state.base_from_board[boards]
     )
-    fit = fit_rig(left, state, free, jitter)
-    size = max(fit.scale, 1.0)
-    return left, replace(fit, covariance=fit.covariance * size**2), jitter, int(out.sum())
+    fit = with_rivals(left, fit_rig(left, state, free, jitter, known), free, jitter, rivals_of(choices))
+    return left, fit, jitter, int(out.sum())
+
+
+def rivals_of(choices: Sequence[Choice]) -> list[Rival]:
+    """The models that may be the true ones after all, one camera at a time."""
+    out = []
+    for c, choice in enumerate(choices):
+        if choice.rival:
+            free = np.zeros(OWN * len(choices), bool)
+            free[OWN * c + MODELS[choice.rival]] = True
+            out.append(Rival(free, choice.chance))
+    return out
 
 
 def _delays(views: Views, fit: RigFit) -> tuple[Array, Array]:

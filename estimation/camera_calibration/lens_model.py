@@ -101,6 +101,22 @@ def belief(size: tuple[int, int], lens: Array) -> Belief:
     return Belief(float(off @ off) + log_ratio**2 + bend**2, slope, information)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownLenses:
+    """Lenses (C, 9) that are known beforehand, and one standard deviation (C, 9) of each number; 0: exactly."""
+
+    lens: Array
+    sigma: Array
+
+
+def knowledge(known: KnownLenses, camera: int, lens: Array) -> Belief:
+    """What is known of one camera's lens (9,) beforehand; what is known exactly is not sought."""
+    sigma = known.sigma[camera]
+    weight = np.where(sigma > 0, 1 / np.where(sigma > 0, sigma, 1.0) ** 2, 0.0)
+    off = lens - known.lens[camera]
+    return Belief(float(weight @ off**2), weight * off, np.diag(weight))
+
+
 def _corner_bend(size: tuple[int, int], lens: Array) -> tuple[float, Array]:
     """By how much of its radius a corner of the image is moved, in sigmas, and the slope (9,) of that."""
     fx, fy, k1, k2, k3 = lens[[0, 1, 4, 5, 8]]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from estimation.camera_calibration.lens_fit import LensFit, fit_lens, fit_poses, start
 from estimation.camera_calibration.lens_model import MODELS
@@ -30,13 +31,24 @@ class ModelScore:
     ahead: float
     doubt: float
 
+    @property
+    def chance(self) -> float:
+        """That it is ahead at all, 0 to 1, the mean over the views being normal."""
+        return float(ndtr(self.ahead / self.doubt)) if self.doubt > 0 else 0.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """The chosen model's fit to all views, and how all models did."""
+    """The chosen model's fit to all views, and how all models did.
+
+    rival: the richest model, '' where it was chosen. chance: that a model richer than the chosen one predicts better
+    after all, 0 to 1.
+    """
 
     fit: LensFit
     scores: tuple[ModelScore, ...]
+    rival: str = ""
+    chance: float = 0.0
 
 
 def choose(views: Views) -> Choice:
@@ -52,7 +64,10 @@ def choose(views: Views) -> Choice:
     scores = tuple(_score(model, errors[model], errors[usual]) for model in MODELS)
     better = [s for s in scores if s.model in possible and s.ahead > WORTH * s.doubt]
     chosen = max(better, key=lambda s: s.ahead).model if better else usual
-    return Choice(fits[chosen], scores)
+    richer = [_score(m, errors[m], errors[chosen]) for m in possible if len(MODELS[m]) > len(MODELS[chosen])]
+    if not richer:
+        return Choice(fits[chosen], scores)
+    return Choice(fits[chosen], scores, richer[-1].model, max(score.chance for score in richer))
 
 
 def _is_possible(views: Views, lens: Array) -> bool:

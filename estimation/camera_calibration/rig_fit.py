@@ -7,6 +7,7 @@ Levenberg and Marquardt, robust weights), made for all views at once: a step ove
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from estimation import se3
 from estimation.camera_calibration.board_motion import WIDTH, Stencils, carried, stencils
 from estimation.camera_calibration.least_squares import damped, huber, minimise
-from estimation.camera_calibration.lens_model import MODELS, belief, image
+from estimation.camera_calibration.lens_model import MODELS, KnownLenses, belief, image, knowledge
 from estimation.camera_calibration.views import Views
 from estimation.se3 import Array
 
@@ -44,8 +45,8 @@ class RigFit:
     """The state that fits best.
 
     covariance: (16 C, 16 C) at the views' stated sigma, camera by camera: fx .. k3, place (a right perturbation of
-    base_from_camera), offset; zero where nothing was free. residuals: (V, P, 2) px, imaged less seen. pace: (V, P, 2)
-    px/s by which the board passed. scale: of the residuals, in stated sigmas.
+    base_from_camera), offset; zero where nothing was free or doubted. residuals: (V, P, 2) px, imaged less
+    seen. pace: (V, P, 2) px/s by which the board passed. scale: of the residuals, in stated sigmas.
     """
 
     state: RigState
@@ -56,11 +57,19 @@ class RigFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Rival:
+    """A richer model that may be the true one. free: (16 C,) what it seeks. chance: 0 to 1."""
+
+    free: NDArray[np.bool_]
+    chance: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Problem:
     """What stays the same from step to step.
 
     free: (16 C,) which of the cameras' numbers are sought. jitter: s, one sigma of single pictures' own delays, 0 for
-    none. late: (V,) s, each view's stamp after its instant's.
+    none. known: of the lenses, if anything. late: (V,) s, each view's stamp after its instant's.
     """
 
     views: Views
@@ -68,6 +77,7 @@ class Problem:
     late: Array
     free: NDArray[np.bool_]
     jitter: float
+    known: KnownLenses | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,29 +99,56 @@ def instant_stamps(views: Views) -> Array:
     return np.asarray(first + np.bincount(views.instant, views.stamp - first) / np.bincount(views.instant))
 
 
-def free_numbers(models: tuple[str, ...], held: bool = False) -> NDArray[np.bool_]:
+def free_numbers(models: tuple[str, ...], known: KnownLenses | None = None) -> NDArray[np.bool_]:
     """(16 C,) what is sought with these distortion models: the first camera's place is the base.
 
-    held: whether the lenses are known and only places and offsets are sought.
+    known: what of the lenses is known; what is known exactly is not sought.
     """
     free = np.zeros((len(models), OWN), bool)
     for c, model in enumerate(models):
-        free[c, MODELS[model]] = not held
+        free[c, MODELS[model]] = True
+        if known is not None:
+            free[c, :9] = known.sigma[c] > 0
         free[c, 9:15] = c > 0
         free[c, OFFSET] = len(models) > 1
     return free.ravel()
 
 
-def fit_rig(views: Views, state: RigState, free: NDArray[np.bool_], jitter: float) -> RigFit:
+def fit_rig(
+    views: Views, state: RigState, free: NDArray[np.bool_], jitter: float, known: KnownLenses | None = None
+) -> RigFit:
     """The state that fits the views best, from a near one. jitter: s, one sigma of single pictures' delays."""
-    stamps = instant_stamps(views)
-    problem = Problem(views, stencils(stamps), views.stamp - stamps[views.instant], free, jitter)
+    problem = _problem(views, free, jitter, known)
     state, at = minimise(state, lambda s: _equations(problem, s), lambda s, at, damping: _step(problem, s, at, damping))
-    seen = views.seen
+    seen, instants = views.seen, len(state.base_from_board)
     cost = huber((np.nan_to_num(at.residuals) ** 2).sum(-1) / views.sigma[:, None] ** 2)[0][seen].sum()
-    count = 2 * int(seen.sum()) - 6 * len(stamps) - int(free.sum()) - (len(views) - len(stamps) if jitter else 0)
+    count = 2 * int(seen.sum()) - 6 * instants - int(free.sum()) - (len(views) - instants if jitter else 0)
     scale = float(np.sqrt(cost / max(count, 1)))
     return RigFit(state, _covariance(problem, at), at.residuals, at.pace, scale)
+
+
+def with_rivals(views: Views, fit: RigFit, free: NDArray[np.bool_], jitter: float, rivals: Sequence[Rival]) -> RigFit:
+    """The fit with a covariance in real units, which also holds which model is the true one.
+
+    Residuals larger than stated widen it. Each rival adds, by its chance, what it knows less and how far it lies away
+    (the total covariance over the models), to first order at the fit's state.
+    """
+    problem, size = _problem(views, free, jitter), max(fit.scale, 1.0)
+    covariance = size**2 * fit.covariance
+    at = _equations(problem, fit.state)
+    for rival in rivals:
+        wider = replace(problem, free=free | rival.free)
+        change = _change(wider, at, 0.0)
+        if change is not None:
+            away = change[: len(free)]
+            less = size**2 * (_covariance(wider, at) - fit.covariance)
+            covariance = covariance + rival.chance * (less + np.outer(away, away))
+    return replace(fit, covariance=covariance)
+
+
+def _problem(views: Views, free: NDArray[np.bool_], jitter: float, known: KnownLenses | None = None) -> Problem:
+    stamps = instant_stamps(views)
+    return Problem(views, stencils(stamps), views.stamp - stamps[views.instant], free, jitter, known)
 
 
 def _equations(problem: Problem, state: RigState) -> _Normal:
@@ -177,10 +214,13 @@ def _assembled(
     matrix[np.ix_(offsets, offsets)] += 1 / MEAN**2 + np.eye(cameras) / FAR**2
     slope[offsets] += mean + state.offset / FAR**2
     for c in range(cameras):
-        known, lens = belief(views.sizes[c], state.lens[c]), slice(OWN * c, OWN * c + 9)
-        matrix[lens, lens] += known.information
-        slope[lens] += known.slope
-        cost += known.cost
+        lens, beliefs = slice(OWN * c, OWN * c + 9), [belief(views.sizes[c], state.lens[c])]
+        if problem.known is not None:
+            beliefs.append(knowledge(problem.known, c, state.lens[c]))
+        for believed in beliefs:
+            matrix[lens, lens] += believed.information
+            slope[lens] += believed.slope
+            cost += believed.cost
     cost += float(mean * state.offset.sum() + (state.offset**2).sum() / FAR**2)
     return _Normal(cost, matrix, slope, residuals, pace, jitter_slope, own, cross, places)
 
@@ -189,13 +229,21 @@ def _sought(problem: Problem, size: int) -> NDArray[np.int64]:
     return np.flatnonzero(np.concatenate([problem.free, np.ones(size - len(problem.free), bool)]))
 
 
-def _step(problem: Problem, state: RigState, at: _Normal, damping: float) -> RigState | None:
+def _change(problem: Problem, at: _Normal, damping: float) -> Array | None:
+    """(16 C + 6 S,) what a damped step adds to all numbers; None where the equations cannot be solved."""
     sought = _sought(problem, len(at.slope))
     change = np.zeros(len(at.slope))
     try:
         factor = cho_factor(damped(at.matrix[np.ix_(sought, sought)], damping), overwrite_a=True, check_finite=False)
         change[sought] = -cho_solve(factor, at.slope[sought], check_finite=False)
     except np.linalg.LinAlgError:
+        return None
+    return change
+
+
+def _step(problem: Problem, state: RigState, at: _Normal, damping: float) -> RigState | None:
+    change = _change(problem, at, damping)
+    if change is None:
         return None
     split = OWN * len(state.lens)
     own, boards = change[:split].reshape(-1, OWN), change[split:].reshape(-1, 6)

@@ -24,10 +24,12 @@ from perception.boards.corners import CornerFinder
 
 BOARD = Board(squares=(8, 11), square=30.0)
 SIZE = (1280, 720)
-LENSES = (
-    (894.0, 896.0, 634.0, 361.0, -0.30, 0.10, 0.0, 0.0, 0.0),
-    (980.0, 979.0, 647.0, 368.0, -0.08, 0.0, 0.0, 0.0, 0.0),
-    (861.0, 861.5, 629.0, 353.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+LENSES = np.array(
+    [
+        [894.0, 896.0, 634.0, 361.0, -0.30, 0.10, 0.0, 0.0, 0.0],
+        [980.0, 979.0, 647.0, 368.0, -0.08, 0.0, 0.0, 0.0, 0.0],
+        [861.0, 861.5, 629.0, 353.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    ]
 )
 TURNS = ((0.0, 0.0, 0.0), (4.0, -30.0, 2.0), (-5.0, 35.0, -3.0))  # degrees about a point DEPTH before the first camera
 DEPTH = 700.0  # mm
@@ -35,6 +37,8 @@ LATE = (-0.016, 0.004, 0.012)  # s
 RATE, BLUR, NOISE = 10.0, 0.8, 1.5  # Hz; px; grey levels
 SIGMA = 0.15  # px, of the corners that are drawn without pictures
 DRAWN = 30  # instants of a run without pictures
+BENT = np.array([0.003, 0.003, 0.1])  # one sigma of p1, p2 and k3 of the worst lens drawn: as webcams were measured
+LEAST_BENT = 0.01  # in parts of that, of the best one
 REFERENCE = "none"
 
 
@@ -81,13 +85,13 @@ def run(options: argparse.Namespace) -> list[Figure]:
     return figures
 
 
-def true_rig() -> Rig:
-    """Three cameras about the board, the first one the base."""
+def true_rig(lenses: Array = LENSES) -> Rig:
+    """Three cameras about the board, the first one the base; lenses: (3, 9)."""
     centre = np.array([0.0, 0.0, DEPTH])
     turns = se3.exp_rotation(np.radians(TURNS))
     places = se3.make(turns, centre - turns @ centre)
-    cameras = zip("abc", LENSES, places, LATE, strict=True)
-    return Rig(tuple(Camera(n, SIZE, matrix_of(lens), np.array(lens[4:]), p, late) for n, lens, p, late in cameras))
+    cameras = zip("abc", lenses, places, LATE, strict=True)
+    return Rig(tuple(Camera(n, SIZE, matrix_of(lens), lens[4:].copy(), p, late) for n, lens, p, late in cameras))
 
 
 def sway(seed: int, speed: float = 1.0) -> Sway:
@@ -184,7 +188,10 @@ def displaced(found: Rig, true: Rig, points: Array) -> Array:
 
 def _nees(seed: int) -> float:
     """Of one run whose corners are drawn about their true places, without pictures."""
-    rig, rng = true_rig(), np.random.default_rng([seed, 63])
+    rng = np.random.default_rng([seed, 63])
+    lenses = LENSES.copy()
+    lenses[:, 6:] = rng.normal(0, BENT, (3, 3)) * LEAST_BENT ** rng.uniform(0, 1, (3, 1))
+    rig = true_rig(lenses)
     camera, instant = np.tile(np.arange(3), DRAWN), np.repeat(np.arange(DRAWN), 3)
     boards = sway(seed, 2.0)(instant / RATE + np.array(LATE)[camera])
     corners = BOARD.corners.reshape(10, 7, 3)[::3, ::3].reshape(-1, 3)

@@ -60,7 +60,9 @@ def _add_cameras(parts: Commands) -> None:
         "--distance-mm", type=_distance, metavar="A,B,MM", help="two cameras and how far apart they are, to check scale"
     )
     part.add_argument(
-        "--keep-lenses", action="store_true", help="take the session's lenses; seek places and clocks only"
+        "--keep-lenses",
+        action="store_true",
+        help="take the session's lenses, within their lens_sigma; seek places and clocks",
     )
     part.add_argument("--new-rig", action="store_true", help="do not compare with the session's own rig")
     part.set_defaults(run=_cameras)

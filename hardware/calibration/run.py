@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from estimation.camera_calibration.calibrate import Calibration, calibrate, rebased
-from estimation.camera_calibration.lens_model import PARAMETERS, lens_of
+from estimation.camera_calibration.lens_model import PARAMETERS
 from estimation.camera_calibration.rig_error import VolumeError, predicted_error, working_volume
 from estimation.errors import InputError
 from hardware.calibration.against_given import check_against, check_distance
@@ -36,8 +36,8 @@ class Wishes:
     """What is asked of a calibration.
 
     limit: mm, of the predicted error. distance: two cameras and how far apart their lenses are, mm, if measured.
-    keep_lenses: whether the session's own lenses are taken as they are. new_rig: whether the session's rig is of no
-    account.
+    keep_lenses: whether the session's own lenses are taken, within what they are said to be off by. new_rig: whether
+    the session's rig is of no account.
     """
 
     limit: float = LIMIT
@@ -71,8 +71,7 @@ def run_calibration(session: Path, board_file: Path, out: Path, wishes: Wishes, 
     check_table(table, board, board_file, source.session)
     cameras = source.session.rig.cameras
     views, dropped = usable(table, board, tuple(c.name for c in cameras), tuple(c.size for c in cameras))
-    known = np.stack([lens_of(c) for c in cameras]) if wishes.keep_lenses else None
-    found = calibrate(views, known=known)
+    found = calibrate(views, known=source.lenses if wishes.keep_lenses else None)
     if wishes.distance is not None:
         check_distance(found.rig, *wishes.distance, board_file, board.square)
     if source.given is not None and not wishes.new_rig:
@@ -81,7 +80,8 @@ def run_calibration(session: Path, board_file: Path, out: Path, wishes: Wishes, 
     verdict = judge(found, error, wishes.limit, hints(found))
     base = cameras[0].base_from_camera if source.given is not None else np.eye(4)
     placed = rebased(found.rig, base)
-    write_rig(out, placed, source.images)
+    sigmas = [np.sqrt(np.diag(found.covariance_of(c))[:9]) for c in range(len(cameras))]
+    write_rig(out, placed, source.images, sigmas)
     out.with_suffix(".json").write_text(_json(found, error, verdict), encoding="utf-8")
     pictures = _pictures(source.session, found)
     text = page(session.name, found, error, verdict, dropped, pictures)

@@ -6,7 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from estimation.camera_calibration.lens_model import KnownLenses, lens_of
 from estimation.rig import Rig
+from estimation.se3 import Array
 from hardware.folder import open_folder
 from hardware.rig_file import ImageSource, is_calibrated, read_rig, read_uncalibrated
 from hardware.session import Session, open_session
@@ -14,11 +18,19 @@ from hardware.session import Session, open_session
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
-    """A session, the rig that it names, if any, and where its images are."""
+    """A session, the rig that it names, if any, where its images are, and how well its lenses are known, if told."""
 
     session: Session
     given: Rig | None
     images: Sequence[ImageSource | None]
+    lens_sigma: Sequence[Array | None]
+
+    @property
+    def lenses(self) -> KnownLenses:
+        """The lenses of the session's rig; those whose doubt nobody told are taken as exact."""
+        cameras = self.session.rig.cameras
+        sigma = [np.zeros(9) if told is None else told for told in self.lens_sigma]
+        return KnownLenses(np.stack([lens_of(camera) for camera in cameras]), np.stack(sigma))
 
 
 def open_source(path: Path) -> Source:
@@ -27,8 +39,10 @@ def open_source(path: Path) -> Source:
     if path.is_dir() and rig_toml.is_file():
         if is_calibrated(rig_toml):
             session = open_folder(path)
-            return Source(session, session.rig, read_rig(rig_toml).sources)
+            told = read_rig(rig_toml)
+            return Source(session, session.rig, told.sources, told.lens_sigma)
         bare = read_uncalibrated(rig_toml)
-        return Source(open_folder(path, bare), None, bare.sources)
+        return Source(open_folder(path, bare), None, bare.sources, bare.lens_sigma)
     session = open_session(path)
-    return Source(session, session.rig, [None] * len(session.rig))
+    nothing = [None] * len(session.rig)
+    return Source(session, session.rig, nothing, nothing)

@@ -149,7 +149,7 @@ def _slopes(grey: Image, near: NDArray[np.int64], half: int) -> tuple[Array, Arr
     y, x = np.mgrid[-half - 1 : half + 2, -half - 1 : half + 2]
     part = grey[near[:, 1, None, None] + y, near[:, 0, None, None] + x].astype(float)
     gx, gy = (part[:, 1:-1, 2:] - part[:, 1:-1, :-2]) / 2, (part[:, 2:, 1:-1] - part[:, :-2, 1:-1]) / 2
-    places = np.stack([x[1:-1, 1:-1].ravel(), y[1:-1, 1:-1].ravel()], -1) + near[:, None]
+    places = np.stack([x[1:-1, 1:-1].ravel(), y[1:-1, 1:-1].ravel()], -1) + near[:, None].astype(float)
     return np.stack([gx, gy], -1).reshape(len(near), -1, 2), places
 
 
