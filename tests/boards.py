@@ -63,6 +63,7 @@ def waved(
     offsets: tuple[float, ...] = (-0.016, 0.004, 0.012),
     jitter: float = 0.0,
     speed: float = 1.0,
+    lenses: Array = LENSES,
 ) -> tuple[Views, Truth]:
     """Views of a board waved before three cameras, and the truth."""
     points, base_from_camera = corners(), places()
@@ -72,7 +73,7 @@ def waved(
     seed = int(rng.integers(1 << 30))
     boards = motion(stamp + late, np.random.default_rng(seed), points.mean(0), speed)
     inside = se3.transform_points(se3.inverse(base_from_camera)[camera] @ boards, points)
-    pixels = image(LENSES[camera][:, None], inside)[0] + rng.normal(0, noise, (len(stamp), len(points), 2))
+    pixels = image(lenses[camera][:, None], inside)[0] + rng.normal(0, noise, (len(stamp), len(points), 2))
     hidden = (pixels < 3).any(-1) | (pixels > np.array(SIZE) - 4).any(-1)
     pixels[hidden] = np.nan
     views = Views(
@@ -85,4 +86,4 @@ def waved(
         pixels,
         np.full(len(stamp), noise),
     )
-    return views.only(views.seen.sum(1) >= 6), Truth(LENSES, base_from_camera, np.array(offsets))
+    return views.only(views.seen.sum(1) >= 6), Truth(lenses, base_from_camera, np.array(offsets))

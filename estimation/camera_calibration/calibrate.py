@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.camera_calibration.held_out import held_out
 from estimation.camera_calibration.homography import LEAST, plane_blunders
 from estimation.camera_calibration.lens_fit import LEAST_CORNERS, LensFit, Undetermined, fit_lens, with_lens
 from estimation.camera_calibration.lens_model import MODELS, KnownLenses, matrix_of
@@ -41,7 +42,8 @@ class Calibration:
 
     rig: base is the first camera. fit: the joint adjustment, whose covariance is already in real units. views: those
     used, with the sigma that their residuals show. choices: per camera. jitter: s, one sigma of single pictures' own
-    delays; 0 where the stamps are as good as the pictures tell. dropped: corners left out as blunders.
+    delays; 0 where the stamps are as good as the pictures tell. dropped: corners left out as blunders. held_out:
+    (V, P, 2) px, residuals under the rig that the rest of the recording gives.
     """
 
     rig: Rig
@@ -51,6 +53,7 @@ class Calibration:
     scores: tuple[tuple[ModelScore, ...], ...]
     jitter: float
     dropped: int
+    held_out: Array
 
     def covariance_of(self, camera: int) -> Array:
         """(16, 16) of one camera's numbers: lens 9, place 6, offset 1."""
@@ -80,7 +83,9 @@ def calibrate(views: Views, say: Say | None = None, known: KnownLenses | None = 
         check_doubt(name, fit.state.lens[c], fit.covariance[OWN * c : OWN * c + 9, OWN * c : OWN * c + 9])
     check_neighbours(names, views.sizes, fit.state.lens)
     scores = tuple(choice.scores for choice in choices)
-    return Calibration(rig_of(views, fit.state), fit, views, models, scores, jitter, dropped + more)
+    tell("stretches held out, one after another")
+    unseen = held_out(views, fit.state, free_numbers(models, known), jitter, known)
+    return Calibration(rig_of(views, fit.state), fit, views, models, scores, jitter, dropped + more, unseen)
 
 
 def lenses(views: Views, say: Say, known: KnownLenses | None = None) -> tuple[Views, list[Choice], int]:

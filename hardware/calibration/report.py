@@ -15,7 +15,7 @@ from estimation.camera_calibration.lens_model import PARAMETERS, lens_of
 from estimation.camera_calibration.rig_error import SIDE, VolumeError
 from estimation.se3 import Array
 from hardware.calibration.coverage import coverage
-from hardware.calibration.verdict import Verdict, board_scatter, residual
+from hardware.calibration.verdict import Verdict, board_scatter, held_out, residual
 from hardware.page import document, figures_table, row_of_tiles, section, tile
 
 WIDTH = 460  # px of one camera's picture
@@ -79,9 +79,10 @@ def _cameras(found: Calibration) -> str:
     head = ["", *found.views.names]
     rows: list[list[str]] = [["views", *(str(int((found.views.camera == c).sum())) for c in _all(found))]]
     rows.append(["distortion model", *found.models])
-    held_out = [next((s.held_out for s in found.scores[c] if s.model == found.models[c]), np.nan) for c in _all(found)]
+    lone = [next((s.held_out for s in found.scores[c] if s.model == found.models[c]), np.nan) for c in _all(found)]
     rows.append(["residual, median px", *(f"{residual(found, c):.2f}" for c in _all(found))])
-    rows.append(["on views held out, RMS px", *(f"{v:.3f}" if np.isfinite(v) else "–" for v in held_out)])
+    rows.append(["in stretches held out of the whole, median px", *(f"{held_out(found, c):.2f}" for c in _all(found))])
+    rows.append(["lens alone, on views held out, RMS px", *(f"{v:.3f}" if np.isfinite(v) else "–" for v in lone)])
     lenses = [lens_of(camera) for camera in found.rig.cameras]
     sigmas = [np.sqrt(np.diag(found.covariance_of(c))) for c in _all(found)]
     for i, name in enumerate(PARAMETERS):

@@ -20,7 +20,7 @@ from hardware.calibration.coverage import hints
 from hardware.calibration.report import millimetres_per_pixel, page
 from hardware.calibration.source import Source, open_source
 from hardware.calibration.suspicion import check_table
-from hardware.calibration.verdict import LIMIT, Verdict, board_scatter, judge, residual
+from hardware.calibration.verdict import LIMIT, Verdict, board_scatter, held_out, judge, residual
 from hardware.progress import Report
 from hardware.rig_file import write_rig
 from hardware.session import Session
@@ -119,7 +119,8 @@ def _json(found: Calibration, error: VolumeError, verdict: Verdict) -> str:
             "model": found.models[i],
             "sigma": dict(zip(numbers, np.sqrt(np.diag(found.covariance_of(i))).tolist(), strict=True)),
             "residual_median_px": residual(found, i),
-            "held_out_rms_px": {s.model: s.held_out for s in found.scores[i]},
+            "residual_held_out_median_px": finite(held_out(found, i)),
+            "lens_held_out_rms_px": {s.model: s.held_out for s in found.scores[i]},
             "mm_per_px": millimetres_per_pixel(found, i),
         }
         for i, c in enumerate(found.rig.cameras)
@@ -128,6 +129,7 @@ def _json(found: Calibration, error: VolumeError, verdict: Verdict) -> str:
         "passed": verdict.passed,
         "predicted_error_mm": {"typical": error.typical, "worst": error.worst},
         "residual_median_px": residual(found),
+        "residual_held_out_median_px": finite(held_out(found)),
         "board_distances_rms_mm": board_scatter(found),
         "jitter_s": found.jitter,
         "numbers": numbers,
@@ -135,6 +137,11 @@ def _json(found: Calibration, error: VolumeError, verdict: Verdict) -> str:
         "covariance": found.fit.covariance.tolist(),
     }
     return json.dumps(table, indent=1, allow_nan=False) + "\n"
+
+
+def finite(value: float) -> float | None:
+    """A figure as JSON has it; None where it could not be measured."""
+    return value if np.isfinite(value) else None
 
 
 def _text(found: Calibration, verdict: Verdict, dropped: Mapping[tuple[str, str], int], out: Path) -> str:

@@ -31,6 +31,13 @@ def residual(calibration: Calibration, camera: int | None = None) -> float:
     return float(np.nanmedian(away if camera is None else away[calibration.views.camera == camera]))
 
 
+def held_out(calibration: Calibration, camera: int | None = None) -> float:
+    """As `residual`, under a rig that was calibrated without the views' own stretch of the recording."""
+    away = np.linalg.norm(calibration.held_out, axis=-1)
+    away = away if camera is None else away[calibration.views.camera == camera]
+    return float(np.nanmedian(away)) if np.isfinite(away).any() else float("nan")
+
+
 def judge(calibration: Calibration, error: VolumeError, limit: float, hints: tuple[str, ...]) -> Verdict:
     """The verdict. limit: mm, of the predicted error in 19 of 20 points of the working volume."""
     off, spread = residual(calibration), error.worst
@@ -39,7 +46,8 @@ def judge(calibration: Calibration, error: VolumeError, limit: float, hints: tup
     lines = [
         f"{word} to print: points in the working volume are off by {error.typical:.3f} mm (one sigma), 19 of 20 by "
         f"less than {spread:.3f} mm; {limit:g} mm is allowed",
-        f"corners lie {off:.2f} px from where they should (median); {RESIDUAL:g} px is allowed",
+        f"corners lie {off:.2f} px from where they should (median); {RESIDUAL:g} px is allowed; "
+        f"{held_out(calibration):.2f} px in stretches of the recording that were held out",
     ]
     if calibration.jitter:
         lines.append(f"pictures are late by {1e3 * calibration.jitter:.1f} ms each for itself: the cameras run free")
