@@ -23,6 +23,7 @@ class Progress:
         self._every = 0.1 if self._tty else 5.0  # s between lines
         self._start = now()
         self._said = self._start
+        self.note = ""  # said behind the figures
         self._open = False  # whether an unfinished line stands on the terminal
 
     def __call__(self, done: int, total: int) -> None:
@@ -31,7 +32,7 @@ class Progress:
         if now - self._said < self._every and done != total:
             return
         self._said = now
-        text = line(self._what, self._unit, done, total, now - self._start)
+        text = line(self._what, self._unit, done, total, now - self._start) + (f"; {self.note}" if self.note else "")
         if self._tty:
             self._stream.write(f"\r\x1b[K{text}")
         else:

@@ -38,7 +38,10 @@ SHORTEST_FOCAL = 0.1  # of the image's longer side: 157 degrees; a focal length 
 
 @dataclass(frozen=True, slots=True)
 class ImageSource:
-    """Where one camera's images are. kind: "video" (a file) or "images" (a glob); pattern: relative to the folder."""
+    """Where one camera's images are. kind: "video" (a file), "images" (a glob) or "source" (live).
+
+    pattern: relative to the folder; a live source as its key has it.
+    """
 
     kind: str
     pattern: str

@@ -31,15 +31,15 @@ def small_rig() -> Rig:
     return Rig(tuple(Camera(name, (640, 480), matrix_of(lens), lens[4:], place) for name, lens, place in cameras))
 
 
-def rendered(folder: Path, instants: int = 14) -> Path:
+def rendered(folder: Path, instants: int = 14, board: Board = BOARD) -> Path:
     """The folder, written; its rig.toml is the true one, without clock offsets."""
     rig, rng = small_rig(), np.random.default_rng(5)
-    views = [BoardView(camera, BOARD) for camera in rig.cameras]
+    views = [BoardView(camera, board) for camera in rig.cameras]
     stamps = np.arange(instants) / RATE
     with SessionFolder(folder, rig, ()) as session:
         for stamp in stamps:
             for c, view in enumerate(views):
                 late = np.array([stamp + OFFSETS[c]])
-                pose = motion(late, np.random.default_rng(11), BOARD.corners.mean(0), 1.5)[0]
+                pose = motion(late, np.random.default_rng(11), board.corners.mean(0), 1.5)[0]
                 session.picture(c, float(stamp), *encode(view.picture(pose, 0.6, 1.5, rng)))
     return folder

@@ -9,23 +9,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from board_session import BOARD, LENSES, OFFSETS, rendered, small_rig
 
 from estimation import se3
-from estimation.camera_calibration.calibrate import rebased
-from estimation.errors import InputError, StillbedError
-from estimation.rig import Rig, pixels_from_points
-from hardware.calibration.against_given import check_against, check_distance
+from estimation.errors import InputError
+from estimation.rig import pixels_from_points
 from hardware.calibration.board_file import read_board, write_board
 from hardware.calibration.board_print import Print, board_of, drawing, pdf, svg, write_print
 from hardware.calibration.collect import collect
 from hardware.calibration.corner_file import content_key, read_corners, write_corners
 from hardware.calibration.run import Outcome, Wishes, run_calibration
 from hardware.calibration.source import open_source
-from hardware.calibration.suspicion import check_table
 from hardware.cli import main
 from hardware.progress import silent
 from hardware.rig_file import read_rig
@@ -175,8 +171,6 @@ def test_the_files_that_are_written_can_be_read(outcome: Outcome, session: Path)
 
 def test_the_command_ends_with_the_verdict(session: Path, board_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["calibrate", "cameras", str(session), "--board", str(board_file), "-o", str(session.parent / "rig.toml")]
-    assert main(command) == 0
-    assert capsys.readouterr().out.startswith("PASS")
     assert main([*command, "--limit-mm", "0.001"]) == 1
     said = capsys.readouterr().out
     assert said.startswith("FAIL") and "hold the board in its picture's" in said
@@ -214,115 +208,6 @@ def test_undistorted_pictures_keep_every_pixel() -> None:
     assert whole_view(camera)[0, 0] < camera.matrix[0, 0]
 
 
-# -- wrong inputs: each named, none accepted
-
-
-def changed(session: Path, out: Path, change: Callable[[str, Image], Image], cameras: str = "abc") -> Path:
-    """The session with its pictures changed."""
-    shutil.copytree(session, out)
-    for path in sorted(out.glob("?/*.png")):
-        if path.parent.name in cameras:
-            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            cv2.imwrite(str(path), np.ascontiguousarray(change(path.parent.name, np.asarray(image, np.uint8))))
-    return out
-
-
-def refused(session: Path, tmp_path: Path, board: Board, words: str) -> None:
-    write_board(tmp_path / "board.toml", board)
-    with pytest.raises(StillbedError, match=words):
-        run_calibration(session, tmp_path / "board.toml", tmp_path / "rig.toml", Wishes(), silent)
-    assert not (tmp_path / "rig.toml").exists()
-
-
-def test_a_wrong_dictionary_is_named(session: Path, tmp_path: Path) -> None:
-    refused(session, tmp_path, replace(BOARD, dictionary="6X6_50"), "camera a: .* dictionary 4X4_50")
-
-
-def test_an_inverted_print_is_named(session: Path, tmp_path: Path) -> None:
-    refused(session, tmp_path, replace(BOARD, inverted=True), r"camera a: .* black and white exchanged \(`inverted`\)")
-
-
-def test_the_wrong_way_round_is_named(session: Path, tmp_path: Path) -> None:
-    refused(session, tmp_path, replace(BOARD, squares=(5, 4)), "camera a: .* another board: 4 x 5|markers")
-
-
-def test_a_smaller_board_than_the_one_that_was_held_is_named(session: Path, tmp_path: Path) -> None:
-    refused(
-        session,
-        tmp_path,
-        replace(BOARD, squares=(3, 4)),
-        "board.toml: squares = .*3 x 4.*it has markers 6, 7, 8, 9 too",
-    )
-
-
-def test_a_wrong_marker_is_named(session: Path, tmp_path: Path) -> None:
-    refused(session, tmp_path, replace(BOARD, marker=0.6), r"board.toml: marker = 0.6, allowed what the pictures show")
-
-
-def test_a_covered_camera_is_named(session: Path, tmp_path: Path) -> None:
-    dark = changed(session, tmp_path / "s", lambda name, image: np.full_like(image, 12), "b")
-    refused(dark, tmp_path, BOARD, "camera b: pictures that show the board = 0, .* one grey")
-
-
-def test_a_mirrored_camera_is_named(session: Path, tmp_path: Path) -> None:
-    mirrored = changed(session, tmp_path / "s", lambda name, image: image[:, ::-1], "c")
-    refused(mirrored, tmp_path, BOARD, "camera c: .* mirrored")
-
-
-def test_a_picture_turned_by_90_degrees_is_named(session: Path, tmp_path: Path) -> None:
-    turned = changed(session, tmp_path / "s", lambda name, image: np.rot90(image), "b")
-    refused(turned, tmp_path, BOARD, "480 x 640 px', allowed 640 x 480 px")
-
-
-def test_blur_is_named(session: Path, tmp_path: Path) -> None:
-    blurred = changed(session, tmp_path / "s", lambda name, image: cv2.GaussianBlur(image, (0, 0), 7.0), "a")
-    refused(blurred, tmp_path, BOARD, "camera a: .*(blur|sharp)")
-
-
-def test_a_truncated_recording_is_named(session: Path, tmp_path: Path) -> None:
-    shutil.copytree(session, tmp_path / "s")
-    sorted((tmp_path / "s" / "b").glob("*.png"))[-1].unlink()
-    refused(tmp_path / "s", tmp_path, BOARD, "number of frames of camera 'b' = 14, allowed 13")
-
-
-def test_too_few_pictures_are_named(session: Path) -> None:
-    source = open_source(session)
-    short = replace(source.session, sets=source.session.sets[:6])
-    with pytest.raises(InputError, match="camera a: pictures that show the board = 6, allowed 10 or more"):
-        check_table(collect(short, BOARD, None, silent), BOARD, Path("board.toml"), short)
-
-
-def exchanged(rig: Rig) -> Rig:
-    a, b, c = rig.cameras
-    return Rig((a, replace(c, name=b.name), replace(b, name=c.name)))
-
-
-def test_swapped_cameras_and_turned_ones_are_named_against_the_rig_they_had(outcome: Outcome) -> None:
-    rig = outcome.calibration.rig
-    check_against(rig, small_rig(), Path("board.toml"), 54.0)
-    check_against(rebased(rig, se3.exp(np.array([1.0, 0.5, 0.2, 9.0, 9.0, 9.0]))), small_rig(), Path("b.toml"), 54.0)
-    with pytest.raises(InputError, match="b and c are swapped"):
-        check_against(exchanged(rig), small_rig(), Path("board.toml"), 54.0)
-    a, b, c = rig.cameras
-    upside_down = replace(b, base_from_camera=b.base_from_camera @ se3.make(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)))
-    with pytest.raises(InputError, match="the picture of b is turned by 180 degrees"):
-        check_against(Rig((a, upside_down, c)), small_rig(), Path("board.toml"), 54.0)
-
-
-def test_a_wrong_square_is_named_by_the_rig_or_by_a_measured_distance_and_by_nothing_else(outcome: Outcome) -> None:
-    rig = outcome.calibration.rig
-    places = [
-        np.block([[c.base_from_camera[:3, :3], 0.8 * c.base_from_camera[:3, 3:]], [np.eye(4)[3:]]]) for c in rig.cameras
-    ]
-    small = Rig(tuple(replace(c, base_from_camera=place) for c, place in zip(rig.cameras, places, strict=True)))
-    with pytest.raises(InputError, match=r"board.toml: square_mm = .43.2 mm., allowed about 5\d(\.\d)? mm"):
-        check_against(small, small_rig(), Path("board.toml"), 43.2)
-    apart = float(np.linalg.norm(small_rig().cameras[1].base_from_camera[:3, 3]))
-    check_distance(rig, "a", "b", apart, Path("board.toml"), 54.0)
-    with pytest.raises(InputError, match=r"board.toml: square_mm = .43.2 mm, which puts a and b"):
-        check_distance(small, "a", "b", apart, Path("board.toml"), 43.2)
-
-
 def test_a_rig_without_lenses_is_enough_to_begin_with(session: Path, tmp_path: Path, outcome: Outcome) -> None:
     shutil.copytree(session, tmp_path / "s")
     lines = [f'[[camera]]\nname = "{n}"\nimages = "{n}/*"\nsize = [640, 480]\n' for n in "abc"]
@@ -333,3 +218,16 @@ def test_a_rig_without_lenses_is_enough_to_begin_with(session: Path, tmp_path: P
         collect(open_source(session).session, BOARD, None, silent), BOARD, ("a", "b", "c"), ((640, 480),) * 3
     )
     assert len(views) == len(outcome.calibration.views)
+
+
+def test_a_chessboard_calibrates_as_well(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    board = Board("chessboard", (6, 7), 40.0)
+    folder, out = rendered(tmp_path / "session", instants=12, board=board), tmp_path / "rig.toml"
+    write_board(tmp_path / "board.toml", board)
+    command = ["calibrate", "cameras", str(folder), "--board", str(tmp_path / "board.toml"), "-o", str(out)]
+    assert main(command) == 0
+    assert capsys.readouterr().out.startswith("PASS")
+    for camera, lens, true in zip(read_rig(out).rig.cameras, LENSES, small_rig().cameras, strict=True):
+        assert camera.matrix[0, 0] == pytest.approx(lens[0], rel=0.005)
+        off = se3.log(se3.inverse(true.base_from_camera) @ camera.base_from_camera)
+        assert np.linalg.norm(off[3:]) < 3 and np.degrees(np.linalg.norm(off[:3])) < 0.3

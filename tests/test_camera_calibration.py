@@ -171,19 +171,17 @@ def test_pictures_that_are_late_each_for_itself_are_noticed_and_forgiven() -> No
 
 def test_lenses_that_bend_in_ways_too_slight_to_be_told_are_doubted() -> None:
     bent = LENSES.copy()
-    bent[:, 6:8] = 4e-4, -4e-4
-    bent[:, 8] = 0.01
+    bent[:, 6:] = 1.5e-3, -1.5e-3, 0.03
     views, truth = waved(np.random.default_rng(3), lenses=bent)
     found = calibrate(views)
     choices = lenses(views, lambda text: None)[1]
-    assert any("p1" not in model for model in found.models)
     assert all(0 <= choice.chance <= 1 for choice in choices)
     assert [c.rival for c in choices] == ["" if m == "k1 k2 p1 p2 k3" else "k1 k2 p1 p2 k3" for m in found.models]
     plain = fit_rig(found.views, found.fit.state, free_numbers(found.models), 0.0)
     gained = found.fit.covariance - plain.covariance
     assert np.linalg.eigvalsh(gained).min() > -1e-7
     error = errors(found, truth)
-    assert nees(error, found.fit.covariance) < 2 < nees(error, plain.covariance)
+    assert nees(error, found.fit.covariance) < 2 and nees(error, plain.covariance) > 4
 
 
 def test_lenses_that_are_kept_bring_their_doubt_along() -> None:

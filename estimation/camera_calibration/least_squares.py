@@ -10,7 +10,7 @@ import numpy as np
 from estimation.se3 import Array
 
 HUBER = 3.0  # sigmas: of pure noise 0.3 % is touched, so that a covariance needs no correction for it
-STEPS, DONE = 40, 1e-7  # most steps; share of the cost that is not worth another one
+STEPS, DONE = 40, 1e-7  # most steps; share of the cost that is not worth another one, where a result hangs on it
 WORST = 1e8  # damping at which no step helps any more
 
 
@@ -39,14 +39,15 @@ def minimise(
     state: State,
     normal: Callable[[State], Normal],
     moved: Callable[[State, Normal, float], State | None],
-    steps: int = STEPS,
+    done: float = DONE,
 ) -> tuple[State, Normal]:
     """The state of least cost by Levenberg and Marquardt's steps, and its normal equations.
 
-    moved: the state after a damped step, None where the equations cannot be solved.
+    moved: the state after a damped step, None where the equations cannot be solved. done: share of the cost that is
+    not worth another step.
     """
     at, damping = normal(state), 1e-4
-    for _ in range(steps):
+    for _ in range(STEPS):
         while damping < WORST:
             tried = moved(state, at, damping)
             there = None if tried is None else normal(tried)
@@ -58,7 +59,7 @@ def minimise(
         assert tried is not None and there is not None
         gain, state, at = at.cost - there.cost, tried, there
         damping = max(damping / 10, 1e-9)
-        if gain <= DONE * at.cost:
+        if gain <= done * at.cost:
             break
     return state, at
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.camera_calibration.homography import focal, homographies, poses
-from estimation.camera_calibration.least_squares import damped, huber, minimise
+from estimation.camera_calibration.least_squares import DONE, damped, huber, minimise
 from estimation.camera_calibration.lens_model import MODELS, belief, image
 from estimation.camera_calibration.views import Views
 from estimation.errors import StillbedError
@@ -69,8 +69,11 @@ def start(views: Views) -> tuple[Array, Array]:
     return lens, poses(found, np.full(len(views), f))
 
 
-def fit_lens(views: Views, model: str, begin: tuple[Array, Array] | None = None) -> LensFit:
-    """The lens that fits one camera's views best; begin: a lens (9,) and poses (V, 4, 4) to start from."""
+def fit_lens(views: Views, model: str, begin: tuple[Array, Array] | None = None, done: float = DONE) -> LensFit:
+    """The lens that fits one camera's views best; begin: a lens (9,) and poses (V, 4, 4) to start from.
+
+    done: share of the cost that is not worth another step.
+    """
     free = MODELS[model]
     lens, camera_from_board = start(views) if begin is None else begin
     lens = np.where(np.isin(np.arange(9), free), lens, 0.0)
@@ -81,17 +84,18 @@ def fit_lens(views: Views, model: str, begin: tuple[Array, Array] | None = None)
     def moved(state: _State, at: _Normal, damping: float) -> _State | None:
         return _step(state, at, damping, free)
 
-    state, at = minimise(_State(lens, camera_from_board), normal, moved)
+    state, at = minimise(_State(lens, camera_from_board), normal, moved, done)
     return LensFit(model, state.lens, _covariance(at, free), state.poses, at.residuals, _scale(views, at, len(free)))
 
 
-def fit_poses(views: Views, lens: Array, camera_from_board: Array) -> tuple[Array, Array]:
+def fit_poses(views: Views, lens: Array, camera_from_board: Array, done: float = DONE) -> tuple[Array, Array]:
     """Poses (V, 4, 4) with the lens held, and residuals (V, P, 2) px."""
     nothing = np.zeros(0, np.int64)
     state, at = minimise(
         _State(lens, camera_from_board),
         lambda state: _equations(views, state),
         lambda state, at, damping: _step(state, at, damping, nothing),
+        done,
     )
     return state.poses, at.residuals
 

@@ -17,6 +17,7 @@ from estimation.se3 import Array
 FOLDS = 4
 BLOCKS = 12  # stretches of neighbouring views that are held out as one: neighbours look alike
 USUAL = "k1 k2"  # what any webcam is given: a number left out is claimed to be zero, one kept has its doubt stated
+ENOUGH = 1e-5  # share of a held-out fit's cost that is not worth another step: models differ by a hundred times that
 WORTH = 2.0  # standard errors by which another model must beat the usual one: one is passed by chance in six
 
 
@@ -98,9 +99,9 @@ def _held_out(views: Views, whole: LensFit, folds: NDArray[np.int64]) -> Array:
     out = np.zeros(len(views))
     for fold in range(folds.max() + 1):
         kept, held = folds != fold, folds == fold
-        lens = fit_lens(views.only(kept), whole.model, (whole.lens, whole.camera_from_board[kept])).lens
+        lens = fit_lens(views.only(kept), whole.model, (whole.lens, whole.camera_from_board[kept]), ENOUGH).lens
         rest = views.only(held)
-        residuals = fit_poses(rest, lens, whole.camera_from_board[held])[1]
+        residuals = fit_poses(rest, lens, whole.camera_from_board[held], ENOUGH)[1]
         limit = (6 * rest.sigma[:, None]) ** 2  # a blunder says nothing of a lens
         out[held] = np.nanmean(np.minimum((residuals**2).sum(-1), limit * 4), axis=1)
     return out

@@ -20,9 +20,12 @@ THREADS = 2  # look at the pictures of one set at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Row:
-    ref: FrameRef
+class Row:
+    """What was found in one picture. stamp: s, on the camera's own clock."""
+
+    camera: int
     instant: int
+    stamp: float
     found: Found
 
 
@@ -33,18 +36,25 @@ def collect(session: Session, board: Board, store: Path | None, report: Report) 
     table = empty_table(board, len(session.rig)) if known is None else known
     reader = session.store.open()
     finders = [CornerFinder(board) for _ in session.rig.cameras]
-    rows: list[_Row] = []
+    rows: list[Row] = []
+    done = table.done
     try:
         with ThreadPoolExecutor(THREADS) as pool:
             for instant in range(table.done, len(session.sets)):
                 rows += _look(pool, reader, finders, session.sets[instant], instant)
-                if (instant + 1) % KEEP == 0 or instant + 1 == len(session.sets):
-                    table, rows = _joined(table, rows, instant + 1), []
-                    if store is not None:
-                        write_corners(store, key, table)
-                report(instant + 1, len(session.sets))
-    finally:
+                done = instant + 1
+                if done % KEEP == 0:
+                    table, rows = _kept(store, key, joined(table, rows, done)), []
+                report(done, len(session.sets))
+    finally:  # Ctrl-C included
+        table = _kept(store, key, joined(table, rows, done))
         reader.close()
+    return table
+
+
+def _kept(store: Path | None, key: str, table: CornerTable) -> CornerTable:
+    if store is not None:
+        write_corners(store, key, table)
     return table
 
 
@@ -54,24 +64,25 @@ def _look(
     finders: list[CornerFinder],
     refs: tuple[FrameRef, ...],
     instant: int,
-) -> list[_Row]:
+) -> list[Row]:
     images = [reader.read(ref) for ref in refs]
     found = pool.map(lambda ref, image: finders[ref.camera](image), refs, images)
-    return [_Row(ref, instant, f) for ref, f in zip(refs, found, strict=True)]
+    return [Row(ref.camera, instant, ref.camera_stamp, f) for ref, f in zip(refs, found, strict=True)]
 
 
-def _joined(table: CornerTable, rows: list[_Row], done: int) -> CornerTable:
+def joined(table: CornerTable, rows: list[Row], done: int) -> CornerTable:
+    """The table with what was found in further pictures; done: instants looked at by now."""
     looked, shown = table.looked.copy(), [row for row in rows if row.found.count]
-    np.add.at(looked, [row.ref.camera for row in rows], 1)
+    np.add.at(looked, [row.camera for row in rows], 1)
     strangers = np.array([*table.strangers, *(i for r in rows for i in r.found.strangers)], np.int64)
     table = replace(table, looked=looked, strangers=strangers, done=done)
     if not shown:
         return table
     return replace(
         table,
-        camera=np.append(table.camera, [r.ref.camera for r in shown]).astype(np.int64),
+        camera=np.append(table.camera, [r.camera for r in shown]).astype(np.int64),
         instant=np.append(table.instant, [r.instant for r in shown]).astype(np.int64),
-        stamp=np.append(table.stamp, [r.ref.camera_stamp for r in shown]),
+        stamp=np.append(table.stamp, [r.stamp for r in shown]),
         pixels=np.concatenate([table.pixels, np.stack([r.found.pixels for r in shown])]),
         sigma=np.append(table.sigma, [r.found.sigma for r in shown]),
         blur=np.append(table.blur, [r.found.blur for r in shown]),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import signal
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ FORMATS = {
     "kalibr": "camchain.yaml",
     "anipose": "aniposelib's and caliscope's TOML, mm",
 }
+INTERRUPTED = 128 + signal.SIGINT  # exit code after Ctrl-C
 FAILED = 1  # exit code of a calibration that is not good enough
 
 
@@ -49,8 +52,25 @@ def _add_board(parts: Commands) -> None:
 
 
 def _add_cameras(parts: Commands) -> None:
-    part = parts.add_parser("cameras", help="lenses, places and clock offsets from a recording of the waved board")
-    part.add_argument("session", type=Path, metavar="SESSION", help="session folder or .mcap; its rig may lack lenses")
+    part = parts.add_parser(
+        "cameras",
+        help="lenses, places and clock offsets from a waved board, recorded or live",
+        description="From a recording, or from live cameras while the board is being waved: it then says where to\n"
+        "hold the board next, and ends once enough was seen. Ctrl-C keeps the corners; the same command goes on.",
+        epilog="examples:\n  stillbed calibrate cameras sessions/board --board board.toml -o rig.toml\n"
+        "  stillbed calibrate cameras /dev/v4l/by-id/CAMERA_A /dev/v4l/by-id/CAMERA_B --board board.toml -o rig.toml",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    part.add_argument(
+        "which",
+        nargs="+",
+        metavar="SESSION_OR_CAMERA",
+        help="session folder or .mcap (its rig may lack lenses); or live cameras as `stillbed cameras` names them, "
+        "or RIG.toml for all of a rig",
+    )
+    part.add_argument(
+        "--seconds", type=float, metavar="S", help="watch live cameras so long at most; default: until enough was seen"
+    )
     part.add_argument("--board", type=Path, required=True, metavar="board.toml", help="the board as it was printed")
     part.add_argument(
         "-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write; report beside it"
@@ -112,16 +132,40 @@ def _board(arguments: argparse.Namespace) -> int:
 
 
 def _cameras(arguments: argparse.Namespace) -> int:
-    from hardware.calibration.run import Wishes, run_calibration
+    from hardware.calibration.run import Wishes, corners_of, run_calibration, run_live
     from hardware.clock import WallClock
     from hardware.progress import Progress
 
-    a = arguments
+    a, clock = arguments, WallClock()
+    recorded = _recorded(a.which)
     wishes = Wishes(a.limit_mm, a.distance_mm, a.keep_lenses, a.new_rig)
-    with Progress("corners", "frame sets", WallClock().now) as progress:
-        outcome = run_calibration(a.session, a.board, a.out, wishes, progress)
+    _check_seconds(a.seconds, recorded)
+    try:
+        with Progress("corners", "frame sets", clock.now) as progress:
+            if recorded is not None:
+                outcome = run_calibration(recorded, a.board, a.out, wishes, progress)
+            else:
+                outcome = run_live(a.which, a.board, a.out, wishes, a.seconds, clock, progress)
+    except KeyboardInterrupt:
+        kept = f"the corners so far are in {corners_of(a.out)}; the same command goes on from there"
+        print(f"\nstillbed: interrupted; {kept}", file=sys.stderr)
+        return INTERRUPTED
     print(outcome.text)
     return 0 if outcome.verdict.passed else FAILED
+
+
+def _recorded(which: list[str]) -> Path | None:
+    """The one recording that is named, None where live cameras are."""
+    path = Path(which[0])
+    named = path.is_dir() or path.suffix == ".mcap"
+    return path if named and len(which) == 1 else None
+
+
+def _check_seconds(seconds: float | None, recorded: Path | None) -> None:
+    from estimation.errors import InputError
+
+    if seconds is not None and (recorded is not None or not seconds >= 0):
+        raise InputError("command line", "--seconds", seconds, "0 or more, with live cameras")
 
 
 def _import(arguments: argparse.Namespace) -> int:

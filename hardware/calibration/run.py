@@ -1,9 +1,9 @@
-"""`stillbed calibrate cameras`: a recording in; a rig, a report and a verdict out."""
+"""`stillbed calibrate cameras`: a recording or live cameras in; a rig, a report and a verdict out."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,13 +17,16 @@ from hardware.calibration.against_given import check_against, check_distance
 from hardware.calibration.board_file import read_board
 from hardware.calibration.collect import collect
 from hardware.calibration.coverage import hints
+from hardware.calibration.live import devices_named, watch
+from hardware.calibration.material import Material
 from hardware.calibration.report import millimetres_per_pixel, page
-from hardware.calibration.source import Source, open_source
+from hardware.calibration.source import open_source
 from hardware.calibration.suspicion import check_table
 from hardware.calibration.verdict import LIMIT, Verdict, board_scatter, held_out, judge, residual
-from hardware.progress import Report
+from hardware.clock import Clock
+from hardware.progress import Progress, Report
 from hardware.rig_file import write_rig
-from hardware.session import Session
+from perception.boards.board import Board
 from perception.boards.collection import usable
 from perception.boards.undistorted import thumbnail, undistorted
 
@@ -61,53 +64,77 @@ def run_calibration(session: Path, board_file: Path, out: Path, wishes: Wishes, 
 
     InputError, Undetermined and Implausible say what is wrong; nothing but the corners is written then.
     """
+    board = _begin(board_file, out)
+    source = open_source(session)
+    rig = source.session.rig
+    _check_wishes(tuple(c.name for c in rig.cameras), source.given is not None, source.session.path, wishes)
+    table = collect(source.session, board, corners_of(out), report)
+    return _finish(source.material(table), board, board_file, out, wishes)
+
+
+def run_live(
+    which: Sequence[str],
+    board_file: Path,
+    out: Path,
+    wishes: Wishes,
+    seconds: float | None,
+    clock: Clock,
+    progress: Progress,
+) -> Outcome:
+    """Calibrate live cameras, named as `stillbed cameras` has them, while a board is waved; writes the same files.
+
+    seconds: at most, None until enough was seen. Interrupted, it leaves the corners, and the next run goes on.
+    """
+    board = _begin(board_file, out)
+    devices = devices_named(which)
+    _check_wishes(devices.names, devices.rig is not None, "command line", wishes)
+    return _finish(watch(devices, board, corners_of(out), seconds, clock, progress), board, board_file, out, wishes)
+
+
+def corners_of(out: Path) -> Path:
+    """Where the corners are kept that a rig.toml is made from."""
+    return out.with_suffix(".corners.npz")
+
+
+def _begin(board_file: Path, out: Path) -> Board:
     board = read_board(board_file)
     if out.suffix != ".toml":
         raise InputError(out, "--out", out.name, "a file that ends in .toml")
-    source = open_source(session)
-    _check_wishes(source, wishes)
     out.parent.mkdir(parents=True, exist_ok=True)
-    table = collect(source.session, board, out.with_suffix(".corners.npz"), report)
-    check_table(table, board, board_file, source.session)
-    cameras = source.session.rig.cameras
-    views, dropped = usable(table, board, tuple(c.name for c in cameras), tuple(c.size for c in cameras))
-    found = calibrate(views, known=source.lenses if wishes.keep_lenses else None)
+    return board
+
+
+def _finish(material: Material, board: Board, board_file: Path, out: Path, wishes: Wishes) -> Outcome:
+    check_table(material.table, board, board_file, material.names, material.pictures)
+    views, dropped = usable(material.table, board, material.names, tuple(c.size for c in material.rig.cameras))
+    found = calibrate(views, known=material.lenses if wishes.keep_lenses else None)
     if wishes.distance is not None:
         check_distance(found.rig, *wishes.distance, board_file, board.square)
-    if source.given is not None and not wishes.new_rig:
-        check_against(found.rig, source.given, board_file, board.square)
+    if material.given and not wishes.new_rig:
+        check_against(found.rig, material.rig, board_file, board.square)
     error = predicted_error(found, working_volume(found), SPEED)
     verdict = judge(found, error, wishes.limit, hints(found))
-    base = cameras[0].base_from_camera if source.given is not None else np.eye(4)
-    placed = rebased(found.rig, base)
-    sigmas = [np.sqrt(np.diag(found.covariance_of(c))[:9]) for c in range(len(cameras))]
-    write_rig(out, placed, source.images, sigmas)
+    placed = rebased(found.rig, material.rig.cameras[0].base_from_camera if material.given else np.eye(4))
+    sigmas = [np.sqrt(np.diag(found.covariance_of(c))[:9]) for c in range(len(placed))]
+    write_rig(out, placed, material.images, sigmas)
     out.with_suffix(".json").write_text(_json(found, error, verdict), encoding="utf-8")
-    pictures = _pictures(source.session, found)
-    text = page(session.name, found, error, verdict, dropped, pictures)
+    text = page(material.title, found, error, verdict, dropped, _pictures(material, found))
     out.with_suffix(".report.html").write_text(text, encoding="utf-8")
     return Outcome(replace(found, rig=placed), error, verdict, _text(found, verdict, dropped, out))
 
 
-def _check_wishes(source: Source, wishes: Wishes) -> None:
-    names = [c.name for c in source.session.rig.cameras]
-    if wishes.keep_lenses and source.given is None:
-        raise InputError(source.session.path, "--keep-lenses", "a rig.toml without lenses", "one that has them")
+def _check_wishes(names: Sequence[str], given: bool, where: object, wishes: Wishes) -> None:
+    if wishes.keep_lenses and not given:
+        raise InputError(where, "--keep-lenses", "a rig.toml without lenses", "one that has them")
     for name in wishes.distance[:2] if wishes.distance else ():
         if name not in names:
             raise InputError("--distance-mm", "camera", name, ", ".join(names))
 
 
-def _pictures(session: Session, found: Calibration) -> dict[str, bytes]:
+def _pictures(material: Material, found: Calibration) -> dict[str, bytes]:
     """A picture of each camera without its distortion."""
-    reader, out = session.store.open(), {}
-    try:
-        for c, camera in enumerate(found.rig.cameras):
-            ref = next(ref for refs in session.sets for ref in refs if ref.camera == c)
-            out[camera.name] = thumbnail(undistorted(camera, reader.read(ref)), PICTURE)
-    finally:
-        reader.close()
-    return out
+    cameras = enumerate(found.rig.cameras)
+    return {camera.name: thumbnail(undistorted(camera, material.pictures(c)[-1]), PICTURE) for c, camera in cameras}
 
 
 def _json(found: Calibration, error: VolumeError, verdict: Verdict) -> str:

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from estimation.camera_calibration.lens_model import KnownLenses, lens_of
 from estimation.rig import Rig
 from estimation.se3 import Array
+from hardware.calibration.material import Material
+from hardware.calibration.suspicion import pictures_of
 from hardware.folder import open_folder
 from hardware.rig_file import ImageSource, is_calibrated, read_rig, read_uncalibrated
 from hardware.session import Session, open_session
+from perception.boards.collection import CornerTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,12 +25,13 @@ class Source:
     images: Sequence[ImageSource | None]
     lens_sigma: Sequence[Array | None]
 
-    @property
-    def lenses(self) -> KnownLenses:
-        """The lenses of the session's rig; those whose doubt nobody told are taken as exact."""
-        cameras = self.session.rig.cameras
-        sigma = [np.zeros(9) if told is None else told for told in self.lens_sigma]
-        return KnownLenses(np.stack([lens_of(camera) for camera in cameras]), np.stack(sigma))
+    def material(self, table: CornerTable) -> Material:
+        """What it is calibrated from, once the corners are found."""
+        session = self.session
+        title, given = session.path.name, self.given is not None
+        return Material(
+            title, session.rig, given, self.images, self.lens_sigma, table, lambda c: pictures_of(session, c)
+        )
 
 
 def open_source(path: Path) -> Source:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,15 +21,18 @@ MARKER = 0.08  # of the marker's edge, between printed and found: thresholds shr
 STRANGE = 0.1  # of the pictures, that one unknown marker is seen in
 
 
-def check_table(table: CornerTable, board: Board, board_file: Path, session: Session) -> None:
-    """InputError that names what is wrong, where the corners found show that something is."""
+Pictures = Callable[[int], list[Image]]  # some pictures of a camera, by its number
+
+
+def check_table(table: CornerTable, board: Board, board_file: Path, names: Sequence[str], pictures: Pictures) -> None:
+    """InputError that names what is wrong, where the corners found show that something is; names: of the cameras."""
     _check_strangers(table, board, board_file)
     _check_markers(table, board, board_file)
-    for c, camera in enumerate(session.rig.cameras):
+    for c, name in enumerate(names):
         views = int((table.camera == c).sum())
-        where = f"camera {camera.name}"
+        where = f"camera {name}"
         if views < FEWEST:
-            allowed = f"{FEWEST} or more of its {table.looked[c]} pictures; {why_unseen(session, c, board)}"
+            allowed = f"{FEWEST} or more of its {table.looked[c]} pictures; {why_unseen(pictures(c), board)}"
             raise InputError(where, "pictures that show the board", views, allowed)
         blur = float(np.median(table.blur[table.camera == c]))
         if blur > BLURRED:
@@ -54,9 +58,8 @@ def _check_markers(table: CornerTable, board: Board, board_file: Path) -> None:
         raise InputError(board_file, "marker", board.marker, f"what the pictures show: about {found:.2f} of a square")
 
 
-def why_unseen(session: Session, camera: int, board: Board) -> str:
-    """Why a camera does not show the board, as far as other boards and mirrors tell."""
-    pictures = _pictures(session, camera)
+def why_unseen(pictures: list[Image], board: Board) -> str:
+    """Why pictures do not show the board, as far as other boards and mirrors tell."""
     if not pictures:
         return "it has no pictures"
     known = CornerFinder(board)
@@ -71,7 +74,8 @@ def why_unseen(session: Session, camera: int, board: Board) -> str:
     return "none of them shows a board that is known; is it in view, sharp and lit?"
 
 
-def _pictures(session: Session, camera: int) -> list[Image]:
+def pictures_of(session: Session, camera: int) -> list[Image]:
+    """A few pictures of a camera, spread over a recording."""
     refs: list[FrameRef] = [ref for refs in session.sets for ref in refs if ref.camera == camera]
     chosen = refs[:: max(len(refs) // TRIED, 1)][:TRIED]
     reader = session.store.open()

@@ -1,0 +1,178 @@
+"""The board before live cameras: corners are found while it is being waved, and it is said where to hold it next.
+
+What was found is kept when it is interrupted, and the next run goes on from there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from estimation import se3
+from estimation.camera_calibration.board_motion import REACH
+from estimation.camera_calibration.lens_model import matrix_of
+from estimation.errors import InputError
+from estimation.rig import Camera, Rig
+from estimation.se3 import Array
+from hardware.calibration.collect import KEEP, THREADS, Row, joined
+from hardware.calibration.corner_file import VERSION, read_corners, write_corners
+from hardware.calibration.guide import Guide
+from hardware.calibration.material import Material
+from hardware.cameras.feed import Place
+from hardware.cameras.identity import identity_from_text
+from hardware.cameras.live import LiveCameras
+from hardware.cameras.settings import CameraSource, read_live_rig
+from hardware.cameras.state import Phase
+from hardware.clock import Clock
+from hardware.progress import Progress
+from hardware.rig_file import NEAREST_RIG, ImageSource, read_rig
+from perception.boards.board import Board
+from perception.boards.collection import empty_table
+from perception.boards.corners import CornerFinder
+from perception.frames import FrameSet, Image
+
+OPENING = 15.0  # s until every camera has shown a picture
+LOOK = 0.5  # s between looks whether time is up
+AGAIN = 2 * REACH  # s put between what earlier runs saw and this one: the board has not moved smoothly since
+PICTURES = 5  # kept of each camera, the newest ones
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Devices:
+    """The cameras that are to be calibrated. rig: where they stood before, None for cameras that have none yet."""
+
+    places: tuple[Place, ...]
+    sources: tuple[CameraSource, ...]
+    rig: Rig | None
+    lens_sigma: Sequence[Array | None]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the cameras."""
+        return tuple(place.name for place in self.places)
+
+
+def devices_named(which: Sequence[str]) -> Devices:
+    """Cameras named as `stillbed cameras` has them, or those of one rig.toml; offsets known so far are left out."""
+    rigs = [text for text in which if text.endswith(".toml")]
+    if rigs and len(which) > 1:
+        raise InputError("command line", "cameras", " ".join(which), "one RIG.toml alone, or cameras without one")
+    if rigs:
+        rig, sources = read_live_rig(rigs[0])
+        places = tuple(Place(i, camera.name, camera.size) for i, camera in enumerate(rig.cameras))
+        return Devices(places, sources, rig, read_rig(rigs[0]).lens_sigma)
+    sources = tuple(CameraSource(identity_from_text("command line", "camera", text, Path.cwd())) for text in which)
+    places = tuple(Place(i, f"camera {i + 1}", None) for i in range(len(which)))
+    return Devices(places, sources, None, [None] * len(which))
+
+
+class Waving:
+    """Takes frame sets in; holds the corners so far, the newest pictures and what is still missing."""
+
+    def __init__(self, names: tuple[str, ...], sizes: tuple[tuple[int, int], ...], board: Board, store: Path) -> None:
+        self._store, self._key = store, _key(names, sizes, board)
+        known = read_corners(store, self._key)
+        self._table = empty_table(board, len(names)) if known is None else known
+        self._finders = [CornerFinder(board) for _ in names]
+        self._rows: list[Row] = []
+        self._done, self._saved = self._table.done, self._table.done
+        self._late: float | None = None if len(self._table) else 0.0  # s, from the cameras' stamps to those kept
+        self.guide = Guide(names, sizes, board)
+        self.guide.remember(self._table)
+        self.pictures: list[list[Image]] = [[] for _ in names]
+
+    @property
+    def done(self) -> int:
+        """Frame sets looked at, those of earlier runs included."""
+        return self._done
+
+    def add(self, pool: ThreadPoolExecutor, one: FrameSet) -> None:
+        """Look for the board in one frame set."""
+        if self._late is None:
+            self._late = float(self._table.stamp.max()) + AGAIN - min(frame.stamp for frame in one.frames)
+        found = list(pool.map(lambda frame: self._finders[frame.camera](frame.image), one.frames))
+        for frame, corners in zip(one.frames, found, strict=True):
+            self._rows.append(Row(frame.camera, self._done, frame.stamp + self._late, corners))
+            self.pictures[frame.camera] = [*self.pictures[frame.camera][1 - PICTURES :], frame.image]
+        self.guide.add({f.camera: c.pixels for f, c in zip(one.frames, found, strict=True) if c.count})
+        self._done += 1
+        if self._done - self._saved >= KEEP:
+            self.save()
+
+    def save(self) -> None:
+        """Write down what was found."""
+        self._table, self._rows = joined(self._table, self._rows, self._done), []
+        write_corners(self._store, self._key, self._table)
+        self._saved = self._done
+
+    def material(self, devices: Devices, sizes: tuple[tuple[int, int], ...]) -> Material:
+        """What was found, once it is saved, to be calibrated from."""
+        rig = devices.rig if devices.rig is not None else _stand_in(devices.names, sizes)
+        images = [ImageSource("source", source.identity.text) for source in devices.sources]
+        title = ", ".join(source.identity.shown for source in devices.sources)
+        given = devices.rig is not None
+        return Material(title, rig, given, images, devices.lens_sigma, self._table, lambda c: self.pictures[c])
+
+
+def _key(names: tuple[str, ...], sizes: tuple[tuple[int, int], ...], board: Board) -> str:
+    return hashlib.sha256(f"live {VERSION} {names} {sizes} {board}".encode()).hexdigest()
+
+
+def _stand_in(names: tuple[str, ...], sizes: tuple[tuple[int, int], ...]) -> Rig:
+    """Cameras of which only names and sizes are known."""
+    cameras = []
+    for number, (name, size) in enumerate(zip(names, sizes, strict=True)):
+        lens = [max(size), max(size), (size[0] - 1) / 2, (size[1] - 1) / 2]
+        place = se3.make(np.eye(3), np.array([NEAREST_RIG * number, 0.0, 0.0]))
+        cameras.append(Camera(name, size, matrix_of([*lens, 0, 0, 0, 0, 0]), np.zeros(5), place))
+    return Rig(tuple(cameras))
+
+
+def watch(
+    devices: Devices, board: Board, store: Path, seconds: float | None, clock: Clock, progress: Progress
+) -> Material:
+    """Watch until enough was seen, for `seconds` at most (None: without end), or until the files end.
+
+    What was found is in `store` then, also where it is interrupted. InputError names a camera that shows nothing.
+    """
+    with LiveCameras(devices.places, devices.sources, clock) as live, ThreadPoolExecutor(THREADS) as pool:
+        sizes, first = _sizes(live, clock)
+        waving = Waving(devices.names, sizes, board, store)
+        end = float("inf") if seconds is None else clock.now() + seconds
+        try:
+            for one in first:
+                waving.add(pool, one)
+            missing = waving.guide.missing()
+            while missing and clock.now() < end and not _ended(live):
+                one = live.next_set(min(end, clock.now() + LOOK))
+                if one is not None:
+                    waving.add(pool, one)
+                    missing = waving.guide.missing()
+                progress.note = missing[0] if missing else "enough"
+                progress(waving.done, 0)
+        finally:  # Ctrl-C included
+            waving.save()
+    return waving.material(devices, sizes)
+
+
+def _ended(live: LiveCameras) -> bool:
+    return all(camera.phase is Phase.ENDED for camera in live.health().cameras)
+
+
+def _sizes(live: LiveCameras, clock: Clock) -> tuple[tuple[tuple[int, int], ...], list[FrameSet]]:
+    """Each camera's picture (W, H) px, and the frame sets that came until all were known."""
+    end, sets = clock.now() + OPENING, []
+    while any(camera.newest is None for camera in live.health().cameras):
+        if clock.now() >= end:
+            silent = next(camera for camera in live.health().cameras if camera.newest is None)
+            raise InputError(f"camera {silent.name}", "pictures", "none", f"one within {OPENING:g} s: {silent.trouble}")
+        one = live.next_set(clock.now() + LOOK)
+        if one is not None:
+            sets.append(one)
+    pictures = [camera.newest for camera in live.health().cameras]
+    return tuple((int(p.shape[1]), int(p.shape[0])) for p in pictures if p is not None), sets

@@ -1,0 +1,190 @@
+"""`stillbed calibrate cameras` before live cameras: it guides, keeps what it found, goes on, and calibrates."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from board_session import BOARD, LENSES, rendered, small_rig
+from boards import motion
+
+from estimation import se3
+from estimation.rig import pixels_from_points
+from hardware.calibration.board_file import write_board
+from hardware.calibration.coverage import GRID, coverage_of, lacking
+from hardware.calibration.guide import TOGETHER, Guide
+from hardware.calibration.live import Waving, devices_named
+from hardware.cli import main
+from hardware.rig_file import read_rig
+from perception.frames import Image
+from tests.streams import CLOCK, HttpCamera, served
+
+SIZE, RATE = (640, 480), 8.0
+SOON = 60.0  # s, by which even a busy machine has looked at a dozen pictures
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[list[Image]]:
+    """What each of three cameras sees, there and back again."""
+    folder = rendered(tmp_path_factory.mktemp("live") / "session")
+    ways = [[cv2.imread(str(p)) for p in sorted((folder / name).glob("*.png"))] for name in "abc"]
+    return [[np.asarray(p, np.uint8) for p in [*way, *way[-2:0:-1]] if p is not None] for way in ways]
+
+
+@pytest.fixture
+def cameras(pictures: list[list[Image]]) -> Iterator[list[HttpCamera]]:
+    begin = CLOCK.now()
+
+    def shown(way: list[Image]) -> HttpCamera:
+        return HttpCamera(fps=RATE, picture_of=lambda n: way[int((CLOCK.now() - begin) * RATE) % len(way)])
+
+    three = [shown(way) for way in pictures]
+    with served(*three):
+        yield three
+
+
+def board_file(folder: Path) -> Path:
+    write_board(folder / "board.toml", BOARD)
+    return folder / "board.toml"
+
+
+def test_live_cameras_are_calibrated_from_what_they_showed(
+    cameras: list[HttpCamera], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, urls = tmp_path / "rig.toml", [camera.url for camera in cameras]
+    command = ["calibrate", "cameras", *urls, "--board", str(board_file(tmp_path)), "-o", str(out), "--seconds"]
+    end = CLOCK.now() + SOON
+    while main([*command, "4"]) == 2:  # too few pictures on a busy machine: the next run goes on
+        assert "pictures that show the board" in capsys.readouterr().err and CLOCK.now() < end
+    said = capsys.readouterr()
+    assert "camera 2: focal length" in said.out
+    written = read_rig(out)
+    for camera, lens in zip(written.rig.cameras, LENSES, strict=True):
+        assert camera.matrix[0, 0] == pytest.approx(lens[0], rel=0.03)
+    assert [f'source = "{url}"' in out.read_text() for url in urls] == [True] * 3
+    assert (tmp_path / "rig.report.html").exists()
+
+
+def test_what_was_found_is_kept_after_ctrl_c_and_the_next_run_goes_on(
+    cameras: list[HttpCamera], tmp_path: Path
+) -> None:
+    out, store = tmp_path / "rig.toml", tmp_path / "rig.corners.npz"
+    urls, file = [camera.url for camera in cameras], board_file(tmp_path)
+    program = [
+        sys.executable,
+        "-m",
+        "hardware.cli",
+        "calibrate",
+        "cameras",
+        *urls,
+        "--board",
+        str(file),
+        "-o",
+        str(out),
+    ]
+    run = subprocess.Popen(program, stderr=subprocess.PIPE, text=True, env=os.environ)
+    assert run.stderr is not None
+    assert "the board" in run.stderr.readline()  # where to hold it, or how to tilt it
+    run.send_signal(signal.SIGINT)
+    told = run.stderr.read()
+    assert run.wait(SOON) == 130
+    assert f"the corners so far are in {store}; the same command goes on from there" in told
+    assert not out.exists()
+    waving = Waving(("camera 1", "camera 2", "camera 3"), (SIZE,) * 3, BOARD, store)
+    assert waving.done > 0
+    before = [waving.guide.coverage(c).parts.sum() for c in range(3)]
+    assert min(before) > 0
+    assert Waving(("camera 1", "camera 2", "camera 3"), (SIZE,) * 3, replace(BOARD, square=50.0), store).done == 0
+
+
+def test_a_camera_that_shows_nothing_is_named(
+    cameras: list[HttpCamera], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("hardware.calibration.live.OPENING", 1.0)
+    cameras[1].online = False
+    urls = [camera.url for camera in cameras]
+    command = ["calibrate", "cameras", *urls, "--board", str(board_file(tmp_path)), "-o", str(tmp_path / "rig.toml")]
+    assert main(command) == 2
+    assert "camera camera 2: pictures = 'none', allowed one within 1 s: camera 2 cannot" in capsys.readouterr().err
+
+
+def test_wrong_words_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    end = ["--board", str(board_file(tmp_path)), "-o", str(tmp_path / "rig.toml")]
+    for words, named in (
+        (["0"], "a name that stays"),
+        (["a.toml", "http://h/1"], "one RIG.toml alone"),
+        (["http://h/1", "--seconds", "-1"], "--seconds = -1.0"),
+        ([str(tmp_path), "--seconds", "3"], "with live cameras"),
+        (["http://h/1", "--keep-lenses"], "--keep-lenses"),
+    ):
+        assert main(["calibrate", "cameras", *words, *end]) == 2
+        assert named in capsys.readouterr().err
+
+
+def test_offsets_of_a_rig_are_found_anew(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.toml"
+    entry = '[[camera]]\nname = "{}"\nsource = "http://h/{}"\nsize = [640, 480]\nclock_offset_s = 0.5\n'
+    numbers = "matrix = [[430, 0, 320], [0, 430, 240], [0, 0, 1]]\ndistortion = [0, 0, 0, 0, 0]\n"
+    place = "base_from_camera = [[1, 0, 0, {}], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    rig.write_text("".join(entry.format(n, n) + numbers + place.format(100 * n) for n in range(2)))
+    devices = devices_named([str(rig)])
+    assert devices.rig is not None and [place.offset for place in devices.places] == [0.0, 0.0]
+
+
+# -- the guide
+
+
+def seen_by(camera: int, poses: np.ndarray) -> list[np.ndarray]:
+    """Corners (P, 2) of each pose, nan outside of the picture."""
+    out = []
+    for pose in poses:
+        pixels = pixels_from_points(small_rig().cameras[camera], se3.transform_points(pose, BOARD.corners))[0]
+        pixels[((pixels < 0) | (pixels > np.array(SIZE) - 1)).any(-1)] = np.nan
+        out.append(pixels)
+    return out
+
+
+def test_the_guide_asks_for_what_is_missing_and_ends_once_it_was_seen() -> None:
+    guide = Guide(("a",), (SIZE,), BOARD)
+    assert "a: hold the board in its picture's top left" in guide.missing()[0]
+    still = motion(np.zeros(1), np.random.default_rng(0), BOARD.corners.mean(0))
+    for pixels in seen_by(0, np.repeat(still, 3, 0)):
+        guide.add({0: pixels})
+    first = guide.missing()
+    assert any("tilt the board by 30 degrees" in words for words in first)
+    assert any("nearer to it, and farther away" in words for words in first)
+    assert any(f"{TOGETHER - 3} frame sets more" in words for words in first)
+    rng = np.random.default_rng(1)
+    everywhere = []
+    for _ in range(300):
+        turn = se3.exp(np.concatenate([rng.uniform(-0.6, 0.6, 3), np.zeros(3)]))
+        depth = rng.uniform(450, 800)
+        at = np.array([*(rng.uniform(-0.75, 0.75, 2) * [0.75 * depth, 0.56 * depth]), depth])
+        everywhere.append(se3.make(np.eye(3), at) @ turn @ se3.make(np.eye(3), -BOARD.corners.mean(0)))
+    for pixels in seen_by(0, np.stack(everywhere)):
+        guide.add({0: pixels})
+    assert guide.missing() == ()
+    assert guide.coverage(0).depth == pytest.approx(1.5, abs=0.3)
+
+
+def test_cameras_that_never_see_it_together_are_asked_to() -> None:
+    guide = Guide(("a", "b"), (SIZE,) * 2, BOARD)
+    still = motion(np.zeros(1), np.random.default_rng(0), BOARD.corners.mean(0))
+    for camera in (0, 1):
+        guide.add({camera: seen_by(camera, still)[0]})
+    assert f"hold the board where two cameras see it, {TOGETHER} frame sets more" in guide.missing()
+    guide.add({c: seen_by(c, still)[0] for c in (0, 1)})
+    assert f"hold the board where two cameras see it, {TOGETHER - 1} frame sets more" in guide.missing()
+
+
+def test_nothing_seen_lacks_everything() -> None:
+    held = coverage_of(np.zeros((0, 12, 2)), SIZE, np.zeros((0, 4, 4)))
+    assert held.parts.shape == GRID[::-1] and [share for share, _ in lacking("a", held)] == [1.0, 1.0, 1.0]
