@@ -149,9 +149,9 @@ def watch(
                 waving.add(pool, one)
             missing = waving.guide.missing()
             while missing and clock.now() < end and not _ended(live):
-                one = live.next_set(min(end, clock.now() + LOOK))
-                if one is not None:
-                    waving.add(pool, one)
+                newest = live.next_set(min(end, clock.now() + LOOK))
+                if newest is not None:
+                    waving.add(pool, newest)
                     missing = waving.guide.missing()
                 progress.note = missing[0] if missing else "enough"
                 progress(waving.done, 0)
