@@ -149,17 +149,7 @@ def _costs(tally: Tally) -> list[Figure]:
 
 def carry_figures() -> list[Figure]:
     """What it costs to carry a long path to another pose."""
-    draw, clock = np.random.default_rng(0), CpuClock()
-    carried = CarriedPath(se3.exp(draw.normal(size=(CHECKPOINTS, 6)) * [0.2, 0.2, 0.2, 20, 20, 2]), SimpleArm())
-    moves = REST @ se3.exp(draw.normal(size=(CARRIES, 6)) * [0.05, 0.05, 0.05, 5, 5, 5])
-    transform, axes = np.empty(CARRIES), np.empty(CARRIES)
-    for k, base_from_surface in enumerate(moves):
-        pose = SurfacePose(float(k), base_from_surface, np.eye(6), np.zeros(6), TrackState.TRACKING)
-        start = clock.now()
-        carried(pose)
-        transform[k] = clock.now() - start
-        assert carried.axes.shape == (6, CHECKPOINTS)
-        axes[k] = clock.now() - start
+    transform, axes = carries(CHECKPOINTS, CARRIES)
     name, note = f"transform of {CHECKPOINTS:,} checkpoints", "processor time"
     return [
         Figure(f"{name}, 99 %", 1000 * float(np.percentile(transform, 99)), "ms", at_most(1), "thesis < 1", note),
@@ -167,3 +157,19 @@ def carry_figures() -> list[Figure]:
         Figure(f"{name}, axes X to C too, 99 %", 1000 * float(np.percentile(axes, 99)), "ms", note=note),
         Figure(f"{name}, axes X to C too, median", 1000 * float(np.median(axes)), "ms"),
     ]
+
+
+def carries(checkpoints: int, count: int) -> tuple[Array, Array]:
+    """Processor time (count,), s, to carry a path to one random pose after the other: as poses, and as axes too."""
+    draw, clock = np.random.default_rng(0), CpuClock()
+    carried = CarriedPath(se3.exp(draw.normal(size=(checkpoints, 6)) * [0.2, 0.2, 0.2, 20, 20, 2]), SimpleArm())
+    moves = REST @ se3.exp(draw.normal(size=(count, 6)) * [0.05, 0.05, 0.05, 5, 5, 5])
+    transform, axes = np.empty(count), np.empty(count)
+    for k, base_from_surface in enumerate(moves):
+        pose = SurfacePose(float(k), base_from_surface, np.eye(6), np.zeros(6), TrackState.TRACKING)
+        start = clock.now()
+        carried(pose)
+        transform[k] = clock.now() - start
+        assert carried.axes.shape == (6, checkpoints)
+        axes[k] = clock.now() - start
+    return transform, axes

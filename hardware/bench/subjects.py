@@ -44,6 +44,7 @@ SUBJECTS: Subjects = {
     "consistency": Subject("hardware.bench.consistency", "poses from pictures: are errors as large as is claimed?"),
     "estimator": Subject("hardware.bench.estimator", "the estimator on synthetic tracks: accuracy, honesty, time"),
     "fill": Subject("hardware.bench.fill", "beads laid into contours and random wounds: coverage and time"),
+    "growth": Subject("hardware.bench.growth", "how cost grows: with tracks, cameras, pixels, checkpoints, minutes"),
     "latency": Subject("hardware.bench.latency", "from three decoded frames to the pose, by wall clock and processor"),
     "link": Subject("hardware.bench.link", "the arm's line with everything going wrong; stops, jitter, the guard"),
     "live": Subject("hardware.bench.live", "whole runs in real time: frames to wire, stops, nozzle, kills"),

@@ -79,11 +79,11 @@ class Made:
             yield FrameSet(stamp, tuple(Frame(c, stamp, image) for c, image in enumerate(images)))
 
 
-def made(name: str, seconds: float) -> Shown:
-    """The recording `name` of MADE, of three cameras as in the thesis."""
+def made(name: str, seconds: float, rig: Rig | None = None) -> Shown:
+    """The recording `name` of MADE; rig: three cameras as in the thesis, if no other."""
     table, motion = MADE[name]
     scene = _patch() if table is None else scene_from_table(WHERE, dict(table), Path(), SEED)
-    rig, truth = arc_rig(), Truth(REST, motion_from_tables(WHERE, [dict(motion)], Path(), SEED))
+    rig, truth = rig or arc_rig(), Truth(REST, motion_from_tables(WHERE, [dict(motion)], Path(), SEED))
     stamps = np.arange(round(seconds * RATE)) / RATE
     poses = truth.base_from_surface(stamps)
     exact = Trajectory(stamps, poses, exact=True)
