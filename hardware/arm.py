@@ -20,7 +20,7 @@ from hardware.arm_line import ArmLine
 from hardware.arm_pace import Pace
 from hardware.arm_port import Opener, UnpluggedError
 from hardware.arm_profile import BITS_PER_BYTE, ArmProfile
-from hardware.arm_queue import ArmQueue
+from hardware.arm_queue import ArmQueue, Stretch
 from hardware.arm_status import ArmEvent, ArmState, ArmStatus
 from hardware.arm_travel import OwnMoves, lifted, travel
 from hardware.link_settings import LinkSettings
@@ -206,6 +206,10 @@ class Arm:
         """Where the arm is at `instant`, s, by what was sent (6,), the servo's lag included; None if not known."""
         late = self.profile.lag - self.profile.frame_time
         return None if self._queue is None else np.array(self._queue.at(instant - max(late, 0.0)))
+
+    def ways(self, since: float) -> list[Stretch]:
+        """The ways of the set-point that end after `since`, s, as far as they are known."""
+        return [] if self._queue is None else self._queue.ways(since)
 
     def events(self) -> list[ArmEvent]:
         """What happened since the last call."""

@@ -3,6 +3,7 @@
 home_mm_deg = [202.5, 225, 113, 0, 0, 0]      # X Y Z A B C
 arm_from_base = [[...], ...]                  # 4x4, mm
 arm_from_upright = [[...], ...]               # 3x3, the nozzle's rotation at A = B = C = 0
+tool_offset_mm = [0, 0, 0]                    # tip in the nozzle frame that the arm believes in; `calibrate arm`
 motion_byte = 1                               # byte 2 of a G1 frame, 1 or 0
 slots = ["J4", "J5", "J6"]                    # which joint stands in each angle slot
 origin_scale = 1                              # 10: the origin is sent in tenths of a millimetre
@@ -40,6 +41,7 @@ KEYS = (
     "home_mm_deg",
     "arm_from_base",
     "arm_from_upright",
+    "tool_offset_mm",
     "motion_byte",
     "slots",
     "origin_scale",
@@ -55,7 +57,12 @@ KEYS = (
 LIMITS = tuple(f.name for f in fields(Limits) if f.name != "zones")
 _AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
 _ANGLES = ("turn", "surface_turn")  # single numbers in rad
-_SHAPES: dict[str, tuple[int | None, ...]] = {"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3)}
+_SHAPES: dict[str, tuple[int | None, ...]] = {
+    "home_mm_deg": (6,),
+    "arm_from_base": (4, 4),
+    "arm_from_upright": (3, 3),
+    "tool_offset_mm": (3,),
+}
 _TO_RAD = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])
 
 
@@ -66,18 +73,14 @@ def read_arm(path: str | Path) -> ArmProfile:
     checks.check_keys(path, "", table, (), KEYS)
     try:
         default = at_baud(ArmProfile(), checks.integer(path, "baud", table.get("baud", ArmProfile().baud), 1))
-        shapes: dict[str, tuple[int | None, ...]] = {
-            "home_mm_deg": (6,),
-            "arm_from_base": (4, 4),
-            "arm_from_upright": (3, 3),
-        }
-        given = {key: checks.numbers(path, key, table[key], shape) for key, shape in shapes.items() if key in table}
+        given = {key: checks.numbers(path, key, table[key], shape) for key, shape in _SHAPES.items() if key in table}
         return ArmProfile(
             arm=SimpleArm(
                 given.get("arm_from_base", default.arm.arm_from_base),
                 given.get("arm_from_upright", default.arm.arm_from_upright),
                 given["home_mm_deg"] * _TO_RAD if "home_mm_deg" in given else default.arm.home,
                 *kinematics_from_table(path, table.get("kinematics")),
+                tool_offset=given.get("tool_offset_mm", default.arm.tool_offset),
             ),
             limits=_limits(path, table.get("limits", {}), table.get("no_go")),
             dialect=_dialect(path, table),
@@ -99,6 +102,7 @@ def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
         f"home_mm_deg = {checks.toml_numbers(arm.home / _TO_RAD)}",
         f"arm_from_base = {checks.toml_numbers(arm.arm_from_base)}",
         f"arm_from_upright = {checks.toml_numbers(arm.arm_from_upright)}",
+        f"tool_offset_mm = {checks.toml_numbers(arm.tool_offset)}",
         f"motion_byte = {dialect.motion_byte}",
         "slots = [" + ", ".join(f'"{joint}"' for joint in dialect.slots) + "]",
         f"origin_scale = {dialect.origin_scale}",

@@ -114,6 +114,10 @@ class ArmQueue:
         index = bisect_right(self._stretches, instant, key=lambda stretch: stretch.start) - 1
         return self._stretches[max(index, 0)].at(instant)
 
+    def ways(self, since: float) -> list[Stretch]:
+        """What ends after `since`, s, in order: of the last second, and of what is queued."""
+        return [stretch for stretch in self._stretches if stretch.end > since]
+
     def passed(self, place: Sequence[float], still: float, until: float) -> float:
         """When X Y Z of the set-point last were within `still` mm of a place (3,) each, s; NaN if not of late."""
         after = until

@@ -62,3 +62,23 @@ class SimClock:
         """Move on to `instant`, s, at once."""
         assert not math.isnan(instant)
         self._now = max(self._now, instant)
+
+
+class RememberingClock:
+    """A clock that remembers. begun: its first instant, s, None before. longest: s that nobody looked at it."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self.begun: float | None = None
+        self.longest, self._last = 0.0, math.inf
+
+    def now(self) -> float:
+        """Instant, s."""
+        now = self._clock.now()
+        self.begun = now if self.begun is None else self.begun
+        self.longest, self._last = max(self.longest, now - self._last), now
+        return now
+
+    def wait_until(self, instant: float) -> None:
+        """Wait until `instant`, s."""
+        self._clock.wait_until(instant)

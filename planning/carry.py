@@ -58,7 +58,8 @@ class CarriedPath:
         """Where the nozzle shall be at each checkpoint (N, 4, 4)."""
         columns = np.moveaxis(self._carried, -1, 0)
         turn = columns[..., :3] @ self._arm.arm_from_upright
-        return np.asarray(se3.inverse(self._arm.arm_from_base) @ se3.make(turn, columns[..., 3]))
+        tip = columns[..., 3] + turn @ self._arm.tool_offset
+        return np.asarray(se3.inverse(self._arm.arm_from_base) @ se3.make(turn, tip))
 
     @property
     def axes(self) -> Array:
@@ -71,6 +72,7 @@ class CarriedPath:
         return axes
 
     def _rows_of(self, transforms: Array) -> Array:
-        """Transforms (N, 4, 4) as (3, 4, N), seen from the tool upright at A = B = C = 0."""
+        """Transforms (N, 4, 4) as (3, 4, N), of where the arm believes the tip, upright at A = B = C = 0."""
+        place = transforms[:, :3, 3] - transforms[:, :3, :3] @ self._arm.tool_offset
         turn = transforms[:, :3, :3] @ self._arm.arm_from_upright.T
-        return np.ascontiguousarray(np.moveaxis(se3.make(turn, transforms[:, :3, 3])[:, :3], 0, -1))
+        return np.ascontiguousarray(np.moveaxis(se3.make(turn, place)[:, :3], 0, -1))

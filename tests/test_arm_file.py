@@ -21,7 +21,8 @@ from planning.limits import Limits
 
 def same(a: ArmProfile, b: ArmProfile) -> bool:
     pairs = [(getattr(a.limits, f.name), getattr(b.limits, f.name)) for f in fields(a.limits)]
-    pairs += [(getattr(a.arm, name), getattr(b.arm, name)) for name in ("arm_from_base", "arm_from_upright", "home")]
+    own = ("arm_from_base", "arm_from_upright", "home", "tool_offset")
+    pairs += [(getattr(a.arm, name), getattr(b.arm, name)) for name in own]
     numbers = all(np.allclose(x, y, rtol=1e-14, atol=1e-14) for x, y in pairs)
     numbers &= np.array_equal(a.tool, b.tool)
     return numbers and (a.dialect, a.baud, a.tick, a.lag) == (b.dialect, b.baud, b.tick, b.lag)
@@ -31,7 +32,10 @@ def same(a: ArmProfile, b: ArmProfile) -> bool:
 def test_a_profile_comes_back(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     draw = np.random.default_rng(seed)
     profile = ArmProfile(
-        SimpleArm(se3.exp(draw.normal(size=6)), se3.exp_rotation(draw.normal(size=3)), draw.uniform(-0.5, 0.5, 6)),
+        SimpleArm(
+            *(se3.exp(draw.normal(size=6)), se3.exp_rotation(draw.normal(size=3)), draw.uniform(-0.5, 0.5, 6)),
+            tool_offset=draw.uniform(-9, 9, 3),
+        ),
         Limits(speed=draw.uniform(1, 100, 6), turn=draw.uniform(0.01, 0.1), surface_turn=draw.uniform(0.1, 1)),
         Dialect(int(draw.integers(2)), ("J5", "J4", "J6"), (1, 10)[int(draw.integers(2))], (0.0, 1500.0)[seed % 2]),
         int(draw.integers(57_600, 1_000_000)),

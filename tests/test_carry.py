@@ -23,7 +23,8 @@ BUMP = Warp(np.zeros((1, 3)), np.array([[0.3, -0.2, 1.0]]), 1e-4 * np.eye(3), np
 def test_each_checkpoint_is_where_its_own_product_of_transforms_puts_it(seed: int, warp: Warp | None) -> None:
     draw = np.random.default_rng(seed)
     path = se3.exp(draw.normal(size=(20, 6)) * [0.3, 0.3, 0.3, 10, 10, 1])
-    arm = SimpleArm(se3.exp(draw.normal(size=6) * [0.2, 0.2, 0.2, 50, 50, 50]), se3.exp_rotation(draw.normal(size=3)))
+    pose = se3.exp(draw.normal(size=6) * [0.2, 0.2, 0.2, 50, 50, 50])
+    arm = SimpleArm(pose, se3.exp_rotation(draw.normal(size=3)), tool_offset=draw.normal(size=3) * 5)
     pose = replace(pose_at(breathing, draw.uniform(0, 4)), warp=warp)
     carried = CarriedPath(path, arm)
     assert carried(pose) is Update.CHANGED

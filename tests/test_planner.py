@@ -274,7 +274,8 @@ def test_a_stalled_caller_finds_the_arm_at_rest() -> None:
 @given(st.integers(0, 10_000))
 def test_axes_and_nozzle_are_one(seed: int) -> None:
     draw = np.random.default_rng(seed)
-    arm = SimpleArm(se3.exp(draw.normal(size=6) * [1, 1, 1, 300, 300, 300]), se3.exp_rotation(draw.normal(size=3)))
+    pose = se3.exp(draw.normal(size=6) * [1, 1, 1, 300, 300, 300])
+    arm = SimpleArm(pose, se3.exp_rotation(draw.normal(size=3)), tool_offset=draw.normal(size=3) * 5)
     axes = np.concatenate([draw.uniform(-500, 500, (5, 3)), draw.uniform(-1.5, 1.5, (5, 3))], axis=1)
     assert np.allclose(axes_from_nozzle(arm, nozzle_from_axes(arm, axes)), axes, atol=1e-9)
 

@@ -37,6 +37,9 @@ class Subject:
 Subjects = Mapping[str, Subject]
 
 SUBJECTS: Subjects = {
+    "arm-calibration": Subject(
+        "hardware.bench.arm_calibration", "the arm's place, tool and latency from what cameras see of its tip"
+    ),
     "calibration": Subject(
         "hardware.bench.calibration", "cameras calibrated from rendered boards, beside the exact rig"
     ),

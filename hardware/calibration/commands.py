@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from hardware.arm_calibration.commands import add_calibrate_arm
+
 Commands = Any  # argparse's own type for this is private
 
 FORMATS = {
@@ -32,6 +34,7 @@ def add_calibrate(commands: Commands) -> None:
     parts = command.add_subparsers(metavar="WHAT", required=True)
     _add_board(parts)
     _add_cameras(parts)
+    add_calibrate_arm(parts)
     _add_import(parts)
     _add_export(parts)
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import pickle
 import threading
-from contextlib import redirect_stdout
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -13,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from hardware.arm_profile import ArmProfile
-from hardware.clock import WallClock
+from hardware.clock import RememberingClock, WallClock
 from hardware.live.children import settle
 from hardware.priority import ask_for_real_time
 from hardware.simulator.arm_faults import ArmFault
@@ -38,26 +36,6 @@ class VirtualArmPlan:
     real_time: bool
 
 
-class _Since:
-    """A clock that remembers its first instant, and the longest time that the arm did not look at it, s."""
-
-    def __init__(self) -> None:
-        self._clock = WallClock()
-        self.begun: float | None = None
-        self.longest, self._last = 0.0, float("inf")
-
-    def now(self) -> float:
-        """Instant, s."""
-        now = self._clock.now()
-        self.begun = now if self.begun is None else self.begun
-        self.longest, self._last = max(self.longest, now - self._last), now
-        return now
-
-    def wait_until(self, instant: float) -> None:
-        """Sleep until `instant`, s."""
-        self._clock.wait_until(instant)
-
-
 def virtual_arm_process(plan: VirtualArmPlan, lifeline: Connection) -> None:
     """Serve until SIGTERM or the end of the lifeline, then write what was executed: stamps (N,) s and axes (N, 6)."""
     settle("arm")
@@ -66,15 +44,18 @@ def virtual_arm_process(plan: VirtualArmPlan, lifeline: Connection) -> None:
         settings, faults = pickle.loads(plan.kept.read_bytes())
     if plan.real_time:
         ask_for_real_time()  # a real controller shares no core with us
-    clock, stop = _Since(), threading.Event()
+    clock, stop = RememberingClock(WallClock()), threading.Event()
     threading.Thread(target=_end_with, args=(lifeline, stop), daemon=True).start()
-    with redirect_stdout(io.StringIO()):
-        arm = run_virtual_arm(settings, plan.profile, faults, plan.link, clock=clock, stop=stop)
+    arm = run_virtual_arm(settings, plan.profile, faults, plan.link, clock=clock, stop=stop, say=_nobody)
     assert clock.begun is not None
     stamps = np.arange(0.0, arm.now, STEP)
     axes = arm.axes_at(stamps) if len(stamps) else np.zeros((0, 6))
     with plan.executed.open("wb") as file:
         np.savez(file, stamps=stamps + clock.begun, axes=axes, deepest=arm.deepest, held_up=clock.longest)
+
+
+def _nobody(words: str) -> None:
+    """Tell nobody."""
 
 
 def _end_with(lifeline: Connection, stop: threading.Event) -> None:

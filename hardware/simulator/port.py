@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -25,6 +25,10 @@ LOG_STEP = 0.001  # s
 _ROWS = 10_000  # of the log at once
 
 
+def _print(words: str) -> None:
+    print(words, flush=True)
+
+
 def run_virtual_arm(
     settings: ArmSettings,
     profile: ArmProfile | None = None,
@@ -33,8 +37,9 @@ def run_virtual_arm(
     log: Path | None = None,
     clock: Clock | None = None,
     stop: threading.Event | None = None,
+    say: Callable[[str], None] = _print,
 ) -> VirtualArm:
-    """Serve a virtual arm on a new pty until `stop` is set, Ctrl-C or SIGTERM; print its device name, then a summary.
+    """Serve a virtual arm on a new pty until `stop` is set, Ctrl-C or SIGTERM; say its device name, then a summary.
 
     profile: dialect, home and baud rate; bytes are taken no faster than that, whatever rate a client asks the pty for.
     link: a symbolic link to the device, which is removed at the end. log: a new CSV of the executed axes, each ms.
@@ -49,7 +54,7 @@ def run_virtual_arm(
     try:
         os.set_blocking(ours, False)
         with _linked(link, device), _ended_by_signals(stop):
-            print(device, flush=True)
+            say(device)
             try:
                 _serve(ours, arm, profile.baud / BITS_PER_BYTE, clock, stop)
             finally:
@@ -58,7 +63,7 @@ def run_virtual_arm(
     finally:
         os.close(theirs)
         os.close(ours)
-    print(summary(arm), flush=True)
+    say(summary(arm))
     return arm
 
 

@@ -1,0 +1,227 @@
+"""The tip of a needle in a picture, to fractions of a pixel: what moved since the background, its thin part, its end.
+
+The tool is what differs from the background, the needle is the longest thin part that hangs on it, and its axis and end
+are measured in linear light, where a pixel half covered is half as bright: so the end is where the needle's area ends,
+whatever blurs it on both sides. A shadow, or another thing that moved, may be taken for the tool in one camera; the
+others do not agree with that, and it is left out later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from estimation.se3 import Array
+from perception.frames import Image
+
+Light = NDArray[np.float32]  # (H, W, 3), linear, 0 to 1
+Mask = NDArray[np.uint8]
+
+NOISE, FAINTEST = 4.0, 8.0  # times the usual difference, and grey levels, that a picture differs by where the tool is
+FAINT = 0.01  # of full light: a needle that adds or takes less cannot be measured
+WINDOW = 48  # px around the rough tip that are measured in
+LEAST_TOOL = 400  # px of area
+SHORTEST = 9.0  # px of needle that must be seen: less has no axis
+FITTED = 24.0  # px of needle behind the end that its axis is fitted to, at most
+BEYOND, INSIDE = 6.0, 7.0  # px on both sides of the end between which it is fitted
+STEPS = 8  # of that fit
+ACROSS = 5.0  # px beside the axis that are looked at
+FINE = 0.25  # px between samples
+STEADY = 0.35  # of its brightness by which the needle's may differ from a straight line: else it is not one
+_TO_LIGHT = np.where((grey := np.arange(256) / 255.0) <= 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4).astype(
+    np.float32
+)  # IEC 61966-2-1, which cameras' pictures follow
+
+_WEAK = np.array([0.02, 1.0, 0.0, 0.02])  # information on level, taper and blur, in samples of the profile
+
+
+@dataclass(frozen=True, slots=True)
+class Tip:
+    """pixel: (2,) as imaged, where the needle's outline ends on its axis. towards: (2,) unit, along it to the tool.
+
+    sigma: px, of noise. width: px, of the needle. contrast: of full light, between needle and background.
+    """
+
+    pixel: tuple[float, float]
+    towards: tuple[float, float]
+    sigma: float
+    width: float
+    contrast: float
+
+
+def background(images: Sequence[Image]) -> Image:
+    """What stays, (H, W, 3), while the tool is elsewhere in most of the pictures: their median."""
+    assert len(images) >= 3
+    return np.asarray(np.median(np.stack([_coloured(image) for image in images]), axis=0), np.uint8)
+
+
+def _coloured(image: Image) -> Image:
+    return image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+
+
+class TipFinder:
+    """Finds the tip in one camera's pictures before a background that stays."""
+
+    def __init__(self, behind: Image, radius: float) -> None:
+        """behind: as `background` gives. radius: px, of the needle at most; what is thicker is what it hangs on."""
+        self._behind, self._radius = behind, max(2, round(radius))
+
+    def __call__(self, image: Image) -> Tip | None:
+        """The tip, or None where no needle is seen whole."""
+        image = _coloured(image)
+        mask = _changed(image, self._behind)
+        rough = None if mask is None else _thin_end(mask, self._radius)
+        if rough is None:
+            return None
+        tip, towards = rough
+        x0, y0 = (int(v) for v in np.maximum(tip - WINDOW, 0))
+        part = slice(y0, int(tip[1]) + WINDOW), slice(x0, int(tip[0]) + WINDOW)
+        change = _in_light(image[part]) - _in_light(self._behind[part])
+        found = _measured(change, tip - [x0, y0], towards)
+        return None if found is None else replace(found, pixel=(found.pixel[0] + x0, found.pixel[1] + y0))
+
+
+def _in_light(image: Image) -> Light:
+    return np.asarray(cv2.LUT(image, _TO_LIGHT), np.float32)
+
+
+def _changed(image: Image, behind: Image) -> Mask | None:
+    """Where the tool is: the largest part that differs; None where nothing does."""
+    size = cv2.blur(cv2.absdiff(image, behind).max(axis=2), (3, 3))
+    noise = float(np.median(size[::4, ::4]))
+    mask = (size > max(NOISE * noise, FAINTEST)).astype(np.uint8)
+    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    if count < 2:
+        return None
+    largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+    if stats[largest, cv2.CC_STAT_AREA] < LEAST_TOOL:
+        return None
+    return np.asarray(labels == largest, np.uint8)
+
+
+def _thin_end(mask: Mask, radius: int) -> tuple[Array, Array] | None:
+    """Rough tip (2,) px and direction (2,) to the tool: the far end of the longest thin part that hangs on it."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    thick = cv2.morphologyEx(cv2.copyMakeBorder(mask, 1, 1, 1, 1, cv2.BORDER_REPLICATE), cv2.MORPH_OPEN, disc)
+    thick = thick[1:-1, 1:-1]
+    if not thick.any():
+        return None
+    near = cv2.dilate(thick, np.ones((3, 3), np.uint8))
+    count, labels = cv2.connectedComponents(np.asarray((mask > 0) & (near == 0), np.uint8), connectivity=8)
+    touching = cv2.dilate(near, np.ones((5, 5), np.uint8))
+    best: tuple[float, Array, Array] | None = None
+    for part in range(1, count):
+        rows, columns = np.nonzero(labels == part)
+        points = np.column_stack([columns, rows]).astype(float)
+        joint = points[touching[rows, columns] > 0]
+        if len(points) < SHORTEST or not len(joint):
+            continue
+        root = joint.mean(0)
+        away = points - root
+        tip = points[np.linalg.norm(away, axis=1).argmax()]
+        length = float(np.linalg.norm(tip - root))
+        if length >= SHORTEST and (best is None or length > best[0]):
+            best = length, tip, (root - tip) / length
+    return None if best is None or _at_border(best[1], mask) else best[1:]
+
+
+def _at_border(pixel: Array, mask: Mask) -> bool:
+    h, w = mask.shape
+    margin = BEYOND + ACROSS
+    return not (margin <= pixel[0] <= w - 1 - margin and margin <= pixel[1] <= h - 1 - margin)
+
+
+def _measured(change: Light, tip: Array, towards: Array) -> Tip | None:
+    """Axis and end of the needle whose rough tip (2,) and direction (2,) are given."""
+    for _ in range(3):
+        along, across, amount, contrast = _strip(change, tip, towards)
+        if contrast < FAINT:
+            return None
+        inner = (along >= 2.0) & (along <= _reach(amount, along))
+        if inner.sum() * FINE < SHORTEST - 3:
+            return None
+        core = np.clip(amount[inner], 0.0, None)
+        weight = core.sum(1)
+        middle = (core * across).sum(1) / np.maximum(weight, 1e-6)
+        slope, offset = np.polyfit(along[inner], middle, 1, w=np.sqrt(np.maximum(weight, 1e-6)))
+        side = np.array([-towards[1], towards[0]])
+        end = _end(along, amount.sum(1) * FINE, inner)
+        if end is None or abs(end) > BEYOND:
+            return None
+        tip = tip + end * towards + (offset + slope * end) * side
+        turned = towards + slope * side
+        towards = turned / np.linalg.norm(turned)
+    return _tip(along, across, amount, inner, tip, towards, contrast, change)
+
+
+def _tip(
+    along: Array,
+    across: Array,
+    amount: Array,
+    inner: NDArray[np.bool_],
+    tip: Array,
+    towards: Array,
+    contrast: float,
+    change: Light,
+) -> Tip | None:
+    profile = amount.sum(1)[inner] * FINE
+    line = np.polyval(np.polyfit(along[inner], profile, 1), along[inner])
+    width = float(np.median(profile))
+    if width < 0.5 or np.std(profile - line) > STEADY * width:
+        return None
+    outside = (np.abs(across) > ACROSS - 1.5)[None, :] & (along[:, None] < 0)
+    noise = float(np.std(amount[np.broadcast_to(outside, amount.shape)]))
+    sigma = noise * np.sqrt((BEYOND + INSIDE) * 2 * ACROSS) / width
+    return Tip((float(tip[0]), float(tip[1])), (float(towards[0]), float(towards[1])), sigma, width, contrast)
+
+
+def _strip(change: Light, tip: Array, towards: Array) -> tuple[Array, Array, Array, float]:
+    """Samples along (S,) and across (W,), px, from the tip, share of needle (S, W) there, and the contrast.
+
+    What the needle adds to the background is one colour; how much of it is in a sample is its share.
+    """
+    along, across = np.arange(-BEYOND - 2, FITTED + FINE, FINE), np.arange(-ACROSS, ACROSS + FINE, FINE)
+    side = np.array([-towards[1], towards[0]])
+    at = tip + along[:, None, None] * towards + across[None, :, None] * side
+    x, y = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
+    patch = cv2.remap(change, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
+    core = patch[(along > 2.5) & (along < 10.0)][:, np.abs(across) < 0.6].reshape(-1, 3)
+    colour = np.median(core, axis=0)
+    contrast = float(np.linalg.norm(colour))
+    amount = patch @ colour / max(contrast**2, 1e-12)
+    return along, across, amount, contrast
+
+
+def _reach(amount: Array, along: Array) -> float:
+    """How far, px, the needle goes on evenly from its end: to where it turns into something thicker."""
+    profile = amount.sum(1) * FINE
+    usual = float(np.median(profile[(along > 2.5) & (along < 8.0)]))
+    wrong = np.flatnonzero((along > 8.0) & (np.abs(profile - usual) > 0.5 * usual))
+    return float(along[wrong[0]]) - 1.5 if len(wrong) else FITTED
+
+
+def _end(along: Array, profile: Array, inner: NDArray[np.bool_]) -> float | None:
+    """Where along the axis, px, the needle ends: half way up to its own width there, which may taper.
+
+    The profile's model is (a + b s) Phi((s - e) / w), fitted by Gauss-Newton; blur and a round end are in w.
+    """
+    level = float(np.median(profile[inner]))
+    window = (along >= -BEYOND) & (along <= INSIDE)
+    s, y = along[window], profile[window] / max(level, 1e-9)
+    a, b, e, w = 1.0, 0.0, 0.0, 1.0
+    for _ in range(STEPS):
+        step, bell = ndtr((s - e) / w), np.exp(-0.5 * ((s - e) / w) ** 2) / np.sqrt(2 * np.pi)
+        line = a + b * s
+        slopes = np.column_stack([step, s * step, -line * bell / w, -line * bell * (s - e) / w**2])
+        left = y - line * step
+        held = slopes.T @ slopes + np.diag(_WEAK)
+        change = np.linalg.solve(held, slopes.T @ left - _WEAK * np.array([a - 1.0, b, 0.0, w - 1.0]))
+        a, b, e = a + change[0], b + change[1], e + float(np.clip(change[2], -1.0, 1.0))
+        w = float(np.clip(w + change[3], 0.3, 3.0))
+    return e if a > 0.3 and abs(e) <= BEYOND else None
