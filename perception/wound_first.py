@@ -10,6 +10,7 @@ import numpy as np
 from estimation.observations import no_observations
 from estimation.pose import SurfacePose, identity_pose
 from estimation.rig import Rig
+from estimation.surface_map import SurfaceMap
 from perception.frames import FrameSet, Roi
 from perception.segmentation import Segmenter
 from perception.tracking import STAGES, StepReport, TrackingStep, trusting_report
@@ -51,6 +52,16 @@ class WoundFirst:
         pose = self._step(frames)
         self.last = self._step.last
         return pose
+
+    @property
+    def map(self) -> SurfaceMap | None:
+        """The map as it is now, in the surface frame; None before there is one."""
+        return None if self._step is None else self._step.map
+
+    @property
+    def roi(self) -> tuple[Roi, ...]:
+        """Where the surface was at the start, none before it was found."""
+        return () if self._step is None else self._step.roi
 
     def idle(self) -> None:
         """Work that no pose waits for."""

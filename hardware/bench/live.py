@@ -24,6 +24,7 @@ from hardware.live.beside import Beside
 from hardware.live.judge import TrueError, judge_run
 from hardware.live.motion_names import EXPOSURE_TO_WIRE, FRAMES_TO_WIRE, LATE
 from hardware.live.prerender import cache_folder, prerender
+from hardware.live.settings import LiveSettings, settings_text
 from hardware.path_file import read_path, write_path
 from planning.path import Path as Toolpath
 from planning.path import lengths
@@ -34,6 +35,7 @@ WEIGH_EVERY = 2.0  # s between looks at the memory
 SETTLED = 0.3  # share of a run after which its memory counts: key frames are full then
 HOMING = "\nhoming\n"  # what a run says once its path is printed
 KILLED = 90.0  # s of a path that is printed by runs which are killed after some seconds each
+STAGES = "frames wait for the tracker", "tracking", "frames handed over to pose"
 STOP = "stop decided to on the wire"
 
 
@@ -43,6 +45,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--stops", type=int, default=3, metavar="N", help="in a run of their own; default 3")
     parser.add_argument("--kills", type=int, default=0, metavar="N", help="of random processes; default none")
     parser.add_argument("--seed", type=int, default=0, help="of what is killed when")
+    parser.add_argument("--pinned", action="store_true", help="motion and recorder on one core, tracking on the other")
     parser.add_argument("--scenario", type=Path, default=SCENARIO, metavar="SCENARIO.toml", help="which world")
 
 
@@ -86,7 +89,8 @@ def to_and_fro(path: Toolpath, seconds: float) -> Toolpath:
 
 def _printing(options: argparse.Namespace, folder: Path, path: Path, arm: Path) -> list[Figure]:
     record, clock = folder / "print.mcap", WallClock()
-    run = LiveSession(_arguments(options.scenario, record, path))
+    told = _arguments(options.scenario, record, path)
+    run = LiveSession([*([str(_pinned(folder))] if options.pinned else []), *told])
     load = []
     try:
         begun = run.wait_for("\nprint\n")
@@ -100,7 +104,7 @@ def _printing(options: argparse.Namespace, folder: Path, path: Path, arm: Path) 
     found: dict[str, Any] = json.loads(Beside(record).summary.read_text(encoding="utf-8"))
     error = judge_run(record, path, arm)
     note = f"load {np.mean(load or [np.nan]):.1f} on {os.cpu_count()} cores"
-    name = f"live {options.minutes:g} min"
+    name = f"live {options.minutes:g} min" + (", pinned" if options.pinned else "")
     return [*_latencies(name, found, note), *_errors(name, found, error), *_burden(name, found, run.memory)]
 
 
@@ -112,7 +116,7 @@ def _latencies(name: str, found: dict[str, Any], note: str) -> list[Figure]:
         Figure(f"{name}: frames to wire, 99 %", _of(wire, "p99"), "ms", at_most(35)),
         Figure(f"{name}: frames to wire, largest", _of(wire, "max"), "ms", at_most(60)),
         Figure(f"{name}: exposure to wire, median", _of(exposure, "p50"), "ms"),
-        Figure(f"{name}: tracking, median", _of(times.get("tracking", {}), "p50"), "ms"),
+        *(Figure(f"{name}: {stage}, median", _of(times.get(stage, {}), "p50"), "ms") for stage in STAGES),
         Figure(f"{name}: tick late, 99 %", _of(late, "p99"), "ms", at_most(3)),
     ]
 
@@ -169,6 +173,13 @@ def _stopping(options: argparse.Namespace, folder: Path, path: Path) -> list[Fig
         Figure("stop decided to on the wire, 99 %", _of(found, "p99"), "ms", at_most(10), "", note),
         Figure("stop decided to on the wire, largest", _of(found, "max"), "ms"),
     ]
+
+
+def _pinned(folder: Path) -> Path:
+    """A session.toml that gives each loop a core of its own."""
+    file = folder / "session.toml"
+    file.write_text(settings_text(LiveSettings(cores_tracking=(0,), cores_motion=(1,), cores_recorder=(1,))))
+    return file
 
 
 def _arguments(scenario: Path, record: Path, path: Path) -> list[str]:

@@ -19,7 +19,7 @@ from hardware.session import open_session
 
 NOTICED = ("tracking", "motion", "recorder")  # by the process that conducts; the feed's end is the cameras'
 VICTIMS = ("run", "tracking", "motion", "recorder", "feed")
-LONGEST = 6.0  # s of printing before a kill
+LONGEST = 3.0  # s of printing before a kill
 WITHIN = 0.5  # s after a kill in which the arm must have come to rest: noticed in 0.1, queued for 0.05, its servo
 SHORTEST = 0.05  # s of rest that are looked at
 STILL = 0.05  # mm
@@ -74,10 +74,6 @@ def kill_figures(scenario: Path, folder: Path, path: Path, count: int, seed: int
         ),
         Figure(f"{name}: recording ends before the kill, most", max(kills.unread, default=np.nan), "s", at_most(1)),
     ]
-
-
-def _most(seconds: list[float]) -> float:
-    return 1000 * max(seconds, default=float("nan"))
 
 
 def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator, before: float | None) -> float:

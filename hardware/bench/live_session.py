@@ -60,9 +60,10 @@ class LiveSession:
         return found
 
     def weigh(self) -> None:
-        """Note how much memory all its processes hold that no other has, MB."""
+        """Note how much memory all its processes but the virtual arm hold that no other has, MB."""
         pages = 0
-        for pid in (self.process.pid, *self.children().values()):
+        own = [pid for name, pid in self.children().items() if name != "arm"]  # which keeps all that it ever did
+        for pid in (self.process.pid, *own):
             try:
                 resident, shared = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1:3]
             except (OSError, ValueError):

@@ -52,7 +52,8 @@ class TrackingReport:
     (4, 4), where the path lies on the tracker's surface; None until that is known. registered: stamp, s, of the pose
     that told. sets, dropped: taken, and left out as a newer one was there. interval: s between two sets, NaN until
     known. unrecorded: sets that found the recorder busy. spans: of its stages. used: tracks by camera. ended: why there
-    will be no more, "" while there are. wrong: whether that was wrong input.
+    will be no more, "" while there are. wrong: whether that was wrong input. truth: (4, 4) mm, base_from_surface at the
+    pose's stamp where the world is simulated. surface: (V, 3) mm, landmarks in the surface frame.
     """
 
     stamp: float
@@ -69,6 +70,8 @@ class TrackingReport:
     used: tuple[int, ...] = ()
     ended: str = ""
     wrong: bool = False
+    truth: Array | None = None
+    surface: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

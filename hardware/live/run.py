@@ -17,6 +17,7 @@ from pathlib import Path as File
 from types import FrameType
 from typing import TYPE_CHECKING
 
+from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmState
 from hardware.clock import WallClock
 from hardware.live.beside import Found, write_found
@@ -73,6 +74,8 @@ class LiveRun:
         self._found = prepared.found is not None
         self._halted = False
         self._laid: Laid | None = None  # as the page shows it
+        self._landmarks = 0  # of the surface that it shows
+        self._used: ArmProfile | None = None  # since the path was begun
 
     def __call__(self) -> Outcome:
         """Run to the end; what came of it. Files are whole and all processes have ended on return."""
@@ -115,6 +118,7 @@ class LiveRun:
         orders = self._ended(keeper, now) + conductor(now, seen, requests)
         self._give(orders)
         self._tally.look(now, conductor.stage, seen, None if conductor.laid is None else conductor.laid.profile.arm)
+        self._viewer.look(seen, self._used)
         self._note_surface()
         self._show(now)
         self._tell(now)
@@ -184,6 +188,7 @@ class LiveRun:
         for name, text in kept.items():
             self._lines.outbox.put(UsedEntry(name, text))
         lag = 1000 * order.profile.lag
+        self._used = order.profile
         self._say(f"begun at checkpoint {order.start:.2f}, the arm's lag taken as {lag:.0f} ms")
         return order
 
@@ -225,9 +230,11 @@ class LiveRun:
     def _note_surface(self) -> None:
         """Keep where the path lies as soon as that is known, for a run that resumes."""
         tracking, laid, prepared = self._seen.tracking, self._conductor.laid, self._prepared
-        if laid is not self._laid and laid is not None:
-            self._laid = laid
-            self._lines.link.scene.put(scene_from(prepared.rig, laid.path))
+        surface = None if tracking is None else tracking.surface
+        count = 0 if surface is None else len(surface)
+        if laid is not self._laid or count != self._landmarks:
+            self._laid, self._landmarks = laid, count
+            self._lines.link.scene.put(scene_from(prepared.rig, None if laid is None else laid.path, surface))
         if self._found or laid is None or tracking is None or tracking.surface_from_path is None:
             return
         self._found = True

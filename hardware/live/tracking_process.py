@@ -32,6 +32,7 @@ from hardware.live.children import gone, settle
 from hardware.live.frame_ring import FrameRing, RingSource
 from hardware.live.histograms import Histograms
 from hardware.live.outbox import Outbox
+from hardware.live.outline import Outline
 from hardware.live.records import (
     Handed,
     LiveMotionReport,
@@ -55,6 +56,7 @@ RIG = ".toml"  # of a file that names live cameras
 PATIENCE = 0.1  # s of a wait for frames, after which it looks who else is still there
 WAITED, TRACKED, POSED = "frames wait for the tracker", "tracking", "frames handed over to pose"
 EXPOSED = "exposure to frames handed over"
+REFRESH, LANDMARKS = 15, 300  # sets between two looks at the map, and how many of its landmarks are shown, about
 INTERVALS = 31  # of which the middle one counts: a second of them
 HISTOGRAMS = 30.0  # s between histograms in the recording
 
@@ -160,6 +162,7 @@ class _Tracking:
         self._pictures = PictureTaker(lines.link.pictures, lines.link.requests)
         names = tuple(camera.name for camera in known.rig.cameras)
         self.report = TrackingReport(self._clock.now(), names)
+        self._outline = Outline(known.rig)
         self._before, self._intervals = np.nan, deque[float](maxlen=INTERVALS)
         lines.reports.put(self.report)
         first = None if plan.earlier is None else open_session(plan.earlier)
@@ -241,8 +244,18 @@ class _Tracking:
             unrecorded=self._outbox.dropped,
             spans=self.times.spans(),
             used=tuple(int(n) for n in self._step.last.used),
+            truth=None if self._known.truth is None else true_pose(self._known.truth, arrived.source),
+            surface=self._surface(pose),
         )
         self._lines.reports.put(self.report)
+
+    def _surface(self, pose: SurfacePose) -> Array | None:
+        """Landmarks for the page, now and then anew, as the map grows."""
+        if self.report.sets % REFRESH or (found := self._step.map) is None:
+            return self.report.surface
+        if not self._outline.laid and pose.state.measured:
+            self._outline.lay(self._step.roi, found.points, pose.base_from_surface)
+        return np.array(found.points[:: max(len(found) // LANDMARKS, 1)])
 
     def _interval(self, arrived: Arrived) -> float:
         """The time between two sets, s, those that nobody took included; NaN before the second."""
@@ -257,15 +270,19 @@ class _Tracking:
         if not self._lines.link.requests.windows:
             return
         seen, names = self._step.last.observations, self.report.cameras
-        shots = [Shot(names[f.camera], f.image, tracks=seen.pixels[seen.camera == f.camera]) for f in frames.frames]
-        self._pictures.offer(frames.stamp, shots, pose.base_from_surface if pose.state.measured else None)
+        there = pose.base_from_surface if pose.state.measured else None
+        shots = []
+        for frame in frames.frames:
+            outline = () if there is None else self._outline.in_pixels(frame.camera, there)
+            tracks = seen.pixels[seen.camera == frame.camera]
+            shots.append(Shot(names[frame.camera], frame.image, outline, tracks))
+        self._pictures.offer(frames.stamp, shots, there)
 
     def _record(self, arrived: Arrived, frames: FrameSet, pose: SurfacePose) -> None:
         stamps = {frame.camera: frame.stamp for frame in frames.frames}
         bare = tuple(frame for frame in frames.frames if frame.camera not in arrived.encoded)
         self._outbox.put(SetEntry(stamps, arrived.encoded, bare))
-        truth = None if self._known.truth is None else true_pose(self._known.truth, arrived.source)
-        self._outbox.put(PoseEntry(pose, self._step.last.observations, frames.head, truth))
+        self._outbox.put(PoseEntry(pose, self._step.last.observations, frames.head, self.report.truth))
         if (now := self._clock.now()) > self._told + HISTOGRAMS:
             self._told = now
             for entry in self.times.entries(now):

@@ -8,6 +8,7 @@ from math import nan
 import numpy as np
 
 from estimation.se3 import Array
+from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmState
 from hardware.live.conductor import Conductor, Seen
 from hardware.live.motion_names import FRAMES_TO_WIRE
@@ -15,6 +16,7 @@ from hardware.live.prepared import Prepared
 from hardware.live.records import LiveMotionReport, TrackingReport
 from hardware.live.stages import QUESTIONS
 from hardware.live.tally import Tally
+from hardware.live.true_error import TrueError
 from hardware.operator.view import (
     Activity,
     CameraView,
@@ -47,9 +49,17 @@ class Viewer:
     """Makes views; remembers what a rate needs."""
 
     prepared: Prepared
+    _true: TrueError = field(init=False)
     _times: Array = field(default_factory=lambda: np.zeros(0))  # (N,) s from each checkpoint to the end
     _sets: tuple[float, int] = (nan, 0)
     _rate: float = nan
+
+    def __post_init__(self) -> None:
+        self._true = TrueError(self.prepared.task.path)
+
+    def look(self, seen: Seen, profile: ArmProfile | None) -> None:
+        """Note what only shows from one look to the next. profile: of the arm, as it is used."""
+        self._true.look(seen.tracking, seen.motion, profile)
 
     def __call__(self, now: float, conductor: Conductor, seen: Seen, tally: Tally) -> OperatorView:
         """The view at `now`, s."""
@@ -81,6 +91,7 @@ class Viewer:
             reason=command.reason if isinstance(command, Hold) else "",
             error=tally.last_error,
             limit=profile.limits.pose_error,
+            true_error=self._true.last,
             in_flight=status.in_flight,
             most_in_flight=FLIGHT,
             base_from_nozzle=nozzle_from_axes(laid.profile.arm, status.axes) if known else None,  # type: ignore[union-attr,arg-type]
