@@ -56,12 +56,13 @@ def _arm(arguments: argparse.Namespace) -> int | None:
 
 
 def _serve(arguments: argparse.Namespace, profile: Any) -> None:
-    from hardware.simulator.arm_faults import fault_from_text
+    from hardware.faults import Part, Runner, check_faults, faults_from_texts
     from hardware.simulator.arm_settings import arm_settings_from_table
     from hardware.simulator.port import run_virtual_arm
 
     settings = arm_settings_from_table("command line", {"replies": arguments.replies})
-    faults = [fault_from_text("command line", "--fault", text) for text in arguments.fault]
+    faults = faults_from_texts("command line", "--fault", arguments.fault, Part.ARM)
+    check_faults(faults, Runner.ARM, "command line", "--fault")
     run_virtual_arm(settings, profile, faults, arguments.link, arguments.log)
 
 

@@ -28,7 +28,7 @@ def read_toml(path: Path) -> Table:
         raise InputError(path, "file", "empty", "TOML")
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # too long a number, and brackets in brackets, are no syntax errors
         raise InputError(path, "syntax", error, "valid TOML") from error
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from estimation.errors import StillbedError
+from estimation.errors import InputError, StillbedError
 from hardware.arm_commands import add_arm
 from hardware.bench.command import add_bench
 from hardware.calibration.commands import add_calibrate
@@ -149,10 +149,21 @@ def _add_simulate(commands: Commands) -> None:
     )
     command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
     command.add_argument("--trace", type=Path, metavar="FILE", help="a recorded motion, TUM or CSV, instead of its own")
+    _add_fault(command)
     command.add_argument("--threads", type=int, default=2, metavar="N", help="threads that render; results do not vary")
     command.add_argument("--pty", action="store_true", help="send the arm's bytes through a pseudo-terminal")
     command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     command.set_defaults(run=_simulate)
+
+
+def _add_fault(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="FAULT",
+        help='what goes wrong, such as "camera0 stuck at 5s for 2s"; may be given more than once; see docs/faults.md',
+    )
 
 
 def _add_track(commands: Commands) -> None:
@@ -205,6 +216,7 @@ def _add_replay(commands: Commands) -> None:
         "--arm", type=named_path, metavar="ARM.toml", help="the arm's place, limits and dialect of the link"
     )
     command.add_argument("--resume", type=Path, metavar="PROGRESS.toml", help="go on where an earlier run stopped")
+    _add_fault(command)
     command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
     command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     command.set_defaults(run=_replay)
@@ -241,9 +253,11 @@ def _add_export(commands: Commands) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
+    from hardware.faults import faults_from_texts
     from hardware.simulator.simulate import Options, run_simulation
 
-    options = Options(arguments.trace, arguments.threads, arguments.pty, arguments.force)
+    faults = faults_from_texts("command line", "--fault", arguments.fault)
+    options = Options(arguments.trace, faults, arguments.threads, arguments.pty, arguments.force)
     outcome = run_simulation(arguments.scenario, arguments.out, options)
     print(outcome.text)
     return 0 if outcome.met else MISSED
@@ -261,12 +275,16 @@ def _track(arguments: argparse.Namespace) -> None:
 def _replay(arguments: argparse.Namespace) -> int | None:
     from hardware.arm_file import read_arm
     from hardware.bookmark_file import read_start
+    from hardware.faults import faults_from_texts
     from hardware.out_folder import prepare_out
     from hardware.path_file import read_path
     from hardware.replay import replay_session
     from hardware.session import open_session
 
+    faults = faults_from_texts("command line", "--fault", arguments.fault)
     if arguments.path is None:
+        if faults:
+            raise InputError("command line", "--fault", str(faults[0]), "with --path: what was recorded is over")
         return _replay_run(arguments)
     session = open_session(arguments.session)
     path = read_path(arguments.path)  # what is wrong with it is told before anything is made
@@ -275,7 +293,7 @@ def _replay(arguments: argparse.Namespace) -> int | None:
     profile = None if arguments.arm is None else read_arm(arguments.arm)
     prepare_out(arguments.out, arguments.force)
     with _progress("replay", "frame sets") as progress:
-        replay_session(session, arguments.path, arguments.out, progress, profile, arguments.resume)
+        replay_session(session, arguments.path, arguments.out, progress, profile, arguments.resume, faults)
     rows = (arguments.out / "commands.csv").read_text(encoding="utf-8").splitlines()[1:]
     moves = sum(row.split(",", 2)[1] == "move" for row in rows)
     print(f"{moves} moves and {len(rows) - moves} holds: commands.csv and frames.bin in {arguments.out}")

@@ -7,7 +7,7 @@ time that was measured, so the same input gives the same bytes on every machine.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path as File
 from types import TracebackType
@@ -20,6 +20,7 @@ from hardware.arm_file import write_arm
 from hardware.arm_profile import ArmProfile, placed
 from hardware.bookmark_file import BookmarkFile, read_start
 from hardware.clock import SimClock
+from hardware.faults import Fault, Part, Runner, check_faults, struck
 from hardware.motion import MotionStep
 from hardware.path_file import read_path
 from hardware.progress import Report, silent
@@ -34,11 +35,12 @@ COLUMNS = (
 
 
 def replay(
-    poses: Iterable[SurfacePose], motion: MotionStep, delay: float = DELAY
+    poses: Iterable[SurfacePose], motion: MotionStep, delay: float = DELAY, hangs: Sequence[Fault] = ()
 ) -> Iterator[tuple[float, Command, bytes]]:
     """Every tick's instant (s), command and frame, from the first pose's stamp until the last pose is known.
 
     poses: in order of stamp, asked for only when they are due. delay: s, from a pose's stamp until the motion knows it.
+    hangs: when no tick is made, s from the first.
     """
     coming = iter(poses)
     pose, ahead = None, next(coming, None)
@@ -51,8 +53,9 @@ def replay(
             _check_order(ahead, after)
             ahead = after
         now = clock.now()
-        frame = motion(pose, now)
-        yield now, motion.last, frame
+        if not any(fault.covers(now - start) for fault in hangs):
+            frame = motion(pose, now)
+            yield now, motion.last, frame
         if ahead is None:
             return
         tick += 1
@@ -110,22 +113,26 @@ def replay_session(
     progress: Report = silent,
     profile: ArmProfile | None = None,
     resume: File | None = None,
+    faults: Sequence[Fault] = (),
 ) -> None:
     """Replay a session with the path at `path` (CSV) into `out`: commands.csv, frames.bin, arm.toml, progress.toml.
 
     A recording knows no arm. Without a profile the default arm is placed so that the first measured surface lies on its
     bench, level and below home; arm.toml says where that is. What was written before an error stays readable.
-    resume: progress.toml of an earlier run, to go on where that stopped.
+    resume: progress.toml of an earlier run, to go on where that stopped. faults: of cameras, tracking and motion.
     """
+    from hardware.frame_faults import tracked_sets
     from hardware.tracker import tracker  # loads cv2: the motion must not
 
+    check_faults(faults, Runner.REPLAY, "command line", "--fault", len(session.rig))
     checkpoints = read_path(path)
     start = 0.0 if resume is None else read_start(resume, checkpoints)
     tool = None if profile is None else profile.tool
     with tracker(session.rig, session.roi, session.surface, tool=tool) as step, CommandWriter(out) as writer:
 
         def track() -> Iterator[SurfacePose]:
-            for done, frames in enumerate(session.frame_sets(), 1):
+            sets = tracked_sets(session.frame_sets(), faults, session.rig, "command line")
+            for done, frames in enumerate(sets, 1):
                 yield step(frames)
                 step.idle()
                 progress(done, len(session))
@@ -135,7 +142,7 @@ def replay_session(
             poses, profile = placed_by(poses)
         write_arm(out / "arm.toml", profile, f"what this replay assumed; poses were known {DELAY} s after their stamps")
         motion, keeper = MotionStep(checkpoints, profile, start), BookmarkFile(out / "progress.toml", checkpoints)
-        for _, command, frame in replay(poses, motion):
+        for _, command, frame in replay(poses, motion, hangs=struck(faults, Part.MOTION)):
             writer.write(command, frame)
             keeper.write(motion.progress)
 

@@ -144,7 +144,7 @@ def read_shape_model(file: Path) -> ShapeModel:
         colour, rank, usual = (np.array(table[key], float) for key in ("colour", "rank", "rank_usual"))
         patterns = tuple(np.array(each, np.int32).reshape(-1, 1, 2) for each in table["patterns"])
         trust = float(table["trust"])
-    except (OSError, tomllib.TOMLDecodeError, KeyError, ValueError, TypeError) as error:
+    except (OSError, KeyError, ValueError, TypeError, RecursionError) as error:
         raise InputError(file, "shape model", str(error), "the file that comes with stillbed") from None
     if colour.shape != (COLOUR_TERMS,) or rank.shape != (TERMS,) or usual.shape != (TERMS,):
         raise InputError(file, "shape model", (colour.shape, rank.shape), f"{COLOUR_TERMS} and {TERMS} numbers")

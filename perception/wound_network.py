@@ -73,7 +73,7 @@ def read_settings(file: Path, found: str) -> Settings:
     """The settings of the network whose SHA-256 is `found`; InputError where they are missing or another network's."""
     try:
         table = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             file, "settings", str(error), "the TOML file that stillbed train writes beside a network"
         ) from None

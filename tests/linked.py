@@ -11,9 +11,9 @@ from estimation.se3 import Array
 from hardware.arm import Arm
 from hardware.arm_profile import ArmProfile
 from hardware.clock import SimClock
+from hardware.faults import Fault
 from hardware.link_settings import LinkSettings
 from hardware.protocol import G1, encode
-from hardware.simulator.arm_faults import ArmFault
 from hardware.simulator.arm_settings import ArmSettings
 from hardware.simulator.controller import VirtualArm
 from hardware.simulator.virtual_port import PortFaults, VirtualDevice
@@ -71,7 +71,7 @@ class Linked:
 
 def linked(
     settings: ArmSettings | None = None,
-    *faults: ArmFault,
+    *faults: Fault,
     port: PortFaults | None = None,
     link: LinkSettings | None = None,
     profile: ArmProfile | None = None,

@@ -13,12 +13,11 @@ from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmState, ArmStatus
 from hardware.cli import main
 from hardware.clock import SimClock
-from hardware.simulator.arm_faults import fault_from_text
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.controller import VirtualArm
 from hardware.simulator.virtual_port import PortFaults, VirtualDevice
 from tests.test_arm_port import serving
-from tests.virtual_arm import HOME
+from tests.virtual_arm import HOME, arm_fault
 
 AWAY = HOME + np.array([-20.0, 10, -30, 0, 0.1, 0])
 
@@ -26,7 +25,7 @@ AWAY = HOME + np.array([-20.0, 10, -30, 0, 0.1, 0])
 def asked(
     request: Request, replies: Replies = Replies.STREAM, fault: str = "", port: PortFaults | None = None
 ) -> tuple[ArmStatus, VirtualArm, list[str]]:
-    faults = [fault_from_text("t", "f", fault)] if fault else []
+    faults = [arm_fault(fault)] if fault else []
     clock, profile = SimClock(), ArmProfile()
     arm = VirtualArm(ArmSettings(replies=replies), profile.dialect, AWAY, faults)
     lines: list[str] = []

@@ -12,12 +12,11 @@ from hardware.arm_status import ArmState
 from hardware.link_settings import LinkSettings
 from hardware.protocol import G1, G4, Dialect, Pause, encode
 from hardware.replies import Reply, ReplyKind
-from hardware.simulator.arm_faults import fault_from_text
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.virtual_port import PortFaults
 from planning.command import feed_for
 from tests.linked import circle, linked
-from tests.virtual_arm import HOME
+from tests.virtual_arm import HOME, arm_fault
 
 ANSWERING = ArmSettings(servo_lag=0.02, replies=Replies.STREAM)
 
@@ -253,7 +252,7 @@ def test_stray_bytes_are_kept_with_their_instants_and_harm_nothing() -> None:
 
 @pytest.mark.parametrize("seconds", [0.2, 0.3, 0.6])
 def test_what_an_arm_that_stalls_has_queued_is_called_back_and_it_goes_on_by_itself(seconds: float) -> None:
-    link = linked(ANSWERING, fault_from_text("t", "f", f"stall {1000 * seconds:g}ms at 2.01s"))
+    link = linked(ANSWERING, arm_fault(f"stall {1000 * seconds:g}ms at 2.01s"))
     refused = link.follow(2.01 + seconds)
     assert any("later on its way" in reason or "called back" in reason for reason in refused)
     assert link.virtual.held <= 0.05 and link.virtual.queued <= 4
@@ -267,7 +266,7 @@ def test_what_an_arm_that_stalls_has_queued_is_called_back_and_it_goes_on_by_its
 
 
 def test_without_a_pause_frame_an_arm_that_stalls_is_held_until_it_has_caught_up() -> None:
-    link = linked(ANSWERING, fault_from_text("t", "f", "stall 600ms at 2s"), link=LinkSettings(pause_frame=False))
+    link = linked(ANSWERING, arm_fault("stall 600ms at 2s"), link=LinkSettings(pause_frame=False))
     refused = link.follow(6.0)
     assert any("later on its way than its lag, limit 50 ms" in reason for reason in refused)
     assert link.virtual.deepest < 0.15 and link.arm.state is ArmState.ARMED
@@ -276,7 +275,7 @@ def test_without_a_pause_frame_an_arm_that_stalls_is_held_until_it_has_caught_up
 
 def test_an_arm_that_stalls_on_its_way_home_gets_there() -> None:
     low = HOME + np.array([-20.0, 10, -20, 0, 0, 0])
-    link = linked(ANSWERING, fault_from_text("t", "f", "stall 600ms at 1s"), begin=low)
+    link = linked(ANSWERING, arm_fault("stall 600ms at 1s"), begin=low)
     assert link.arm.home(0.0) == ""
     link.run(8.0)
     assert link.virtual.deepest < 0.16
@@ -284,7 +283,7 @@ def test_an_arm_that_stalls_on_its_way_home_gets_there() -> None:
 
 
 def test_an_arm_that_does_not_answer_works_off_what_a_stall_has_queued() -> None:
-    link = linked(ArmSettings(servo_lag=0.0), fault_from_text("t", "f", "stall 600ms at 1s"))
+    link = linked(ArmSettings(servo_lag=0.0), arm_fault("stall 600ms at 1s"))
 
     def each(now: float) -> None:
         goal = circle(link.phase + 0.02)
@@ -300,7 +299,7 @@ def test_an_arm_that_does_not_answer_works_off_what_a_stall_has_queued() -> None
 
 
 def test_an_arm_that_stays_behind_is_stopped() -> None:
-    link = linked(ANSWERING, fault_from_text("t", "f", "stall 5s at 1s"))
+    link = linked(ANSWERING, arm_fault("stall 5s at 1s"))
     link.follow(6.0)
     assert link.arm.state is ArmState.STOPPED
     assert "called back" in link.arm.reason and link.virtual.deepest < 0.15
@@ -317,7 +316,7 @@ def test_an_arm_that_runs_away_is_stopped_at_once() -> None:
 
 
 def test_an_arm_that_falls_silent_is_held_and_then_stopped() -> None:
-    link = linked(ANSWERING, fault_from_text("t", "f", "unplug at 2s"))
+    link = linked(ANSWERING, arm_fault("unplug at 2s"))
     refused = link.follow(6.0)
     assert any("has not answered for" in reason for reason in refused)
     assert link.arm.state is ArmState.STOPPED

@@ -13,12 +13,11 @@ from hardware.arm_travel import lifted, travel
 from hardware.link_settings import LinkSettings
 from hardware.protocol import G1, G4, encode
 from hardware.replies import Reply, ReplyKind, encode_reply
-from hardware.simulator.arm_faults import fault_from_text
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.virtual_port import PortFaults, VirtualPort
 from planning.command import feed_for
 from tests.linked import circle, linked
-from tests.virtual_arm import HOME
+from tests.virtual_arm import HOME, arm_fault
 
 ANSWERING = ArmSettings(servo_lag=0.02, replies=Replies.STREAM)
 
@@ -88,7 +87,7 @@ def test_a_device_that_is_not_there_is_waited_for() -> None:
 
 def test_every_fault_of_the_line_ends_at_rest() -> None:
     for text in ("drop at 1s for 1s", "garble at 1s for 1s", "unplug at 1s for 1s", "stall 600ms at 1s"):
-        link = linked(ANSWERING, fault_from_text("t", "f", text))
+        link = linked(ANSWERING, arm_fault(text))
         link.follow(4.0)
         link.arm.stop("the end", link.clock.now())
         link.run(1.0)

@@ -13,6 +13,7 @@ from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.images import decode
 from hardware.simulator.cameras import Fate, Shot
 from hardware.simulator.instant import Instant
+from hardware.simulator.lenses import Lenses
 from hardware.simulator.look import Look
 from hardware.simulator.pictures import Pictures
 from hardware.simulator.scene import Scene
@@ -28,7 +29,7 @@ def scene() -> Scene:
 
 
 def pictures(seed: int = 3, quality: int | None = 90, threads: int = 1) -> Pictures:
-    return Pictures(scene(), RIG.cameras, Sensor(), quality, seed, threads)
+    return Pictures(scene(), Lenses(RIG.cameras), Sensor(), quality, seed, threads)
 
 
 def shot(camera: int, number: int, fate: Fate = Fate.DELIVERED) -> Shot:
@@ -105,7 +106,7 @@ def test_each_picture_is_taken_once() -> None:
 
 def test_what_is_printed_is_brought_up_to_the_first_exposure_that_waits() -> None:
     told = list[float]()
-    source = Pictures(scene(), RIG.cameras, Sensor(), 90, 3, 1, told.append)
+    source = Pictures(scene(), Lenses(RIG.cameras), Sensor(), 90, 3, 1, told.append)
     for one in (shot(0, 1), shot(1, 0), shot(2, 1)):
         source.expose(one, instant(one.number))
     source.take(shot(2, 1))

@@ -12,8 +12,8 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.arm_profile import ArmProfile
+from hardware.faults import Kind
 from hardware.rig_file import ImageSource, write_rig
-from hardware.simulator.arm_faults import FaultKind
 from hardware.simulator.scenario_file import read_scenario
 from tests.worlds import write_path, write_scenario
 
@@ -90,7 +90,7 @@ def test_words_become_what_they_say(tmp_path: Path) -> None:
         "tracking": {"by": "truth", "processing_s": "measured", "register": "scan"},
         "sensor": {"jpeg_quality": 0},
         "scene": {"nozzle": False, "beads": False, "body": "chest"},
-        "faults": ["stall 600ms at 5s", "slow 80% at 2s for 1s"],
+        "faults": ["arm stall 600ms at 5s", "camera1 stuck at 2s for 1s"],
         "strain": {"kind": "sine", "rate_hz": 0.25},
     }
     scenario = read_scenario(write_scenario(tmp_path, tables))
@@ -98,7 +98,7 @@ def test_words_become_what_they_say(tmp_path: Path) -> None:
     assert (tracking.pictures, tracking.processing, tracking.scan) == (False, None, True)
     assert (scenario.jpeg_quality, scenario.nozzle, scenario.beads) == (None, False, False)
     assert scenario.scene == {"body": "chest"}
-    assert [fault.kind for fault in scenario.faults] == [FaultKind.STALL, FaultKind.SLOW]
+    assert [fault.kind for fault in scenario.faults] == [Kind.STALL, Kind.STUCK]
     assert scenario.strain is not None
     assert scenario.strain(np.array([1.0])) == pytest.approx([1.0])
 
@@ -131,9 +131,11 @@ WRONG = [
     ("clearance_mm", {"clearance_mm": -0.1}),
     ("clearance_mm", {"clearance_mm": True}),
     ("bead_mm", {"bead_mm": 0}),
-    ("faults", {"faults": "stall 600ms"}),
-    ("faults[1]", {"faults": ["drop", "dance"]}),
+    ("faults", {"faults": "arm stall 600ms"}),
+    ("faults[1]", {"faults": ["arm drop", "arm dance"]}),
     ("faults[0]", {"faults": [5]}),
+    ("faults", {"faults": ["camera9 off"]}),
+    ("faults", {"faults": ["disk full"]}),
     ("motion", {"motion": 5}),
     ("motion", {"motion": {"kind": "sine"}}),
     ("motion[0].kind", {"motion": [{"kind": "dance"}]}),

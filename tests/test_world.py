@@ -257,7 +257,7 @@ def worked_off(since: Array) -> Array:
 
 
 def test_an_arm_that_stalls_is_late_by_as_much_and_works_it_off(tmp_path: Path) -> None:
-    _, log = with_faults(tmp_path, "stall 300ms at 1s")
+    _, log = with_faults(tmp_path, "arm stall 300ms at 1s")
     distance = np.linalg.norm(difference(log), axis=1)
     steady = inner(log)
     assert distance[steady & (log.stamps < 1.0)].max() < 0.005
@@ -266,7 +266,7 @@ def test_an_arm_that_stalls_is_late_by_as_much_and_works_it_off(tmp_path: Path) 
 
 
 def test_a_slow_arm_falls_behind(tmp_path: Path) -> None:
-    _, log = with_faults(tmp_path, "slow 50% at 1s for 0.4s")
+    _, log = with_faults(tmp_path, "arm slow 50% at 1s for 0.4s")
     distance = np.linalg.norm(difference(log), axis=1)
     after = inner(log) & (log.stamps > 1.45)
     late = 0.4 - 0.5 * 0.4 / HASTE - worked_off(log.stamps[after] - 1.4)
@@ -274,7 +274,7 @@ def test_a_slow_arm_falls_behind(tmp_path: Path) -> None:
 
 
 def test_a_lost_frame_is_an_error_for_a_moment(tmp_path: Path) -> None:
-    sink, log = with_faults(tmp_path, "drop at 1s")
+    sink, log = with_faults(tmp_path, "arm drop at 1s")
     distance = np.linalg.norm(difference(log), axis=1)
     late = log.stamps[inner(log) & (distance > 0.05)]
     assert 1.0 <= late[0] < 1.1
@@ -285,12 +285,12 @@ def test_a_lost_frame_is_an_error_for_a_moment(tmp_path: Path) -> None:
 def test_a_garbled_frame_does_not_end_the_run(tmp_path: Path) -> None:
     for seed in range(2):
         change = {"arm": {"seed": seed}}
-        sink = heard(write_scenario(tmp_path, IDEAL, change, faults=["garble at 1s"], seconds=2.0))
+        sink = heard(write_scenario(tmp_path, IDEAL, change, faults=["arm garble at 1s"], seconds=2.0))
         assert len(sink.log) == 2000
 
 
 def test_an_arm_that_is_unplugged_stands_and_its_target_goes_on(tmp_path: Path) -> None:
-    _, log = with_faults(tmp_path, "unplug at 1s")
+    _, log = with_faults(tmp_path, "arm unplug at 1s")
     after = log.stamps > 1.05
     assert np.ptp(log.base_from_nozzle[after, :3, 3], axis=0).max() < 1e-9
     assert np.linalg.norm(difference(log), axis=1)[log.extrude][-1] > 3.0

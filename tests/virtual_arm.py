@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.se3 import Array
+from hardware.faults import Fault, Part, fault_from_text
 from hardware.protocol import G1, THESIS, encode
-from hardware.simulator.arm_faults import ArmFault
 from hardware.simulator.arm_settings import ArmSettings
 from hardware.simulator.controller import VirtualArm
 
@@ -14,7 +14,7 @@ HOME = np.array([202.5, 225, 113, 0, 0, 0])
 IDEAL = ArmSettings(servo_lag=0.0)
 
 
-def virtual_arm(settings: ArmSettings = IDEAL, *faults: ArmFault) -> VirtualArm:
+def virtual_arm(settings: ArmSettings = IDEAL, *faults: Fault) -> VirtualArm:
     return VirtualArm(settings, THESIS, HOME, faults)
 
 
@@ -36,3 +36,8 @@ def motion(arm: VirtualArm) -> tuple[Array, Array]:
     """Every millisecond so far: stamps (N,), s, and executed axes (N, 6), mm and rad."""
     stamps = np.minimum(np.arange(int(arm.now / 0.001 + 1e-6) + 1) * 0.001, arm.now)
     return stamps, arm.axes_at(stamps)
+
+
+def arm_fault(text: str) -> Fault:
+    """A fault of the arm by its text, which need not name the arm."""
+    return fault_from_text("x.toml", "arm.faults", text, Part.ARM)

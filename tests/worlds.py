@@ -27,8 +27,9 @@ from hardware.simulator.scenario import Scenario
 from hardware.simulator.scenario_file import read_scenario
 from hardware.simulator.scene import STILL, Scene
 from hardware.simulator.shape import flat
+from hardware.simulator.sight import Exposures
 from hardware.simulator.truth import Truth
-from hardware.simulator.world import Exposures, World
+from hardware.simulator.world import World
 from perception.frames import FrameSet, PrintHead
 from perception.tracking import StepReport
 from planning.command import Command, Hold
@@ -148,7 +149,7 @@ def world_of(
     scene = patch(deformation)
     truth = Truth(scenario.rest, scenario.motion, deformation, scenario.strain, scene.shape.surface_from_grid)
     offset = scenario.told_rig.cameras[0].base_from_camera @ se3.inverse(scenario.rig.cameras[0].base_from_camera)
-    step = PerfectTracker(truth, offset, lambda camera, stamp: exposures[camera, stamp], len(scenario.rig))
+    step = PerfectTracker(truth, offset, lambda camera, stamp: exposures[camera, stamp].exposed, len(scenario.rig))
     path = read_path(scenario.path)
     return World(scenario, scene, path, truth, step, exposures, sink, SimClock(), line=line)
 

@@ -28,11 +28,11 @@ from hardware.arm_profile import BENCH, ArmProfile
 from hardware.arm_status import ArmState
 from hardware.bench.figure import Figure, at_least, at_most
 from hardware.clock import WallClock
+from hardware.faults import Fault, Kind, Part
 from hardware.motion_loop import Order
 from hardware.motion_process import MotionPlan, MotionReport, motion_process
 from hardware.newest import Newest
 from hardware.priority import ask_for_real_time
-from hardware.simulator.arm_faults import ArmFault, FaultKind
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.port import run_virtual_arm
 from planning.path import Path as Toolpath
@@ -193,18 +193,18 @@ def _serve(link: Path, seed: int, bad: bool, found: Connection) -> None:
     found.send(Arrived(arm.frames, len(arm.ignored), len(arm.refused), garbage, arm.deepest, arm.in_flight))
 
 
-def _faults(seed: int) -> list[ArmFault]:
+def _faults(seed: int) -> list[Fault]:
     """Stalls, losses and cuts of the wire, each some seconds after the last, for an hour."""
-    rng, now, faults = np.random.default_rng(seed), 5.0, list[ArmFault]()
+    rng, now, faults = np.random.default_rng(seed), 5.0, list[Fault]()
     while now < 3600:
         kind = FAULTS[rng.integers(len(FAULTS))]
-        length = 0.0 if kind is FaultKind.DROP else float(rng.uniform(0.05, HALT))
-        faults.append(ArmFault(kind, now, length))
+        length = 0.0 if kind is Kind.DROP else float(rng.uniform(0.05, HALT))
+        faults.append(Fault(Part.ARM, kind, now, length))
         now += float(rng.uniform(4, 10))
     return faults
 
 
-FAULTS = (FaultKind.STALL, FaultKind.STALL, FaultKind.DROP, FaultKind.UNPLUG)
+FAULTS = (Kind.STALL, Kind.STALL, Kind.DROP, Kind.UNPLUG)
 
 
 class _Operator:

@@ -12,10 +12,10 @@ from hardware.arm import Arm
 from hardware.arm_profile import ArmProfile, at_baud
 from hardware.arm_status import ArmState
 from hardware.clock import SimClock
+from hardware.faults import Fault, Kind, Part
 from hardware.link_settings import LinkSettings
 from hardware.protocol import G1, LENGTH, TAILS, FrameStream, decode, encode
 from hardware.replies import REPLY_LENGTH, REPLY_TAILS, decode_reply
-from hardware.simulator.arm_faults import ArmFault, FaultKind
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.controller import VirtualArm
 from hardware.simulator.virtual_port import PortFaults, VirtualDevice, Window
@@ -130,14 +130,14 @@ class Run:
         replies = Replies.STREAM if seed % 2 else (Replies.OFF, Replies.STRAY)[rng.integers(2)]
         manner = MANNERS[seed // 2 % len(MANNERS)]
         self.kind = f"{manner}, {'answering' if seed % 2 else 'silent'}"
-        faults: list[ArmFault] = []
+        faults: list[Fault] = []
         self._ends: deque[float] = deque()
         if manner == STALLING:
             stalls = windows(rng, 40.0, LONGEST)
-            faults = [ArmFault(FaultKind.STALL, a, b - a) for a, b in stalls]
+            faults = [Fault(Part.ARM, Kind.STALL, a, b - a) for a, b in stalls]
             self._ends = deque(b for a, b in stalls if b - a >= NOTICED)
         if manner == LOSSY:
-            faults = [ArmFault(FaultKind.UNPLUG, a, b - a) for a, b in windows(rng, 150.0, 2.0)]
+            faults = [Fault(Part.ARM, Kind.UNPLUG, a, b - a) for a, b in windows(rng, 150.0, 2.0)]
         profile = at_baud(ArmProfile(), baud)
         settings = ArmSettings(replies=replies, seed=seed)
         self._clock = SimClock()

@@ -7,6 +7,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path as File
 
 from hardware.live.frame_ring import FrameRing
+from hardware.live.injected import Begun
 from hardware.live.place import Place
 from hardware.live.prepared import Prepared
 from hardware.live.records import Handed, LiveMotionReport, RecorderReport, TrackingReport
@@ -14,11 +15,11 @@ from hardware.newest import Newest
 from hardware.operator.link import OperatorLink
 
 
-def show(prepared: Prepared, ring: FrameRing, words: Connection) -> None:
+def show(prepared: Prepared, ring: FrameRing, words: Connection, begun: Begun) -> None:
     """Show a recorded session, as cameras would."""
     from hardware.live.feed import FeedPlan, feed_process
 
-    feed_process(FeedPlan(prepared.session, prepared.again), ring, words)
+    feed_process(FeedPlan(prepared.session, prepared.again, prepared.faults, begun), ring, words)
 
 
 def record(prepared: Prepared, senders: Sequence[Connection], reports: Newest[RecorderReport]) -> None:

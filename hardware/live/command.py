@@ -47,6 +47,13 @@ def add_live(commands: Commands) -> None:
     how.add_argument("--yes", action="store_true", default=None, help="nobody confirms the path and the start")
     how.add_argument("--stands-home", action="store_true", default=None, help="an arm that does not answer stands so")
     how.add_argument("--jpeg-quality", type=int, metavar="Q", help="record unencoded pictures smaller and not exactly")
+    how.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="FAULT",
+        help='of a simulated run, what goes wrong, such as "tracking hang at 5s for 1s"; see docs/faults.md',
+    )
     how.add_argument("--no-page", action="store_true", help="without the operator's page in the browser")
     how.add_argument("--force", action="store_true", help="overwrite the recording")
     command.set_defaults(run=_live)
@@ -67,12 +74,14 @@ def add_init(commands: Commands) -> None:
 
 def _live(arguments: argparse.Namespace) -> int:
     from estimation.errors import InputError
+    from hardware.faults import faults_from_texts
     from hardware.live.console import Console
-    from hardware.live.prepared import prepare, prepare_again
+    from hardware.live.prepared import prepare, prepare_again, with_faults
     from hardware.live.run import LiveRun
     from hardware.live.settings import LiveSettings, overridden, read_settings
 
     a = arguments
+    faults = faults_from_texts("command line", "--fault", a.fault)
     flags = {name: getattr(a, name) for name in FLAGS} | {"unattended": a.yes, "page": False if a.no_page else None}
     if a.resume is not None:
         if a.settings is not None or a.record is not None:
@@ -82,7 +91,7 @@ def _live(arguments: argparse.Namespace) -> int:
         given = LiveSettings() if a.settings is None else read_settings(a.settings)
         prepared = prepare(overridden(given, flags), a.settings or "command line", a.force)
     with Console() as console:
-        outcome = LiveRun(prepared, console)()
+        outcome = LiveRun(with_faults(prepared, faults), console)()
         outcome.write()
         console.say(outcome.words)
     return outcome.code

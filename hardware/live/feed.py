@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -18,10 +18,13 @@ import numpy as np
 from estimation.errors import StillbedError
 from estimation.trajectory import Trajectory
 from hardware.clock import WallClock
+from hardware.faults import Fault
+from hardware.frame_faults import FrameFaults
 from hardware.images import decode
 from hardware.live.arrived import Encoded
 from hardware.live.children import settle
 from hardware.live.frame_ring import FrameRing
+from hardware.live.injected import Begun
 from hardware.session import FrameReader, FrameRef, Session, open_session
 from perception.frames import Frame, FrameSet
 from perception.pairing import frame_set
@@ -36,10 +39,12 @@ KEPT = 2**30  # bytes of encoded pictures that are kept for a session shown agai
 
 @dataclass(frozen=True, slots=True)
 class FeedPlan:
-    """What is shown. session: folder or MCAP. again: whether it never ends."""
+    """What is shown. session: folder or MCAP. again: whether it never ends. faults: of cameras, from `begun` on."""
 
     session: Path
     again: bool
+    faults: tuple[Fault, ...] = ()
+    begun: Begun = field(default_factory=Begun)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +96,7 @@ def feed_process(plan: FeedPlan, ring: FrameRing, words: Connection) -> None:
 
 def _show(session: Session, plan: FeedPlan, ring: FrameRing, words: Connection) -> None:
     clock, pictures = WallClock(), _Pictures(session, plan.again)
+    spoil = FrameFaults(plan.faults, session.rig, "command line")
     _wait_until_wanted(ring, clock)
     stamps = np.array([np.mean([ref.stamp for ref in refs]) for refs in session.sets])
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
@@ -108,8 +114,12 @@ def _show(session: Session, plan: FeedPlan, ring: FrameRing, words: Connection) 
         shown = [replace(f, stamp=_live(f.stamp, anchor, showing)) for f in frames]
         head = session.heads.at(anchor)
         whole = FrameSet(frame_set(shown).stamp, tuple(shown), head)
+        seen = spoil(whole, showing.live - plan.begun.instant)
+        same = {frame.camera for frame in seen.frames if frame in whole.frames}
+        encoded = {camera: stored for camera, stored in encoded.items() if camera in same}
         clock.wait_until(due)
-        words.send(ring.put(whole, encoded, clock.now, anchor))
+        if seen.frames:
+            words.send(ring.put(seen, encoded, clock.now, anchor))
 
 
 def _wait_until_wanted(ring: FrameRing, clock: WallClock) -> None:

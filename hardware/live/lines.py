@@ -12,6 +12,7 @@ from hardware.clock import WallClock
 from hardware.live.bodies import move, move_virtually, record, show
 from hardware.live.crew import CONTEXT, Crew
 from hardware.live.frame_ring import FrameRing
+from hardware.live.injected import Begun
 from hardware.live.outbox import Outbox
 from hardware.live.place import Place
 from hardware.live.prepared import Prepared
@@ -30,7 +31,7 @@ READY = 60.0  # s in which a virtual arm's device must be there, on a busy machi
 @dataclass(slots=True)
 class Lines:
     """What joins the processes. url: of the arm's port. lifeline, arm_line: nothing is ever said on them; they end
-    with us. trouble: why the arm cannot be used at all."""
+    with us. trouble: why the arm cannot be used at all. begun: when printing began."""
 
     crew: Crew
     url: str
@@ -44,6 +45,7 @@ class Lines:
     outbox: Outbox
     link: OperatorLink
     trouble: Newest[str]
+    begun: Begun
 
     def end(self) -> None:
         """End the processes in the order in which nobody misses anybody: the arm's first, the recorder last."""
@@ -80,17 +82,17 @@ def _started(crew: Crew, prepared: Prepared, folder: File, tracker: Body) -> Lin
         _start_arm(crew, prepared, File(url), arm_line[0])
     place, ring = Place(), FrameRing([camera.size for camera in prepared.rig.cameras])
     poses, tracking, motion = Newest[Handed](), Newest[TrackingReport](), Newest[LiveMotionReport]()
-    recorder, link, trouble = Newest[RecorderReport](), OperatorLink(), Newest[str](TROUBLE)
+    recorder, link, trouble, begun = Newest[RecorderReport](), OperatorLink(), Newest[str](TROUBLE), Begun()
     senders = [CONTEXT.Pipe(duplex=False) for _ in range(3)]
     lifeline, words, orders = (CONTEXT.Pipe(duplex=False) for _ in range(3))
     crew.start("recorder", record, (prepared, [end for end, _ in senders], recorder))
     crew.start("motion", move, (prepared, url, place, poses, motion, orders[0], link, trouble, senders[0][1]))
     if not prepared.live:
-        crew.start("feed", show, (prepared, ring, words[1]))
+        crew.start("feed", show, (prepared, ring, words[1], begun))
     told = prepared, ring, words[0], poses, tracking, motion, link, senders[1][1], lifeline[0]
     crew.start("tracking", tracker, told)
     ends = orders[1], lifeline[1], arm_line[1], Outbox(senders[2][1])
-    return Lines(crew, url, place, tracking, motion, recorder, *ends, link, trouble)
+    return Lines(crew, url, place, tracking, motion, recorder, *ends, link, trouble, begun)
 
 
 def _start_arm(crew: Crew, prepared: Prepared, link: File, lifeline: Connection) -> None:

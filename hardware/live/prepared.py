@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
@@ -13,6 +14,7 @@ from estimation.rig import Rig
 from hardware.arm_file import read_arm
 from hardware.arm_profile import ArmProfile
 from hardware.bookmark_file import read_start
+from hardware.faults import Fault, Part, Runner, check_faults
 from hardware.live.beside import Beside, Found, read_found
 from hardware.live.conductor import Task
 from hardware.live.crew import CONTEXT
@@ -30,7 +32,7 @@ class Prepared:
     """settings: as used. session: whose pictures are shown (to and fro for ever where `again`), or live cameras.
 
     virtual: what a virtual arm is like, None for one that answers. found: where an earlier run's path lies, None of a
-    new run. notes: what one should know all the time.
+    new run. notes: what one should know all the time. faults: what is to go wrong, before a simulated world alone.
     """
 
     settings: LiveSettings
@@ -42,6 +44,7 @@ class Prepared:
     found: Found | None
     beside: Beside
     notes: tuple[str, ...]
+    faults: tuple[Fault, ...] = ()
 
     @property
     def live(self) -> bool:
@@ -92,7 +95,7 @@ def _prepared(settings: LiveSettings, beside: Beside, found: Found | None) -> Pr
     virtual: File | None = None
     if scenario is not None:
         rendered = _rendered(scenario)
-        session, virtual = rendered / "session.mcap", rendered / "virtual_arm.pickle"
+        session, virtual = rendered / "session.mcap", rendered / "virtual_arm.toml"
         profile, path = profile or rendered / "arm.toml", path or rendered / "path.csv"
         notes.append("simulated: pictures rendered before, shown in real time; the arm is not in them")
     assert session is not None and path is not None
@@ -148,3 +151,16 @@ def _render(scenario: File, answer: Connection) -> None:
         answer.send((str(prerender(scenario, cache_folder()).folder), ""))
     except StillbedError as error:
         answer.send(("", str(error)))
+
+
+def with_faults(prepared: Prepared, faults: tuple[Fault, ...]) -> Prepared:
+    """The run with what is to go wrong in it; InputError unless cameras and arm are simulated."""
+    check_faults(faults, Runner.LIVE, "command line", "--fault", len(prepared.rig))
+    if faults and (prepared.live or prepared.settings.arm != VIRTUAL):
+        raise InputError("command line", "--fault", str(faults[0]), "with --simulated and a virtual arm alone")
+    for fault in faults:
+        if fault.part is Part.ARM and math.isfinite(fault.duration):
+            raise InputError(
+                "command line", "--fault", str(fault), "no duration: a virtual arm is not plugged in again"
+            )
+    return replace(prepared, faults=faults, notes=(*prepared.notes, *(f"will happen: {fault}" for fault in faults)))

@@ -1,7 +1,7 @@
 """Pictures of a scenario, rendered before a live run shows them in real time: small machines cannot do both at once.
 
 A cache folder holds one session for each scenario: session.mcap with exact truth, path.csv as laid onto the true
-surface, arm.toml as the motion knows the arm, virtual_arm.pickle as it is, and
+surface, arm.toml as the motion knows the arm, virtual_arm.toml as it is, and
 scenario.toml. The nozzle and what it prints are not in the pictures,
 as nobody knows beforehand where they will be.
 """
@@ -10,19 +10,20 @@ from __future__ import annotations
 
 import hashlib
 import os
-import pickle
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from estimation.errors import InputError
 from estimation.observations import no_observations
 from estimation.pose import SurfacePose, identity_pose
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
 from hardware.arm_file import write_arm
 from hardware.clock import WallClock
+from hardware.faults import Part
 from hardware.path_file import read_path, write_path
 from hardware.progress import Progress
 from hardware.recording import Recorder
@@ -35,6 +36,7 @@ from hardware.simulator.scenario_file import read_scenario
 from hardware.simulator.scene_table import scene_from_table
 from hardware.simulator.simulate import regions
 from hardware.simulator.truth import Truth
+from hardware.simulator.virtual_arm_file import write_virtual_arm
 from hardware.simulator.world import World
 from hardware.tum import rows_from_trajectory
 from perception.frames import FrameSet, PrintHead
@@ -42,7 +44,7 @@ from perception.tracking import StepReport, trusting_report
 from planning.command import Command
 from planning.progress import Progress as Print
 
-VERSION = "3"  # of what the cache holds: another one is rendered anew
+VERSION = "4"  # of what the cache holds: another one is rendered anew
 DIGITS = 9  # of a truth's stamp: exposures of one instant are one
 
 
@@ -101,6 +103,8 @@ def prerender(file: Path, cache: Path, threads: int = 2) -> Rendered:
     InputError for a scenario that makes no sense.
     """
     scenario = read_scenario(file)
+    if others := [fault for fault in scenario.faults if fault.part is not Part.ARM]:
+        raise InputError(file, "faults", str(others[0]), "faults of the arm; a live run takes others as --fault")
     rendered = cached(file, cache)
     if (rendered.folder / "scenario").exists():
         return rendered
@@ -123,7 +127,7 @@ def _render(scenario: Scenario, out: Path, threads: int) -> None:
         path = laid(path, scene.shape, scenario.clearance, scenario.path)
     truth = Truth(scenario.rest, scenario.motion, scene.deformation, scenario.strain, scene.shape.surface_from_grid)
     write_path(out / "path.csv", path)
-    (out / "virtual_arm.pickle").write_bytes(pickle.dumps((scenario.arm, scenario.faults)))
+    write_virtual_arm(out / "virtual_arm.toml", scenario.arm, scenario.faults)
     write_arm(out / "arm.toml", scenario.profile, "what the motion knew of the arm")
     shutil.copyfile(scenario.file, out / "scenario.toml")
     with (

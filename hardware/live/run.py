@@ -7,6 +7,7 @@ orders. It does nothing that takes long, so that a stop waits for nothing here.
 from __future__ import annotations
 
 import importlib
+import math
 import signal
 import socket
 import tempfile
@@ -26,6 +27,7 @@ from hardware.live.checklist import table
 from hardware.live.conductor import Conductor, Orders, Seen
 from hardware.live.console import HELP, Console
 from hardware.live.halting import halt
+from hardware.live.injected import Injector
 from hardware.live.keeper import Keeper
 from hardware.live.kept import kept_begin
 from hardware.live.laid import Laid
@@ -87,6 +89,7 @@ class LiveRun:
             lines.outbox.put(UsedEntry("session.toml", settings_text(prepared.settings)))
             keeper = Keeper(prepared.beside.progress, prepared.task.fingerprint, lines.place)
             stack.callback(keeper.close)
+            self._injector = Injector(prepared.faults, lines.crew, prepared.beside.record, lines.begun)
             self._open_page(stack)
             importlib.import_module("scipy.interpolate")  # predicting takes it; now nobody waits for this process
             for note in prepared.notes:
@@ -115,6 +118,8 @@ class LiveRun:
         seen.tracking, seen.motion, seen.recorder = lines.tracking.get(), lines.motion.get(), lines.recorder.get()
         self._count_stops(now)
         conductor = self._conductor
+        for fault in self._injector.look(now):
+            self._say(f"on purpose: {fault}", WARNING)
         orders = self._ended(keeper, now) + conductor(now, seen, requests)
         self._give(orders)
         self._tally.look(now, conductor.stage, seen, None if conductor.laid is None else conductor.laid.profile.arm)
@@ -246,6 +251,8 @@ class LiveRun:
         conductor = self._conductor
         if conductor.turn != self._turn:
             self._turn = conductor.turn
+            if conductor.stage is Stage.PRINT and math.isnan(self._lines.begun.instant):
+                self._lines.begun.instant = now
             self._say(f"{conductor.stage.value}{': ' + conductor.reason if conductor.reason else ''}")
             if conductor.stage is Stage.FIND:
                 self._console.say(table(conductor.checks))

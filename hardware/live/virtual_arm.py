@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import threading
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -12,11 +11,12 @@ import numpy as np
 
 from hardware.arm_profile import ArmProfile
 from hardware.clock import RememberingClock, WallClock
+from hardware.faults import Fault
 from hardware.live.children import settle
 from hardware.priority import ask_for_real_time
-from hardware.simulator.arm_faults import ArmFault
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.port import run_virtual_arm
+from hardware.simulator.virtual_arm_file import read_virtual_arm
 
 AFTERWARDS = 2.0  # s that the arm goes on without whoever conducted the run: it has to come to rest by itself
 STEP = 0.002  # s between rows of what was executed
@@ -39,9 +39,9 @@ class VirtualArmPlan:
 def virtual_arm_process(plan: VirtualArmPlan, lifeline: Connection) -> None:
     """Serve until SIGTERM or the end of the lifeline, then write what was executed: stamps (N,) s and axes (N, 6)."""
     settle("arm")
-    settings, faults = ArmSettings(replies=Replies.STREAM), tuple[ArmFault, ...]()
+    settings, faults = ArmSettings(replies=Replies.STREAM), tuple[Fault, ...]()
     if plan.kept is not None:
-        settings, faults = pickle.loads(plan.kept.read_bytes())
+        settings, faults = read_virtual_arm(plan.kept)
     if plan.real_time:
         ask_for_real_time()  # a real controller shares no core with us
     clock, stop = RememberingClock(WallClock()), threading.Event()

@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from estimation.se3 import Array
+from hardware.faults import Fault
 from hardware.replies import Reply, ReplyKind, encode_reply
-from hardware.simulator.arm_faults import ArmFault, unplugged
+from hardware.simulator.arm_faults import unplugged
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.wire import Wire
 
@@ -22,7 +23,7 @@ class Answers:
     the arm's geometry.
     """
 
-    def __init__(self, settings: ArmSettings, baud: float, faults: Sequence[ArmFault]) -> None:
+    def __init__(self, settings: ArmSettings, baud: float, faults: Sequence[Fault]) -> None:
         self._mode, self._period = settings.replies, settings.reply_period
         self._faults, self._wire = faults, Wire(baud)
         self._rng = np.random.default_rng([settings.seed, 0])

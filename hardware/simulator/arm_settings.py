@@ -107,6 +107,20 @@ def arm_settings_from_table(where: object, table: checks.Table) -> ArmSettings:
         raise InputError(where, f"arm.{_key(str(error.what))}", error.got, error.allowed) from None
 
 
+def table_from_arm_settings(settings: ArmSettings) -> dict[str, Any]:
+    """The table [arm] that gives these settings; angles in degrees, as arrays where there are six numbers."""
+    table: dict[str, Any] = {}
+    for key in KEYS:
+        value = getattr(settings, _field(key))
+        if key.endswith("_mm_deg"):
+            value = value / _TO_RAD
+        elif key.endswith("_deg_s"):
+            value = float(np.rad2deg(value))
+        if value is not None:
+            table[key] = value.value if isinstance(value, Replies) else value
+    return table
+
+
 def _field(key: str) -> str:
     for unit in ("_mm_s2", "_mm_s", "_deg_s", "_mm_deg", "_s"):
         if key.endswith(unit):

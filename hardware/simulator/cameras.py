@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
+from hardware.faults import Fault, Kind, Part, struck
 from hardware.simulator.camera_settings import CameraSettings
 
 FATE_STREAM, GAIN_STREAM = 22, 23  # of the scenario's seed: no other draw of the simulator shares them
@@ -17,6 +18,7 @@ QUEUE = 1e-4  # s by which a frame that would overtake its camera's last one arr
 SCAN = b"\xff\xda"  # a JPEG's start of scan: all that follows its header is entropy-coded
 HEAD = 64  # bytes kept of what is no JPEG
 SHORTEST, LONGEST = 64, 0.25  # of a damaged stretch: bytes, and share of the picture
+FLASHED, BLACKENED = 20.0, 0.0  # gain: light that a sensor cannot hold, and none
 CUT_SHORT = 0.2  # share of damaged pictures that end early: OpenCV decodes none of them, and most of the others
 
 
@@ -35,7 +37,9 @@ class Shot:
 
     camera: its number in the rig. number: counts the camera's frames from 0. picture: number of the shot whose picture
     it carries, its own unless duplicated. exposed: s, true middle of that picture's exposure. stamp: s, what the
-    software says it is. arrival: s, when the computer has it. exposure: s. gain: of the picture, 1 is nominal.
+    software says it is. arrival: s, when the computer has it. exposure: s. gain: of the picture, 1 is nominal. lens:
+    the camera that truly took it, None for its own; bump: the fault by which that one stands aside. covered: the fault
+    that lies something over the wound.
     """
 
     camera: int
@@ -47,6 +51,9 @@ class Shot:
     exposure: float
     gain: float
     fate: Fate
+    lens: int | None = None
+    bump: Fault | None = None
+    covered: Fault | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +68,14 @@ class _Draw:
 class SimulatedCameras:
     """The cameras of a rig in time. A frame's draws depend on seed, camera and number alone."""
 
-    def __init__(self, settings: CameraSettings, seed: int) -> None:
-        """seed: >= 0."""
+    def __init__(self, settings: CameraSettings, seed: int, faults: Sequence[Fault] = ()) -> None:
+        """seed: >= 0. faults: those of cameras and their clock count, and what covers the surface."""
         self.settings, self._seed = settings, seed
+        self._faults = [struck(faults, Part.CAMERA) for _ in settings.phases]
+        for camera, mine in enumerate(self._faults):
+            self._faults[camera] = [fault for fault in mine if fault.number == camera]
+        self._swaps = struck(faults, Part.CAMERA, Kind.SWAP)
+        self._jumps, self._covers = struck(faults, Part.CLOCK), struck(faults, Part.SURFACE, Kind.COVER)
         rng = np.random.default_rng([seed, GAIN_STREAM])
         self._gain_phases = rng.uniform(0, 2 * math.pi, len(settings.phases)).tolist()
 
@@ -92,10 +104,36 @@ class SimulatedCameras:
         while picture and self._fate(camera, picture, self._draw(camera, picture).lot) is Fate.DUPLICATED:
             picture -= 1
         exposed = self.due(camera, picture)
+        lens = self._lens(camera, exposed)
         arrival = due + settings.exposure / 2 + settings.transport + draw.transport
-        stamp = due - settings.offsets[camera] + draw.stamp
-        gain = self._gain(camera, exposed)
-        return Shot(camera, number, picture, exposed, stamp, max(arrival, earliest), settings.exposure, gain, fate)
+        arrival += sum(fault.amount for fault in self._strike(camera, due, Kind.SLOW))
+        jump = sum(fault.amount for fault in self._jumps if fault.covers(due))
+        return Shot(
+            camera=camera,
+            number=number,
+            picture=picture,
+            exposed=exposed,
+            stamp=due - settings.offsets[camera] + draw.stamp + jump,
+            arrival=max(arrival, earliest),
+            exposure=settings.exposure,
+            gain=self._gain(lens, exposed),
+            fate=fate,
+            lens=lens,
+            bump=next(iter(self._strike(lens, exposed, Kind.BUMP)), None),
+            covered=next((fault for fault in self._covers if fault.covers(exposed)), None),
+        )
+
+    def _strike(self, camera: int, instant: float, *kinds: Kind) -> list[Fault]:
+        """The faults of some kinds that strike a camera at an instant, s."""
+        return [fault for fault in self._faults[camera] if fault.kind in kinds and fault.covers(instant)]
+
+    def _lens(self, camera: int, exposed: float) -> int:
+        """The camera whose cable is plugged in for this one."""
+        for fault in self._swaps:
+            pair = fault.number, (fault.number + 1) % len(self._faults)
+            if fault.covers(exposed) and camera in pair:
+                camera = pair[1 - pair.index(camera)]
+        return camera
 
     def _draw(self, camera: int, number: int) -> _Draw:
         rng = np.random.default_rng([self._seed, FATE_STREAM, camera, number])
@@ -106,11 +144,12 @@ class SimulatedCameras:
     def _fate(self, camera: int, number: int, lot: float) -> Fate:
         settings, due = self.settings, self.due(camera, number)
         off = any(which == camera and start <= due < end for which, start, end in settings.off)
-        if off or lot < settings.drop:
+        struck = [fault.kind for fault in self._strike(camera, due, Kind.OFF, Kind.STUCK, Kind.GARBLE)]
+        if off or Kind.OFF in struck or lot < settings.drop:
             return Fate.DROPPED
-        if lot < settings.drop + settings.duplicate and number:
+        if (Kind.STUCK in struck or lot < settings.drop + settings.duplicate) and number:
             return Fate.DUPLICATED
-        if settings.drop + settings.duplicate <= lot < settings.drop + settings.duplicate + settings.garble:
+        if Kind.GARBLE in struck or 0 <= lot - settings.drop - settings.duplicate < settings.garble:
             return Fate.GARBLED
         return Fate.DELIVERED
 
@@ -119,7 +158,9 @@ class SimulatedCameras:
         settings = self.settings
         drift = math.sin(2 * math.pi * exposed / settings.gain_period + self._gain_phases[camera])
         light = math.sin(2 * math.pi * settings.flicker_hz * exposed) * np.sinc(settings.flicker_hz * settings.exposure)
-        return float((1 + settings.gain_drift * drift) * (1 + settings.flicker * light))
+        struck = [fault.kind for fault in self._strike(camera, exposed, Kind.BLACK, Kind.FLASH)]
+        given = BLACKENED if Kind.BLACK in struck else FLASHED if Kind.FLASH in struck else 1.0
+        return float((1 + settings.gain_drift * drift) * (1 + settings.flicker * light)) * given
 
 
 def garble(data: bytes, rng: np.random.Generator) -> bytes:

@@ -20,6 +20,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from hardware.faults import Fault, Part, struck
 from hardware.protocol import (
     G1,
     G4,
@@ -33,8 +34,9 @@ from hardware.protocol import (
     Mode,
     decode,
 )
+from hardware.rates import Rates, Stretches
 from hardware.simulator.answers import Answers
-from hardware.simulator.arm_faults import ArmFault, FaultyLine, Rates, Stretches
+from hardware.simulator.arm_faults import FaultyLine
 from hardware.simulator.arm_settings import ArmSettings
 from hardware.simulator.polyline import AXES, Polyline
 from hardware.simulator.servo import Servo
@@ -57,10 +59,13 @@ class VirtualArm:
         settings: ArmSettings,
         dialect: Dialect,
         home_axes: Array,
-        faults: Sequence[ArmFault] = (),
+        faults: Sequence[Fault] = (),
         baud: float = 115_200,
     ) -> None:
-        """home_axes: (6,) mm and rad, where it stands at first. baud: bits/s of what it sends, inf for no delay."""
+        """home_axes: (6,) mm and rad, where it stands at first. baud: bits/s of what it sends, inf for no delay.
+
+        faults: those of the arm count.
+        """
         if home_axes.shape != (AXES,) or not np.isfinite(home_axes).all():
             raise InputError("arm", "home", home_axes.tolist(), "6 finite numbers X Y Z A B C, mm and rad")
         self.frames, self.mode, self.now = 0, 0, 0.0
@@ -72,7 +77,7 @@ class VirtualArm:
         self._settings = settings
         self._stream = FrameStream(LENGTH, TAILS, lambda frame: decode(frame, dialect))
         self._line_in = FaultyLine(faults, np.random.default_rng([settings.seed, 1]))
-        self._rates = Rates(faults)
+        self._rates = Rates(struck(faults, Part.ARM))
         self._answers = Answers(settings, baud, faults)
         self._setpoint = Polyline(0.0, home_axes)
         self._servo = Servo(self._setpoint, settings.dead_time, settings.servo_lag, _most(settings))

@@ -5,9 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from estimation import se3
+from estimation.rig import Camera, pixels_from_points
 from estimation.se3 import Array
+from hardware.faults import Fault, drawn
 from perception.frames import Image
 
+EXTENT = np.array([[x, y, 0.0] for x in (-26.0, 26.0) for y in (-19.0, 19.0)])  # mm, round a usual wound
 ROOM = 1.35  # a cover that lies over all of the wound is larger than it by this
 
 
@@ -32,6 +36,13 @@ def covered(image: Image, box: tuple[Array, Array], aside: float, rng: np.random
         part = cloth[y0 - corner[1] : y1 - corner[1], x0 - corner[0] : x1 - corner[0]]
         out[y0:y1, x0:x1] = np.clip(part, 0, 255).astype(np.uint8)
     return out
+
+
+def laid_over(image: Image, camera: Camera, base_from_surface: Array, fault: Fault) -> Image:
+    """An image (H, W, 3) of a camera with a cover over the wound; base_from_surface: (4, 4) mm then."""
+    pixels, _ = pixels_from_points(camera, se3.transform_points(base_from_surface, EXTENT))
+    box = pixels.min(0), pixels.max(0)
+    return np.stack([covered(image[..., k], box, 0.0, drawn(fault)) for k in range(image.shape[2])], -1)
 
 
 def glared(image: Image, box: tuple[Array, Array], share: float, rng: np.random.Generator) -> Image:

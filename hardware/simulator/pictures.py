@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.rig import Camera
 from hardware.images import encode
 from hardware.simulator.cameras import Fate, Shot, garble
+from hardware.simulator.cover import laid_over
 from hardware.simulator.instant import Instant
+from hardware.simulator.lenses import Lenses
 from hardware.simulator.render import render
 from hardware.simulator.scene import Scene
 from hardware.simulator.sensor import Sensor
@@ -37,15 +38,15 @@ class Pictures:
     def __init__(
         self,
         scene: Scene,
-        cameras: Sequence[Camera],
+        lenses: Lenses,
         sensor: Sensor,
         jpeg_quality: int | None,
         seed: int,
         threads: int = 2,
         lay: Callable[[float], None] = lambda until: None,
     ) -> None:
-        """cameras: the true ones. lay: brings the scene's printed material up to an instant, s."""
-        self._scene, self._cameras, self._sensor, self._quality = scene, cameras, sensor, jpeg_quality
+        """lenses: the true cameras. lay: brings the scene's printed material up to an instant, s."""
+        self._scene, self._lenses, self._sensor, self._quality = scene, lenses, sensor, jpeg_quality
         self._seed, self._threads, self._lay = seed, threads, lay
         self._waiting: list[Waiting] = []
         self._done: dict[tuple[int, int], tuple[str, bytes]] = {}
@@ -69,9 +70,12 @@ class Pictures:
             self._render(list(batch.values()))
 
     def _render(self, batch: Sequence[Waiting]) -> None:
-        cameras, instants = [self._cameras[w.shot.camera] for w in batch], [w.instant for w in batch]
+        cameras, instants = [self._lenses(w.shot) for w in batch], [w.instant for w in batch]
         rngs = [self._rng(NOISE, w.shot.camera, w.shot.picture) for w in batch]
         images = render(self._scene, cameras, instants, self._sensor, rngs, self._threads)
+        for i, (w, camera) in enumerate(zip(batch, cameras, strict=True)):
+            if w.shot.covered is not None:
+                images[i] = laid_over(images[i], camera, w.instant.base_from_surface, w.shot.covered)
         with ThreadPoolExecutor(self._threads) as pool:
             encoded = list(pool.map(lambda image: encode(image, self._quality), images))
         for w, (kind, data) in zip(batch, encoded, strict=True):

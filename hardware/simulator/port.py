@@ -14,7 +14,7 @@ import numpy as np
 from estimation.errors import InputError
 from hardware.arm_profile import BITS_PER_BYTE, ArmProfile
 from hardware.clock import Clock, WallClock
-from hardware.simulator.arm_faults import ArmFault
+from hardware.faults import Fault
 from hardware.simulator.arm_settings import ArmSettings
 from hardware.simulator.controller import VirtualArm
 from hardware.simulator.pty_link import open_pty
@@ -32,7 +32,7 @@ def _print(words: str) -> None:
 def run_virtual_arm(
     settings: ArmSettings,
     profile: ArmProfile | None = None,
-    faults: Sequence[ArmFault] = (),
+    faults: Sequence[Fault] = (),
     link: Path | None = None,
     log: Path | None = None,
     clock: Clock | None = None,

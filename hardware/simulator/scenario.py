@@ -11,8 +11,8 @@ from estimation.se3 import Array
 from estimation.synthetic.motions import Motion
 from hardware.arm_profile import ArmProfile
 from hardware.checks import Table
+from hardware.faults import Fault
 from hardware.methods import MAP
-from hardware.simulator.arm_faults import ArmFault
 from hardware.simulator.arm_settings import ArmSettings
 from hardware.simulator.camera_settings import CameraSettings
 from hardware.simulator.run_limits import RunLimits
@@ -24,12 +24,14 @@ from planning.kinematics import SimpleArm
 class Tracking:
     """How poses are made. pictures: by a tracking step from rendered pictures, else exact ones at their instants.
 
+    tracks: without pictures, by the estimator from tracks that nobody has rendered, instead of exact ones.
     processing: s that a frame set takes, None for the time that was measured (then no two runs are alike).
     scan: whether the tracker has the scan and registers to it; else the path is registered by the skin's texture.
     method: of the tracking step, a key of METHODS.
     """
 
     pictures: bool = True
+    tracks: bool = False
     processing: float | None = 0.02  # 15 ms of tracking and 5 ms of decoding, measured on two cores
     scan: bool = False
     method: str = MAP
@@ -65,7 +67,7 @@ class Scenario:
     jpeg_quality: int | None
     tracking: Tracking
     arm: ArmSettings
-    faults: tuple[ArmFault, ...]
+    faults: tuple[Fault, ...]
     true_arm: SimpleArm
     baud: float
     profile: ArmProfile

@@ -6,15 +6,16 @@ seed = 1
 path = "../paths/x.csv"          # checkpoints in the surface frame; files are relative to this one
 clearance_mm = 0.4               # lays the path onto the true surface at this height; left out: the path as it is
 bead_mm = 1.0
-faults = ["stall 600ms at 5s"]   # of the arm
+faults = ["arm stall 600ms at 5s"]   # what goes wrong, as hardware/faults.py names it
 [scene]                          # the body or a scan, the wound, its wetness
 [[motion]]                       # composed in order; without any the surface is still
 [strain]                         # a waveform: the amount of [scene.deformation] over time
 [rig]                            # file, or angles_deg, distance_mm, focal_px, size, distortion
 [cameras]                        # rate, exposure, way to the computer, clock offsets, lost and damaged frames
 [sensor]                         # noise, vignetting, jpeg_quality (0 for lossless pictures)
-[tracking]                       # by = "pictures", "thesis", "thesis-flow" or "truth"; processing_s = 0.02 or
-                                 # "measured"; register = "texture" or "scan"
+[tracking]                       # by = "pictures", "thesis", "thesis-flow", "tracks" (the estimator, from tracks that
+                                 # nobody has rendered) or "truth"; processing_s = 0.02 or "measured";
+                                 # register = "texture" or "scan"
 [arm]                            # file, assumed_lag_s, wire_baud, tool_mm (as in an arm file), and the virtual
                                  # controller: servo, dead time, replies
 [planted]                        # rig_offset_mm, arm_offset_mm: errors of calibration that nothing in the loop knows of
@@ -37,10 +38,10 @@ from hardware import checks
 from hardware.arm_file import read_arm, tool_from_value
 from hardware.arm_profile import BITS_PER_BYTE, LONGEST_LAG, ArmProfile, placed
 from hardware.checks import Table
+from hardware.faults import Fault, Runner, check_faults, faults_from_texts
 from hardware.methods import MAP, THESIS, THESIS_FLOW
 from hardware.protocol import LENGTH
 from hardware.rig_file import read_rig
-from hardware.simulator.arm_faults import ArmFault, fault_from_text
 from hardware.simulator.arm_settings import ArmSettings, arm_settings_from_table
 from hardware.simulator.camera_settings import camera_settings_from_table
 from hardware.simulator.motion_table import motion_from_tables, waveform_from_table
@@ -52,6 +53,7 @@ KEYS = ("title", "seconds", "path")
 TABLES = ("scene", "strain", "rig", "cameras", "sensor", "tracking", "arm", "planted", "limits")
 OPTIONAL = ("seed", "clearance_mm", "bead_mm", "faults", "motion", *TABLES)
 MOST_CAMERAS = 8
+WITHOUT = ("truth", "tracks")  # ways of tracking that need no pictures
 SIDES = 64, 4096  # px of a picture
 LONGEST = 3600.0  # s: an hour of pictures is 300,000 of them
 STRAIN_STREAM = 11  # of random numbers, so that motions and strain do not share theirs
@@ -101,7 +103,7 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
         jpeg_quality=quality or None,
         tracking=_tracking(path, parts["tracking"]),
         arm=arm,
-        faults=_faults(path, table.get("faults", [])),
+        faults=_faults(path, table.get("faults", []), len(rig)),
         true_arm=profile.arm,
         baud=baud,
         profile=replace(profile, arm=known),
@@ -186,12 +188,13 @@ def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:
 
 def _tracking(path: Path, table: Table) -> Tracking:
     checks.check_keys(path, "tracking.", table, (), ("by", "processing_s", "register"))
-    by = _one_of(path, "tracking.by", table.get("by", "pictures"), ("pictures", THESIS, THESIS_FLOW, "truth"))
+    by = _one_of(path, "tracking.by", table.get("by", "pictures"), ("pictures", THESIS, THESIS_FLOW, *WITHOUT))
     register = _one_of(path, "tracking.register", table.get("register", "texture"), ("texture", "scan"))
     spent = table.get("processing_s", Tracking().processing)
     measured = spent == "measured"
     processing = None if measured else _within(path, "tracking.processing_s", spent, 0, 10, 's, or "measured"')
-    return Tracking(by != "truth", processing, register == "scan", MAP if by in ("pictures", "truth") else by)
+    method = MAP if by in ("pictures", *WITHOUT) else by
+    return Tracking(by not in WITHOUT, by == "tracks", processing, register == "scan", method)
 
 
 def _switch(path: Path, key: str, value: object) -> bool:
@@ -207,9 +210,7 @@ def _one_of(path: Path, key: str, value: object, allowed: tuple[str, ...]) -> st
     return word
 
 
-def _faults(path: Path, value: object) -> tuple[ArmFault, ...]:
-    if not isinstance(value, list):
-        raise InputError(path, "faults", value, 'a list of texts such as "stall 600ms at 5s"')
-    return tuple(
-        fault_from_text(path, f"faults[{i}]", checks.text(path, f"faults[{i}]", text)) for i, text in enumerate(value)
-    )
+def _faults(path: Path, value: object, cameras: int) -> tuple[Fault, ...]:
+    faults = faults_from_texts(path, "faults", value)
+    check_faults(faults, Runner.SIMULATE, path, "faults", cameras)
+    return faults

@@ -51,6 +51,11 @@ SCENARIO_KEYS = {"scene": ("nozzle", "beads"), "sensor": ("jpeg_quality",)}  # t
 
 def scene_from_table(where: object, table: Table, folder: Path, seed: int, base_from_rest: Array = REST) -> Scene:
     """The scene that a [scene] table describes; files are relative to `folder`. InputError names the key."""
+    return Scene(*bare_scene(where, table, folder, seed), seed, base_from_rest)
+
+
+def bare_scene(where: object, table: Table, folder: Path, seed: int) -> tuple[Shape, Look, Deformation]:
+    """Shape, look and deformation of the scene, for those who need no pictures: painting it takes seconds."""
     keys = _keys(where, "scene", table)
     look, wound, deformation = _look(keys), _wound(keys), _deformation(keys)
     kind = keys.word("body", tuple(BODIES), "forearm")
@@ -67,7 +72,7 @@ def scene_from_table(where: object, table: Table, folder: Path, seed: int, base_
                 f"false for a scan of {shape.size[0]:.1f} x {shape.size[1]:.1f} mm: a drape needs {MARGIN:g} a side"
             )
             raise InputError(where, "scene.drape", True, allowed)
-    return Scene(shape, look, deformation, seed, base_from_rest)
+    return shape, look, deformation
 
 
 def sensor_from_table(where: object, table: Table) -> Sensor:

@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from estimation.errors import InputError
 from estimation.trajectory import Trajectory
 from hardware.clock import WallClock
 from hardware.evaluation import Evaluation, evaluate
+from hardware.faults import Fault, Kind, Part, Runner, check_faults
 from hardware.methods import MAP, step_by
 from hardware.out_folder import prepare_out
 from hardware.path_file import read_path
@@ -37,13 +38,18 @@ from hardware.simulator.scenario import Scenario
 from hardware.simulator.scenario_file import read_scenario
 from hardware.simulator.scene import STILL, Scene, rois
 from hardware.simulator.scene_table import scene_from_table
+from hardware.simulator.shape import Shape
+from hardware.simulator.sight import Exposures
+from hardware.simulator.struck_surface import folded, struck_motion
+from hardware.simulator.track_tracker import TrackTracker
 from hardware.simulator.truth import Truth
-from hardware.simulator.world import Exposures, World
+from hardware.simulator.world import World
 from hardware.summary import write_summary
 from hardware.track import Step
 from perception.frames import Roi
 from planning.path import Path as Checkpoints
 
+SEEN = (Kind.GARBLE, Kind.SWAP, Kind.BUMP, Kind.BLACK, Kind.FLASH, Kind.COVER)  # faults that pictures show
 SCAN_STEP = 1.0  # mm between the vertices of a scan, as handheld scanners give them
 FILES = (
     ("nozzle.csv", "where the nozzle was and should have been, every millisecond"),
@@ -59,11 +65,12 @@ FILES = (
 class Options:
     """How to run a scenario.
 
-    trace: a recorded motion instead of the scenario's own. threads: that render. pty: whether the arm's bytes pass a
-    pseudo-terminal. force: whether to write into a folder that is not empty.
+    trace: a recorded motion instead of the scenario's own. faults: besides the scenario's own. threads: that render.
+    pty: whether the arm's bytes pass a pseudo-terminal. force: whether to write into a folder that is not empty.
     """
 
     trace: Path | None = None
+    faults: tuple[Fault, ...] = ()
     threads: int = 2
     pty: bool = False
     force: bool = False
@@ -87,6 +94,8 @@ def run_simulation(file: Path, out: Path, options: Options | None = None) -> Out
     if options.threads < 1:
         raise InputError("command line", "--threads", options.threads, ">= 1")
     scenario = read_scenario(file, options.trace)
+    check_faults(options.faults, Runner.SIMULATE, "command line", "--fault", len(scenario.rig))
+    scenario = replace(scenario, faults=(*scenario.faults, *options.faults))
     path = read_path(scenario.path)
     scene = scene_from_table(scenario.file, scenario.scene, scenario.file.parent, scenario.seed)
     _check_pairs(scenario, scene)
@@ -96,14 +105,14 @@ def run_simulation(file: Path, out: Path, options: Options | None = None) -> Out
         raise InputError(out, "--out", "the folder that holds the scenario", "another one: files there are replaced")
     prepare_out(out, options.force)
     clear(out)
-    truth = Truth(scenario.rest, scenario.motion, scene.deformation, scenario.strain, scene.shape.surface_from_grid)
+    truth = true_surface(scenario, scene)
     around, scan = regions(scenario, scene, truth), _scan(scenario, scene, out)
     folder = RunFolder(out, scenario, planned_line(path), around, truth.base_from_surface, scan)
     complete, skipped = False, 0
     try:
         with folder, ExitStack() as stack:
             exposures: Exposures = {}
-            step = stack.enter_context(_tracking(scenario, truth, around, scan, exposures))
+            step = stack.enter_context(_tracking(scenario, truth, scene.shape, around, scan, exposures))
             line = stack.enter_context(PtyLink()).transfer if options.pty else bytes
             progress = stack.enter_context(Progress("simulate", "frame sets", WallClock().now))
             print(f"watch: {folder.watch.page.resolve().as_uri()}", file=sys.stderr)
@@ -118,6 +127,15 @@ def run_simulation(file: Path, out: Path, options: Options | None = None) -> Out
     return outcome
 
 
+def true_surface(scenario: Scenario, scene: Scene) -> Truth:
+    """The truth of a scenario's surface, its faults included; the scene is told how it folds."""
+    strain = scenario.strain
+    if (fold := folded(scenario.file, scene.deformation, scenario.faults)) is not None:
+        scene.deformation, strain = fold
+    motion = struck_motion(scenario.motion, scenario.faults)
+    return Truth(scenario.rest, motion, scene.deformation, strain, scene.shape.surface_from_grid)
+
+
 def _check_pairs(scenario: Scenario, scene: Scene) -> None:
     """InputError for what was read and would have no effect."""
     if (scenario.strain is None) != (scene.deformation == STILL):
@@ -126,6 +144,11 @@ def _check_pairs(scenario: Scenario, scene: Scene) -> None:
     if scenario.tracking.scan and not (scenario.tracking.pictures and scenario.tracking.method == MAP):
         allowed = 'with by = "pictures": nothing else registers to a scan'
         raise InputError(scenario.file, "tracking.register", "scan", allowed)
+    if not (scenario.tracking.pictures or scenario.tracking.tracks):
+        for fault in scenario.faults:
+            if fault.kind in SEEN and fault.part in (Part.CAMERA, Part.SURFACE):
+                allowed = 'with tracking.by = "pictures" or "tracks": who knows the truth does not look'
+                raise InputError(scenario.file, "faults", str(fault), allowed)
 
 
 def _finish(
@@ -154,7 +177,7 @@ def _finish(
         files=FILES if scenario.tracking.pictures else tuple(f for f in FILES if f[0] != "session"),
     )
     result = judge(run)
-    summary = nozzle_dict(result) | {"frame_sets_skipped": skipped}
+    summary = nozzle_dict(result) | {"frame_sets_skipped": skipped, "faults": [str(f) for f in scenario.faults]}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     write_nozzle_report(out / "report.html", result)
     folder.watch.finish(summary["verdict"][0])
@@ -169,7 +192,8 @@ def _tracking_report(
     table = read_poses(folder / "poses.csv")
     exact = Trajectory(table.stamps, truth.base_from_surface(table.stamps), exact=True) if len(table) else None
     since = min((roi.stamp for roi in regions), default=-np.inf)
-    method = scenario.tracking.method if scenario.tracking.pictures else "truth"
+    tracking = scenario.tracking
+    method = tracking.method if tracking.pictures else "tracks" if tracking.tracks else "truth"
     result = evaluate(table, exact, scenario.title, since, complete, method=method)
     write_summary(folder / "summary.json", result)
     write_report(folder / "report.html", result)
@@ -178,7 +202,7 @@ def _tracking_report(
 
 def regions(scenario: Scenario, scene: Scene, truth: Truth) -> tuple[Roi, ...]:
     """What an operator would draw around the wound in each camera's first picture."""
-    start = SimulatedCameras(scenario.cameras, scenario.seed)
+    start = SimulatedCameras(scenario.cameras, scenario.seed, scenario.faults)
     found: list[Roi] = []
     for camera in range(len(scenario.rig)):
         shot = next((s for s in start.shots(camera, scenario.seconds) if s.fate is not Fate.DROPPED), None)
@@ -199,14 +223,18 @@ def _scan(scenario: Scenario, scene: Scene, out: Path) -> Path | None:
 
 @contextmanager
 def _tracking(
-    scenario: Scenario, truth: Truth, regions: Sequence[Roi], scan: Path | None, exposures: Exposures
+    scenario: Scenario, truth: Truth, shape: Shape, regions: Sequence[Roi], scan: Path | None, exposures: Exposures
 ) -> Iterator[Step]:
-    """The tracking step of the scenario: that of a live run, or one that knows the truth."""
+    """The tracking step of the scenario: that of a live run, its estimator alone, or one that knows the truth."""
     if scenario.tracking.pictures:
         method, rig, tool = scenario.tracking.method, scenario.told_rig, scenario.profile.tool
         with step_by(method, rig, regions, scan, WallClock().now, tool) as step:
             yield step
         return
+    if scenario.tracking.tracks:
+        rigs = scenario.rig, scenario.told_rig
+        yield TrackTracker(*rigs, truth, shape, lambda camera, stamp: exposures[camera, stamp], scenario.seed)
+        return
     told, true = scenario.told_rig.cameras[0], scenario.rig.cameras[0]
     offset = told.base_from_camera @ se3.inverse(true.base_from_camera)
-    yield PerfectTracker(truth, offset, lambda camera, stamp: exposures[camera, stamp], len(scenario.rig))
+    yield PerfectTracker(truth, offset, lambda camera, stamp: exposures[camera, stamp].exposed, len(scenario.rig))

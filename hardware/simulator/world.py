@@ -8,7 +8,7 @@ the scenario asks for measured tracking times.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Protocol
@@ -16,32 +16,30 @@ from typing import Protocol
 import numpy as np
 
 from estimation import se3
-from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.clock import Clock
 from hardware.commanded import Commanded
-from hardware.images import decode
+from hardware.faults import Part, struck
 from hardware.motion import MotionStep
 from hardware.progress import Report, silent
-from hardware.schemas import WARNING
-from hardware.simulator.agenda import ARRIVAL, EXPOSURE, KNOWN, TICK, Agenda
-from hardware.simulator.cameras import Fate, Shot, SimulatedCameras
+from hardware.simulator.agenda import ARRIVAL, TICK, Agenda
+from hardware.simulator.cameras import Shot
 from hardware.simulator.controller import VirtualArm
 from hardware.simulator.instant import Instant
 from hardware.simulator.ledger import Ledger, executed_rows
+from hardware.simulator.lenses import Lenses
 from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.pictures import Pictures
 from hardware.simulator.registering import truth_from_estimate
 from hardware.simulator.scenario import Scenario
 from hardware.simulator.scene import Scene
+from hardware.simulator.sight import Exposures, Sight, Watcher
 from hardware.simulator.truth import Truth
 from hardware.simulator.wire import Wire
 from hardware.track import Step
-from perception.frames import Frame, FrameSet, PrintHead
-from perception.pairing import Pairing
-from perception.tracking import StepReport
+from perception.frames import FrameSet, PrintHead
 from planning.command import Command
 from planning.kinematics import nozzle_from_axes
 from planning.path import Path
@@ -50,27 +48,11 @@ from planning.progress import Progress as Print
 
 BLOCK = 0.2  # s of rows given out at once
 REST = 0.3  # s that the run goes on after the path is finished
-NO_IMAGE = np.zeros((0, 0), np.uint8)  # of a frame that nobody looks at
 BEAD_STEP = 0.01  # s between the ends of the pieces in which a bead is drawn
 
 
-Exposures = dict[tuple[int, float], float]  # (camera, stamp): true middle of the exposure, s
-
-
-class Sink(Protocol):
+class Sink(Watcher, Protocol):
     """What is told of everything that passes."""
-
-    def picture(self, shot: Shot, kind: str, data: bytes) -> None:
-        """A picture that can be decoded has arrived, as encoded by its camera."""
-        ...
-
-    def head(self, stamp: float, head: PrintHead) -> None:
-        """Where the print head was at the stamp of a frame set, s, which may yet find the tracker busy."""
-        ...
-
-    def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
-        """A pose was made of a frame set in `spent` s of real time."""
-        ...
 
     def command(self, command: Command, progress: Print, frame: bytes, received: bytes) -> None:
         """A command was sent, how far the print is by it, and what came from the arm since the last."""
@@ -82,10 +64,6 @@ class Sink(Protocol):
 
     def registered(self, truth_from_estimate: Array) -> None:
         """The path was registered: truth_surface_from_estimated_surface (4, 4)."""
-        ...
-
-    def event(self, stamp: float, text: str, level: int = WARNING) -> None:
-        """Something that a person should know."""
         ...
 
 
@@ -107,11 +85,11 @@ class World:
     ) -> None:
         """scene: the scenario's, rendered into. path: in the true surface frame. clock: measures tracking times.
 
-        exposures: filled with the true instant of each picture, for a step that may know. line: carries bytes from the
+        exposures: filled with the shot of each picture, for a step that may know. line: carries bytes from the
         motion to the arm, e.g. over a pty.
         """
-        self.scenario, self._scene, self._path, self._sink, self._clock = scenario, scene, path, sink, clock
-        self._truth, self._step, self._exposed = truth, step, exposures
+        self.scenario, self._scene, self._path, self._sink = scenario, scene, path, sink
+        self._truth, self._exposed = truth, exposures
         profile = scenario.profile
         self.arm = VirtualArm(scenario.arm, profile.dialect, profile.arm.home, scenario.faults, scenario.baud)
         self._wire, self._line = Wire(scenario.baud), line
@@ -120,15 +98,13 @@ class World:
         if scenario.tracking.pictures:
             quality = scenario.jpeg_quality
             self._pictures = Pictures(
-                scene, scenario.rig.cameras, scenario.sensor, quality, scenario.seed, threads, self._lay
+                scene, Lenses(scenario.rig.cameras), scenario.sensor, quality, scenario.seed, threads, self._lay
             )
-        self._cameras = SimulatedCameras(scenario.cameras, scenario.seed)
         self._instant_before: Instant | None = None
-        self._pairer = Pairing(len(scenario.rig), scenario.cameras.period)
         self._agenda = Agenda()
-        self._busy = False  # the tracker
-        self._waiting: FrameSet | None = None  # the newest that came meanwhile
-        self.tracked, self.skipped = 0, 0  # frame sets, and those that the tracker had no time for
+        watched = self._pictures, self._instant, self._head
+        self._sight = Sight(scenario, self._agenda, step, exposures, sink, clock, self._know, *watched)
+        self._hangs = struck(scenario.faults, Part.MOTION)
         self._pose: SurfacePose | None = None
         self._motion: MotionStep | None = None
         self._commanded = Commanded(profile)
@@ -136,11 +112,20 @@ class World:
         self._bead: Array | None = None  # (2,) where the last piece of bead ended
         self._end = scenario.seconds
 
+    @property
+    def tracked(self) -> int:
+        """Frame sets that the tracker took."""
+        return self._sight.tracked
+
+    @property
+    def skipped(self) -> int:
+        """Frame sets that the tracker had no time for."""
+        return self._sight.skipped
+
     def run(self, progress: Report = silent) -> None:
         """Let the scenario's time pass; progress is told of each frame set tracked. What was given out stays given."""
         total = int(self.scenario.seconds / self.scenario.cameras.period)
-        for camera in range(len(self.scenario.rig)):
-            self._next_shot(self._cameras.shots(camera, self.scenario.seconds))
+        self._sight.begin()
         self._agenda.at(0.0, TICK, self._tick)
         told, complete = 0, False
         try:
@@ -151,24 +136,6 @@ class World:
             complete = True
         finally:
             self._give_rows(self._end if complete else self.arm.now)
-
-    # -- cameras
-
-    def _next_shot(self, shots: Iterator[Shot]) -> None:
-        shot = next(shots, None)
-        if shot is not None:
-            due = self._cameras.due(shot.camera, shot.number)
-            self._agenda.at(due, EXPOSURE, partial(self._expose, shot, shots))
-
-    def _expose(self, shot: Shot, shots: Iterator[Shot], now: float) -> None:
-        """Half of a camera's exposure is over: from here on the world may change, the picture may not."""
-        self._next_shot(shots)
-        if shot.fate is Fate.DROPPED:
-            return
-        self._exposed[shot.camera, shot.stamp] = shot.exposed
-        if self._pictures is not None:
-            self._pictures.expose(shot, self._instant(shot, now))
-        self._agenda.at(shot.arrival, ARRIVAL, partial(self._arrive, shot))
 
     def _instant(self, shot: Shot, now: float) -> Instant:
         """The world as a shot meets it; the very same object for cameras that expose together."""
@@ -190,61 +157,14 @@ class World:
         )
         return self._instant_before
 
-    def _arrive(self, shot: Shot, now: float) -> None:
-        frame = Frame(shot.camera, shot.stamp, NO_IMAGE)
-        if self._pictures is not None:
-            kind, data = self._pictures.take(shot)
-            try:
-                image = decode(data, f"camera {self.scenario.rig.cameras[shot.camera].name}", f"picture {shot.number}")
-            except InputError as error:  # as a driver drops what it cannot decode
-                self._sink.event(now, str(error))
-                return
-            self._sink.picture(shot, kind, data)
-            frame = replace(frame, image=image)
-        self._formed(self._pairer.add(frame, now), now)
-        self._agenda.at(now + self._pairer.patience, ARRIVAL, self._overdue)
+    def _head(self, stamp: float) -> PrintHead | None:
+        return self._commanded.at(stamp) if self.scenario.nozzle else None
 
-    def _overdue(self, now: float) -> None:
-        self._formed(self._pairer.due(now), now)
-
-    # -- tracking
-
-    def _formed(self, sets: Sequence[FrameSet], now: float) -> None:
-        """New frame sets: the tracker takes the newest when it is free."""
-        for frames in sets:
-            if self._waiting is not None:
-                self.skipped += 1
-            self._waiting = self._with_head(frames)
-        if not self._busy and self._waiting is not None:
-            self._track(now)
-
-    def _with_head(self, frames: FrameSet) -> FrameSet:
-        """The frame set with its print head, which the sink is told of even if the set is left out."""
-        head = self._commanded.at(frames.stamp) if self.scenario.nozzle else None
-        if head is None:
-            return frames
-        self._sink.head(frames.stamp, head)
-        return replace(frames, head=head)
-
-    def _track(self, now: float) -> None:
-        assert self._waiting is not None
-        frames, self._waiting, self._busy = self._waiting, None, True
-        start = self._clock.now()
-        pose = self._step(frames)
-        spent = self._clock.now() - start
-        self.tracked += 1
-        self._sink.pose(frames, pose, self._step.last, spent)
-        took = spent if self.scenario.tracking.processing is None else self.scenario.tracking.processing
-        self._agenda.at(now + took, KNOWN, partial(self._know, pose, frames, self._step.last.observations))
-        self._step.idle()
-
-    def _know(self, pose: SurfacePose, frames: FrameSet, seen: Observations, now: float) -> None:
+    def _know(self, pose: SurfacePose, frames: FrameSet, seen: Observations) -> None:
         """A pose has reached the motion."""
-        self._pose, self._busy = pose, False
+        self._pose = pose
         if self._motion is None and pose.state is TrackState.TRACKING:
             self._register(pose, frames, seen)
-        if self._waiting is not None:
-            self._track(now)
 
     def _register(self, pose: SurfacePose, frames: FrameSet, seen: Observations) -> None:
         """Tell the motion where its path lies on the surface that the tracker follows, if that can be told yet."""
@@ -253,7 +173,7 @@ class World:
         if scenario.tracking.pictures and not scenario.tracking.scan:
             exposed = np.full(len(scenario.rig), pose.stamp)
             for frame in frames.frames:
-                exposed[frame.camera] = self._exposed[frame.camera, frame.stamp]
+                exposed[frame.camera] = self._exposed[frame.camera, frame.stamp].exposed
             rigs = scenario.rig, scenario.told_rig
             change = truth_from_estimate(pose, seen, rigs, self._truth, self._scene.shape, exposed)
         if change is None:
@@ -267,7 +187,7 @@ class World:
     def _tick(self, now: float) -> None:
         self._ticks += 1
         self._agenda.at(self._ticks * self.scenario.profile.tick, TICK, self._tick)
-        if self._motion is not None:
+        if self._motion is not None and not any(fault.covers(now) for fault in self._hangs):
             frame = self._motion(self._pose, now)
             arrival = float(self._wire.send(frame, now)[-1])
             self._agenda.at(arrival, ARRIVAL, partial(self._receive, self._line(frame)))
