@@ -44,6 +44,8 @@ PARTS = (
     Part("planner", ("--updates", "20000"), ("--updates", "2000")),
     Part("link", ("--hours", "0.5", "--commands", "20000"), ("--hours", "0.02", "--commands", "1000")),
     Part("outages", ("--count", "22")),
+    Part("faults", ("--count", "42"), ("--count", "7")),
+    Part("fuzz", ("--count", "20000"), ("--count", "2000")),
     Part("registration", ("--seeds", "1")),
 )  # fmt: skip
 

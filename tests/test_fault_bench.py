@@ -1,0 +1,110 @@
+"""The campaign of faults: what is drawn, what is judged as harm, and a run whose faults are said and gone again."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.bench.fault_draw import KINDS, PLACES, SLOT, drawn_faults
+from hardware.bench.fault_judge import WRONG, judged
+from hardware.bench.fault_page import fault_page
+from hardware.bench.fault_run import Ran, Word
+from hardware.bench.faults import append_log, figures, one_run, read_log, run
+from hardware.faults import Fault, Kind, Part, Runner, check_faults, fault_from_text
+from hardware.simulator.nozzle_log import NozzleLog
+
+SCENARIOS = Path(__file__).parents[1] / "data" / "scenarios"
+STAMPS, ROWS = np.arange(0.0, 8.0, 0.02), np.arange(0.001, 8.0, 0.001)
+FAULT = Fault(Part.CAMERA, Kind.OFF, 4.0, 0.5)
+
+
+def test_the_faults_of_a_run_are_its_own_in_order_and_all_kinds_come_in_turn() -> None:
+    assert drawn_faults(1, 5) == drawn_faults(1, 5) != drawn_faults(2, 5)
+    seen = set()
+    for number in range(12):
+        faults = drawn_faults(3, number)
+        starts = [fault.start for fault in faults]
+        assert len(faults) == PLACES and (np.diff(starts) > SLOT - 0.5).all()
+        assert all(fault.kind is not Kind.KILL and fault.end < after.start for fault, after in pairwise(faults))
+        check_faults(faults, Runner.SIMULATE, "x", "y", 3)
+        assert [fault_from_text("x", "y", str(fault)) for fault in faults] == faults
+        seen |= {(fault.part, fault.kind) for fault in faults}
+    assert seen == set(KINDS)
+
+
+def ran(
+    error: Array | None = None, said: tuple[float, float] | None = None, held: tuple[float, float] | None = None
+) -> Ran:
+    """A run whose nozzle goes along x at 5 mm/s, off by `error` (N,) mm; said, held: from, to, s."""
+    error = np.zeros(len(ROWS)) if error is None else error
+    target = np.tile(np.eye(4), (len(ROWS), 1, 1))
+    target[:, 0, 3] = 5 * ROWS
+    nozzle = target.copy()
+    nozzle[:, 1, 3] += error
+    extrude = np.ones(len(ROWS), bool)
+    still = np.array([held is not None and held[0] <= t < held[1] for t in ROWS])
+    extrude[still] = False
+    none = np.zeros(len(ROWS))
+    log = NozzleLog(ROWS, target, nozzle, target, none, none.astype(np.int64), extrude, none.astype(str), none[:, None])
+    words = []
+    for stamp in STAMPS.tolist():
+        holds = held is not None and held[0] <= stamp < held[1]
+        talks = said is not None and said[0] <= stamp < said[1]
+        words.append(Word(stamp, "x" if holds or talks else "", not holds, False, stamp - 0.05))
+    return Ran(words=words, log=log, ended=8.0)
+
+
+def test_what_is_said_in_time_and_over_with_its_cause_is_well() -> None:
+    verdict = judged(ran(said=(4.06, 4.6)), FAULT, 7.0)
+    assert verdict is not None and not (verdict.silent or verdict.restless or verdict.operator)
+    assert verdict.detected == pytest.approx(0.06) and verdict.seen == pytest.approx(0.01)
+    assert verdict.recovered == pytest.approx(0.1) and verdict.worst == 0.0
+
+
+def test_an_error_of_which_nobody_says_a_word_is_silent_and_one_that_is_told_is_not() -> None:
+    error = np.where((ROWS > 4.2) & (ROWS < 4.5), WRONG + 0.1, 0.0)
+    silent, told = judged(ran(error), FAULT, 7.0), judged(ran(error, said=(4.1, 4.6)), FAULT, 7.0)
+    assert silent is not None and silent.silent and np.isnan(silent.detected) and silent.worst == pytest.approx(1.1)
+    assert told is not None and not told.silent
+    usual = np.where((ROWS > 1.0) & (ROWS < 1.5), WRONG, 0.0) + error
+    assert not judged(ran(usual), FAULT, 7.0).silent
+
+
+def test_an_arm_that_moves_on_while_it_is_held_is_restless() -> None:
+    held = ran(held=(4.1, 5.0))
+    moves_on = judged(held, FAULT, 7.0)
+    assert moves_on is not None and moves_on.restless
+    assert held.log is not None
+    nozzle = held.log.base_from_nozzle.copy()
+    nozzle[(ROWS > 4.2) & (ROWS < 5.0), 0, 3] = 5 * 4.2
+    rests = judged(replace(held, log=replace(held.log, base_from_nozzle=nozzle)), FAULT, 7.0)
+    assert rests is not None and not rests.restless
+
+
+def test_what_never_comes_back_is_told_and_what_struck_no_print_is_left_out() -> None:
+    never = judged(ran(said=(4.1, 8.0)), FAULT, 7.0)
+    assert never is not None and never.recovered == np.inf
+    assert judged(ran(held=(3.8, 4.2)), FAULT, 7.0) is None
+
+
+def test_a_run_of_a_scenario_is_judged_kept_and_not_done_again(tmp_path: Path) -> None:
+    rows = one_run(SCENARIOS, 1, 1)
+    assert len(rows) >= 4 and all(row.over == 0 and not row.verdict.silent for row in rows)
+    append_log(log := tmp_path / "faults.csv", rows)
+    again = read_log(log, 1)
+    assert [str(row.verdict.fault) for row in again] == [str(row.verdict.fault) for row in rows]
+    assert not read_log(log, 2)
+    assert "camera" in fault_page([row.verdict for row in again])
+    assert {figure.what: figure.value for figure in figures(again)}["silent failures"] == 0
+    log.write_text("a,b\n")
+    with pytest.raises(InputError, match="header"):
+        read_log(log, 1)
+    with pytest.raises(InputError, match="--count"):
+        run(Namespace(count=0, jobs=1, log=None, out=None, seed=1, scenarios=None))
