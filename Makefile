@@ -1,4 +1,4 @@
-# make demo | test | slow | bench | check | format | outages | browser: each makes .venv and installs what it needs; a second time costs nothing.
+# make demo | test | slow | bench | check | format | outages | faults | fuzz | hazards | browser: each makes .venv and installs what it needs; a second time costs nothing.
 
 PYTHON ?= python3
 BIN    := .venv/bin
@@ -6,7 +6,7 @@ STAMP  := .venv/.installed
 DEMO   := demo
 APT    := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0
 
-.PHONY: demo test slow bench check format install outages browser
+.PHONY: demo test slow bench check format install outages faults fuzz hazards browser
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
@@ -24,11 +24,21 @@ bench: $(STAMP)
 outages: $(STAMP)
 	$(BIN)/stillbed bench outages --count 1000 --seed 1 -o out/outages --force
 
+faults: $(STAMP)
+	$(BIN)/stillbed bench faults --count 10000 --seed 1 --jobs 2 --log out/faults.csv -o out/faults --force
+
+fuzz: $(STAMP)
+	$(BIN)/stillbed bench fuzz --count 1000000 -o out/fuzz --force
+
+hazards: $(STAMP)
+	$(BIN)/python -m tests.hazard_table --run
+
 check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest tests/test_floors.py
+	$(BIN)/python -m pytest tests/test_floors.py tests/test_hazards.py
+	$(BIN)/python -m tests.hazard_table --check
 
 # The operator's page is tested in Chromium; where there is none those tests are skipped, and say so.
 browser:

@@ -1,0 +1,135 @@
+"""docs/hazards.md from data/hazards.toml, the pinned versions, and the tests that prove each control.
+
+python -m tests.hazard_table            writes docs/hazards.md
+python -m tests.hazard_table --run      runs all the tests that it names first; nothing is written where one fails
+python -m tests.hazard_table --check    tells those that failed when they last ran here; exit code 1 where one did
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import sys
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+DATA, DOCUMENT = ROOT / "data" / "hazards.toml", ROOT / "docs" / "hazards.md"
+LAST_FAILED = ROOT / ".pytest_cache" / "v" / "cache" / "lastfailed"
+KEYS = {"id", "hazard", "cause", "control", "tests", "figure", "command"}
+OPENING = """# Hazards
+
+A stop by software is no safety function, nor is anything else on this page: it runs on an ordinary computer that may
+hang, and nobody has assessed it. An arm near a patient needs an emergency stop in hardware that takes its power away,
+within reach of somebody who watches. This is research software, not a medical device.
+
+Made from `data/hazards.toml` by `make hazards`, which runs the tests named here. `make check` fails where one of them
+is not there, may be skipped, or failed when it last ran on the machine, or where this page is not what that file says.
+
+| | hazard | cause | control | proved by | figure |
+|---|---|---|---|---|---|
+"""
+PARTS = """
+## Parts by others
+
+What stillbed loads when it runs, in the versions that were tested together (`constraints.txt`):
+
+{parts}.
+
+| part | what is known of it | why it does no harm here |
+|---|---|---|
+"""
+
+
+@dataclass(frozen=True)
+class Hazard:
+    """One hazard. tests: pytest's names of the tests that prove its control. command: measures its figure."""
+
+    id: str
+    hazard: str
+    cause: str
+    control: str
+    tests: tuple[str, ...]
+    figure: str
+    command: str
+
+
+def hazards() -> list[Hazard]:
+    """All of them, in the file's order; ValueError for one that lacks a word or says one too many."""
+    found = []
+    for table in tomllib.loads(DATA.read_text(encoding="utf-8"))["hazard"]:
+        if table.keys() != KEYS:
+            raise ValueError(f"{DATA.name}: {table.get('id')}: {sorted(table.keys() ^ KEYS)}")
+        found.append(Hazard(**{**table, "tests": tuple(table["tests"])}))
+    return found
+
+
+def document() -> str:
+    """The page."""
+    rows = "".join(_row(each) for each in hazards())
+    anomalies = tomllib.loads(DATA.read_text(encoding="utf-8"))["anomaly"]
+    told = "".join(f"| {a['part']} {versions()[a['part']]} | {a['known']} | {a['matters']} |\n" for a in anomalies)
+    parts = ", ".join(f"{name} {version}" for name, version in versions().items())
+    return OPENING + rows + PARTS.format(parts=parts) + told
+
+
+def _row(one: Hazard) -> str:
+    tests = "<br>".join(f"`{name.removeprefix('tests/')}`" for name in one.tests)
+    figure = f"{one.figure}: `{one.command}`" if one.command else ""
+    return f"| {one.id} | {one.hazard} | {one.cause} | {one.control} | {tests} | {figure} |\n"
+
+
+def versions() -> dict[str, str]:
+    """The version of each library that is needed at run time, as it is pinned."""
+    pinned = dict(
+        re.findall(r"^([\w.-]+)==(\S+)", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE)
+    )
+    by_name = {name.lower().replace("_", "-"): version for name, version in pinned.items()}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    names = [re.split(r"[<>=\[; ]", line)[0] for line in project["dependencies"]]
+    return {name: by_name[name.lower().replace("_", "-")] for name in names}
+
+
+def missing(names: Iterable[str], root: Path = ROOT) -> list[str]:
+    """Those of pytest's names that stand for no test, or for one that is skipped or expected to fail whatever comes."""
+    return [name for name in names if not _is_test(*name.split("::"), root)]
+
+
+def _is_test(file: str, function: str, root: Path) -> bool:
+    if not (root / file).is_file():
+        return False
+    for node in ast.parse((root / file).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef) and node.name == function:
+            marks = {ast.unparse(each).split("(")[0] for each in node.decorator_list}
+            return not marks & {"pytest.mark.skip", "pytest.mark.xfail"}
+    return False
+
+
+def failed(names: Iterable[str], cache: Path = LAST_FAILED) -> list[str]:
+    """Those that failed when they last ran here, as pytest remembers it; of one that never ran it knows nothing."""
+    remembered = json.loads(cache.read_text(encoding="utf-8")) if cache.exists() else {}
+    broken = {name.split("[")[0] for name in remembered}
+    return [name for name in names if name in broken]
+
+
+def main(arguments: list[str]) -> int:
+    """Write the page; with --run, once its tests have passed. With --check, say which of them failed last."""
+    names = [name for each in hazards() for name in each.tests]
+    if "--check" in arguments:
+        broken = [f"{each.id}: {name}" for each in hazards() for name in (*missing(each.tests), *failed(each.tests))]
+        print("\n".join(["hazards without a passing test:", *broken]) if broken else "every hazard has its tests")
+        return int(bool(broken))
+    if "--run" in arguments:
+        import pytest
+
+        if code := pytest.main(["-o", "addopts=--strict-markers --strict-config -p no:dash", *dict.fromkeys(names)]):
+            return int(code)
+    DOCUMENT.write_text(document(), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
