@@ -27,6 +27,11 @@ def read_poses(path: str | Path) -> Iterator[SurfacePose]:
     return _read(path, {"/pose": messages.pose_from_message})
 
 
+def read_smoothed(path: str | Path) -> Iterator[SurfacePose]:
+    """Poses as `stillbed smooth` added them."""
+    return _read(path, {"/smoothed": messages.pose_from_message})
+
+
 def read_observations(path: str | Path) -> Iterator[Observations]:
     """Observations."""
     return _read(path, {"/observations": messages.observations_from_message})

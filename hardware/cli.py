@@ -21,6 +21,7 @@ from hardware.live.command import add_init, add_live
 from hardware.methods import MAP, METHODS
 from hardware.plan_commands import add_plan
 from hardware.reach_command import add_reach
+from hardware.smoothing.command import add_smooth
 from hardware.wound_commands import add_segment, add_train
 from perception.shipped import named_path
 
@@ -89,6 +90,7 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(metavar="COMMAND", required=True)
     _add_simulate(commands)
     _add_track(commands)
+    add_smooth(commands)
     add_segment(commands)
     add_plan(commands)
     add_live(commands)

@@ -109,14 +109,14 @@ def _drawn(result: Evaluation) -> Array:
     return np.where(hidden, np.nan, 1.0)
 
 
-def _components(poses: Array, origin: Array) -> Array:
+def components(poses: Array, origin: Array) -> Array:
     """(N, 6): x y z in base, mm, and the rotation vector against `origin` (4, 4), degrees."""
     turns = se3.log_rotation(origin[:3, :3].T @ poses[:, :3, :3])
     return np.concatenate([poses[:, :3, 3], np.degrees(turns)], axis=-1)
 
 
-def _deviations(poses: Array, covariance: Array) -> Array:
-    """(N, 6): one standard deviation of what `_components` shows; rotations to first order."""
+def deviations(poses: Array, covariance: Array) -> Array:
+    """(N, 6): one standard deviation of what `components` shows; rotations to first order."""
     rotations = poses[:, :3, :3]
     position = rotations @ covariance[:, 3:, 3:] @ np.swapaxes(rotations, -1, -2)
     both = np.stack([position, covariance[:, :3, :3]], axis=1)  # (N, 2, 3, 3)
@@ -130,13 +130,13 @@ def _trajectory(result: Evaluation) -> str:
     if not np.isfinite(drawn).any():
         return ""
     origin = table.base_from_surface[int(np.flatnonzero(np.isfinite(drawn))[0])]
-    values = _components(table.base_from_surface, origin) * drawn[:, None]
-    sigma = 2 * _deviations(table.base_from_surface, table.covariance) * drawn[:, None]
+    values = components(table.base_from_surface, origin) * drawn[:, None]
+    sigma = 2 * deviations(table.base_from_surface, table.covariance) * drawn[:, None]
     truth = None
     if result.comparison is not None:
         target = result.comparison.expected @ result.comparison.start.truth_surface_from_estimated_surface
         truth = np.full((len(table), 6), np.nan)
-        truth[result.comparison.rows] = _components(target, origin)
+        truth[result.comparison.rows] = components(target, origin)
     names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
     plots = []
     for i, name in enumerate(names):

@@ -25,7 +25,12 @@ OWNERS = {  # library: the files that may import it
     ),
     "gtsam": ("estimation/*.py",),
     "matplotlib": ("perception/training/*.py",),
-    "mcap": ("hardware/mcap_walk.py", "hardware/recording.py", "hardware/recording_file.py"),
+    "mcap": (
+        "hardware/mcap_walk.py",
+        "hardware/recording.py",
+        "hardware/recording_file.py",
+        "hardware/smoothing/recording_copy.py",
+    ),
     "numba": ("estimation/compiled.py",),
     "onnx": ("perception/training/*.py",),
     "onnxruntime": ("perception/*.py",),

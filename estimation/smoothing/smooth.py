@@ -76,9 +76,9 @@ def smooth(
 
     known: the map of the surface where there is one, such as from a scan: tracks then count its rows, and its
     covariance is its prior. Without it, the pose of the first frame set lays the surface frame and is held. start:
-    rough poses of a run, base_from_surface, at any stamps; without them they are found. prior: what of the cameras the
-    recording may correct, by default the clocks alone. Raises InputError where the observations do not determine a
-    pose.
+    rough poses of a run, base_from_surface, at any stamps, the first of which is held; without them they are found.
+    prior: what of the cameras the recording may correct, by default the clocks alone. Raises InputError where the
+    observations do not determine a pose.
     """
     prior = CalibrationPrior() if prior is None else prior
     data = packed(observations, len(rig))
@@ -87,14 +87,15 @@ def smooth(
     if told.sum() < 6:
         raise InputError("observations", "landmarks", f"{int(told.sum())} seen from apart", "6 or more")
     data, points = data.landmarks(told), points[told]
+    held = 0 if start is None else int(np.abs(data.stamps - start.stamps[0]).argmin())
     cameras, sigma = cameras_of(rig), sigmas(prior, len(rig))
     before = Known(
         cameras,
         prior_information(sigma, len(rig)),
         points.copy(),
         np.eye(points.size) / FREE**2 if known is None else _information(known, data),
-        poses[0],
-        0,
+        poses[held],
+        held,
         HELD if known is None else ANYWHERE,
         np.tile(LIVELY, (len(data) - 1, 1)),
     )
@@ -156,7 +157,9 @@ class _Solver:
 
         So far apart they tell no velocity, and so nothing of the clocks.
         """
-        few = self._part(np.linspace(0, len(self._data) - 1, KEY_FRAMES).round().astype(np.int64), self._known)
+        spread = np.linspace(0, len(self._data) - 1, KEY_FRAMES).round().astype(np.int64)
+        frames = np.union1d(spread, [self._known.held])
+        few = self._part(frames, replace(self._known, held=int(np.searchsorted(frames, self._known.held))))
         few._problem = replace(few._problem, free=self._problem.free[self._problem.free >= len(self._rig)])
         for gate in (*WIDENINGS, 1.0, 1.0, 1.0):
             few._step(gate)
@@ -167,7 +170,9 @@ class _Solver:
         """The noise as a stretch has it that shows most, which all frame sets then correct."""
         seen = np.convolve(np.diff(self._data.starts), np.ones(STRETCH), mode="valid")
         frames = int(seen.argmax()) + np.arange(STRETCH)
-        few = self._part(frames, replace(self._known, frame=ANYWHERE, pose=self._estimate.states.poses[frames[0]]))
+        few = self._part(
+            frames, replace(self._known, frame=ANYWHERE, held=0, pose=self._estimate.states.poses[frames[0]])
+        )
         for gate in WIDENINGS:
             few._carry(gate)
         few._learn_all()
@@ -244,6 +249,7 @@ class _Solver:
             surface,
             self._data.tracks,
             e.cameras.rig(self._rig),
+            self._rig,
             e.cameras.offsets,
             clocks,
             self._fitted(done.cost + equations.prior_cost()),

@@ -65,7 +65,8 @@ class Smoothed:
     by the tracks' noise and next: (K - 1, 18, 18), of each with the one after; share: (K, 18, 18), what the landmarks'
     and the cameras' doubt adds. psd: (K - 1, 6)
     density of the jerk. map: landmarks of the surface frame with their joint covariance; tracks: (L,) the id that each
-    bears among the observations. rig: the cameras as corrected, clock offsets included. offsets: (C,) s, how much later
+    bears among the observations. rig: the cameras as corrected, clock offsets included; calibrated:
+    as they were told. offsets: (C,) s, how much later
     than stamped each exposes beside the mean of all, offset_covariance: (C, C) s^2. fitted: the residuals.
     """
 
@@ -78,6 +79,7 @@ class Smoothed:
     map: SurfaceMap
     tracks: NDArray[np.int64]
     rig: Rig
+    calibrated: Rig
     offsets: Array
     offset_covariance: Array
     fitted: Fitted

@@ -1,0 +1,1 @@
+"""`stillbed smooth`: recorded sessions smoothed after the fact, and what is written of them."""

@@ -1,0 +1,82 @@
+"""The tracks of a session: those that were recorded, or made from its images by the tracker and kept."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.observations import Observations
+from estimation.pose import SurfacePose
+from estimation.trajectory import Trajectory
+from hardware.channels import read_observations, read_poses
+from hardware.clock import WallClock
+from hardware.progress import Progress
+from hardware.recording import Recorder
+from hardware.session import Session
+from hardware.tracker import tracker
+
+TRACKS = "tracks.mcap"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """What a causal run left. observations: of each frame set, in order of stamp. poses: its own, in order of stamp."""
+
+    observations: tuple[Observations, ...]
+    poses: tuple[SurfacePose, ...]
+
+    @property
+    def start(self) -> Trajectory | None:
+        """The poses that were measured; None where there are none."""
+        measured = [pose for pose in self.poses if pose.state.measured]
+        if not measured:
+            return None
+        stamps = np.array([pose.stamp for pose in measured])
+        return Trajectory(stamps, np.stack([pose.base_from_surface for pose in measured]), exact=False)
+
+
+def tracks_of(session: Session, out: Path) -> Tracks:
+    """The session's tracks. Where it has none, its images are tracked first, into tracks.mcap in the folder `out`.
+
+    That file gets its name when it is whole; of a run that was interrupted, tracks.part.mcap is left.
+    """
+    if session.path.is_file():
+        recorded = _read(session.path)
+        if any(map(len, recorded.observations)):
+            return recorded
+    kept = out / TRACKS
+    if not kept.exists():
+        _track(session, kept)
+    found = _read(kept)
+    if not any(map(len, found.observations)):
+        raise InputError(session.path, "tracks", "none in its images", "a surface that the tracker finds")
+    return found
+
+
+def _read(path: Path) -> Tracks:
+    """By stamp, each once: a run that was interrupted while it wrote may have stored a stretch twice."""
+    observations = {seen.stamp: seen for seen in read_observations(path)}
+    poses = {pose.stamp: pose for pose in read_poses(path) if np.isfinite(pose.base_from_surface).all()}
+    return Tracks(
+        tuple(observations[stamp] for stamp in sorted(observations)), tuple(poses[stamp] for stamp in sorted(poses))
+    )
+
+
+def _track(session: Session, target: Path) -> None:
+    part, clock = target.with_suffix(".part.mcap"), WallClock()
+    with (
+        tracker(session.rig, session.roi, session.surface, clock.now) as step,
+        Recorder(part, session.rig, overwrite=True) as recorder,
+        Progress("track", "frame sets", clock.now) as progress,
+    ):
+        for done, frames in enumerate(session.frame_sets(), 1):
+            pose = step(frames)
+            recorder.write(step.last.observations)
+            recorder.write(pose)
+            step.idle()
+            progress(done, len(session))
+    os.replace(part, target)

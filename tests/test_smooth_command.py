@@ -1,0 +1,109 @@
+"""`stillbed smooth` from a recording with its tracks to the files, once and only once."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation import se3
+from estimation.synthetic.follow import steps
+from estimation.synthetic.world import synthetic_world
+from hardware.channels import read_observations, read_poses, read_smoothed
+from hardware.cli import main
+from hardware.evaluation import best_constant
+from hardware.recording import Recorder
+from hardware.rig_file import read_rig
+from hardware.session import open_session
+from hardware.smoothing import run as run_module
+from hardware.tum import read_tum
+from perception.frames import Frame
+
+BLANK = np.full((720, 1280), 90, np.uint8)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A live run on a breathing surface, 3 s at 20 Hz, with its truth."""
+    path = tmp_path_factory.mktemp("live") / "run.mcap"
+    world = synthetic_world("breathing", seconds=3.0, rate=20.0, count=40, offsets=(0.004, 0.0, -0.004))
+    with Recorder(path, world.rig) as recorder:
+        recorder.truth(world.truth)
+        for k, step in enumerate(steps(world, "seen")):
+            for camera in range(3 if k % 20 == 0 else 1):
+                recorder.frame(Frame(camera, step.pose.stamp, BLANK))
+            recorder.write(step.seen)
+            recorder.write(step.pose)
+    return path
+
+
+@pytest.fixture(scope="module")
+def out(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("smoothed") / "out"
+    assert main(["smooth", str(recording), "-o", str(folder), "--rate", "100"]) == 0
+    return folder
+
+
+def test_the_poses_are_better_than_the_live_ones(recording: Path, out: Path) -> None:
+    truth = open_session(recording).truth
+    assert truth is not None
+    ours = read_tum(out / "smoothed.tum", exact=False)
+    assert (ours.stamps == truth.stamps).all()
+    live = np.stack([pose.base_from_surface for pose in read_poses(recording)])
+    off = []
+    for poses in (ours.base_from_surface, live):
+        constant = best_constant(se3.inverse(truth.base_from_surface) @ poses)
+        off.append(se3.log(se3.inverse(poses) @ truth.base_from_surface @ constant)[:, 3:])
+    assert np.sqrt((off[0] ** 2).mean()) < 0.8 * np.sqrt((off[1] ** 2).mean())
+
+
+def test_the_table_has_the_rate_that_was_asked_for(out: Path) -> None:
+    with (out / "smoothed.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    stamps = np.array([float(row["stamp_s"]) for row in rows])
+    assert np.allclose(np.diff(stamps), 0.01, atol=1e-5) and len(rows) == 295
+    assert len(rows[0]) == 8 + 6 + 21 + 21
+    assert all(float(row["cov_tz_tz"]) >= 0 and float(row["twist_cov_tz_tz"]) > 0 for row in rows)
+
+
+def test_rig_map_and_copy_can_be_read_again(recording: Path, out: Path) -> None:
+    offsets = [camera.clock_offset for camera in read_rig(out / "rig.toml").rig.cameras]
+    assert offsets == pytest.approx([0.004, 0.0, -0.004], abs=0.003)
+    header, *_ = (out / "map.ply").read_text(encoding="ascii").split("end_header")
+    assert "element vertex 40" in header and "property uchar red" in header
+    copied = list(read_smoothed(out / "smoothed.mcap"))
+    assert len(copied) == 60
+    assert len(list(read_observations(out / "smoothed.mcap"))) == len(list(read_observations(recording)))
+    assert len(open_session(out / "smoothed.mcap")) == len(open_session(recording))
+    assert not list(read_smoothed(recording))
+
+
+def test_the_report_says_what_was_found(out: Path) -> None:
+    text = (out / "report.html").read_text(encoding="utf-8")
+    for part in ("Trajectory", "Live against smoothed", "Residuals", "Spectrum", "Had the loop", "Calibration drift"):
+        assert f"<h2>{part}" in text
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert summary["poses"] == 60 and summary["landmarks"] == 40 and 0 < summary["live_rms_mm"] < 0.2
+
+
+def test_what_is_done_is_not_done_again(
+    recording: Path, out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = (out / "summary.json").stat().st_mtime_ns
+    assert main(["smooth", str(recording), "-o", str(out), "--rate", "100"]) == 0
+    assert "done already" in capsys.readouterr().out
+    assert (out / "summary.json").stat().st_mtime_ns == before
+    asked = [run_module.content_hash(recording, run_module.Wishes(rate)) for rate in (100.0, 50.0)]
+    assert asked[0] != asked[1]
+
+
+def test_wrong_wishes_are_named(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["smooth", str(recording), "-o", str(tmp_path / "x"), "--rate", "0"]) == 2
+    assert "--rate" in capsys.readouterr().err
+    assert main(["smooth", str(tmp_path / "no.mcap"), "-o", str(tmp_path / "x")]) == 2
+    assert "no.mcap" in capsys.readouterr().err
+    assert main(["smooth", str(recording), str(recording), "-o", str(tmp_path / "y")]) == 2
+    assert "different names" in capsys.readouterr().err
