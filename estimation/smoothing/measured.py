@@ -23,6 +23,8 @@ from estimation.smoothing.loops import frame_sums, squares
 from estimation.smoothing.packed import Packed
 from estimation.smoothing.prior import STATE, States, right_jacobian
 
+TOGETHER = 1e-4  # s: as the sum of a frame set's delays is held at nothing
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
@@ -159,7 +161,8 @@ def condensed(
     by_landmark = products.reshape(frames, -1, 10 * n) @ tall if step is None else empty  # (F, 3L, M)
     cross = np.concatenate([whole[:, state, rest], np.swapaxes(by_landmark[..., state], 1, 2)], axis=2)
     own_cross = np.concatenate([whole[:, own, rest], np.swapaxes(by_landmark[..., own], 1, 2)], axis=2)
-    root = np.linalg.inv(np.linalg.cholesky(whole[:, own, own] + np.diag(noise.own_information())))
+    seeing = grams[..., 8, 8] > 0  # (F, C)
+    root = np.linalg.inv(np.linalg.cholesky(whole[:, own, own] + _own_prior(noise, seeing)))
     by_state, by_shared, by_right = root @ whole[:, own, state], root @ own_cross, root @ right[:, own, None]
     turned = np.swapaxes(by_state, 1, 2)
     held = np.swapaxes(root, 1, 2)
@@ -204,6 +207,19 @@ def _columns(
         out[:, c, :6, begin + n + 6 * c : begin + n + 6 * c + 6] = place[:, c]
         out[:, c, 6 + lens, begin + 7 * n + 4 * c + lens] = 1.0
     return np.ascontiguousarray(out[..., np.concatenate([np.arange(begin), begin + free])])
+
+
+def _own_prior(noise: Noise, seeing: NDArray[np.bool_]) -> Array:
+    """Information (F, 3C, 3C) of what each camera's tracks share. seeing: (F, C).
+
+    The instant of a frame set is the mean of its cameras': what their delays have in common nobody could tell from the
+    motion, and a prior that smoothed it away took poses of a waved board three times as far off.
+    """
+    frames, n = seeing.shape
+    out = np.tile(np.diag(noise.own_information()), (frames, 1, 1))
+    both = seeing[:, :, None] & seeing[:, None]
+    out[:, :n, :n] += np.where(both, TOGETHER**-2.0, 0.0)
+    return out
 
 
 def _shared(corrections: Array, by_landmark: Array, known: Array) -> Array:

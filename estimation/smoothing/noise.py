@@ -38,13 +38,15 @@ def shared_sizes(done: Pass, steps: Array, own: Array, noise: Noise) -> tuple[fl
     """
     through = np.einsum("kij,kjl,kil->ki", done.follows, own, done.follows, optimize=True)
     n, known = len(noise.unit), noise.own_information()
+    apart = np.repeat([max(1 - 1 / n, 1e-6), 1.0], [n, 2 * n])  # of the delays, whose sum is held
+    known = known / apart
     effects = done.effects + (done.follows @ steps[..., None])[..., 0]
     told = np.clip(1 - (done.doubts + through) * known, 0.0, 1.0)  # (K, 3C): nothing where the camera was blind
     sizes = []
     for part, least in ((slice(0, n), LEAST_JITTER), (slice(n, 3 * n), LEAST_UNREST)):
         square, count = float((effects[:, part] ** 2).sum()), float(told[:, part].sum())
         before = 1 / known[part.start]
-        variance = (square + BELIEF * before) / (count + BELIEF)
+        variance = (square + BELIEF * before) / (count + BELIEF) / apart[part.start]
         sizes.append(max(float(np.sqrt(variance)), least))
     return sizes[0], sizes[1]
 

@@ -11,7 +11,8 @@ from estimation.smoothing.smoothed import Smoothed
 
 BREATHING = (0.1, 0.7)  # Hz: 6 to 42 breaths a minute
 PULSE = (0.75, 3.0)  # Hz: 45 to 180 beats a minute
-CYCLES = 3  # of a rhythm that a recording must hold for it to be named
+CYCLES = 4  # of a rhythm that a recording must hold for it to be named
+LONG = 10.0  # s: of a shorter recording nothing is said
 CLEAR = 8.0  # times the band's own median power: a peak that stands out
 HARMONIC = 0.08  # parts: a peak so near to a multiple of the breathing is the breathing's
 
@@ -57,7 +58,7 @@ def _peak(
     peaks = np.zeros(len(hertz), bool)
     peaks[1:-1] = (amplitude[1:-1] > amplitude[:-2]) & (amplitude[1:-1] >= amplitude[2:])
     found = np.flatnonzero(inside & peaks)
-    if not len(found):
+    if not len(found) or seconds < LONG:
         return float("nan")
     best = found[amplitude[found].argmax()]
     clear = amplitude[best] ** 2 > CLEAR * np.median(amplitude[(hertz >= band[0]) & (hertz <= band[1])] ** 2)
