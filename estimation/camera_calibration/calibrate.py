@@ -13,7 +13,7 @@ from estimation.camera_calibration.held_out import held_out
 from estimation.camera_calibration.homography import LEAST, plane_blunders
 from estimation.camera_calibration.lens_fit import LEAST_CORNERS, LensFit, Undetermined, fit_lens, with_lens
 from estimation.camera_calibration.lens_model import MODELS, KnownLenses, matrix_of
-from estimation.camera_calibration.model_choice import Choice, ModelScore, choose
+from estimation.camera_calibration.model_choice import Choice, ModelScore, choose, doubted
 from estimation.camera_calibration.plausible import check_doubt, check_lens, check_neighbours
 from estimation.camera_calibration.rig_fit import OWN, RigFit, RigState, Rival, fit_rig, free_numbers, with_rivals
 from estimation.camera_calibration.rig_start import first_rig
@@ -80,7 +80,8 @@ def calibrate(views: Views, say: Say | None = None, known: KnownLenses | None = 
     views, fit, jitter, more = adjust(views, state, choices, known)
     for c, name in enumerate(names):
         check_lens(name, views.sizes[c], fit.state.lens[c])
-        check_doubt(name, fit.state.lens[c], fit.covariance[OWN * c : OWN * c + 9, OWN * c : OWN * c + 9])
+        if known is None:
+            check_doubt(name, fit.state.lens[c], fit.covariance[OWN * c : OWN * c + 9, OWN * c : OWN * c + 9])
     check_neighbours(names, views.sizes, fit.state.lens)
     scores = tuple(choice.scores for choice in choices)
     tell("stretches held out, one after another")
@@ -99,7 +100,7 @@ def lenses(views: Views, say: Say, known: KnownLenses | None = None) -> tuple[Vi
         rows = np.flatnonzero((views.camera == c) & (views.seen.sum(1) >= LEAST_CORNERS))
         _check_number(name, len(rows))
         own = views.only(rows)
-        own, choice, out = _chosen(own) if known is None else _given(own, known.lens[c])
+        own, choice, out = _chosen(own) if known is None else _given(own, known.lens[c], not known.sigma[c].any())
         good = own.without(out).seen.sum(1) >= np.maximum(LEAST_CORNERS, WRONG_SHARE * own.seen.sum(1))
         _check_number(name, int(good.sum()))
         dropped += int(out.sum())
@@ -128,15 +129,18 @@ def _chosen(own: Views) -> tuple[Views, Choice, NDArray[np.bool_]]:
     return own, choose(own.without(out)), out
 
 
-def _given(own: Views, lens: Array) -> tuple[Views, Choice, NDArray[np.bool_]]:
-    """As `_chosen`, with a lens (9,) that is known."""
+def _given(own: Views, lens: Array, exact: bool) -> tuple[Views, Choice, NDArray[np.bool_]]:
+    """As `_chosen`, with a lens (9,) that is known. exact: whether nobody told how far it may be off."""
     rough = with_lens(replace(own, sigma=np.full(len(own), FIRST_SIGMA)), lens)
     usual = float(np.nanmedian(np.linalg.norm(rough.residuals, axis=-1))) / RAYLEIGH
     own = replace(own, sigma=np.full(len(own), max(usual, FINEST)))
     fit = with_lens(own, lens)
     out = blunders(own, fit.residuals, fit.scale)
     out &= (~out & own.seen).sum(1, keepdims=True) >= LEAST
-    return own, Choice(fit, ()), out
+    if not exact:
+        return own, Choice(fit, ()), out
+    left = own.without(out)
+    return own, doubted(left, with_lens(left, lens)), out
 
 
 def blunders(views: Views, residuals: Array, scale: float) -> NDArray[np.bool_]:

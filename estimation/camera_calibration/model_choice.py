@@ -17,6 +17,7 @@ from estimation.se3 import Array
 FOLDS = 4
 BLOCKS = 12  # stretches of neighbouring views that are held out as one: neighbours look alike
 USUAL = "k1 k2"  # what any webcam is given: a number left out is claimed to be zero, one kept has its doubt stated
+RICHEST = list(MODELS)[-1]
 ENOUGH = 1e-5  # share of a held-out fit's cost that is not worth another step: models differ by a hundred times that
 WORTH = 2.0  # standard errors by which another model must beat the usual one: one is passed by chance in six
 
@@ -71,6 +72,14 @@ def choose(views: Views) -> Choice:
     return Choice(fits[chosen], scores, richer[-1].model, max(score.chance for score in richer))
 
 
+def doubted(views: Views, given: LensFit) -> Choice:
+    """A lens that was given, with the chance that one sought from these views images others of them better."""
+    fits, folds = _fits(views), folds_of(len(views))
+    kept = _squares(views, given.residuals)
+    rivals = [_score(model, _held_out(views, fits[model], folds), kept) for model in (USUAL, RICHEST)]
+    return Choice(given, (), RICHEST, max(score.chance for score in rivals))
+
+
 def _is_possible(views: Views, lens: Array) -> bool:
     try:
         check_lens("", views.sizes[int(views.camera[0])], lens)
@@ -101,10 +110,14 @@ def _held_out(views: Views, whole: LensFit, folds: NDArray[np.int64]) -> Array:
         kept, held = folds != fold, folds == fold
         lens = fit_lens(views.only(kept), whole.model, (whole.lens, whole.camera_from_board[kept]), ENOUGH).lens
         rest = views.only(held)
-        residuals = fit_poses(rest, lens, whole.camera_from_board[held], ENOUGH)[1]
-        limit = (6 * rest.sigma[:, None]) ** 2  # a blunder says nothing of a lens
-        out[held] = np.nanmean(np.minimum((residuals**2).sum(-1), limit * 4), axis=1)
+        out[held] = _squares(rest, fit_poses(rest, lens, whole.camera_from_board[held], ENOUGH)[1])
     return out
+
+
+def _squares(views: Views, residuals: Array) -> Array:
+    """(V,) mean squared length, px^2, of each view's residuals (V, P, 2)."""
+    limit = (6 * views.sigma[:, None]) ** 2  # a blunder says nothing of a lens
+    return np.asarray(np.nanmean(np.minimum((residuals**2).sum(-1), limit * 4), axis=1))
 
 
 def _score(model: str, errors: Array, usual: Array) -> ModelScore:
