@@ -16,7 +16,7 @@ from estimation.camera_calibration.views import Views
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
 from hardware.bench.figure import Figure, Target, at_most
-from hardware.calibration.verdict import residual
+from hardware.calibration.verdict import held_out, residual
 from hardware.simulator.board_picture import BoardView
 from perception.boards.board import Board
 from perception.boards.collection import CornerTable, empty_table, usable
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> list[Figure]:
     figures = list(_rendered(options.instants))
     if options.runs:
         values = [_nees(seed) for seed in range(options.runs)]
-        note = f"{options.runs} runs on drawn corners of {SIGMA:g} px, {DRAWN} instants each"
+        note = f"{options.runs} runs on drawn corners of {SIGMA:g} px, {DRAWN} instants, lenses bent more or less"
         figures.append(
             Figure(
                 "squared error, in parts of what is claimed",
@@ -111,6 +111,8 @@ def _rendered(instants: int) -> Iterator[Figure]:
     focal = float(np.abs(error[:, 0] / [lens[0] for lens in LENSES]).max())
     yield Figure("focal length", 100 * focal, "%", at_most(0.1), REFERENCE, note)
     yield Figure("place", float(np.linalg.norm(error[:, 12:15], axis=1).max()), "mm", at_most(0.05))
+    claimed = max(float(np.sqrt(np.trace(found.covariance_of(c)[12:15, 12:15]))) for c in range(len(rig)))
+    yield Figure("place, as claimed", claimed, "mm")
     yield Figure("turn", float(np.degrees(np.linalg.norm(error[:, 9:12], axis=1).max())), "degrees", at_most(0.02))
     yield Figure("clock offset", 1e3 * float(np.abs(error[:, 15]).max()), "ms", at_most(1.0))
     points = working_volume(found)
@@ -120,6 +122,7 @@ def _rendered(instants: int) -> Iterator[Figure]:
     )
     yield Figure("3D error as predicted", predicted_error(found, points).typical, "mm")
     yield Figure("corner residual, median", residual(found), "px")
+    yield Figure("and in stretches held out", held_out(found), "px")
     yield Figure("squared error, rendered, in parts of what is claimed", consistency(found, error), "")
 
 
