@@ -13,7 +13,7 @@ from estimation.camera_calibration.lens_model import KnownLenses, lens_of
 from estimation.camera_calibration.views import Views
 from estimation.rig import Rig
 from hardware.calibration.collect import collect
-from hardware.calibration.verdict import board_scatter, residual
+from hardware.calibration.verdict import board_scatter, held_out, residual
 from hardware.progress import silent
 from hardware.session import open_session
 from perception.boards.board import Board
@@ -25,7 +25,7 @@ BOARD = Board(squares=(4, 5), square=54.0, inverted=True)
 pytestmark = pytest.mark.skipif(not (DATA / "webcams_a").is_dir(), reason=f"no recordings in {DATA}")
 
 
-@pytest.fixture(scope="module", params=["webcams_a", "webcams_b"])
+@pytest.fixture(scope="module", params=["webcams_a", pytest.param("webcams_b", marks=pytest.mark.slow)])
 def recording(request: pytest.FixtureRequest) -> tuple[str, Views, Rig]:
     session = open_session(DATA / request.param)
     cameras = session.rig.cameras
@@ -34,12 +34,13 @@ def recording(request: pytest.FixtureRequest) -> tuple[str, Views, Rig]:
     return request.param, views, session.rig
 
 
-def test_corners_lie_within_half_a_pixel_and_their_distances_within_a_millimetre(
+def test_corners_lie_within_half_a_pixel_and_their_distances_within_half_a_millimetre(
     recording: tuple[str, Views, Rig],
 ) -> None:
     found = calibrate(recording[1])
     assert residual(found) < 0.25
-    assert board_scatter(found) < 1.0
+    assert held_out(found) < 0.25
+    assert board_scatter(found) < 0.4
     assert 0.005 < found.jitter < 0.03
 
 
@@ -50,8 +51,9 @@ def test_with_the_lenses_that_are_given_the_cameras_stand_where_they_are_given(
     found = calibrate(views, known=KnownLenses(np.stack([lens_of(c) for c in rig.cameras]), np.zeros((3, 9))))
     assert residual(found) < 0.25
     millimetres, degrees = apart(found, rebased(rig, np.eye(4)))
-    # webcams_b's own rig puts the axis of cam_0 33 px from where webcams_a's does; it is no better known than that
-    assert (millimetres, degrees) < ((3.0, 0.3) if name == "webcams_a" else (7.0, 0.6))
+    # webcams_b's own rig images its own recording 1.4 times worse than this one does, and its two halves agree on that
+    most = (3.0, 0.3) if name == "webcams_a" else (7.0, 0.6)
+    assert millimetres < most[0] and degrees < most[1]
 
 
 def apart(found: Calibration, given: Rig) -> tuple[float, float]:
