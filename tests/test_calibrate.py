@@ -173,6 +173,7 @@ def test_the_command_ends_with_the_verdict(session: Path, board_file: Path, caps
     command = ["calibrate", "cameras", str(session), "--board", str(board_file), "-o", str(session.parent / "rig.toml")]
     assert main([*command, "--limit-mm", "0.001"]) == 1
     said = capsys.readouterr().out
+    assert re.search(r"away from where the rig.toml had it: b \d\.\d mm, 0\.\d\d degrees; c \d\.\d mm, 0\.", said)
     assert said.startswith("FAIL") and "hold the board in its picture's" in said
 
 

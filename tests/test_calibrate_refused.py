@@ -15,7 +15,7 @@ from board_session import BOARD, rendered, small_rig
 
 from estimation import se3
 from estimation.rig import Rig
-from hardware.calibration.against_given import check_against, check_distance
+from hardware.calibration.against_given import check_against, check_distance, elsewhere
 from hardware.calibration.board_file import write_board
 from hardware.cli import main
 from hardware.rig_file import ImageSource, write_rig
@@ -166,6 +166,10 @@ def test_a_rig_that_only_moved_is_no_mistake() -> None:
         for c in rig.cameras
     )
     check_against(Rig(moved), rig, file, 54.0)
+    assert elsewhere(rig, rig) == pytest.approx(np.zeros((3, 2)), abs=1e-9)
+    assert elsewhere(Rig((rig.cameras[0], *moved[1:])), rig)[2] == pytest.approx(
+        (np.linalg.norm([5.0, -8.0, 3.0]), np.degrees(np.hypot(0.02, 0.01))), rel=0.02
+    )
     check_against(exchanged(exchanged(rig)), rig, file, 54.0)
     apart = float(np.linalg.norm(rig.cameras[1].base_from_camera[:3, 3]))
     check_distance(rig, "a", "b", apart, file, 54.0)

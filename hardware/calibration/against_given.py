@@ -31,6 +31,16 @@ def check_against(found: Rig, given: Rig, board_file: Path, square: float) -> No
         raise InputError(board_file, "square_mm", f"{square:g} mm", allowed)
 
 
+def elsewhere(found: Rig, given: Rig) -> tuple[tuple[float, float], ...]:
+    """How far each camera stands, mm and degrees, from where it is given, the first one's places being the same."""
+    same = given.cameras[0].base_from_camera @ se3.inverse(found.cameras[0].base_from_camera)
+    off = [
+        se3.log(se3.inverse(b.base_from_camera) @ same @ a.base_from_camera)
+        for a, b in zip(found.cameras, given.cameras, strict=True)
+    ]
+    return tuple((float(np.linalg.norm(x[3:])), float(np.degrees(np.linalg.norm(x[:3])))) for x in off)
+
+
 def check_distance(found: Rig, first: str, second: str, distance: float, board_file: Path, square: float) -> None:
     """InputError where two lenses are not as far apart as was measured, mm; scale cannot be told from a board alone."""
     ends = [found.cameras[found.index(name)].base_from_camera[:3, 3] for name in (first, second)]

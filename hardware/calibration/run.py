@@ -13,7 +13,8 @@ from estimation.camera_calibration.calibrate import Calibration, calibrate, reba
 from estimation.camera_calibration.lens_model import PARAMETERS
 from estimation.camera_calibration.rig_error import VolumeError, predicted_error, working_volume
 from estimation.errors import InputError
-from hardware.calibration.against_given import check_against, check_distance
+from estimation.rig import Rig
+from hardware.calibration.against_given import check_against, check_distance, elsewhere
 from hardware.calibration.board_file import read_board
 from hardware.calibration.collect import collect
 from hardware.calibration.coverage import hints
@@ -120,7 +121,15 @@ def _finish(material: Material, board: Board, board_file: Path, out: Path, wishe
     out.with_suffix(".json").write_text(_json(found, error, verdict), encoding="utf-8")
     text = page(material.title, found, error, verdict, dropped, _pictures(material, found))
     out.with_suffix(".report.html").write_text(text, encoding="utf-8")
-    return Outcome(replace(found, rig=placed), error, verdict, _text(found, verdict, dropped, out))
+    lines = _beside(placed, material.rig) if material.given else []
+    return Outcome(replace(found, rig=placed), error, verdict, _text(found, verdict, dropped, out, lines))
+
+
+def _beside(found: Rig, given: Rig) -> list[str]:
+    """Where the cameras stand beside the rig that was given."""
+    apart = zip(found.cameras[1:], elsewhere(found, given)[1:], strict=True)
+    words = [f"{camera.name} {millimetres:.1f} mm, {degrees:.2f} degrees" for camera, (millimetres, degrees) in apart]
+    return [f"away from where the rig.toml had it: {'; '.join(words)}"] if words else []
 
 
 def _check_wishes(names: Sequence[str], given: bool, where: object, wishes: Wishes) -> None:
@@ -171,7 +180,9 @@ def finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _text(found: Calibration, verdict: Verdict, dropped: Mapping[tuple[str, str], int], out: Path) -> str:
+def _text(
+    found: Calibration, verdict: Verdict, dropped: Mapping[tuple[str, str], int], out: Path, more: list[str]
+) -> str:
     lines = ["PASS" if verdict.passed else "FAIL", *verdict.lines]
     for i, camera in enumerate(found.rig.cameras):
         sigma = np.sqrt(np.diag(found.covariance_of(i)))
@@ -181,6 +192,7 @@ def _text(found: Calibration, verdict: Verdict, dropped: Mapping[tuple[str, str]
             f"{millimetres_per_pixel(found, i):.3f} mm/px"
         )
     lines.append(f"distances between corners: {board_scatter(found):.2f} mm RMS")
+    lines += more
     lines += [f"{name}: {count} views left out, {reason}" for (name, reason), count in sorted(dropped.items())]
     lines += list(verdict.hints)
     lines.append(f"rig: {out}, report: {out.with_suffix('.report.html')}")
