@@ -36,7 +36,7 @@ def page(
     word = "passed" if verdict.passed else "failed"
     body = [
         _tiles(found, error),
-        section("Verdict", " ".join(verdict.lines), _hints(verdict)),
+        section("Verdict", ". ".join(verdict.lines) + ".", _hints(verdict)),
         section("Cameras", "One sigma behind each figure.", _cameras(found) + _left_out(found, dropped)),
         section("Where the board was", "Every corner used, where the lens imaged it.", _each(found, _corners)),
         section(
