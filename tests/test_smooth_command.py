@@ -107,3 +107,12 @@ def test_wrong_wishes_are_named(recording: Path, tmp_path: Path, capsys: pytest.
     assert "no.mcap" in capsys.readouterr().err
     assert main(["smooth", str(recording), str(recording), "-o", str(tmp_path / "y")]) == 2
     assert "different names" in capsys.readouterr().err
+
+
+def test_a_session_that_fails_does_not_stop_the_others(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["smooth", str(tmp_path / "no.mcap"), str(recording), "-o", str(tmp_path / "all")]) == 1
+    text = capsys.readouterr().out
+    assert "no.mcap: not smoothed" in text and "60 poses" in text
+    assert (tmp_path / "all" / "run" / "smoothed.tum").exists()

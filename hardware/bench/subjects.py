@@ -62,6 +62,7 @@ SUBJECTS: Subjects = {
     "segmentation": Subject(
         "hardware.bench.segmentation", "finding the wound: Dice, silence, a half covered one, time"
     ),
+    "smoothing": Subject("hardware.bench.smoothing", "smoothed poses beside causal ones, clocks, time by length"),
     "steps": Subject("hardware.bench.steps", "movements of 300 um and 0.1 degree: how soon flagged, how often falsely"),
     "tracks": Subject("hardware.bench.tracks", "scatter and creep of tracks before a surface that stands still"),
     "views": Subject("hardware.bench.views", "skin that deforms, grazing views with glare, a cube's edges"),

@@ -8,6 +8,8 @@ from typing import Any
 
 Commands = Any  # argparse's own type for this is private
 
+FAILED = 1  # exit code where one of several sessions could not be smoothed
+
 
 def add_smooth(commands: Commands) -> None:
     """Add the sub-command `smooth`."""
@@ -18,7 +20,8 @@ def add_smooth(commands: Commands) -> None:
         "ahead as well as back. Tracks are those of the recording; where it has none, its images are tracked first.\n"
         "Writes smoothed.tum, smoothed.csv (covariances and twists), rig.toml (the cameras as corrected), map.ply,\n"
         "summary.json, report.html and, of an .mcap file, smoothed.mcap: a copy with the channel /smoothed.\n"
-        "Of several sessions each gets a folder of its own. What is done already is not done again.",
+        "Of several sessions each gets a folder of its own; one that fails does not stop the others (exit code 1).\n"
+        "What is done already is not done again.",
         epilog="example:\n  stillbed smooth out/calm/session.mcap -o out/smoothed --rate 1000",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -33,9 +36,11 @@ def add_smooth(commands: Commands) -> None:
     command.set_defaults(run=_smooth)
 
 
-def _smooth(arguments: argparse.Namespace) -> None:
+def _smooth(arguments: argparse.Namespace) -> int:
     from hardware.smoothing.run import Wishes, run_smooth
 
-    a = arguments
-    for text in run_smooth(a.sessions, a.out, Wishes(a.rate, a.refine_cameras)):
+    a, failed = arguments, 0
+    for text, good in run_smooth(a.sessions, a.out, Wishes(a.rate, a.refine_cameras)):
         print(text, flush=True)
+        failed += not good
+    return FAILED if failed else 0

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from estimation.errors import InputError
+from estimation.errors import InputError, StillbedError
 from estimation.smoothing.cameras import REFINED, CalibrationPrior
 from estimation.smoothing.smooth import smooth
 from estimation.smoothing.smoothed import Smoothed
@@ -41,8 +41,11 @@ class Wishes:
     refine: bool = False
 
 
-def run_smooth(paths: Sequence[Path], out: Path, wishes: Wishes) -> Iterator[str]:
-    """Smooth sessions one after the other; of each a summary as text. Several get a folder of their own in `out`."""
+def run_smooth(paths: Sequence[Path], out: Path, wishes: Wishes) -> Iterator[tuple[str, bool]]:
+    """Smooth sessions one after the other; of each a summary as text, and whether it was smoothed.
+
+    Several get a folder of their own in `out`, and one that cannot be smoothed does not stop the others.
+    """
     if wishes.rate is not None and not 0 < wishes.rate <= 1e5:
         raise InputError("command line", "--rate", wishes.rate, "0 < rate <= 100000 Hz")
     names = [path.resolve().stem if path.is_file() else path.resolve().name for path in paths]
@@ -50,7 +53,13 @@ def run_smooth(paths: Sequence[Path], out: Path, wishes: Wishes) -> Iterator[str
         raise InputError("command line", "SESSION", ", ".join(names), "sessions of different names")
     prepare_out(out, force=True)
     for path, name in zip(paths, names, strict=True):
-        yield smooth_session(path, out if len(paths) == 1 else out / name, wishes)
+        if len(paths) == 1:
+            yield smooth_session(path, out, wishes), True
+            continue
+        try:
+            yield smooth_session(path, out / name, wishes), True
+        except (StillbedError, OSError) as error:
+            yield f"{path}: not smoothed: {error}", False
 
 
 def smooth_session(path: Path, out: Path, wishes: Wishes) -> str:
