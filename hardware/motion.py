@@ -37,6 +37,15 @@ class MotionStep:
         return bytes_from_command(self.last, self.profile.dialect)
 
     @property
+    def paused(self) -> bool:
+        """Whether the nozzle is to go up from the surface and stand there; it goes on where it left off."""
+        return self._planner.paused
+
+    @paused.setter
+    def paused(self, value: bool) -> None:
+        self._planner.paused = value
+
+    @property
     def progress(self) -> Progress:
         """Which checkpoint is being printed, and in which phase the print is."""
         return self._planner.progress

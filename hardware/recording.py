@@ -179,15 +179,17 @@ class Recorder:
         pose_stamp: float,
         asked: bool,
         begun: float,
+        paused: bool,
         fraction: float,
         phase: str,
         frame: bytes,
     ) -> None:
         """Write a tick of the motion: s, the stamp of the pose it was given (NaN: none), whether planner and guard were
-        asked, where on the path they were begun anew before it (NaN: they were not), the place on the path, what the
-        nozzle does, and the frame that they gave. Places count checkpoints.
+        asked, where on the path they were begun anew before it (NaN: they were not), whether they were told to wait
+        above the surface, the place on the path, what the nozzle does, and the frame that they gave. Places count
+        checkpoints.
         """
-        given = messages.message_from_tick(stamp, pose_stamp, asked, begun, fraction, phase, frame)
+        given = messages.message_from_tick(stamp, pose_stamp, asked, begun, paused, fraction, phase, frame)
         self._message("/tick", stamp, given)
 
     def latency(self, stamp: float, stage: str, width: float, counts: NDArray[np.int64], most: float) -> None:

@@ -225,6 +225,7 @@ TICK = _object(
     pose_stamp=_array(NUMBER, None, "s, of the pose they were given; empty: none"),
     asked=_about(FLAG, "whether planner and guard were asked, and gave the frame"),
     begun=_array(NUMBER, None, "where on the path they were begun anew before it; empty: they were not"),
+    paused=_about(FLAG, "whether they were told to wait above the surface"),
     fraction=_about(NUMBER, "place on the path, counted in checkpoints"),
     phase=TEXT,
     frame=BASE64,

@@ -40,10 +40,19 @@ def entry(surface_from_nozzle: Array, goal: Array, speed: float) -> Curve | None
     return _through([surface_from_nozzle, goal] if near else [surface_from_nozzle, lifted, over, before, goal], speed)
 
 
+def above(surface_from_nozzle: Array) -> Array:
+    """The nozzle (4, 4) straight above where it is now, where it touches nothing."""
+    return se3.make(surface_from_nozzle[:3, :3], surface_from_nozzle[:3, 3] + CLEARANCE * surface_from_nozzle[:3, 2])
+
+
+def straight(surface_from_nozzle: Array, goal: Array) -> Curve | None:
+    """From the nozzle (4, 4) to `goal` (4, 4); None if there."""
+    return _through([surface_from_nozzle, goal], TRAVEL)
+
+
 def exit_from(surface_from_nozzle: Array) -> Curve:
     """From the nozzle (4, 4) straight up."""
-    up = se3.make(surface_from_nozzle[:3, :3], surface_from_nozzle[:3, 3] + CLEARANCE * surface_from_nozzle[:3, 2])
-    curve = _through([surface_from_nozzle, up], TRAVEL)
+    curve = straight(surface_from_nozzle, above(surface_from_nozzle))
     assert curve is not None
     return curve
 

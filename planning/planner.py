@@ -23,7 +23,7 @@ from planning.curve import Curve, curve_through
 from planning.demand import Demand, demand
 from planning.follow import LEAD, Follower
 from planning.kinematics import SimpleArm, axes_from_nozzle, joints_from_axes, limits_of, nozzle_from_axes
-from planning.legs import CORNER, SWERVE, Leg, entry, exit_from
+from planning.legs import CORNER, SWERVE, Leg, above, entry, exit_from, straight
 from planning.limits import JOINT_MARGIN, MARGIN, Limits
 from planning.path import Path, check_path
 from planning.progress import Phase, Progress, check_start
@@ -33,6 +33,7 @@ from planning.stations import Stations, stations_on
 HORIZON = 1.0  # s of path timed at once: any speed can be stopped in it
 RENEW = 0.5  # s of it left when the next is timed, after HORIZON at the latest; it ends at rest, and the surface is
 # foreseen for half a second
+PAUSED = "paused"
 STALL = 3.0  # ticks without a call after which the arm has come to rest by itself
 SHARE = 0.98  # of what the guard tolerates of a pose: the planner brakes before the guard would cut
 
@@ -59,6 +60,9 @@ class Planner:
         self.horizons = 0  # timed so far
         self._finished = False
         self._before = -np.inf
+        self.paused = False  # go up from the surface and stand there, until this is no longer set
+        self._goal: Array | None = None  # surface_from_nozzle (4, 4) where it stands in a pause
+        self._retreated = False
 
     def __call__(self, pose: SurfacePose | None, now: float) -> Command:
         """The command of the tick at `now`, s: its axes are reached one tick later. pose: the newest there is."""
@@ -72,6 +76,9 @@ class Planner:
         if reason := self._doubt(pose, now):
             return self._stop(now, reason)
         pose = _late(pose, self._lag)
+        if self.paused:
+            return self._retreat(pose, now)
+        self._resume()
         if reason := self._keep_leg(pose, now):
             return self._stop(now, reason)
         if self._finished:
@@ -140,10 +147,7 @@ class Planner:
     def _begin(self, pose: SurfacePose, now: float) -> str:
         """Go from where the nozzle is to where the path goes on, or up if it is done."""
         self._leg = None
-        base_from_nozzle = nozzle_from_axes(self._arm, self._follower.position)
-        nozzle = se3.inverse(pose.predict(now).base_from_surface) @ base_from_nozzle
-        if pose.warp is not None:
-            nozzle = pose.warp.uncarry(nozzle[None])[0]
+        nozzle = self._nozzle(pose, now)
         if self._place >= self._curve.length:
             return self._start(pose, Phase.LEAVING, exit_from(nozzle), 0.0, now)
         goal = self._curve.poses(np.array([self._place]))[0]
@@ -151,6 +155,33 @@ class Planner:
         if way is None:
             return self._next(pose, Phase.ENTERING, now)
         return self._start(pose, Phase.ENTERING, way, 0.0, now)
+
+    def _nozzle(self, pose: SurfacePose, now: float) -> Array:
+        """surface_from_nozzle (4, 4) as commanded, on the surface as it is at `now`, s."""
+        base_from_nozzle = nozzle_from_axes(self._arm, self._follower.position)
+        nozzle = se3.inverse(pose.predict(now).base_from_surface) @ base_from_nozzle
+        return nozzle if pose.warp is None else pose.warp.uncarry(nozzle[None])[0]
+
+    def _retreat(self, pose: SurfacePose, now: float) -> Command:
+        """In a pause: straight up from where it began, then at rest; what interrupts it is made good."""
+        nozzle, leg = self._nozzle(pose, now), self._leg
+        if self._goal is None:
+            self._goal = above(nozzle)
+        if leg is not None and leg.phase is Phase.RETREATING and now >= leg.timing.end:
+            self._retreated = leg.timing.places[-1] >= leg.curve.length
+            leg = None
+        curve = None if self._retreated else straight(nozzle, self._goal)
+        if curve is None:
+            return self._stop(now, PAUSED)
+        begins = leg is None or leg.phase is not Phase.RETREATING
+        if begins and (reason := self._start(pose, Phase.RETREATING, curve, 0.0, now)):
+            return self._stop(now, f"{PAUSED}; {reason}")
+        return self._follow(pose, now)
+
+    def _resume(self) -> None:
+        """After a pause: the way back to the path begins anew."""
+        if self._goal is not None:
+            self._goal, self._retreated, self._leg = None, False, None
 
     def _next(self, pose: SurfacePose, phase: Phase, now: float) -> str:
         """Begin the leg after one of `phase`."""

@@ -19,6 +19,7 @@ class Phase(Enum):
     WAITING = "waiting"  # at rest, nothing begun
     ENTERING = "entering"  # on the way to where printing begins or goes on
     PRINTING = "printing"
+    RETREATING = "retreating"  # up from the surface in a pause, and then at rest above it
     LEAVING = "leaving"  # on the way up from the last checkpoint
     FINISHED = "finished"
 

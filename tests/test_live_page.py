@@ -18,6 +18,7 @@ CLOCK = WallClock()
 CHROMIUM = executable()
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
 SETTLED = 0.3  # s after which what was sent before has been carried out
+RETREATED = 2.0  # s after which the nozzle stands above the surface in a pause
 
 
 @pytest.fixture
@@ -66,7 +67,7 @@ def test_every_button_does_what_it_says_and_the_end_is_told(run: Running, browse
     started = press(page, "start", '["homing", "approach", "print"]', sure=True)
     prints(page)
     paused = press(page, "pause", '["paused"]')
-    pause_ends = later(1.0)
+    pause_ends = later(RETREATED + 1.0)
     press(page, "resume", '["approach", "print"]')
     prints(page)
     homing = press(page, "home", '["homing", "stopped"]', sure=True)
@@ -92,7 +93,7 @@ def test_every_button_does_what_it_says_and_the_end_is_told(run: Running, browse
 
     assert between(0.0, confirmed) == 0
     assert between(started, paused) > 20
-    assert between(paused + SETTLED, pause_ends) == 0
+    assert between(paused + RETREATED, pause_ends) == 0
     assert between(pause_ends, homing) > 20
     assert between(homing, home) > 5 and between(home + SETTLED, home_ends) == 0
     assert between(home_ends, stopped) > 20
@@ -102,6 +103,9 @@ def test_every_button_does_what_it_says_and_the_end_is_told(run: Running, browse
     for begin, end in ((stopped, stop_ends), (home, home_ends), (ended, np.inf)):
         still = axes[(stamps > begin + SETTLED) & (stamps < end)]
         assert not len(still) or np.ptp(still, axis=0).max() < 0.05
+    waits = axes[(stamps > paused + RETREATED) & (stamps < pause_ends)]
+    printing = axes[(stamps > paused - 0.3) & (stamps < paused)]
+    assert waits[:, 2].min() > printing[:, 2].max() + 5.0
     at_home = axes[(stamps > home + SETTLED) & (stamps < home_ends)]
     assert np.abs(at_home[:, 2] - HOME).max() < 0.1
 

@@ -117,7 +117,7 @@ class Conductor:
         return [] if self.done else [Order.STOP]
 
     def pause(self, reason: str, now: float) -> Orders:
-        """Have the nozzle brake and wait."""
+        """Have the nozzle leave the surface and wait above it."""
         self._to(Stage.PAUSED, reason, now)
         return [Pace.PAUSE]
 

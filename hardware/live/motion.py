@@ -53,7 +53,8 @@ class LiveMotion:
         if self._step is None:
             self.last = Hold(now, self._profile.limits.pause, WAITING)
             return bytes_from_command(self.last, self._profile.dialect)
-        self.frame = self._step(None if self.paused else pose, now)
+        self._step.paused = self.paused
+        self.frame = self._step(pose, now)
         self.last = self._step.last
         if self.paused and isinstance(self.last, Hold):
             self.last = replace(self.last, reason=PAUSED)

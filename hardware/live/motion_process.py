@@ -139,11 +139,11 @@ class _Watch:
         self._events.extend(loop.arm.events())
         progress, late = motion.progress, loop.lateness
         if progress is not None:
-            stamp = math.nan if self._given is None or motion.paused else self._given.pose.stamp
+            stamp = math.nan if self._given is None else self._given.pose.stamp
             asked, begun = motion.asked and motion.last.stamp == tick.stamp, motion.begun
             motion.begun, frame = math.nan, motion.frame if asked else b""
             place = progress.fraction, progress.phase
-            self._outbox.put(TickEntry(tick.stamp, stamp, asked, begun, tick.command, frame, *place))
+            self._outbox.put(TickEntry(tick.stamp, stamp, asked, begun, motion.paused, tick.command, frame, *place))
         spans = (*self.times.spans(), Span(LATE, late.count, late.percentile(50), late.percentile(99), late.most))
         stops = loop.arm.stops
         self._reports.put(

@@ -131,7 +131,7 @@ def _write(recorder: Recorder, entry: Entry) -> None:
         _write_pose(recorder, entry)
     elif isinstance(entry, TickEntry):
         recorder.write(entry.command)
-        given = entry.pose_stamp, entry.asked, entry.begun
+        given = entry.pose_stamp, entry.asked, entry.begun, entry.paused
         recorder.tick(entry.stamp, *given, entry.fraction, entry.phase.value, entry.frame)
     elif isinstance(entry, WireEntry):
         (recorder.sent if entry.sent else recorder.received)(entry.stamp, entry.data)

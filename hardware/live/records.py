@@ -172,13 +172,15 @@ class TickEntry:
     """A tick of the motion: s, the stamp of the pose that it was given (NaN: none), and what the loop came to.
 
     asked: whether planner and guard were asked, and the frame that they then gave. begun: where on the path they were
-    begun anew before it, counted in checkpoints (NaN: they were not). fraction, phase: how far the print then is.
+    begun anew before it, counted in checkpoints (NaN: they were not). paused: whether they were told to wait above the
+    surface. fraction, phase: how far the print then is.
     """
 
     stamp: float
     pose_stamp: float
     asked: bool
     begun: float
+    paused: bool
     command: Command
     frame: bytes
     fraction: float

@@ -49,6 +49,7 @@ def replay_run(record: File) -> Iterator[Replayed]:
         if stamp and stamp[0] not in run.poses:
             raise InputError(record, "/tick: pose_stamp", stamp[0], "a pose that is recorded")
         now = float(tick["stamp"])
+        step.paused = bool(tick.get("paused"))
         frame = step(run.poses[stamp[0]] if stamp else None, now)
         yield Replayed(now, step.last, frame, bytes_from_message({"data": tick["frame"]}))
 

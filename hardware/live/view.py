@@ -41,6 +41,7 @@ RATE = 0.9  # share of the last rate that is kept when it is smoothed
 ACTIVITIES = {
     Phase.ENTERING: Activity.ENTERING,
     Phase.LEAVING: Activity.LEAVING,
+    Phase.RETREATING: Activity.LEAVING,
 }
 
 
