@@ -6,6 +6,7 @@ import math
 import signal
 import threading
 from collections.abc import Callable
+from multiprocessing import Pipe
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +21,16 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import arc_rig
 from estimation.synthetic.motions import Motion
-from hardware.clock import SimClock
+from hardware.clock import SimClock, WallClock
 from hardware.faults import LONGEST, SPECS, Fault, Kind, Part, Runner, check_faults, fault_from_text, faults_from_texts
 from hardware.frame_faults import FrameFaults, tracked_sets
 from hardware.live.crew import Crew
+from hardware.live.feed import FeedPlan
+from hardware.live.feed import _show as show
+from hardware.live.frame_ring import FrameRing, RingSource
 from hardware.live.injected import Begun, Injector
 from hardware.path_file import read_path
+from hardware.session import open_session
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from hardware.simulator.camera_settings import CameraSettings
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras
@@ -39,6 +44,7 @@ from hardware.simulator.virtual_arm_file import read_virtual_arm, write_virtual_
 from hardware.simulator.world import World
 from perception.frames import Frame, FrameSet
 from planning.command import Hold
+from tests.session_files import SIZE, make_folder
 from tests.worlds import SMALL, Heard, patch, write_path, write_scenario
 
 ROOT = Path(__file__).parents[1]
@@ -311,3 +317,19 @@ def test_a_virtual_arm_is_read_back_from_its_file(tmp_path: Path) -> None:
     assert read == faults and again.replies is Replies.STREAM and again.top_turn == pytest.approx(settings.top_turn)
     assert (again.servo_lag, again.acceleration, again.seed) == (0.03, 900.0, 5)
     assert again.low == pytest.approx(settings.low) and again.high == pytest.approx(settings.high)
+
+
+def test_a_feed_shows_what_struck_cameras_deliver(tmp_path: Path) -> None:
+    session = make_folder(tmp_path / "session", count=20, cameras=2, pictures=True)
+    ring, (ours, theirs), begun = FrameRing([SIZE, SIZE]), Pipe(duplex=False), Begun()
+    begun.instant = WallClock().now()
+    plan = FeedPlan(session, False, (fault("camera0 off"), fault("camera1 black")), begun)
+    shown = threading.Thread(target=show, args=(open_session(session), plan, ring, theirs))
+    ring.want()
+    shown.start()
+    source, taken = RingSource(ring, ours), None
+    while taken is None and (shown.is_alive() or ours.poll()):
+        taken = source.take(0.2)
+    shown.join()
+    assert taken is not None and [frame.camera for frame in taken.frames.frames] == [1]
+    assert taken.frames.frames[0].image.max() == 0 and not taken.encoded
