@@ -26,9 +26,9 @@ class Verdict:
     """One fault, judged; times in s, NaN where there is nothing to tell.
 
     detected: from its beginning until the motion knew. seen: until the exposure of the pose that said so. worst: mm,
-    the largest error while extruding, from its beginning on. silent: too far off while extruding, and nobody said
-    anything. restless: it held, and the arm moved. recovered: from the end of the cause until moves go out and nothing
-    is to be said; inf where that never came. operator: whether an operator was needed.
+    the largest error while extruding from then on, 0 where nothing was. silent: too far off while extruding, and nobody
+    said anything. restless: it held, and the arm moved. recovered: from the end of the cause until moves go out and
+    nothing is to be said; inf where that never came. operator: whether an operator was needed.
     """
 
     fault: Fault
@@ -60,7 +60,7 @@ def judged(ran: Ran, fault: Fault, until: float) -> Verdict | None:
         fault=fault,
         detected=detected,
         seen=max(ran.words[first[0]].seen - fault.start, 0.0) if len(first) else np.nan,
-        worst=float(np.nanmax(np.append(error[during], -np.inf))),
+        worst=float(np.nanmax(np.append(error[during], 0.0))),
         silent=_silent(log.stamps, error, during, stamps[words & said], _usual(log.stamps, error)),
         restless=_restless(ran, stamps[words], (moving | own)[words], log.stamps),
         recovered=_recovered(stamps[words], said[words] | ~moving[words], fault),
