@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.bump_detector import BumpDetector
 from estimation.se3 import Array
 
 
@@ -36,6 +37,7 @@ class CameraHealth:
 
     def __init__(self, names: Sequence[str], settings: HealthSettings | None = None) -> None:
         self.settings, self._names = settings or HealthSettings(), tuple(names)
+        self.bumps = BumpDetector(names)
         self._pictures = frozenset(range(len(self._names)))  # until somebody says which
         self._repeated: frozenset[int] = frozenset()
         self.begin()
@@ -43,6 +45,7 @@ class CameraHealth:
     def begin(self) -> None:
         """Forget everything, as for a new map."""
         count = len(self._names)
+        self.bumps.begin()
         self.left_out: frozenset[int] = frozenset()
         self._usual, self._tracks = np.zeros(count), np.zeros(count)  # px off, and tracks
         self._off = np.zeros(count)  # px, how far a camera that is left out stands off
@@ -129,13 +132,16 @@ class CameraHealth:
     def _troubled(self, stamp: float, at_once: bool) -> list[int]:
         late = (self._missed >= 2) & (stamp - self._carried > self.settings.away)
         named = (self._missed > 0) & np.isfinite(self._carried) & (late | at_once)
-        return [c for c in range(len(self._names)) if named[c] or c in self.left_out or self._apart[c]]
+        off = self.left_out | self.bumps.bumped.keys()
+        return [c for c in range(len(self._names)) if named[c] or c in off or self._apart[c]]
 
     def _why(self, camera: int) -> str:
         if camera in self._repeated:
             return "shows the same picture again"
         if camera not in self._pictures:
             return "delivers no picture"
+        if camera in self.bumps.bumped:
+            return self.bumps.bumped[camera]
         if camera in self.left_out or self._apart[camera]:
             return f"stands {self._off[camera]:.1f} px off the others"
         return "hardly sees the surface"

@@ -259,7 +259,7 @@ class Estimator:
     def sound(self, fit: Fit) -> bool:
         """Whether map, warp and clocks may learn from a fit: what blurred or bumped cameras show would bend them."""
         blurred = self.health.blurred(fit.used, fit.off, fit.allowed, fit.odd)
-        return not fit.odd and self.health.clear(fit.used) and not blurred
+        return not (fit.odd or self.health.bumps.bumped or blurred) and self.health.clear(fit.used)
 
     def carriers(self, fit: Fit) -> NDArray[np.int64]:
         """The cameras that carry a fit, by number."""
@@ -293,7 +293,7 @@ class Estimator:
 
     def accept(self, fit: Fit, observations: Observations) -> SurfacePose:
         """Take a measured fit into the window and give the pose."""
-        assert fit.measured and fit.solution.shared is not None
+        assert fit.measured and fit.solution.shared is not None and self.map is not None
         if self._pose is not None:
             sound = self.sound(fit)
             self._unlearned = (fit, observations, fit.stamp - self._pose.stamp) if sound else None
@@ -302,6 +302,9 @@ class Estimator:
                 self._warp.learn(observations, fit.solution, sigma, fit.twist, self.cameras.delays.sigma)
         self._accepted += 1
         self._detector(fit.stamp, fit.solution.base_from_surface, fit.noise)
+        points = self.map.points if self._warp is None else self._warp.points(self.map)
+        exposed, on = self.as_exposed(fit.solution.base_from_surface, fit.twist), points[observations.track]
+        self.health.bumps.watch(self.rig, observations, on, exposed, fit.solution.jacobians)
         self._heed(fit)
         lasting = fit.lasting + self._calibration(fit)
         seen = Measurement(

@@ -20,6 +20,7 @@ from hardware.arm_queue import Stretch
 
 NAME = "commanded.csv"
 HEADER = "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg"
+RESOLUTION = 2e-6  # s: knots nearer than what six digits tell apart are one
 _UNITS = np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
 
 
@@ -29,7 +30,7 @@ class CommandedFile:
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", encoding="utf-8")
         self._file.write(HEADER + "\n")
-        self._last: tuple[float, tuple[float, ...]] | None = None
+        self._last = -np.inf
         self._until = -np.inf
 
     def note(self, arm: Arm, now: float) -> None:
@@ -41,9 +42,9 @@ class CommandedFile:
 
     def _add(self, way: Stretch) -> None:
         for instant, axes in ((way.start, way.source), (way.end, way.target)):
-            if self._last is None or instant > self._last[0]:
+            if instant >= self._last + RESOLUTION:
                 self._file.write(f"{instant:.6f}," + ",".join(f"{v:.6f}" for v in np.array(axes) * _UNITS) + "\n")
-                self._last = instant, axes
+                self._last = instant
 
     def __enter__(self) -> CommandedFile:
         return self

@@ -33,8 +33,8 @@ def page(title: str, found: ArmCalibration, verdict: Verdict, against: Sequence[
         tile(latency, "ms", "late in all"),
         tile(str(int(found.fit.used.sum())), "", "tips used"),
     ]
-    hints = "<ul>" + "".join(f"<li>{escape(h)}</li>" for h in verdict.hints) + "</ul>" if verdict.hints else ""
-    body = [row_of_tiles(tiles), section("Verdict", " ".join(verdict.lines), hints)]
+    said = "".join(f"<li>{escape(words)}</li>" for words in (*verdict.lines, *verdict.hints))
+    body = [row_of_tiles(tiles), section("Verdict", "What was found, and what to do next.", f"<ul>{said}</ul>")]
     body.append(section("Numbers", "One sigma behind each figure.", _numbers(found, sigma)))
     if against:
         rows = [list(row) for row in against]

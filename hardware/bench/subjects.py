@@ -40,6 +40,7 @@ SUBJECTS: Subjects = {
     "arm-calibration": Subject(
         "hardware.bench.arm_calibration", "the arm's place, tool and latency from what cameras see of its tip"
     ),
+    "bumps": Subject("hardware.bench.bumps", "cameras knocked and lenses turned by little: found, named, false alarms"),
     "calibration": Subject(
         "hardware.bench.calibration", "cameras calibrated from rendered boards, beside the exact rig"
     ),

@@ -26,7 +26,7 @@ def add_calibrate(commands: Commands) -> None:
     """Add the sub-command `calibrate`."""
     command: argparse.ArgumentParser = commands.add_parser(
         "calibrate",
-        help="calibrate the cameras from a printed board: board, cameras, import, export",
+        help="calibrate cameras from a printed board, and the arm: board, cameras, arm, import, export",
         description="Print a board, wave it before the cameras, and get a rig that says how far it can be trusted.",
         epilog="example:\n  stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -1,0 +1,185 @@
+"""Whether a camera has moved a little, or its lens was turned: seen in all of its tracks together, against the others.
+
+Single frame sets hardly show a bump of half a millimetre, and the pose takes up a part of it. What is asked of each
+camera is by how much its picture stands shifted, turned and scaled about its axis, once the pose is free to take up
+whatever it can of that; averaged over half a second, and compared with what was usual before. The camera that explains
+most of what has changed is the one. A shift is a bump, a change of scale a turned lens; a camera that was pushed along
+its axis looks like the latter, as 4 mm of 400 are one percent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimation.median import median
+from estimation.observations import Observations
+from estimation.pose_solver import project
+from estimation.rig import Rig
+from estimation.se3 import Array
+
+NUMBERS = 4  # of a camera's picture: shift right and down, px; roll, rad; scale
+FEWEST = 8  # tracks of a camera that tell its four numbers
+RIDGE = 1e-3  # information on all of it, 1/px^2: a number that nothing tells stays where it is
+EVERY = 0.06  # s: every other frame set of 30 a second is looked at, which is plenty for what stays
+BLUNDER = 6.0  # px beside the median of its camera at which a track counts for nothing
+
+
+@dataclass(frozen=True, slots=True)
+class BumpSettings:
+    """When a change is a bump. quick: s over which it is averaged; usual: s over which it is learned what is usual.
+
+    warm: s after a beginning in which nothing is said. limit: px, root mean square over the tracks, that they may move
+    by at least, and spread: times what is usual of that. sure: times what the next camera explains. lasts: s that it
+    must be so, calm: s that it must not be so any more.
+    """
+
+    quick: float = 0.4
+    usual: float = 20.0
+    warm: float = 3.0
+    limit: float = 0.25
+    spread: float = 5.0
+    sure: float = 1.2
+    lasts: float = 0.2
+    calm: float = 0.5
+
+
+class _Sums:
+    """Information (4, 4) and pull (4,) of one camera's numbers, fading."""
+
+    def __init__(self) -> None:
+        self.information, self.pull = np.zeros((NUMBERS, NUMBERS)), np.zeros(NUMBERS)
+
+    def take(self, information: Array, pull: Array, share: float) -> None:
+        self.information += share * (information - self.information)
+        self.pull += share * (pull - self.pull)
+
+    def numbers(self) -> Array:
+        return np.asarray(np.linalg.solve(self.information + RIDGE * np.eye(NUMBERS), self.pull))
+
+
+class BumpDetector:
+    """Remembers of each camera what is usual of its picture, and what it lately was."""
+
+    def __init__(self, names: Sequence[str], settings: BumpSettings | None = None) -> None:
+        self.settings, self._names = settings or BumpSettings(), tuple(names)
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget everything, as for a new map."""
+        count = len(self._names)
+        self.bumped: dict[int, str] = {}  # cameras, and what is said of them
+        self._quick, self._usual = [_Sums() for _ in range(count)], [_Sums() for _ in range(count)]
+        self._spread = np.zeros(count)  # px^2, usual square of what is off
+        self._since = np.full(count, np.nan)  # s, since when a camera is off, or on again
+        self._first, self._stamp, self._count = np.nan, np.nan, 0
+
+    def watch(self, rig: Rig, seen: Observations, points: Array, exposed: Array, jacobians: Array) -> None:
+        """Take an accepted frame set.
+
+        points: (N, 3) mm, surface, of the tracks. exposed: (C, 4, 4) base_from_surface when each camera exposed.
+        jacobians: (N, 2, 6) px of the pose.
+        """
+        if seen.stamp - self._stamp < EVERY:
+            return
+        parts = picture_changes(rig, seen, points, exposed, jacobians)
+        if np.isnan(self._first):
+            self._first = self._stamp = seen.stamp
+        step, self._stamp = max(seen.stamp - self._stamp, 0.0), seen.stamp
+        self._count += 1
+        if seen.stamp - self._first < self.settings.warm:
+            for camera, part in parts.items():
+                for sums in (self._quick[camera], self._usual[camera]):
+                    sums.take(part.information, part.pull, 1 / self._count)
+            return
+        for camera, part in parts.items():
+            self._quick[camera].take(part.information, part.pull, min(1.0, step / self.settings.quick))
+        changes = {c: self._quick[c].numbers() - self._usual[c].numbers() for c in parts}
+        moved = {c: float(np.sqrt(np.mean(((parts[c].slopes @ v) ** 2).sum(-1)))) for c, v in changes.items()}
+        gains = {c: float(v @ self._quick[c].information @ v) for c, v in changes.items()}
+        for camera in parts:
+            others = [g for c, g in gains.items() if c != camera and c not in self.bumped]
+            clear = gains[camera] > self.settings.sure * max(others, default=0.0)
+            self._decide(camera, moved[camera], clear)
+            if camera in self.bumped:
+                self.bumped[camera] = _words(changes[camera], parts[camera], moved[camera])
+        if not self.bumped:
+            share = min(1.0, step / self.settings.usual)
+            for camera, part in parts.items():
+                self._spread[camera] += share * (moved[camera] ** 2 - self._spread[camera])
+                self._usual[camera].take(part.information, part.pull, share)
+
+    def _decide(self, camera: int, moved: float, clear: bool) -> None:
+        """Whether a camera counts as bumped from now on. moved: px. clear: whether it explains more than the others."""
+        s, known = self.settings, camera in self.bumped
+        limit = max(s.limit, s.spread * float(np.sqrt(self._spread[camera])))
+        off = moved > limit / 2 if known else moved > limit and clear
+        if off == known:
+            self._since[camera] = np.nan
+        elif np.isnan(self._since[camera]):
+            self._since[camera] = self._stamp
+        lasted = self._stamp - self._since[camera]  # nan where nothing changes
+        if off and not known and lasted >= s.lasts:
+            self.bumped[camera] = ""
+        elif known and not off and lasted >= s.calm:
+            del self.bumped[camera]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PictureChange:
+    """One camera in one frame set. information: (4, 4), pull: (4,) of its numbers once the pose has taken up what it
+    can. slopes: (N, 2, 4) px, of its tracks by the numbers."""
+
+    information: Array
+    pull: Array
+    slopes: Array
+
+
+def picture_changes(
+    rig: Rig, seen: Observations, points: Array, exposed: Array, jacobians: Array
+) -> dict[int, PictureChange]:
+    """What each camera alone would have to be off by, with the pose free (Schur complement), by camera number."""
+    pose, pulled = np.zeros((6, 6)), np.zeros(6)
+    parts: dict[int, tuple[Array, Array, Array, Array]] = {}
+    for camera in range(len(rig)):
+        mine = np.flatnonzero(seen.camera == camera)
+        if not len(mine):
+            continue
+        pixels = seen.pixels[mine]
+        left = pixels - project(rig, seen.camera[mine], exposed[camera], points[mine])[0]
+        middle = np.array([median(left[:, 0]), median(left[:, 1])])
+        beside = ((left - middle) ** 2).sum(1) / BLUNDER**2
+        weights = (np.maximum(1 - beside, 0.0) / np.maximum(seen.sigma[mine], 0.1)) ** 2
+        rows = jacobians[mine].reshape(-1, 6)
+        weighted = rows * np.repeat(weights, 2)[:, None]
+        pose += weighted.T @ rows
+        pulled += weighted.T @ left.ravel()
+        if len(mine) >= FEWEST:
+            slopes = _slopes(rig, camera, pixels)
+            flat = slopes.reshape(-1, NUMBERS)
+            own = flat * np.repeat(weights, 2)[:, None]
+            parts[camera] = own.T @ flat, own.T @ rows, own.T @ left.ravel(), slopes
+    pose += (1e-9 * np.trace(pose) + 1e-12) * np.eye(6)
+    out = {}
+    for camera, (information, cross, pull, slopes) in parts.items():
+        taken = np.linalg.solve(pose, np.column_stack([cross.T, pulled]))
+        out[camera] = PictureChange(information - cross @ taken[:, :-1], pull - cross @ taken[:, -1], slopes)
+    return out
+
+
+def _slopes(rig: Rig, camera: int, pixels: Array) -> Array:
+    """(N, 2, 4) how pixels (N, 2) move with shift, roll and scale about the camera's axis."""
+    across, down = (pixels - rig.matrices[camera][:2, 2]).T
+    zero, one = np.zeros_like(across), np.ones_like(across)
+    return np.stack([np.stack([one, zero, -down, across], -1), np.stack([zero, one, across, down], -1)], 1)
+
+
+def _words(change: Array, part: PictureChange, moved: float) -> str:
+    by_scale = float(np.sqrt(np.mean(((part.slopes[..., 3] * change[3]) ** 2).sum(-1))))
+    rest = np.append(change[:3], 0.0)
+    by_rest = float(np.sqrt(np.mean(((part.slopes @ rest) ** 2).sum(-1))))
+    if by_scale > by_rest:
+        return f"shows all {100 * abs(change[3]):.1f} % {'larger' if change[3] > 0 else 'smaller'}: its lens was turned"
+    return f"was bumped: its picture stands {moved:.1f} px off where it stood"

@@ -1,0 +1,96 @@
+"""Small bumps and turned lenses are found, told apart and named; what all cameras see alike is the surface's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_estimator import LANDMARKS, RATE, RIG, begun
+
+from estimation import se3
+from estimation.bump_detector import picture_changes
+from estimation.pose import TrackState
+from estimation.pose_solver import project
+from estimation.rig import Rig
+from estimation.se3 import Array
+from estimation.synthetic.look import observations
+from tests.synthetic import breathing
+
+CALM, AFTER = 3.6, 1.2  # s
+
+
+def knocked(camera: int, change: Array, scale: float = 1.0) -> Rig:
+    cameras, own = list(RIG.cameras), RIG.cameras[camera]
+    matrix = own.matrix * np.array([[scale, 1, 1], [1, scale, 1], [1, 1, 1]])
+    cameras[camera] = replace(own, base_from_camera=own.base_from_camera @ change, matrix=matrix)
+    return Rig(tuple(cameras))
+
+
+def watched(rig: Rig, back: bool = False) -> tuple[list[TrackState], list[str]]:
+    """States and reasons from the knock on; back: the camera is put back after AFTER, and watched twice as long."""
+    estimator, draw = begun(breathing), np.random.default_rng(4)
+    states, reasons = [], []
+    for number in range(1, round((CALM + AFTER * (1 + 2 * back)) * RATE)):
+        stamp = number / RATE
+        struck = CALM <= stamp < CALM + AFTER
+        seen = observations(rig if struck else RIG, LANDMARKS, breathing(stamp), stamp, draw, 0.3)
+        fit = estimator.fit(seen, estimator.predict(stamp))
+        pose = estimator.accept(fit, seen)
+        if stamp < CALM:
+            assert not estimator.health.bumps.bumped
+        else:
+            states.append(pose.state)
+            reasons.append(pose.reason)
+    return states, reasons
+
+
+@pytest.mark.parametrize("camera", [0, 2])
+def test_half_a_millimetre_is_named(camera: int) -> None:
+    states, reasons = watched(knocked(camera, se3.exp([0, 0, 0, 0.5, 0, 0])))
+    assert states[-1] is TrackState.DEGRADED
+    assert reasons[-1].startswith(f"{RIG.cameras[camera].name} was bumped: its picture stands 1.")
+
+
+@pytest.mark.parametrize(("camera", "scale", "words"), [(0, 1.01, "larger"), (2, 0.99, "smaller")])
+def test_a_lens_that_was_turned_is_told_from_a_bump(camera: int, scale: float, words: str) -> None:
+    states, reasons = watched(knocked(camera, np.eye(4), scale))
+    assert states[-1] is TrackState.DEGRADED
+    assert RIG.cameras[camera].name in reasons[-1] and f"% {words}: its lens was turned" in reasons[-1]
+    assert any(f"{share} %" in reasons[-1] for share in ("0.8", "0.9", "1.0", "1.1"))
+
+
+def test_a_camera_that_is_put_back_is_trusted_again() -> None:
+    states, reasons = watched(knocked(1, se3.exp([0, 0, 0, 0.7, 0, 0])), back=True)
+    assert "bumped" in reasons[round(AFTER * RATE) - 2]
+    assert states[-1] is TrackState.TRACKING and not reasons[-1]
+
+
+def test_a_moved_surface_is_no_change_of_a_camera() -> None:
+    """Law: what a pose explains to first order is in no camera's numbers."""
+    draw, at, stamp = np.random.default_rng(1), breathing(0.0), 0.0
+    seen = observations(RIG, LANDMARKS, at, stamp, draw, 0.0)
+    moved = at @ se3.exp(np.array([2e-5, -1e-5, 3e-5, 2e-3, 1e-3, -2e-3]))
+    points = LANDMARKS[seen.track]
+    _, _, jacobians = project(RIG, seen.camera, moved, points)
+    parts = picture_changes(RIG, seen, points, np.broadcast_to(moved, (3, 4, 4)), jacobians)
+    still = picture_changes(RIG, seen, points, np.broadcast_to(at, (3, 4, 4)), jacobians)
+    for camera, part in parts.items():
+        size = np.sqrt(np.diag(part.information))
+        assert np.abs(part.pull / size).max() < 2e-3
+        assert np.abs(still[camera].pull / size).max() < 2e-3
+
+
+def test_a_change_of_one_picture_comes_back_in_its_numbers() -> None:
+    draw, at = np.random.default_rng(2), breathing(0.0)
+    seen = observations(RIG, LANDMARKS, at, 0.0, draw, 0.0)
+    points, true = LANDMARKS[seen.track], np.array([0.3, -0.2, 1e-3, 2e-3])
+    exposed = np.broadcast_to(at, (3, 4, 4))
+    _, _, jacobians = project(RIG, seen.camera, at, points)
+    mine = seen.camera == 1
+    slopes = picture_changes(RIG, seen, points, exposed, jacobians)[1].slopes
+    pixels = seen.pixels.copy()
+    pixels[mine] += slopes @ true
+    part = picture_changes(RIG, replace(seen, pixels=pixels), points, exposed, jacobians)[1]
+    found = np.linalg.solve(part.information, part.pull)
+    assert found == pytest.approx(true, rel=0.02, abs=1e-4)
