@@ -213,7 +213,7 @@ def _own_prior(noise: Noise, seeing: NDArray[np.bool_]) -> Array:
     """Information (F, 3C, 3C) of what each camera's tracks share. seeing: (F, C).
 
     The instant of a frame set is the mean of its cameras': what their delays have in common nobody could tell from the
-    motion, and a prior that smoothed it away took poses of a waved board three times as far off.
+    motion, and a prior that smoothed it away took poses of a waved board farther off.
     """
     frames, n = seeing.shape
     out = np.tile(np.diag(noise.own_information()), (frames, 1, 1))
