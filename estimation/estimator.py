@@ -32,7 +32,7 @@ from estimation.se3 import Array
 from estimation.smoother import Measured, Smoother
 from estimation.state_machine import Measurement, StateMachine, StateSettings
 from estimation.surface_map import SurfaceMap
-from estimation.warp_filter import WarpFilter
+from estimation.warp_filter import WarpFilter, landmarks
 
 BEGINS = np.array([1e-4] * 3 + [1.0] * 3)  # rad^2/s^3, mm^2/s^3: what lies still may begin to breathe
 SHARP = 0.1  # mm that cameras may see the surface apart: beyond, what is late cannot be told from what is bent
@@ -71,7 +71,7 @@ class Estimator:
         self._warp: WarpFilter | None = None
         self._map_error: MapError | None = None
         self._claim = Claim(len(rig))
-        self._unlearned: tuple[Fit, Observations, float] | None = None  # accepted, and s since the one before
+        self._unlearned: tuple[Fit, Observations, float, bool] | None = None  # accepted, s since the last, and sound
         self._predictor = Predictor()
         self._pose: SurfacePose | None = None  # as decisions are made by it
         self._given: SurfacePose | None = None  # as it is claimed
@@ -131,8 +131,8 @@ class Estimator:
         assert self.map is not None and self._map_error is not None
         if len(observations) < self.settings.least_tracks:
             return self._no_fit(observations, start)
-        warped = self.map.points if self._warp is None else self._warp.points(self.map)
-        points, (twist, doubt) = warped[observations.track], self._twist(observations.stamp, start)
+        points = landmarks(self.map, self._warp)[observations.track]
+        twist, doubt = self._twist(observations.stamp, start)
         seen, moved = self._together(observations, points, start, twist)
         allowed = self.health.allowed(np.full(len(self.rig), moved))
         shared = self.cameras.shared(twist)
@@ -206,11 +206,8 @@ class Estimator:
 
         And how far, px, the surface moves in the time by which a camera's exposure is unknown.
         """
-        sigma, pixels, camera = (
-            np.maximum(observations.sigma, self.settings.floor_sigma),
-            observations.pixels,
-            observations.camera,
-        )
+        sigma, camera = np.maximum(observations.sigma, self.settings.floor_sigma), observations.camera
+        pixels = observations.pixels
         at_once, _, jacobians = project(self.rig, camera, start, points)
         sigma = self._own_doubt.widened(sigma, observations.track, jacobians)
         velocity = jacobians @ twist
@@ -246,10 +243,10 @@ class Estimator:
         """
         self.map, self._caveat, self._view = surface_map, caveat, len(surface_map)
         self._own_doubt, self._claim = OwnDoubt(surface_map), Claim(len(self.rig))
-        self._accepted, self._first, self._first_bias, self._bends = 0, None, None, False
+        self._map_error = MapError(surface_map)
+        self._accepted, self._first, self._first_bias, self._bends, self._unlearned = 0, None, None, False, None
         self._smoother.reset()
         self._detector, self._warp = MotionDetector(surface_map.points.mean(0)), WarpFilter(surface_map)
-        self._map_error = MapError(surface_map)
         self.health.begin()
         self._predictor = Predictor(surface_map.points)
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
@@ -283,8 +280,12 @@ class Estimator:
     def learn(self) -> None:
         """Take what the last accepted fit tells of the cameras: no pose waits for it, but the next fit needs it."""
         if self._unlearned is not None:
-            (fit, seen, seconds), self._unlearned = self._unlearned, None
-            assert fit.solution.shared is not None
+            (fit, seen, seconds, sound), self._unlearned = self._unlearned, None
+            assert fit.solution.shared is not None and self.map is not None
+            exposed, on = self.as_exposed(fit.solution.base_from_surface, fit.twist), landmarks(self.map, self._warp)
+            self.health.bumps.watch(self.rig, seen, on[seen.track], exposed, fit.solution.jacobians)
+            if not sound:
+                return
             if not self._bends or not self.deforms:
                 self.cameras.learn(fit.solution.shared, seconds, fit.clear)
                 self._clocks.keep(fit.stamp, self.cameras)
@@ -293,18 +294,15 @@ class Estimator:
 
     def accept(self, fit: Fit, observations: Observations) -> SurfacePose:
         """Take a measured fit into the window and give the pose."""
-        assert fit.measured and fit.solution.shared is not None and self.map is not None
+        assert fit.measured and fit.solution.shared is not None
         if self._pose is not None:
             sound = self.sound(fit)
-            self._unlearned = (fit, observations, fit.stamp - self._pose.stamp) if sound else None
+            self._unlearned = fit, observations, fit.stamp - self._pose.stamp, sound
             if self._warp is not None and sound and self._smeared(fit) < SHARP:
                 sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
                 self._warp.learn(observations, fit.solution, sigma, fit.twist, self.cameras.delays.sigma)
         self._accepted += 1
         self._detector(fit.stamp, fit.solution.base_from_surface, fit.noise)
-        points = self.map.points if self._warp is None else self._warp.points(self.map)
-        exposed, on = self.as_exposed(fit.solution.base_from_surface, fit.twist), points[observations.track]
-        self.health.bumps.watch(self.rig, observations, on, exposed, fit.solution.jacobians)
         self._heed(fit)
         lasting = fit.lasting + self._calibration(fit)
         seen = Measurement(

@@ -191,3 +191,8 @@ def _seen(
     dull = np.linalg.inv(np.eye(count) + BIAS**2 * information)
     information = dull @ information
     return np.asarray((information + information.T) / 2), np.asarray(dull @ gradient)
+
+
+def landmarks(surface_map: SurfaceMap, warp: WarpFilter | None) -> Array:
+    """Points (N, 3), mm, of a map in the surface frame, as a warp has moved them; without one, as they were mapped."""
+    return surface_map.points if warp is None else warp.points(surface_map)
