@@ -10,7 +10,7 @@ its axis looks like the latter, as 4 mm of 400 are one percent.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,15 +46,16 @@ class BumpSettings:
     calm: float = 0.5
 
 
+@dataclass(slots=True, eq=False)
 class _Sums:
     """Information (4, 4) and pull (4,) of one camera's numbers, fading."""
 
-    def __init__(self) -> None:
-        self.information, self.pull = np.zeros((NUMBERS, NUMBERS)), np.zeros(NUMBERS)
+    information: Array = field(default_factory=lambda: np.zeros((NUMBERS, NUMBERS)))
+    pull: Array = field(default_factory=lambda: np.zeros(NUMBERS))
 
     def take(self, information: Array, pull: Array, share: float) -> None:
-        self.information += share * (information - self.information)
-        self.pull += share * (pull - self.pull)
+        self.information = self.information + share * (information - self.information)
+        self.pull = self.pull + share * (pull - self.pull)
 
     def numbers(self) -> Array:
         return np.asarray(np.linalg.solve(self.information + RIDGE * np.eye(NUMBERS), self.pull))
@@ -75,15 +76,21 @@ class BumpDetector:
         self._spread = np.zeros(count)  # px^2, usual square of what is off
         self._since = np.full(count, np.nan)  # s, since when a camera is off, or on again
         self._first, self._stamp, self._count = np.nan, np.nan, 0
+        self._odd: frozenset[int] = frozenset()
 
-    def watch(self, rig: Rig, seen: Observations, points: Array, exposed: Array, jacobians: Array) -> None:
+    def watch(
+        self, rig: Rig, seen: Observations, points: Array, exposed: Array, jacobians: Array, odd: frozenset[int]
+    ) -> None:
         """Take an accepted frame set.
 
         points: (N, 3) mm, surface, of the tracks. exposed: (C, 4, 4) base_from_surface when each camera exposed.
-        jacobians: (N, 2, 6) px of the pose.
+        jacobians: (N, 2, 6) px of the pose. odd: cameras so far off that the pose is without them: what they
+        showed is forgotten once they are back.
         """
         if seen.stamp - self._stamp < EVERY:
             return
+        self._forget(self._odd - odd)
+        self._odd = odd
         parts = picture_changes(rig, seen, points, exposed, jacobians)
         if np.isnan(self._first):
             self._first = self._stamp = seen.stamp
@@ -110,6 +117,13 @@ class BumpDetector:
             for camera, part in parts.items():
                 self._spread[camera] += share * (moved[camera] ** 2 - self._spread[camera])
                 self._usual[camera].take(part.information, part.pull, share)
+
+    def _forget(self, cameras: frozenset[int]) -> None:
+        """Take it that cameras show again what is usual of them."""
+        for camera in cameras:
+            self.bumped.pop(camera, None)
+            self._since[camera] = np.nan
+            self._quick[camera] = replace(self._usual[camera])
 
     def _decide(self, camera: int, moved: float, clear: bool) -> None:
         """Whether a camera counts as bumped from now on. moved: px. clear: whether it explains more than the others."""

@@ -283,7 +283,7 @@ class Estimator:
             (fit, seen, seconds, sound), self._unlearned = self._unlearned, None
             assert fit.solution.shared is not None and self.map is not None
             exposed, on = self.as_exposed(fit.solution.base_from_surface, fit.twist), landmarks(self.map, self._warp)
-            self.health.bumps.watch(self.rig, seen, on[seen.track], exposed, fit.solution.jacobians)
+            self.health.bumps.watch(self.rig, seen, on[seen.track], exposed, fit.solution.jacobians, fit.odd)
             if not sound:
                 return
             if not self._bends or not self.deforms:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +22,7 @@ from hardware.calibration.live import Waving, devices_named
 from hardware.cli import main
 from hardware.rig_file import read_rig
 from perception.frames import Image
+from tests.started import started
 from tests.streams import CLOCK, HttpCamera, served
 
 SIZE, RATE = (640, 480), 8.0
@@ -75,8 +73,8 @@ def test_live_cameras_are_calibrated_from_what_they_showed(
     out = tmp_path / "rig.toml"
     command = ["calibrate", "cameras", *files, "--board", str(board_file(tmp_path)), "-o", str(out), "--limit-mm", "1"]
     end = CLOCK.now() + SOON
-    while (code := main(command)) == 2:  # too few pictures on a busy machine: the next run goes on
-        assert "pictures that show the board" in capsys.readouterr().err and CLOCK.now() < end
+    while (code := main(command)) == 2:  # too few pictures, or too few corners in them: the next run goes on
+        assert "allowed" in capsys.readouterr().err and CLOCK.now() < end
     assert code == 0
     said = capsys.readouterr()
     assert "camera 2: focal length" in said.out
@@ -93,8 +91,7 @@ def test_what_was_found_is_kept_after_ctrl_c_and_the_next_run_goes_on(
     out, store = tmp_path / "rig.toml", tmp_path / "rig.corners.npz"
     urls, file = [camera.url for camera in cameras], board_file(tmp_path)
     command = ["calibrate", "cameras", *urls, "--board", str(file), "-o", str(out)]
-    program = [sys.executable, "-m", "hardware.cli", *command]
-    run = subprocess.Popen(program, stderr=subprocess.PIPE, text=True, env=os.environ)
+    run = started(command)
     assert run.stderr is not None
     assert "the board" in run.stderr.readline()  # where to hold it, or how to tilt it
     run.send_signal(signal.SIGINT)

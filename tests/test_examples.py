@@ -26,7 +26,7 @@ def test_a_folder_of_pictures_is_tracked(tmp_path: Path, capsys: pytest.CaptureF
     write_session(tmp_path / "s", seconds=0.7, rate=10.0, seed=2)
     run("track_videos.py", tmp_path / "s")
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 7 and "tracking" in lines[-1]
+    assert len(lines) == 7 and "TRACKING" in lines[-1]
     assert 0 < float(lines[-1].split("+-")[1]) < 0.2  # mm
 
 

@@ -17,7 +17,9 @@ ROOT = Path(__file__).parents[1]
 def test_an_installation_carries_every_folder_of_data() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     carried = project["tool"]["setuptools"]["data-files"]
-    assert carried == {f"share/stillbed/{f.name}": [f"data/{f.name}/*"] for f in sorted((ROOT / "data").iterdir())}
+    assert carried == {
+        f"share/stillbed/{f.name}": [f"data/{f.name}/*"] for f in (ROOT / "data").iterdir() if f.is_dir()
+    }
 
 
 def test_a_path_of_the_documents_leads_to_the_shipped_file_from_anywhere(

@@ -32,6 +32,7 @@ LEVEL, LEAST_LEVEL, NOISES = (
 LEAST_DEPTH, LEAST_AREA = 0.4, 10.0  # mm and mm^2: less is a pore or a crease
 SLACK = 0.02  # mm: an outline is moved less by being made simple; a twentieth of a fine bead
 BULGE = 0.25  # a depression whose volume is a smaller part of a bulge's: the scan is inside out
+FEWEST_NODES = 30  # of the coarse map that are surface: of fewer no skin can be told
 LEAST_PIECE = 1.0  # mm^2: of an outline, and of an island of skin inside it
 OPENING = 0.5  # mm: creases narrower than twice that are not part of a wound
 ROUNDS = 3  # of outline and restored skin: each is found by the other
@@ -152,6 +153,10 @@ def _searched(first: HeightMap, where: object) -> tuple[MultiPolygon, int]:
     """The largest depression, and how many others there are."""
     coarse = first.grid.coarser(max(COARSE, first.grid.step))
     known = downsampled(first.grid, coarse, first.known.astype(float)) > 0.99
+    if known.sum() < FEWEST_NODES:
+        width, height = first.grid.step * (np.array(first.grid.shape[::-1]) - 1)
+        allowed = "a scan of a wound and the skin about it, in mm: --unit says so where it is in another unit"
+        raise InputError(where, "scan", f"{width:.3g} x {height:.3g} mm that hardly hang together", allowed)
     surface, _, scatter = skin_nodes(coarse, downsampled(first.grid, coarse, first.heights), known)
     depth = np.where(first.known, upsampled(first.grid, coarse, surface) - first.heights, 0.0)
     level = max(LEAST_DEPTH, 4 * scatter)
