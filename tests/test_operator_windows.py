@@ -45,9 +45,10 @@ class Socket:
                 said = json.loads(message.data)
             else:
                 raise ConnectionError(f"{message.type} {self.socket.close_code}")
-            if "bundle" in said and self._acknowledges:
+            empty = said.get("view", "") is None  # it opened before anything was to be seen
+            if "bundle" in said and (self._acknowledges or empty):
                 await self.socket.send_str(json.dumps({"shown": said["bundle"]}))
-            if said["kind"] == kind and said.get("view", "") is not None:
+            if said["kind"] == kind and not empty:
                 return said
 
     async def ask(self, wish: Wish, turn: int, tag: int = 1) -> None:
