@@ -67,6 +67,7 @@ def board_file(folder: Path) -> Path:
     return folder / "board.toml"
 
 
+@pytest.mark.slow  # how much is seen in how long depends on the machine
 def test_live_cameras_are_calibrated_from_what_they_showed(
     files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -85,6 +86,7 @@ def test_live_cameras_are_calibrated_from_what_they_showed(
     assert (tmp_path / "rig.report.html").exists()
 
 
+@pytest.mark.slow  # how much is seen in how long depends on the machine
 def test_what_was_found_is_kept_after_ctrl_c_and_the_next_run_goes_on(
     cameras: list[HttpCamera], tmp_path: Path
 ) -> None:
