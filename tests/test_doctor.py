@@ -12,7 +12,8 @@ import pytest
 from hardware.cameras.identity import Device
 from hardware.cli import main
 from hardware.clock import SimClock
-from hardware.doctor import devices, libraries, machine
+from hardware.doctor import devices, machine
+from hardware.doctor.libraries import REMEDY, failures, library_checks
 from hardware.operator.view import Check, Verdict
 
 PASS, WARN, FAIL = Verdict.PASS, Verdict.WARN, Verdict.FAIL
@@ -39,14 +40,14 @@ def test_each_library_that_fails_is_named_however_it_fails(tmp_path: Path, monke
     (tmp_path / "dies.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGILL)\n")
     (tmp_path / "hangs.py").write_text("import threading\nthreading.Event().wait()\n")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
-    found = libraries.failures(["json", "lacks_file", "dies", "csv", "hangs", "re"], patience=3)
+    found = failures(["json", "lacks_file", "dies", "csv", "hangs", "re"], patience=3)
     assert list(found) == ["lacks_file", "dies", "hangs"]
     assert "libGL.so.1" in found["lacks_file"] and "signal 4" in found["dies"] and "longer than 3 s" in found["hangs"]
 
 
 def test_a_library_that_is_not_installed_fails_with_a_remedy() -> None:
-    (check,) = libraries.library_checks(["no-such-library"])
-    assert check == Check("no-such-library", FAIL, "not installed", libraries.REMEDY)
+    (check,) = library_checks(["no-such-library"])
+    assert check == Check("no-such-library", FAIL, "not installed", REMEDY)
 
 
 def system(root: Path, flags: str, free_kb: int) -> Path:
