@@ -157,16 +157,9 @@ def frame_change(keyframes: list[KeyFrame], refined: Array, skew: float) -> Arra
 
 def single_fit(rig: Rig, points: Array, seen: Observations, camera: int, near: Array) -> PoseFit:
     """The fit to one camera's tracks alone, at its own instant, held to `near` (4, 4) where it sees little."""
-    mine = seen.camera == camera
+    mine = seen.only(seen.camera == camera)
     return solve_pose(
-        rig,
-        seen.camera[mine],
-        points[seen.track[mine]],
-        seen.pixels[mine],
-        seen.sigma[mine],
-        near,
-        scales=(4.0, 1.0),
-        prior=SINGLE,
+        rig, mine.camera, points[mine.track], mine.pixels, mine.sigma, near, scales=(4.0, 1.0), prior=SINGLE
     )
 
 

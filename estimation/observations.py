@@ -27,6 +27,10 @@ class Observations:
     def __len__(self) -> int:
         return len(self.camera)
 
+    def only(self, rows: NDArray[np.bool_]) -> Observations:
+        """Those of the rows (N,)."""
+        return Observations(self.stamp, self.camera[rows], self.track[rows], self.pixels[rows], self.sigma[rows])
+
 
 def no_observations(stamp: float) -> Observations:
     """A frame set in which no track was found."""

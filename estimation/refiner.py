@@ -227,4 +227,4 @@ def _inliers(rig: Rig, surface_map: SurfaceMap, near: Array, observations: Obser
         agrees = single_fit(rig, surface_map.points, seen, int(c), near).weights > 0.2
         if agrees.sum() >= max(LEAST_OF_CAMERA, 0.5 * mine.sum()):
             keep[mine] = agrees
-    return Observations(seen.stamp, seen.camera[keep], seen.track[keep], seen.pixels[keep], seen.sigma[keep])
+    return seen.only(keep)

@@ -210,6 +210,14 @@ def orthonormalise(transform: ArrayLike) -> Array:
     return make(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt, transform[:3, 3])
 
 
+def rigid_from_points(source: Array, target: Array) -> Array:
+    """The motion (4, 4) that carries points (N, 3) onto others in least squares (Umeyama 1991, without scale)."""
+    a, b = source.mean(0), target.mean(0)
+    u, _, vt = np.linalg.svd((target - b).T @ (source - a))
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    return make(rotation, b - rotation @ a)
+
+
 def quaternion_from_rotation(rotation: ArrayLike) -> Array:
     """Unit quaternions (..., 4) [qx qy qz qw] of rotations (..., 3, 3) (Bar-Itzhack, largest of four candidates)."""
     r = np.asarray(rotation, float)

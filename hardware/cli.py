@@ -16,6 +16,7 @@ from hardware.arm_commands import add_arm
 from hardware.bench.command import add_bench
 from hardware.calibration.commands import add_calibrate
 from hardware.cameras.command import add_cameras
+from hardware.comparing.command import add_compare
 from hardware.doctor.command import add_doctor
 from hardware.live.command import add_init, add_live
 from hardware.methods import MAP, METHODS
@@ -91,6 +92,7 @@ def parser() -> argparse.ArgumentParser:
     _add_simulate(commands)
     _add_track(commands)
     add_smooth(commands)
+    add_compare(commands)
     add_segment(commands)
     add_plan(commands)
     add_live(commands)

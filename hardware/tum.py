@@ -76,12 +76,12 @@ def checked_rows(where: object, rows: Iterable[tuple[str, Sequence[float]]]) -> 
     return np.array(checked, float).reshape(-1, 8)
 
 
-def row_from_words(where: object, what: str, words: Sequence[str]) -> list[float]:
-    """The numbers in words; InputError (where, what) unless they are numbers."""
+def row_from_words(where: object, what: str, words: Sequence[str], allowed: str = ALLOWED) -> list[float]:
+    """The numbers in words; InputError (where, what, with `allowed`) unless they are numbers."""
     try:
         return [float(word) for word in words]
     except ValueError:
-        raise InputError(where, what, " ".join(words), ALLOWED) from None
+        raise InputError(where, what, " ".join(words), allowed) from None
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:

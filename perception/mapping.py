@@ -198,7 +198,7 @@ class Mapping:
         self, matcher: Matcher, fit: Fit, observations: Observations, pyramids: dict[int, Pyramid], warp: Warp | None
     ) -> Look:
         seen, kept = observations, fit.inlier
-        inliers = Observations(seen.stamp, seen.camera[kept], seen.track[kept], seen.pixels[kept], seen.sigma[kept])
+        inliers = seen.only(kept)
         single = self._single(matcher, fit, observations, pyramids)
         images = {c: p[0] for c, p in pyramids.items()}
         heads, pose, doubt = self._keep_out.masks, fit.solution.base_from_surface, fit.covariance + fit.lasting

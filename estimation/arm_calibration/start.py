@@ -22,14 +22,6 @@ TRIES = 300  # of three places drawn
 UNDISTORTED = 12  # rounds of fixed-point iteration: to 1e-4 px for plain webcams
 
 
-def rigid(source: Array, target: Array) -> Array:
-    """The motion (4, 4) that carries points (N, 3) onto others in least squares (Umeyama 1991, without scale)."""
-    a, b = source.mean(0), target.mean(0)
-    u, _, vt = np.linalg.svd((target - b).T @ (source - a))
-    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    return se3.make(rotation, b - rotation @ a)
-
-
 def robust_rigid(
     source: Array, target: Array, near: float, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -39,16 +31,17 @@ def robust_rigid(
         three = rng.choice(len(source), 3, replace=False)
         spread = np.linalg.svd(source[three] - source[three].mean(0), compute_uv=False)[1]
         if spread > near:
-            off = np.linalg.norm(se3.transform_points(rigid(source[three], target[three]), source) - target, axis=1)
+            motion = se3.rigid_from_points(source[three], target[three])
+            off = np.linalg.norm(se3.transform_points(motion, source) - target, axis=1)
             if (off < near).sum() > best.sum():
                 best = off < near
     if best.sum() >= FEWEST:
-        found = rigid(source[best], target[best])
+        found = se3.rigid_from_points(source[best], target[best])
         best = np.linalg.norm(se3.transform_points(found, source) - target, axis=1) < near
     if best.sum() < FEWEST:
         allowed = f"{FEWEST} or more that agree to {near:g} mm: is the needle in view, the rig right, the scene still?"
         raise InputError("arm calibration", "places at which arm and cameras agree", int(best.sum()), allowed)
-    return rigid(source[best], target[best]), best
+    return se3.rigid_from_points(source[best], target[best]), best
 
 
 def seen_places(sightings: Sightings, rig: Rig) -> tuple[NDArray[np.int64], Array]:

@@ -10,7 +10,6 @@ import numpy as np
 from estimation import se3
 from estimation.arm_calibration.fit import PLACE, TIP, TOOL
 from estimation.arm_calibration.moves import check_places, check_turns
-from estimation.arm_calibration.start import rigid
 from estimation.se3 import Array
 
 
@@ -54,7 +53,8 @@ def fit_touched(arm_from_nozzle: Array, points: Array, sigma: Array, tool: Array
 
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3 * len(points)), keys, error))
-    values.insert(PLACE, gtsam.Pose3(rigid(se3.transform_points(arm_from_nozzle, tool[None])[:, 0], points)))
+    tips = se3.transform_points(arm_from_nozzle, tool[None])[:, 0]
+    values.insert(PLACE, gtsam.Pose3(se3.rigid_from_points(tips, points)))
     if seek_tool:
         values.insert(TIP, np.asarray(tool, float))
         graph.add(gtsam.PriorFactorVector(TIP, tool, gtsam.noiseModel.Isotropic.Sigma(3, TOOL)))

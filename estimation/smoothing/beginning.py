@@ -85,19 +85,11 @@ def _first(rig: Rig, data: Packed, points: Array, told: bool) -> tuple[int, Arra
         if not told:
             points[laid.tracks] = laid.map.points
             return frame, laid.base_from_surface
-        mine = _aligned(points[laid.tracks], laid.map.points)
+        mine = se3.rigid_from_points(points[laid.tracks], laid.map.points)
         start = laid.base_from_surface @ mine
         found = _fit(rig, seen, points, start)
         return frame, start if found is None else found
     raise InputError("observations", "tracks", "no frame set", f"one in which two cameras see {LEAST} landmarks alike")
-
-
-def _aligned(from_points: Array, to_points: Array) -> Array:
-    """to_from (4, 4), the rigid motion that takes points (N, 3) nearest to others (Kabsch)."""
-    a, b = from_points.mean(0), to_points.mean(0)
-    u, _, vt = np.linalg.svd((to_points - b).T @ (from_points - a))
-    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    return se3.make(rotation, b - rotation @ a)
 
 
 def _fit(rig: Rig, seen: Observations, points: Array, start: Array) -> Array | None:
@@ -105,15 +97,9 @@ def _fit(rig: Rig, seen: Observations, points: Array, start: Array) -> Array | N
     usable = np.isfinite(points[seen.track, 0])
     if usable.sum() < LEAST:
         return None
+    known = seen.only(usable)
     fit = solve_pose(
-        rig,
-        seen.camera[usable],
-        points[seen.track[usable]],
-        seen.pixels[usable],
-        seen.sigma[usable],
-        start,
-        scales=(8.0, 2.0),
-        iterations=4,
+        rig, known.camera, points[known.track], known.pixels, known.sigma, start, scales=(8.0, 2.0), iterations=4
     )
     if (fit.weights > 0.2).sum() < AGREED or not np.isfinite(fit.base_from_surface).all():
         return None

@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.errors import InputError
 from estimation.rig import Rig, distort, ideal_pixels
 from estimation.se3 import Array, quaternion_from_rotation, transform_points
 from estimation.smoothing.smoothed import Instants, Smoothed
+from hardware.checks import read_csv
 from hardware.pose_file import TANGENT
 from hardware.session import Session
+from hardware.tum import checked_rows, row_from_words, trajectory_from_rows
 from perception.frames import Image
 
 COLUMNS = ("stamp_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
@@ -34,6 +37,25 @@ def write_instants(path: Path, instants: Instants) -> None:
         for stamp, row, *parts in zip(instants.stamps, numbers, *spreads, strict=True):
             claims = (f"{v:.6g}" for part in parts for v in part)
             writer.writerow([f"{stamp:.6f}", *(f"{v:.9f}" for v in row), *claims])
+
+
+def read_instants(path: Path) -> tuple[Array, Array, Array]:
+    """Stamps (N,), poses (N, 4, 4), covariances (N, 6, 6) of a smoothed.csv; InputError names what is wrong."""
+    rows, count = read_csv(path), len(COLUMNS)
+    width = count + len(TWIST)
+    lines = [(f"line {number}", words) for number, words in rows[1:] if words]
+    for what, words in lines:
+        if len(words) != len(rows[0][1]):
+            raise InputError(path, what, f"{len(words)} columns", f"{len(rows[0][1])} columns")
+    places = checked_rows(path, ((what, row_from_words(path, what, words[:count])) for what, words in lines))
+    if not len(places):
+        raise InputError(path, "poses", "none", "at least one line")
+    covariance = np.empty((len(lines), 6, 6))
+    for k, (what, words) in enumerate(lines):
+        claims = row_from_words(path, f"{what}: covariance", words[width : width + len(UPPER[0])], "21 numbers")
+        covariance[k][UPPER] = covariance[k].T[UPPER] = claims
+    trajectory = trajectory_from_rows(places, exact=False)
+    return trajectory.stamps, trajectory.base_from_surface, covariance
 
 
 def write_map(path: Path, smoothed: Smoothed, session: Session) -> None:
