@@ -92,9 +92,12 @@ class SurfacePose:
         if self.forecast is None:
             return np.asarray(self.base_from_surface @ se3.exp(self.twist * ahead[:, None]))
         within = np.clip(ahead, 0.0, self.forecast.end)
-        increments, rates = self.forecast.at(within)
-        speed = np.where((ahead < 0)[:, None], self.twist, body_rate(increments, rates))
-        return np.asarray(self.base_from_surface @ se3.exp(increments) @ se3.exp(speed * (ahead - within)[:, None]))
+        foreseen = np.asarray(self.base_from_surface @ se3.exp(self.forecast.at(within)[0]))
+        if np.array_equal(within, ahead):
+            return foreseen
+        beyond = body_rate(*self.forecast.at(np.array([self.forecast.end])))
+        speed = np.where((ahead < 0)[:, None], self.twist, beyond)
+        return np.asarray(foreseen @ se3.exp(speed * (ahead - within)[:, None]))
 
     def _foreseen(self, stamp: float, forecast: Forecast) -> SurfacePose:
         """The pose at `stamp`, s, within its forecast."""

@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # the axes after each and before each
 _SMALL = 1e-4  # rad: below, the fourth-order series is exact to 1e-16 relative
+_TINY = 1e-100  # rad: so small a turn, and none, are the same to every digit, its square's among them
 
 
 def hat(v: ArrayLike) -> Array:
@@ -31,23 +32,42 @@ def cross(a: Array, b: Array) -> Array:
     return np.asarray(a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT])
 
 
-def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
-    """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 with their series near zero."""
-    small = angle < _SMALL
-    a = np.where(small, 1.0, angle)
-    a2 = angle**2
-    s = np.where(small, 1 - a2 / 6, np.sin(a) / a)
-    c = np.where(small, 0.5 - a2 / 24, 2 * np.sin(a / 2) ** 2 / a**2)
-    d = np.where(angle < 0.05, 1 / 6 - a2 / 120 + a2**2 / 5040 - a2**3 / 362880, (a - np.sin(a)) / a**3)
-    return s, c, d
+def _coefficients(angle: Array) -> tuple[Array, Array]:
+    """sin(a)/a and (1 - cos a)/a^2, which lose nothing near zero as they stand."""
+    a = np.maximum(angle, _TINY)
+    return np.sin(a) / a, 2 * (np.sin(a / 2) / a) ** 2
+
+
+def _third(a2: Array) -> Array:
+    """(a - sin a)/a^3, with its series near zero, of a^2."""
+    series = 1 / 6 - a2 * (1 / 120 - a2 * (1 / 5040 - a2 / 362880))
+    if a2.max(initial=0.0) < 0.05**2:
+        return np.asarray(series)
+    a = np.sqrt(a2)
+    return np.where(a < 0.05, series, (a - np.sin(a)) / np.maximum(a2 * a, _TINY))
 
 
 def exp_rotation(w: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad (Rodrigues)."""
     w = np.asarray(w, float)
-    s, c, _ = _coefficients(np.linalg.norm(w, axis=-1))
-    h = hat(w)
-    return np.asarray(np.eye(3) + s[..., None, None] * h + c[..., None, None] * (h @ h))
+    out = np.empty((*w.shape, 3))
+    _turn(w[..., 0], w[..., 1], w[..., 2], out)
+    return out
+
+
+def _turn(x: Array, y: Array, z: Array, out: Array) -> tuple[Array, Array]:
+    """cos(a) I + s hat(w) + c w w^T into out (..., 3, 3), of w = x y z (...) and its angle a; c and a^2, each (...).
+
+    By components, as numpy takes a hundred numbers at once in the time of three.
+    """
+    a2 = x * x + y * y + z * z
+    s, c = _coefficients(np.sqrt(a2))
+    sx, sy, sz, cx, cy, cos = s * x, s * y, s * z, c * x, c * y, 1 - c * a2
+    xy, xz, yz = cx * y, cx * z, cy * z
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = cos + cx * x, xy - sz, xz + sy
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = xy + sz, cos + cy * y, yz - sx
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = xz - sy, yz + sx, cos + c * z * z
+    return c, a2
 
 
 def log_rotation(rotation: ArrayLike) -> Array:
@@ -65,12 +85,16 @@ def exp(xi: ArrayLike) -> Array:
     xi = np.asarray(xi, float)
     if xi.ndim == 1:
         return _exp_one(xi)
-    w, v = xi[..., :3], xi[..., 3:]
-    s, c, d = (k[..., None, None] for k in _coefficients(np.linalg.norm(w, axis=-1)))
-    h = hat(w)
-    square = h @ h
-    left = np.eye(3) + c * h + d * square
-    return make(np.eye(3) + s * h + c * square, (left @ v[..., None])[..., 0])
+    x, y, z, tx, ty, tz = (xi[..., k] for k in range(6))
+    out = np.zeros((*xi.shape[:-1], 4, 4))
+    c, a2 = _turn(x, y, z, out[..., :3, :3])
+    d = _third(a2)
+    e, f = 1 - d * a2, d * (x * tx + y * ty + z * tz)  # of the left Jacobian: e I + c hat(w) + d w w^T
+    out[..., 0, 3] = e * tx + c * (y * tz - z * ty) + f * x
+    out[..., 1, 3] = e * ty + c * (z * tx - x * tz) + f * y
+    out[..., 2, 3] = e * tz + c * (x * ty - y * tx) + f * z
+    out[..., 3, 3] = 1.0
+    return out
 
 
 def _exp_one(xi: Array) -> Array:
@@ -103,7 +127,7 @@ def log(transform: ArrayLike) -> Array:
         return _log_one(transform)
     w = log_rotation(transform[..., :3, :3])
     angle = np.linalg.norm(w, axis=-1)
-    s, c, _ = _coefficients(angle)
+    s, c = _coefficients(angle)
     small = angle < 0.05
     e = np.where(
         small, 1 / 12 + angle**2 / 720 + angle**4 / 30240, (1 - s / (2 * c)) / np.where(small, 1.0, angle) ** 2
@@ -224,19 +248,14 @@ def quaternion_from_rotation(rotation: ArrayLike) -> Array:
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     a, b, c = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
     d, e, f = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
-    candidates = np.stack(
-        [
-            np.stack([1 + xx - yy - zz, d, e, a], -1),
-            np.stack([d, 1 - xx + yy - zz, f, b], -1),
-            np.stack([e, f, 1 - xx - yy + zz, c], -1),
-            np.stack([a, b, c, 1 + xx + yy + zz], -1),
-        ],
-        -2,
-    )
-    norms = np.linalg.norm(candidates, axis=-1)
-    best = np.argmax(norms, axis=-1)[..., None]
-    chosen = np.take_along_axis(candidates, best[..., None], -2)[..., 0, :]
-    return np.asarray(chosen / np.take_along_axis(norms, best, -1))
+    products = np.empty((*xx.shape, 4, 4))  # 4 q q^T
+    products[..., 0, 0], products[..., 0, 1], products[..., 0, 2], products[..., 0, 3] = 1 + xx - yy - zz, d, e, a
+    products[..., 1, 0], products[..., 1, 1], products[..., 1, 2], products[..., 1, 3] = d, 1 - xx + yy - zz, f, b
+    products[..., 2, 0], products[..., 2, 1], products[..., 2, 2], products[..., 2, 3] = e, f, 1 - xx - yy + zz, c
+    products[..., 3, 0], products[..., 3, 1], products[..., 3, 2], products[..., 3, 3] = a, b, c, 1 + xx + yy + zz
+    best = np.argmax(np.diagonal(products, axis1=-2, axis2=-1), axis=-1)
+    chosen = np.take_along_axis(products, best[..., None, None], -2)[..., 0, :]
+    return np.asarray(chosen / np.linalg.norm(chosen, axis=-1, keepdims=True))
 
 
 def rotation_from_quaternion(quaternion: ArrayLike) -> Array:

@@ -52,8 +52,8 @@ def demand(arm: SimpleArm, pose: SurfacePose, curve: Curve, grid: Stations, begi
     asked = limited_axes(arm, np.stack([now @ nozzle, base @ nozzle[1]])).reshape(2, 3, count, -1)
     first, second = _differences(asked[0], STEP)
     turn = arm.arm_from_base[:3, :3] @ now[:, :3, :3]
-    first[:, :3] = (turn @ curve.slope(places)[..., None])[..., 0]
-    second[:, :3] = (turn @ curve.curvature(places)[..., None])[..., 0]
+    along = turn @ np.stack(curve.derivatives(places), axis=-1)
+    first[:, :3], second[:, :3] = along[..., 0], along[..., 1]
     moved = maximum_filter1d(np.abs(np.stack(_differences(asked[1], PAUSE))), 2 * AROUND + 1, axis=1)
     by_move, by_turn = most_change(arm, asked[0, 1])
     bend = by_move * grid.bend[:, None] + by_turn * grid.swing[:, None]

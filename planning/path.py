@@ -78,9 +78,19 @@ def check_path(path: Path, where: object = "path", lines: Sequence[int] | None =
 
 def lengths(surface_from_nozzle: Array) -> Array:
     """Lengths (N-1,), mm, of the ways between poses (N, 4, 4): the longer of the move and the turn times LEVER."""
-    move = np.linalg.norm(np.diff(surface_from_nozzle[:, :3, 3], axis=0), axis=1)
-    turn = se3.angle_of(np.swapaxes(surface_from_nozzle[:-1, :3, :3], -1, -2) @ surface_from_nozzle[1:, :3, :3])
-    return np.asarray(np.maximum(move, LEVER * turn))
+    return lengths_of(*steps(surface_from_nozzle))
+
+
+def steps(surface_from_nozzle: Array) -> tuple[Array, Array]:
+    """Moves (N-1, 3), mm, and turns (N-1, 3), body vectors in rad, between poses (N, 4, 4)."""
+    rotations = surface_from_nozzle[:, :3, :3]
+    turns = se3.log_rotation(np.swapaxes(rotations[:-1], -1, -2) @ rotations[1:])
+    return np.diff(surface_from_nozzle[:, :3, 3], axis=0), turns
+
+
+def lengths_of(moves: Array, turns: Array) -> Array:
+    """`lengths` of ways by their moves (M, 3), mm, and turns (M, 3), rad."""
+    return np.asarray(np.maximum(np.linalg.norm(moves, axis=1), LEVER * np.linalg.norm(turns, axis=1)))
 
 
 def _check_lengths(path: Path, where: object) -> None:

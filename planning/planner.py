@@ -159,7 +159,7 @@ class Planner:
     def _nozzle(self, pose: SurfacePose, now: float) -> Array:
         """surface_from_nozzle (4, 4) as commanded, on the surface as it is at `now`, s."""
         base_from_nozzle = nozzle_from_axes(self._arm, self._follower.position)
-        nozzle = se3.inverse(pose.predict(now).base_from_surface) @ base_from_nozzle
+        nozzle = se3.inverse(pose.base_at(np.array([now]))[0]) @ base_from_nozzle
         return nozzle if pose.warp is None else pose.warp.uncarry(nozzle[None])[0]
 
     def _retreat(self, pose: SurfacePose, now: float) -> Command:

@@ -11,7 +11,7 @@ from estimation.se3 import Array
 from planning.curve import Curve
 
 SHORTEST_BLEND = 1e-9  # mm: beside a checkpoint where nothing changes there is none
-POINTS = 30  # evenly spread grid points of one horizon: toppra takes some 20 us for each
+POINTS = 30  # evenly spread grid points of one horizon: some 15 us for each
 
 
 @dataclass(frozen=True, slots=True, eq=False)
