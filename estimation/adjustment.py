@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.camera_errors import Delays
+from estimation.heap import give_back
 from estimation.local_surface import smooth_normals
 from estimation.observations import Observations
 from estimation.pose_solver import PoseFit, project, solve_pose
@@ -84,6 +85,14 @@ def adjust(
     Base and surface swap roles (X = surface_from_base), so that GTSAM's stock projection factor with
     body_P_sensor = base_from_camera is the measurement.
     """
+    adjusted = _adjusted(rig, surface_map, keyframes, delays, anchors)
+    give_back()
+    return adjusted
+
+
+def _adjusted(
+    rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], delays: Delays, anchors: Anchors | None
+) -> Adjusted | None:
     sightings = np.zeros(len(surface_map), int)
     for frame in keyframes:
         np.add.at(sightings, frame.observations.track, 1)

@@ -44,6 +44,11 @@ class History:
         """s from the oldest pose to the newest."""
         return float(self._stamps[self._end - 1] - self._stamps[self._first]) if self._end > self._first else 0.0
 
+    @property
+    def newest(self) -> Array:
+        """The last pose (4, 4); only where there is one."""
+        return np.asarray(self._poses[self._end - 1])
+
     def increments(self, poses: Array, stamps: Array) -> Array:
         """Tangent vectors (N, 6) from poses (N, 4, 4), or one (4, 4) for all, to where the surface was at stamps (N,).
 

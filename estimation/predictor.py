@@ -2,7 +2,8 @@
 
 Experts (hold, constant velocity and the `Members`) each say where it will be; the `Stack` weighs them by their delayed
 errors, and the `Intervals` say how far off that was. All are trained directly for each horizon, at samples STEP s apart
-that are interpolated from the poses as they come: the camera's rate and its jitter do not matter.
+that are interpolated from the poses as they come: the camera's rate and its jitter do not matter. What a `Surprise`
+spoils nobody learns from: no forecast could have known, and the next ones are not worse for it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from estimation import se3
 from estimation.calibration import Intervals
 from estimation.forecast import Forecast
 from estimation.history import History
@@ -20,6 +22,7 @@ from estimation.members import LAGS, LEVER, Members
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from estimation.stacking import Stack
+from estimation.surprise import Surprise
 
 HORIZONS = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # s
 STEP = 0.1  # s between samples learned from; a camera that is faster only predicts in between
@@ -33,7 +36,7 @@ EARLY = 1e-3  # s: stamps that are equal but for rounding
 
 @dataclass(slots=True)
 class _Sample:
-    """A past instant, and what was expected of it. known: horizons whose truth has come."""
+    """A past instant, and what was expected of it. known: horizons whose truth has come. spoilt: surprised since."""
 
     stamp: float
     pose: Array
@@ -42,6 +45,7 @@ class _Sample:
     expected: Array  # (H, 6)
     claimed: Array  # (H, N)
     known: int = 0
+    spoilt: bool = False
     moved: Array = field(default_factory=lambda: np.zeros((len(HORIZONS), 6)))
 
 
@@ -61,6 +65,8 @@ class Predictor:
         self._samples: deque[_Sample] = deque()
         self._judged = 0
         self._before = -np.inf
+        self._surprise = Surprise()
+        self._last: tuple[Forecast, Array] | None = None  # the newest forecast, and what was claimed of it, mm^2
 
     def add(self, pose: SurfacePose, lasting: Array | None = None) -> Forecast | None:
         """Learn from a measured pose, newer than those before, and forecast from it; None while too little is known.
@@ -72,6 +78,8 @@ class Predictor:
         if not 0 < pose.stamp - self._before <= GAP:
             self._history.clear()
             self._samples.clear()
+            self._last = None
+        self._heed(pose)
         self._before = pose.stamp
         self._history.add(pose.stamp, pose.base_from_surface)
         if self._history.reach < STEP / 2:
@@ -84,6 +92,17 @@ class Predictor:
         if self._history.reach < LAGS[-1] - EARLY:
             return None
         return self._forecast(pose, moved[len(due) :], np.zeros((6, 6)) if lasting is None else lasting)
+
+    def _heed(self, pose: SurfacePose) -> None:
+        """See whether a pose is where the one before foretold it."""
+        if self._last is None:
+            return
+        (forecast, claim), seconds = self._last, pose.stamp - self._before
+        foretold = self._history.newest @ se3.exp(forecast.at(np.array([seconds]))[0][0])
+        off = se3.log(se3.inverse(foretold) @ pose.base_from_surface) * SCALE
+        if self._surprise(off, seconds, float(HORIZONS[0]), claim):
+            for sample in self._samples:
+                sample.spoilt = True
 
     def _due(self, now: float) -> list[tuple[_Sample, int]]:
         """The samples and horizons whose time has come."""
@@ -102,8 +121,11 @@ class Predictor:
             self._samples.append(_Sample(pose.stamp, pose.base_from_surface, inputs, experts, expected, claimed))
         if self._judged < SETTLE:
             return None
-        covariances = spread / np.outer(SCALE, SCALE) + lasting + self._unseen(pose)
-        return Forecast(HORIZONS, expected / SCALE, covariances)
+        sudden = HORIZONS[:, None, None] ** 2 * self._surprise.velocity
+        covariances = (spread + sudden) / np.outer(SCALE, SCALE) + lasting + self._unseen(pose)
+        forecast = Forecast(HORIZONS, expected / SCALE, covariances)
+        self._last = forecast, spread[0] + lasting * np.outer(SCALE, SCALE)
+        return forecast
 
     def _unseen(self, pose: SurfacePose) -> Array:
         """Covariances (H, 6, 6) of what errors seen so far do not tell, fading as the first breaths are seen.
@@ -116,19 +138,21 @@ class Predictor:
 
     def _learn(self, due: list[tuple[_Sample, int]], moved: Array) -> None:
         """Compare what was expected with what came, (K, 6), horizon by horizon as its time comes."""
-        for batch in _once_each(due):
-            samples, k = [due[i][0] for i in batch], np.array([due[i][1] for i in batch])
-            truth = moved[batch]
-            each = range(len(batch))
-            self._stack.learn(k, np.stack([samples[i].experts[k[i]] for i in each]), truth)
-            error = truth - np.stack([samples[i].expected[k[i]] for i in each])
-            self._intervals.learn(k, error, np.stack([samples[i].claimed[k[i]] for i in each]))
         for (sample, j), vector in zip(due, moved, strict=True):
             sample.moved[j], sample.known = vector, j + 1
+        fair = [(sample, k) for sample, k in due if not sample.spoilt]
+        for batch in _once_each(fair):
+            samples, k = [fair[i][0] for i in batch], np.array([fair[i][1] for i in batch])
+            pairs = list(zip(samples, k.tolist(), strict=True))
+            truth = np.stack([sample.moved[j] for sample, j in pairs])
+            self._stack.learn(k, np.stack([sample.experts[j] for sample, j in pairs]), truth)
+            error = truth - np.stack([sample.expected[j] for sample, j in pairs])
+            self._intervals.learn(k, error, np.stack([sample.claimed[j] for sample, j in pairs]))
         while self._samples and self._samples[0].known == len(HORIZONS):
             sample = self._samples.popleft()
-            self._members.learn(sample.inputs, sample.experts[:, 1:], sample.moved)
-            self._judged += 1
+            if not sample.spoilt:
+                self._members.learn(sample.inputs, sample.experts[:, 1:], sample.moved)
+                self._judged += 1
 
 
 def _once_each(due: list[tuple[_Sample, int]]) -> Iterator[list[int]]:

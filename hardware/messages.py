@@ -207,13 +207,14 @@ def message_from_move(move: Move) -> Message:
         "feed": move.feed,
         "checkpoint": int(move.checkpoint),
         "extrude": bool(move.extrude),
+        "reason": move.reason,
     }
 
 
 def move_from_message(message: Message) -> Move:
     """A move from its message."""
-    axes = np.array(message["axes"], float)
-    return Move(message["stamp"], axes, message["feed"], message["checkpoint"], message["extrude"])
+    axes, reason = np.array(message["axes"], float), message.get("reason", "")
+    return Move(message["stamp"], axes, message["feed"], message["checkpoint"], message["extrude"], reason)
 
 
 def message_from_hold(hold: Hold) -> Message:

@@ -215,6 +215,7 @@ MOVE = _object(
     feed=_about(NUMBER, "mm/s"),
     checkpoint={"type": "integer"},
     extrude=FLAG,
+    reason=_about(TEXT, "why it brakes; empty of a move along the path"),
 )
 HOLD = _object("stillbed.Hold", "Stay, because of the reason", stamp=STAMP, duration=_about(NUMBER, "s"), reason=TEXT)
 BYTES = _object("stillbed.Bytes", "Bytes on the arm's link", stamp=STAMP, data=BASE64)

@@ -18,8 +18,8 @@ TURNING = 1e-3  # mm: a shorter move only turns; the arm gets its axes as binary
 class Move:
     """Go to the machine axes [X Y Z A B C] (6,), mm and rad, at `feed` mm/s; on the way to `checkpoint`. stamp: s.
 
-    Of a move that only turns, by no more than TURNING along X Y Z, `feed` is in degrees/s, as controllers of arms read
-    it.
+    reason: why it brakes, "" of one that goes where the path leads. Of a move that only turns, by no more than TURNING
+    along X Y Z, `feed` is in degrees/s, as controllers of arms read it.
     """
 
     stamp: float
@@ -27,6 +27,7 @@ class Move:
     feed: float
     checkpoint: int
     extrude: bool
+    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)

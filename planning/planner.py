@@ -259,13 +259,13 @@ class Planner:
             start = self._follower.position
             axes = self._follower.brake()
             if not isinstance(axes, str):
-                return self._move(now, start, axes, extrude=False)
+                return self._move(now, start, axes, extrude=False, reason=reason)
             self._follower.rest()
         return Hold(now, self._limits.pause, reason)
 
-    def _move(self, now: float, start: Array, axes: Array, extrude: bool) -> Move:
+    def _move(self, now: float, start: Array, axes: Array, extrude: bool, reason: str = "") -> Move:
         feed = min(feed_for(start, axes, self._tick), self._limits.feed)
-        return Move(now, axes, feed, self._checkpoint(), extrude)
+        return Move(now, axes, feed, self._checkpoint(), extrude, reason)
 
     def _checkpoint(self) -> int:
         """The checkpoint that the place on the path leads to."""

@@ -45,7 +45,7 @@ from hardware.simulator.truth import Truth
 from hardware.simulator.virtual_port import PortFaults, VirtualDevice
 from perception.frames import FrameSet, PrintHead
 from perception.tracking import StepReport
-from planning.command import Hold, Move
+from planning.command import Move
 from planning.kinematics import axes_from_nozzle
 from planning.path import Path
 from planning.progress import Phase
@@ -203,7 +203,7 @@ class FaultRun:
 
     def _tell(self, tick: Tick) -> None:
         ran, pose, status = self._ran, self._pose, tick.status
-        said = tick.command.reason if isinstance(tick.command, Hold) else reservation(pose)
+        said = tick.command.reason or reservation(pose)
         if status.state is ArmState.STOPPED and (not ran.stopped or now_stopped(ran, tick.stamp)):
             ran.stopped.append(tick.stamp)
         self._ledger.write(tick.command, self._motion.progress)

@@ -20,12 +20,12 @@ from hardware.arm_file import read_arm
 from hardware.live.beside import Beside
 from hardware.live.kept import used_in
 from hardware.mcap_walk import ChunkOf, parse, walk
-from hardware.messages import Message, row_from_message
+from hardware.messages import Message, move_from_message, row_from_message
 from hardware.path_file import read_path
 from hardware.simulator.ledger import Ledger, executed_rows
 from hardware.simulator.truth import Truth
 from hardware.tum import trajectory_from_rows
-from planning.command import Command, Hold, Move
+from planning.command import Command, Hold
 from planning.progress import Phase, Progress
 
 BLOCK = 10.0  # s of rows judged at once
@@ -137,8 +137,7 @@ def _told(ticks: dict[float, Message], moves: dict[float, Message]) -> Iterator[
         move, fraction, phase = moves.get(stamp), float(tick["fraction"]), Phase(tick["phase"])
         command: Command = Hold(stamp, 0.001, "held")
         if move is not None:
-            axes = np.array(move["axes"], float)
-            command = Move(stamp, axes, move["feed"], move["checkpoint"], move["extrude"])
+            command = move_from_message(move)
         yield command, Progress(phase, 0, 0, fraction, 0.0, fraction)
 
 

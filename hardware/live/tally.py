@@ -11,7 +11,7 @@ from estimation import se3
 from hardware.live.conductor import Seen
 from hardware.live.histograms import Histograms
 from hardware.operator.view import Stage
-from planning.command import Hold, Move
+from planning.command import Move
 from planning.kinematics import SimpleArm, nozzle_from_axes
 from planning.progress import Phase
 
@@ -80,7 +80,7 @@ class Tally:
         command, progress = motion.tick.command, motion.progress
         if progress is None or stage not in (Stage.APPROACH, Stage.PRINT, Stage.PAUSED, Stage.STOPPED):
             return
-        reason = _NUMBER.sub("…", command.reason) if isinstance(command, Hold) else ""
+        reason = _NUMBER.sub("…", command.reason)
         if reason:
             self._hold(reason, step)
         self._reason = reason

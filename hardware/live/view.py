@@ -89,7 +89,7 @@ class Viewer:
         known = laid is not None and status.axes is not None
         return MotionView(
             activity=_activity(motion, conductor.stage),
-            reason=command.reason if isinstance(command, Hold) else "",
+            reason=command.reason,
             error=tally.last_error,
             limit=profile.limits.pose_error,
             true_error=self._true.last,

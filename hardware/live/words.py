@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from hardware.live.conductor import Conductor, Seen
 from hardware.operator.view import Stage, Verdict
-from planning.command import Hold
 
 
 def status_line(conductor: Conductor, seen: Seen) -> str:
@@ -19,5 +18,5 @@ def status_line(conductor: Conductor, seen: Seen) -> str:
     if seen.motion is None or seen.motion.progress is None:
         return f"{conductor.stage.value}: {state}"
     progress, command = seen.motion.progress, seen.motion.tick.command
-    held = f", holds: {command.reason}" if isinstance(command, Hold) else ""
+    held = f", holds: {command.reason}" if command.reason else ""
     return f"{conductor.stage.value}: {progress.fraction:.1f} of {progress.total - 1} checkpoints, {state}{held}"

@@ -13,7 +13,7 @@ from estimation.se3 import Array
 from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.planned_line import planned_line
 from hardware.simulator.truth import Truth
-from planning.command import Command, Hold, Move
+from planning.command import Command, Move
 from planning.kinematics import SimpleArm, nozzle_from_axes
 from planning.path import Path
 from planning.progress import Phase, Progress
@@ -45,7 +45,7 @@ class Ledger:
         self._due.append(command.stamp + self._tick + self._lag)
         self._fraction.append(progress.fraction if begun else np.nan)
         self._extrude.append(isinstance(command, Move) and command.extrude)
-        self._reason.append(command.reason if isinstance(command, Hold) else "")
+        self._reason.append(command.reason)
 
     @property
     def known_until(self) -> float:

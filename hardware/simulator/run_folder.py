@@ -38,7 +38,7 @@ from hardware.simulator.watch import Watch
 from hardware.tum import rows_from_trajectory
 from perception.frames import FrameSet, PrintHead, Roi
 from perception.tracking import STAGES, StepReport
-from planning.command import Command, Hold, Move
+from planning.command import Command, Move
 from planning.progress import Progress
 
 DIGITS = 9  # of a stamp: a row and an exposure of one instant are one
@@ -149,7 +149,7 @@ class RunFolder:
             recorder.sent(command.stamp, frame)
             if received:
                 recorder.received(command.stamp, received)
-        reason = command.reason if isinstance(command, Hold) else ""
+        reason = command.reason
         if reason and reason != self._reason:
             self.event(command.stamp, f"hold: {reason}", WARNING)
         self._reason = reason
