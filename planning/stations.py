@@ -45,19 +45,13 @@ def stations_on(curve: Curve, start: float, end: float) -> Stations:
     beyond = np.searchsorted(curve.knots - curve.half, places[1:], "left") - 1  # the last one begun
     part = slice(int(min(first[0], before[0])), int(max(last[-1], beyond[-1])) + 2)
     stretches, corners = (first - part.start, last - part.start), (before - part.start, beyond - part.start)
-    cruise = _at_points(_largest(1 / curve.speed[part], *stretches))
-    slowest = _at_points(_largest(1 / curve.corner[part], *corners))
     within = 2 * np.maximum(curve.half[part], SHORTEST_BLEND)
-    bend, swing = (np.linalg.norm(change[part], axis=1) / within for change in (curve.bend, curve.swing))
-    spin = np.linalg.norm(curve.spin[part], axis=1)
-    return Stations(
-        places,
-        1 / np.maximum(cruise, slowest),
-        1 / cruise,
-        _at_points(_largest(bend, *corners)),
-        _at_points(_largest(swing, *corners)),
-        _at_points(_largest(spin, *stretches)),
-    )
+    bend, swing, spin = (np.linalg.norm(of[part], axis=1) for of in (curve.bend, curve.swing, curve.spin))
+    of_corners = np.stack([1 / curve.corner[part], bend / within, swing / within], axis=1)
+    of_stretches = np.stack([1 / curve.speed[part], spin], axis=1)
+    slowest, bend, swing = _at_points(_largest(of_corners, *corners)).T
+    cruise, spin = _at_points(_largest(of_stretches, *stretches)).T
+    return Stations(places, 1 / np.maximum(cruise, slowest), 1 / cruise, bend, swing, spin)
 
 
 def _places(curve: Curve, start: float, end: float) -> Array:
@@ -67,19 +61,20 @@ def _places(curve: Curve, start: float, end: float) -> Array:
         return even
     knots, half = curve.knots[inside], curve.half[inside]
     points = np.concatenate([even, knots - half, knots + half])
-    points = np.unique(points[(points >= start) & (points <= end)])
+    points = np.sort(points[(points >= start) & (points <= end)])
     points = points[np.concatenate([[True], np.diff(points) > 1e-6])]
     points[-1] = end
     return np.asarray(points)
 
 
 def _largest(values: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
-    """The largest (M,) of values[first : last + 1], none below 0, for each pair of (M,); 0 where there is none."""
-    padded = np.concatenate([values, [0.0, 0.0]])
+    """The largest (M, D) of values (K, D), none below 0, from `first` to `last` (M,); 0 where there is none."""
+    padded = np.concatenate([values, np.zeros((2, values.shape[1]))])
     ends = np.stack([np.minimum(first, len(values)), np.maximum(last, first) + 1], 1).ravel()
-    return np.where(last >= first, np.maximum.reduceat(padded, np.minimum(ends, len(values) + 1))[::2], 0.0)
+    found = np.maximum.reduceat(padded, np.minimum(ends, len(values) + 1))[::2]
+    return np.where((last >= first)[:, None], found, 0.0)
 
 
 def _at_points(between: Array) -> Array:
-    """The largest (M,) on both sides of grid points of (M-1,) in the intervals between them."""
+    """The largest (M, D) on both sides of grid points of (M-1, D) in the intervals between them."""
     return np.concatenate([between[:1], np.maximum(between[:-1], between[1:]), between[-1:]])
