@@ -23,6 +23,7 @@ OWNERS = {  # library: the files that may import it
         "hardware/images.py",
         "hardware/simulator/*.py",
     ),
+    "distributed": ("hardware/smoothing/cluster.py",),
     "gtsam": ("estimation/*.py",),
     "matplotlib": ("perception/training/*.py",),
     "mcap": (
@@ -102,7 +103,8 @@ def test_every_dependency_is_imported_by_someone_and_declared() -> None:
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     packages = {"opencv-python-headless": "cv2", "open3d-cpu": "open3d", "pyserial": "serial", "pyyaml": "yaml"}
-    declared = {line.split(">")[0] for line in project["dependencies"] + project["optional-dependencies"]["train"]}
+    extras = [line for extra in ("cluster", "train") for line in project["optional-dependencies"][extra]]
+    declared = {line.split(">")[0] for line in project["dependencies"] + extras}
     declared = {packages.get(name, name) for name in declared}
     assert set.union(*map(roots, FILES)) & {*OWNERS, *FREE} - ABSENT <= declared
 

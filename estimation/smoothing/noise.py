@@ -12,10 +12,10 @@ from estimation.track_loops import MEDIAN
 
 LEAST_UNIT = 0.3  # of what is claimed: better than that no track is believed to be
 LEAST_JITTER, LEAST_UNREST = 1e-4, 3e-3  # s, px: no stamp and no lens is steadier
-HEAVY = 2.0  # numbers that the whole recording's liveliness counts for where a moment has its own
+HEAVY = 0.5  # numbers that the whole recording's liveliness counts for where a moment has its own
 EAGER = 1.4  # steps of the fixed point, which otherwise comes near slowly
 BELIEF = 0.1  # numbers that what was believed before counts for
-AROUND = 2  # frame sets over which it is taken
+AROUND = 1  # frame sets to either side over which it is taken
 LEAST_PSD = np.array([1e-4] * 3 + [1e-1] * 3)  # rad^2/s^5, mm^2/s^5: less is rest
 
 

@@ -1,22 +1,21 @@
-"""`stillbed smooth`: sessions in, a folder of results each; what is done already is told, not done again."""
+"""One session smoothed into a folder of results; what is done already is told, not done again."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
-from estimation.errors import InputError, StillbedError
+from estimation.errors import InputError
 from estimation.smoothing.cameras import REFINED, CalibrationPrior
 from estimation.smoothing.smooth import smooth
 from estimation.smoothing.smoothed import Smoothed
 from hardware.clock import WallClock
-from hardware.out_folder import prepare_out
+from hardware.evaluation import spread
 from hardware.progress import Progress
 from hardware.rig_file import write_rig
 from hardware.session import Session, open_session
@@ -41,44 +40,31 @@ class Wishes:
     refine: bool = False
 
 
-def run_smooth(paths: Sequence[Path], out: Path, wishes: Wishes) -> Iterator[tuple[str, bool]]:
-    """Smooth sessions one after the other; of each a summary as text, and whether it was smoothed.
-
-    Several get a folder of their own in `out`, and one that cannot be smoothed does not stop the others.
-    """
+def check_wishes(wishes: Wishes) -> None:
+    """InputError for what cannot be done."""
     if wishes.rate is not None and not 0 < wishes.rate <= 1e5:
         raise InputError("command line", "--rate", wishes.rate, "0 < rate <= 100000 Hz")
-    names = [path.resolve().stem if path.is_file() else path.resolve().name for path in paths]
-    if len(set(names)) < len(names):
-        raise InputError("command line", "SESSION", ", ".join(names), "sessions of different names")
-    prepare_out(out, force=True)
-    for path, name in zip(paths, names, strict=True):
-        if len(paths) == 1:
-            yield smooth_session(path, out, wishes), True
-            continue
-        try:
-            yield smooth_session(path, out / name, wishes), True
-        except (StillbedError, OSError) as error:
-            yield f"{path}: not smoothed: {error}", False
 
 
-def smooth_session(path: Path, out: Path, wishes: Wishes) -> str:
-    """Smooth one session into the folder `out`, unless that holds its results already; the summary as text."""
+def smooth_session(path: Path, out: Path, wishes: Wishes, stream: TextIO | None = None) -> tuple[bool, str]:
+    """Smooth one session into the folder `out`, unless that holds its results already: whether it does, and the summary
+    as text. stream: where progress is said, stderr without.
+    """
     session = open_session(path)
     contents = content_hash(path, wishes)
     done = _done(out, contents)
     if done is not None:
-        return f"{path}: done already\n{done}"
+        return True, f"{path}: done already\n{done}"
     out.mkdir(parents=True, exist_ok=True)
-    tracks = tracks_of(session, out)
-    result = _solved(session, tracks, wishes)
+    tracks = tracks_of(session, out, stream)
+    result = _solved(session, tracks, wishes, stream)
     judged = judge(result, tracks, session.truth)
     _write(out, session, result, wishes)
     text = f"{lead(result, judged)}\nreport: {out / 'report.html'}"
     (out / "report.html").write_text(page(session.path.name, result, judged), encoding="utf-8")
     summary = {"contents": contents, "text": text, **_figures(result, judged, session)}
     (out / SUMMARY).write_text(json.dumps(finite(summary), indent=2) + "\n", encoding="utf-8")
-    return text
+    return False, text
 
 
 def content_hash(path: Path, wishes: Wishes) -> str:
@@ -102,9 +88,9 @@ def _done(out: Path, contents: str) -> str | None:
         return None
 
 
-def _solved(session: Session, tracks: Tracks, wishes: Wishes) -> Smoothed:
+def _solved(session: Session, tracks: Tracks, wishes: Wishes, stream: TextIO | None) -> Smoothed:
     passes = 0
-    with Progress("smooth", "frame sets, passes taken together,", WallClock().now) as progress:
+    with Progress("smooth", "frame sets, passes taken together,", WallClock().now, stream) as progress:
 
         def say(what: str, done: int, total: int) -> None:
             nonlocal passes
@@ -129,6 +115,7 @@ def _write(out: Path, session: Session, result: Smoothed, wishes: Wishes) -> Non
 def _figures(result: Smoothed, judged: Judged, session: Session) -> dict[str, Any]:
     fitted, names = result.fitted, [camera.name for camera in result.rig.cameras]
     sigma = np.sqrt(np.trace(result.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)
+    ours, live = (None if e is None else spread(e.translation).rmse for e in judged.errors or (None, None))
     return {
         "session": str(session.path.name),
         "poses": len(result),
@@ -142,6 +129,8 @@ def _figures(result: Smoothed, judged: Judged, session: Session) -> dict[str, An
         "breathing_per_minute": 60 * judged.rhythms.breathing,
         "pulse_per_minute": 60 * judged.rhythms.pulse,
         "live_rms_mm": judged.live_rms,
+        "error_mm": ours,
+        "live_error_mm": live,
         "passes": fitted.passes,
         "cost": fitted.cost,
         "damage": session.damage,

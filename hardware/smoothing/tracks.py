@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -39,10 +40,11 @@ class Tracks:
         return Trajectory(stamps, np.stack([pose.base_from_surface for pose in measured]), exact=False)
 
 
-def tracks_of(session: Session, out: Path) -> Tracks:
+def tracks_of(session: Session, out: Path, stream: TextIO | None = None) -> Tracks:
     """The session's tracks. Where it has none, its images are tracked first, into tracks.mcap in the folder `out`.
 
-    That file gets its name when it is whole; of a run that was interrupted, tracks.part.mcap is left.
+    That file gets its name when it is whole; of a run that was interrupted, tracks.part.mcap is left. stream: where
+    progress is said, stderr without.
     """
     if session.path.is_file():
         recorded = _read(session.path)
@@ -50,7 +52,7 @@ def tracks_of(session: Session, out: Path) -> Tracks:
             return recorded
     kept = out / TRACKS
     if not kept.exists():
-        _track(session, kept)
+        _track(session, kept, stream)
     found = _read(kept)
     if not any(map(len, found.observations)):
         raise InputError(session.path, "tracks", "none in its images", "a surface that the tracker finds")
@@ -66,12 +68,12 @@ def _read(path: Path) -> Tracks:
     )
 
 
-def _track(session: Session, target: Path) -> None:
+def _track(session: Session, target: Path, stream: TextIO | None) -> None:
     part, clock = target.with_suffix(".part.mcap"), WallClock()
     with (
         tracker(session.rig, session.roi, session.surface, clock.now) as step,
         Recorder(part, session.rig, overwrite=True) as recorder,
-        Progress("track", "frame sets", clock.now) as progress,
+        Progress("track", "frame sets", clock.now, stream) as progress,
     ):
         for done, frames in enumerate(session.frame_sets(), 1):
             pose = step(frames)

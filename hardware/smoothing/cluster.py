@@ -1,0 +1,63 @@
+"""Sessions on a Dask cluster, one task each: an existing scheduler's, or a local one's (owns dask.distributed).
+
+What Dask does is not done again here: it queues, sends a lost worker's task to another one, and gives up on a task
+that took several workers with it. A task writes only into its session's folder and its summary last, so it can be begun
+anew anywhere. All workers must reach sessions and results under the same paths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from estimation.errors import InputError
+from hardware.smoothing.many import FAILED, Cluster, Job, Outcome, smooth_job
+from hardware.smoothing.run import Wishes
+
+LOCAL = "local"
+PATIENCE = 15  # s for a scheduler to answer
+MISSING = "dask.distributed, by pip install 'stillbed[cluster]'"
+
+
+def on_cluster(jobs: Sequence[Job], wishes: Wishes, cluster: Cluster) -> Iterator[Outcome]:
+    """What became of each job, as they are done; when interrupted, what is not done is called off."""
+    try:
+        import distributed
+    except ImportError:
+        raise InputError("command line", "--scheduler", cluster.scheduler, MISSING) from None
+    with ExitStack() as stack:
+        address = cluster.scheduler
+        if address == LOCAL:
+            local = distributed.LocalCluster(
+                n_workers=cluster.workers,
+                threads_per_worker=1,  # the work holds Python's lock
+                host="127.0.0.1",
+                dashboard_address=None,
+                silence_logs="CRITICAL",
+            )
+            address = stack.enter_context(local).scheduler_address
+        try:
+            client = stack.enter_context(distributed.Client(address, timeout=PATIENCE))
+        except (OSError, TimeoutError, ValueError, ImportError) as error:
+            allowed = f"{LOCAL}, or the address of a running scheduler, such as tcp://host:8786 ({error})"
+            raise InputError("command line", "--scheduler", cluster.scheduler, allowed) from error
+        there = [Job(_anywhere(job.session), _anywhere(job.out)) for job in jobs]
+        futures = [client.submit(smooth_job, job, wishes, pure=False) for job in there]
+        own = {future.key: job for future, job in zip(futures, jobs, strict=True)}
+        for future in distributed.as_completed(futures):
+            yield _told(own[future.key], future)
+
+
+def _anywhere(path: Path) -> Path:
+    """The path as a worker in another folder has to write it."""
+    return path.resolve()
+
+
+def _told(job: Job, future: object) -> Outcome:
+    """The outcome under the paths that were asked for; a task that Dask gave up on failed with Dask's reason."""
+    error = future.exception()  # type: ignore[attr-defined]
+    if error is not None:
+        return Outcome(job, FAILED, f"{type(error).__name__}: {error}", 0.0)
+    found: Outcome = future.result()  # type: ignore[attr-defined]
+    return Outcome(job, found.state, found.text, found.spent)

@@ -1,0 +1,164 @@
+"""Many sessions smoothed on a cluster: failures listed, nothing done twice, and a lost worker loses no session."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.errors import InputError
+from estimation.synthetic.world import synthetic_world
+from hardware.cli import main
+from hardware.recording import Recorder
+from hardware.smoothing import many
+from hardware.smoothing.many import ALREADY, FAILED, SMOOTHED, Cluster, Job, Outcome, run_smooth, sessions_in
+from hardware.smoothing.run import Wishes
+from perception.frames import Frame
+
+distributed = pytest.importorskip("distributed")
+
+BLANK = np.full((720, 1280), 90, np.uint8)
+
+
+def record(path: Path, seed: int) -> None:
+    """Half a second of a breathing surface, with its tracks."""
+    world = synthetic_world("breathing", seconds=0.5, rate=20.0, count=30, seed=seed)
+    with Recorder(path, world.rig) as recorder:
+        recorder.truth(world.truth)
+        for seen in world:
+            for camera in range(3):
+                recorder.frame(Frame(camera, seen.stamp, BLANK))
+            recorder.write(seen)
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three sessions, and a file that is none."""
+    folder = tmp_path_factory.mktemp("sessions")
+    record(folder / "a.mcap", 0)
+    for name in ("b", "c"):
+        shutil.copy(folder / "a.mcap", folder / f"{name}.mcap")
+    (folder / "broken.mcap").write_bytes(b"no recording")
+    (folder / "notes.txt").write_text("nobody's session")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """A running scheduler with two workers."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, silence_logs="CRITICAL"
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+def table(out: Path) -> dict[str, dict[str, str]]:
+    with (out / "sessions.csv").open(encoding="utf-8") as stream:
+        return {Path(row["session"]).name: row for row in csv.DictReader(stream)}
+
+
+def test_failures_are_listed_and_what_is_done_is_not_done_again(
+    sessions: Path, address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["smooth", str(sessions), "-o", str(tmp_path), "--scheduler", address]
+    assert main(words) == 1
+    assert "broken.mcap: not smoothed: " in capsys.readouterr().out
+    rows = table(tmp_path)
+    assert [row["state"] for row in rows.values()] == [SMOOTHED, SMOOTHED, FAILED, SMOOTHED]
+    assert "broken.mcap" in rows["broken.mcap"]["reason"] and not rows["a.mcap"]["reason"]
+    assert int(rows["b.mcap"]["poses"]) == 10 and 0 < float(rows["b.mcap"]["error_mm"]) < 0.1
+    assert rows["a.mcap"]["error_mm"] == rows["c.mcap"]["error_mm"]
+
+    before = (tmp_path / "a" / "summary.json").stat().st_mtime_ns
+    (sessions / "c.mcap").unlink()
+    record(sessions / "c.mcap", 1)
+    assert main(words) == 1
+    again = table(tmp_path)
+    assert [row["state"] for row in again.values()] == [ALREADY, ALREADY, FAILED, SMOOTHED]
+    assert (tmp_path / "a" / "summary.json").stat().st_mtime_ns == before
+    assert again["a.mcap"]["error_mm"] == rows["a.mcap"]["error_mm"] != again["c.mcap"]["error_mm"]
+
+
+def killed_once(job: Job, wishes: Wishes) -> Outcome:
+    """Half-way through the first session its worker is killed, as if its machine had gone."""
+    mark = job.out.parent / "killed"
+    if job.session.name == "a.mcap" and not mark.exists():
+        mark.touch()
+        job.out.mkdir(exist_ok=True)
+        (job.out / "summary.json").write_text('{"conte')
+        os.kill(os.getpid(), signal.SIGKILL)
+    return many.smooth_job(job, wishes)
+
+
+def test_a_worker_that_is_killed_loses_no_session(
+    sessions: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hardware.smoothing import cluster
+
+    monkeypatch.setattr(cluster, "smooth_job", killed_once)
+    found = list(run_smooth([sessions], tmp_path, Wishes(), Cluster(address)))
+    assert (tmp_path / "killed").exists()
+    assert {o.job.session.name: o.state for o in found if not o.failed} == dict.fromkeys(
+        ("a.mcap", "b.mcap", "c.mcap"), SMOOTHED
+    )
+    assert (tmp_path / "a" / "smoothed.tum").exists()
+
+
+@pytest.mark.slow
+def test_forty_sessions_are_smoothed_though_a_local_worker_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hardware.smoothing import cluster
+
+    folder = tmp_path / "sessions"
+    folder.mkdir()
+    record(folder / "a.mcap", 0)
+    for k in range(39):
+        shutil.copy(folder / "a.mcap", folder / f"s{k:02}.mcap")
+    monkeypatch.setattr(cluster, "smooth_job", killed_once)
+    found = list(run_smooth([folder], tmp_path / "out", Wishes(), Cluster("local", 2)))
+    assert (tmp_path / "out" / "killed").exists()
+    assert [outcome.state for outcome in found] == [SMOOTHED] * 40
+
+
+def test_what_was_interrupted_is_in_the_table(sessions: Path, tmp_path: Path) -> None:
+    some = run_smooth([sessions], tmp_path, Wishes())
+    next(some)
+    some.close()
+    rows = list(table(tmp_path).values())
+    assert [row["state"] for row in rows] == [SMOOTHED, "not done", "not done", "not done"]
+
+
+def test_a_folder_names_its_sessions(sessions: Path, tmp_path: Path) -> None:
+    assert [p.name for p in sessions_in(sessions)] == ["a.mcap", "b.mcap", "broken.mcap", "c.mcap"]
+    assert sessions_in(sessions / "a.mcap") == [sessions / "a.mcap"]
+    with pytest.raises(InputError, match="sessions = 'none'"):
+        sessions_in(tmp_path)
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "rig.toml").write_text("")
+    (tmp_path / "a.mcap").touch()
+    found = list(run_smooth([tmp_path], tmp_path / "out", Wishes()))
+    assert [outcome.job.out.name for outcome in found] == ["a", "a.mcap"]
+    assert all(outcome.failed for outcome in found)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--scheduler", "nowhere://1"], "--scheduler"),
+        (["--workers", "2"], "--workers"),
+        (["--scheduler", "local", "--workers", "0"], "--workers"),
+    ],
+)
+def test_wrong_wishes_are_one_clear_line(
+    sessions: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], told: str
+) -> None:
+    assert main(["smooth", str(sessions), "-o", str(tmp_path), *words]) == 2
+    said = capsys.readouterr().err
+    assert told in said and "allowed" in said and said.count("\n") == 1
