@@ -111,7 +111,7 @@ class Estimator:
         """The pose that is expected at `stamp`, as doubtful as it is searched for. Only after the first map."""
         assert self._pose is not None
         if self._ahead is None or self._ahead[0] is not self._pose or self._ahead[1].stamp != stamp:
-            self._ahead = self._pose, self._pose.predict(stamp)
+            self._ahead = self._pose, self._pose.predict(stamp, onwards=False)
         return self._ahead[1]
 
     def predict(self, stamp: float) -> Array:

@@ -72,19 +72,20 @@ class SurfacePose:
         """Root mean square displacement of the landmarks, mm, that no rigid motion explains."""
         return 0.0 if self.warp is None else self.warp.deformation
 
-    def predict(self, stamp: float) -> SurfacePose:
+    def predict(self, stamp: float, onwards: bool = True) -> SurfacePose:
         """The pose at `stamp` (s): along the forecast as far as it reaches, under constant body velocity from there on.
 
         The covariance is the forecast's, whose 90 % radii are calibrated, or that of white noise on acceleration
         (Barfoot 2017, 11.1): P + dt^2 P_twist + q dt^3 / 3, carried along the geodesic. A stamp before the pose's own
-        runs the constant velocity backwards.
+        runs the constant velocity backwards. onwards: whether what is left of the forecast goes along; it costs more than
+        all the rest.
         """
         dt = stamp - self.stamp
         if self.forecast is None or dt <= 0:
             return self._drift(stamp)
         if dt > self.forecast.end:
-            return self._foreseen(self.stamp + self.forecast.end, self.forecast)._drift(stamp)
-        return self._foreseen(stamp, self.forecast)
+            return self._foreseen(self.stamp + self.forecast.end, self.forecast, onwards=False)._drift(stamp)
+        return self._foreseen(stamp, self.forecast, onwards)
 
     def base_at(self, stamps: Array) -> Array:
         """base_from_surface (T, 4, 4) at stamps (T,), s: the poses of `predict`, for many stamps at once."""
@@ -99,7 +100,7 @@ class SurfacePose:
         speed = np.where((ahead < 0)[:, None], self.twist, beyond)
         return np.asarray(foreseen @ se3.exp(speed * (ahead - within)[:, None]))
 
-    def _foreseen(self, stamp: float, forecast: Forecast) -> SurfacePose:
+    def _foreseen(self, stamp: float, forecast: Forecast, onwards: bool) -> SurfacePose:
         """The pose at `stamp`, s, within its forecast."""
         ahead = min(stamp - self.stamp, forecast.end)
         increments, rates = forecast.at(np.array([ahead]))
@@ -111,7 +112,7 @@ class SurfacePose:
             twist=body_rate(increments[0], rates[0]),
             twist_covariance=self.twist_covariance + np.diag(self.acceleration_psd) * ahead,
             warp=None if self.warp is None else self.warp.later(ahead),
-            forecast=forecast.after(ahead),
+            forecast=forecast.after(ahead) if onwards else None,
         )
 
     def _drift(self, stamp: float) -> SurfacePose:

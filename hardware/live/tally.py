@@ -103,7 +103,7 @@ class Tally:
         assert seen.tracking is not None
         if (pose := seen.tracking.pose) is None:
             return
-        then = pose.predict(max(move.stamp, pose.stamp))
+        then = pose.predict(max(move.stamp, pose.stamp), onwards=False)
         nozzle = se3.inverse(pose.base_from_surface) @ nozzle_from_axes(arm, move.axes)
         error = float(then.error_at(nozzle[None, :3, 3])[0])
         self.errors[min(int(error / ERROR_BIN), ERROR_BINS - 1)] += 1
