@@ -77,8 +77,8 @@ class SurfacePose:
 
         The covariance is the forecast's, whose 90 % radii are calibrated, or that of white noise on acceleration
         (Barfoot 2017, 11.1): P + dt^2 P_twist + q dt^3 / 3, carried along the geodesic. A stamp before the pose's own
-        runs the constant velocity backwards. onwards: whether what is left of the forecast goes along; it costs more than
-        all the rest.
+        runs the constant velocity backwards. onwards: whether what is left of the forecast goes along, which costs more
+        than all the rest.
         """
         dt = stamp - self.stamp
         if self.forecast is None or dt <= 0:
