@@ -28,11 +28,12 @@ _HEAD = struct.Struct("<BQ")  # opcode and length in front of every record
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """One message as it is stored: its channel's topic, its sequence number, its JSON."""
+    """One message as it is stored: its channel's topic and encoding, its sequence number, its bytes."""
 
     topic: str
     sequence: int
     data: bytes
+    encoding: str = "json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ Part = ChunkOf | Attached | Damage
 
 def walk(path: Path) -> Iterator[Part]:
     """The parts of a recording in the order of the file; a Damage, if any, is the last one."""
-    topics: dict[int, str] = {}
+    channels: dict[int, Channel] = {}
     try:
         file = open(path, "rb")  # noqa: SIM115  (closed by the block below)
     except OSError as error:
@@ -91,7 +92,7 @@ def walk(path: Path) -> Iterator[Part]:
             if opcode not in (Opcode.CHUNK, Opcode.ATTACHMENT):
                 file.seek(length, 1)
                 continue
-            part = _part(opcode, offset, file.read(length), topics)
+            part = _part(opcode, offset, file.read(length), channels)
             yield part or _damage(offset, size, "a record is broken")
             if part is None:
                 return
@@ -101,26 +102,27 @@ def _damage(offset: int, size: int, why: str) -> Damage:
     return Damage(f"{why}: read up to byte {offset} of {size}")
 
 
-def _part(opcode: int, offset: int, data: bytes, topics: dict[int, str]) -> Part | None:
-    """A chunk or an attachment with its checksum checked, None if it is broken; topics: learnt on the way."""
+def _part(opcode: int, offset: int, data: bytes, channels: dict[int, Channel]) -> Part | None:
+    """A chunk or an attachment with its checksum checked, None if it is broken; channels: learnt on the way."""
     try:
         if opcode == Opcode.ATTACHMENT:
             attachment = Attachment.read(ReadDataStream(BytesIO(data)))
             (crc,) = struct.unpack("<I", data[-4:])
             return Attached(attachment.name, attachment.data) if crc in (0, zlib.crc32(data[:-4])) else None
-        return ChunkOf(offset, _unpack(data, topics))
+        return ChunkOf(offset, _unpack(data, channels))
     except Exception:  # whatever the library, its decompressors and struct say of broken bytes: the same thing
         return None
 
 
-def _unpack(data: bytes, topics: dict[int, str]) -> tuple[Stored, ...]:
+def _unpack(data: bytes, channels: dict[int, Channel]) -> tuple[Stored, ...]:
     records = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(data))), validate_crc=True)
-    topics.update((r.id, r.topic) for r in records if isinstance(r, Channel))
-    return tuple(Stored(topics[r.channel_id], r.sequence, r.data) for r in records if isinstance(r, Message))
+    channels.update((r.id, r) for r in records if isinstance(r, Channel))
+    said = ((channels[r.channel_id], r) for r in records if isinstance(r, Message))
+    return tuple(Stored(of.topic, r.sequence, r.data, of.message_encoding) for of, r in said)
 
 
 def chunk_messages(file: BinaryIO, offset: int) -> list[bytes]:
-    """The JSON of every message in the chunk at `offset` of a file that `walk` found whole."""
+    """The bytes of every message in the chunk at `offset` of a file that `walk` found whole."""
     file.seek(offset)
     _, length = _HEAD.unpack(file.read(_HEAD.size))
     chunk = Chunk.read(ReadDataStream(BytesIO(file.read(length))))

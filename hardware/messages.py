@@ -6,7 +6,6 @@ Matrices are flat, row by row. An array that is not finite becomes an empty one,
 from __future__ import annotations
 
 import base64
-import json
 from typing import Any
 
 import numpy as np
@@ -251,13 +250,6 @@ def message_from_bytes(stamp: float, data: bytes) -> Message:
 def bytes_from_message(message: Message) -> bytes:
     """Bytes from a message with base64 `data`."""
     return base64.b64decode(message["data"], validate=True)
-
-
-def text_of_image(kind: str, data: bytes, camera: str, log_time: int) -> bytes:
-    """An encoded image as the JSON of Foxglove's CompressedImage; base64 needs no look for what must be escaped."""
-    head = {"timestamp": time_of(log_time), "frame_id": camera_frame(camera), "format": kind}
-    text = json.dumps(head, separators=(",", ":")).encode()
-    return b"".join([text[:-1], b',"data":"', base64.b64encode(data), b'"}'])
 
 
 def message_from_calibration(camera: Camera, log_time: int) -> Message:

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import TypeVar
 
 import numpy as np
+import orjson
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
@@ -22,11 +23,11 @@ from estimation.se3 import Array
 from estimation.trajectory import Trajectory
 from hardware import messages
 from hardware.checks import read_bytes
+from hardware.compressed_image import ENCODING, NAME, SCHEMA, SCHEMA_ENCODING, pack
 from hardware.images import check_size, encode
 from hardware.messages import SURFACE_FRAME, Message
 from hardware.schemas import (
     CALIBRATION,
-    IMAGE,
     INFO,
     TOPICS,
     Schema,
@@ -131,8 +132,8 @@ class Recorder:
         own = stamp - self.rig.cameras[camera].clock_offset if camera_stamp is None else camera_stamp
         name, number = self.rig.cameras[camera].name, self._numbers[camera]
         self._check_rising(f"stamp of camera {name!r}", stamp)
-        image = messages.text_of_image(kind, data, name, self._log_time(stamp))
-        self._message(image_topic(name), stamp, image, IMAGE, number)
+        image = pack(kind, data, camera_frame(name), self._log_time(stamp))
+        self._add(image_topic(name), None, stamp, image, number)
         entry = {"stamp": stamp, "camera_stamp": own, "camera": int(camera), "number": number}
         self._message("/frames", stamp, entry)  # after the image: where this can be read, the image can
         self._numbers[camera] += 1
@@ -261,33 +262,38 @@ class Recorder:
             transform = messages.message_from_transform(camera.base_from_camera, camera_frame(camera.name), log_time)
             self._message("/tf", stamp, transform)
 
-    def _message(
-        self, topic: str, stamp: float, message: Message | bytes, schema: Schema | None = None, sequence: int = 0
-    ) -> None:
-        """Write a message, or the JSON of one that is made already."""
+    def _message(self, topic: str, stamp: float, message: Message, schema: Schema | None = None) -> None:
+        self._add(topic, TOPICS[topic] if schema is None else schema, stamp, self._text(topic, message))
+
+    def _add(self, topic: str, schema: Schema | None, stamp: float, data: bytes, sequence: int = 0) -> None:
+        """Write the bytes of a message; schema: None for an image."""
         log_time = self._log_time(stamp)
         if abs(stamp - self._chunk_start) >= CHUNK_SECONDS:
             self.flush()
         if math.isnan(self._chunk_start):
             self._chunk_start = stamp
-        data = message if isinstance(message, bytes) else self._text(topic, message)
-        channel = self._channel(topic, TOPICS[topic] if schema is None else schema)
+        channel = self._channel(topic, schema)
         self._guarded(lambda: self._writer.add_message(channel, log_time, data, log_time, sequence))
 
     def _text(self, topic: str, message: Message) -> bytes:
-        try:
-            return json.dumps(message, allow_nan=False, separators=(",", ":")).encode()
-        except ValueError:
-            raise InputError(self.path, topic, message, "finite numbers") from None
+        data = orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY)
+        if b"null" in data:  # what stands there for a number that is not finite, unless it is a word
+            try:
+                json.dumps(message, allow_nan=False)
+            except ValueError:
+                raise InputError(self.path, topic, message, "finite numbers") from None
+        return data
 
-    def _channel(self, topic: str, schema: Schema) -> int:
+    def _channel(self, topic: str, schema: Schema | None) -> int:
         if topic not in self._channels:
-            name = schema["title"]
+            if schema is None:
+                name, kind, encoding, text = NAME, SCHEMA_ENCODING, ENCODING, SCHEMA.encode()
+            else:
+                name, kind, encoding, text = schema["title"], "jsonschema", "json", orjson.dumps(schema)
             if name not in self._schemas:
-                text = json.dumps(schema).encode()
-                self._schemas[name] = self._guarded(lambda: self._writer.register_schema(name, "jsonschema", text))
+                self._schemas[name] = self._guarded(lambda: self._writer.register_schema(name, kind, text))
             number = self._schemas[name]
-            self._channels[topic] = self._guarded(lambda: self._writer.register_channel(topic, "json", number))
+            self._channels[topic] = self._guarded(lambda: self._writer.register_channel(topic, encoding, number))
         return self._channels[topic]
 
     def _guarded(self, action: Callable[[], T]) -> T:

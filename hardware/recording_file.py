@@ -15,7 +15,7 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.trajectory import Trajectory
-from hardware import messages
+from hardware import compressed_image, messages
 from hardware.folder_tables import check_polygon
 from hardware.heads import Heads
 from hardware.images import check_size, decode
@@ -30,7 +30,8 @@ CACHED_CHUNKS = 4  # frames of one instant lie in neighbouring chunks
 
 SURFACE_NAMES = tuple(f"surface{suffix}" for suffix in SURFACE_SUFFIXES)  # an attachment with a path in it is none
 
-Places = dict[tuple[str, int], tuple[int, int]]  # of an image's topic and number: offset of its chunk, place in it
+# of an image's topic and number: offset of its chunk, place in it, how it is encoded
+Places = dict[tuple[str, int], tuple[int, int, str]]
 
 
 @dataclass(slots=True)
@@ -86,7 +87,7 @@ def _contents(path: Path) -> Contents:
 
 def _take(path: Path, contents: Contents, place: tuple[int, int], stored: Stored) -> None:
     if stored.topic.endswith("/image"):
-        contents.places[stored.topic, stored.sequence] = place
+        contents.places[stored.topic, stored.sequence] = *place, stored.encoding
     elif stored.topic in ("/rig", "/roi", "/truth", "/head", "/frames"):
         message = parse(path, stored)
         try:
@@ -200,12 +201,15 @@ class RecordingReader:
     def encoded(self, ref: FrameRef) -> tuple[str, bytes]:
         """Format ("png" or "jpeg") and bytes of the image as stored."""
         topic = image_topic(self._store.rig.cameras[ref.camera].name)
-        offset, index = self._store.places[topic, ref.number]
-        message = parse(self._store.path, Stored(topic, ref.number, self._chunk(offset)[index]))
+        offset, index, encoding = self._store.places[topic, ref.number]
+        data = self._chunk(offset)[index]
         try:
+            if encoding == compressed_image.ENCODING:
+                return compressed_image.unpack(data)
+            message = parse(self._store.path, Stored(topic, ref.number, data))  # as recordings once held them
             return message["format"], messages.bytes_from_message(message)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise InputError(self._store.path, topic, repr(error), "a foxglove.CompressedImage") from error
+            raise InputError(self._store.path, topic, repr(error), "an encoded image") from error
 
     def _chunk(self, offset: int) -> list[bytes]:
         if offset not in self._chunks:

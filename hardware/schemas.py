@@ -1,4 +1,4 @@
-"""The published schemas of a recording: every channel's messages, as JSON Schema.
+"""The published schemas of a recording: every channel's messages but the images' (compressed_image.py), as JSON Schema.
 
 Foxglove's well-known messages where one fits (foxglove.*: field names and meanings are theirs, lengths in metres),
 our own otherwise (stillbed.*: mm, s, rad, px). The float64 `stamp` of our own messages is exact; the file's
@@ -76,14 +76,6 @@ CAMERA = {
     "required": ["name", "size", "matrix", "distortion", "base_from_camera"],
 }
 
-IMAGE = _object(
-    "foxglove.CompressedImage",
-    "An image as the camera gave it",
-    timestamp=TIME,
-    frame_id=TEXT,
-    data=BASE64,
-    format=_about(TEXT, "png or jpeg"),
-)
 CALIBRATION = _object(
     "foxglove.CameraCalibration",
     "A camera of the rig",

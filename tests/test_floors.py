@@ -36,6 +36,7 @@ OWNERS = {  # library: the files that may import it
     "onnx": ("perception/training/*.py",),
     "onnxruntime": ("perception/*.py",),
     "open3d": ("hardware/mesh_file.py",),
+    "orjson": ("hardware/recording.py",),
     "packaging": ("hardware/doctor/libraries.py",),
     "pytest": ("estimation/synthetic/plugin.py",),
     "ruckig": ("planning/*.py",),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import os
+import pickle
 import threading
 from dataclasses import replace
 from multiprocessing import Pipe
@@ -9,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
@@ -23,12 +26,14 @@ from hardware.live.beside import Beside, Found, read_found, write_found
 from hardware.live.conductor import Task
 from hardware.live.feed import schedule, turns
 from hardware.live.frame_ring import SLOTS, FrameRing, RingSource
+from hardware.live.inbox import HEAD, Inbox
 from hardware.live.kept import kept_begin
 from hardware.live.laid import laid_on, lifted
 from hardware.live.outbox import Outbox
 from hardware.live.prepared import prepare, prepare_again
 from hardware.live.records import (
     Begin,
+    Entry,
     EventEntry,
     SetEntry,
 )
@@ -157,22 +162,53 @@ def test_a_recorder_that_takes_nothing_holds_up_nobody_and_what_finds_no_room_is
     before = box.dropped
     box.put(EventEntry(1.0, "small", 2, "x"))
     assert box.dropped == before  # pictures leave room for what is small
-    found = list[int]()
-    reader = threading.Thread(target=lambda: found.extend(_lengths(ours)))
+    found = list[Entry]()
+    reader = threading.Thread(target=lambda: found.extend(_taken(Inbox(ours))))
     reader.start()
     box.close()
     reader.join(10)
-    assert len(found) == 21 - before and found[-1] < 1000
+    assert [type(entry) for entry in found] == [SetEntry] * (20 - before) + [EventEntry]
     box.put(picture)
 
 
-def _lengths(connection: object) -> list[int]:
-    taken = []
-    try:
-        while True:
-            taken.append(len(connection.recv_bytes()))  # type: ignore[attr-defined]
-    except EOFError:
-        return taken
+def _taken(inbox: Inbox) -> list[Entry]:
+    taken = list[Entry]()
+    while not inbox.ended:
+        taken += inbox.take()
+    return taken
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.integers(0, 5_000) | st.integers(900_000, 3_000_000), max_size=5))
+def test_what_is_put_is_taken_in_order_however_large(sizes: list[int]) -> None:
+    ours, theirs = Pipe(duplex=False)
+    inbox, box = Inbox(ours), Outbox(theirs)
+    found = list[Entry]()
+    reader = threading.Thread(target=lambda: found.extend(_taken(inbox)))
+    reader.start()
+    for number, size in enumerate(sizes):
+        box.put(EventEntry(float(number), "x" * size, 2, "test"))
+    box.close()
+    reader.join(10)
+    assert [(e.stamp, len(e.text)) for e in found if isinstance(e, EventEntry)] == list(enumerate(sizes))
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(0, 300), max_size=5), st.lists(st.integers(1, 200), min_size=1), st.integers(0, 2000))
+def test_what_a_killed_sender_cut_short_is_left_out(sizes: list[int], pieces: list[int], cut: int) -> None:
+    entries = [pickle.dumps(EventEntry(float(k), "x" * size, 2, "test")) for k, size in enumerate(sizes)]
+    data = b"".join(HEAD.pack(len(entry)) + entry for entry in entries)[:cut]
+    whole = int(np.searchsorted(np.cumsum([HEAD.size + len(entry) for entry in entries]), len(data), "right"))
+    ours, theirs = Pipe(duplex=False)
+    inbox, found, begin = Inbox(ours), list[Entry](), 0
+    for size in itertools.cycle(pieces):
+        if begin >= len(data):
+            break
+        begin += os.write(theirs.fileno(), data[begin : begin + size])
+        found += inbox.take()
+    theirs.close()
+    found += _taken(inbox)
+    assert [len(e.text) for e in found if isinstance(e, EventEntry)] == sizes[:whole]
 
 
 # -- what is shown when

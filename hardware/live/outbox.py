@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import threading
 from collections import deque
 from multiprocessing.connection import Connection
 
+from hardware.live.inbox import HEAD
 from hardware.live.records import Entry, SetEntry
 
 ROOM = 48 * 2**20  # bytes that may wait: 3 s of pictures as three cameras encode them
@@ -47,7 +49,7 @@ class Outbox:
     def _send(self) -> None:
         try:
             while (data := self._next()) is not None:
-                self._connection.send_bytes(data)
+                _give(self._connection.fileno(), HEAD.pack(len(data)), data)
         except (OSError, ValueError):  # nobody is there any more
             with self._changed:
                 self._gone = True
@@ -66,3 +68,10 @@ class Outbox:
             data = self._waiting.popleft()
             self._size -= len(data)
             return data
+
+
+def _give(pipe: int, head: bytes, data: bytes) -> None:
+    """Write all of it, waiting where the pipe is full."""
+    left = memoryview(data)[max(os.writev(pipe, [head, data]) - len(head), 0) :]
+    while left:
+        left = left[os.write(pipe, left) :]
