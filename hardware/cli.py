@@ -23,6 +23,7 @@ from hardware.methods import MAP, METHODS
 from hardware.plan_commands import add_plan
 from hardware.reach_command import add_reach
 from hardware.smoothing.command import add_smooth
+from hardware.viewing.command import add_view
 from hardware.wound_commands import add_segment, add_train
 from perception.shipped import named_path
 
@@ -93,6 +94,7 @@ def parser() -> argparse.ArgumentParser:
     _add_track(commands)
     add_smooth(commands)
     add_compare(commands)
+    add_view(commands)
     add_segment(commands)
     add_plan(commands)
     add_live(commands)
