@@ -1,4 +1,4 @@
-# make demo | test | slow | bench | check | format | outages | faults | fuzz | hazards | browser: each makes .venv and installs what it needs; a second time costs nothing.
+# make demo | test | slow | bench | check | format | outages | faults | fuzz | hazards | references | browser: each makes .venv and installs what it needs; a second time costs nothing.
 
 PYTHON ?= python3
 BIN    := .venv/bin
@@ -6,7 +6,7 @@ STAMP  := .venv/.installed
 DEMO   := demo
 APT    := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0
 
-.PHONY: demo test slow bench check format install outages faults fuzz hazards browser
+.PHONY: demo test slow bench check format install outages faults fuzz hazards references browser
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
@@ -39,6 +39,11 @@ check: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/python -m pytest tests/test_floors.py tests/test_hazards.py
 	$(BIN)/python -m tests.hazard_table --check
+	$(BIN)/python -m tests.process_replay
+
+# What comes of the reference recordings now is what is to come of them: for a change that is meant.
+references: $(STAMP)
+	$(BIN)/python -m tests.process_replay --update
 
 # The operator's page is tested in Chromium; where there is none those tests are skipped, and say so.
 browser:
