@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import cv2
@@ -14,25 +15,30 @@ from board_session import BOARD, LENSES, rendered, small_rig
 from boards import motion
 
 from estimation import se3
+from estimation.camera_calibration.homography import LEAST, focal, homography, poses
 from estimation.rig import pixels_from_points
 from hardware.calibration.board_file import write_board
 from hardware.calibration.coverage import GRID, coverage_of, lacking
 from hardware.calibration.guide import TOGETHER, Guide
-from hardware.calibration.live import Waving, devices_named
+from hardware.calibration.live import Waving, devices_named, watch
+from hardware.calibration.run import Wishes, finish
+from hardware.cameras.state import CameraState, LiveHealth, Phase
 from hardware.cli import main
+from hardware.progress import Progress
 from hardware.rig_file import read_rig
-from perception.frames import Image
+from perception.frames import Frame, FrameSet, Image, StampedBy
 from tests.started import started
 from tests.streams import CLOCK, HttpCamera, served
 
 SIZE, RATE = (640, 480), 8.0
+INSTANTS = 14
 SOON = 60.0  # s, by which even a busy machine has looked at a dozen pictures
 
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[list[Image]]:
     """What each of three cameras sees, there and back again."""
-    folder = rendered(tmp_path_factory.mktemp("live") / "session")
+    folder = rendered(tmp_path_factory.mktemp("live") / "session", INSTANTS)
     ways = [[cv2.imread(str(p)) for p in sorted((folder / name).glob("*.png"))] for name in "abc"]
     return [[np.asarray(p, np.uint8) for p in [*way, *way[-2:0:-1]] if p is not None] for way in ways]
 
@@ -49,50 +55,73 @@ def cameras(pictures: list[list[Image]]) -> Iterator[list[HttpCamera]]:
         yield three
 
 
-@pytest.fixture
-def files(pictures: list[list[Image]], tmp_path: Path) -> list[str]:
-    """The same as video files, three times to and fro: what belongs together comes together."""
-    out = []
-    for name, way in zip("abc", pictures, strict=True):
-        out.append(str(tmp_path / f"{name}.avi"))
-        writer = cv2.VideoWriter(out[-1], cv2.VideoWriter.fourcc(*"MJPG"), 12.0, SIZE)
-        for picture in way * 3:
-            writer.write(picture)
-        writer.release()
-    return out
-
-
 def board_file(folder: Path) -> Path:
     write_board(folder / "board.toml", BOARD)
     return folder / "board.toml"
 
 
-@pytest.mark.slow  # how much is seen in how long depends on the machine
-def test_live_cameras_are_calibrated_from_what_they_showed(
-    files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "rig.toml"
-    command = ["calibrate", "cameras", *files, "--board", str(board_file(tmp_path)), "-o", str(out), "--limit-mm", "1"]
-    end = CLOCK.now() + SOON
-    while (code := main(command)) == 2:  # too few pictures, or too few corners in them: the next run goes on
-        assert "allowed" in capsys.readouterr().err and CLOCK.now() < end
-    assert code == 0
-    said = capsys.readouterr()
-    assert "camera 2: focal length" in said.out
+class ListedCameras:
+    """Three cameras that show a list of pictures, a set each time they are asked, and then end."""
+
+    def __init__(self, ways: list[list[Image]]) -> None:
+        self._ways, self._shown = ways, 0
+
+    def next_set(self, until: float) -> FrameSet | None:
+        self._shown += 1
+        return None if self._over else self._set(self._shown - 1)
+
+    def health(self) -> LiveHealth:
+        phase = Phase.ENDED if self._over else Phase.OPEN
+        newest = [None if self._shown == 0 else way[0] for way in self._ways]
+        return LiveHealth(tuple(state(name, phase, one) for name, one in zip("abc", newest, strict=True)), 0, 0, 0, 0)
+
+    @property
+    def _over(self) -> bool:
+        return self._shown > len(self._ways[0])
+
+    def _set(self, k: int) -> FrameSet:
+        stamp = k / RATE
+        return FrameSet(stamp, tuple(Frame(c, stamp, way[k]) for c, way in enumerate(self._ways)))
+
+
+def state(name: str, phase: Phase, newest: Image | None) -> CameraState:
+    by: StampedBy = "driver"
+    return CameraState(name, "a list", phase, *[0.0] * 5, by, 0, 0, 0, {}, None, 0, (), newest)
+
+
+def test_live_cameras_are_calibrated_from_what_they_showed(pictures: list[list[Image]], tmp_path: Path) -> None:
+    file, out, store = board_file(tmp_path), tmp_path / "rig.toml", tmp_path / "rig.corners.npz"
+    devices = devices_named(["http://h/0", "http://h/1", "http://h/2"])
+    progress = Progress("corners", "frame sets", CLOCK.now, StringIO())
+    once = [way[:INSTANTS] for way in pictures]
+    material = watch(ListedCameras(once), devices, BOARD, store, None, CLOCK, progress)
+    assert material.table.done == INSTANTS
+    assert "camera" in progress.note and "the board" in progress.note
+    outcome = finish(material, BOARD, file, out, Wishes(limit=1.0))
+    assert outcome.verdict.passed and "camera 2: focal length" in outcome.text
     written = read_rig(out)
     for camera, lens in zip(written.rig.cameras, LENSES, strict=True):
         assert camera.matrix[0, 0] == pytest.approx(lens[0], rel=0.03)
-    assert [f'source = "{file}"' in out.read_text() for file in files] == [True] * 3
+    assert [f'source = "http://h/{c}"' in out.read_text() for c in range(3)] == [True] * 3
     assert (tmp_path / "rig.report.html").exists()
 
 
-@pytest.mark.slow  # how much is seen in how long depends on the machine
-def test_what_was_found_is_kept_after_ctrl_c_and_the_next_run_goes_on(
-    cameras: list[HttpCamera], tmp_path: Path
-) -> None:
+@pytest.fixture
+def still(pictures: list[list[Image]]) -> Iterator[list[HttpCamera]]:
+    """Cameras before a board that nobody moves: enough never comes."""
+
+    def shown(way: list[Image]) -> HttpCamera:
+        return HttpCamera(fps=RATE, picture_of=lambda _: way[0])
+
+    three = [shown(way) for way in pictures]
+    with served(*three):
+        yield three
+
+
+def test_what_was_found_is_kept_after_ctrl_c_and_the_next_run_goes_on(still: list[HttpCamera], tmp_path: Path) -> None:
     out, store = tmp_path / "rig.toml", tmp_path / "rig.corners.npz"
-    urls, file = [camera.url for camera in cameras], board_file(tmp_path)
-    command = ["calibrate", "cameras", *urls, "--board", str(file), "-o", str(out)]
+    urls, file = [camera.url for camera in still], board_file(tmp_path)
+    command = ["calibrate", "cameras", *urls, "--board", str(file), "-o", str(out), "--no-page"]
     run = started(command)
     assert run.stderr is not None
     assert "the board" in run.stderr.readline()  # where to hold it, or how to tilt it
@@ -103,8 +132,8 @@ def test_what_was_found_is_kept_after_ctrl_c_and_the_next_run_goes_on(
     assert not out.exists()
     names = ("camera 1", "camera 2", "camera 3")
     before = Waving(names, (SIZE,) * 3, BOARD, store)
-    assert before.done > 0 and min(before.guide.coverage(c).parts.sum() for c in range(3)) > 0
-    assert main([*command, "--seconds", "0"]) in (0, 1, 2)  # 2: not yet ten pictures of each
+    assert before.done > 0 and max(before.guide.coverage(c).parts.sum() for c in range(3)) > 0
+    assert main([*command, "--seconds", "0"]) == 2  # a board that stands still tells no lens
     after = Waving(names, (SIZE,) * 3, BOARD, store)
     assert after.done > before.done
     assert all(after.guide.coverage(c).parts.sum() >= before.guide.coverage(c).parts.sum() for c in range(3))
@@ -117,7 +146,8 @@ def test_a_camera_that_shows_nothing_is_named(
     monkeypatch.setattr("hardware.calibration.live.OPENING", 1.0)
     cameras[1].online = False
     urls = [camera.url for camera in cameras]
-    command = ["calibrate", "cameras", *urls, "--board", str(board_file(tmp_path)), "-o", str(tmp_path / "rig.toml")]
+    files = ["--board", str(board_file(tmp_path)), "-o", str(tmp_path / "rig.toml")]
+    command = ["calibrate", "cameras", *urls, *files, "--no-page"]
     assert main(command) == 2
     assert "camera camera 2: pictures = 'none', allowed one within 1 s: camera 2 cannot" in capsys.readouterr().err
 
@@ -189,6 +219,33 @@ def test_cameras_that_never_see_it_together_are_asked_to() -> None:
     assert f"hold the board where two cameras see it, {TOGETHER} frame sets more" in guide.missing()
     guide.add({c: seen_by(c, still)[0] for c in (0, 1)})
     assert f"hold the board where two cameras see it, {TOGETHER - 1} frame sets more" in guide.missing()
+
+
+def test_what_is_added_up_is_what_all_views_tell_and_old_ones_are_seldom_looked_at_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looked = list[int]()
+
+    def counted(planes: np.ndarray, f: np.ndarray) -> np.ndarray:
+        looked.append(len(planes))
+        return poses(planes, f)
+
+    monkeypatch.setattr("hardware.calibration.guide.poses", counted)
+    rng = np.random.default_rng(3)
+    views = seen_by(0, motion(np.linspace(0, 20, 120), rng, BOARD.corners.mean(0)))
+    views = [pixels + rng.normal(0, 0.2, pixels.shape) for pixels in views]
+    views = [pixels for pixels in views if np.isfinite(pixels[:, 0]).sum() >= LEAST]
+    guide, middle = Guide(("a",), (SIZE,), BOARD), (np.array(SIZE) - 1) / 2
+    for pixels in views:
+        guide.add({0: pixels})
+        guide.missing()
+    seen = [np.isfinite(pixels[:, 0]) for pixels in views]
+    planes = np.stack([homography(BOARD.corners[s, :2], p[s] - middle) for s, p in zip(seen, views, strict=True)])
+    whole = coverage_of(np.stack(views), SIZE, poses(planes, np.full(len(planes), focal(planes))))
+    held = guide.coverage(0)
+    assert np.array_equal(held.parts, whole.parts)
+    assert held.tilts == pytest.approx(whole.tilts, abs=0.05) and held.depth == pytest.approx(whole.depth, rel=0.03)
+    assert len(views) > 60 and sum(looked) < 6 * len(views)
 
 
 def test_nothing_seen_lacks_everything() -> None:

@@ -34,6 +34,7 @@ class Staged:
         self.seen, self.pose = Seen(recorder=RecorderReport(0.0, 0, 0.0, "")), SURFACE
         self.ended, self.asked, self.answers = "", 0, 0
         self.orders: list[object] = []
+        self.led: list[object] = []  # orders on the way to where it prints, begun paths by a word
 
     def look(self, *wishes: Wish, seconds: float = 0.1) -> Stage:
         self.now += seconds
@@ -53,26 +54,37 @@ class Staged:
         self.orders += self.conductor(self.now, self.seen, asked)
         return self.conductor.stage
 
-    def to_print(self) -> None:
-        """Lead it to where it prints."""
+    def to_homing(self) -> Staged:
+        """Lead it to where the arm goes home, with nothing printed yet."""
+        confirm, start = ((), ()) if self.conductor.task.unattended else ((Wish.CONFIRM,), (Wish.START,))
         self.look(seconds=0.0)
         self.look()
-        self.look(Wish.CONFIRM)
-        self.look(Wish.START)
+        self.look(*confirm)
+        self.look(*start)
         self.arm = ArmState.ARMED
         self.look()
+        return self
+
+    def to_print(self) -> Staged:
+        """Lead it to where it prints; the orders until then are forgotten."""
+        self.to_homing()
         self.arm = ArmState.DISARMED
         self.look()
         self.arm, self.phase = ArmState.ARMED, Phase.PRINTING
         self.look()
         assert self.look() is Stage.PRINT
+        self.led = [order if isinstance(order, Order | Pace) else "begin" for order in self.orders]
+        self.orders.clear()
+        return self
+
+    def stays(self, stage: Stage, looks: int = 100) -> None:
+        """Look again and again: it stays where it is."""
+        assert {self.look() for _ in range(looks)} == {stage}
 
 
 def test_stages_follow_each_other_and_the_arm_is_armed_only_after_it_went_home() -> None:
-    run = Staged()
-    run.to_print()
-    kinds = [order if isinstance(order, Order | Pace) else "begin" for order in run.orders]
-    assert kinds == [Order.AT_HOME, Order.HOME, "begin", Pace.RESUME, Order.ARM]
+    run = Staged().to_print()
+    assert run.led == [Order.AT_HOME, Order.HOME, "begin", Pace.RESUME, Order.ARM]
     run.phase = Phase.FINISHED
     assert run.look() is Stage.HOMING
     run.look()
@@ -92,16 +104,14 @@ def test_nothing_moves_before_it_was_confirmed_and_started() -> None:
 
 @pytest.mark.parametrize("stage", [Stage.CHECK, Stage.CONFIRM, Stage.PRINT, Stage.PAUSED, Stage.HOMING])
 def test_a_stop_is_always_ordered_whatever_the_window_showed(stage: Stage) -> None:
-    run = Staged()
-    run.to_print()
+    run = Staged().to_print()
     run.conductor.stage = stage
     orders = run.conductor(run.now, run.seen, [Request(1, Wish.STOP, -7)])
     assert orders[0] is Order.STOP
 
 
 def test_a_wish_from_before_a_stop_lets_nothing_go_on() -> None:
-    run = Staged()
-    run.to_print()
+    run = Staged().to_print()
     turn = run.conductor.turn
     run.arm = ArmState.STOPPED
     run.look(Wish.STOP)
@@ -112,27 +122,16 @@ def test_a_wish_from_before_a_stop_lets_nothing_go_on() -> None:
 
 
 def test_an_arm_that_stops_by_itself_is_not_armed_again_unasked() -> None:
-    run = Staged()
-    run.to_print()
-    run.orders.clear()
+    run = Staged().to_print()
     run.arm = ArmState.STOPPED
-    for _ in range(100):
-        assert run.look() is Stage.STOPPED
+    run.stays(Stage.STOPPED)
     assert not run.orders and run.conductor.reason == "why"
     run.look(Wish.RESUME)
     assert run.orders == [Pace.RESUME, Order.ARM]
 
 
 def test_what_goes_on_by_itself_ends_where_nobody_is_there_to_resume() -> None:
-    run = Staged(unattended=True)
-    for _ in range(4):
-        run.look()
-    run.arm = ArmState.ARMED
-    run.look()
-    run.arm = ArmState.DISARMED
-    run.look()
-    run.arm, run.phase = ArmState.ARMED, Phase.PRINTING
-    run.look()
+    run = Staged(unattended=True).to_print()
     run.arm = ArmState.STOPPED
     run.look()
     run.look()
@@ -141,8 +140,7 @@ def test_what_goes_on_by_itself_ends_where_nobody_is_there_to_resume() -> None:
 
 @pytest.mark.parametrize(("fault", "words"), [("cameras", "no more"), ("recorder", "disk")])
 def test_what_ends_a_run_stops_the_arm_and_says_so(fault: str, words: str) -> None:
-    run = Staged()
-    run.to_print()
+    run = Staged().to_print()
     if fault == "cameras":
         run.ended = "no more"
     else:
@@ -153,21 +151,17 @@ def test_what_ends_a_run_stops_the_arm_and_says_so(fault: str, words: str) -> No
 
 
 def test_whoever_ends_a_run_is_not_told_that_it_failed() -> None:
-    run = Staged()
-    run.to_print()
+    run = Staged().to_print()
     assert run.look(Wish.END) is Stage.ENDED and run.orders[-1] is Order.STOP and not run.conductor.done
 
 
 def test_pictures_that_do_not_come_stop_the_arm_until_somebody_resumes() -> None:
-    run = Staged(patience=2.0)
-    run.to_print()
-    run.orders.clear()
+    run = Staged(patience=2.0).to_print()
     assert run.conductor(run.now + 2.1, run.seen, []) == [Order.STOP]
     assert run.conductor.stage is Stage.STOPPED and "no pictures for 2.1 s" in run.conductor.reason
     run.now += 2.1
     run.arm = ArmState.STOPPED
-    for _ in range(20):
-        assert run.look() is Stage.STOPPED
+    run.stays(Stage.STOPPED)
     run.look(Wish.RESUME)
     run.arm = ArmState.ARMED
     run.look()
@@ -179,7 +173,6 @@ def test_an_arm_that_is_unplugged_is_waited_for_and_says_where_it_stands_or_is_t
     run = Staged()
     run.answers = answers
     run.to_print()
-    run.orders.clear()
     run.arm = ArmState.UNPLUGGED
     for _ in range(200):
         assert run.look() is Stage.STOPPED and "plug it in" in run.conductor.reason
@@ -193,9 +186,7 @@ def test_an_arm_that_is_unplugged_is_waited_for_and_says_where_it_stands_or_is_t
 
 
 def test_an_arm_that_is_unplugged_ends_a_run_that_nobody_attends() -> None:
-    run = Staged(unattended=True)
-    for _ in range(4):
-        run.look()
+    run = Staged(unattended=True).to_homing()
     run.arm = ArmState.UNPLUGGED
     run.look()
     run.look()
@@ -203,17 +194,10 @@ def test_an_arm_that_is_unplugged_ends_a_run_that_nobody_attends() -> None:
 
 
 def test_an_arm_that_stops_on_its_way_home_is_not_taken_to_be_there() -> None:
-    run = Staged()
-    run.look(seconds=0.0)
-    run.look()
-    run.look(Wish.CONFIRM)
-    run.look(Wish.START)
-    run.arm = ArmState.ARMED
-    run.look()
+    run = Staged().to_homing()
     run.orders.clear()
     run.arm = ArmState.STOPPED
-    for _ in range(20):
-        assert run.look() is Stage.STOPPED
+    run.stays(Stage.STOPPED)
     assert run.conductor.reason == "why" and set(run.orders) <= {Order.STOP}
 
 

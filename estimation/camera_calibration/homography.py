@@ -70,15 +70,26 @@ def focal(found: Array) -> float:
 
     Each gives h1' w h2 = 0 and h1' w h1 = h2' w h2 with w = diag(1/f^2, 1/f^2, 1): linear in 1/f^2, weighted by tilt.
     """
+    return focal_of(focal_terms(found))
+
+
+def focal_terms(found: Array) -> Array:
+    """(3,) of homographies (V, 3, 3), what a focal length is found from; terms of several add up."""
     h = found[np.isfinite(found).all((1, 2))]
     a, b = h[:, :, 0], h[:, :, 1]
     flat = np.concatenate([(a[:, :2] * b[:, :2]).sum(1), (a[:, :2] ** 2 - b[:, :2] ** 2).sum(1)])
     deep = np.concatenate([a[:, 2] * b[:, 2], a[:, 2] ** 2 - b[:, 2] ** 2])
     scale = np.tile((a[:, :2] ** 2).sum(1), 2)
     flat, deep = flat / scale, deep / scale
-    if not flat @ deep < 0:
+    return np.array([flat @ flat, deep @ deep, flat @ deep])
+
+
+def focal_of(terms: Array) -> float:
+    """The focal length, px, by summed terms (3,); nan where they tell none."""
+    flat, deep, both = terms
+    if not both < 0:
         return float("nan")
-    return float(((flat @ flat) / (deep @ deep)) ** 0.25)  # neither of the two is free of noise
+    return float((flat / deep) ** 0.25)  # neither of the two is free of noise
 
 
 def poses(found: Array, f: Array) -> Array:

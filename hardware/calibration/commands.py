@@ -5,10 +5,16 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hardware.arm_calibration.commands import add_calibrate_arm
+
+if TYPE_CHECKING:
+    from hardware.calibration.waving_page import WavingPage
+    from hardware.clock import Clock
 
 Commands = Any  # argparse's own type for this is private
 
@@ -59,7 +65,8 @@ def _add_cameras(parts: Commands) -> None:
         "cameras",
         help="lenses, places and clock offsets from a waved board, recorded or live",
         description="From a recording, or from live cameras while the board is being waved: it then says where to\n"
-        "hold the board next, and ends once enough was seen. Ctrl-C keeps the corners; the same command goes on.",
+        "hold the board next, here and on a page in the browser, and ends once enough was seen. Ctrl-C keeps the\n"
+        "corners; the same command goes on.",
         epilog="examples:\n  stillbed calibrate cameras sessions/board --board board.toml -o rig.toml\n"
         "  stillbed calibrate cameras /dev/v4l/by-id/CAMERA_A /dev/v4l/by-id/CAMERA_B --board board.toml -o rig.toml",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -74,6 +81,7 @@ def _add_cameras(parts: Commands) -> None:
     part.add_argument(
         "--seconds", type=float, metavar="S", help="watch live cameras so long at most; default: until enough was seen"
     )
+    part.add_argument("--no-page", action="store_true", help="with live cameras: without the page in the browser")
     part.add_argument("--board", type=Path, required=True, metavar="board.toml", help="the board as it was printed")
     part.add_argument(
         "-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write; report beside it"
@@ -148,13 +156,23 @@ def _cameras(arguments: argparse.Namespace) -> int:
             if recorded is not None:
                 outcome = run_calibration(recorded, a.board, a.out, wishes, progress)
             else:
-                outcome = run_live(a.which, a.board, a.out, wishes, a.seconds, clock, progress)
+                open_page = nullcontext if a.no_page else partial(_opened_page, clock)
+                outcome = run_live(a.which, a.board, a.out, wishes, a.seconds, clock, progress, open_page)
     except KeyboardInterrupt:
         kept = f"the corners so far are in {corners_of(a.out)}; the same command goes on from there"
         print(f"\nstillbed: interrupted; {kept}", file=sys.stderr)
         return INTERRUPTED
     print(outcome.text)
     return 0 if outcome.verdict.passed else FAILED
+
+
+def _opened_page(clock: Clock) -> WavingPage:
+    """The page, and where it is."""
+    from hardware.calibration.waving_page import WavingPage
+
+    page = WavingPage(clock)
+    print(f"open {page.address} to see where to hold the board", file=sys.stderr, flush=True)
+    return page
 
 
 def _recorded(which: list[str]) -> Path | None:

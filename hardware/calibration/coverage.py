@@ -34,16 +34,28 @@ class Coverage:
 
 def coverage_of(pixels: Array, size: tuple[int, int], camera_from_board: Array) -> Coverage:
     """Of views with corners (V, P, 2) px, nan where not seen, and poses (V, 4, 4); size: (W, H) px."""
-    if not len(pixels):
-        return Coverage(np.zeros(GRID[::-1]), np.zeros(4), 1.0)
+    return covered(parts_of(pixels, size), looks_of(camera_from_board))
+
+
+def covered(parts: Array, looks: Array) -> Coverage:
+    """By the corners in each part (rows, columns) and how the board was held in each view (V, 3), as `looks_of`."""
+    if not len(looks):
+        return Coverage(parts, np.zeros(4), 1.0)
+    across, up, depth = looks.T
+    tilted = [across < -TILT, across > TILT, up < -TILT, up > TILT]
+    near, far = np.percentile(depth, ENDS)
+    return Coverage(parts, np.array([t.mean() for t in tilted]), float(far / near))
+
+
+def looks_of(camera_from_board: Array) -> Array:
+    """(V, 3) of poses (V, 4, 4): how far the board is turned across and up, rad, and its distance, mm."""
     back = camera_from_board[:, :3, 2]  # the board's, in the camera
     across, up = np.arctan2(back[:, 0], back[:, 2]), np.arctan2(back[:, 1], back[:, 2])
-    tilted = [across < -TILT, across > TILT, up < -TILT, up > TILT]
-    near, far = np.percentile(camera_from_board[:, 2, 3], ENDS)
-    return Coverage(_parts(pixels, size), np.array([t.mean() for t in tilted]), float(far / near))
+    return np.stack([across, up, camera_from_board[:, 2, 3]], 1)
 
 
-def _parts(pixels: Array, size: tuple[int, int]) -> Array:
+def parts_of(pixels: Array, size: tuple[int, int]) -> Array:
+    """(rows, columns) corners in each part of a picture of `size` (W, H) px; pixels (..., 2), nan where not seen."""
     at = pixels[np.isfinite(pixels[..., 0])]
     w, h = size
     return np.asarray(np.histogram2d(at[:, 1], at[:, 0], bins=GRID[::-1], range=((0, h), (0, w)))[0])

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -23,12 +24,13 @@ from hardware.calibration.collect import KEEP, THREADS, Row, joined
 from hardware.calibration.corner_file import VERSION, read_corners, write_corners
 from hardware.calibration.guide import Guide
 from hardware.calibration.material import Material
+from hardware.calibration.waving_page import WavingPage
 from hardware.cameras.feed import Place
-from hardware.cameras.identity import identity_from_text
-from hardware.cameras.live import LiveCameras
-from hardware.cameras.settings import CameraSource, read_live_rig
-from hardware.cameras.state import Phase
+from hardware.cameras.named import places_without_rig, sources_named
+from hardware.cameras.settings import CameraSource
+from hardware.cameras.state import LiveHealth, Phase
 from hardware.clock import Clock
+from hardware.operator.request import Wish
 from hardware.progress import Progress
 from hardware.rig_file import NEAREST_RIG, ImageSource, read_rig
 from perception.boards.board import Board
@@ -59,16 +61,23 @@ class Devices:
 
 def devices_named(which: Sequence[str]) -> Devices:
     """Cameras named as `stillbed cameras` has them, or those of one rig.toml; offsets known so far are left out."""
-    rigs = [text for text in which if text.endswith(".toml")]
-    if rigs and len(which) > 1:
-        raise InputError("command line", "cameras", " ".join(which), "one RIG.toml alone, or cameras without one")
-    if rigs:
-        rig, sources = read_live_rig(rigs[0])
-        places = tuple(Place(i, camera.name, camera.size) for i, camera in enumerate(rig.cameras))
-        return Devices(places, sources, rig, read_rig(rigs[0]).lens_sigma)
-    sources = tuple(CameraSource(identity_from_text("command line", "camera", text, Path.cwd())) for text in which)
-    places = tuple(Place(i, f"camera {i + 1}", None) for i in range(len(which)))
-    return Devices(places, sources, None, [None] * len(which))
+    rig, sources = sources_named(which)
+    if rig is None:
+        return Devices(places_without_rig(len(which)), sources, None, [None] * len(which))
+    places = tuple(Place(i, camera.name, camera.size) for i, camera in enumerate(rig.cameras))
+    return Devices(places, sources, rig, read_rig(which[0]).lens_sigma)
+
+
+class Watched(Protocol):
+    """What is asked of live cameras."""
+
+    def next_set(self, until: float) -> FrameSet | None:
+        """Wait for a set newer than the last one until the instant `until`, s."""
+        ...
+
+    def health(self) -> LiveHealth:
+        """How every camera fares now."""
+        ...
 
 
 class Waving:
@@ -82,6 +91,7 @@ class Waving:
         self._rows: list[Row] = []
         self._done, self._saved = self._table.done, self._table.done
         self._late: float | None = None if len(self._table) else 0.0  # s, from the cameras' stamps to those kept
+        self.seen: dict[int, Array] = {}  # corners (P, 2) px of the newest set by camera, nan where not seen
         self.guide = Guide(names, sizes, board)
         self.guide.remember(self._table)
         self.pictures: list[list[Image]] = [[] for _ in names]
@@ -99,7 +109,8 @@ class Waving:
         for frame, corners in zip(one.frames, found, strict=True):
             self._rows.append(Row(frame.camera, self._done, frame.stamp + self._late, corners))
             self.pictures[frame.camera] = [*self.pictures[frame.camera][1 - PICTURES :], frame.image]
-        self.guide.add({f.camera: c.pixels for f, c in zip(one.frames, found, strict=True) if c.count})
+        self.seen = {f.camera: c.pixels for f, c in zip(one.frames, found, strict=True) if c.count}
+        self.guide.add(self.seen)
         self._done += 1
         if self._done - self._saved >= KEEP:
             self.save()
@@ -134,13 +145,21 @@ def _stand_in(names: tuple[str, ...], sizes: tuple[tuple[int, int], ...]) -> Rig
 
 
 def watch(
-    devices: Devices, board: Board, store: Path, seconds: float | None, clock: Clock, progress: Progress
+    live: Watched,
+    devices: Devices,
+    board: Board,
+    store: Path,
+    seconds: float | None,
+    clock: Clock,
+    progress: Progress,
+    page: WavingPage | None = None,
 ) -> Material:
     """Watch until enough was seen, for `seconds` at most (None: without end), or until the files end.
 
-    What was found is in `store` then, also where it is interrupted. InputError names a camera that shows nothing.
+    What was found is in `store` then, also where it is interrupted. page: shows it, and may ask to stop
+    (KeyboardInterrupt) or to be content. InputError names a camera that shows nothing.
     """
-    with LiveCameras(devices.places, devices.sources, clock) as live, ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         sizes, first = _sizes(live, clock)
         waving = Waving(devices.names, sizes, board, store)
         end = float("inf") if seconds is None else clock.now() + seconds
@@ -155,16 +174,29 @@ def watch(
                     missing = waving.guide.missing()
                 progress.note = missing[0] if missing else "enough"
                 progress(waving.done, 0)
+                if page is not None and _shown(page, waving, missing, newest):
+                    break
         finally:  # Ctrl-C included
             waving.save()
     return waving.material(devices, sizes)
 
 
-def _ended(live: LiveCameras) -> bool:
+def _shown(page: WavingPage, waving: Waving, missing: tuple[str, ...], newest: FrameSet | None) -> bool:
+    """Show the state on the page; whether somebody there is content. KeyboardInterrupt where somebody wants to stop."""
+    if newest is not None:
+        page.picture(waving.guide.names, newest, waving.seen)
+    page.show(waving.guide, missing, waving.done, waving.seen)
+    wish = page.wished()
+    if wish is Wish.STOP:
+        raise KeyboardInterrupt
+    return wish is Wish.END
+
+
+def _ended(live: Watched) -> bool:
     return all(camera.phase is Phase.ENDED for camera in live.health().cameras)
 
 
-def _sizes(live: LiveCameras, clock: Clock) -> tuple[tuple[tuple[int, int], ...], list[FrameSet]]:
+def _sizes(live: Watched, clock: Clock) -> tuple[tuple[tuple[int, int], ...], list[FrameSet]]:
     """Each camera's picture (W, H) px, and the frame sets that came until all were known."""
     end, sets = clock.now() + OPENING, []
     while any(camera.newest is None for camera in live.health().cameras):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +25,10 @@ from hardware.calibration.report import millimetres_per_pixel, page
 from hardware.calibration.source import open_source
 from hardware.calibration.suspicion import check_table
 from hardware.calibration.verdict import LIMIT, Verdict, board_scatter, held_out, judge, residual
+from hardware.calibration.waving_page import WavingPage
+from hardware.cameras.live import LiveCameras
 from hardware.clock import Clock
+from hardware.operator.waving import WavingStage
 from hardware.progress import Progress, Report
 from hardware.rig_file import write_rig
 from perception.boards.board import Board
@@ -70,7 +74,7 @@ def run_calibration(session: Path, board_file: Path, out: Path, wishes: Wishes, 
     rig = source.session.rig
     _check_wishes(tuple(c.name for c in rig.cameras), source.given is not None, source.session.path, wishes)
     table = collect(source.session, board, corners_of(out), report)
-    return _finish(source.material(table), board, board_file, out, wishes)
+    return finish(source.material(table), board, board_file, out, wishes)
 
 
 def run_live(
@@ -81,15 +85,25 @@ def run_live(
     seconds: float | None,
     clock: Clock,
     progress: Progress,
+    open_page: Callable[[], AbstractContextManager[WavingPage | None]] = nullcontext,
 ) -> Outcome:
     """Calibrate live cameras, named as `stillbed cameras` has them, while a board is waved; writes the same files.
 
-    seconds: at most, None until enough was seen. Interrupted, it leaves the corners, and the next run goes on.
+    seconds: at most, None until enough was seen. open_page: gives the page that shows where to hold the board, and
+    what came of it. Interrupted, it leaves the corners, and the next run goes on.
     """
     board = _begin(board_file, out)
     devices = devices_named(which)
     _check_wishes(devices.names, devices.rig is not None, "command line", wishes)
-    return _finish(watch(devices, board, corners_of(out), seconds, clock, progress), board, board_file, out, wishes)
+    with open_page() as shown:
+        with LiveCameras(devices.places, devices.sources, clock) as live:
+            material = watch(live, devices, board, corners_of(out), seconds, clock, progress, shown)
+        if shown is not None:
+            shown.tell(WavingStage.SOLVE)
+        outcome = finish(material, board, board_file, out, wishes)
+        if shown is not None:
+            shown.tell(WavingStage.PASSED if outcome.verdict.passed else WavingStage.FAILED, *outcome.text.split("\n"))
+    return outcome
 
 
 def corners_of(out: Path) -> Path:
@@ -105,7 +119,8 @@ def _begin(board_file: Path, out: Path) -> Board:
     return board
 
 
-def _finish(material: Material, board: Board, board_file: Path, out: Path, wishes: Wishes) -> Outcome:
+def finish(material: Material, board: Board, board_file: Path, out: Path, wishes: Wishes) -> Outcome:
+    """Calibrate from the corners that were found, and write all files."""
     check_table(material.table, board, board_file, material.names, material.pictures)
     views, dropped = usable(material.table, board, material.names, tuple(c.size for c in material.rig.cameras))
     found = calibrate(views, known=material.lenses if wishes.keep_lenses else None)

@@ -85,19 +85,11 @@ def _list_json(devices: tuple[Device, ...]) -> str:
 
 def cameras_named(which: list[str], clock: Clock) -> LiveCameras:
     """The cameras of a rig.toml, or those named one by one."""
-    from estimation.errors import InputError
-    from hardware.cameras.feed import Place
-    from hardware.cameras.identity import identity_from_text
     from hardware.cameras.live import LiveCameras
-    from hardware.cameras.settings import CameraSource, read_live_rig
+    from hardware.cameras.named import places_without_rig, sources_named
 
-    rigs = [text for text in which if text.endswith(".toml")]
-    if rigs and len(which) > 1:
-        raise InputError("command line", "cameras", " ".join(which), "one RIG.toml alone, or cameras without one")
-    if rigs:
-        return LiveCameras(*read_live_rig(rigs[0]), clock)
-    sources = [CameraSource(identity_from_text("command line", "camera", text, Path.cwd())) for text in which]
-    return LiveCameras([Place(i, f"camera {i + 1}", None) for i in range(len(which))], sources, clock)
+    rig, sources = sources_named(which)
+    return LiveCameras(places_without_rig(len(which)) if rig is None else rig, sources, clock)
 
 
 def _watch(arguments: argparse.Namespace, live: LiveCameras, clock: Clock) -> int:

@@ -11,6 +11,7 @@ from hardware.operator.link import OperatorLink
 from hardware.operator.pictures import Pictures
 from hardware.operator.scene import Scene
 from hardware.operator.view import Activity, MotionView, OperatorView
+from hardware.operator.waving import WavingView
 
 KEPT = 60.0  # s of the error's course: a few breaths, and what led to the present hold
 ROWS = 1200  # of it: at 20 views per second, which is more than the board looks
@@ -28,7 +29,7 @@ class Board:
         self._pictures: Pictures | None = None
         self._since = nan
         self._course: deque[tuple[float, float, float, float, bool]] = deque(maxlen=ROWS)
-        self.view: OperatorView | None = None
+        self.view: OperatorView | WavingView | None = None
         self.gone, self.refused = False, 0
         self.view_text, self.scene_text, self.pictures_bytes = "null", "", b""
         self.news = asyncio.Event()  # set, and replaced, when there is something new
@@ -39,7 +40,7 @@ class Board:
         new = view is not None and (self.view is None or view.stamp > self.view.stamp)
         if view is not None and new:
             self.view, self.view_text, self._since = view, text_of(view), now
-            self._note(view.stamp, view.motion)
+            self._note(view.stamp, view.motion if isinstance(view, OperatorView) else None)
         if (scene := self._link.scene.get()) is not self._scene and scene is not None:
             self._scene, self.scene_text, new = scene, scene_text(scene), True
         if watched and (pictures := self._link.pictures.get()) is not self._pictures and pictures is not None:

@@ -10,6 +10,7 @@ from hardware.operator.pictures import Pictures
 from hardware.operator.request import RequestLine
 from hardware.operator.scene import Scene
 from hardware.operator.view import OperatorView
+from hardware.operator.waving import WavingView
 
 
 def _pictures() -> Newest[Pictures]:
@@ -28,7 +29,7 @@ class OperatorLink:
     the page and taken by one process.
     """
 
-    views: Newest[OperatorView] = field(default_factory=Newest)
+    views: Newest[OperatorView | WavingView] = field(default_factory=Newest)
     pictures: Newest[Pictures] = field(default_factory=_pictures)
     scene: Newest[Scene] = field(default_factory=_scene)
     requests: RequestLine = field(default_factory=RequestLine)

@@ -82,7 +82,7 @@ class OperatorServer:
         return {**self._headers, "Server": "stillbed"}
 
     async def _file(self, request: web.Request) -> web.StreamResponse:
-        name = request.match_info["name"] or "index.html"
+        name = request.match_info["name"] or self._settings.page
         if name not in self._files:
             raise web.HTTPNotFound
         kind = KINDS[name.rsplit(".", 1)[1]]

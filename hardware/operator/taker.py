@@ -44,8 +44,11 @@ class Shot:
 class PictureTaker:
     """One thread; `made` counts the pictures' instants that were put out, `dropped` those that were not."""
 
-    def __init__(self, pictures: Newest[Pictures], requests: RequestLine, clock: Clock | None = None) -> None:
-        self._pictures, self._requests, self._clock = pictures, requests, clock or WallClock()
+    def __init__(
+        self, pictures: Newest[Pictures], requests: RequestLine, clock: Clock | None = None, near: bool = True
+    ) -> None:
+        """near: whether the part around what was found is shown as well."""
+        self._pictures, self._requests, self._clock, self._near = pictures, requests, clock or WallClock(), near
         self._due = float("-inf")
         self._crops: dict[str, Crop] = {}
         self._waiting: tuple[float, Sequence[Shot], Array | None] | None = None
@@ -97,7 +100,7 @@ class PictureTaker:
             self.dropped += 1
 
     def _picture(self, shot: Shot) -> CameraPicture:
-        crop = crop_around(shot, self._crops.get(shot.camera))
+        crop = crop_around(shot, self._crops.get(shot.camera)) if self._near else None
         whole, near = small_jpeg(shot.image, WIDTH, QUALITY), b""
         if crop is not None:
             self._crops[shot.camera] = crop

@@ -1,0 +1,113 @@
+"""The page beside a calibration: what it shows is what the guide says, and its two buttons do what they say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from board_session import BOARD, small_rig
+from boards import motion
+from browser import Browser, Page, executable
+
+from estimation import se3
+from estimation.rig import pixels_from_points
+from hardware.calibration.guide import TOGETHER, Guide
+from hardware.calibration.waving_page import WavingPage
+from hardware.clock import WallClock
+from hardware.operator.request import Wish
+from hardware.operator.waving import WavingStage
+from perception.frames import Frame, FrameSet
+
+CLOCK = WallClock()
+CHROMIUM = executable()
+SIZE = (640, 480)
+PATIENCE = 60.0  # s, on a busy machine
+GREY = np.full((480, 640, 3), 150, np.uint8)
+NAMES = ("camera 1", "camera 2", "camera 3")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
+
+
+@pytest.fixture
+def shown() -> Iterator[WavingPage]:
+    with WavingPage(CLOCK) as made:
+        yield made
+
+
+@pytest.fixture
+def browser() -> Iterator[Browser]:
+    assert CHROMIUM is not None
+    made = Browser(CHROMIUM)
+    yield made
+    made.close()
+
+
+def seen_at(instant: float) -> dict[int, np.ndarray]:
+    """Corners (P, 2) px of a moving board in each camera, nan outside of its picture."""
+    pose = motion(np.array([instant]), np.random.default_rng(11), BOARD.corners.mean(0), 1.5)[0]
+    found = {}
+    for c, camera in enumerate(small_rig().cameras):
+        pixels = pixels_from_points(camera, se3.transform_points(pose, BOARD.corners))[0]
+        pixels[((pixels < 0) | (pixels > np.array(SIZE) - 1)).any(-1)] = np.nan
+        if np.isfinite(pixels).any():
+            found[c] = pixels
+    return found
+
+
+def wished(shown: WavingPage) -> Wish:
+    """The next thing that a window asks for."""
+    end = CLOCK.now() + PATIENCE
+    while (wish := shown.wished()) is None:
+        assert CLOCK.now() < end
+        CLOCK.wait_until(CLOCK.now() + 0.05)
+    return wish
+
+
+def tell(shown: WavingPage, page: Page, guide: Guide, looked: int, until: str) -> None:
+    """Show the guide and its pictures until the page has it."""
+    seen, end = seen_at(0.2), CLOCK.now() + 20
+    pictures = tuple(Frame(c, 0.0, GREY) for c in range(3))
+    while not page.js(until):
+        assert CLOCK.now() < end, page.js("document.body.innerText")
+        shown.picture(NAMES, FrameSet(CLOCK.now(), pictures), seen)
+        shown.show(guide, guide.missing(), looked, seen)
+        CLOCK.wait_until(CLOCK.now() + 0.1)
+
+
+def test_the_page_shows_what_is_missing_and_enough_is_enough(shown: WavingPage, browser: Browser) -> None:
+    guide = Guide(NAMES, (SIZE,) * 3, BOARD)
+    for instant in np.arange(0, 4, 0.25):
+        guide.add(seen_at(float(instant)))
+    page = browser.page(shown.address)
+    tell(shown, page, guide, 16, 'document.querySelector("canvas")?.dataset.drawn === "corners"')
+    hint = guide.missing()[0]
+    assert page.text("#question") == hint[0].upper() + hint[1:]
+    assert page.js('[...document.querySelectorAll(".board")].map((each) => each.dataset.camera)') == list(NAMES)
+    named = page.js('document.querySelector(".board[data-next=yes]").dataset.camera')
+    assert hint.startswith(f"{named}:")
+    assert page.text("#together b") == f"{int(100 * guide.together / TOGETHER)} %"
+    parts = guide.coverage(0).parts
+    first = page.text(".board .needs b")
+    assert first == f"{int(100 * np.minimum(parts / 20, 1).mean())} %"
+    page.click('footer [data-wish="end"]')
+    assert wished(shown) is Wish.END
+    shown.tell(WavingStage.SOLVE)
+    page.until('document.body.dataset.stage === "solve"', timeout=PATIENCE)
+    assert page.js('[...document.querySelectorAll("footer button")].every((each) => each.disabled)')
+    shown.tell(WavingStage.PASSED, "PASS", "good enough to print")
+    page.until('document.querySelector("#result pre").textContent === "PASS\\ngood enough to print"', timeout=PATIENCE)
+    assert page.text("#chip") == "Passed"
+
+
+def test_stop_stops_and_what_happened_stays_to_be_read(browser: Browser) -> None:
+    guide = Guide(NAMES, (SIZE,) * 3, BOARD)
+    with pytest.raises(KeyboardInterrupt), WavingPage(CLOCK) as shown:
+        page = browser.page(shown.address)
+        tell(shown, page, guide, 0, 'document.body?.dataset.stage === "wave"')
+        assert "top left" in page.text("#question")
+        page.click('footer [data-wish="stop"]')
+        assert wished(shown) is Wish.STOP
+        raise KeyboardInterrupt  # as the calibration does, to keep its corners
+    page.until('document.body.dataset.stage === "stopped"', timeout=PATIENCE)
+    assert page.text("#question") == "Stopped. What was seen is kept."
+    assert "the same command goes on" in page.text("#result")
