@@ -38,6 +38,7 @@ OWNERS = {  # library: the files that may import it
     "open3d": ("hardware/mesh_file.py",),
     "orjson": ("hardware/recording.py",),
     "packaging": ("hardware/doctor/libraries.py",),
+    "pycolmap": ("hardware/bench/bundle_adjustment.py",),
     "pytest": ("estimation/synthetic/plugin.py",),
     "ruckig": ("planning/*.py",),
     "serial": ("hardware/*.py",),
@@ -104,7 +105,7 @@ def test_every_dependency_is_imported_by_someone_and_declared() -> None:
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     packages = {"opencv-python-headless": "cv2", "open3d-cpu": "open3d", "pyserial": "serial", "pyyaml": "yaml"}
-    extras = [line for extra in ("cluster", "train") for line in project["optional-dependencies"][extra]]
+    extras = [line for extra in ("bench", "cluster", "train") for line in project["optional-dependencies"][extra]]
     declared = {line.split(">")[0] for line in project["dependencies"] + extras}
     declared = {packages.get(name, name) for name in declared}
     assert set.union(*map(roots, FILES)) & {*OWNERS, *FREE} - ABSENT <= declared

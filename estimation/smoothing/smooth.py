@@ -203,11 +203,7 @@ class _Solver:
         return equations, done
 
     def _move(self, done: Pass, step: Array) -> None:
-        e, free = self._estimate, self._problem.free
-        corrections = np.zeros(11 * len(e.cameras))
-        corrections[free] = step[: len(free)]
-        points = e.points + step[len(free) :].reshape(-1, 3)
-        self._estimate = Estimate(e.states.moved(done.chain.steps()), e.cameras.moved(corrections), points)
+        self._estimate = self._estimate.moved(done.chain.steps(), step, self._problem.free)
 
     def _learn(self, equations: Equations, done: Pass, settled: bool) -> float:
         """Take what a pass tells of the noise; of the images only once the motion is `settled`, or a jerk of the

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from estimation import se3
@@ -31,6 +32,13 @@ class Estimate:
     states: States
     cameras: Cameras
     points: Array
+
+    def moved(self, steps: Array, shared: Array, free: NDArray[np.int64]) -> Estimate:
+        """The same after steps of the states (K, 18) and of the shared unknowns (S,), the `free` cameras' first."""
+        corrections = np.zeros(11 * len(self.cameras))
+        corrections[free] = shared[: len(free)]
+        points = self.points + shared[len(free) :].reshape(-1, 3)
+        return Estimate(self.states.moved(steps), self.cameras.moved(corrections), points)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

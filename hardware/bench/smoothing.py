@@ -1,4 +1,4 @@
-"""`stillbed bench smoothing`: smoothed poses beside causal ones on synthetic tracks, clocks, time by length."""
+"""`stillbed bench smoothing`: smoothed poses beside causal ones, clocks, Ceres, many sessions, time by length."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from estimation.smoothing.cameras import REFINED
 from estimation.smoothing.smoothed import Smoothed
 from estimation.synthetic.follow import follow
 from estimation.synthetic.world import World, synthetic_world
+from hardware.bench.bundle_adjustment import ceres_figures
 from hardware.bench.figure import Figure, Target, at_most
+from hardware.bench.smoothing_many import many_figures
 from hardware.clock import CpuClock
 from hardware.evaluation import best_constant
 
@@ -44,6 +46,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--minutes", type=float, nargs="*", default=[1.0, 3.0, 10.0], metavar="M", help="runs that are timed"
     )
+    parser.add_argument(
+        "--adjusted",
+        type=float,
+        default=4.0,
+        metavar="S",
+        help="of the bundle adjustment beside Ceres's; default 4, 0: none",
+    )
+    parser.add_argument(
+        "--sessions", type=int, default=40, metavar="N", help="smoothed by one and by two workers; default 40, 0: none"
+    )
 
 
 def run(options: argparse.Namespace) -> list[Figure]:
@@ -55,6 +67,10 @@ def run(options: argparse.Namespace) -> list[Figure]:
         print(f"{movement}: {found[0].value:.2f} of the causal error", file=sys.stderr, flush=True)
         figures += found
     figures += _late_figures(options)
+    if options.adjusted:
+        figures += ceres_figures(options.adjusted, options.count)
+    if options.sessions:
+        figures += many_figures(options.sessions)
     return figures + [figure for minutes in options.minutes for figure in _timed(minutes, options.count)]
 
 

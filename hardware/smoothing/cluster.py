@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from estimation.errors import InputError
 from hardware.smoothing.many import FAILED, Cluster, Job, Outcome, smooth_job
@@ -22,21 +23,11 @@ MISSING = "dask.distributed, by pip install 'stillbed[cluster]'"
 
 def on_cluster(jobs: Sequence[Job], wishes: Wishes, cluster: Cluster) -> Iterator[Outcome]:
     """What became of each job, as they are done; when interrupted, what is not done is called off."""
-    try:
-        import distributed
-    except ImportError:
-        raise InputError("command line", "--scheduler", cluster.scheduler, MISSING) from None
     with ExitStack() as stack:
         address = cluster.scheduler
         if address == LOCAL:
-            local = distributed.LocalCluster(
-                n_workers=cluster.workers,
-                threads_per_worker=1,  # the work holds Python's lock
-                host="127.0.0.1",
-                dashboard_address=None,
-                silence_logs="CRITICAL",
-            )
-            address = stack.enter_context(local).scheduler_address
+            address = stack.enter_context(local_cluster(cluster.workers)).scheduler_address
+        distributed = _library(cluster.scheduler)
         try:
             client = stack.enter_context(distributed.Client(address, timeout=PATIENCE))
         except (OSError, TimeoutError, ValueError, ImportError) as error:
@@ -49,15 +40,33 @@ def on_cluster(jobs: Sequence[Job], wishes: Wishes, cluster: Cluster) -> Iterato
             yield _told(own[future.key], future)
 
 
+def local_cluster(workers: int | None) -> Any:
+    """A Dask cluster of this machine's processes, for a `with`; `workers` of them, None for as many as cores.
+
+    A thread each: the work holds Python's lock. Nothing outside this machine can reach it.
+    """
+    return _library(LOCAL).LocalCluster(
+        n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, silence_logs="CRITICAL"
+    )
+
+
+def _library(scheduler: str) -> Any:
+    try:
+        import distributed
+    except ImportError:
+        raise InputError("command line", "--scheduler", scheduler, MISSING) from None
+    return distributed
+
+
 def _anywhere(path: Path) -> Path:
     """The path as a worker in another folder has to write it."""
     return path.resolve()
 
 
-def _told(job: Job, future: object) -> Outcome:
+def _told(job: Job, future: Any) -> Outcome:
     """The outcome under the paths that were asked for; a task that Dask gave up on failed with Dask's reason."""
-    error = future.exception()  # type: ignore[attr-defined]
+    error = future.exception()
     if error is not None:
         return Outcome(job, FAILED, f"{type(error).__name__}: {error}", 0.0)
-    found: Outcome = future.result()  # type: ignore[attr-defined]
+    found: Outcome = future.result()
     return Outcome(job, found.state, found.text, found.spent)
