@@ -43,6 +43,7 @@ def test_that_pycolmap_is_missing_is_said(monkeypatch: pytest.MonkeyPatch) -> No
     assert [(f.note, f.verdict) for f in ceres_figures(0.5, 30)] == [(MISSING, "")] * 2
 
 
+@pytest.mark.slow  # three clusters; tests/test_smooth_many.py has the same of one
 def test_two_workers_and_one_that_is_killed_finish_all_sessions() -> None:
     pytest.importorskip("distributed")
     faster, killed = many_figures(3)
