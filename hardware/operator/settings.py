@@ -18,20 +18,19 @@ def new_token() -> str:
 @dataclass(frozen=True, slots=True)
 class OperatorSettings:
     """host: address that is listened on; port: 0 for whichever is free. token: what every request must know.
-    page: which of the pages is served.
 
     elsewhere: serve other machines as well; then `certificate` and `key` (PEM files) are needed, and `names` are those
-    by which browsers call this machine, as the certificate has them.
+    by which browsers call this machine, as the certificate has them. page: which of the pages is served.
     """
 
     host: str = "127.0.0.1"
     port: int = 0
     token: str = field(default_factory=new_token, repr=False)
-    page: str = "index.html"
     elsewhere: bool = False
     certificate: Path | None = None
     key: Path | None = None
     names: tuple[str, ...] = ()
+    page: str = "index.html"
 
     @property
     def scheme(self) -> str:
