@@ -87,6 +87,9 @@ def png() -> bytes:
 
 def main(folder: Path, record: Path, *flags: str) -> int:
     """Run; the exit code is the run's."""
+    from dataclasses import replace
+
+    from hardware.faults import faults_from_texts
     from hardware.live.console import Console
     from hardware.live.prepared import prepare, prepare_again
     from hardware.live.run import LiveRun
@@ -99,7 +102,9 @@ def main(folder: Path, record: Path, *flags: str) -> int:
         device = next((flag for flag in flags if not flag.startswith("--")), "virtual")
         more = {"unattended": "--yes" in flags, "page": "--page" in flags, "stands_home": True}
         given = LiveSettings(rig=rig, path=path, arm=device, profile=profile, record=record, **more)
-        prepared = prepare(given, "the test", False)
+        texts = [flag.partition("=")[2] for flag in flags if flag.startswith("--fault=")]
+        faults = faults_from_texts("command line", "--fault", texts)  # allowed, as what is tracked is simulated
+        prepared = replace(prepare(given, "the test", False), faults=faults)
     with Console() as console:
         outcome = LiveRun(prepared, console, track_nothing)()
         outcome.write()

@@ -160,3 +160,23 @@ def test_an_arm_that_is_unplugged_is_waited_for_and_goes_on_from_home(start: Sta
         run.press("q")
         assert run.end() == 1 and "ended by the operator" in run.said
     assert not open_session(record).damage
+
+
+def test_what_goes_wrong_on_purpose_is_said_held_through_and_in_the_end_stops_the_arm(
+    start: Start, tmp_path: Path
+) -> None:
+    record = tmp_path / "run.mcap"
+    hang, full = "tracking hang at 1s for 1s", "disk full at 4s"
+    run = start(record, "--yes", f"--fault={hang}", f"--fault={full}")
+    run.wait_for("on purpose: tracking hang")
+    hung = CLOCK.now()
+    run.wait_for("on purpose: disk full")
+    struck = CLOCK.now()
+    assert run.end() == 1
+    assert "recording stopped" in run.said and "go on with: stillbed live --resume" in run.said
+    holds = [m for m in messages(record, "/hold") if hung < float(str(m["stamp"])) < hung + 1.2]
+    assert any("pose is" in str(m["reason"]) for m in holds)
+    went_on = [m for m in messages(record, "/move") if hung + 1.0 < float(str(m["stamp"])) < struck]
+    assert len(went_on) > 20
+    assert rests(record, struck, 1.0)
+    assert kept(record, tmp_path / "path.csv") >= last_place(record) - 1e-9

@@ -48,7 +48,6 @@ FIRST = 10.0  # s that the cameras may take for their first pictures
 FEWEST_SETS = 5  # frame sets before the arm begins to move
 RIG_JSON = "rig.json"  # of a recorded calibration: what the rig's own calibration was worth
 WORST = 4.0  # times its sigma that a touched point may lie beside
-PICTURES = 92  # JPEG quality of what is recorded
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +127,8 @@ def record_live(
                     frames = live.next_set(clock.now() + 0.2)
                     for frame in frames.frames if frames is not None else ():
                         stamp = frame.stamp - rig.cameras[frame.camera].clock_offset
-                        session.picture(frame.camera, stamp, *encode(frame.image, PICTURES))
+                        # exactly: JPEG stores a thin needle's colour at half the resolution
+                        session.picture(frame.camera, stamp, *encode(frame.image))
                     count[0] += frames is not None
         except Exception as error:  # told by the thread that moves the arm
             failed.append(error)
