@@ -12,7 +12,7 @@ from estimation.track_loops import MEDIAN
 
 LEAST_UNIT = 0.3  # of what is claimed: better than that no track is believed to be
 LEAST_JITTER, LEAST_UNREST = 1e-4, 3e-3  # s, px: no stamp and no lens is steadier
-HEAVY = 0.5  # numbers that the whole recording's liveliness counts for where a moment has its own
+HEAVY = 2.0  # numbers that the whole recording's liveliness counts for where a moment has its own
 EAGER = 1.4  # steps of the fixed point, which otherwise comes near slowly
 BELIEF = 0.1  # numbers that what was believed before counts for
 AROUND = 1  # frame sets to either side over which it is taken
