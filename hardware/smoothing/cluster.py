@@ -46,7 +46,11 @@ def local_cluster(workers: int | None) -> Any:
     A thread each: the work holds Python's lock. Nothing outside this machine can reach it.
     """
     return _library(LOCAL).LocalCluster(
-        n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, silence_logs="CRITICAL"
+        n_workers=workers,
+        threads_per_worker=1,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+        silence_logs="CRITICAL",
     )
 
 
