@@ -1,12 +1,13 @@
-# make demo | test | slow | bench | check | format | outages | faults | fuzz | hazards | references | browser: each makes .venv and installs what it needs; a second time costs nothing.
+# make demo | test | slow | bench | check | format | outages | faults | fuzz | hazards | references | audit | browser: each makes .venv and installs what it needs; a second time costs nothing.
 
 PYTHON ?= python3
 BIN    := .venv/bin
 STAMP  := .venv/.installed
+AUDIT  := .venv/audit
 DEMO   := demo
 APT    := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0
 
-.PHONY: demo test slow bench check format install outages faults fuzz hazards references browser
+.PHONY: demo test slow bench check format install outages faults fuzz hazards references audit browser
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
@@ -44,6 +45,12 @@ check: $(STAMP)
 # What comes of the reference recordings now is what is to come of them: for a change that is meant.
 references: $(STAMP)
 	$(BIN)/python -m tests.process_replay --update
+
+# pip-audit has a place of its own: what it needs is nothing that stillbed needs.
+audit:
+	@test -x $(AUDIT)/bin/pip-audit || { $(PYTHON) -m venv $(AUDIT) && $(AUDIT)/bin/python -m pip install --quiet pip-audit==2.10.1; } || \
+		echo "pip-audit cannot be installed; is there a network?"
+	@$(PYTHON) -m tests.audit $(AUDIT)/bin/pip-audit
 
 # The operator's page is tested in Chromium; where there is none those tests are skipped, and say so.
 browser:

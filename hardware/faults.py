@@ -105,7 +105,9 @@ SPECS: dict[tuple[Part, Kind], Spec] = {
     (Part.CLOCK, Kind.JUMP): Spec("the stamps of all pictures jump by that much", (_SIMULATE,), "s", -3600, 3600, 1.0),
     (Part.TRACKING, Kind.KILL): Spec("the tracking ends and does not come back", _SEEN),
     (Part.TRACKING, Kind.HANG): Spec("the tracking stands still", _SEEN),
-    (Part.TRACKING, Kind.SLOW): Spec("the tracking has that share of its speed", (_SIMULATE,), "%", 0.1, 100, 20.0),
+    (Part.TRACKING, Kind.SLOW): Spec(
+        "the tracking has that share of its speed", (_SIMULATE, _LIVE), "%", 0.1, 100, 20.0
+    ),
     (Part.MOTION, Kind.KILL): Spec("the motion ends and does not come back", _SEEN),
     (Part.MOTION, Kind.HANG): Spec("the motion stands still", _SEEN),
     (Part.ARM, Kind.STALL): Spec("the controller does nothing; what comes in is queued", _MADE, lasts=None),
@@ -114,6 +116,7 @@ SPECS: dict[tuple[Part, Kind], Spec] = {
     (Part.ARM, Kind.UNPLUG): Spec("nothing goes in or out", (*_MADE, _LIVE)),
     (Part.ARM, Kind.SLOW): Spec("moves go at that share of their feed", _MADE, "%", 0.1, 100, None),
     (Part.DISK, Kind.FULL): Spec("the recording's file can grow no more", (_LIVE,)),
+    (Part.PAGE, Kind.FLOOD): Spec("more windows than may be, each saying as much as it can", (_LIVE,)),
     (Part.SURFACE, Kind.FAST): Spec(
         "the surface runs away and comes back, that fast at most", (_SIMULATE,), "mm/s", 1, 1000, 80.0, 1.0
     ),

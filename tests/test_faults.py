@@ -111,7 +111,8 @@ def test_a_text_names_a_fault(text: str, expected: Fault) -> None:
         ("camera0 bump 2s", "0.01 to 100 mm"),
         ("tracking kill for 2s", "what is killed stays so"),
         ("arm stall", "how long"),
-        ("page flud", "one of camera0"),
+        ("paper flood", "one of camera0"),
+        ("page flud", "did you mean .flood."),
     ],
 )
 def test_a_text_that_names_none_is_told_what_was_meant(text: str, said: str) -> None:

@@ -21,11 +21,16 @@ from hypothesis import strategies as st
 from operator_page import Served, full_view, served
 
 from hardware.clock import WallClock
+from hardware.faults import Fault, Kind, Part
+from hardware.live.injected import Begun
+from hardware.operator import flood
+from hardware.operator.flood_count import FloodCount
 from hardware.operator.link import OperatorLink
 from hardware.operator.pictures import CameraPicture, Pictures
 from hardware.operator.process import OperatorPage
 from hardware.operator.request import Wish
 from hardware.operator.settings import Limits, OperatorSettings
+from hardware.operator.window import FLOOD
 
 CALM = Limits(stale=30.0, patience=30.0)
 
@@ -241,6 +246,31 @@ def test_a_flood_of_stops_is_one_stop_after_another_and_nothing_else() -> None:
         page.put(full_view())
         asyncio.run(flood(page))
         assert {request.wish for request in page.taken()} == {Wish.STOP}
+
+
+def test_a_flood_of_windows_is_turned_away_and_another_one_is_served_all_the_while(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    count, begun = FloodCount(), Begun()
+    begun.instant = WallClock().now()
+    poured = Fault(Part.PAGE, Kind.FLOOD, 0.0, 60.0)
+    monkeypatch.setattr(flood, "AGAIN", 0.01)
+
+    async def both(page: Served) -> None:
+        async with window(page.address) as one:
+            await one.next()
+            flooding = asyncio.create_task(flood.flood(page.address, poured, begun, count))
+            while not (count.closed and count.refused):
+                await asyncio.sleep(0.01)
+            await one.ask(Wish.PAUSE, 7)
+            assert (await one.next("asked"))["words"] == ""
+            flooding.cancel()
+
+    with served(CALM) as page:
+        page.put(full_view(turn=7))
+        asyncio.run(both(page))
+        assert count.messages > FLOOD
+        assert [request.wish for request in page.taken()] == [Wish.PAUSE]  # what was asked under no turn is not asked
 
 
 GARBAGE = st.binary(max_size=400) | st.text(max_size=200)

@@ -17,6 +17,7 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.arm_file import read_arm, write_arm
 from hardware.arm_profile import ArmProfile
+from hardware.bench.fuzz_folders import FOLDERS
 from hardware.bookmark_file import keep_bookmark, read_start
 from hardware.calibration.board_file import read_board, write_board
 from hardware.calibration.formats import formats
@@ -243,6 +244,7 @@ def readers() -> dict[str, Reader]:
         "network": Reader("wound.onnx", _make_model, _model, 0.1),
         "shape model": Reader("shape.toml", _make_shape, _shape_model, 0.3),
     }
+    found |= {name: Reader(struck, make, read, weight) for name, (struck, make, read, weight) in FOLDERS.items()}
     for name, each in formats().items():
         file = "cam_0.yaml" if each.folder else f"x{SUFFIX[name]}"
         found[f"rig of {name}"] = Reader(file, _exported(name, "." if each.folder else file), each.read, 0.2)

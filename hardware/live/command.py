@@ -11,6 +11,7 @@ from perception.shipped import named_path
 FLAGS = (
     *("rig", "simulated", "path", "arm", "profile", "record"),
     *("dry_run", "lift", "stands_home", "jpeg_quality"),
+    *("page_address", "page_port", "page_certificate", "page_key"),
 )
 Commands = Any  # argparse's own type for this is private
 
@@ -27,7 +28,8 @@ def add_live(commands: Commands) -> None:
         epilog="examples:\n  stillbed live session.toml\n"
         "  stillbed live --rig rig.toml --path path.csv --arm /dev/ttyUSB0 --record run.mcap\n"
         "  stillbed live --simulated data/scenarios/breathing_calm.toml --record run.mcap --yes\n"
-        "  stillbed live --resume run.mcap",
+        "  stillbed live --resume run.mcap\n"
+        "  stillbed live session.toml --page-address 0.0.0.0 --page-cert page.pem --page-key page.key --page-name lab",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.add_argument("settings", nargs="?", type=Path, metavar="session.toml", help="see stillbed init")
@@ -54,7 +56,13 @@ def add_live(commands: Commands) -> None:
         metavar="FAULT",
         help='of a simulated run, what goes wrong, such as "tracking hang at 5s for 1s"; see docs/faults.md',
     )
-    how.add_argument("--no-page", action="store_true", help="without the operator's page in the browser")
+    page = command.add_argument_group("the operator's page (docs/operator.md)")
+    page.add_argument("--no-page", action="store_true", help="without it")
+    page.add_argument("--page-address", metavar="ADDR", help="serve other machines too, at this address, by TLS alone")
+    page.add_argument("--page-port", type=int, metavar="N", help="by default any that is free")
+    page.add_argument("--page-cert", dest="page_certificate", type=Path, metavar="PEM", help="certificate for that")
+    page.add_argument("--page-key", type=Path, metavar="PEM", help="the certificate's key, without a password")
+    page.add_argument("--page-name", action="append", metavar="NAME", help="as browsers call this machine; repeatable")
     how.add_argument("--force", action="store_true", help="overwrite the recording")
     command.set_defaults(run=_live)
 
@@ -78,11 +86,13 @@ def _live(arguments: argparse.Namespace) -> int:
     from hardware.live.console import Console
     from hardware.live.prepared import prepare, prepare_again, with_faults
     from hardware.live.run import LiveRun
-    from hardware.live.settings import LiveSettings, overridden, read_settings
+    from hardware.live.settings import LiveSettings, names_given, overridden, read_settings
 
     a = arguments
     faults = faults_from_texts("command line", "--fault", a.fault)
     flags = {name: getattr(a, name) for name in FLAGS} | {"unattended": a.yes, "page": False if a.no_page else None}
+    if a.page_name is not None:
+        flags["page_names"] = names_given("command line", "--page-name", a.page_name)
     if a.resume is not None:
         if a.settings is not None or a.record is not None:
             raise InputError("command line", "--resume", a.resume, "without session.toml and --record")

@@ -18,6 +18,7 @@ from hardware.faults import Fault, Part, Runner, check_faults
 from hardware.live.beside import Beside, Found, read_found
 from hardware.live.conductor import Task
 from hardware.live.crew import CONTEXT
+from hardware.live.page_address import page_settings
 from hardware.live.settings import VIRTUAL, LiveSettings, check_settings, overridden, read_settings
 from hardware.mcap_walk import ChunkOf, parse, walk
 from hardware.messages import rig_from_message
@@ -55,6 +56,8 @@ class Prepared:
 def prepare(settings: LiveSettings, where: object, force: bool) -> Prepared:
     """A new run. InputError where a file makes no sense or the recording exists and `force` is not set."""
     settings = check_settings(settings, where)
+    if settings.page:
+        page_settings(settings, where)
     assert settings.record is not None
     beside = Beside(settings.record)
     if settings.record.exists() and not force:
@@ -74,7 +77,10 @@ def prepare_again(record: File, flags: dict[str, Any]) -> Prepared:
     settings = overridden(read_settings(beside.session), flags)
     found = read_found(beside.surface) if beside.surface.exists() else None
     again = beside.next()
-    prepared = _prepared(check_settings(replace(settings, record=again.record), beside.session), again, found)
+    settings = check_settings(replace(settings, record=again.record), beside.session)
+    if settings.page:
+        page_settings(settings, beside.session)
+    prepared = _prepared(settings, again, found)
     path = prepared.task.path
     start = read_start(beside.progress, path) if beside.progress.exists() else 0.0
     if start >= len(path) - 1:
@@ -159,6 +165,8 @@ def with_faults(prepared: Prepared, faults: tuple[Fault, ...]) -> Prepared:
     if faults and (prepared.live or prepared.settings.arm != VIRTUAL):
         raise InputError("command line", "--fault", str(faults[0]), "with --simulated and a virtual arm alone")
     for fault in faults:
+        if fault.part is Part.PAGE and not prepared.settings.page:
+            raise InputError("command line", "--fault", str(fault), "a run with the operator's page, without --no-page")
         if fault.part is Part.ARM and math.isfinite(fault.duration):
             raise InputError(
                 "command line", "--fault", str(fault), "no duration: a virtual arm is not plugged in again"

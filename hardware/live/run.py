@@ -32,6 +32,7 @@ from hardware.live.keeper import Keeper
 from hardware.live.kept import kept_begin
 from hardware.live.laid import Laid
 from hardware.live.lines import Body, started
+from hardware.live.page_address import page_settings
 from hardware.live.prepared import Prepared
 from hardware.live.records import Begin, EventEntry, UsedEntry
 from hardware.live.settings import settings_text
@@ -42,7 +43,6 @@ from hardware.motion_loop import Order
 from hardware.operator.process import OperatorPage
 from hardware.operator.request import Request, Wish
 from hardware.operator.scene import scene_from
-from hardware.operator.settings import OperatorSettings
 from hardware.operator.view import Stage
 from hardware.schemas import INFO, WARNING
 
@@ -89,8 +89,9 @@ class LiveRun:
             lines.outbox.put(UsedEntry("session.toml", settings_text(prepared.settings)))
             keeper = Keeper(prepared.beside.progress, prepared.task.fingerprint, lines.place)
             stack.callback(keeper.close)
-            self._injector = Injector(prepared.faults, lines.crew, prepared.beside.record, lines.begun)
             self._open_page(stack)
+            page = "" if self._page is None else self._page.address
+            self._injector = Injector(prepared.faults, lines.crew, prepared.beside.record, lines.begun, page)
             importlib.import_module("scipy.interpolate")  # predicting takes it; now nobody waits for this process
             for note in prepared.notes:
                 self._console.say(note)
@@ -118,8 +119,8 @@ class LiveRun:
         seen.tracking, seen.motion, seen.recorder = lines.tracking.get(), lines.motion.get(), lines.recorder.get()
         self._count_stops(now)
         conductor = self._conductor
-        for fault in self._injector.look(now):
-            self._say(f"on purpose: {fault}", WARNING)
+        for words in self._injector.look(now):
+            self._say(f"on purpose: {words}", WARNING)
         orders = self._ended(keeper, now) + conductor(now, seen, requests)
         self._give(orders)
         self._tally.look(now, conductor.stage, seen, None if conductor.laid is None else conductor.laid.profile.arm)
@@ -213,7 +214,8 @@ class LiveRun:
         if not self._prepared.settings.page:
             return
         link = self._lines.link
-        self._page = OperatorPage(link, OperatorSettings())
+        settings = self._prepared.settings
+        self._page = OperatorPage(link, page_settings(settings, self._prepared.beside.session))
         stack.callback(self._page.close)
         self._page.tend(self._clock.now())
         link.scene.put(scene_from(self._prepared.rig))
@@ -293,6 +295,7 @@ class LiveRun:
 
     def _shut_down(self) -> None:
         lines = self._lines
+        self._injector.close()
         with suppress(OSError):
             lines.orders.send(Order.QUIT)
         lines.end()

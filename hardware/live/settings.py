@@ -6,6 +6,7 @@ recording. Files in it are relative to it.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,12 @@ from typing import Any
 from estimation.errors import InputError
 from hardware import checks
 
+LOOPBACK = "127.0.0.1"  # nobody but this machine
 VIRTUAL = "virtual"  # the arm that needs no device
 HIGHEST = 100.0  # mm of a dry run: above, the arm leaves the room that was looked at
 LONGEST = 600.0  # s of patience
 CORES = 1024
+NAME = re.compile(r"(?!.*\.\.)[A-Za-z0-9][A-Za-z0-9.-]{0,252}")  # of a machine
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +30,9 @@ class LiveSettings:
     a scenario, its own. arm: device, URL of pyserial's or "virtual". profile: arm file. record: the recording.
     jpeg_quality: of pictures that come unencoded; 0 keeps them exactly. dry_run: nothing is extruded, the
     nozzle `lift` mm higher. unattended: nobody confirms. stands_home: the operator says that the arm does. pause_frame:
-    the arm knows the frame that stops it. page: serve the operator's page. patience: s without pictures that stop
-    the arm. real_time: ask for that priority. cores_*: to run on, all without any.
+    the arm knows the frame that stops it. page: serve the operator's page, at page_address and page_port (0: any that
+    is free); other machines are let in only encrypted, by page_certificate and page_key, and under page_names.
+    patience: s without pictures that stop the arm. real_time: ask for that priority. cores_*: to run on, or all.
     """
 
     rig: Path | None = None
@@ -44,6 +48,11 @@ class LiveSettings:
     stands_home: bool = False
     pause_frame: bool = True
     page: bool = True
+    page_address: str = LOOPBACK
+    page_port: int = 0
+    page_certificate: Path | None = None
+    page_key: Path | None = None
+    page_names: tuple[str, ...] = ()
     patience: float = 10.0  # somebody finds a loose cable in that
     real_time: bool = True
     cores_tracking: tuple[int, ...] = ()
@@ -82,11 +91,16 @@ KEYS = (
     Key("record", "file", "record", "the recording; what else a run leaves stands beside it", '"run.mcap"'),
     Key("record", "jpeg_quality", "jpeg_quality", "of pictures that come unencoded, 1 to 100; 0: exact", "90"),
     Key("page", "serve", "page", "the operator's page in the browser", "true"),
+    Key("page", "address", "page_address", "where it is served; other machines are let in by TLS alone", '"0.0.0.0"'),
+    Key("page", "port", "page_port", "0: any that is free", "8443"),
+    Key("page", "certificate", "page_certificate", "PEM file, with all between it and an authority", '"page.pem"'),
+    Key("page", "key", "page_key", "its PEM file, without a password", '"page.key"'),
+    Key("page", "names", "page_names", "by which browsers call this machine", '["printer.local"]'),
     Key("cores", "tracking", "cores_tracking", "processor cores to run on; left out: all", "[0]"),
     Key("cores", "motion", "cores_motion", "", "[1]"),
     Key("cores", "recorder", "cores_recorder", "", "[0]"),
 )
-FILES = ("rig", "simulated", "path", "profile", "record")
+FILES = ("rig", "simulated", "path", "profile", "record", "page_certificate", "page_key")
 SWITCHES = ("dry_run", "unattended", "stands_home", "pause_frame", "page", "real_time")
 TABLES = tuple(dict.fromkeys(key.table for key in KEYS))
 OPENING = "# A live run of stillbed: `stillbed live session.toml`. Lines that begin with # are examples.\n"
@@ -120,11 +134,20 @@ def _value(file: Path, key: Key, value: object) -> Any:
         if not (isinstance(value, list) and all(isinstance(core, int) and 0 <= core < CORES for core in value)):
             raise InputError(file, where, value, "a list of core numbers, such as [0]")
         return tuple(value)
-    if key.setting == "arm":
+    if key.setting == "page_names":
+        return names_given(file, where, value)
+    if key.setting in ("arm", "page_address"):
         return checks.text(file, where, value)
-    if key.setting == "jpeg_quality":
+    if key.setting in ("jpeg_quality", "page_port"):
         return checks.integer(file, where, value, 0)
     return checks.number(file, where, value)
+
+
+def names_given(where: object, key: str, names: object) -> tuple[str, ...]:
+    """Names of this machine; InputError unless they are a list of such."""
+    if not (isinstance(names, list) and all(isinstance(name, str) and NAME.fullmatch(name) for name in names)):
+        raise InputError(where, key, names, 'a list of names of this machine, such as ["printer.local"]')
+    return tuple(names)
 
 
 def check_settings(settings: LiveSettings, where: object) -> LiveSettings:

@@ -1,0 +1,121 @@
+"""Faults that a live run is given on purpose: the print goes on, and the ticks keep their time."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hardware.faults import fault_from_text
+from hardware.live.crew import Crew
+from hardware.live.injected import Begun, Injector
+from hardware.live.replayed import replay_run
+from tests.light_live import prepare_files
+from tests.live_runs import CLOCK, Running, messages
+
+Start = Callable[..., Running]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Starts a run that nobody attends, and leaves none behind."""
+    running: list[Running] = []
+    prepare_files(tmp_path, lines=3, speed=8.0)
+
+    def started(record: Path, *flags: str) -> Running:
+        program = "tests.light_live", str(tmp_path), str(record)
+        running.append(Running("--yes", *flags, cache=tmp_path, program=program))
+        return running[-1]
+
+    yield started
+    for run in running:
+        run.close()
+
+
+def ticks(record: Path) -> np.ndarray:
+    """Stamps and ages of the poses (N, 2), s, of the ticks in which the motion was asked."""
+    asked = [tick for tick in messages(record, "/tick") if tick["asked"] and tick["pose_stamp"]]
+    rows = [(float(str(tick["stamp"])), float(np.ravel(tick["pose_stamp"])[0])) for tick in asked]
+    return np.array([(stamp, stamp - pose) for stamp, pose in rows])
+
+
+def span(record: Path, seconds: float) -> tuple[float, float]:
+    """From when until when, s, the run's one fault went on."""
+    told = [event for event in messages(record, "/events") if "on purpose" in str(event["message"])]
+    begun = float(str(told[0]["stamp"]))
+    return begun, begun + seconds
+
+
+def laid_in_order(record: Path) -> bool:
+    """Whether what was extruded went along the path to its end, and never back."""
+    extruding = {move["stamp"]: move["extrude"] for move in messages(record, "/move")}
+    places = [float(str(tick["fraction"])) for tick in messages(record, "/tick") if extruding.get(tick["stamp"])]
+    return len(places) > 50 and bool((np.diff(places) >= -1e-9).all()) and places[-1] > 4.5
+
+
+def stands_still(pid: int, expected: bool) -> bool:
+    """Whether a process comes to be stopped, or to run, as is expected of it."""
+    for _ in range(500):
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="ascii")
+        if (stat.rsplit(")", 1)[1].split()[0] == "T") is expected:
+            return True
+        CLOCK.wait_until(CLOCK.now() + 0.01)
+    return False
+
+
+def test_what_is_slow_runs_for_its_share_of_every_period_and_freely_afterwards(tmp_path: Path) -> None:
+    crew, begun = Crew(), Begun()
+    slow = fault_from_text("here", "fault", "tracking slow 25% at 1s for 1s")
+    try:
+        crew.start("tracking", time.sleep, (600.0,))
+        pid = crew.members["tracking"].pid
+        assert pid is not None
+        injector = Injector([slow], crew, tmp_path / "run.mcap", begun)
+        assert injector.look(99.0) == []  # nothing has begun
+        begun.instant = 100.0
+        assert injector.look(100.99) == [] and stands_still(pid, False)
+        assert injector.look(101.01) == [str(slow)] and stands_still(pid, False)
+        for k in range(1, 8):
+            assert injector.look(101.01 + 0.05 * k) == [] and stands_still(pid, k % 4 != 0)
+        injector.look(102.01)
+        assert stands_still(pid, False)
+        injector.look(102.1)
+        assert stands_still(pid, False)
+    finally:
+        crew.kill("tracking")
+
+
+def test_a_flooded_page_turns_windows_away_and_the_print_goes_on_in_its_rhythm(start: Start, tmp_path: Path) -> None:
+    record = tmp_path / "run.mcap"
+    run = start(record, "--page", "--fault=page flood at 0.3s for 1.5s")
+    end = run.wait_for("page flood is over: .* not let in")
+    found = re.search(r"(\d+) messages sent, (\d+) windows closed for it, (\d+) not let in", run.said[:end])
+    assert found is not None
+    sent, _, refused = map(int, found.groups())  # how many are closed for it is up to how busy the machine is
+    assert sent > 0 and refused > 0
+    assert run.end() == 0 and "the path is printed" in run.said
+    assert not re.search("paused|stopped", run.said)  # no wish of the flood was followed, none lost to it
+    assert laid_in_order(record)
+    rows, (first, last) = ticks(record), span(record, 1.5)
+    during = (rows[:, 0] > first) & (rows[:, 0] < last)
+    rhythms = [np.median(np.diff(rows[part, 0])) for part in (~during, during)]
+    assert rhythms[1] == pytest.approx(rhythms[0], rel=0.2)
+    assert all(tick.frame == tick.recorded for tick in replay_run(record))
+
+
+@pytest.mark.slow
+def test_a_slow_tracking_makes_poses_old_and_ticks_no_later(start: Start, tmp_path: Path) -> None:
+    record = tmp_path / "run.mcap"
+    run = start(record, "--fault=tracking slow 20% at 0.3s for 2s")
+    run.wait_for("the path is printed")
+    assert run.end() == 0
+    rows, (first, last) = ticks(record), span(record, 2.0)
+    during = (rows[:, 0] > first + 0.2) & (rows[:, 0] < last)
+    calm = rows[rows[:, 0] < first]
+    assert np.percentile(rows[during, 1], 90) > np.median(calm[:, 1]) + 0.08  # it stands still for 0.16 s of 0.2
+    assert np.median(np.diff(rows[during, 0])) == pytest.approx(np.median(np.diff(calm[:, 0])), rel=0.2)
+    assert laid_in_order(record)
