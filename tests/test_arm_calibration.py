@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.arm_calibration.fit import Asked, fit_arm
+from estimation.arm_calibration.fit import Asked, fit_arm, widened
 from estimation.arm_calibration.model import ArmState, Sightings, predict
 from estimation.arm_calibration.moves import check_latency, check_places, check_turns
 from estimation.arm_calibration.set_point import SetPoint
@@ -94,6 +94,26 @@ def test_errors_are_as_large_as_is_claimed_and_blunders_are_left_out() -> None:
         assert found.scatter == pytest.approx(1.0, abs=0.1)
         assert 0.85 < found.used.mean() < 0.95
     assert 0.5 < np.mean(squares) < 1.7  # 99.8 % of chi^2 with 44
+
+
+def test_what_is_off_alike_at_a_place_is_in_the_doubt() -> None:
+    plain, wide = [], []
+    for seed in range(2):
+        true, draw = true_state(seed), np.random.default_rng(seed)
+        sightings = sightings_of(true, sent(), KINEMATICS, RIG, 0.2, 0.1, 0.0, draw)
+        group = np.searchsorted(np.quantile(sightings.stamp, np.linspace(0, 1, 8)), sightings.stamp)
+        alike = draw.normal(size=(9, len(RIG), 2)) * 0.4  # px, of each camera in each seventh of the time
+        sightings = replace(sightings, pixels=sightings.pixels + alike[group, sightings.camera])
+        found = fit_arm(sightings, sent(), KINEMATICS, RIG, start_from(sightings))
+        left = [sightings.take(group != g) for g in range(1, 8)]
+        states = [fit_arm(some, sent(), KINEMATICS, RIG, found.state).state for some in left]
+        doubted = widened(found, states)
+        gap = se3.log(se3.inverse(true.base_from_arm) @ found.state.base_from_arm)
+        off = np.concatenate([gap, found.state.tool - true.tool])
+        for out, fit in ((plain, found), (wide, doubted)):
+            out.append(off @ np.linalg.solve(fit.covariance[:9, :9], off) / 9)
+        assert np.allclose(widened(found, [found.state] * 3).covariance, found.covariance)
+    assert np.mean(plain) > 2.5 and 0.3 < np.mean(wide) < 2.5
 
 
 def test_what_the_rig_may_be_off_by_is_in_the_doubt() -> None:

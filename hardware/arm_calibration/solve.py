@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from estimation import se3
-from estimation.arm_calibration.fit import ArmFit, Asked, fit_arm, held_out
+from estimation.arm_calibration.fit import ArmFit, Asked, fit_arm, held_out, widened
 from estimation.arm_calibration.model import OWN, ArmState, Kinematics, Sightings, predict, tips
 from estimation.arm_calibration.moves import check_latency, check_places, check_turns
 from estimation.arm_calibration.set_point import SetPoint
@@ -27,7 +27,7 @@ from hardware.progress import Report
 from planning.kinematics import SimpleArm, nozzle_from_axes
 
 ARM = "arm.toml"  # of a recorded calibration: the arm as it was taken to be
-FOLDS = 4  # of held-out sightings
+FOLDS = 8  # of held-out sightings: with fewer, each fit lacks so much that it tells of that
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,7 +90,8 @@ def solve(
     def left(state: ArmState, some: Sightings) -> Array:
         return predict(state, set_point, kinematics, rig, some.stamp, some.camera).pixels - some.pixels
 
-    away = np.linalg.norm(held_out(sightings, lambda some: fit(some, again), left, FOLDS), axis=1)
+    residuals, states = held_out(sightings, lambda some: fit(some, again), left, FOLDS)
+    found, away = widened(found, states), np.linalg.norm(residuals, axis=1)
     held = np.where(found.used, away, np.nan)
     points = tips(found.state, set_point, kinematics, sightings.stamp)
     bases = np.stack([c.base_from_camera for c in rig.cameras])[sightings.camera]
