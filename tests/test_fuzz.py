@@ -32,6 +32,11 @@ def test_every_reader_takes_or_refuses_what_is_nearly_valid(
     assert not result.wrong
 
 
+@pytest.mark.parametrize("number", [324, 549])  # a zip of a version, and of a compression, that nobody has
+def test_a_file_of_corners_that_no_zip_reader_knows_holds_none(number: int, tmp_path: Path) -> None:
+    assert not fuzzed("corners", READERS["corners"], range(number, number + 1), 1, tmp_path).wrong
+
+
 @given(st.binary(max_size=200), st.integers(0, 2**32))
 def test_what_is_made_wrong_is_the_same_each_time(data: bytes, seed: int) -> None:
     assert mutated(data, np.random.default_rng(seed)) == mutated(data, np.random.default_rng(seed))

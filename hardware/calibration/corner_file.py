@@ -44,7 +44,7 @@ def read_corners(path: Path, key: str) -> CornerTable | None:
             if str(stored["key"]) != key:
                 return None
             parts = {name: stored[name] for name in names}
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError):  # the last: a flag that no zip of ours has
         return None
     except Exception as error:  # a cut zip raises zipfile's own, and zlib's
         if type(error).__module__ not in ("zipfile", "zlib"):
