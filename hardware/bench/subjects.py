@@ -54,6 +54,7 @@ SUBJECTS: Subjects = {
     "latency": Subject("hardware.bench.latency", "from three decoded frames to the pose, by wall clock and processor"),
     "link": Subject("hardware.bench.link", "the arm's line with everything going wrong; stops, jitter, the guard"),
     "live": Subject("hardware.bench.live", "whole runs in real time: frames to wire, stops, nozzle, kills"),
+    "loop": Subject("hardware.bench.loop", "the closed loop at the nozzle, with and without prediction"),
     "map": Subject("hardware.bench.mapping", "landmarks off the true surface beside their claim, and the map's growth"),
     "outages": Subject("hardware.bench.outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?"),
     "plan": Subject("hardware.bench.plan", "a whole plan of a large wound: time, memory, coverage, ink"),
