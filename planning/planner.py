@@ -33,6 +33,7 @@ from planning.stations import Stations, stations_on
 HORIZON = 1.0  # s of path timed at once: any speed can be stopped in it
 RENEW = 0.5  # s of it left when the next is timed, after HORIZON at the latest; it ends at rest, and the surface is
 # foreseen for half a second
+NOTHING = 1e-3  # mm of a path that are as good as none: along 20 nm, where a stop once left one, there is no timing
 PAUSED = "paused"
 STALL = 3.0  # ticks without a call after which the arm has come to rest by itself
 SHARE = 0.98  # of what the guard tolerates of a pose: the planner brakes before the guard would cut
@@ -148,7 +149,8 @@ class Planner:
         """Go from where the nozzle is to where the path goes on, or up if it is done."""
         self._leg = None
         nozzle = self._nozzle(pose, now)
-        if self._place >= self._curve.length:
+        if self._place > self._curve.length - NOTHING:
+            self._place = self._curve.length
             return self._start(pose, Phase.LEAVING, exit_from(nozzle), 0.0, now)
         goal = self._curve.poses(np.array([self._place]))[0]
         way = entry(nozzle, goal, float(self._path.speed[self._checkpoint()]))

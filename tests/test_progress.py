@@ -85,6 +85,14 @@ def test_any_checkpoint_can_be_the_first(checkpoint: int) -> None:
         assert intervals[-1][1] == pytest.approx(lengths[-1])
 
 
+@pytest.mark.parametrize("left", [1e-3, 1e-6, 1e-7, 1e-9])
+def test_a_last_bit_too_short_to_go_along_ends_the_print(left: float) -> None:
+    path = raster(size=2, lines=3)
+    planner = Planner(path, Limits(), CLOSE, TICK, start=5 - left)
+    printed_by(planner, 10.0, 6.0)
+    assert planner.progress.phase is Phase.FINISHED
+
+
 def test_printed_printing_and_next_are_told() -> None:
     planner = Planner(raster(size=2, lines=2), Limits(), CLOSE, TICK)
     seen = set()
