@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimation.errors import InputError
-from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.bench.fault_run import FaultRun, Stage, stage
@@ -106,7 +105,7 @@ class LoopRun(FaultRun):
         super().__init__(on, (), seed)
         self._told = told
 
-    def _know(self, pose: SurfacePose, frames: FrameSet, seen: Observations) -> None:
+    def _know(self, pose: SurfacePose, frames: FrameSet, seen: object) -> None:
         super()._know(self._told(pose), frames, seen)
 
 
