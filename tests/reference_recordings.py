@@ -44,11 +44,11 @@ fps = 15.0
 def main() -> None:
     """Make all of them."""
     write_path(FOLDER / "path.csv", raster())
-    wound = {"movement": "breathing", "seconds": 4.0, "count": 36}
+    wound = {"movement": "breathing", "count": 36}
     late = {"outliers": 0.03, "offsets": (0.0, 8e-3, -5e-3), "dropouts": 0.05, "seed": 3}
     hidden = {"calibration": 0.3, "outages": ((1.5, 1.9), (2.5, 3.2, 1)), "seed": 4}
-    _tracks("breathing", synthetic_world(**wound, **late))
-    _tracks("outage", synthetic_world(**wound, **hidden))
+    _tracks("breathing", synthetic_world(seconds=12.0, rate=15.0, **wound, **late))  # forecasts begin after 8 s
+    _tracks("outage", synthetic_world(seconds=4.0, **wound, **hidden))
     _pictures()
 
 
