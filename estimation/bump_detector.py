@@ -5,12 +5,16 @@ camera is by how much its picture stands shifted, turned and scaled about its ax
 whatever it can of that; averaged over half a second, and compared with what was usual before. The camera that explains
 most of what has changed is the one. A shift is a bump, a change of scale a turned lens; a camera that was pushed along
 its axis looks like the latter, as 4 mm of 400 are one percent.
+
+What is usual is learned of all cameras together and taken off the residuals, so that it holds whichever of them see the
+surface; and a number that the pose could take up nearly whole (two cameras of three, along the plane of their rays) is
+not told from a map's small errors, and stays where it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +26,7 @@ from estimation.se3 import Array
 
 NUMBERS = 4  # of a camera's picture: shift right and down, px; roll, rad; scale
 FEWEST = 8  # tracks of a camera that tell its four numbers
-RIDGE = 1e-3  # information on all of it, 1/px^2: a number that nothing tells stays where it is
+TAKEN = 0.03  # of what a camera's tracks tell of a number: where the pose leaves less of it, it stays where it is
 EVERY = 0.06  # s: every other frame set of 30 a second is looked at, which is plenty for what stays
 BLUNDER = 6.0  # px beside the median of its camera at which a track counts for nothing
 
@@ -48,17 +52,25 @@ class BumpSettings:
 
 @dataclass(slots=True, eq=False)
 class _Sums:
-    """Information (4, 4) and pull (4,) of one camera's numbers, fading."""
+    """Information (n, n) and pull (n,) of n numbers, and information (n, n) of them at a fixed pose; all fading."""
 
-    information: Array = field(default_factory=lambda: np.zeros((NUMBERS, NUMBERS)))
-    pull: Array = field(default_factory=lambda: np.zeros(NUMBERS))
+    information: Array
+    pull: Array
+    fixed: Array
 
-    def take(self, information: Array, pull: Array, share: float) -> None:
-        self.information = self.information + share * (information - self.information)
-        self.pull = self.pull + share * (pull - self.pull)
+    @staticmethod
+    def of(count: int) -> _Sums:
+        square = np.zeros((count, count))
+        return _Sums(square, np.zeros(count), square)
+
+    def take(self, told: Told, share: float) -> None:
+        self.information = self.information + share * (told.information - self.information)
+        self.pull = self.pull + share * (told.pull - self.pull)
+        self.fixed = self.fixed + share * (told.fixed - self.fixed)
 
     def numbers(self) -> Array:
-        return np.asarray(np.linalg.solve(self.information + RIDGE * np.eye(NUMBERS), self.pull))
+        steady = TAKEN * self.fixed + 1e-9 * np.eye(len(self.pull))  # of cameras never seen: zeros
+        return np.asarray(np.linalg.solve(self.information + steady, self.pull))
 
 
 class BumpDetector:
@@ -72,7 +84,7 @@ class BumpDetector:
         """Forget everything, as for a new map."""
         count = len(self._names)
         self.bumped: dict[int, str] = {}  # cameras, and what is said of them
-        self._quick, self._usual = [_Sums() for _ in range(count)], [_Sums() for _ in range(count)]
+        self._quick, self._usual = [_Sums.of(NUMBERS) for _ in range(count)], _Sums.of(NUMBERS * count)
         self._spread = np.zeros(count)  # px^2, usual square of what is off
         self._since = np.full(count, np.nan)  # s, since when a camera is off, or on again
         self._first, self._stamp, self._count = np.nan, np.nan, 0
@@ -91,21 +103,30 @@ class BumpDetector:
             return
         self._forget(self._odd - odd)
         self._odd = odd
-        parts = picture_changes(rig, seen, points, exposed, jacobians)
+        parts = picture_parts(rig, seen, points, exposed, jacobians)
         if np.isnan(self._first):
             self._first = self._stamp = seen.stamp
         step, self._stamp = max(seen.stamp - self._stamp, 0.0), seen.stamp
         self._count += 1
         if seen.stamp - self._first < self.settings.warm:
-            for camera, part in parts.items():
-                for sums in (self._quick[camera], self._usual[camera]):
-                    sums.take(part.information, part.pull, 1 / self._count)
+            self._usual.take(together(parts, len(rig)), 1 / self._count)
             return
-        for camera, part in parts.items():
-            self._quick[camera].take(part.information, part.pull, min(1.0, step / self.settings.quick))
-        changes = {c: self._quick[c].numbers() - self._usual[c].numbers() for c in parts}
+        self._judge({c: p.without(u) for (c, p), u in zip(parts.items(), self._usual_of(parts), strict=True)}, step)
+        if not self.bumped and not odd:
+            self._usual.take(together(parts, len(rig)), min(1.0, step / self.settings.usual))
+
+    def _usual_of(self, cameras: Iterable[int]) -> Array:
+        return self._usual.numbers().reshape(-1, NUMBERS)[list(cameras)]
+
+    def _judge(self, parts: dict[int, PicturePart], step: float) -> None:
+        """Take what each camera is off by beside what is usual, and decide on each."""
+        steady = parts.keys() - self.bumped.keys() - self._odd
+        for camera in parts:
+            told = alone(parts, camera, steady)
+            self._quick[camera].take(told, min(1.0, step / self.settings.quick))
+        changes = {c: self._quick[c].numbers() for c in parts}
         moved = {c: float(np.sqrt(np.mean(((parts[c].slopes @ v) ** 2).sum(-1)))) for c, v in changes.items()}
-        gains = {c: float(v @ self._quick[c].information @ v) for c, v in changes.items()}
+        gains = {c: float(v @ self._quick[c].pull) for c, v in changes.items()}
         for camera in parts:
             others = [g for c, g in gains.items() if c != camera and c not in self.bumped]
             clear = gains[camera] > self.settings.sure * max(others, default=0.0)
@@ -114,16 +135,15 @@ class BumpDetector:
                 self.bumped[camera] = _words(changes[camera], parts[camera], moved[camera])
         if not self.bumped:
             share = min(1.0, step / self.settings.usual)
-            for camera, part in parts.items():
+            for camera in parts:
                 self._spread[camera] += share * (moved[camera] ** 2 - self._spread[camera])
-                self._usual[camera].take(part.information, part.pull, share)
 
     def _forget(self, cameras: frozenset[int]) -> None:
         """Take it that cameras show again what is usual of them."""
         for camera in cameras:
             self.bumped.pop(camera, None)
             self._since[camera] = np.nan
-            self._quick[camera] = replace(self._usual[camera])
+            self._quick[camera] = replace(self._quick[camera], pull=np.zeros(NUMBERS))
 
     def _decide(self, camera: int, moved: float, clear: bool) -> None:
         """Whether a camera counts as bumped from now on. moved: px. clear: whether it explains more than the others."""
@@ -142,45 +162,78 @@ class BumpDetector:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PictureChange:
-    """One camera in one frame set. information: (4, 4), pull: (4,) of its numbers once the pose has taken up what it
-    can. slopes: (N, 2, 4) px, of its tracks by the numbers."""
+class Told:
+    """Information (n, n) and pull (n,) of n numbers once the pose has taken up what it can; fixed: (n, n), information
+    with the pose known."""
 
     information: Array
     pull: Array
+    fixed: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PicturePart:
+    """The normal equations of one camera in one frame set: of its numbers (4, 4) and (4,), of the pose (6, 6) and (6,),
+    and across (4, 6). slopes: (N, 2, 4) px, of its tracks by the numbers."""
+
+    own: Array
+    pull: Array
+    pose: Array
+    pulled: Array
+    cross: Array
     slopes: Array
 
+    def without(self, numbers: Array) -> PicturePart:
+        """As it would be, were the picture not off by these numbers (4,)."""
+        return replace(self, pull=self.pull - self.own @ numbers, pulled=self.pulled - numbers @ self.cross)
 
-def picture_changes(
+
+def picture_parts(
     rig: Rig, seen: Observations, points: Array, exposed: Array, jacobians: Array
-) -> dict[int, PictureChange]:
-    """What each camera alone would have to be off by, with the pose free (Schur complement), by camera number."""
-    pose, pulled = np.zeros((6, 6)), np.zeros(6)
-    parts: dict[int, tuple[Array, Array, Array, Array]] = {}
+) -> dict[int, PicturePart]:
+    """What each camera with enough tracks tells of its own numbers and of the pose, by camera number."""
+    parts: dict[int, PicturePart] = {}
     for camera in range(len(rig)):
         mine = np.flatnonzero(seen.camera == camera)
-        if not len(mine):
+        if len(mine) < FEWEST:
             continue
         pixels = seen.pixels[mine]
         left = pixels - project(rig, seen.camera[mine], exposed[camera], points[mine])[0]
         middle = np.array([median(left[:, 0]), median(left[:, 1])])
         beside = ((left - middle) ** 2).sum(1) / BLUNDER**2
-        weights = (np.maximum(1 - beside, 0.0) / np.maximum(seen.sigma[mine], 0.1)) ** 2
-        rows = jacobians[mine].reshape(-1, 6)
-        weighted = rows * np.repeat(weights, 2)[:, None]
-        pose += weighted.T @ rows
-        pulled += weighted.T @ left.ravel()
-        if len(mine) >= FEWEST:
-            slopes = _slopes(rig, camera, pixels)
-            flat = slopes.reshape(-1, NUMBERS)
-            own = flat * np.repeat(weights, 2)[:, None]
-            parts[camera] = own.T @ flat, own.T @ rows, own.T @ left.ravel(), slopes
-    pose += (1e-9 * np.trace(pose) + 1e-12) * np.eye(6)
-    out = {}
-    for camera, (information, cross, pull, slopes) in parts.items():
-        taken = np.linalg.solve(pose, np.column_stack([cross.T, pulled]))
-        out[camera] = PictureChange(information - cross @ taken[:, :-1], pull - cross @ taken[:, -1], slopes)
-    return out
+        weights = np.repeat((np.maximum(1 - beside, 0.0) / np.maximum(seen.sigma[mine], 0.1)) ** 2, 2)[:, None]
+        rows, slopes = jacobians[mine].reshape(-1, 6), _slopes(rig, camera, pixels)
+        flat, gap = slopes.reshape(-1, NUMBERS), left.ravel()
+        posed, own = (rows * weights).T, (flat * weights).T
+        parts[camera] = PicturePart(own @ flat, own @ gap, posed @ rows, posed @ gap, own @ rows, slopes)
+    return parts
+
+
+def alone(parts: dict[int, PicturePart], camera: int, others: Collection[int]) -> Told:
+    """What this camera alone would have to be off by, with the pose free and told by it and these others."""
+    mine = parts[camera]
+    taken = _taken([mine, *(p for c, p in parts.items() if c in others and c != camera)], mine.cross)
+    return Told(mine.own - mine.cross @ taken[:, :-1], mine.pull - mine.cross @ taken[:, -1], mine.own)
+
+
+def together(parts: dict[int, PicturePart], count: int) -> Told:
+    """What all of `count` cameras together would have to be off by, with the pose free; of those not seen, nothing."""
+    size = NUMBERS * count
+    fixed, cross, pull = np.zeros((size, size)), np.zeros((size, 6)), np.zeros(size)
+    for camera, part in parts.items():
+        at = slice(NUMBERS * camera, NUMBERS * (camera + 1))
+        fixed[at, at], cross[at], pull[at] = part.own, part.cross, part.pull
+    taken = _taken(list(parts.values()), cross)
+    return Told(fixed - cross @ taken[:, :-1], pull - cross @ taken[:, -1], fixed)
+
+
+def _taken(parts: Sequence[PicturePart], cross: Array) -> Array:
+    """(6, n + 1) what the pose, told by these, takes up of n numbers (cross: (n, 6)) and of what they are pulled by."""
+    pose, pulled = np.zeros((6, 6)), np.zeros(6)
+    for part in parts:
+        pose, pulled = pose + part.pose, pulled + part.pulled
+    held = pose + (1e-9 * np.trace(pose) + 1e-12) * np.eye(6)
+    return np.asarray(np.linalg.solve(held, np.column_stack([cross.T, pulled])))
 
 
 def _slopes(rig: Rig, camera: int, pixels: Array) -> Array:
@@ -190,7 +243,7 @@ def _slopes(rig: Rig, camera: int, pixels: Array) -> Array:
     return np.stack([np.stack([one, zero, -down, across], -1), np.stack([zero, one, across, down], -1)], 1)
 
 
-def _words(change: Array, part: PictureChange, moved: float) -> str:
+def _words(change: Array, part: PicturePart, moved: float) -> str:
     by_scale = float(np.sqrt(np.mean(((part.slopes[..., 3] * change[3]) ** 2).sum(-1))))
     rest = np.append(change[:3], 0.0)
     by_rest = float(np.sqrt(np.mean(((part.slopes @ rest) ** 2).sum(-1))))

@@ -9,7 +9,7 @@ import pytest
 from test_estimator import LANDMARKS, RATE, RIG, begun
 
 from estimation import se3
-from estimation.bump_detector import picture_changes
+from estimation.bump_detector import alone, picture_parts, together
 from estimation.pose import TrackState
 from estimation.pose_solver import project
 from estimation.rig import Rig
@@ -73,12 +73,10 @@ def test_a_moved_surface_is_no_change_of_a_camera() -> None:
     moved = at @ se3.exp(np.array([2e-5, -1e-5, 3e-5, 2e-3, 1e-3, -2e-3]))
     points = LANDMARKS[seen.track]
     _, _, jacobians = project(RIG, seen.camera, moved, points)
-    parts = picture_changes(RIG, seen, points, np.broadcast_to(moved, (3, 4, 4)), jacobians)
-    still = picture_changes(RIG, seen, points, np.broadcast_to(at, (3, 4, 4)), jacobians)
-    for camera, part in parts.items():
-        size = np.sqrt(np.diag(part.information))
-        assert np.abs(part.pull / size).max() < 2e-3
-        assert np.abs(still[camera].pull / size).max() < 2e-3
+    for pose in (moved, at):
+        parts = picture_parts(RIG, seen, points, np.broadcast_to(pose, (3, 4, 4)), jacobians)
+        for told in (*(alone(parts, c, parts) for c in parts), together(parts, 3)):
+            assert np.abs(told.pull / np.sqrt(np.diag(told.fixed))).max() < 2e-3
 
 
 def test_a_change_of_one_picture_comes_back_in_its_numbers() -> None:
@@ -88,9 +86,32 @@ def test_a_change_of_one_picture_comes_back_in_its_numbers() -> None:
     exposed = np.broadcast_to(at, (3, 4, 4))
     _, _, jacobians = project(RIG, seen.camera, at, points)
     mine = seen.camera == 1
-    slopes = picture_changes(RIG, seen, points, exposed, jacobians)[1].slopes
+    slopes = picture_parts(RIG, seen, points, exposed, jacobians)[1].slopes
     pixels = seen.pixels.copy()
     pixels[mine] += slopes @ true
-    part = picture_changes(RIG, replace(seen, pixels=pixels), points, exposed, jacobians)[1]
-    found = np.linalg.solve(part.information, part.pull)
+    parts = picture_parts(RIG, replace(seen, pixels=pixels), points, exposed, jacobians)
+    told = alone(parts, 1, parts)
+    found = np.linalg.solve(told.information, told.pull)
     assert found == pytest.approx(true, rel=0.02, abs=1e-4)
+    without = alone({**parts, 1: parts[1].without(true)}, 1, parts)
+    assert np.abs(without.pull).max() < 0.02 * np.abs(told.pull).max()
+
+
+@pytest.mark.parametrize("hidden", [0, 1, 2])
+def test_what_is_usual_of_three_cameras_is_usual_of_any_two(hidden: int) -> None:
+    """Law: pictures that stand as they always did are off by nothing, whichever of them are seen."""
+    draw, at = np.random.default_rng(3), breathing(0.0)
+    seen = observations(RIG, LANDMARKS, at, 0.0, draw, 0.0)
+    _, _, jacobians = project(RIG, seen.camera, at, LANDMARKS[seen.track])
+    exposed, true = np.broadcast_to(at, (3, 4, 4)), draw.normal(size=(3, 4)) * [0.3, 0.3, 1e-3, 1e-3]
+    slopes = picture_parts(RIG, seen, LANDMARKS[seen.track], exposed, jacobians)
+    pixels = seen.pixels.copy()
+    for c in range(3):
+        pixels[seen.camera == c] += slopes[c].slopes @ true[c]
+    parts = picture_parts(RIG, replace(seen, pixels=pixels), LANDMARKS[seen.track], exposed, jacobians)
+    told = together(parts, 3)
+    usual = np.linalg.lstsq(told.information, told.pull, rcond=1e-9)[0].reshape(3, 4)
+    left = {c: parts[c].without(usual[c]) for c in range(3) if c != hidden}
+    for c in left:
+        before, after = alone(parts, c, left), alone(left, c, left)
+        assert np.abs(after.pull).max() < 1e-3 * np.abs(before.pull).max() + 1e-6
