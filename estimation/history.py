@@ -44,6 +44,11 @@ class History:
         """s from the oldest pose to the newest."""
         return float(self._stamps[self._end - 1] - self._stamps[self._first]) if self._end > self._first else 0.0
 
+    def carry(self, moved: Array) -> None:
+        """Put all poses where they are carried by `moved` (4, 4), in the base frame."""
+        own = slice(self._first, self._end)
+        self._poses[own] = moved @ self._poses[own]
+
     @property
     def newest(self) -> Array:
         """The last pose (4, 4); only where there is one."""

@@ -2,8 +2,8 @@
 
 Experts (hold, constant velocity and the `Members`) each say where it will be; the `Stack` weighs them by their delayed
 errors, and the `Intervals` say how far off that was. All are trained directly for each horizon, at samples STEP s apart
-that are interpolated from the poses as they come: the camera's rate and its jitter do not matter. What a `Surprise`
-spoils nobody learns from: no forecast could have known, and the next ones are not worse for it.
+that are interpolated from the poses as they come: the camera's rate and its jitter do not matter. What is a `Surprise`
+nobody learns from: no forecast could have known, and the next ones are not worse for it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.calibration import Intervals
-from estimation.forecast import Forecast
+from estimation.forecast import Forecast, body_rate
 from estimation.history import History
 from estimation.members import LAGS, LEVER, Members
 from estimation.pose import SurfacePose
@@ -78,8 +78,9 @@ class Predictor:
         if not 0 < pose.stamp - self._before <= GAP:
             self._history.clear()
             self._samples.clear()
+            self._surprise.forget()
             self._last = None
-        self._heed(pose)
+        twist = self._heed(pose)
         self._before = pose.stamp
         self._history.add(pose.stamp, pose.base_from_surface)
         if self._history.reach < STEP / 2:
@@ -91,41 +92,50 @@ class Predictor:
         self._learn(due, moved[: len(due)])
         if self._history.reach < LAGS[-1] - EARLY:
             return None
-        return self._forecast(pose, moved[len(due) :], np.zeros((6, 6)) if lasting is None else lasting)
+        return self._forecast(pose, twist, moved[len(due) :], np.zeros((6, 6)) if lasting is None else lasting)
 
-    def _heed(self, pose: SurfacePose) -> None:
-        """See whether a pose is where the one before foretold it."""
+    def _heed(self, pose: SurfacePose) -> Array:
+        """The twist (6,) that forecasts reckon with: what suddenly moves the surface is set aside.
+
+        The past goes along with it, as if the surface had been there all the time.
+        """
         if self._last is None:
-            return
+            return pose.twist
         (forecast, claim), seconds = self._last, pose.stamp - self._before
-        foretold = self._history.newest @ se3.exp(forecast.at(np.array([seconds]))[0][0])
+        increments, rates = forecast.at(np.array([seconds]))
+        foretold = self._history.newest @ se3.exp(increments[0])
         off = se3.log(se3.inverse(foretold) @ pose.base_from_surface) * SCALE
-        if self._surprise(off, seconds, float(HORIZONS[0]), claim):
-            for sample in self._samples:
-                sample.spoilt = True
+        if not self._surprise(off, seconds, float(HORIZONS[0]), claim):
+            return pose.twist
+        moved = pose.base_from_surface @ se3.inverse(foretold)
+        self._history.carry(moved)
+        for sample in self._samples:
+            sample.pose, sample.spoilt = moved @ sample.pose, True
+        return body_rate(increments[0], rates[0])
 
     def _due(self, now: float) -> list[tuple[_Sample, int]]:
         """The samples and horizons whose time has come."""
         waiting = ((s, k) for s in self._samples for k in range(s.known, len(HORIZONS)))
         return [(s, k) for s, k in waiting if s.stamp + HORIZONS[k] <= now + EARLY]
 
-    def _forecast(self, pose: SurfacePose, past: Array, lasting: Array) -> Forecast | None:
-        twist = pose.twist * SCALE
+    def _forecast(self, pose: SurfacePose, twist: Array, past: Array, lasting: Array) -> Forecast | None:
+        twist = twist * SCALE
         inputs = self._members.inputs(past, twist)
         ahead = (HORIZONS[:, None] * twist)[:, None]  # (H, 1, 6)
         experts = np.concatenate([np.zeros_like(ahead), ahead, self._members(inputs) + ahead], axis=1)
         expected = self._stack(experts)
         spread, claimed = self._intervals()
-        if not self._samples or pose.stamp - self._samples[-1].stamp > STEP - EARLY:
+        due = not self._samples or pose.stamp - self._samples[-1].stamp > STEP - EARLY
+        if due and not self._surprise.active:
             self._members.watch(past)
             self._samples.append(_Sample(pose.stamp, pose.base_from_surface, inputs, experts, expected, claimed))
         if self._judged < SETTLE:
             return None
-        sudden = HORIZONS[:, None, None] ** 2 * self._surprise.velocity
-        covariances = (spread + sudden) / np.outer(SCALE, SCALE) + lasting + self._unseen(pose)
-        forecast = Forecast(HORIZONS, expected / SCALE, covariances)
-        self._last = forecast, spread[0] + lasting * np.outer(SCALE, SCALE)
-        return forecast
+        covariances = spread / np.outer(SCALE, SCALE) + lasting + self._unseen(pose)
+        known = Forecast(HORIZONS, expected / SCALE, covariances)
+        self._last = known, spread[0] + lasting * np.outer(SCALE, SCALE)
+        sudden, doubt = self._surprise.ahead(HORIZONS)
+        return Forecast(HORIZONS, known.increments + sudden / SCALE, covariances + doubt / np.outer(SCALE, SCALE))
 
     def _unseen(self, pose: SurfacePose) -> Array:
         """Covariances (H, 6, 6) of what errors seen so far do not tell, fading as the first breaths are seen.

@@ -12,7 +12,7 @@ from estimation.forecast import Forecast
 from estimation.pose import SurfacePose, TrackState
 from estimation.predictor import Predictor
 from estimation.se3 import Array
-from estimation.surprise import Surprise
+from estimation.surprise import PATIENCE, Surprise
 
 RATE = 30.0
 AT = 30.0  # s at which something happens
@@ -69,23 +69,25 @@ def test_what_is_usual_is_learned_whatever_its_size(scale: float, seed: int) -> 
     surprise, draw = Surprise(), np.random.default_rng(seed)
     for _ in range(200):
         surprise(scale * draw.normal(size=6), 1 / RATE, 0.1, scale**2 * np.eye(6))
+    assert not surprise.active
     assert surprise(30 * scale * np.ones(6), 1 / RATE, 0.1, scale**2 * np.eye(6))
-    assert not surprise(scale * draw.normal(size=6), 1 / RATE, 0.1, scale**2 * np.eye(6))
 
 
 def test_what_goes_on_surprising_becomes_usual() -> None:
     surprise, draw = Surprise(), np.random.default_rng(1)
     for _ in range(300):
         surprise(0.01 * draw.normal(size=6), 1 / RATE, 0.1, 1e-4 * np.eye(6))
-    surprises = [surprise(0.3 * draw.normal(size=6), 1 / RATE, 0.1, 1e-4 * np.eye(6)) for _ in range(120)]
-    assert all(surprises[:10]) and not any(surprises[60:])
+    asides = [surprise(0.3 * draw.normal(size=6), 1 / RATE, 0.1, 1e-4 * np.eye(6)) for _ in range(200)]
+    first = int(PATIENCE * RATE)
+    assert all(asides[: first - 1]) and not any(asides[first + 2 :])
+    assert not surprise.active and not surprise.drift.any()
 
 
 def test_an_unknown_velocity_fades() -> None:
     surprise = Surprise()
     for off in (0.01, 0.01, 1.0):
         surprise(off * np.ones(6), 1 / RATE, 0.1, 1e-4 * np.eye(6))
-    widest = np.trace(surprise.velocity)
+    widest = np.trace(surprise.unknown)
     for _ in range(30):
         surprise(0.01 * np.ones(6), 1 / RATE, 0.1, 1e-4 * np.eye(6))
-    assert 0 < np.trace(surprise.velocity) < 1e-3 * widest
+    assert 0 < np.trace(surprise.unknown) < 1e-3 * widest
