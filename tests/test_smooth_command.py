@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
+from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from estimation import se3
+from estimation import se3, smooth
+from estimation.errors import InputError
+from estimation.synthetic.arc_rig import arc_rig
 from estimation.synthetic.follow import steps
 from estimation.synthetic.world import synthetic_world
 from hardware.channels import read_observations, read_poses, read_smoothed
@@ -17,10 +22,15 @@ from hardware.cli import main
 from hardware.evaluation import best_constant
 from hardware.recording import Recorder
 from hardware.rig_file import read_rig
-from hardware.session import open_session
+from hardware.session import FrameRef, open_session
 from hardware.smoothing import run as run_module
+from hardware.smoothing.kept import made_of
+from hardware.smoothing.relinked import relinked
+from hardware.smoothing.run import session_hash
+from hardware.smoothing.tracks import tracks_of
 from hardware.tum import read_tum
-from perception.frames import Frame
+from perception.frames import Frame, Image
+from tests.synthetic import write_session
 
 BLANK = np.full((720, 1280), 90, np.uint8)
 
@@ -96,7 +106,7 @@ def test_what_is_done_is_not_done_again(
     assert main(["smooth", str(recording), "-o", str(out), "--rate", "100"]) == 0
     assert "done already" in capsys.readouterr().out
     assert (out / "summary.json").stat().st_mtime_ns == before
-    asked = [run_module.content_hash(recording, run_module.Wishes(rate)) for rate in (100.0, 50.0)]
+    asked = [run_module.content_hash("a session's", run_module.Wishes(rate)) for rate in (100.0, 50.0)]
     assert asked[0] != asked[1]
 
 
@@ -116,3 +126,61 @@ def test_a_session_that_fails_does_not_stop_the_others(
     text = capsys.readouterr().out
     assert "no.mcap: not smoothed" in text and "60 poses" in text
     assert (tmp_path / "all" / "run" / "smoothed.tum").exists()
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session of a few pictures, without tracks."""
+    folder = tmp_path_factory.mktemp("pictures") / "breathing"
+    write_session(folder, seconds=0.6, rate=10.0, seed=2, cameras=arc_rig(size=(320, 240), focal=280.0))
+    return folder
+
+
+def test_pictures_are_tracked_and_searched_once_and_anew_when_they_change(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+
+    def times() -> list[int]:
+        return [(out / name).stat().st_mtime_ns for name in ("tracks.mcap", "relinked.mcap")]
+
+    assert main(["smooth", str(pictures), "-o", str(out)]) == 0
+    assert "looks at landmarks were found" in capsys.readouterr().out
+    summary, first = json.loads((out / "summary.json").read_text(encoding="utf-8")), times()
+    looks = sum(map(len, read_observations(out / "relinked.mcap")))
+    assert summary["looks_found"] == looks > 0 and summary["error_mm"] < 0.1
+    assert main(["smooth", str(pictures), "-o", str(out), "--no-relink"]) == 0
+    assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["looks_found"] == 0 and times() == first
+
+    changed, kept = tmp_path / "breathing", made_of(out / "tracks.mcap")
+    shutil.copytree(pictures, changed)
+    picture, other = sorted((changed / "cam_0").iterdir())[3:5]
+    shutil.copyfile(other, picture)
+    tracks_of(open_session(changed), out, session_hash(changed))
+    assert times()[0] > first[0] and made_of(out / "tracks.mcap") not in ("", kept)
+
+
+def test_a_picture_that_cannot_be_read_leaves_the_tracks_to_be_smoothed(recording: Path, tmp_path: Path) -> None:
+    session = open_session(recording)
+    tracks = tracks_of(session, tmp_path, "")
+    result = smooth(session.rig, tracks.observations, start=tracks.start)
+    broken = replace(session, store=Unreadable())
+    found = relinked(broken, tracks, result, tmp_path, "of these", StringIO())
+    assert found.looks == 0 and "no picture" in found.text
+    assert made_of(tmp_path / "relinked.mcap") == ""
+
+
+class Unreadable:
+    """Holds no picture."""
+
+    def open(self) -> Unreadable:
+        return self
+
+    def read(self, ref: FrameRef) -> Image:
+        raise InputError("x.avi", "picture", "no picture", "a whole one")
+
+    def encoded(self, ref: FrameRef) -> None:
+        return None
+
+    def close(self) -> None:
+        """Nothing is open."""

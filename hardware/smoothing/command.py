@@ -38,6 +38,12 @@ def add_smooth(commands: Commands) -> None:
         help="let the recording also correct the cameras' places and lenses, with their calibration as prior",
     )
     command.add_argument(
+        "--no-relink",
+        action="store_true",
+        help="take the tracks as they are; without it, all images are searched for landmarks that the tracks do not "
+        "say to be seen, such as before they joined the map",
+    )
+    command.add_argument(
         "--scheduler",
         metavar="ADDRESS",
         help="of a Dask scheduler, such as tcp://host:8786, whose workers reach sessions and OUT under the same paths; "
@@ -56,7 +62,8 @@ def _smooth(arguments: argparse.Namespace) -> int:
     if a.workers is not None and a.scheduler != "local":
         raise InputError("command line", "--workers", a.workers, "with --scheduler local")
     cluster = None if a.scheduler is None else Cluster(a.scheduler, a.workers)
-    for outcome in run_smooth(a.sessions, a.out, Wishes(a.rate, a.refine_cameras), cluster):
+    wishes = Wishes(a.rate, a.refine_cameras, relink=not a.no_relink)
+    for outcome in run_smooth(a.sessions, a.out, wishes, cluster):
         print(f"{outcome.job.session}: not smoothed: {outcome.text}" if outcome.failed else outcome.text, flush=True)
         failed += outcome.failed
     return FAILED if failed else 0

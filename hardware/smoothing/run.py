@@ -22,6 +22,7 @@ from hardware.session import Session, open_session
 from hardware.smoothing.files import write_instants, write_map
 from hardware.smoothing.judged import Judged, judge
 from hardware.smoothing.recording_copy import write_copy
+from hardware.smoothing.relinked import Relinked, relinked
 from hardware.smoothing.report import lead, page
 from hardware.smoothing.tracks import Tracks, tracks_of
 from hardware.summary import finite
@@ -34,10 +35,13 @@ BLOCK = 2**20
 
 @dataclass(frozen=True, slots=True)
 class Wishes:
-    """What is asked for. rate: rows of smoothed.csv a second, Hz, or None for the stamps. refine: the cameras too."""
+    """What is asked for. rate: rows of smoothed.csv a second, Hz, or None for the stamps. refine: the cameras too.
+    relink: look for the landmarks in all images.
+    """
 
     rate: float | None = None
     refine: bool = False
+    relink: bool = True
 
 
 def check_wishes(wishes: Wishes) -> None:
@@ -51,25 +55,32 @@ def smooth_session(path: Path, out: Path, wishes: Wishes, stream: TextIO | None 
     as text. stream: where progress is said, stderr without.
     """
     session = open_session(path)
-    contents = content_hash(path, wishes)
+    recorded = session_hash(path)
+    contents = content_hash(recorded, wishes)
     done = _done(out, contents)
     if done is not None:
         return True, f"{path}: done already\n{done}"
     out.mkdir(parents=True, exist_ok=True)
-    tracks = tracks_of(session, out, stream)
+    tracks = tracks_of(session, out, recorded, stream)
     result = _solved(session, tracks, wishes, stream)
+    found = Relinked(tracks)
+    if wishes.relink:
+        motion = content_hash(recorded, Wishes(refine=wishes.refine))  # the rate changes nothing of it
+        found = relinked(session, tracks, result, out, motion, stream)
+    if found.looks:
+        result = _solved(session, found.tracks, wishes, stream)
     judged = judge(result, tracks, session.truth)
     _write(out, session, result, wishes)
-    text = f"{lead(result, judged)}\nreport: {out / 'report.html'}"
-    (out / "report.html").write_text(page(session.path.name, result, judged), encoding="utf-8")
-    summary = {"contents": contents, "text": text, **_figures(result, judged, session)}
+    text = f"{lead(result, judged)}{found.text}\nreport: {out / 'report.html'}"
+    (out / "report.html").write_text(page(session.path.name, result, judged, found.text), encoding="utf-8")
+    summary = {"contents": contents, "text": text, **_figures(result, judged, session), **found.figures}
     (out / SUMMARY).write_text(json.dumps(finite(summary), indent=2) + "\n", encoding="utf-8")
     return False, text
 
 
-def content_hash(path: Path, wishes: Wishes) -> str:
-    """Of a session's every byte, and of what is asked for."""
-    digest = hashlib.sha256(json.dumps(asdict(wishes)).encode())
+def session_hash(path: Path) -> str:
+    """Of a session's every byte."""
+    digest = hashlib.sha256()
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     for file in files:
         digest.update(file.name.encode())
@@ -77,6 +88,11 @@ def content_hash(path: Path, wishes: Wishes) -> str:
             while block := stream.read(BLOCK):
                 digest.update(block)
     return digest.hexdigest()
+
+
+def content_hash(recorded: str, wishes: Wishes) -> str:
+    """Of a session, by its hash, and of what is asked for."""
+    return hashlib.sha256(json.dumps([recorded, asdict(wishes)]).encode()).hexdigest()
 
 
 def _done(out: Path, contents: str) -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -16,8 +15,8 @@ from estimation.trajectory import Trajectory
 from hardware.channels import read_observations, read_poses
 from hardware.clock import WallClock
 from hardware.progress import Progress
-from hardware.recording import Recorder
 from hardware.session import Session
+from hardware.smoothing.kept import keeping, made_of
 from hardware.tracker import tracker
 
 TRACKS = "tracks.mcap"
@@ -40,26 +39,26 @@ class Tracks:
         return Trajectory(stamps, np.stack([pose.base_from_surface for pose in measured]), exact=False)
 
 
-def tracks_of(session: Session, out: Path, stream: TextIO | None = None) -> Tracks:
+def tracks_of(session: Session, out: Path, contents: str, stream: TextIO | None = None) -> Tracks:
     """The session's tracks. Where it has none, its images are tracked first, into tracks.mcap in the folder `out`.
 
-    That file gets its name when it is whole; of a run that was interrupted, tracks.part.mcap is left. stream: where
-    progress is said, stderr without.
+    contents: the session's hash; tracks.mcap of another one is made anew. stream: where progress is said, stderr
+    without.
     """
     if session.path.is_file():
-        recorded = _read(session.path)
+        recorded = read_tracks(session.path)
         if any(map(len, recorded.observations)):
             return recorded
     kept = out / TRACKS
-    if not kept.exists():
-        _track(session, kept, stream)
-    found = _read(kept)
+    if made_of(kept) != contents:
+        _track(session, kept, contents, stream)
+    found = read_tracks(kept)
     if not any(map(len, found.observations)):
         raise InputError(session.path, "tracks", "none in its images", "a surface that the tracker finds")
     return found
 
 
-def _read(path: Path) -> Tracks:
+def read_tracks(path: Path) -> Tracks:
     """By stamp, each once: a run that was interrupted while it wrote may have stored a stretch twice."""
     observations = {seen.stamp: seen for seen in read_observations(path)}
     poses = {pose.stamp: pose for pose in read_poses(path) if np.isfinite(pose.base_from_surface).all()}
@@ -68,11 +67,11 @@ def _read(path: Path) -> Tracks:
     )
 
 
-def _track(session: Session, target: Path, stream: TextIO | None) -> None:
-    part, clock = target.with_suffix(".part.mcap"), WallClock()
+def _track(session: Session, target: Path, contents: str, stream: TextIO | None) -> None:
+    clock = WallClock()
     with (
         tracker(session.rig, session.roi, session.surface, clock.now) as step,
-        Recorder(part, session.rig, overwrite=True) as recorder,
+        keeping(target, session.rig, contents) as recorder,
         Progress("track", "frame sets", clock.now, stream) as progress,
     ):
         for done, frames in enumerate(session.frame_sets(), 1):
@@ -81,4 +80,3 @@ def _track(session: Session, target: Path, stream: TextIO | None) -> None:
             recorder.write(pose)
             step.idle()
             progress(done, len(session))
-    os.replace(part, target)
