@@ -230,15 +230,20 @@ def is_transform(matrix: ArrayLike, tolerance: float = 1e-5) -> bool:
 def orthonormalise(transform: ArrayLike) -> Array:
     """The nearest rigid motion to a nearly rigid (4, 4) matrix (polar decomposition of its rotation)."""
     transform = np.asarray(transform, float)
-    u, _, vt = np.linalg.svd(transform[:3, :3])
-    return make(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt, transform[:3, 3])
+    return make(nearest_rotation(transform[:3, :3]), transform[:3, 3])
+
+
+def nearest_rotation(matrix: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) nearest to matrices (..., 3, 3), by squares of their differences (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd(np.asarray(matrix, float))
+    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
+    return np.asarray(u @ vt)
 
 
 def rigid_from_points(source: Array, target: Array) -> Array:
     """The motion (4, 4) that carries points (N, 3) onto others in least squares (Umeyama 1991, without scale)."""
     a, b = source.mean(0), target.mean(0)
-    u, _, vt = np.linalg.svd((target - b).T @ (source - a))
-    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    rotation = nearest_rotation((target - b).T @ (source - a))
     return make(rotation, b - rotation @ a)
 
 

@@ -158,6 +158,15 @@ def test_nearest_rigid_motion_of_a_rigid_motion_is_itself(t: Array) -> None:
     assert se3.is_transform(se3.orthonormalise(noisy), 1e-9)
 
 
+@given(transforms, vectors(3, 1.0), vectors(9, 0.2))
+def test_the_nearest_rotation_is_that_of_a_stretched_one_and_no_mirror(t: Array, stretch: Array, bend: Array) -> None:
+    turn, skewed = t[:3, :3], np.eye(3) + bend.reshape(3, 3) / 2
+    shape = skewed @ np.diag(1.5 + stretch / 2) @ skewed.T  # symmetric and positive
+    many = se3.nearest_rotation(np.stack([turn @ shape, turn @ np.diag([1, 1, -0.1])]))
+    assert np.allclose(many[0], turn, rtol=0, atol=1e-9)
+    assert np.allclose(np.linalg.det(many), 1.0)
+
+
 @given(transforms, vectors(3, 300.0))
 def test_points_move_as_homogeneous_vectors(t: Array, point: Array) -> None:
     assert close(se3.transform_points(t, point[None])[0], (t @ np.append(point, 1.0))[:3])

@@ -183,10 +183,8 @@ def displaced(found: Rig, true: Rig, points: Array) -> Array:
             held += np.swapaxes(by_point, 1, 2) @ by_point
             pull += np.einsum("npi,np->ni", by_point, there - pixels)
         at = at - np.linalg.solve(held, pull[..., None])[..., 0]
-    a, b = points - points.mean(0), at - at.mean(0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    turn = vt.T @ np.diag([1, 1, np.linalg.det(vt.T @ u.T)]) @ u.T
-    return np.asarray(np.linalg.norm(b - a @ turn.T, axis=1))
+    carried = se3.transform_points(se3.rigid_from_points(points, at), points)
+    return np.asarray(np.linalg.norm(at - carried, axis=1))
 
 
 def _nees(seed: int) -> float:

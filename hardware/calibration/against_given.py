@@ -58,8 +58,7 @@ def _rotations(rig: Rig) -> Array:
 
 def misfit(found: Array, given: Array) -> float:
     """Largest angle, degrees, between rotations (C, 3, 3) and (C, 3, 3) once the bases agree at best."""
-    u, _, vt = np.linalg.svd((found @ np.swapaxes(given, 1, 2)).sum(0))
-    change = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    change = se3.nearest_rotation((found @ np.swapaxes(given, 1, 2)).sum(0))
     return float(np.degrees(se3.angle_of(np.swapaxes(found, 1, 2) @ change @ given)).max())
 
 

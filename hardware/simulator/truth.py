@@ -86,5 +86,4 @@ class Truth:
         ahead = [self.displacement(points + STEP / 2 * axis, amount) for axis in np.eye(3)]
         behind = [self.displacement(points - STEP / 2 * axis, amount) for axis in np.eye(3)]
         gradient = np.eye(3) + (np.stack(ahead, -1) - np.stack(behind, -1)) / STEP
-        u, _, vt = np.linalg.svd(gradient)
-        return np.asarray(u @ vt)
+        return se3.nearest_rotation(gradient)
