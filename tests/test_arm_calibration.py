@@ -26,11 +26,13 @@ from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.arm_calibration.moves import MoveWishes, planned
 from hardware.arm_calibration.run import run_touched
 from hardware.arm_calibration.solve import calibrated, kinematics_of
+from hardware.arm_calibration.tool_shadow import hidden_tips, needle_shown
 from hardware.arm_file import read_arm
 from hardware.arm_profile import ArmProfile, placed
 from hardware.rig_file import write_rig
 from hardware.simulator.polyline import Polyline
 from hardware.simulator.servo import Servo
+from perception.tool_profile import SYRINGE
 
 RIG, TOLD = arc_rig(), placed(ArmProfile(), REST)
 KINEMATICS = kinematics_of(TOLD.arm)
@@ -227,6 +229,30 @@ def test_the_profile_takes_over_what_was_found() -> None:
     assert np.allclose(profile.arm.arm_from_base @ state.base_from_arm, np.eye(4), atol=1e-12)
     assert profile.lag == pytest.approx(profile.frame_time + state.dead_time + state.lag)
     assert calibrated(TOLD, state, Asked(latency=False)).lag == TOLD.lag
+
+
+@given(st.floats(-1.0, 1.0))
+def test_a_tool_hides_its_needle_from_who_looks_along_it(along: float) -> None:
+    square = float(np.sqrt(1 - along**2))
+    height, upper = np.arange(0, 12.8, 0.05), np.arange(12.85, 96, 0.05)
+    beside = (upper - height[:, None]) * square  # times `along`, of the line of sight from the axis, where it is higher
+    hit = (along > 0) & (beside < along * np.interp(upper, *SYRINGE.T)).any(1)
+    free = height[: int(np.argmax(hit))] if hit.any() else height
+    expected = square * float(free[-1]) if len(free) else 0.0
+    assert float(needle_shown(SYRINGE, np.array([along]))[0]) == pytest.approx(expected, abs=0.1)
+
+
+def test_where_the_tool_hides_its_tip_is_told_from_where_it_is_lost() -> None:
+    state, point = true_state(4), sent()
+    rested = np.unique(sightings_of(state, point, KINEMATICS, RIG, 0.2, 0.0, 0.0, np.random.default_rng(0)).stamp)[:6]
+    ahead = state.base_from_arm @ KINEMATICS(point.lagged(rested, state.dead_time, state.lag))
+    watcher = RIG.cameras[0]
+    for turn, hides in ((0.0, True), (np.pi / 2, False)):
+        view = ahead[0, :3, :3] @ se3.exp_rotation([0.0, turn + np.pi, 0.0])  # looks down the tool, or at its side
+        place = ahead[0, :3, 3] + ahead[0, :3, :3] @ state.tool - 400 * view[:, 2]
+        rig = Rig((replace(watcher, base_from_camera=se3.make(view, place)),))
+        found = hidden_tips(state, SYRINGE, point, KINEMATICS, rig, rested[:1], np.zeros(1, np.int64))
+        assert found.tolist() == [hides]
 
 
 def touched(count: int, seek: bool, sigma: float) -> tuple[ArmState, Array, Array]:

@@ -113,7 +113,7 @@ class _Problem:
         def error(_: object, values: gtsam.Values, slopes: list[Array] | None) -> Array:
             found, left = self.seen(values)
             if slopes is not None:
-                for i, slope in enumerate(self._slopes(found)):
+                for i, slope in enumerate(self._slopes(found, values)):
                     slopes[i] = np.asfortranarray((slope[rows] * root[:, None, None]).reshape(2 * len(root), -1))
             return np.asarray((left[rows] * root[:, None]).ravel())
 
@@ -129,8 +129,10 @@ class _Problem:
             graph.add(gtsam.PriorFactorVector(CAMERAS, np.zeros(OWN * self._cameras), doubt))
         return graph
 
-    def _slopes(self, found: Predicted) -> list[Array]:
+    def _slopes(self, found: Predicted, values: gtsam.Values) -> list[Array]:
         by = {PLACE: found.by_arm, TIP: found.by_tool, TIMING: found.by_time, END: found.by_blunt}
+        if self.asked.latency and values.atVector(TIMING)[1] < 0:  # which stands for a lag as long
+            by[TIMING] = found.by_time * [1.0, -1.0]
         slopes = [by[key] for key in self.keys if key in by]
         if self.rig_covariance is not None:
             spread = np.zeros((len(self.sightings), 2, self._cameras, OWN))
@@ -199,7 +201,9 @@ def _weighed(problem: _Problem, values: gtsam.Values) -> tuple[gtsam.Values, Arr
 
 
 def _solve(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
-    return gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    wishes = gtsam.LevenbergMarquardtParams()
+    wishes.setDiagonalDamping(True)  # in each number's own unit: radians, mm and s lie far apart
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, wishes).optimize()
 
 
 def _positive(covariance: Array) -> Array:

@@ -44,7 +44,7 @@ def add_calibrate_arm(parts: Commands) -> None:
     moves.add_argument("--reach-mm", type=float, default=50.0, metavar="MM", help="along X and Y; default 50")
     moves.add_argument("--up-mm", type=float, default=45.0, metavar="MM", help="above where it begins; default 45")
     moves.add_argument("--down-mm", type=float, default=20.0, metavar="MM", help="below it; default 20")
-    moves.add_argument("--turn-deg", type=float, default=20.0, metavar="DEG", help="of A, B and C; default 20")
+    moves.add_argument("--turn-deg", type=float, default=35.0, metavar="DEG", help="of A, B and C; default 35")
     moves.add_argument("--speed-mm-s", type=float, default=80.0, metavar="MM_S", help="at most; default 80")
     moves.add_argument("--swing-s", type=float, default=8.0, metavar="S", help="a swing at the end; default 8")
     moves.add_argument("--stands", metavar="WHERE", help="where a silent arm stands: X,Y,Z,A,B,C or home")

@@ -37,7 +37,7 @@ class MoveWishes:
     reach: float = 50.0
     up: float = 45.0
     down: float = 20.0
-    turn: float = float(np.deg2rad(20.0))
+    turn: float = float(np.deg2rad(35.0))  # as far as a needle is still seen: less, and tool and arm look alike
     speed: float = 80.0
     dwell: float = 0.6
     swing: float = 8.0

@@ -12,6 +12,7 @@ from estimation import se3
 from estimation.arm_calibration.model import predict
 from estimation.se3 import Array
 from hardware.arm_calibration.solve import ArmCalibration, kinematics_of
+from hardware.arm_calibration.verdict import seen_words
 from hardware.calibration.verdict import Verdict
 from hardware.images import encode
 from hardware.page import document, figures_table, legend, line_key, row_of_tiles, section, tile
@@ -65,9 +66,8 @@ def _numbers(found: ArmCalibration, sigma: Array) -> str:
     ]
     for c, camera in enumerate(found.rig.cameras):
         place = (arm_from_base @ camera.base_from_camera)[:3, 3]
-        seen = f"{found.look.found[c]} of {found.look.looked[c]} pictures"
-        rows.append([f"{camera.name} in the arm's frame, mm", _three(place), seen])
-    return figures_table(["", "found", "± or seen in"], rows)
+        rows.append([f"{camera.name} in the arm's frame, mm", _three(place), seen_words(found, c)])
+    return figures_table(["", "found", "±, or the tip"], rows)
 
 
 def _three(values: Array, digits: int = 2) -> str:

@@ -31,7 +31,7 @@ from hardware.arm_calibration.solve import (
     tip_error,
 )
 from hardware.arm_calibration.touched_file import TouchedPoints, read_touched
-from hardware.arm_calibration.verdict import LIMIT, judge
+from hardware.arm_calibration.verdict import LIMIT, judge, seen_words
 from hardware.arm_file import write_arm
 from hardware.arm_port import Opener
 from hardware.arm_profile import ArmProfile
@@ -214,7 +214,7 @@ class ArmTruth:
 def _text(found: ArmCalibration, verdict: Verdict, against: Sequence[tuple[str, str, str]], out: Path) -> str:
     lines = ["PASS" if verdict.passed else "FAIL", *verdict.lines]
     for c, camera in enumerate(found.rig.cameras):
-        lines.append(f"{camera.name}: tip found in {found.look.found[c]} of {found.look.looked[c]} pictures")
+        lines.append(f"{camera.name}: tip {seen_words(found, c)}")
     lines += [f"beside the truth: {what}: {off} (stated {stated or '-'})" for what, off, stated in against]
     lines += list(verdict.hints)
     lines.append(f"arm file: {out}, report: {out.with_suffix('.report.html')}")

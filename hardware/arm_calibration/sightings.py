@@ -32,13 +32,15 @@ SHOWN = 6  # of them per camera
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
     """What was seen. sightings: of resting places one per camera, the mean. looked, found: (C,) pictures. crops: by
-    camera, pictures (K, CROP, CROP, 3) about tips, and pixels (K, 2) of the tips in them; width: (C,) px of needle."""
+    camera, pictures (K, CROP, CROP, 3) about tips, and pixels (K, 2) of the tips in them; width: (C,) px of needle.
+    missed: stamps (M,), s, and cameras (M,) of pictures without a tip."""
 
     sightings: Sightings
     looked: NDArray[np.int64]
     found: NDArray[np.int64]
     crops: tuple[tuple[Array, Array], ...]
     width: Array
+    missed: tuple[Array, NDArray[np.int64]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,7 +160,9 @@ def _gathered(seen: Sequence[_Seen], cameras: int) -> Look:
         place=np.array([max(key[0], -1) for key in rows], np.int64),
     )
     width = np.array([_median([o.tip.width for o in seen if o.tip and o.ref.camera == c]) for c in range(cameras)])
-    return Look(sightings, looked, found, tuple(_crops(seen, c) for c in range(cameras)), width)
+    without = [one.ref for one in seen if one.tip is None]
+    missed = np.array([ref.stamp for ref in without], float), np.array([ref.camera for ref in without], np.int64)
+    return Look(sightings, looked, found, tuple(_crops(seen, c) for c in range(cameras)), width, missed)
 
 
 def _median(values: Sequence[float]) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.arm_calibration.fit import ArmFit, Asked, fit_arm, held_out, widened
@@ -20,6 +21,7 @@ from estimation.se3 import Array
 from hardware import checks
 from hardware.arm_calibration.commanded import NAME, read_commanded
 from hardware.arm_calibration.sightings import Look, look
+from hardware.arm_calibration.tool_shadow import hidden_tips
 from hardware.arm_file import read_arm
 from hardware.arm_profile import ArmProfile
 from hardware.folder import open_folder
@@ -34,7 +36,8 @@ FOLDS = 8  # of held-out sightings: with fewer, each fit lacks so much that it t
 class ArmCalibration:
     """rig, profile: as they were. look: what was seen. fit: the result. places: (P, 3) mm, base, that were rested at.
     error: (P,) mm, one sigma of the tip at them. held_px: (N,) px and held_mm: (N,) mm, by which sightings lie beside
-    where fits that did not see them put them; nan where left out. asked: what was sought."""
+    where fits that did not see them put them; nan where left out. asked: what was sought. hidden: (C,) pictures in
+    which the tool itself stands before its tip."""
 
     rig: Rig
     profile: ArmProfile
@@ -46,6 +49,7 @@ class ArmCalibration:
     held_px: Array
     held_mm: Array
     asked: Asked
+    hidden: NDArray[np.int64]
 
 
 def kinematics_of(arm: SimpleArm) -> Kinematics:
@@ -71,6 +75,8 @@ def solve(
     rig: Rig, profile: ArmProfile, set_point: SetPoint, seen: Look, asked: Asked, rig_covariance: Array | None = None
 ) -> ArmCalibration:
     """Solve for what is asked from what was seen. rig_covariance: (16 C, 16 C), if it is known."""
+    if not asked.latency:  # how late it is is then not known: where it was on its way is not, either
+        seen = replace(seen, sightings=seen.sightings.take(seen.sightings.place >= 0))
     kinematics, sightings = kinematics_of(profile.arm), seen.sightings
     pose, axes, _ = first_pose(sightings, set_point, kinematics, rig)
     check_places(axes[:, :3])
@@ -100,7 +106,9 @@ def solve(
     arm_from_nozzle = kinematics(axes)
     at = se3.transform_points(found.state.base_from_arm @ arm_from_nozzle, found.state.tool[None])[:, 0]
     error = tip_error(found.state.base_from_arm, found.state.tool, found.covariance[:9, :9], arm_from_nozzle)
-    return ArmCalibration(rig, profile, seen, set_point, found, at, error, held, in_mm, asked)
+    shaded = hidden_tips(found.state, profile.tool, set_point, kinematics, rig, *seen.missed)
+    hidden = np.bincount(seen.missed[1][shaded], minlength=len(rig))
+    return ArmCalibration(rig, profile, seen, set_point, found, at, error, held, in_mm, asked, hidden)
 
 
 def tip_error(base_from_arm: Array, tool: Array, covariance: Array, arm_from_nozzle: Array) -> Array:

@@ -44,10 +44,19 @@ def judge(found: ArmCalibration, limit: float) -> Verdict:
     return Verdict(all(good), tuple(lines), () if all(good) else tuple(_hints(found, good)))
 
 
+def seen_words(found: ArmCalibration, camera: int) -> str:
+    """In how many of a camera's pictures the tip was found, and why not in the others where that is known."""
+    look, hidden = found.look, int(found.hidden[camera])
+    words = f"found in {look.found[camera]} of {look.looked[camera]} pictures"
+    return f"{words}, hidden by the tool itself in {hidden}" if hidden else words
+
+
 def _hints(found: ArmCalibration, good: list[bool]) -> list[str]:
     look, hints = found.look, []
-    for camera, seen, found_in in zip(found.rig.cameras, look.looked, look.found, strict=True):
-        if found_in < SEEN * seen:
+    for camera, seen, found_in, hidden in zip(found.rig.cameras, look.looked, look.found, found.hidden, strict=True):
+        if hidden > seen / 2:
+            hints.append(f"{camera.name} looks along the tool, which hides its own tip: a larger --turn-deg")
+        elif found_in < SEEN * (seen - hidden):
             hints.append(
                 f"{camera.name} found the tip in {found_in} of {seen} pictures: is the needle in view, lit, and of "
                 "another colour than what is behind it?"

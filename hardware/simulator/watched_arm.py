@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.rig import Rig
@@ -41,7 +42,9 @@ from planning.kinematics import SimpleArm, nozzle_from_axes
 DEAD, LAG = (0.005, 0.025), (0.012, 0.03)  # s between which the virtual arm's own are drawn
 AWRY = np.array([0.02] * 3 + [4.0] * 3)  # rad and mm, one sigma by which it stands beside where its file says
 TOOL = 1.5  # mm, likewise of the tip
-FPS = 4.0  # pictures a second: rendering is what takes long
+FPS = 12.0  # pictures a second, of which one in EVERY is kept but where the arm is LIVELY: rendering takes long
+EVERY, LIVELY = 3, 300.0  # mm/s^2: what tells dead time from lag
+AROUND = 0.02  # s on both sides between which that is measured
 OPENS = 5.0  # s that a pseudo-terminal may take to appear
 QUALITY = None  # no JPEG: a needle two pixels wide is seen by its colour, which JPEG stores at half the resolution
 
@@ -108,6 +111,12 @@ def _nobody(words: str) -> None:
     """Tell nobody."""
 
 
+def _lively(arm: VirtualArm, instants: Array) -> NDArray[np.bool_]:
+    """Whether (N,) the arm changes its speed quickly at instants (N,), s."""
+    around = [arm.axes_at(np.clip(instants + h, 0.0, arm.now))[:, :3] for h in (-AROUND, 0.0, AROUND)]
+    return np.asarray(np.linalg.norm(around[2] - 2 * around[1] + around[0], axis=1) > LIVELY * AROUND**2)
+
+
 def take_pictures(
     watched: WatchedArm, arm: VirtualArm, begun: float, span: tuple[float, float], folder: Path, report: Report = silent
 ) -> None:
@@ -122,6 +131,8 @@ def take_pictures(
     until = min(span[1] - begun, arm.now)
     streams = [cameras.shots(c, until) for c in range(len(watched.rig))]
     rounds = [shots for shots in zip(*streams, strict=False) if shots[0].exposed + begun >= span[0]]
+    lively = _lively(arm, np.array([shots[0].exposed for shots in rounds]))
+    rounds = [shots for number, shots in enumerate(rounds) if lively[number] or number % EVERY == 0]
 
     def taken(shot: Shot) -> tuple[str, bytes]:
         axes = arm.axes_at(np.array([min(shot.exposed, arm.now)]))[0]
