@@ -9,19 +9,20 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from math import degrees
+from itertools import chain
 
 import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm_echo import STILL, ArmEcho
+from hardware.arm_echo import ArmEcho
 from hardware.arm_line import ArmLine
 from hardware.arm_pace import Pace
 from hardware.arm_port import Opener, UnpluggedError
 from hardware.arm_profile import BITS_PER_BYTE, ArmProfile
 from hardware.arm_queue import ArmQueue, Stretch
-from hardware.arm_status import ArmEvent, ArmState, ArmStatus
+from hardware.arm_recall import Recall, Recalled, near
+from hardware.arm_status import ArmEvent, ArmState, ArmStatus, told
 from hardware.arm_travel import OwnMoves, lifted, travel
 from hardware.link_settings import LinkSettings
 from hardware.protocol import G1, G4, G54, Instruction, Pause, decode, encode
@@ -49,7 +50,7 @@ class Arm:
         self._line: ArmLine | None = None
         self._queue: ArmQueue | None = None  # None while nobody knows where the arm stands
         self._echo, self._pace = ArmEcho(settings, profile.lag), Pace(profile, settings)
-        self._own = OwnMoves()
+        self._own, self._recall = OwnMoves(), Recall(self._pace.flight - profile.tick, settings.speed, profile.lag)
         self._look = now  # when the device is looked for next
         self._doubt_since: float | None = None
         self._open(now)
@@ -155,9 +156,7 @@ class Arm:
             return f"the arm is {self.state.value}: {self.reason}"
         if self.travels:
             return "the arm is on its way"
-        if self._own.goal is not None:
-            return RECALLED
-        return self._wait(now)
+        return RECALLED if self._recall.goal is not None else self._wait(now)
 
     def send(self, frame: bytes, now: float) -> str:
         """Send the frame of a move or pause; why it was not sent, "" if it was. What cannot be sent stops the arm.
@@ -173,8 +172,17 @@ class Arm:
         if reason := self._pace.excess(instruction, self._queue, now):
             self.stop(reason, now)
             return reason
+        self._own.ours = False
         self._give(instruction, now, frame if not self.origin.any() else None)
         return ""
+
+    def take_up(self) -> Recalled | None:
+        """What was called back, once the arm obeys again: until somebody has taken note, nothing more is sent."""
+        place, queue = self._recall.place, self._queue
+        if not self._recall.obeys or place is None or queue is None:
+            return None
+        self._recall.drop()
+        return Recalled(place, np.array(queue.target))
 
     @property
     def travels(self) -> bool:
@@ -188,10 +196,7 @@ class Arm:
 
     def arrived(self, now: float) -> bool:
         """Whether it stands where it was sent: by dead reckoning, and by its answers where it answers."""
-        return self._own.goal is None and self._there(now)
-
-    def _there(self, now: float) -> bool:
-        if self._queue is None or self.travels or self._queue.in_flight(now) > 0:
+        if self._queue is None or self.travels or self._recall.goal is not None or self._queue.in_flight(now) > 0:
             return False
         answered = self._echo.axes(now)
         if answered is None:
@@ -250,6 +255,7 @@ class Arm:
             self._line.port.close()
         self._line, self._queue = None, None
         self._own.drop()
+        self._recall.drop()
         self.origin = np.zeros(3)
         self._look = now + self.settings.reopen
         self._change(ArmState.UNPLUGGED, reason, now)
@@ -321,22 +327,15 @@ class Arm:
     def _advance(self, now: float) -> None:
         """Send the next step of its own move, when the one before is nearly done."""
         assert self._queue is not None
-        if self._queue.in_flight(now) <= self.profile.tick and (self._own.goal is None or self._confirmed(now)):
+        if self._queue.in_flight(now) <= self.profile.tick:
             self._give(self._own.take(), now)
-
-    def _confirmed(self, now: float) -> bool:
-        """Whether it answers from so near that one step more leaves no more than may be under way, stalled or not."""
-        answered, target, ahead = self._echo.axes(now), self.target, self.settings.flight - self.profile.tick
-        if answered is None or target is None:
-            return False
-        way, turn = np.linalg.norm((answered - target)[:3]), np.linalg.norm((answered - target)[3:])
-        return bool(way <= ahead * self.settings.speed and turn <= ahead * self.settings.turning)
 
     def _halt(self) -> None:
         """Drop its own moves, and the frames of which nothing is on the wire."""
         if self._line is not None:
             self._line.recall()
         self._own.drop()
+        self._recall.drop()
 
     def _wait(self, now: float) -> str:
         """Why no frame of a tick may go out now."""
@@ -350,44 +349,47 @@ class Arm:
             self.stop(f"the port took no bytes for {blocked:.2f} s, limit {self.settings.write_timeout:g} s", now)
         elif self._echo.off > self.settings.lost:
             self.stop(f"the arm is {self._echo.off:.1f} mm off its way, limit {self.settings.lost:g} mm", now)
-        elif doubt := self._echo.doubt(now) or (RECALLED if self._own.goal is not None else ""):
+        elif doubt := self._recall.why or self._echo.doubt(now):
             self._doubt_since = now if self._doubt_since is None else self._doubt_since
             if now - self._doubt_since > self.settings.patience:
                 self.stop(f"{doubt}, for {self.settings.patience:g} s", now)
         else:
             self._doubt_since = None
         if self.state is ArmState.ARMED and self.settings.pause_frame:
-            self._catch_up(now)
+            self._keep_up(now)
 
-    def _catch_up(self, now: float) -> None:
-        """Call back what an arm has queued that is known to be late, and once it rests go to where that led, slowly."""
+    def _keep_up(self, now: float) -> None:
+        """Call back what an arm has queued that does not follow; once it rests, learn when it obeys again."""
         assert self._line is not None and self._queue is not None
-        own, answered = self._own, self._echo.axes(now) is not None
-        if self._echo.behind > self.settings.slack and not own.halted:
-            self._note(f"{RECALLED}: {self._echo.doubt(now)}", now)
-            own.break_off(np.array(self._queue.target))
-            self._line.recall()
-            self._give(Pause(), now, decided=now)
-        elif own.halted and answered and self._queue.in_flight(now) == 0 and self._echo.still(now):
-            assert own.goal is not None
-            self._believe(now)
-            self._echo.behind = 0.0
-            own.start(self._travel(np.array(self._queue.target), own.goal, lift=False))
-        elif own.goal is not None and self._there(now) and not own.halted:
-            own.resume()
+        recall, echo = self._recall, self._echo
+        if recall.goal is None and (doubt := echo.doubt(now)):
+            recall.begin(f"{RECALLED}: {doubt}", np.array(self._queue.target), self._own.break_off(), now)
+            self._note(recall.why, now)
+            self._call_back(self._line, now)
+        elif recall.goal is not None and not (recall.obeys or self._line.blocked or self._queue.in_flight(now) > 0):
+            if recall.stepped is None and echo.settled(recall.since):
+                self._believe(now)
+            following = recall.next(echo, np.array(self._queue.target), now)
+            if isinstance(following, Pause):
+                self._call_back(self._line, now)
+            elif following is not None:
+                self._give(following, now)
+            if recall.obeys and recall.rest is not None:
+                back = self._travel(np.array(self._queue.target), recall.goal, lift=False)
+                self._own.start(chain(back, recall.rest))
+                recall.drop()
+
+    def _call_back(self, line: ArmLine, now: float) -> None:
+        line.recall()
+        self._give(Pause(), now, decided=now)
 
     def _believe(self, now: float) -> None:
         """What the arm answers at rest is where it stands, unless that is what was known, to rounding."""
         answered, known = self._echo.axes(now), self._queue
-        if answered is None:
+        if answered is None or (known is not None and near(answered, np.array(known.target))):
             return
-        if known is not None:
-            away = np.abs(answered - known.target)
-            if away[:3].max() <= STILL[0] and away[3:].max() <= STILL[1]:
-                return
         self._queue = ArmQueue(answered.tolist(), self.profile.frame_time, now)
-        told = ", ".join([*(f"{v:.1f}" for v in answered[:3]), *(f"{degrees(v):.2f}" for v in answered[3:])])
-        self._note(f"stands at {told} by its own answer", now)
+        self._note(f"stands at {told(answered)} by its own answer", now)
 
     def _change(self, state: ArmState, reason: str, now: float) -> None:
         if (state, reason) != (self.state, self.reason):

@@ -23,6 +23,7 @@ FORGET = 0.98  # of the lag's sums with each answer: two or three seconds of the
 STILL = 0.15, float(np.deg2rad(0.015))  # mm and rad between answers of an arm at rest: one count of rounding
 MISSED = 4  # answers in a row: noise spoils one of them now and then
 RESTS = 0.2  # s after which it counts as at rest: four of the slowest answers
+SETTLED = 0.04  # s after which one that was called back does: two of the slowest answers that agree
 MOVING = 2.0  # mm/s below which an answer says nothing about the lag
 KNOWN = 100.0  # (mm/s)^2 in all, after which the lag is told: one answer at 10 mm/s
 
@@ -35,11 +36,12 @@ class _Part:
     stamp: float = -math.inf
     before: float = 0.0  # deviation of the answer before
     off: float = 0.0  # deviation, confirmed by two answers
-    since: float = math.inf  # when it was first where it is
+    first: Array | None = None  # answer from where it still is
+    since: float = math.inf  # when that came
 
     def take(self, values: Array, deviation: float, still: float, now: float) -> None:
-        if self.values is None or np.abs(values - self.values).max() > still:
-            self.since = now
+        if self.first is None or np.abs(values - self.first).max() > still:
+            self.first, self.since = values, now
         self.off = min(deviation, self.before)
         self.values, self.stamp, self.before = values, now, deviation
 
@@ -101,6 +103,26 @@ class ArmEcho:
     def still(self, now: float) -> bool:
         """Whether its answers say that it is at rest; an arm that does not answer says nothing against it."""
         return self.axes(now) is None or now - max(self._place.since, self._turn.since) >= RESTS
+
+    def settled(self, since: float) -> bool:
+        """Whether answers agree that it is at rest, of which the newest was given after `since`, s, and its lag."""
+        place, turn = self._place, self._turn
+        late = min(place.stamp, turn.stamp) >= since + self.late
+        return late and place.stamp - place.since >= SETTLED and turn.stamp - turn.since >= SETTLED
+
+    def answered(self, since: float) -> bool:
+        """Whether a place has come that the arm gave after `since`, s."""
+        return self._place.stamp >= since
+
+    def moved(self, since: float) -> bool:
+        """Whether a place that came after `since`, s, was another than the one before."""
+        return self.count > 0 and self._place.since > since
+
+    def forgive(self) -> None:
+        """Where it stands is its place from now on: what was said against it no longer counts."""
+        self.behind = 0.0
+        for part in (self._place, self._turn):
+            part.off = part.before = 0.0
 
     def doubt(self, now: float) -> str:
         """Why the arm may not be where it should be; "" if it answers from there, or never answered."""

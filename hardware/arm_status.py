@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from math import degrees
 
 from estimation.se3 import Array
 
@@ -48,3 +49,8 @@ class ArmEvent:
 
     stamp: float
     text: str
+
+
+def told(axes: Array) -> str:
+    """Axes (6,), mm and rad, for a person: mm and degrees."""
+    return ", ".join([*(f"{v:.1f}" for v in axes[:3]), *(f"{degrees(v):.2f}" for v in axes[3:])])

@@ -57,45 +57,34 @@ def _turned(start: Array, goal: Array, turning: float, tick: float) -> Iterator[
 
 
 class OwnMoves:
-    """What the link moves by itself.
-
-    step: the next one, None without. goal: (6,) to go to after a recall, before anything else. halted: a recall was
-    sent, and the way to the goal has not begun.
-    """
+    """What the link moves by itself. step: the next one, None without. ours: whether the last move sent was a step."""
 
     def __init__(self) -> None:
         self.step: G1 | None = None
-        self.goal: Array | None = None
-        self.halted = False
+        self.ours = False
         self._steps: Iterator[G1] = iter(())
-        self._broken: Iterator[G1] = iter(())  # off by a recall
 
     def start(self, steps: Iterator[G1]) -> None:
         """Make these the next steps."""
         self._steps = steps
-        self.step, self.halted = next(steps, None), False
+        self.step = next(steps, None)
 
     def take(self) -> G1:
         """The next step, once."""
         step = self.step
         assert step is not None
-        self.step = next(self._steps, None)
+        self.step, self.ours = next(self._steps, None), True
         return step
 
-    def break_off(self, goal: Array) -> None:
-        """What was sent last, to `goal` (6,), was called back; a second time that is not where it has to go."""
-        if self.goal is None:
-            rest = self._steps if self.step is None else chain([self.step], self._steps)
-            self.goal, self._broken = goal, rest
-        self.start(iter(()))
-        self.halted = True
-
-    def resume(self) -> None:
-        """The goal is reached: go on with what was broken off."""
-        self.goal = None
-        self.start(self._broken)
+    def break_off(self) -> Iterator[G1] | None:
+        """The steps that come no more, as what was sent last is called back; None where that was not a step's way."""
+        rest = None
+        if self.step is not None or self.ours:
+            rest = iter(()) if self.step is None else chain([self.step], self._steps)
+        self.drop()
+        return rest
 
     def drop(self) -> None:
         """Forget all."""
-        self.goal, self._broken = None, iter(())
         self.start(iter(()))
+        self.ours = False

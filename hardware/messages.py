@@ -227,7 +227,15 @@ def hold_from_message(message: Message) -> Hold:
 
 
 def message_from_tick(
-    stamp: float, pose_stamp: float, asked: bool, begun: float, paused: bool, fraction: float, phase: str, frame: bytes
+    stamp: float,
+    pose_stamp: float,
+    asked: bool,
+    begun: float,
+    paused: bool,
+    fraction: float,
+    phase: str,
+    frame: bytes,
+    recalled: Array | None = None,
 ) -> Message:
     """A tick of the motion as a message."""
     return {
@@ -235,6 +243,7 @@ def message_from_tick(
         "pose_stamp": _flat(np.array([pose_stamp])),
         "asked": asked,
         "begun": _flat(np.array([begun])),
+        "recalled": [] if recalled is None else recalled.ravel().tolist(),
         "paused": paused,
         "fraction": fraction,
         "phase": phase,

@@ -7,6 +7,7 @@ or onnxruntime: a call of gtsam was measured to stop every other thread for as l
 from __future__ import annotations
 
 from estimation.pose import SurfacePose
+from estimation.se3 import Array
 from hardware.arm_profile import ArmProfile
 from hardware.protocol import G1, G4, Dialect, encode
 from planning.command import Command, Hold, Move
@@ -35,6 +36,11 @@ class MotionStep:
         if isinstance(wanted, Move) and isinstance(self.last, Hold):
             self._planner.refused(self._guard.axes)
         return bytes_from_command(self.last, self.profile.dialect)
+
+    def recalled(self, place: Array, stands: Array) -> None:
+        """The arm was stopped at `place` (6,) on its way and stands at `stands` (6,): the path goes on from there."""
+        self._planner.recalled(place, stands)
+        self._guard.stands(stands)
 
     @property
     def paused(self) -> bool:

@@ -15,6 +15,7 @@ from typing import Protocol
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm import Arm
+from hardware.arm_recall import Recalled
 from hardware.arm_status import ArmState, ArmStatus
 from hardware.clock import Clock
 from hardware.lateness import Lateness
@@ -31,6 +32,10 @@ class Motion(Protocol):
 
     def __call__(self, pose: SurfacePose | None, now: float) -> bytes:
         """The frame of the tick at `now`, s."""
+        ...
+
+    def recalled(self, place: Array, stands: Array) -> None:
+        """The arm was stopped at `place` (6,) on its way and stands at `stands` (6,): all sent beyond is undone."""
         ...
 
 
@@ -50,6 +55,7 @@ class Tick:
     """What one tick did.
 
     stamp: s, for which it was made. frame: the bytes sent, none of a hold by the link. late: s behind its instant.
+    recalled: what the motion was told before it of moves that were called back.
     """
 
     stamp: float
@@ -58,6 +64,7 @@ class Tick:
     late: float
     status: ArmStatus
     answer: str  # why the last order was not followed, "" if it was
+    recalled: Recalled | None = None
 
 
 def nobody(tick: Tick) -> None:
@@ -159,6 +166,9 @@ class MotionLoop:
         late = max(now - self._rhythm.due, 0.0)
         self.lateness.add(late)
         frame = b""
+        if recalled := self.arm.take_up():
+            self._left_off = recalled.stands
+            self.motion.recalled(recalled.place, recalled.stands)
         if reason := "the arm goes home" if self._homing else self.arm.hold(now):
             command: Command = Hold(instant, self._pause, reason)
         else:
@@ -168,4 +178,4 @@ class MotionLoop:
                 self._left_off = command.axes
             if reason := self.arm.send(frame, now):
                 frame, command = b"", Hold(instant, self._pause, reason)
-        self._tell(Tick(instant, command, frame, late, self.arm.status(now), self._answer))
+        self._tell(Tick(instant, command, frame, late, self.arm.status(now), self._answer, recalled))

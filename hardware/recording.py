@@ -184,13 +184,15 @@ class Recorder:
         fraction: float,
         phase: str,
         frame: bytes,
+        recalled: Array | None = None,
     ) -> None:
         """Write a tick of the motion: s, the stamp of the pose it was given (NaN: none), whether planner and guard were
         asked, where on the path they were begun anew before it (NaN: they were not), whether they were told to wait
-        above the surface, the place on the path, what the nozzle does, and the frame that they gave. Places count
-        checkpoints.
+        above the surface, the place on the path, what the nozzle does, the frame that they gave, and, where they were
+        told before it that moves were called back, (2, 6) mm and rad, where the arm came to rest and where it stands.
+        Places on the path count checkpoints.
         """
-        given = messages.message_from_tick(stamp, pose_stamp, asked, begun, paused, fraction, phase, frame)
+        given = messages.message_from_tick(stamp, pose_stamp, asked, begun, paused, fraction, phase, frame, recalled)
         self._message("/tick", stamp, given)
 
     def latency(self, stamp: float, stage: str, width: float, counts: NDArray[np.int64], most: float) -> None:

@@ -218,6 +218,7 @@ TICK = _object(
     pose_stamp=_array(NUMBER, None, "s, of the pose they were given; empty: none"),
     asked=_about(FLAG, "whether planner and guard were asked, and gave the frame"),
     begun=_array(NUMBER, None, "where on the path they were begun anew before it; empty: they were not"),
+    recalled=_array(NUMBER, None, "12, mm and rad: where the arm rested and stands, if moves were called back"),
     paused=_about(FLAG, "whether they were told to wait above the surface"),
     fraction=_about(NUMBER, "place on the path, counted in checkpoints"),
     phase=TEXT,

@@ -46,6 +46,10 @@ class Guard:
         """Where the arm was last sent (6,), mm and rad."""
         return self._axes
 
+    def stands(self, axes: Array) -> None:
+        """The arm stands at `axes` (6,), mm and rad: what was let through beyond was called back."""
+        self._axes = axes.copy()
+
     def __call__(self, command: Command, pose: SurfacePose | None, now: float) -> Command:
         """The command itself, or a Refusal that says which limit it breaks. pose: the newest at `now`, s."""
         doubt = self._doubt(pose, now)

@@ -11,6 +11,8 @@ doubt included. A surface that deforms, but whose warp is known, carries the che
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -36,6 +38,7 @@ RENEW = 0.5  # s of it left when the next is timed, after HORIZON at the latest;
 NOTHING = 1e-3  # mm of a path that are as good as none: along 20 nm, where a stop once left one, there is no timing
 PAUSED = "paused"
 STALL = 3.0  # ticks without a call after which the arm has come to rest by itself
+SENT = 64  # moves that are remembered: a second of them, more than an arm is sent before it is called back
 SHARE = 0.98  # of what the guard tolerates of a pose: the planner brakes before the guard would cut
 
 
@@ -64,6 +67,7 @@ class Planner:
         self.paused = False  # go up from the surface and stand there, until this is no longer set
         self._goal: Array | None = None  # surface_from_nozzle (4, 4) where it stands in a pause
         self._retreated = False
+        self._sent: deque[tuple[Array, float]] = deque(maxlen=SENT)  # where to (3,), mm, and the place printed then
 
     def __call__(self, pose: SurfacePose | None, now: float) -> Command:
         """The command of the tick at `now`, s: its axes are reached one tick later. pose: the newest there is."""
@@ -90,6 +94,16 @@ class Planner:
         """The last move was not sent: the arm stands at `axes` (6,), and the leg begins anew."""
         self._follower.rest(axes)
         self._leg = None
+        self._sent.clear()
+
+    def recalled(self, place: Array, stands: Array) -> None:
+        """The arm was stopped at `place` (6,) on its way and stands at `stands` (6,): what was sent beyond is undone.
+
+        The path goes on where the last moves passed `place`.
+        """
+        if self._sent:
+            self._place = min(self._place, passed(self._sent, place[:3]))
+        self.refused(stands)
 
     @property
     def progress(self) -> Progress:
@@ -267,6 +281,7 @@ class Planner:
 
     def _move(self, now: float, start: Array, axes: Array, extrude: bool, reason: str = "") -> Move:
         feed = min(feed_for(start, axes, self._tick), self._limits.feed)
+        self._sent.append((axes[:3], self._place))
         return Move(now, axes, feed, self._checkpoint(), extrude, reason)
 
     def _checkpoint(self) -> int:
@@ -302,6 +317,22 @@ class Planner:
         unit = "mm" if axis in "XYZ" else "degrees"
         shown = np.array([got, low, high]) if unit == "mm" else np.rad2deg([got, low, high])
         return f"{where}: {axis} = {shown[0]:.1f}, allowed {shown[1]:g} to {shown[2]:g} {unit}"
+
+
+def passed(sent: Sequence[tuple[Array, float]], where: Array) -> float:
+    """The place on the path, mm, at which moves passed `where` (3,), mm: the last such where they did so twice.
+
+    sent: the moves, each where to (3,), mm, and the place on the path there.
+    """
+    ends, places = np.stack([end for end, _ in sent]), np.array([place for _, place in sent])
+    if len(ends) == 1:
+        return float(places[0])
+    ways = np.diff(ends, axis=0)  # (N - 1, 3)
+    squares = np.maximum((ways**2).sum(1), 1e-12)
+    shares = np.clip(((where - ends[:-1]) * ways).sum(1) / squares, 0.0, 1.0)
+    off = np.linalg.norm(ends[:-1] + shares[:, None] * ways - where, axis=1)
+    last = int(np.flatnonzero(off <= off.min() + 1e-6)[-1])
+    return float(places[last] + shares[last] * (places[last + 1] - places[last]))
 
 
 def _late(pose: SurfacePose, lag: float) -> SurfacePose:

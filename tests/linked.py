@@ -49,6 +49,7 @@ class Linked:
         refused: list[str] = []
 
         def each(now: float) -> None:
+            self.arm.take_up()
             if reason := self.arm.hold(now) or self.send(circle(self.phase + 0.02)):
                 refused.append(reason)
             else:

@@ -220,5 +220,5 @@ def test_an_arm_turned_off_its_way_is_held() -> None:
         tool = Reply(ReplyKind.TOOL, HOME[3:] + np.deg2rad([0, 3.0, 0]))
         link.arm._echo.take(tool, link.arm._queue, np.zeros(3), link.clock.now())
     assert "degrees off its way, limit 2 degrees" in link.arm.hold(link.clock.now())
-    link.run(0.2)
-    assert link.arm.hold(link.clock.now()) == ""
+    link.run(0.5)
+    assert link.arm.take_up() is not None and link.arm.hold(link.clock.now()) == ""

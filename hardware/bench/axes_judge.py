@@ -26,6 +26,10 @@ class AxesJudge:
         """The arm has come to rest by itself, where it was sent last."""
         self._last = np.tile(self._last[-1], (4, 1))
 
+    def stands(self, axes: Array) -> None:
+        """What was sent beyond was called back: the arm stands at `axes` (6,)."""
+        self._last = np.tile(axes, (4, 1))
+
     def __call__(self, axes: Array | None) -> None:
         """One tick: the axes (6,) that are reached by its end, None where the arm is held."""
         self._last = np.vstack([self._last[1:], self._last[-1] if axes is None else axes])

@@ -210,6 +210,8 @@ class FaultRun:
         if tick.stamp - self._before > 1.5 * self._profile.tick or self._arm.travels:
             self._judge.rest()
         self._before = tick.stamp
+        if tick.recalled is not None:
+            self._judge.stands(tick.recalled.stands)
         if isinstance(tick.command, Move):
             self._judge(tick.command.axes)
         elif tick.frame:

@@ -176,6 +176,7 @@ class Run:
     def _tick(self, now: float) -> None:
         counts, arm = self._counts, self._arm
         counts.ticks += 1
+        arm.take_up()  # it goes on from where it stands
         if arm.hold(now):
             counts.held += 1
             return

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 from estimation.pose import SurfacePose
+from estimation.se3 import Array
 from hardware.arm_profile import ArmProfile
 from hardware.live.place import Place
 from hardware.live.records import Begin
@@ -41,6 +42,11 @@ class LiveMotion:
         """The arm stands at home: the motion begins from there, at the same place of the path."""
         if self._step is not None:
             self._make(self._step.progress.fraction)
+
+    def recalled(self, place: Array, stands: Array) -> None:
+        """The arm was stopped at `place` (6,) on its way and stands at `stands` (6,): the path goes on from there."""
+        if self._step is not None:
+            self._step.recalled(place, stands)
 
     @property
     def progress(self) -> Progress | None:

@@ -142,8 +142,8 @@ class _Watch:
             stamp = math.nan if self._given is None else self._given.pose.stamp
             asked, begun = motion.asked and motion.last.stamp == tick.stamp, motion.begun
             motion.begun, frame = math.nan, motion.frame if asked else b""
-            place = progress.fraction, progress.phase
-            self._outbox.put(TickEntry(tick.stamp, stamp, asked, begun, motion.paused, tick.command, frame, *place))
+            came_to = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
+            self._outbox.put(TickEntry(tick.stamp, stamp, asked, begun, motion.paused, tick.command, frame, *came_to))
         spans = (*self.times.spans(), Span(LATE, late.count, late.percentile(50), late.percentile(99), late.most))
         stops = loop.arm.stops
         self._reports.put(

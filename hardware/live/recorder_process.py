@@ -143,7 +143,7 @@ def _write(recorder: Recorder, entry: Entry) -> None:
     elif isinstance(entry, TickEntry):
         recorder.write(entry.command)
         given = entry.pose_stamp, entry.asked, entry.begun, entry.paused
-        recorder.tick(entry.stamp, *given, entry.fraction, entry.phase.value, entry.frame)
+        recorder.tick(entry.stamp, *given, entry.fraction, entry.phase.value, entry.frame, entry.recalled)
     elif isinstance(entry, WireEntry):
         (recorder.sent if entry.sent else recorder.received)(entry.stamp, entry.data)
     elif isinstance(entry, EventEntry):

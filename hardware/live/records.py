@@ -173,7 +173,8 @@ class TickEntry:
 
     asked: whether planner and guard were asked, and the frame that they then gave. begun: where on the path they were
     begun anew before it, counted in checkpoints (NaN: they were not). paused: whether they were told to wait above the
-    surface. fraction, phase: how far the print then is.
+    surface. fraction, phase: how far the print then is. recalled: (2, 6) mm and rad, where the arm came to rest and
+    where it stands, if they were told that what was sent had been called back.
     """
 
     stamp: float
@@ -185,6 +186,7 @@ class TickEntry:
     frame: bytes
     fraction: float
     phase: Phase
+    recalled: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)

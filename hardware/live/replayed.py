@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path as File
 
+import numpy as np
+
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from hardware.live.kept import used
@@ -43,6 +45,8 @@ def replay_run(record: File) -> Iterator[Replayed]:
     for tick in sorted(run.ticks, key=lambda tick: float(tick["stamp"])):
         if tick["begun"]:
             step = MotionStep(path, profile, float(tick["begun"][0]))
+        if step is not None and tick.get("recalled"):
+            step.recalled(*np.array(tick["recalled"], float).reshape(2, 6))
         if step is None or not tick["asked"]:
             continue
         stamp = tick["pose_stamp"]

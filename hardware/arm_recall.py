@@ -1,0 +1,108 @@
+"""What was called back from an arm that does not follow, until it is known to obey again.
+
+An arm that stalls, that frames do not reach or that a garbled one sent astray is told by its answers. What it has
+queued is called back, so that it rests; where it rests, its answers tell. One short step towards where it had been
+sent, given again for as long as nothing comes of it, tells when it obeys again: axes are absolute, so a step given
+twice goes no farther than one. Only then may whoever sends go on, from where the arm stands: what was called back was
+not done, and is to be done from where the arm came to rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimation.se3 import Array
+from hardware.arm_echo import STILL, ArmEcho
+from hardware.protocol import G1, Pause
+
+TOLD = 2 * STILL[0]  # mm of a step that answers tell from none
+STARTED = 0.01  # s of a step, its lag aside, after which an answer from where it began says that it did not begin
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recalled:
+    """What whoever sends must know before anything more is sent. place: (6,) mm and rad, where the arm came to rest.
+
+    stands: (6,) where it is now, and the next move begins.
+    """
+
+    place: Array
+    stands: Array
+
+    @property
+    def rows(self) -> Array:
+        """Both (2, 6)."""
+        return np.stack([self.place, self.stands])
+
+
+class Recall:
+    """One arm's. goal: (6,) mm and rad, where it had been sent, None while nothing is called back.
+
+    why: for a person. since: s, when it was called back. place: (6,) where it first came to rest, None until it has.
+    rest: of a travel that was broken off, None where a motion was. stepped: s, when the last step was given, None where
+    none is. obeys: whether the arm is known to move again.
+    """
+
+    def __init__(self, longest: float, speed: float, lag: float) -> None:
+        """longest: s of a step, and speed: mm/s. lag: s that the arm is later at a command's axes than one tick."""
+        self._longest, self._speed, self._lag = longest, speed, lag
+        self.why = ""
+        self.goal: Array | None = None
+        self.since = 0.0
+        self.place: Array | None = None
+        self.rest: Iterator[G1] | None = None
+        self.stepped: float | None = None
+        self.obeys = False
+        self._stood: Array | None = None  # where the last step began
+
+    def begin(self, why: str, goal: Array, rest: Iterator[G1] | None, now: float) -> None:
+        """What was sent, to `goal` (6,), is called back at `now`, s."""
+        self.drop()
+        self.why, self.goal, self.since, self.rest = why, goal, now, rest
+
+    def drop(self) -> None:
+        """Nothing is called back any more."""
+        self.goal = self.place = self._stood = self.rest = self.stepped = None
+        self.why, self.obeys = "", False
+
+    def next(self, echo: ArmEcho, target: Array, now: float) -> G1 | Pause | None:
+        """What is to be sent to an arm with nothing under way, which by what is known stands at `target` (6,)."""
+        answered = echo.axes(now)
+        if self.stepped is None:
+            return self._rested(echo, target, now) if echo.settled(self.since) else None
+        if near(answered, target):
+            self._obey(echo)
+        elif echo.answered(self.stepped + self._lag + STARTED) and near(answered, self._stood):
+            self.since, self.stepped = now, None
+            return Pause()
+        return None
+
+    def _rested(self, echo: ArmEcho, stands: Array, now: float) -> G1 | None:
+        """It rests: the step, unless it has moved since it was called back, or no step could be told."""
+        echo.forgive()
+        self._stood, self.place = stands, stands if self.place is None else self.place
+        assert self.goal is not None
+        way = self.goal[:3] - stands[:3]
+        length = float(np.linalg.norm(way))
+        if echo.moved(self.since) or (length <= TOLD and echo.still(now)):
+            self._obey(echo)
+        elif length > TOLD:
+            self.stepped = now
+            share = min(self._longest * self._speed / length, 1.0)
+            return G1(np.concatenate([stands[:3] + share * way, stands[3:]]), self._speed)
+        return None
+
+    def _obey(self, echo: ArmEcho) -> None:
+        self.obeys = True
+        echo.forgive()
+
+
+def near(answered: Array | None, axes: Array | None) -> bool:
+    """Whether an arm answers from `axes` (6,), mm and rad, to rounding."""
+    if answered is None or axes is None:
+        return False
+    away = np.abs(answered - axes)
+    return bool(away[:3].max() <= STILL[0] and away[3:].max() <= STILL[1])

@@ -1,0 +1,148 @@
+"""What an arm that does not follow is called back from: nothing is lost or done twice, and it goes on soon."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimation import se3
+from hardware.arm import RECALLED
+from hardware.arm_profile import ArmProfile
+from hardware.arm_recall import TOLD, near
+from hardware.arm_status import ArmState
+from hardware.motion_loop import Order, Tick
+from hardware.simulator.arm_settings import ArmSettings, Replies
+from planning.command import Move
+from planning.kinematics import nozzle_from_axes
+from planning.planner import Planner, passed
+from tests.linked import Linked, circle, linked
+from tests.moving import breathing, pose_at, raster
+from tests.test_motion_loop import Looping, seen
+from tests.virtual_arm import HOME, arm_fault
+
+ANSWERING = ArmSettings(servo_lag=0.02, replies=Replies.STREAM)
+ROUNDING = 0.15  # mm: of answers that count 0.1 mm
+SOON = 0.2  # s
+
+
+def recalled_by(link: Linked, seconds: float) -> list[float]:
+    """Follow a circle as a motion does that takes note of recalls; the instants, s, at which frames went out."""
+    sent: list[float] = []
+
+    def each(now: float) -> None:
+        before = link.executed()
+        if recalled := link.arm.take_up():
+            assert np.abs(recalled.stands - before)[:3].max() < ROUNDING
+        if not link.arm.hold(now) and not link.send(circle(link.phase + 0.02)):
+            link.phase += 0.02
+            sent.append(now)
+
+    link.run(seconds, each)
+    return sent
+
+
+@settings(max_examples=12)
+@given(
+    fault=st.sampled_from(["stall", "drop", "garble", "unplug", "slow 40%"]),
+    start=st.floats(1.0, 1.2),
+    seconds=st.floats(0.15, 1.0),
+)
+def test_it_goes_on_soon_after_what_struck_it_is_gone(fault: str, start: float, seconds: float) -> None:
+    link = linked(ANSWERING, arm_fault(f"{fault} at {start}s for {seconds}s seed 3"))
+    sent = np.array(recalled_by(link, start + seconds + 1.5))
+    again = sent[sent > start + seconds]
+    assert again[0] < start + seconds + SOON
+    assert np.diff(again).max() < 0.05  # and on
+    assert link.arm.state is ArmState.ARMED and link.virtual.held <= 0.06
+
+
+def test_nothing_is_sent_before_somebody_has_taken_note_of_what_was_called_back() -> None:
+    link = linked(ANSWERING, arm_fault("stall 300ms at 1s"))
+    recalled_by(link, 1.2)
+    assert link.arm.hold(link.clock.now()) == RECALLED and link.arm.take_up() is None  # it stands still
+    rested = link.executed()
+    link.run(0.5)
+    assert link.arm.hold(link.clock.now()) == RECALLED
+    recalled = link.arm.take_up()
+    assert recalled is not None and link.arm.hold(link.clock.now()) == ""
+    assert np.abs(recalled.place - rested)[:3].max() < ROUNDING
+    assert np.abs(recalled.stands - link.executed())[:3].max() < ROUNDING
+    assert TOLD - ROUNDING < np.linalg.norm((recalled.stands - rested)[:3]) < 1.0  # the step that told
+    assert link.arm.take_up() is None
+
+
+def test_a_step_that_is_lost_is_given_again_and_goes_no_farther() -> None:
+    link = linked(ANSWERING, arm_fault("drop at 1s for 800ms"))
+    recalled_by(link, 1.75)
+    rested = link.executed()
+    assert sum("called back" in event.text for event in link.arm.events()) == 1  # and pause frames since
+    link.run(0.5)
+    recalled = link.arm.take_up()
+    assert recalled is not None
+    assert np.linalg.norm((link.executed() - rested)[:3]) < 0.03 * link.arm.settings.speed + ROUNDING
+
+
+def printed(ticks: list[Tick], link: Linked) -> np.ndarray:
+    """Where the tip was on the surface (N, 3), mm, while moves that extrude were made."""
+    profile = link.arm.profile
+    times = np.concatenate(
+        [
+            t.stamp + profile.tick + profile.lag - np.arange(0, profile.tick, 0.002)
+            for t in ticks
+            if isinstance(t.command, Move) and t.command.extrude
+        ]
+    )
+    times = times[times < link.virtual.now]
+    tips = nozzle_from_axes(profile.arm, link.virtual.axes_at(times))[:, :3, 3]
+    surfaces = np.stack([breathing(t) for t in times])
+    return np.asarray(se3.transform_points(se3.inverse(surfaces), tips[:, None])[:, 0])
+
+
+def test_of_the_path_nothing_is_left_out_and_it_is_done_as_soon_as_it_can_be() -> None:
+    link = linked(ANSWERING, arm_fault("stall 500ms at 6s"), stand=False, profile=ArmProfile())
+    looping = Looping({0.0: Order.AT_HOME, 0.5: Order.ARM}, link, seen)
+    ticks = looping.run(10.0)
+    recalls = [t for t in ticks if t.recalled is not None]
+    assert len(recalls) == 1 and 6.5 < recalls[0].stamp < 6.5 + SOON
+    done = printed(ticks, link)
+    path = looping.motion.progress.place
+    ways = raster(speed=10.0).surface_from_nozzle[:, :3, 3]
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ways, axis=0), axis=1))])
+    asked = np.arange(0.0, path - 0.5, 0.2)
+    places = np.stack([np.interp(asked, along, ways[:, i]) for i in range(3)], 1)
+    gaps = np.linalg.norm(places[:, None] - done[None], axis=2).min(1)
+    assert path > 20 and gaps.max() < 0.4
+
+
+def test_the_path_goes_on_where_the_arm_came_to_rest() -> None:
+    profile = ArmProfile()
+    planner = Planner(raster(speed=10.0), profile.limits, profile.arm, profile.tick)
+    sent: list[tuple[np.ndarray, float]] = []
+    now = 0.0
+    while not (sent and sent[-1][1] > 6.0):
+        command = planner(pose_at(breathing, now), now)
+        if isinstance(command, Move):
+            sent.append((command.axes, planner.progress.place))
+        now += profile.tick
+    where = 0.5 * (sent[-6][0] + sent[-5][0])
+    stands = sent[-2][0]
+    planner.recalled(where, stands)
+    assert planner.progress.place == pytest.approx(0.5 * (sent[-6][1] + sent[-5][1]), abs=1e-6)
+    first = planner(pose_at(breathing, now), now)
+    assert isinstance(first, Move) and np.linalg.norm((first.axes - stands)[:3]) < 0.5
+    planner.recalled(HOME, HOME)  # far from all that was sent since: no farther on than it was
+    assert planner.progress.place <= 0.5 * (sent[-6][1] + sent[-5][1]) + 1e-9
+
+
+def test_where_moves_passed_is_told_by_the_last_time_they_did() -> None:
+    ends = [np.array([x, 0.0, 0.0]) for x in (0.0, 1.0, 2.0, 1.0, 0.0)]
+    sent = list(zip(ends, (0.0, 1.0, 2.0, 3.0, 4.0), strict=True))
+    assert passed(sent, np.array([1.5, 0.3, 0.0])) == pytest.approx(2.5)
+    assert passed(sent[:2], np.array([9.0, 0.0, 0.0])) == 1.0 and passed(sent[:1], ends[4]) == 0.0
+
+
+def test_an_answer_is_near_within_its_rounding_alone() -> None:
+    assert near(HOME + 0.1, HOME) is False and near(HOME + [0.1, 0, 0, 0, 0, 0], HOME)
+    assert not near(HOME + [0.2, 0, 0, 0, 0, 0], HOME) and not near(None, HOME) and not near(HOME, None)
