@@ -119,6 +119,7 @@ def test_a_soak_compares_its_end_with_its_start(capsys: pytest.CaptureFixture[st
     assert sum(line.startswith("soak 0.001 h, exact map") for line in lines) == 4
 
 
+@pytest.mark.slow
 def test_where_clocks_differ_the_bench_asks_what_is_known_of_them(capsys: pytest.CaptureFixture[str]) -> None:
     command = ["estimator", "--only", "breathing, offsets 16 ms", "--seeds", "1", "--seconds", "0.3", "--maps", "told"]
     run_bench(_arguments(*command))

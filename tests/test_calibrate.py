@@ -221,6 +221,7 @@ def test_a_rig_without_lenses_is_enough_to_begin_with(session: Path, tmp_path: P
     assert len(views) == len(outcome.calibration.views)
 
 
+@pytest.mark.slow
 def test_a_chessboard_calibrates_as_well(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     board = Board("chessboard", (6, 7), 40.0)
     folder, out = rendered(tmp_path / "session", instants=12, board=board), tmp_path / "rig.toml"

@@ -169,6 +169,7 @@ def test_pictures_that_are_late_each_for_itself_are_noticed_and_forgiven() -> No
     assert nees(errors(found, truth), found.fit.covariance) < 2
 
 
+@pytest.mark.slow
 def test_lenses_that_bend_in_ways_too_slight_to_be_told_are_doubted() -> None:
     bent = LENSES.copy()
     bent[:, 6:] = 1.5e-3, -1.5e-3, 0.03
@@ -195,6 +196,7 @@ def test_lenses_that_are_kept_bring_their_doubt_along() -> None:
     assert nees(errors(doubted, truth), doubted.fit.covariance) < 2
 
 
+@pytest.mark.slow
 def test_lenses_that_are_kept_as_exact_are_doubted_as_far_as_the_views_speak_against_them() -> None:
     views, truth = waved(np.random.default_rng(3))
     nothing, wrong = np.zeros((3, 9)), truth.lens + [8.0, 8.0, -12.0, 12.0, 0, 0, 0, 0, 0]
@@ -357,6 +359,7 @@ def test_another_base_leaves_the_cameras_where_they_are_to_each_other(known: tup
         assert np.allclose(base @ a.base_from_camera, b.base_from_camera)
 
 
+@pytest.mark.slow
 def test_the_same_corners_give_the_same_rig() -> None:
     views, _ = waved(np.random.default_rng(9), instants=12)
     a, b = calibrate(views), calibrate(views)

@@ -42,7 +42,8 @@ def test_a_surface_at_rest_teaches_nothing_of_the_offsets() -> None:
     assert (np.abs(estimator.cameras.offset) < 2 * before).all()
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_lens_that_is_off_is_not_taken_for_a_late_clock(seed: int) -> None:
     offsets = (0.0, 0.016, -0.016)
     world = synthetic_world("breathing", 20.0, offsets=offsets, calibration=0.3, seed=seed)

@@ -213,7 +213,7 @@ def test_too_few_tracks_are_no_measurement() -> None:
     assert estimator.fit(look(breathing, 0.1, 3, keep=6), breathing(0.1)).measured
 
 
-@pytest.mark.parametrize("outliers", [0.3, 0.7, 1.0])
+@pytest.mark.parametrize("outliers", [*(pytest.param(o, marks=pytest.mark.slow) for o in (0.3, 0.7)), 1.0])
 def test_tracks_that_scatter_widen_the_claim_to_what_they_cost(outliers: float) -> None:
     values = []
     for seed in range(12):
@@ -260,7 +260,7 @@ def test_coasting_claims_less_with_every_frame_and_enough(seed: int) -> None:
     assert (np.diff(sigma) > 0).all() and all(inside)
 
 
-@pytest.mark.parametrize("map_error", [0.0, 0.1, 0.5])
+@pytest.mark.parametrize("map_error", [*(pytest.param(e, marks=pytest.mark.slow) for e in (0.0, 0.1)), 0.5])
 def test_the_covariance_is_as_wide_as_the_errors(map_error: float) -> None:
     values = []
     for seed in range(6):
@@ -278,6 +278,7 @@ def run_skewed(delays: Sequence[float], seconds: float, motion: Motion = lively)
     return estimator
 
 
+@pytest.mark.slow
 def test_offsets_widen_the_claim_to_what_they_cost() -> None:
     estimator, values, claimed = begun(lively), [], []
     for t in stamps(4.0):

@@ -135,6 +135,7 @@ def test_a_map_is_the_same_map_in_another_frame(first: FirstMap) -> None:
     assert np.isclose(np.trace(moved.map.covariance), np.trace(first.map.covariance))
 
 
+@pytest.mark.slow
 def test_two_runs_give_the_same_bits(first: FirstMap) -> None:
     again = build(0, 1, 2)
     assert again.map.points.tobytes() == first.map.points.tobytes()

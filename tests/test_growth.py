@@ -99,6 +99,7 @@ def test_what_was_added_lies_on_the_true_surface_as_claimed() -> None:
     assert np.linalg.eigvalsh(last.covariance).min() > -1e-9
 
 
+@pytest.mark.slow
 def test_an_executor_changes_no_bit() -> None:
     with ThreadPoolExecutor(1) as executor:
         poses, maps, _ = followed(executor)

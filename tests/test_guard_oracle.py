@@ -16,7 +16,7 @@ from planning.guard import Guard
 from planning.kinematics import joints_from_axes
 from planning.limits import Limits
 
-COUNT = 1000
+COUNT = 500
 HAIR = 1e-12  # rad, rad/s: the joints are solved anew under each limit, which moves their last bits
 
 

@@ -30,6 +30,7 @@ def test_a_run_in_which_everything_goes_wrong_breaks_nothing(seed: int) -> None:
     assert queued <= 0.05 or not kind.startswith("obeying")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_the_same_seed_gives_the_same_run() -> None:
     first, second = Counts(), Counts()

@@ -43,6 +43,7 @@ def test_a_curved_scan_is_found_exactly_from_exact_points(seed: int) -> None:
     assert result.sure and result.verdict.startswith("found") and len(result.free) == 0
 
 
+@pytest.mark.slow
 @settings(max_examples=4)
 @given(seeds)
 def test_noise_costs_accuracy_as_the_covariance_says(seed: int) -> None:
@@ -138,6 +139,7 @@ def test_too_few_points_hold_nothing() -> None:
     assert not result.sure and len(result.free) == 6 and f"{FEWEST} needed" in result.verdict
 
 
+@pytest.mark.slow
 def test_registration_is_deterministic() -> None:
     (a, _), (b, _) = found(BODY, 9, 0.05), found(BODY, 9, 0.05)
     np.testing.assert_array_equal(a.base_from_surface, b.base_from_surface)

@@ -138,12 +138,14 @@ def test_its_claimed_covariance_is_of_the_errors_size() -> None:
     assert 0.05 < error @ np.linalg.solve(found.covariance, error) / 6 < 3.0
 
 
+@pytest.mark.slow
 def test_a_flat_scan_stays_open_along_itself() -> None:
     found = place("flat")
     assert not found.sure and found.verdict.count("slide along") == 2 and found.verdict.count("turn about") == 1
     assert np.abs(over_wound("flat", found)[:, 2]).max() < 0.05  # across it, it is held
 
 
+@pytest.mark.slow
 def test_a_cylinder_stays_open_along_and_about_its_axis() -> None:
     found = place("cylinder")
     assert not found.sure and found.free.shape == (2, 6)
@@ -158,6 +160,7 @@ def test_the_scan_of_another_body_is_no_sure_fit() -> None:
     assert not found.sure and "poor fit" in found.verdict
 
 
+@pytest.mark.slow
 def test_two_searches_give_the_same_bits() -> None:
     again = ScanPlacing(scan("wound")).search(LENSES, *_arguments("wound"))
     assert again.base_from_surface.tobytes() == place("wound").base_from_surface.tobytes()

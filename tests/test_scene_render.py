@@ -178,6 +178,7 @@ def test_a_scene_built_again_gives_the_same_picture_and_another_seed_another() -
     assert np.abs(first.astype(int) - taken(other, instant(), cameras=camera)[0]).mean() > 3
 
 
+@pytest.mark.slow
 def test_a_view_does_not_remember_the_pictures_before() -> None:
     scene = Scene(body("forearm", Wound(), 2), Look(texel=0.3), seed=2)
     taken(scene, instant(MOVED))
@@ -243,6 +244,7 @@ def test_beads_are_seen_where_they_are_laid_and_nowhere_else() -> None:
         assert not change.any()
 
 
+@pytest.mark.slow
 def test_a_bead_in_pieces_is_one_bead_and_laying_it_twice_changes_nothing() -> None:
     scenes = [Scene(body("chest", Wound(), 1), Look(texel=0.2), seed=1) for _ in range(2)]
     ends = np.column_stack([np.linspace(-6, 6, 41), np.linspace(2, -3, 41)])
@@ -257,6 +259,7 @@ def test_a_bead_in_pieces_is_one_bead_and_laying_it_twice_changes_nothing() -> N
     np.testing.assert_allclose(coarse, fine.reshape(coarse.shape[0], 4, coarse.shape[1], 4, 4).mean((1, 3)), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_wet_wound_glares_and_a_dry_one_does_not() -> None:
     wet, dry = (Scene(body("forearm", Wound(), 2), Look(texel=0.2, wetness=w), seed=2) for w in (1.0, 0.0))
     xy = np.array([[-12.0, -8.0], [12.0, 8.0]])

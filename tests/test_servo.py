@@ -32,13 +32,14 @@ def executed(line: Polyline, dead_time: float = 0.0, tau: float = 0.0, most: Arr
     return Servo(line, dead_time, tau, most).at(GRID, 3.0)
 
 
+@settings(max_examples=25)
 @given(stretches)
 def test_without_dead_time_lag_and_limit_it_is_the_setpoint_itself(parts: list[tuple[float, list[float]]]) -> None:
     line = line_of(parts)
     assert (executed(line) == line.at(GRID)).all()
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(stretches, st.integers(1, 300), st.sampled_from([None, np.array([3000.0, 60])]))
 def test_dead_time_is_a_shift(parts: list[tuple[float, list[float]]], late: int, most: Array | None) -> None:
     line = line_of(parts)
@@ -72,7 +73,7 @@ def test_a_steady_setpoint_is_followed_a_lag_behind() -> None:
     assert behind[1000] == pytest.approx([1.5, 0, 0, 0.03, 0, 0])
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(stretches, st.floats(0, 0.05), st.floats(100, 5000))
 def test_the_limit_is_never_passed(parts: list[tuple[float, list[float]]], tau: float, most: float) -> None:
     moved = executed(line_of(parts), tau=tau, most=np.array([most, most / 50]))
@@ -81,7 +82,8 @@ def test_the_limit_is_never_passed(parts: list[tuple[float, list[float]]], tau: 
     assert np.linalg.norm(bend[:, 3:], axis=1).max() <= most / 50 * (1 + 1e-6) + 1e-4
 
 
-@settings(max_examples=40)
+@pytest.mark.slow
+@settings(max_examples=25)
 @given(stretches, st.floats(0.005, 0.05))
 def test_a_limit_that_is_not_reached_changes_next_to_nothing(
     parts: list[tuple[float, list[float]]], tau: float

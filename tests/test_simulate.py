@@ -73,6 +73,7 @@ def test_two_runs_and_any_number_of_threads_give_the_same_bytes(recorded: Path) 
     assert sum(name.endswith(".jpg") for name in names) > 40
 
 
+@pytest.mark.slow
 def test_another_seed_gives_other_pictures_and_other_errors(recorded: Path) -> None:
     tremor = [BREATHING, {"kind": "tremor", "rms_mm": [0.1, 0.1, 0.1]}]
     file = write_scenario(recorded, SMALL, motion=tremor, seconds=0.3, seed=6, clearance_mm=0.4, name="other.toml")
@@ -84,6 +85,7 @@ def test_another_seed_gives_other_pictures_and_other_errors(recorded: Path) -> N
 # -- what is measured
 
 
+@pytest.mark.slow
 def test_with_pictures_too_an_offset_planted_in_the_rig_comes_out_as_that_offset(tmp_path: Path) -> None:
     offset = [0.2, -0.1, 0.3]
     change = {"scene": {"nozzle": False}, "planted": {"rig_offset_mm": offset}}
@@ -268,6 +270,7 @@ def test_a_scenario_is_not_run_over_itself(tmp_path: Path) -> None:
     assert file.exists()
 
 
+@pytest.mark.slow
 def test_nothing_of_an_earlier_run_is_left_to_be_mistaken_for_this_one(tmp_path: Path) -> None:
     out = tmp_path / "out"
     for seconds, quality in ((0.9, 90), (0.5, 0)):

@@ -233,6 +233,7 @@ def test_the_loop_closes_with_the_thesis(tmp_path: Path) -> None:
 # -- on the bench
 
 
+@pytest.mark.slow
 def test_the_bench_shows_both_on_the_same_frame_sets(tmp_path: Path) -> None:
     write_session(tmp_path / "session", seconds=0.6, rate=10.0, cameras=RIG)
     options = Namespace(sessions=[tmp_path / "session"], seconds=1.0, method="thesis")

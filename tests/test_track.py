@@ -101,6 +101,7 @@ def test_the_simulated_surface_is_followed(tracked: Path) -> None:
     assert summary["errors"]["off_by_more_than_10_mm_while_tracking"] == 0
 
 
+@pytest.mark.slow
 def test_the_recording_of_the_run_tracks_to_the_same_poses(tracked: Path, tmp_path: Path) -> None:
     assert main(["track", str(tracked.parent / "run.mcap"), "-o", str(tmp_path / "again")]) == 0
     assert (tmp_path / "again" / "poses.tum").read_bytes() == (tracked / "poses.tum").read_bytes()

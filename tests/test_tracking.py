@@ -110,6 +110,7 @@ def test_a_pose_uses_nothing_that_came_later(sets: list[FrameSet], plain: list[S
     assert not same(poses[12], plain[12])
 
 
+@pytest.mark.slow
 def test_two_runs_give_the_same_bits(sets: list[FrameSet], plain: list[SurfacePose]) -> None:
     assert all(same(a, b) for a, b in zip(run(sets), plain, strict=True))
 
@@ -129,6 +130,7 @@ def test_poses_do_not_depend_on_the_clock(sets: list[FrameSet], plain: list[Surf
         assert step.last.seconds.shape == (len(STAGES),) and step.last.seconds.sum() > 0
 
 
+@pytest.mark.slow
 def test_grey_and_colour_images_give_the_same(sets: list[FrameSet], plain: list[SurfacePose]) -> None:
     assert all(same(a, b) for a, b in zip(run([change(s, lambda _, i: grey(i)) for s in sets]), plain, strict=True))
 
@@ -144,7 +146,7 @@ def test_the_report_counts_what_carries_the_pose(sets: list[FrameSet]) -> None:
         assert len(seen.pixels) == len(seen.sigma) == len(seen.track) == len(seen) and (seen.sigma > 0).all()
 
 
-@pytest.mark.parametrize("lost", [0, 1, 2])
+@pytest.mark.parametrize("lost", [0, *(pytest.param(c, marks=pytest.mark.slow) for c in (1, 2))])
 def test_a_camera_that_misses_frames_costs_little(sets: list[FrameSet], lost: int) -> None:
     holes = [change(s, lambda c, i: None if c == lost else i) if k % 3 == 2 else s for k, s in enumerate(sets)]
     poses = run(holes)
@@ -271,11 +273,13 @@ def test_what_moves_outside_the_region_is_not_followed() -> None:
     assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses, still)[FIRST:].max() < 0.1
 
 
+@pytest.mark.slow
 def test_what_stands_outside_the_region_does_not_hold_it_back() -> None:
     poses = run(two_patches(breathing, lambda stamp: breathing(0.0), STAMPS[:14]))
     assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.1
 
 
+@pytest.mark.slow
 def test_without_a_region_whatever_two_cameras_see_is_the_surface(sets: list[FrameSet]) -> None:
     """Before an even background, as a drape is: the patch is all there is to match."""
     plain, behind = [], clean(SCENE, AWAY)
@@ -287,6 +291,7 @@ def test_without_a_region_whatever_two_cameras_see_is_the_surface(sets: list[Fra
     assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.1
 
 
+@pytest.mark.slow
 def test_a_surface_at_rest_stays_at_rest() -> None:
     poses = run(shot(lambda stamp: REST, STAMPS[:20], 5))
     assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses, lambda stamp: REST)[FIRST:].max() < 0.03
@@ -317,6 +322,7 @@ def test_two_cameras_do_the_whole_job(sets: list[FrameSet], cameras: tuple[int, 
     assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses)[FIRST:].max() < 0.25
 
 
+@pytest.mark.slow
 def test_a_camera_that_runs_late_makes_the_claim_wider_not_wrong() -> None:
     """Camera 2 is exposed 20 ms late: at 25 mm/s that is half a millimetre of disagreement."""
 

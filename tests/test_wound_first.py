@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 
 from estimation.pose import TrackState
 from perception.contact_sheet import CELL, COLUMNS, Shown, contact_sheet
@@ -59,6 +60,7 @@ def test_the_surface_is_tracked_where_the_wound_was_seen() -> None:
     assert all(same(a, b) for a, b in zip(poses[3:], run(sets[3:], rois), strict=True))
 
 
+@pytest.mark.slow
 def test_without_a_wound_in_two_cameras_the_whole_pictures_are_taken() -> None:
     sets = shot(stamps=np.arange(3 * LOOKS + 1) / 10)
     step, asked = first_step(sets, (1,))
@@ -67,6 +69,7 @@ def test_without_a_wound_in_two_cameras_the_whole_pictures_are_taken() -> None:
     assert asked == [()]
 
 
+@pytest.mark.slow
 def test_a_camera_that_does_not_see_the_wound_is_searched_whole() -> None:
     sets = shot(stamps=np.arange(4) / 10)
     step, asked = first_step(sets, (0, 2))

@@ -146,6 +146,7 @@ def test_the_bench_judges_by_what_was_held_out_of_the_networks_own_data_and_by_a
     assert len(names) >= 150
 
 
+@pytest.mark.slow
 def test_the_bench_runs_without_data_and_says_what_is_missing() -> None:
     import argparse
 
