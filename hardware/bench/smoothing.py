@@ -1,4 +1,4 @@
-"""`stillbed bench smoothing`: smoothed poses beside causal ones, clocks, Ceres, many sessions, time by length."""
+"""`stillbed bench smoothing`: smoothed poses beside causal ones, from tracks and from pictures; clocks, Ceres, time."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from estimation.synthetic.world import World, synthetic_world
 from hardware.bench.bundle_adjustment import ceres_figures
 from hardware.bench.figure import Figure, Target, at_most
 from hardware.bench.smoothing_many import many_figures
+from hardware.bench.smoothing_rendered import SCENARIOS, rendered_figures
 from hardware.clock import CpuClock
 from hardware.evaluation import best_constant
 
@@ -40,11 +41,20 @@ class Pair:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Which worlds, how many and how long; and the lengths of the runs that are timed."""
     parser.add_argument("--movements", nargs="+", choices=MOVEMENTS, default=MOVEMENTS, help="of the worlds")
+    parser.add_argument(
+        "--scenarios", nargs="*", choices=SCENARIOS, default=SCENARIOS, help="rendered, tracked and smoothed"
+    )
+    parser.add_argument(
+        "--rendered", type=float, default=8.0, metavar="S", help="of each scenario; kept rendered; default 8"
+    )
     parser.add_argument("--seeds", type=int, default=4, metavar="N", help="worlds of each movement; default 4")
     parser.add_argument("--seconds", type=float, default=6.0, metavar="S", help="of each world; default 6")
     parser.add_argument("--count", type=int, default=100, metavar="N", help="landmarks; default 100")
     parser.add_argument(
         "--minutes", type=float, nargs="*", default=[1.0, 3.0, 10.0], metavar="M", help="runs that are timed"
+    )
+    parser.add_argument(
+        "--landmarks", type=int, nargs="*", default=[200, 400], metavar="N", help="of more runs, a minute each"
     )
     parser.add_argument(
         "--adjusted",
@@ -67,11 +77,13 @@ def run(options: argparse.Namespace) -> list[Figure]:
         print(f"{movement}: {found[0].value:.2f} of the causal error", file=sys.stderr, flush=True)
         figures += found
     figures += _late_figures(options)
+    figures += rendered_figures(options.scenarios, options.rendered)
     if options.adjusted:
         figures += ceres_figures(options.adjusted, options.count)
     if options.sessions:
         figures += many_figures(options.sessions)
-    return figures + [figure for minutes in options.minutes for figure in _timed(minutes, options.count)]
+    figures += [figure for minutes in options.minutes for figure in _timed(minutes, options.count)]
+    return figures + [_timed(1.0, count)[0] for count in options.landmarks]  # less memory than the longest run took
 
 
 def pair_figures(movement: str, pairs: list[Pair]) -> list[Figure]:
@@ -138,7 +150,7 @@ def _timed(minutes: float, count: int) -> list[Figure]:
     spent = clock.now() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     asked = minutes == AT_MINUTES
-    name = f"{minutes:g} min, {len(world)} poses"
+    name = f"{minutes:g} min, {len(world)} poses, {count} landmarks"
     return [
         Figure(f"{name}: time", spent, "s", at_most(MOST_SECONDS) if asked else None, "", "of one core"),
         Figure(f"{name}: memory", peak, "GB", at_most(MOST_GIGABYTES) if asked else None, "", "peak, tracks included"),

@@ -80,9 +80,13 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stillbed"
 
 
-def cached(file: Path, cache: Path) -> Rendered:
-    """Where the session of a scenario lies or will lie; another text of scenario or path is another folder."""
+def cached(file: Path, cache: Path, seconds: float | None = None) -> Rendered:
+    """Where the session of a scenario lies or will lie; another text of scenario or path is another folder.
+
+    seconds: of its beginning, None for all of it.
+    """
     text = file.read_bytes() + _path_bytes(file) + VERSION.encode()
+    text += b"" if seconds is None else f"{seconds:g} s".encode()
     return Rendered(cache / f"{file.stem}-{hashlib.sha256(text).hexdigest()[:12]}")
 
 
@@ -97,15 +101,17 @@ def _path_bytes(file: Path) -> bytes:
         return b""
 
 
-def prerender(file: Path, cache: Path, threads: int = 2) -> Rendered:
+def prerender(file: Path, cache: Path, threads: int = 2, seconds: float | None = None) -> Rendered:
     """The session of the scenario in `file`, rendered unless it is there; a run cut short leaves nothing in its place.
 
-    InputError for a scenario that makes no sense.
+    seconds: only so much of its beginning. InputError for a scenario that makes no sense.
     """
     scenario = read_scenario(file)
+    if seconds is not None:
+        scenario = replace(scenario, seconds=min(seconds, scenario.seconds))
     if others := [fault for fault in scenario.faults if fault.part is not Part.ARM]:
         raise InputError(file, "faults", str(others[0]), "faults of the arm; a live run takes others as --fault")
-    rendered = cached(file, cache)
+    rendered = cached(file, cache, seconds)
     if (rendered.folder / "scenario").exists():
         return rendered
     beside = rendered.folder.with_name(f"{rendered.folder.name}.{os.getpid()}")

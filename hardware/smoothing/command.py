@@ -18,6 +18,7 @@ def add_smooth(commands: Commands) -> None:
         help="the best estimate of recorded sessions, from all frame sets at once",
         description="Estimate all poses of a recorded session, its landmarks and its cameras' clocks at once, looking\n"
         "ahead as well as back. Tracks are those of the recording; where it has none, its images are tracked first.\n"
+        "Then all images are searched for landmarks that the tracks do not have there, and all is smoothed again.\n"
         "Writes smoothed.tum, smoothed.csv (covariances and twists), rig.toml (the cameras as corrected), map.ply,\n"
         "summary.json, report.html and, of an .mcap file, smoothed.mcap: a copy with the channel /smoothed.\n"
         "Of several sessions, and of those in a folder of sessions, each gets a folder of its own; one that fails\n"
