@@ -34,16 +34,24 @@ def test_what_is_saved_comes_back(tmp_path: Path) -> None:
     assert math.isnan(again[3].value) and again[3].verdict == "MISSED"
 
 
-@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.subject)
+def test_each_part_has_a_folder_of_its_own() -> None:
+    assert len({part.name or part.subject for part in PARTS}) == len(PARTS)
+
+
+@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.name or part.subject)
 def test_each_part_is_a_subject_with_options_that_it_has(part: Part) -> None:
     for options in (part.options, part.quick or ()):
         subject_parser(part.subject, SUBJECTS[part.subject]).parse_args(list(options))
 
 
 def test_all_parts_are_measured_and_a_failed_one_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    parts = (Part("planner", ("--updates", "20"), ("--updates", "20")), Part("prediction", (), ()), Part("plan"))
+    parts = (
+        Part("planner", ("--updates", "20"), ("--updates", "20")),
+        Part("prediction", (), ("--traces", "none"), name="chests"),
+        Part("plan"),
+    )
     done = measure_all(tmp_path, True, parts)
-    assert [one.subject for one in done] == ["planner", "prediction"]  # the quick look leaves `plan` out
+    assert [one.subject for one in done] == ["planner", "chests"]  # the quick look leaves `plan` out
     assert any(f.what == "uncaught errors" and f.verdict == "met" for f in done[0].figures)
     assert "stillbed bench prediction" in done[1].trouble and "no figures" in summary(done)
     assert "1 of 2: planner --updates 20" in capsys.readouterr().out

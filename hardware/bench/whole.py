@@ -24,17 +24,23 @@ RUN = "import sys; from hardware.cli import main; sys.exit(main(sys.argv[1:]))"
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One subject with its options: as a part of the whole, and of the quick look, which it is left out of by None."""
+    """One subject with its options: as a part of the whole, and of the quick look, which it is left out of by None.
+
+    name: in the table and of its folder, where the subject has another part beside it.
+    """
 
     subject: str
     options: tuple[str, ...] = ()
     quick: tuple[str, ...] | None = None
+    name: str = ""
 
 
 ONE_WORLD = "--maps", "seen", "--seeds", "1"
 PARTS = (
     Part("estimator", (*ONE_WORLD, "--seconds", "6"), (*ONE_WORLD, "--seconds", "3", "--only", "breathing, c*")),
     Part("consistency", ("--scenes", "1")),
+    Part("estimator", ("--maps", "seen", "--soak", "0.05"), name="memory"),
+    Part("prediction", (), ("--seconds", "90")),
     Part("steps", ("--steps", "500", "--hours", "0.2"), ("--steps", "50", "--hours", "0.02")),
     Part("latency", ("--seconds", "4")),
     Part("thesis", ("--seconds", "2")),
@@ -53,7 +59,7 @@ PARTS = (
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What one subject came to. trouble: why there are no figures, "" where there are."""
+    """What one part came to, by its name. trouble: why there are no figures, "" where there are."""
 
     subject: str
     figures: tuple[Figure, ...]
@@ -64,10 +70,10 @@ def measure_all(out: Path, quick: bool, parts: Sequence[Part] = PARTS) -> list[M
     """Measure every subject into a folder each of `out`; what stands there of the same commit and options is kept."""
     clock, machine, done = WallClock(), this_machine(), []
     wanted = [(part, part.quick if quick else part.options) for part in parts]
-    chosen = [(part.subject, options) for part, options in wanted if options is not None]
-    for number, (subject, options) in enumerate(chosen, 1):
+    chosen = [(part.subject, part.name or part.subject, options) for part, options in wanted if options is not None]
+    for number, (subject, name, options) in enumerate(chosen, 1):
         begun = clock.now()
-        one = _kept(out / subject, options, machine) or _measured(out / subject, subject, options)
+        one = _kept(out / name, options, machine) or _measured(out / name, subject, options)
         taken = duration(clock.now() - begun)
         print(f"{number} of {len(chosen)}: {subject} {' '.join(options)}, {taken}\n", flush=True)
         print(one.trouble or table_text(one.figures), end="\n\n", flush=True)
@@ -92,9 +98,9 @@ def _measured(folder: Path, subject: str, options: Sequence[str]) -> Measured:
     (folder / "figures.json").unlink(missing_ok=True)
     done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)  # its progress is shown as it goes
     if done.returncode or not (folder / "figures.json").is_file():
-        return Measured(subject, (), f"no figures: `stillbed bench {subject} {' '.join(options)}` says why")
+        return Measured(folder.name, (), f"no figures: `stillbed bench {subject} {' '.join(options)}` says why")
     (folder / "options.json").write_text(json.dumps([this_machine().commit, *options]), encoding="utf-8")
-    return Measured(subject, tuple(saved_figures(folder / "figures.json")))
+    return Measured(folder.name, tuple(saved_figures(folder / "figures.json")))
 
 
 def summary(done: Sequence[Measured]) -> str:
