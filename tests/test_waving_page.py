@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from board_session import BOARD, small_rig
+from board_session import BOARD, LENSES, RATE, rendered, small_rig
 from boards import motion
 from browser import Browser, Page, executable
 
 from estimation import se3
 from estimation.rig import pixels_from_points
+from hardware.calibration.board_file import write_board
 from hardware.calibration.guide import TOGETHER, Guide
 from hardware.calibration.waving_page import WavingPage
 from hardware.clock import WallClock
 from hardware.operator.request import Wish
 from hardware.operator.waving import WavingStage
+from hardware.rig_file import read_rig
 from perception.frames import Frame, FrameSet
+from tests.started import started
 
 CLOCK = WallClock()
 CHROMIUM = executable()
@@ -97,6 +102,43 @@ def test_the_page_shows_what_is_missing_and_enough_is_enough(shown: WavingPage, 
     shown.tell(WavingStage.PASSED, "PASS", "good enough to print")
     page.until('document.querySelector("#result pre").textContent === "PASS\\ngood enough to print"', timeout=PATIENCE)
     assert page.text("#chip") == "Passed"
+
+
+def videos(folder: Path) -> list[str]:
+    """What each of three cameras sees of a board that goes there and back for a while."""
+    session, files = rendered(folder / "session"), []
+    for name in "abc":
+        way = [cv2.imread(str(path)) for path in sorted((session / name).glob("*.png"))]
+        files.append(str(folder / f"{name}.avi"))
+        out = cv2.VideoWriter(files[-1], cv2.VideoWriter.fourcc(*"MJPG"), RATE, SIZE)
+        for number in range(int(PATIENCE * RATE)):
+            out.write(way[min(number % (2 * len(way) - 2), -number % (2 * len(way) - 2))])
+        out.release()
+    return files
+
+
+@pytest.mark.slow
+def test_a_board_before_live_cameras_becomes_a_rig_once_somebody_says_enough(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("board_session.OFFSETS", (0.0, 0.0, 0.0))  # what goes back is late by what it was early before
+    board, out, cameras = tmp_path / "board.toml", tmp_path / "rig.toml", videos(tmp_path)
+    write_board(board, BOARD)
+    run = started(["calibrate", "cameras", *cameras, "--board", str(board), "-o", str(out), "--limit-mm", "1"])
+    assert run.stderr is not None and run.stdout is not None
+    page = browser.page(run.stderr.readline().split()[1])
+    page.until('parseInt(document.querySelector("#looked")?.textContent) >= 14', timeout=PATIENCE)
+    page.until('[...document.querySelectorAll("canvas")].every((each) => each.dataset.drawn)', timeout=PATIENCE)
+    assert not page.js('document.querySelector("[data-wish=end]").disabled')
+    page.click('footer [data-wish="end"]')
+    page.until('document.body.dataset.stage === "passed"', timeout=PATIENCE)
+    shown = page.text("#result pre").splitlines()
+    told = run.stdout.read().splitlines()
+    assert run.wait(PATIENCE) == 0 and told[0] == "PASS"
+    assert shown == told[: len(shown)]
+    for camera, lens in zip(read_rig(out).rig.cameras, LENSES, strict=True):
+        assert camera.matrix[0, 0] == pytest.approx(lens[0], rel=0.03)
+    assert all(f'source = "{path}"' in out.read_text() for path in cameras)
 
 
 def test_stop_stops_and_what_happened_stays_to_be_read(browser: Browser) -> None:
