@@ -15,10 +15,10 @@ from hardware.arm_calibration.commanded import HEADER, NAME, read_commanded
 from hardware.arm_calibration.moves import MoveWishes, check_moves, places, planned
 from hardware.arm_calibration.run import Wishes, check_out, check_record, move_arm, run_folder
 from hardware.arm_calibration.solve import ARM
-from hardware.arm_calibration.virtual import record_in_virtual_time
 from hardware.arm_file import read_arm
 from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmState
+from hardware.cli import main
 from hardware.clock import SimClock
 from hardware.progress import silent
 from hardware.simulator.arm_settings import ArmSettings
@@ -128,17 +128,32 @@ def test_wrong_wishes_are_named(name: str, value: float) -> None:
         MoveWishes(**{name: value})  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ([], "one of a recorded FOLDER, --device, --virtual or --touched"),
+        (["moved", "--virtual"], "folder and virtual"),
+        (["--virtual"], "--record = 'missing'"),
+        (["--device", "/dev/x", "--record", "r"], "--cameras = 'missing'"),
+        (["--device", "/dev/x", "--terminal"], "--terminal"),
+        (["--device", "/dev/x", "--cameras", "rig.toml", "--record", "r"], "nobody is within the arm's reach"),
+    ],
+)
+def test_wrong_words_are_named(words: list[str], named: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", "arm", *words, "-o", "arm.toml"]) == 2
+    assert named in capsys.readouterr().err
+
+
 @pytest.mark.slow
-def test_a_simulated_arm_is_calibrated_from_pictures_alone(tmp_path: Path) -> None:
-    folder = tmp_path / "moved"
-    folder.mkdir()
-    wishes = MoveWishes(places=10, swing=8.0, speed=100.0)
-    truth = record_in_virtual_time(watched_arm(1), folder, wishes, silent)
-    outcome = run_folder(folder, tmp_path / "arm.toml", Wishes(limit=0.2), silent, truth)
-    assert outcome.verdict.passed, outcome.text
-    found, told = read_arm(tmp_path / "arm.toml"), read_arm(folder / ARM)
-    change = found.arm.arm_from_base @ truth.base_from_arm
+def test_a_simulated_arm_is_calibrated_from_pictures_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    watched, folder, out = watched_arm(1), tmp_path / "moved", tmp_path / "arm.toml"
+    moves = ["--places", "10", "--speed-mm-s", "100", "--seed", "1", "--limit-mm", "0.2"]
+    assert main(["calibrate", "arm", "--virtual", "--record", str(folder), "-o", str(out), *moves]) == 0
+    assert "cam_1: tip found in" in (told := capsys.readouterr().out) and "hidden by the tool itself" in told
+    found, before = read_arm(out), read_arm(folder / ARM)
+    change = found.arm.arm_from_base @ se3.inverse(watched.true.arm_from_base)
     assert np.degrees(se3.angle_of(change)) < 0.1 and np.linalg.norm(change[:3, 3]) < 1.0
-    assert found.arm.tool_offset == pytest.approx(truth.tool, abs=0.5)
-    assert found.lag == pytest.approx(told.frame_time + truth.late + truth.lag, abs=0.003)
-    assert (tmp_path / "arm.report.html").read_text().count("<figure>") > 8
+    assert found.arm.tool_offset == pytest.approx(watched.true.tool_offset, abs=0.3)
+    late = watched.settings.dead_time + watched.settings.servo_lag
+    assert found.lag == pytest.approx(before.frame_time + late, abs=0.005)
+    assert out.with_suffix(".report.html").read_text().count("<figure>") > 8

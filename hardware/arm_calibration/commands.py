@@ -30,6 +30,9 @@ def add_calibrate_arm(parts: Commands) -> None:
     part.add_argument("--device", metavar="DEVICE", help="the arm's port: a path, or a URL of pyserial's")
     part.add_argument("--virtual", action="store_true", help="an arm and cameras that are simulated, with exact truth")
     part.add_argument(
+        "--terminal", action="store_true", help="with --virtual: on a pseudo-terminal, in real time, as at a port"
+    )
+    part.add_argument(
         "--touched", type=Path, metavar="POINTS.toml", help="four or more points that the tip has touched"
     )
     part.add_argument("-o", "--out", type=Path, required=True, metavar="ARM.toml", help="to write; report beside it")
@@ -46,6 +49,7 @@ def add_calibrate_arm(parts: Commands) -> None:
     moves.add_argument("--down-mm", type=float, default=20.0, metavar="MM", help="below it; default 20")
     moves.add_argument("--turn-deg", type=float, default=35.0, metavar="DEG", help="of A, B and C; default 35")
     moves.add_argument("--speed-mm-s", type=float, default=80.0, metavar="MM_S", help="at most; default 80")
+    moves.add_argument("--dwell-s", type=float, default=0.6, metavar="S", help="at each place; default 0.6")
     moves.add_argument("--swing-s", type=float, default=8.0, metavar="S", help="a swing at the end; default 8")
     moves.add_argument("--stands", metavar="WHERE", help="where a silent arm stands: X,Y,Z,A,B,C or home")
     moves.add_argument("--yes", action="store_true", help="somebody sees that nobody is within the arm's reach")
@@ -66,6 +70,8 @@ def _calibrate_arm(arguments: argparse.Namespace) -> int:
             " and ".join(given) or "nothing",
             "one of a recorded FOLDER, --device, --virtual or --touched",
         )
+    if a.terminal and not a.virtual:
+        raise InputError("command line", "--terminal", "given", "with --virtual: a --device is at its own port")
     needed = {"device": ("cameras", "record"), "virtual": ("record",), "touched": ("cameras",), "folder": ()}[given[0]]
     for name in needed:
         if getattr(a, name) is None:
@@ -86,7 +92,7 @@ def _wishes(a: argparse.Namespace) -> Any:
     swing = 0.0 if a.keep_latency else a.swing_s
     lengths = a.places, a.reach_mm, a.up_mm, a.down_mm, turn, a.speed_mm_s
     return Wishes(
-        a.limit_mm, Asked(tool=not a.keep_tool, latency=not a.keep_latency), MoveWishes(*lengths, swing=swing)
+        a.limit_mm, Asked(tool=not a.keep_tool, latency=not a.keep_latency), MoveWishes(*lengths, a.dwell_s, swing)
     )
 
 
@@ -108,7 +114,7 @@ def _folder(a: argparse.Namespace, truth: Any = None, folder: Path | None = None
 
 def _virtual(a: argparse.Namespace) -> Any:
     from hardware.arm_calibration.run import check_out, check_record
-    from hardware.arm_calibration.virtual import record_on_terminal
+    from hardware.arm_calibration.virtual import record_in_virtual_time, record_on_terminal
     from hardware.clock import WallClock
     from hardware.progress import Progress
     from hardware.simulator.watched_arm import watched_arm
@@ -117,7 +123,11 @@ def _virtual(a: argparse.Namespace) -> Any:
     wishes, clock = _wishes(a), WallClock()
     check_record(a.record)
     with Progress("moves", "ticks", clock.now) as moves, Progress("pictures", "frame sets", clock.now) as pictures:
-        truth = record_on_terminal(watched_arm(a.seed), clock, a.record, wishes.moves, moves, pictures)
+        watched = watched_arm(a.seed)
+        if a.terminal:
+            truth = record_on_terminal(watched, clock, a.record, wishes.moves, moves, pictures)
+        else:
+            truth = record_in_virtual_time(watched, a.record, wishes.moves, moves, pictures)
     return _folder(a, truth, a.record)
 
 

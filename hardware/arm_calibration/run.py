@@ -44,7 +44,7 @@ from hardware.progress import Report
 from hardware.rig_file import read_rig
 from hardware.simulator.session_folder import SessionFolder
 
-FIRST = 10.0  # s that the cameras may take for their first pictures
+FIRST = 20.0  # s that the cameras may take for their first pictures; one on a network takes five to open
 FEWEST_SETS = 5  # frame sets before the arm begins to move
 RIG_JSON = "rig.json"  # of a recorded calibration: what the rig's own calibration was worth
 WORST = 4.0  # times its sigma that a touched point may lie beside

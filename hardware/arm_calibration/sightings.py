@@ -102,11 +102,14 @@ def _chosen(session: Session, set_point: SetPoint) -> list[tuple[tuple[FrameRef,
 def _finders(session: Session, set_point: SetPoint, radius: float) -> list[TipFinder]:
     """A finder for each camera, before a background of pictures that are far apart."""
     finders, reader = [], session.store.open()
+    own: list[list[FrameRef]] = [[] for _ in session.rig.cameras]  # a set may lack a camera
+    for ref in (ref for refs in session.sets for ref in refs):
+        own[ref.camera].append(ref)
+    picked = [ref for refs in own for ref in _far_apart(refs, set_point)]
     try:
         stacks: list[list[Image]] = [[] for _ in session.rig.cameras]
-        for refs in _far_apart(session, set_point):
-            for ref in refs:
-                stacks[ref.camera].append(reader.read(ref))
+        for ref in sorted(picked, key=lambda one: one.stamp):
+            stacks[ref.camera].append(reader.read(ref))
     finally:
         reader.close()
     for camera, stack in zip(session.rig.cameras, stacks, strict=True):
@@ -118,16 +121,17 @@ def _finders(session: Session, set_point: SetPoint, radius: float) -> list[TipFi
     return finders
 
 
-def _far_apart(session: Session, set_point: SetPoint) -> Sequence[tuple[FrameRef, ...]]:
-    """Frame sets, in order, in which the arm stands as far from the other ones as it can: farthest point sampling."""
-    stamps = np.array([refs[0].stamp for refs in session.sets])
-    points = set_point.lagged(stamps, 0.0, 0.0)[:, :3]
+def _far_apart(refs: Sequence[FrameRef], set_point: SetPoint) -> Sequence[FrameRef]:
+    """Pictures in which the arm stands as far from the other ones as it can: farthest point sampling."""
+    if not refs:
+        return ()
+    points = set_point.lagged(np.array([ref.stamp for ref in refs]), 0.0, 0.0)[:, :3]
     picked = [0]
     away = np.linalg.norm(points - points[0], axis=1)
     while len(picked) < min(BEHIND, len(points)):
         picked.append(int(away.argmax()))
         away = np.minimum(away, np.linalg.norm(points - points[picked[-1]], axis=1))
-    return [session.sets[i] for i in sorted(set(picked))]
+    return [refs[i] for i in sorted(set(picked))]
 
 
 def _find(finders: list[TipFinder], ref: FrameRef, place: int, image: Image) -> _Seen:

@@ -1,4 +1,4 @@
-"""`stillbed calibrate arm --virtual`: the whole of it before simulated cameras, the arm on a pseudo-terminal."""
+"""`stillbed calibrate arm --virtual`: the whole of it before simulated cameras, in virtual time or at a port."""
 
 from __future__ import annotations
 
@@ -55,13 +55,15 @@ def record_on_terminal(
     return _truth(watched, device.arm, device.begun, read_commanded(folder / NAME))
 
 
-def record_in_virtual_time(watched: WatchedArm, folder: Path, wishes: MoveWishes, pictures: Report) -> ArmTruth:
-    """The same in virtual time: as exact as the wire, however busy the machine is."""
+def record_in_virtual_time(
+    watched: WatchedArm, folder: Path, wishes: MoveWishes, moves: Report, pictures: Report
+) -> ArmTruth:
+    """The same in virtual time: as exact as the wire, however busy the machine is, and the same each time."""
     write_arm(folder / ARM, watched.told, "the virtual arm as it is taken to be")
     clock = SimClock()
     virtual = VirtualArm(watched.settings, watched.told.dialect, watched.begin, (), watched.told.baud)
     arm = Arm(VirtualDevice(virtual, clock, watched.told.baud), watched.told, 0.0)
-    move_arm(arm, clock, folder, watched.begin, wishes, lambda done, total: None)
+    move_arm(arm, clock, folder, watched.begin, wishes, moves)
     virtual.advance(clock.now())
     take_pictures(watched, virtual, 0.0, (0.0, clock.now()), folder, pictures)
     return _truth(watched, virtual, 0.0, read_commanded(folder / NAME))

@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> list[Figure]:
 def _rendered(seed: int) -> Iterator[Figure]:
     watched = watched_arm(seed)
     with tempfile.TemporaryDirectory() as place, Progress("pictures", "frame sets", WallClock().now) as progress:
-        truth = record_in_virtual_time(watched, Path(place), MoveWishes(), progress)
+        truth = record_in_virtual_time(watched, Path(place), MoveWishes(), silent, progress)
         found = solve_folder(Path(place), None, Asked(), silent)
     note = f"arm {seed}, {len(found.look.sightings)} tips of {int(found.look.looked.sum())} rendered pictures"
     true = ArmState(truth.base_from_arm, truth.tool, truth.late, truth.lag, found.fit.state.blunt)
@@ -69,6 +69,8 @@ def _rendered(seed: int) -> Iterator[Figure]:
     yield Figure(f"dead time, arm {seed}", 1e3 * abs(float(off[9])), "ms", at_most(1.0))
     yield Figure(f"servo's lag, arm {seed}", 1e3 * abs(float(off[10])), "ms", at_most(3.0))
     yield Figure(f"held-out tips, median, arm {seed}", float(np.nanmedian(found.held_px)), "px")
+    known = off[:11], found.fit.covariance[:11, :11]  # the needle's own end is none that the truth names
+    yield Figure(f"squared error, in parts of what is claimed, arm {seed}", _parts(*known))
 
 
 def error_of(fit: ArmFit, true: ArmState) -> Array:
@@ -77,6 +79,11 @@ def error_of(fit: ArmFit, true: ArmState) -> Array:
     pose = se3.log(se3.inverse(true.base_from_arm) @ state.base_from_arm)
     rest = [state.dead_time - true.dead_time, state.lag - true.lag, state.blunt - true.blunt]
     return np.concatenate([pose, np.asarray(state.tool) - true.tool, rest])
+
+
+def _parts(off: Array, covariance: Array) -> float:
+    """Squared error in parts of what a covariance claims, per number."""
+    return float(off @ np.linalg.solve(covariance, off)) / len(off)
 
 
 def _at_places(found: ArmCalibration, true: ArmState) -> Array:
@@ -106,6 +113,6 @@ def _drawn(seed: int) -> tuple[float, float, float, float]:
     pose, axes, _ = first_pose(seen, set_point, kinematics, watched.rig)
     fit = fit_arm(seen, set_point, kinematics, watched.rig, ArmState(pose, np.zeros(3), 0.01, 0.01, 0.5))
     off, poses = error_of(fit, true), kinematics(axes)
-    nees = float(off @ np.linalg.solve(fit.covariance, off)) / len(off)
+    nees = _parts(off, fit.covariance)
     a, b = (se3.transform_points(x.base_from_arm @ poses, np.asarray(x.tool)[None])[:, 0] for x in (fit.state, true))
     return nees, float(np.sqrt(np.mean(((a - b) ** 2).sum(1)))), 1e3 * float(off[9]), 1e3 * float(off[10])
