@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.adjustment import FREE, Adjusted, Anchors, KeyFrame, adjust, single_fit
 from estimation.camera_errors import Delays
-from estimation.deferred import Deferred
+from estimation.deferred import Deferred, sets_until_ready
 from estimation.fit import Fit
 from estimation.observations import Observations
 from estimation.rig import Rig
@@ -31,7 +31,10 @@ LEAST_OF_CAMERA = 12  # tracks: fewer may agree by chance, and so may less than 
 
 
 class Refiner:
-    """Keeps the key frames of one surface and asks for a new map when a new one is worth it."""
+    """Keeps the key frames of one surface and asks for a new map when a new one is worth it.
+
+    interval: s between the last two frame sets offered, 0 before.
+    """
 
     def __init__(self, rig: Rig, executor: Executor | None = None) -> None:
         self._rig = rig
@@ -43,6 +46,8 @@ class Refiner:
         self._anchors: Anchors | None = None
         self._ask = self._kept = False
         self._offered: tuple[Fit, Observations, Array] | None = None
+        self._before = np.nan  # s, of the frame set offered last
+        self.interval = 0.0  # s between the last two
         self._delays = Delays(np.zeros(len(rig)), np.zeros((len(rig),) * 2))  # as known now
         self._doubt = np.inf  # s, of them at the last adjustment
 
@@ -101,6 +106,7 @@ class Refiner:
 
     def offer(self, fit: Fit, observations: Observations, twist: Array, delays: Delays) -> None:
         """A measured frame set; `poll` keeps it if it shows the surface anew."""
+        self.interval, self._before = max(float(np.nan_to_num(fit.stamp - self._before)), 0.0), fit.stamp
         self._offered, self._delays = (fit, observations, twist), delays
 
     def withdraw(self) -> None:
@@ -210,6 +216,7 @@ class Refiner:
         if self._ask and not self._work.busy and self._map is not None and len(self._frames) >= 3:
             self._ask = False
             self._doubt = self._delays.sigma
+            self._work.delay = sets_until_ready(self.interval)
             self._work.ask(adjust, self._rig, self._map, list(self._frames), self._delays, self._anchors)
         return result
 

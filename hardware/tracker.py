@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -16,6 +17,8 @@ from perception.prefilter import NONE, PREFILTERS
 from perception.tool import Tool
 from perception.tracking import TrackingStep
 from perception.wound_first import WoundFirst
+
+NICE = 10  # by which the process of the map stands back
 
 
 @contextmanager
@@ -39,7 +42,7 @@ def tracker(
         from hardware.mesh_file import read_mesh  # loads open3d, which nothing without a scan may need
 
         scan = read_mesh(surface).scan
-    with ProcessPoolExecutor(1, get_context("spawn"), _leave_interrupts) as executor:
+    with ProcessPoolExecutor(1, get_context("spawn"), _settle) as executor:
         executor.submit(int).result()  # started before the first frame set, not beside it
 
         def made(found: Sequence[Roi]) -> TrackingStep:
@@ -58,6 +61,7 @@ def tracker(
             yield WoundFirst(rig, made, segmenter, thread)
 
 
-def _leave_interrupts() -> None:
-    """Ctrl-C is for the parent, which then ends this process in good order."""
+def _settle() -> None:
+    """Ctrl-C is for the parent, which then ends this process in good order; frames go before the map."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(NICE)

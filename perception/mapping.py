@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.adjustment import Adjusted, single_fit
-from estimation.deferred import Deferred
+from estimation.deferred import Deferred, sets_until_ready
 from estimation.estimator import Estimator
 from estimation.fit import Fit
 from estimation.observations import Observations
@@ -187,6 +187,7 @@ class Mapping:
         elif self._refiner.kept and lacking and not self._growth.busy and len(matcher.map) < MOST:
             warp = None if estimator.pose is None else estimator.pose.warp
             look = self._look(matcher, fit, observations, pyramids, warp)
+            self._growth.delay = sets_until_ready(self._refiner.interval)
             self._growth.ask(look_for_more, self._lenses.rig, look, matcher.map)
 
     def _shown(self, matcher: Matcher, fit: Fit, pyramids: dict[int, Pyramid]) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_adjustment import RIG, as_map, landmarks, look, shape_error, swaying, unsure
 
-from estimation.deferred import DELAY
+from estimation.deferred import DELAY, sets_until_ready
 from estimation.estimator import Estimator
 from estimation.refiner import Refiner
 from estimation.se3 import Array
@@ -62,3 +62,8 @@ def test_a_surface_that_deforms_has_the_map_again_as_it_was_confirmed_and_it_sta
     assert back is not None and len(back.map) == len(grown)
     assert np.array_equal(back.map.points[: len(true)], confirmed.map.points)
     assert refiner.freeze() is None
+
+
+@pytest.mark.parametrize(("interval", "sets"), [(0.0, DELAY), (1 / 10, DELAY), (1 / 30, 9), (1 / 60, 18), (1.0, DELAY)])
+def test_a_map_is_given_the_time_that_it_takes_however_fast_the_cameras_are(interval: float, sets: int) -> None:
+    assert sets_until_ready(interval) == sets

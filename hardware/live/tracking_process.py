@@ -47,6 +47,7 @@ from hardware.live.remembered import remember, true_pose
 from hardware.newest import Newest
 from hardware.operator.link import OperatorLink
 from hardware.operator.taker import PictureTaker, Shot
+from hardware.priority import settle_memory
 from hardware.session import Session, open_session
 from hardware.tracker import tracker
 from perception.frames import FrameSet, PrintHead, Roi
@@ -184,6 +185,7 @@ class _Tracking:
             self._outbox.put(RoiEntry(replace(roi, stamp=self.report.stamp)))
 
     def __call__(self) -> None:
+        settle_memory()
         while not gone(self._lines.lifeline):
             arrived = self._source.take(PATIENCE)
             if arrived is None:
@@ -230,6 +232,7 @@ class _Tracking:
         if self._plan.truth and self._known.truth is not None:
             known = se3.inverse(pose.base_from_surface) @ true_pose(self._known.truth, arrived.source)
         self.report = replace(self.report, surface_from_path=known, registered=pose.stamp)
+        settle_memory()  # what was compiled since, as nothing moves yet
 
     def _report(self, arrived: Arrived, pose: SurfacePose) -> None:
         report, frames = self.report, arrived.frames
