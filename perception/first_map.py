@@ -204,7 +204,7 @@ def find_landmarks(
         if len(pixels) < 6:
             return None
         normals = smooth_normals(points, outward)
-        on_ray = _along(rig, camera, pixels, points)
+        on_ray = on_rays(rig, camera, pixels, points)
         offset = found - ideal_pixels(rig.cameras[other], on_ray)[0]
         found, good = _place(lenses, pyramids, camera, other, on_ray, normals, offset, least=0.8)
     points = _pair_points(rig, camera, other, pixels[good], found[good])[0]
@@ -261,7 +261,7 @@ def _sweep(
     return origins + directions / inverse[best][:, None], (peak > 0.7) & (rival < peak - 0.1)
 
 
-def _along(rig: Rig, camera: int, pixels: Array, points: Array) -> Array:
+def on_rays(rig: Rig, camera: int, pixels: Array, points: Array) -> Array:
     """The spots (N, 3) on the pixels' own rays nearest to points: a landmark stands exactly where its camera saw it."""
     origins, directions = rays(rig, np.full(len(pixels), camera), pixels)
     return np.asarray(origins + np.einsum("ni,ni->n", points - origins, directions)[:, None] * directions)

@@ -20,6 +20,7 @@ from estimation.pose_solver import project, solve_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.features import grey
+from perception.first_map import on_rays
 from perception.frames import FrameSet
 from perception.freshness import Freshness
 from perception.known_motion import Expected, KnownMotion
@@ -52,14 +53,16 @@ class References:
         """Keep the pictures of the landmarks whose first good look is in this frame set."""
         motion, k, expected = self.motion, self.motion.row(frames.stamp), self.motion.at(frames.stamp)
         for frame in frames.frames if k is not None else ():
-            rows = self._first.get((k or 0, frame.camera))
-            if rows is None or expected is None:
+            first = self._first.get((k or 0, frame.camera))
+            if first is None or expected is None:
                 continue
             pose = motion.poses(expected, motion.seen_at(frames.stamp))[frame.camera]
-            points, normals = motion.map.points[rows], motion.map.normals[rows]
+            there = se3.transform_points(pose, motion.map.points[first.track])
+            spots = on_rays(motion.rig, frame.camera, first.pixels, there)  # the very spots that the tracks are of
+            points, normals = se3.transform_points(se3.inverse(pose), spots), motion.map.normals[first.track]
             found = take_templates(self.lenses, pyramid(grey(frame.image)), frame.camera, pose, points, normals)
             sharp = found.contrast > FLAT
-            self._cut.append((rows[sharp], found.take(sharp)))
+            self._cut.append((first.track[sharp], found.take(sharp)))
 
     def matcher(self) -> tuple[NDArray[np.int64], Matcher] | None:
         """The rows (M,) of the landmarks whose pictures were cut, and what finds them; None without any."""
@@ -167,12 +170,12 @@ class Relinker:
         return replace(seen, track=self._place_of[seen.track])
 
 
-def _first_looks(motion: KnownMotion) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """By frame set and camera, the landmarks whose pictures are to be cut there.
+def _first_looks(motion: KnownMotion) -> dict[tuple[int, int], Observations]:
+    """By frame set and camera, the looks at which landmarks' pictures are to be cut.
 
-    That is where the motion first puts them right, in the camera that sees them most squarely.
+    Of each landmark it is the first that is where the motion puts it, in the camera that sees it most squarely.
     """
-    whole, out = motion.map, dict[tuple[int, int], NDArray[np.int64]]()
+    whole, out = motion.map, dict[tuple[int, int], Observations]()
     open_ = np.ones(len(whole), bool)
     eyes = np.stack([camera.base_from_camera[:3, 3] for camera in motion.rig.cameras])
     for k, all_seen in enumerate(motion.seen):
@@ -187,10 +190,10 @@ def _first_looks(motion: KnownMotion) -> dict[tuple[int, int], NDArray[np.int64]
         away = away - whole.points[seen.track]
         squarely = (away * whole.normals[seen.track]).sum(1) / np.linalg.norm(away, axis=1)
         order = np.lexsort((-squarely, seen.track))
-        rows, first = np.unique(seen.track[order], return_index=True)
-        camera = seen.camera[order][first]
-        out |= {(k, int(c)): rows[camera == c] for c in np.unique(camera)}
-        open_[rows] = False
+        best = np.zeros(len(seen), bool)
+        best[order[np.unique(seen.track[order], return_index=True)[1]]] = True
+        out |= {(k, int(c)): seen.only(best & (seen.camera == c)) for c in np.unique(seen.camera[best])}
+        open_[seen.track] = False
     return out
 
 
