@@ -20,7 +20,7 @@ from hardware.operator.server import KINDS, page_files
 from hardware.operator.settings import OperatorSettings
 from hardware.viewing.playback import PictureBook, Playback
 
-SHARED = ("camera.js", "lens.js", "scene.js", "words.js", "page.css", "icon.svg")  # of the operator's page
+SHARED = ("camera.js", "lens.js", "panes.js", "scene.js", "words.js", "page.css", "icon.svg")  # of the operator's page
 UNREADABLE = 422  # an answer that says why, to a question that was understood
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]

@@ -1,7 +1,7 @@
 // The operator's page: hears the run, shows it, and asks. The newest wins; nothing is kept but the last minute's error.
 import { Buttons } from "./buttons.js";
-import { CameraPane } from "./camera.js";
 import { Course } from "./course.js";
+import { Panes } from "./panes.js";
 import { SceneView } from "./scene.js";
 import { Line } from "./socket.js";
 import { ACTIVITIES, duration, figure, milliseconds, STAGES, TRACKING, upper, VERDICTS } from "./words.js";
@@ -11,7 +11,7 @@ const EVENTS = 2; // of the last ones that there is room for
 const CHECKED = ["check", "find", "confirm", "ready", "failed"];
 const by = (id) => document.getElementById(id);
 const state = { view: null, scene: null, poses: null, age: Infinity, since: 0, stale: 1, refused: 0, gone: false, full: false, chosen: null, large: null, near: true };
-const panes = new Map();
+const panes = new Panes(by("pictures"), choose);
 const course = new Course(document.querySelector("#course canvas"));
 const space = new SceneView(by("scene"));
 
@@ -38,33 +38,16 @@ function view(message) {
 function scene(message) {
   for (const key of ["path", "surface"]) message[key] = Float32Array.from(message[key]);
   state.scene = message;
-  for (const camera of message.cameras) pane(camera.name).see(camera);
+  for (const camera of message.cameras) panes.of(camera.name).see(camera);
   space.see(message);
   refresh();
 }
 
 async function pictures(data) {
-  const size = new DataView(data).getUint32(0, true), head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size)));
-  let offset = 4 + size;
-  const image = (size) => {
-    const bytes = new Blob([new Uint8Array(data, offset, size)], { type: "image/jpeg" });
-    offset += size;
-    return size ? createImageBitmap(bytes).catch(() => null) : null;
-  };
-  const images = await Promise.all(head.pictures.flatMap((each) => [image(each.size), image(each.near)]));
-  head.pictures.forEach((each, k) => images[2 * k] && pane(each.camera).show(images[2 * k], images[2 * k + 1], each));
+  const head = await panes.show(data);
   by("closer").hidden = !head.pictures.some((each) => each.crop);
   state.poses = head.base_from_surface;
   refresh();
-}
-
-function pane(name) {
-  if (!panes.has(name)) {
-    const made = new CameraPane(name, choose);
-    panes.set(name, made);
-    by("pictures").append(made.root);
-  }
-  return panes.get(name);
 }
 
 function choose(name) {
@@ -89,7 +72,7 @@ function show() {
     tiles(seen);
     progress(seen);
     events(seen.events);
-    for (const camera of seen.cameras) pane(camera.name).fares(camera);
+    for (const camera of seen.cameras) panes.of(camera.name).fares(camera);
   }
   refresh();
 }

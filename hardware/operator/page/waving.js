@@ -1,4 +1,5 @@
 // The page beside a calibration: live pictures with the corners that were found, what each camera still needs, the hint.
+import { unpacked } from "./panes.js";
 import { Line } from "./socket.js";
 import { duration, upper } from "./words.js";
 
@@ -131,14 +132,8 @@ async function hear(message) {
 }
 
 async function pictures(data) {
-  const size = new DataView(data).getUint32(0, true), head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size)));
-  let offset = 4 + size;
-  const images = await Promise.all(head.pictures.map((each) => {
-    const bytes = new Blob([new Uint8Array(data, offset, each.size)], { type: "image/jpeg" });
-    offset += each.size + each.near;
-    return createImageBitmap(bytes).catch(() => null);
-  }));
-  head.pictures.forEach((each, k) => images[k] && pane(each.camera).show(images[k], each.tracks));
+  const { head, images } = await unpacked(data);
+  head.pictures.forEach((each, k) => images[k][0] && pane(each.camera).show(images[k][0], each.tracks));
   for (const each of boards.values()) each.draw();
 }
 

@@ -1,6 +1,6 @@
 // The viewer: one number, the frame set that is shown; everything else is asked of the server for it, the newest only.
-import { CameraPane } from "./camera.js";
 import { inverse, moved, product } from "./lens.js";
+import { Panes } from "./panes.js";
 import { SceneView } from "./scene.js";
 import { Timeline } from "./timeline.js";
 import { figure, TRACKING } from "./words.js";
@@ -10,7 +10,7 @@ const AXES = ["#c8553d", "#4c9a6a", "#2a6f97"]; // of the surface frame: x, y, z
 const GIVEN = { truth: "Truth", reference: "Reference" }; // poses that nobody estimated have no state
 const by = (id) => document.getElementById(id);
 const state = { session: null, k: 0, wanted: -1, busy: false, seen: null, poses: null, first: null, playing: false, begun: 0, from: 0, chosen: null };
-const panes = new Map();
+const panes = new Panes(by("pictures"), choose);
 
 class Film extends SceneView {
   draw(view, fraction) {
@@ -52,7 +52,7 @@ async function begin() {
   if (!answer.ok) return alarm(await answer.text());
   const session = (state.session = await answer.json());
   for (const key of ["path", "surface"]) session.scene[key] = Float32Array.from(session.scene[key]);
-  for (const camera of session.scene.cameras) pane(camera.name).see(camera);
+  for (const camera of session.scene.cameras) panes.of(camera.name).see(camera);
   space.see(session.scene);
   timeline.see(session);
   const last = session.stamps.length - 1;
@@ -94,7 +94,8 @@ async function fetchNewest() {
       state.seen = await said.json();
       show();
       if (!pictures.ok) throw new Error(await pictures.text());
-      await unpack(await pictures.arrayBuffer());
+      state.poses = (await panes.show(await pictures.arrayBuffer())).base_from_surface;
+      refresh();
       alarm("");
     } catch (error) {
       alarm(error instanceof TypeError ? "No connection: stillbed view has ended." : error.message);
@@ -102,25 +103,6 @@ async function fetchNewest() {
     document.body.dataset.shown = k;
   }
   state.busy = false;
-}
-
-async function unpack(data) {
-  const size = new DataView(data).getUint32(0, true), head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size)));
-  let offset = 4 + size;
-  const cut = head.pictures.map((each) => new Uint8Array(data, (offset += each.size + each.near) - each.size - each.near, each.size));
-  const images = await Promise.all(cut.map((bytes) => createImageBitmap(new Blob([bytes], { type: "image/jpeg" })).catch(() => null)));
-  head.pictures.forEach((each, k) => images[k] && pane(each.camera).show(images[k], null, each));
-  state.poses = head.base_from_surface;
-  refresh();
-}
-
-function pane(name) {
-  if (!panes.has(name)) {
-    const made = new CameraPane(name, choose);
-    panes.set(name, made);
-    by("pictures").append(made.root);
-  }
-  return panes.get(name);
 }
 
 function choose(name) {
