@@ -27,7 +27,9 @@ from estimation.se3 import Array
 NUMBERS = 4  # of a camera's picture: shift right and down, px; roll, rad; scale
 FEWEST = 8  # tracks of a camera that tell its four numbers
 TAKEN = 0.03  # of what a camera's tracks tell of a number: where the pose leaves less of it, it stays where it is
-EVERY = 0.06  # s: every other frame set of 30 a second is looked at, which is plenty for what stays
+EVERY = (
+    0.06  # s: every other frame set of 30 a second is looked at, which is plenty for what stays; all while one is off
+)
 BLUNDER = 6.0  # px beside the median of its camera at which a track counts for nothing
 
 
@@ -37,7 +39,7 @@ class BumpSettings:
 
     warm: s after a beginning in which nothing is said. limit: px, root mean square over the tracks, that they may move
     by at least, and spread: times what is usual of that. sure: times what the next camera explains. lasts: s that it
-    must be so, calm: s that it must not be so any more.
+    must be so, calm: s that single looks must show half of the limit at most for it to be so no more.
     """
 
     quick: float = 0.4
@@ -47,29 +49,32 @@ class BumpSettings:
     spread: float = 5.0
     sure: float = 1.2
     lasts: float = 0.2
-    calm: float = 0.5
+    calm: float = 0.06
 
 
-@dataclass(slots=True, eq=False)
-class _Sums:
-    """Information (n, n) and pull (n,) of n numbers, and information (n, n) of them at a fixed pose; all fading."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """Information (n, n) and pull (n,) of n numbers once the pose has taken up what it can; fixed: (n, n), information
+    with the pose known."""
 
     information: Array
     pull: Array
     fixed: Array
 
     @staticmethod
-    def of(count: int) -> _Sums:
+    def nothing(count: int) -> Told:
+        """Of so many numbers."""
         square = np.zeros((count, count))
-        return _Sums(square, np.zeros(count), square)
+        return Told(square, np.zeros(count), square)
 
-    def take(self, told: Told, share: float) -> None:
-        self.information = self.information + share * (told.information - self.information)
-        self.pull = self.pull + share * (told.pull - self.pull)
-        self.fixed = self.fixed + share * (told.fixed - self.fixed)
+    def mixed(self, newer: Told, share: float) -> Told:
+        """As it fades by a share that is newer."""
+        old, new = (self.information, self.pull, self.fixed), (newer.information, newer.pull, newer.fixed)
+        return Told(*(a + share * (b - a) for a, b in zip(old, new, strict=True)))
 
     def numbers(self) -> Array:
-        steady = TAKEN * self.fixed + 1e-9 * np.eye(len(self.pull))  # of cameras never seen: zeros
+        """(n,) what explains it; where the pose takes up nearly all, and of cameras that nobody saw, zeros."""
+        steady = TAKEN * self.fixed + 1e-9 * np.eye(len(self.pull))
         return np.asarray(np.linalg.solve(self.information + steady, self.pull))
 
 
@@ -84,7 +89,7 @@ class BumpDetector:
         """Forget everything, as for a new map."""
         count = len(self._names)
         self.bumped: dict[int, str] = {}  # cameras, and what is said of them
-        self._quick, self._usual = [_Sums.of(NUMBERS) for _ in range(count)], _Sums.of(NUMBERS * count)
+        self._quick, self._usual = [Told.nothing(NUMBERS)] * count, Told.nothing(NUMBERS * count)
         self._spread = np.zeros(count)  # px^2, usual square of what is off
         self._since = np.full(count, np.nan)  # s, since when a camera is off, or on again
         self._first, self._stamp, self._count = np.nan, np.nan, 0
@@ -99,7 +104,7 @@ class BumpDetector:
         jacobians: (N, 2, 6) px of the pose. odd: cameras so far off that the pose is without them: what they
         showed is forgotten once they are back.
         """
-        if seen.stamp - self._stamp < EVERY:
+        if seen.stamp - self._stamp < EVERY and not self.bumped:
             return
         self._forget(self._odd - odd)
         self._odd = odd
@@ -109,28 +114,29 @@ class BumpDetector:
         step, self._stamp = max(seen.stamp - self._stamp, 0.0), seen.stamp
         self._count += 1
         if seen.stamp - self._first < self.settings.warm:
-            self._usual.take(together(parts, len(rig)), 1 / self._count)
+            self._usual = self._usual.mixed(together(parts, len(rig)), 1 / self._count)
             return
         self._judge({c: p.without(u) for (c, p), u in zip(parts.items(), self._usual_of(parts), strict=True)}, step)
         if not self.bumped and not odd:
-            self._usual.take(together(parts, len(rig)), min(1.0, step / self.settings.usual))
+            self._usual = self._usual.mixed(together(parts, len(rig)), min(1.0, step / self.settings.usual))
 
     def _usual_of(self, cameras: Iterable[int]) -> Array:
         return self._usual.numbers().reshape(-1, NUMBERS)[list(cameras)]
 
     def _judge(self, parts: dict[int, PicturePart], step: float) -> None:
         """Take what each camera is off by beside what is usual, and decide on each."""
-        steady = parts.keys() - self.bumped.keys() - self._odd
+        steady, now = parts.keys() - self.bumped.keys() - self._odd, {}
         for camera in parts:
             told = alone(parts, camera, steady)
-            self._quick[camera].take(told, min(1.0, step / self.settings.quick))
+            self._quick[camera] = self._quick[camera].mixed(told, min(1.0, step / self.settings.quick))
+            now[camera] = parts[camera].moved(told.numbers())
         changes = {c: self._quick[c].numbers() for c in parts}
-        moved = {c: float(np.sqrt(np.mean(((parts[c].slopes @ v) ** 2).sum(-1)))) for c, v in changes.items()}
+        moved = {c: parts[c].moved(v) for c, v in changes.items()}
         gains = {c: float(v @ self._quick[c].pull) for c, v in changes.items()}
         for camera in parts:
             others = [g for c, g in gains.items() if c != camera and c not in self.bumped]
             clear = gains[camera] > self.settings.sure * max(others, default=0.0)
-            self._decide(camera, moved[camera], clear)
+            self._decide(camera, now[camera] if camera in self.bumped else moved[camera], clear)
             if camera in self.bumped:
                 self.bumped[camera] = _words(changes[camera], parts[camera], moved[camera])
         if not self.bumped:
@@ -158,17 +164,7 @@ class BumpDetector:
         if off and not known and lasted >= s.lasts:
             self.bumped[camera] = ""
         elif known and not off and lasted >= s.calm:
-            del self.bumped[camera]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Told:
-    """Information (n, n) and pull (n,) of n numbers once the pose has taken up what it can; fixed: (n, n), information
-    with the pose known."""
-
-    information: Array
-    pull: Array
-    fixed: Array
+            self._forget(frozenset([camera]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,6 +182,10 @@ class PicturePart:
     def without(self, numbers: Array) -> PicturePart:
         """As it would be, were the picture not off by these numbers (4,)."""
         return replace(self, pull=self.pull - self.own @ numbers, pulled=self.pulled - numbers @ self.cross)
+
+    def moved(self, numbers: Array) -> float:
+        """By how much these numbers (4,) move its tracks: px, root mean square."""
+        return float(np.sqrt(np.mean(((self.slopes @ numbers) ** 2).sum(-1))))
 
 
 def picture_parts(
