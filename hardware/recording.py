@@ -25,6 +25,7 @@ from hardware import messages
 from hardware.checks import read_bytes
 from hardware.compressed_image import ENCODING, NAME, SCHEMA, SCHEMA_ENCODING, pack
 from hardware.images import check_size, encode
+from hardware.mcap_index import pack_index
 from hardware.messages import SURFACE_FRAME, Message
 from hardware.schemas import (
     CALIBRATION,
@@ -90,6 +91,7 @@ class Recorder:
         self._writer = Writer(
             self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD if compress else CompressionType.NONE
         )
+        pack_index(self._writer)
         self._guarded(lambda: self._writer.start(profile="", library="stillbed"))
 
     def __enter__(self) -> Recorder:

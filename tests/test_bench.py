@@ -8,11 +8,13 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from estimation.errors import InputError
 from hardware.bench.command import add_bench, run_bench, subject_parser
 from hardware.bench.figure import Figure, Target, at_least, at_most
+from hardware.bench.live import growth
 from hardware.bench.machine import this_machine
 from hardware.bench.subjects import SUBJECTS, Subject
 from hardware.bench.table import table_text
@@ -124,3 +126,12 @@ def test_where_clocks_differ_the_bench_asks_what_is_known_of_them(capsys: pytest
     command = ["estimator", "--only", "breathing, offsets 16 ms", "--seeds", "1", "--seconds", "0.3", "--maps", "told"]
     run_bench(_arguments(*command))
     assert "offsets 16 ms, exact map: offsets off by" in capsys.readouterr().out
+
+
+def test_what_grows_is_told_process_by_process() -> None:
+    seconds = np.arange(0.0, 600.0, 2.0)
+    held = [(s, {"run": 50.0, "recorder": 80.0 + 0.01 * s} | ({"map": 100.0} if s > 300 else {})) for s in seconds]
+    grown = growth(held)
+    assert grown["run"] == pytest.approx((0.0, 50.0), abs=1e-6)
+    assert grown["recorder"] == pytest.approx((36.0, 85.98), abs=1e-6) and grown["map"][1] == 100.0
+    assert growth(held[:4]) == {}

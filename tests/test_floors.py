@@ -27,6 +27,7 @@ OWNERS = {  # library: the files that may import it
     "gtsam": ("estimation/*.py",),
     "matplotlib": ("perception/training/*.py",),
     "mcap": (
+        "hardware/mcap_index.py",
         "hardware/mcap_walk.py",
         "hardware/recording.py",
         "hardware/recording_file.py",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import fields
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.records import ChunkIndex
 from session_files import image, rig, stamps, trajectory
 
 from estimation.errors import InputError, StillbedError
@@ -177,3 +179,18 @@ def test_what_the_reader_would_refuse_is_refused_when_written(tmp_path: Path) ->
         with pytest.raises(InputError, match="finite"):
             recorder.write(Move(5.0, np.full(6, np.nan), 1.0, 0, False))
     assert len(open_session(tmp_path / "x.mcap")) == 3
+
+
+def test_an_index_kept_as_bytes_gives_the_very_file_and_holds_nothing_of_its_chunks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def record(name: str) -> tuple[bytes, int]:
+        with Recorder(tmp_path / name, rig()) as recorder:
+            write_frames(recorder, 60, 3, 0.0)
+            held = sum(isinstance(each, ChunkIndex) for each in gc.get_objects())
+        return (tmp_path / name).read_bytes(), held
+
+    packed, held = record("packed.mcap")
+    monkeypatch.setattr("hardware.recording.pack_index", lambda writer: None)
+    plain, chunks = record("plain.mcap")
+    assert packed == plain and held == 0 and chunks > 2

@@ -133,17 +133,29 @@ def _errors(name: str, found: dict[str, Any], error: TrueError) -> list[Figure]:
     ]
 
 
-def _burden(name: str, found: dict[str, Any], memory: Sequence[tuple[float, float]]) -> list[Figure]:
-    share = found["recorder_share_of_core"]
-    settled = np.array(memory[int(SETTLED * len(memory)) :])
-    slope = np.polyfit(settled[:, 0], settled[:, 1], 1)[0] * 3600 if len(settled) > 5 else np.nan
-    size = settled[-1, 1] if len(settled) else np.nan
+def growth(memory: Sequence[tuple[float, dict[str, float]]]) -> dict[str, tuple[float, float]]:
+    """By process, from s and MB each: MB an hour by which it grows once it has settled, and MB in the end."""
+    settled = memory[int(SETTLED * len(memory)) :]
+    stamps = np.array([stamp for stamp, _ in settled])
+    found = {}
+    for name in settled[-1][1] if len(settled) > 5 else ():
+        held = np.array([each.get(name, np.nan) for _, each in settled])
+        there = np.isfinite(held)
+        slope = np.polyfit(stamps[there] - stamps[0], held[there], 1)[0] if there.sum() > 5 else np.nan
+        found[name] = float(3600 * slope), float(held[-1])
+    return found
+
+
+def _burden(name: str, found: dict[str, Any], memory: Sequence[tuple[float, dict[str, float]]]) -> list[Figure]:
+    share, grown = found["recorder_share_of_core"], growth(memory)
+    slope, size = (sum(each[k] for each in grown.values()) if grown else np.nan for k in (0, 1))
+    told = ", ".join(f"{process} {by:+.0f}" for process, (by, _) in grown.items())
     return [
         Figure(
             f"{name}: recorder", 100 * (share or np.nan) / 2, "%", at_most(3), "", "of two cores, its start included"
         ),
         Figure(f"{name}: not recorded", found["unrecorded"], "", at_most(0)),
-        Figure(f"{name}: memory grows", slope, "MB/h", at_most(5), "", "a short run tells little; pictures kept count"),
+        Figure(f"{name}: memory grows", slope, "MB/h", at_most(5), "", f"{told}; a short run tells little"),
         Figure(f"{name}: memory", size, "MB"),
     ]
 

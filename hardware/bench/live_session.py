@@ -13,16 +13,17 @@ from pathlib import Path
 from hardware.clock import WallClock
 
 NAME = "(sb-"  # of the processes of a run, as the system tells it
+MAP = "map"  # the processes of the tracking's own
 STARTED = 300.0  # s in which a run must have begun to print, on a busy machine
 LOOK = 0.005  # s
 
 
 class LiveSession:
-    """A run in a process of its own. said: what it told so far. memory: of all its processes, (s, MB)."""
+    """A run in a process of its own. said: what it told so far. memory: s, and MB by process."""
 
     def __init__(self, arguments: list[str]) -> None:
         self.said = ""
-        self.memory: list[tuple[float, float]] = []
+        self.memory: list[tuple[float, dict[str, float]]] = []
         self._clock = WallClock()
         self.keys, theirs = pty.openpty()
         command = [sys.executable, "-m", "hardware.cli", "live", *arguments]
@@ -48,28 +49,21 @@ class LiveSession:
 
     def children(self) -> dict[str, int]:
         """Its processes by name."""
-        found = {}
-        for folder in Path("/proc").glob("[0-9]*"):
-            try:
-                text = (folder / "stat").read_text()
-            except OSError:
-                continue
-            name, rest = text[text.find("(") : text.rfind(")")], text[text.rfind(")") + 2 :].split()
-            if name.startswith(NAME) and int(rest[1]) == self.process.pid:
-                found[name.removeprefix(NAME)] = int(folder.name)
-        return found
+        named = ((name, pid) for pid, name in _children(self.process.pid) if name.startswith(NAME))
+        return {name.removeprefix(NAME): pid for name, pid in named}
 
     def weigh(self) -> None:
-        """Note how much memory all its processes but the virtual arm hold that no other has, MB."""
-        pages = 0
-        own = [pid for name, pid in self.children().items() if name != "arm"]  # which keeps all that it ever did
-        for pid in (self.process.pid, *own):
+        """Note how much memory each of its processes but the virtual arm holds that no other has, MB."""
+        held: dict[str, float] = {}
+        own = {name: pid for name, pid in self.children().items() if name != "arm"}  # which keeps all that it ever did
+        of_map = [(MAP, pid) for pid, _ in _children(own.get("tracking", -1))]
+        for name, pid in [("run", self.process.pid), *own.items(), *of_map]:
             try:
                 resident, shared = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1:3]
             except (OSError, ValueError):
                 continue
-            pages += int(resident) - int(shared)
-        self.memory.append((self._clock.now(), pages * os.sysconf("SC_PAGE_SIZE") / 1e6))
+            held[name] = held.get(name, 0.0) + (int(resident) - int(shared)) * os.sysconf("SC_PAGE_SIZE") / 1e6
+        self.memory.append((self._clock.now(), held))
 
     def kill(self, name: str) -> float:
         """Kill one of its processes, "run" for the one that conducts; the instant, s, NaN where there is none."""
@@ -100,3 +94,17 @@ class LiveSession:
         assert self.process.stderr is not None
         for line in self.process.stderr:
             self.said += line
+
+
+def _children(parent: int) -> list[tuple[int, str]]:
+    """The processes that a process has started: each its number and name, which begins with a bracket."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            text = (folder / "stat").read_text()
+        except OSError:
+            continue
+        name, rest = text[text.find("(") : text.rfind(")")], text[text.rfind(")") + 2 :].split()
+        if int(rest[1]) == parent:
+            found.append((int(folder.name), name))
+    return found
