@@ -110,6 +110,7 @@ def test_what_is_off_alike_at_a_place_is_in_the_doubt() -> None:
         left = [sightings.take(group != g) for g in range(1, 8)]
         states = [fit_arm(some, sent(), KINEMATICS, RIG, found.state).state for some in left]
         doubted = widened(found, states)
+        assert doubted.widened_by > 2 and found.widened_by == 1
         gap = se3.log(se3.inverse(true.base_from_arm) @ found.state.base_from_arm)
         off = np.concatenate([gap, found.state.tool - true.tool])
         for out, fit in ((plain, found), (wide, doubted)):

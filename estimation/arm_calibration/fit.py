@@ -38,7 +38,8 @@ class Asked:
 class ArmFit:
     """state: as found. covariance: (12, 12) of [rx ry rz tx ty tz] of base_from_arm, rad and mm, right perturbation,
     tool offset mm, dead time s, lag s, blunt mm; zero for what was not asked. residuals: (N, 2) px, as predicted less
-    seen. used: (N,) sightings that lie where they should. scatter: of those, in the sigmas they came with.
+    seen. used: (N,) sightings that lie where they should. scatter: of those, in the sigmas they came with. widened_by:
+    what the covariance was multiplied by, beyond what the scatter says.
     """
 
     state: ArmState
@@ -46,6 +47,7 @@ class ArmFit:
     residuals: Array
     used: NDArray[np.bool_]
     scatter: float
+    widened_by: float = 1.0
 
     @property
     def sigma(self) -> Array:
@@ -244,7 +246,8 @@ def widened(fit: ArmFit, states: Sequence[ArmState]) -> ArmFit:
     away = (off - off.mean(0))[:, known]
     inverse = np.linalg.inv(fit.covariance[np.ix_(known, known)])
     square = float(np.einsum("ki,ij,kj->", away, inverse, away)) / int(known.sum())
-    return replace(fit, covariance=fit.covariance * max((1 - 1 / len(states)) * square, 1.0))
+    factor = max((1 - 1 / len(states)) * square, 1.0)
+    return replace(fit, covariance=fit.covariance * factor, widened_by=factor)
 
 
 def _apart(state: ArmState, other: ArmState) -> Array:

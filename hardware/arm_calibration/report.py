@@ -55,12 +55,13 @@ def _numbers(found: ArmCalibration, sigma: Array) -> str:
     state = found.fit.state
     arm_from_base = se3.inverse(state.base_from_arm)
     turn = np.degrees(se3.angle_of(arm_from_base))
+    dead, lag = (f"{1e3 * s:.2f}" if found.asked.latency else "kept" for s in sigma[9:11])
     rows = [
         ["place of the base in the arm's frame, mm", _three(arm_from_base[:3, 3]), f"{np.linalg.norm(sigma[3:6]):.3f}"],
         ["its turn, degrees", f"{turn:.3f}", f"{np.degrees(np.linalg.norm(sigma[:3])):.4f}"],
-        ["tip in the tool, mm", _three(np.asarray(state.tool)), _three(sigma[6:9], 3)],
-        ["dead time, ms", f"{1e3 * state.dead_time:.2f}", f"{1e3 * sigma[9]:.2f}"],
-        ["servo's lag, ms", f"{1e3 * state.lag:.2f}", f"{1e3 * sigma[10]:.2f}"],
+        ["tip in the tool, mm", _three(np.asarray(state.tool)), _three(sigma[6:9], 3) if found.asked.tool else "kept"],
+        ["dead time, ms", f"{1e3 * state.dead_time:.2f}", dead],
+        ["servo's lag, ms", f"{1e3 * state.lag:.2f}", lag],
         ["radius of the needle's end, mm", f"{state.blunt:.2f}", f"{sigma[11]:.2f}"],
         ["scatter, in the sigmas of single tips", f"{found.fit.scatter:.2f}", ""],
     ]

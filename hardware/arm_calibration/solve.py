@@ -157,6 +157,7 @@ def numbers_text(found: ArmCalibration) -> str:
         "sigma": sigma.tolist(),
         "covariance": found.fit.covariance.tolist(),
         "scatter": found.fit.scatter,
+        "widened_by": found.fit.widened_by,
         "held_out_median_px": float(np.nanmedian(found.held_px)),
         "held_out_median_mm": float(np.nanmedian(found.held_mm)),
     }

@@ -69,8 +69,9 @@ def _rendered(seed: int) -> Iterator[Figure]:
     yield Figure(f"dead time, arm {seed}", 1e3 * abs(float(off[9])), "ms", at_most(1.0))
     yield Figure(f"servo's lag, arm {seed}", 1e3 * abs(float(off[10])), "ms", at_most(3.0))
     yield Figure(f"held-out tips, median, arm {seed}", float(np.nanmedian(found.held_px)), "px")
-    known = off[:11], found.fit.covariance[:11, :11]  # the needle's own end is none that the truth names
-    yield Figure(f"squared error, in parts of what is claimed, arm {seed}", _parts(*known))
+    parts = _parts(off[:11], found.fit.covariance[:11, :11])  # the needle's own end is none that the truth names
+    yield Figure(f"squared error, in parts of what is claimed, arm {seed}", parts)
+    yield Figure(f"likewise, before the claim is widened, arm {seed}", parts * found.fit.widened_by)
 
 
 def error_of(fit: ArmFit, true: ArmState) -> Array:
