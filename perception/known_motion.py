@@ -45,7 +45,8 @@ class KnownMotion:
         eyes = np.mean([camera.base_from_camera[:3, 3] for camera in rig.cameras], axis=0)
         outward = se3.transform_points(se3.inverse(smoothed.states.poses[0]), eyes) - points.mean(0)
         self.map = SurfaceMap(points, smooth_normals(points, outward), smoothed.map.covariance)
-        self.seen = [_by_row(seen, smoothed.tracks) for seen in observations]
+        there = [seen for seen in observations if smoothed.stamps[0] <= seen.stamp <= smoothed.stamps[-1]]
+        self.seen = [_by_row(seen, smoothed.tracks) for seen in there]
         self._own = np.einsum("ninj->nij", self.map.covariance.reshape(len(points), 3, len(points), 3))  # (L, 3, 3)
         self._covariance = smoothed.covariance[:, :6, :6]
         self._apart = pairing_tolerance(frame_period([smoothed.stamps]))

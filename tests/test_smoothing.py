@@ -189,6 +189,16 @@ def test_the_same_observations_give_the_same_bits() -> None:
     assert (first.states.poses == second.states.poses).all() and (first.covariance == second.covariance).all()
 
 
+def test_what_comes_before_the_first_track_and_after_the_last_changes_nothing() -> None:
+    world = synthetic_world("lively", 1.0, count=30, seed=1)
+    seen = list(world)
+    before = [no_observations(seen[0].stamp - 0.17 * k) for k in range(70, 0, -1)]
+    after = [no_observations(seen[-1].stamp + 0.17 * k) for k in range(1, 70)]
+    within, whole = smooth(world.rig, seen), smooth(world.rig, [*before, *seen, *after])
+    assert (whole.stamps == within.stamps).all()
+    assert whole.states.poses.tobytes() == within.states.poses.tobytes()
+
+
 def test_any_instant_between_is_told_as_well() -> None:
     result, world = smoothed("breathing", 2.0, 0)
     there = result.at(result.stamps)

@@ -72,7 +72,7 @@ def smooth(
     prior: CalibrationPrior | None = None,
     progress: Told = silent,
 ) -> Smoothed:
-    """Smooth a recording's observations, in order of stamp.
+    """Smooth a recording's observations, in order of stamp, from the first frame set that shows anything to the last.
 
     known: the map of the surface where there is one, such as from a scan: tracks then count its rows, and its
     covariance is its prior. Without it, the pose of the first frame set lays the surface frame and is held. start:
@@ -81,7 +81,7 @@ def smooth(
     observations do not determine a pose.
     """
     prior = CalibrationPrior() if prior is None else prior
-    data = packed(observations, len(rig))
+    data = packed(_tracked(observations), len(rig))
     poses, points = begin(rig, data, known, start)
     told = np.isfinite(points[:, 0]) & (np.bincount(data.landmark, minlength=len(points)) >= LEAST_SIGHTINGS)
     if told.sum() < 6:
@@ -102,6 +102,12 @@ def smooth(
     estimate = Estimate(_rates(poses, data.stamps), cameras, points)
     noise = Noise(np.ones(len(rig)), JITTER, UNREST)
     return _Solver(rig, Problem(data, np.flatnonzero(sigma > 0)), estimate, before, noise, progress).solve()
+
+
+def _tracked(observations: Sequence[Observations]) -> Sequence[Observations]:
+    """Without those before anything is seen and after it: a motion carried on for seconds goes anywhere."""
+    some = [k for k, seen in enumerate(observations) if len(seen)]
+    return observations[some[0] : some[-1] + 1] if some else observations
 
 
 def _rates(poses: Array, stamps: Array) -> States:
