@@ -66,6 +66,8 @@ def test_what_is_said_in_time_and_over_with_its_cause_is_well() -> None:
     assert verdict is not None and not (verdict.silent or verdict.restless or verdict.operator)
     assert verdict.detected == pytest.approx(0.06) and verdict.seen == pytest.approx(0.01)
     assert verdict.recovered == pytest.approx(0.1) and verdict.worst == 0.0
+    jumped = judged(ran(said=(4.06, 4.6)), replace(FAULT, part=Part.CLOCK, kind=Kind.JUMP, amount=1.0), 7.0)
+    assert jumped is not None and jumped.seen == jumped.detected and np.isnan(jumped.recovered)
 
 
 def test_an_error_of_which_nobody_says_a_word_is_silent_and_one_that_is_told_is_not() -> None:

@@ -25,10 +25,11 @@ FINAL = (Kind.KILL,)
 class Verdict:
     """One fault, judged; times in s, NaN where there is nothing to tell.
 
-    detected: from its beginning until the motion knew. seen: until the exposure of the pose that said so. worst: mm,
-    the largest error while extruding from then on, 0 where nothing was. silent: too far off while extruding, and nobody
-    said anything. restless: it held, and the arm moved. recovered: from the end of the cause until moves go out and
-    nothing is to be said; inf where that never came. operator: whether an operator was needed.
+    detected: from its beginning until the motion knew. seen: until the exposure of the pose that said so, or, where
+    clocks are what is wrong, until the motion knew. worst: mm, the largest error while extruding from then on, 0 where
+    nothing was. silent: too far off while extruding, and nobody said anything. restless: it held, and the arm moved.
+    recovered: from the end of the cause until moves go out and nothing is to be said; inf where that never came.
+    operator: whether an operator was needed.
     """
 
     fault: Fault
@@ -59,13 +60,18 @@ def judged(ran: Ran, fault: Fault, until: float) -> Verdict | None:
     return Verdict(
         fault=fault,
         detected=detected,
-        seen=max(ran.words[first[0]].seen - fault.start, 0.0) if len(first) else np.nan,
+        seen=_seen(ran.words[first[0]].seen, detected, fault) if len(first) else np.nan,
         worst=float(np.nanmax(np.append(error[during], 0.0))),
         silent=_silent(log.stamps, error, during, stamps[words & said], _usual(log.stamps, error)),
         restless=_restless(ran, stamps[words], (moving | own)[words], log.stamps),
         recovered=_recovered(stamps[words], said[words] | ~moving[words], fault),
         operator=any(fault.start <= stamp < until for stamp in ran.stopped),
     )
+
+
+def _seen(stamp: float, detected: float, fault: Fault) -> float:
+    """From the beginning until the exposure of a pose with this stamp; where stamps are what is wrong, until known."""
+    return detected if fault.part is Part.CLOCK else max(stamp - fault.start, 0.0)
 
 
 def _usual(stamps: Array, error: Array) -> float:
