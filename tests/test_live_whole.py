@@ -170,3 +170,19 @@ def test_a_full_disk_ends_the_run_and_what_was_written_stays(start: Start, cache
     assert run.end() == 1
     assert len(open_session(record)) > 20
     assert np.isfinite([ref.stamp for refs in open_session(record).sets for ref in refs]).all()
+
+
+def test_a_camera_that_is_stuck_is_said_and_left_out_and_the_print_goes_on(
+    start: Start, cache: Path, tmp_path: Path
+) -> None:
+    record, stuck = tmp_path / "run.mcap", "camera0 stuck at 1s for 1.5s"
+    run = start("--simulated", cache / "small.toml", "--record", record, "--yes", f"--fault={stuck}")
+    run.wait_for("the path is printed")
+    assert run.end() == 0
+    poses = list(recorded_poses(record))
+    same = [[f"cam_{c} shows the same picture again" in pose.reason for c in range(3)] for pose in poses]
+    said = [pose.stamp for pose, (first, *others) in zip(poses, same, strict=True) if first and not any(others)]
+    assert len(said) > 10 and said[-1] - said[0] == pytest.approx(1.5, abs=0.2)
+    assert poses[0].stamp < said[0] - 1.0 and said[-1] + 1.0 < poses[-1].stamp
+    assert all(pose.state.measured for pose in poses if said[0] <= pose.stamp <= said[-1])  # two see enough
+    printed_once(record)
