@@ -32,6 +32,7 @@ BEYOND, INSIDE = 6.0, 4.0  # px on both sides of the end between which it is fit
 STEPS = 8  # of that fit
 ACROSS = 5.0  # px beside the axis that are looked at
 FINE = 0.25  # px between samples
+COLOURED = 0.3  # of the contrast, by which needle and background must differ in colour: else brightness must tell
 STEADY = 0.35  # of its brightness by which the needle's may differ from a straight line: else it is not one
 _TO_LIGHT = np.where((grey := np.arange(256) / 255.0) <= 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4).astype(
     np.float32
@@ -81,8 +82,8 @@ class TipFinder:
         tip, towards = rough
         x0, y0 = (int(v) for v in np.maximum(tip - WINDOW, 0))
         part = slice(y0, int(tip[1]) + WINDOW), slice(x0, int(tip[0]) + WINDOW)
-        change = _in_light(image[part]) - _in_light(self._behind[part])
-        found = _measured(change, tip - [x0, y0], towards)
+        behind = _in_light(self._behind[part])
+        found = _measured(_in_light(image[part]) - behind, behind, tip - [x0, y0], towards)
         return None if found is None else replace(found, pixel=(found.pixel[0] + x0, found.pixel[1] + y0))
 
 
@@ -137,10 +138,10 @@ def _at_border(pixel: Array, mask: Mask) -> bool:
     return not (margin <= pixel[0] <= w - 1 - margin and margin <= pixel[1] <= h - 1 - margin)
 
 
-def _measured(change: Light, tip: Array, towards: Array) -> Tip | None:
+def _measured(change: Light, behind: Light, tip: Array, towards: Array) -> Tip | None:
     """Axis and end of the needle whose rough tip (2,) and direction (2,) are given."""
     for _ in range(3):
-        along, across, amount, contrast = _strip(change, tip, towards)
+        along, across, amount, contrast = _strip(change, behind, tip, towards)
         if contrast < FAINT:
             return None
         inner = (along >= 2.0) & (along <= _reach(amount, along))
@@ -157,7 +158,7 @@ def _measured(change: Light, tip: Array, towards: Array) -> Tip | None:
         tip = tip + end * towards + (offset + slope * end) * side
         turned = towards + slope * side
         towards = turned / np.linalg.norm(turned)
-    return _tip(along, across, amount, inner, tip, towards, contrast, change)
+    return _tip(along, across, amount, inner, tip, towards, contrast)
 
 
 def _tip(
@@ -168,7 +169,6 @@ def _tip(
     tip: Array,
     towards: Array,
     contrast: float,
-    change: Light,
 ) -> Tip | None:
     profile = amount.sum(1)[inner] * FINE
     line = np.polyval(np.polyfit(along[inner], profile, 1), along[inner])
@@ -181,21 +181,33 @@ def _tip(
     return Tip((float(tip[0]), float(tip[1])), (float(towards[0]), float(towards[1])), sigma, width, contrast)
 
 
-def _strip(change: Light, tip: Array, towards: Array) -> tuple[Array, Array, Array, float]:
+def _strip(change: Light, behind: Light, tip: Array, towards: Array) -> tuple[Array, Array, Array, float]:
     """Samples along (S,) and across (W,), px, from the tip, share of needle (S, W) there, and the contrast.
 
-    What the needle adds to the background is one colour; how much of it is in a sample is its share.
+    A round needle is of one colour, but bright on one side and dark on the other: its share is how much is gone of that
+    part of the background's light which the needle's colour does not have. Brightness tells it where there is none.
     """
     along, across = np.arange(-BEYOND - 2, FITTED + FINE, FINE), np.arange(-ACROSS, ACROSS + FINE, FINE)
     side = np.array([-towards[1], towards[0]])
     at = tip + along[:, None, None] * towards + across[None, :, None] * side
     x, y = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
-    patch = cv2.remap(change, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
-    core = patch[(along > 2.5) & (along < 10.0)][:, np.abs(across) < 0.6].reshape(-1, 3)
-    colour = np.median(core, axis=0)
-    contrast = float(np.linalg.norm(colour))
-    amount = patch @ colour / max(contrast**2, 1e-12)
-    return along, across, amount, contrast
+    patch, back = (
+        cv2.remap(light, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
+        for light in (change, behind)
+    )
+    added, own = (
+        np.median(light[(along > 2.5) & (along < 10.0)][:, np.abs(across) < 0.6].reshape(-1, 3), axis=0)
+        for light in (patch, patch + back)
+    )
+    contrast = float(np.linalg.norm(added))
+    own = own / max(float(np.linalg.norm(own)), 1e-9)
+    left = np.eye(3) - np.outer(own, own)  # of a light: what is not of the needle's colour
+    foreign = back @ left
+    size = np.sum(foreign**2, axis=-1)
+    usual = float(np.median(size))
+    if usual < (COLOURED * contrast) ** 2:
+        return along, across, patch @ added / max(contrast**2, 1e-12), contrast
+    return along, across, -np.sum(patch @ left * foreign, axis=-1) / np.maximum(size, usual / 4), contrast
 
 
 def _reach(amount: Array, along: Array) -> float:
