@@ -40,7 +40,9 @@ class Pair:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Which worlds, how many and how long; and the lengths of the runs that are timed."""
-    parser.add_argument("--movements", nargs="+", choices=MOVEMENTS, default=MOVEMENTS, help="of the worlds")
+    parser.add_argument(
+        "--movements", nargs="*", choices=MOVEMENTS, default=MOVEMENTS, help="of the worlds; none: no worlds"
+    )
     parser.add_argument(
         "--scenarios", nargs="*", choices=SCENARIOS, default=SCENARIOS, help="rendered, tracked and smoothed"
     )
@@ -76,7 +78,8 @@ def run(options: argparse.Namespace) -> list[Figure]:
         found = pair_figures(movement, pairs)
         print(f"{movement}: {found[0].value:.2f} of the causal error", file=sys.stderr, flush=True)
         figures += found
-    figures += _late_figures(options)
+    if options.movements:
+        figures += _late_figures(options)
     figures += rendered_figures(options.scenarios, options.rendered)
     if options.adjusted:
         figures += ceres_figures(options.adjusted, options.count)
