@@ -82,13 +82,16 @@ class Relinker:
         self._motion, self._rows, self._matcher = motion, rows, matcher
         self._place_of = np.full(len(motion.map), -1)
         self._place_of[rows] = np.arange(len(rows))
+        self._apart = np.zeros(
+            (len(motion.rig), len(motion.map), 3)
+        )  # px that pictures are off tracks, summed; and looks
         self._fresh = Freshness()
         self._waiting: deque[tuple[float, dict[int, Pyramid]]] = deque(maxlen=WAITING)
 
     def __call__(self, frames: FrameSet) -> list[Observations]:
         """What is found anew in this frame set, and in those that waited for one where the surface is known; by stamp.
 
-        Tracks are the ids of the observations that were smoothed.
+        Tracks count rows of the motion's map.
         """
         motion = self._motion
         stamp = motion.seen_at(frames.stamp).stamp  # to its last bit
@@ -102,8 +105,17 @@ class Relinker:
             return []
         found = self._found(stamp, pyramids, expected)
         out = self._backwards(stamp, pyramids, expected, joined(motion.seen_at(stamp), found))
-        tracks = motion.smoothed.tracks
-        return [replace(part, track=tracks[part.track]) for part in (*out, found) if len(part)]
+        return [part for part in (*out, found) if len(part)]
+
+    def told(self, found: Observations) -> Observations:
+        """What was found, as looks at the very spots that the tracks are of, which bear the ids of the tracks.
+
+        A track is of the picture that the run had. Where one and the same frame set has both, what lies between them
+        is seen, and without it a landmark would jump where one takes over from the other.
+        """
+        apart = self._apart[found.camera, found.track]
+        pixels = found.pixels - apart[:, :2] / np.maximum(apart[:, 2:], 1.0)
+        return replace(found, pixels=pixels, track=self._motion.smoothed.tracks[found.track])
 
     def _found(self, stamp: float, pyramids: dict[int, Pyramid], expected: Expected) -> Observations:
         """Landmarks that were not seen then."""
@@ -112,14 +124,23 @@ class Relinker:
         poses = motion.poses(expected, seen)
         wanted = (doubt < AROUND) & motion.unseen(stamp)
         wanted[[c for c in range(len(wanted)) if c not in pyramids]] = False
-        self._search(np.asarray(wanted[:, self._rows].any(0)))
+        self._search(np.ones(len(self._rows), bool))
         coarse = bool(wanted.any()) and float(np.median(doubt[wanted])) > NEAR
         found = self._of_motion(matcher.align(stamp, pyramids, {c: poses[c] for c in pyramids}, coarse=coarse))
+        self._compare(seen, found)
         put = project(motion.rig, found.camera, poses, motion.map.points[found.track])[0]
         near = np.linalg.norm(found.pixels - put, axis=1) < AGREES * (1 + doubt[found.camera, found.track])
         found = found.only(near & wanted[found.camera, found.track])
         whole = joined(self._of_matcher(seen), found)
         return found.only(np.isin(found.camera, self._showing(pyramids, expected.base_from_surface, whole)))
+
+    def _compare(self, seen: Observations, found: Observations) -> None:
+        """How far the pictures of landmarks are `found` from where the tracks have `seen` them."""
+        known = np.full(self._apart.shape[:2] + (2,), np.nan)
+        known[seen.camera, seen.track] = seen.pixels
+        off = found.pixels - known[found.camera, found.track]
+        both = np.linalg.norm(off, axis=1) < AGREES  # not where one is unknown
+        self._apart[found.camera[both], found.track[both]] += np.c_[off[both], np.ones(both.sum())]
 
     def _showing(self, pyramids: dict[int, Pyramid], pose: Array, seen: Observations) -> list[int]:
         """The cameras in which enough is `seen` of what is in view at a pose (4, 4) for the surface to be there."""

@@ -53,10 +53,11 @@ class Case:
         for frames in self.sets:
             if frames.stamp in references.stamps:
                 references.cut(frames)
-        found = references.matcher()
-        assert found is not None
-        relinker = Relinker(motion, *found)
-        return with_looks(self.tracks, [seen for frames in sets for seen in relinker(frames)])
+        cut = references.matcher()
+        assert cut is not None
+        relinker = Relinker(motion, *cut)
+        found = [seen for frames in sets for seen in relinker(frames)]
+        return with_looks(self.tracks, map(relinker.told, found))
 
 
 @pytest.fixture(scope="module")

@@ -104,7 +104,10 @@ def _searched(session: Session, tracks: Tracks, smoothed: Smoothed, stream: Text
         found = references.matcher()
         if found is None:
             return
-        relinker = Relinker(motion, *found)
-        for done, frames in enumerate(session.frame_sets(), 1 + len(some)):
-            yield from relinker(frames)
-            progress(done, total)
+        relinker, looks = Relinker(motion, *found), list[Observations]()
+        try:
+            for done, frames in enumerate(session.frame_sets(), 1 + len(some)):
+                looks += relinker(frames)
+                progress(done, total)
+        finally:
+            yield from map(relinker.told, looks)
