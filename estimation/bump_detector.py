@@ -27,9 +27,7 @@ from estimation.se3 import Array
 NUMBERS = 4  # of a camera's picture: shift right and down, px; roll, rad; scale
 FEWEST = 8  # tracks of a camera that tell its four numbers
 TAKEN = 0.03  # of what a camera's tracks tell of a number: where the pose leaves less of it, it stays where it is
-EVERY = (
-    0.06  # s: every other frame set of 30 a second is looked at, which is plenty for what stays; all while one is off
-)
+EVERY = 0.06  # s: every other frame set of 30 a second is plenty for what stays; all are looked at while one is off
 BLUNDER = 6.0  # px beside the median of its camera at which a track counts for nothing
 
 

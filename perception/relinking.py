@@ -82,9 +82,7 @@ class Relinker:
         self._motion, self._rows, self._matcher = motion, rows, matcher
         self._place_of = np.full(len(motion.map), -1)
         self._place_of[rows] = np.arange(len(rows))
-        self._apart = np.zeros(
-            (len(motion.rig), len(motion.map), 3)
-        )  # px that pictures are off tracks, summed; and looks
+        self._apart = np.zeros((len(motion.rig), len(motion.map), 3))  # px of pictures off tracks, summed; and looks
         self._fresh = Freshness()
         self._waiting: deque[tuple[float, dict[int, Pyramid]]] = deque(maxlen=WAITING)
 
