@@ -17,6 +17,7 @@ from hardware.bench.machine import this_machine
 from hardware.bench.saved import save, saved_figures, whole_table
 from hardware.bench.subjects import SUBJECTS
 from hardware.bench.whole import PARTS, Measured, Part, measure_all, read_whole, regressions, summary
+from hardware.bench.whole_page import counted, whole_markdown, whole_page
 
 FIGURES = [
     Figure("error", 0.02, "mm", at_most(0.03), "thesis", "a note"),
@@ -56,6 +57,26 @@ def test_all_parts_are_measured_and_a_failed_one_is_told(tmp_path: Path, capsys:
     assert "stillbed bench prediction" in done[1].trouble and "no figures" in summary(done)
     assert "1 of 2: planner --updates 20" in capsys.readouterr().out
     assert ("planner", "uncaught errors") in read_whole(tmp_path / "figures.json")
+    page, table = (tmp_path / "report.html").read_text(), (tmp_path / "table.md").read_text()
+    for figure in done[0].figures:
+        assert figure.what in page and f"| {figure.what} |" in table
+    assert "no figures" in page and "## chests" in table
+
+
+def test_the_page_counts_colours_and_leads_to_the_pictures(tmp_path: Path) -> None:
+    parts = {"toy": FIGURES, "<odd>": []}
+    assert counted(parts) == (4, 1, 1)
+    page = whole_page(parts, {"<odd>": "why & not"}, {"toy": "toy/toy.html"}, this_machine())
+    assert page.count('<td class="met">') == 3 and page.count('<td class="missed">') == 1
+    assert 'href="toy/toy.html"' in page and "&lt;odd&gt;" in page and "why &amp; not" in page
+
+
+def test_a_table_in_markdown_has_a_line_for_each_figure() -> None:
+    odd = Figure("a | b", 2.0, "mm", at_most(1.0))
+    lines = whole_markdown({"toy": [*FIGURES, odd]}, this_machine()).splitlines()
+    rows = [line for line in lines if line.startswith("| ")]
+    assert len(rows) == len(FIGURES) + 2 and all(row.replace(r"\|", "").count("|") == 7 for row in rows)
+    assert "3 of 5 targets are met;" in "\n".join(lines)
 
 
 def test_what_was_measured_of_the_same_code_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

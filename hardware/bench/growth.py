@@ -42,10 +42,9 @@ class Axis:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """How long, and where the picture goes."""
+    """How long, and whether pictures are rendered."""
     parser.add_argument("--seconds", type=float, default=4.0, metavar="S", help="of each world; default 4")
     parser.add_argument("--no-pictures", action="store_true", help="leave out resolution, which has to be rendered")
-    parser.add_argument("--page", type=Path, metavar="X.html", help="also draw the curves")
 
 
 def run(options: argparse.Namespace) -> list[Figure]:
@@ -61,8 +60,10 @@ def run(options: argparse.Namespace) -> list[Figure]:
                 done += 1
                 progress(done, total)
             measured.append((axis, np.array(costs)))
-    if options.page is not None:
-        options.page.write_text(page(measured), encoding="utf-8")
+    if options.out is not None:
+        drawn: Path = options.out / "growth.html"
+        drawn.write_text(page(measured), encoding="utf-8")
+        print(f"the curves: {drawn}\n")
     return [figure for axis, costs in measured for figure in figures(axis, costs)]
 
 

@@ -15,10 +15,12 @@ from hardware.bench.figure import Figure, Target
 from hardware.bench.machine import Machine, this_machine
 from hardware.bench.saved import saved_figures, whole_table
 from hardware.bench.table import table_text
+from hardware.bench.whole_page import whole_markdown, whole_page
 from hardware.clock import WallClock
 from hardware.progress import duration
 
 WORSE = 1.2  # times farther from good than before: less is what these machines vary by
+FIGURES, PAGE, TABLE = "figures.json", "report.html", "table.md"  # of the whole, in its folder
 RUN = "import sys; from hardware.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
@@ -54,6 +56,7 @@ PARTS = (
     Part("faults", ("--count", "42"), ("--count", "7")),
     Part("fuzz", ("--count", "20000"), ("--count", "2000")),
     Part("registration", ("--seeds", "1")),
+    Part("growth", ("--seconds", "2")),
 )  # fmt: skip
 
 
@@ -67,7 +70,10 @@ class Measured:
 
 
 def measure_all(out: Path, quick: bool, parts: Sequence[Part] = PARTS) -> list[Measured]:
-    """Measure every subject into a folder each of `out`; what stands there of the same commit and options is kept."""
+    """Measure every subject into a folder each of `out`; what stands there of the same commit and options is kept.
+
+    The table is written after each, so that one that is interrupted shows what it came to.
+    """
     clock, machine, done = WallClock(), this_machine(), []
     wanted = [(part, part.quick if quick else part.options) for part in parts]
     chosen = [(part.subject, part.name or part.subject, options) for part, options in wanted if options is not None]
@@ -78,29 +84,39 @@ def measure_all(out: Path, quick: bool, parts: Sequence[Part] = PARTS) -> list[M
         print(f"{number} of {len(chosen)}: {subject} {' '.join(options)}, {taken}\n", flush=True)
         print(one.trouble or table_text(one.figures), end="\n\n", flush=True)
         done.append(one)
-    table = whole_table({one.subject: one.figures for one in done}, machine)
-    (out / "figures.json").write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")
+        _save(out, done, machine)
     return done
+
+
+def _save(out: Path, done: Sequence[Measured], machine: Machine) -> None:
+    """The table so far: to read back, to look at, and for a document."""
+    parts = {one.subject: one.figures for one in done}
+    troubles = {one.subject: one.trouble for one in done if one.trouble}
+    drawn = {one.subject: sorted((out / one.subject).glob("*.html")) for one in done}
+    pages = {name: files[0].relative_to(out).as_posix() for name, files in drawn.items() if files}
+    (out / FIGURES).write_text(json.dumps(whole_table(parts, machine), indent=2) + "\n", encoding="utf-8")
+    (out / PAGE).write_text(whole_page(parts, troubles, pages, machine), encoding="utf-8")
+    (out / TABLE).write_text(whole_markdown(parts, machine), encoding="utf-8")
 
 
 def _kept(folder: Path, options: Sequence[str], machine: Machine) -> Measured | None:
     """What an earlier run left, if it was of this very code, with these options."""
     asked = folder / "options.json"
-    if not asked.is_file() or not (folder / "figures.json").is_file() or machine.commit.endswith("+"):
+    if not asked.is_file() or not (folder / FIGURES).is_file() or machine.commit.endswith("+"):
         return None
     if json.loads(asked.read_text(encoding="utf-8")) != [machine.commit, *options]:
         return None
-    return Measured(folder.name, tuple(saved_figures(folder / "figures.json")))
+    return Measured(folder.name, tuple(saved_figures(folder / FIGURES)))
 
 
 def _measured(folder: Path, subject: str, options: Sequence[str]) -> Measured:
     command = [sys.executable, "-c", RUN, "bench", subject, "-o", str(folder), "--force", *options]
-    (folder / "figures.json").unlink(missing_ok=True)
+    (folder / FIGURES).unlink(missing_ok=True)
     done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)  # its progress is shown as it goes
-    if done.returncode or not (folder / "figures.json").is_file():
+    if done.returncode or not (folder / FIGURES).is_file():
         return Measured(folder.name, (), f"no figures: `stillbed bench {subject} {' '.join(options)}` says why")
     (folder / "options.json").write_text(json.dumps([this_machine().commit, *options]), encoding="utf-8")
-    return Measured(folder.name, tuple(saved_figures(folder / "figures.json")))
+    return Measured(folder.name, tuple(saved_figures(folder / FIGURES)))
 
 
 def summary(done: Sequence[Measured]) -> str:
@@ -166,6 +182,6 @@ def run_whole(out: Path, quick: bool, against: Path | None) -> None:
     print(summary(done))
     if against is not None:
         print(regressions(done, against))
-    print(f"\nthe whole table: {out / 'figures.json'}")
+    print(f"\nthe whole table: {out / PAGE}, {out / TABLE} and {out / FIGURES}")
     if any(one.trouble for one in done):
         raise StillbedError("not everything could be measured; what could is kept")
