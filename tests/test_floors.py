@@ -23,6 +23,7 @@ OWNERS = {  # library: the files that may import it
         "hardware/images.py",
         "hardware/simulator/*.py",
     ),
+    "dask": ("hardware/smoothing/cluster.py",),
     "distributed": ("hardware/smoothing/cluster.py",),
     "gtsam": ("estimation/*.py",),
     "matplotlib": ("perception/training/*.py",),

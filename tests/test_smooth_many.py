@@ -17,6 +17,7 @@ from estimation.synthetic.world import synthetic_world
 from hardware.cli import main
 from hardware.recording import Recorder
 from hardware.smoothing import many
+from hardware.smoothing.cluster import local_cluster
 from hardware.smoothing.many import ALREADY, FAILED, SMOOTHED, Cluster, Job, Outcome, run_smooth, sessions_in
 from hardware.smoothing.run import Wishes
 from perception.frames import Frame
@@ -52,10 +53,21 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     """A running scheduler with two workers."""
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0", silence_logs="CRITICAL"
-    ) as cluster:
+    with local_cluster(2) as cluster:
         yield cluster.scheduler_address
+
+
+def spared() -> tuple[bool, bool]:
+    """Whether the process it runs in looks at its threads, and whether what an array leaves stays with it."""
+    import dask
+
+    held = int(os.environ["MALLOC_TRIM_THRESHOLD_"]) == int(os.environ["MALLOC_MMAP_THRESHOLD_"]) > 1e8
+    return bool(dask.config.get("distributed.worker.profile.enabled")), held
+
+
+def test_workers_here_spend_their_time_on_the_work(address: str) -> None:
+    with distributed.Client(address) as client:
+        assert set(client.run(spared).values()) == {(False, True)}
 
 
 def table(out: Path) -> dict[str, dict[str, str]]:
