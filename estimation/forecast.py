@@ -63,6 +63,11 @@ class Forecast:
         return Forecast(steps, se3.log(se3.inverse(se3.exp(here)) @ se3.exp(there)), covariances)
 
 
+def prepare(horizons: Array) -> None:
+    """Load and make what forecasts over these horizons (H,), s, take: 0.1 to 0.5 s, which the first need not spend."""
+    _basis(tuple(horizons.tolist()))
+
+
 @lru_cache(maxsize=8)
 def _basis(horizons: tuple[float, ...]) -> tuple[CubicSpline, CubicSpline]:
     """What each horizon's increment adds along the curve, and to its slope."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.calibration import Intervals
-from estimation.forecast import Forecast, body_rate
+from estimation.forecast import Forecast, body_rate, prepare
 from estimation.history import History
 from estimation.members import LAGS, LEVER, Members
 from estimation.pose import SurfacePose
@@ -56,6 +56,7 @@ class Predictor:
         """points: (N, 3) mm of the surface, for which the intervals shall hold."""
         if points is None:
             points = LEVER * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+        prepare(HORIZONS)  # before the first frame set: the first forecast comes in the middle of a run
         probes = points[:: -(-len(points) // PROBES)]
         self._members = Members(len(HORIZONS))
         count = self._members.count

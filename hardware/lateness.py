@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 BIN = 1e-4  # s
 _BINS = 1000  # a tenth of a second; what is later counts as that
 
@@ -12,7 +14,7 @@ class Lateness:
     """Counts of lateness. most: s, the largest."""
 
     def __init__(self) -> None:
-        self._counts = [0] * _BINS
+        self._counts = np.zeros(_BINS, np.int64)
         self.count, self.most = 0, 0.0
 
     def add(self, late: float) -> None:
@@ -24,13 +26,11 @@ class Lateness:
     @property
     def counts(self) -> tuple[int, ...]:
         """How many there were in each bin of BIN s; the last one holds all that were later."""
-        return tuple(self._counts)
+        return tuple(self._counts.tolist())
 
     def percentile(self, share: float) -> float:
         """Lateness, s, that `share` percent of the ticks do not exceed, rounded up to a bin; NaN of none."""
-        wanted, seen = share / 100 * self.count, 0
-        for index, count in enumerate(self._counts):
-            seen += count
-            if count and seen >= wanted:
-                return (index + 1) * BIN
-        return math.nan
+        if not self.count:
+            return math.nan
+        wanted = max(share / 100 * self.count, 1.0)
+        return (int(np.searchsorted(np.cumsum(self._counts), wanted)) + 1) * BIN

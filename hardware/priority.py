@@ -6,7 +6,7 @@ import gc
 import os
 
 REAL_TIME = 10  # of 1 to 99: above all ordinary work, below the kernel's own
-NICE = -10
+NICE = -10  # before all that asked for nothing
 
 
 def settle_memory() -> None:
@@ -23,6 +23,11 @@ def ask_for_real_time() -> str:
         return f"real time, priority {REAL_TIME}"
     except (AttributeError, OSError):
         pass
+    return ask_to_go_first()
+
+
+def ask_to_go_first() -> str:
+    """Be served before ordinary processes, which still get their share; what was granted. Children inherit it."""
     try:
         return f"nice {os.nice(NICE)}"
     except OSError:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import pickle
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -111,6 +114,25 @@ def test_a_pose_that_is_not_finite_changes_nothing(stamps: Array) -> None:
     plain, mixed = forecasts(poses)[-1], forecasts([*poses[:100], *bad, *poses[100:]])[-1]
     assert plain is not None and mixed is not None
     assert plain.increments.tobytes() == mixed.increments.tobytes()
+
+
+def test_nothing_is_loaded_once_it_follows() -> None:
+    """The first forecast comes seconds after the first pose, while an arm already moves by it."""
+    code = """
+import sys
+import numpy as np
+from estimation.predictor import Predictor
+from tests.test_predictor import breathing, seen
+stamps = np.arange(0, 12, 0.1)
+poses, predictor = seen(stamps, breathing(stamps)), Predictor()
+before = set(sys.modules)
+found = [predictor.add(pose) for pose in poses]
+found[-1].at(np.array([0.05]))
+print(sorted(set(sys.modules) - before))
+"""
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 def test_a_short_outage_or_a_wild_jump_leaves_forecasts_finite(stamps: Array) -> None:

@@ -18,6 +18,7 @@ from estimation.se3 import Array
 from hardware.live.arrived import Arrived, Encoded, SourceEnded
 from perception.frames import Frame, FrameSet, Image, PrintHead
 from perception.pairing import frame_set
+from perception.side_by_side import side_by_side
 
 SLOTS = 4  # sets: a reader that takes the newest one has 100 ms at 30 fps to copy it, which takes 2
 COLOURS = 3
@@ -84,12 +85,15 @@ class FrameRing:
         """A copy of a set that was told of; None where it is written over already."""
         slot = word.count % SLOTS
         memory = np.frombuffer(self._memory, np.uint8)
-        frames, encoded = [], dict[int, Encoded]()
-        for part in word.parts:
+
+        def copied(part: Part) -> Frame:
             start = self._start(slot, part.camera)
             image: Image = memory[start : start + int(np.prod(part.shape))].reshape(part.shape).copy()
-            frames.append(Frame(part.camera, part.stamp, image))
-            start += self._pixels[part.camera]
+            return Frame(part.camera, part.stamp, image)
+
+        frames, encoded = side_by_side(copied, word.parts), dict[int, Encoded]()
+        for part in word.parts:
+            start = self._start(slot, part.camera) + self._pixels[part.camera]
             if part.size:
                 encoded[part.camera] = part.kind, memory[start : start + part.size].tobytes()
         whole = replace(frame_set(frames), head=word.head)

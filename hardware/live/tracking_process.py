@@ -47,7 +47,7 @@ from hardware.live.remembered import remember, true_pose
 from hardware.newest import Newest
 from hardware.operator.link import OperatorLink
 from hardware.operator.taker import PictureTaker, Shot
-from hardware.priority import settle_memory
+from hardware.priority import ask_to_go_first, settle_memory
 from hardware.session import Session, open_session
 from hardware.tracker import tracker
 from perception.frames import FrameSet, PrintHead, Roi
@@ -56,7 +56,7 @@ from perception.tracking import STAGES
 RIG = ".toml"  # of a file that names live cameras
 PATIENCE = 0.1  # s of a wait for frames, after which it looks who else is still there
 WAITED, TRACKED, POSED = "frames wait for the tracker", "tracking", "frames handed over to pose"
-EXPOSED = "exposure to frames handed over"
+EXPOSED, TIDIED = "exposure to frames handed over", "pose handed over to ready for frames"
 REFRESH, LANDMARKS = 15, 300  # sets between two looks at the map, and how many of its landmarks are shown, about
 INTERVALS = 31  # of which the middle one counts: a second of them
 HISTOGRAMS = 30.0  # s between histograms in the recording
@@ -98,6 +98,7 @@ class TrackingLines:
 def tracking_process(plan: TrackingPlan, lines: TrackingLines) -> None:
     """Track until the frames end, or nobody conducts the run any more; the last report says why."""
     settle("tracking", plan.cores)
+    ask_to_go_first()  # the process of the map, which stands back behind this one, is then an ordinary one
     signal.signal(signal.SIGTERM, _ended)
     outbox, report = Outbox(lines.record), TrackingReport(WallClock().now())
     try:
@@ -207,6 +208,7 @@ class _Tracking:
         self._record(arrived, frames, pose)
         self._step.idle()
         self._source.learn(self._step.last.offsets)
+        self.times.add(TIDIED, self._clock.now() - put)
 
     def _with_head(self, frames: FrameSet) -> FrameSet:
         """The print head where the pictures show it, rounded as a recording keeps it: a replay sees the same."""
