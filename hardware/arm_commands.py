@@ -6,9 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from hardware.command_line import Commands, positive
 from perception.shipped import named_path
-
-Commands = Any  # argparse's own type for this is private
 
 
 def add_arm(commands: Commands) -> None:
@@ -28,7 +27,7 @@ def add_arm(commands: Commands) -> None:
     which.add_argument("--virtual", action="store_true", help="serve a virtual arm on a pseudo-terminal")
     command.add_argument("--arm", type=named_path, metavar="ARM.toml", help="its home, limits, dialect and baud rate")
     real = command.add_argument_group("an arm on a port")
-    real.add_argument("--seconds", type=float, default=5.0, metavar="S", help="to listen; default 5")
+    real.add_argument("--seconds", type=positive, default=5.0, metavar="S", help="to listen; default 5")
     real.add_argument("--watch", action="store_true", help="listen until Ctrl-C")
     real.add_argument("--home", action="store_true", help="go home, slowly: up, across, down")
     real.add_argument("--jog", nargs="+", metavar="AXIS=BY", help="go by so many mm or degrees: X=+5 B=-2.5")

@@ -56,6 +56,8 @@ def run_arm(
 
     However it ends, nothing is left under way: an arm that was armed is stopped or disarmed.
     """
+    if not request.seconds > 0:
+        raise InputError("command line", "--seconds", request.seconds, "above 0")
     if request.moves and not request.confirmed:
         raise InputError("arm", "--yes", "missing", "given by whoever sees that nobody is within the arm's reach")
     start, settings = clock.now(), LinkSettings() if settings is None else settings
@@ -112,21 +114,20 @@ def axes_from_text(text: str, home: Array) -> Array:
     """Axes (6,), mm and rad, from "home" or six numbers X,Y,Z,A,B,C in mm and degrees."""
     if text == "home":
         return home
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    numbers = checks.numbers("command line", "--stands", values, (6,), "mm and degrees, or home")
-    return np.asarray(numbers / _UNITS)
+    return np.asarray(_numbers("--stands", text, 6, "mm and degrees, or home") / _UNITS)
 
 
 def origin_from_text(text: str) -> Array:
     """A work origin (3,), mm in machine axes, from X,Y,Z."""
+    return _numbers("--origin", text, 3, "mm")
+
+
+def _numbers(option: str, text: str, count: int, unit: str) -> Array:
+    """So many finite numbers with commas between."""
     try:
-        values = [float(word) for word in text.split(",")]
+        return checks.numbers("command line", option, [float(word) for word in text.split(",")], (count,), unit)
     except ValueError:
-        values = []
-    return checks.numbers("command line", "--origin", values, (3,), "mm")
+        raise InputError("command line", option, text, f"{count} finite numbers, {unit}") from None
 
 
 class _Console:

@@ -23,7 +23,7 @@ def read_toml(path: Path) -> Table:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, "file", error, "a readable UTF-8 text file") from error
+        raise InputError(path, "file", why(error), "a readable UTF-8 text file") from error
     if not text.strip():
         raise InputError(path, "file", "empty", "TOML")
     try:
@@ -32,12 +32,19 @@ def read_toml(path: Path) -> Table:
         raise InputError(path, "syntax", error, "valid TOML") from error
 
 
+def why(error: Exception) -> str:
+    """Why a file cannot be read, in words without the file's name."""
+    if isinstance(error, UnicodeDecodeError):
+        return f"not text: byte {error.start} is {error.object[error.start]:#04x}"
+    return (error.strerror or str(error)).lower() if isinstance(error, OSError) else str(error)
+
+
 def read_bytes(path: Path) -> bytes:
     """A file's bytes; InputError where it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(path, "file", error, "a readable file") from error
+        raise InputError(path, "file", why(error), "a readable file") from error
 
 
 def read_csv(path: Path, allowed: str = "a readable CSV file") -> list[tuple[int, list[str]]]:
@@ -50,7 +57,7 @@ def read_csv(path: Path, allowed: str = "a readable CSV file") -> list[tuple[int
             reader = csv.reader(stream, skipinitialspace=True)
             return [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "file", error, allowed) from error
+        raise InputError(path, "file", why(error), allowed) from error
 
 
 def check_keys(where: object, prefix: str, table: Table, required: Iterable[str], optional: Iterable[str] = ()) -> None:

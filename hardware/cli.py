@@ -9,13 +9,14 @@ import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from estimation.errors import InputError, StillbedError
 from hardware.arm_commands import add_arm
 from hardware.bench.command import add_bench
 from hardware.calibration.commands import add_calibrate
 from hardware.cameras.command import add_cameras
+from hardware.command_line import WRONG_INPUT, Commands, Parser, add_command
 from hardware.comparing.command import add_compare
 from hardware.doctor.command import add_doctor
 from hardware.live.command import add_init, add_live
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 
 MISSED = 1  # a simulation that ran to its end and did not reach its own limits
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
-WRONG_INPUT = 2
 NAMED = 20  # files of an interrupted command that are told by name; of more, the count is
 
 
@@ -51,12 +51,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # nobody reads on, as after `| head`; the files are written all the same
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (StillbedError, OSError) as error:
-        print(f"stillbed: {error}", file=sys.stderr)
+        print(f"stillbed: {_told(error)}", file=sys.stderr)
         return WRONG_INPUT
     except KeyboardInterrupt:
         print(f"\nstillbed: interrupted; {kept(getattr(arguments, 'out', None))}", file=sys.stderr)
         return INTERRUPTED
     return code or 0
+
+
+def _told(error: Exception) -> str:
+    """What was wrong; of what the system refuses, the file first, as everywhere."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror.lower()}"
+    return str(error)
 
 
 def _end_in_order() -> None:
@@ -81,9 +88,9 @@ def kept(out: Path | None) -> str:
     return "nothing was written"
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """The whole command line."""
-    top = argparse.ArgumentParser(
+    top = Parser(
         prog="stillbed",
         description="Make a moving wound look like a still print bed.",
         epilog="A SESSION is a folder with rig.toml and frames.csv, or an .mcap file. More: stillbed COMMAND --help",
@@ -125,22 +132,8 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-Commands = Any  # argparse's own type for this is private
-
-
-def _command(commands: Commands, name: str, summary: str, text: str, example: str) -> argparse.ArgumentParser:
-    made: argparse.ArgumentParser = commands.add_parser(
-        name,
-        help=summary,
-        description=text,
-        epilog=f"example:\n  {example}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    return made
-
-
 def _add_simulate(commands: Commands) -> None:
-    command = _command(
+    command = add_command(
         commands,
         "simulate",
         "print on a simulated wound, and measure the nozzle's error",
@@ -173,7 +166,7 @@ def _add_fault(command: argparse.ArgumentParser) -> None:
 
 
 def _add_track(commands: Commands) -> None:
-    command = _command(
+    command = add_command(
         commands,
         "track",
         "follow the surface through a session",
@@ -200,7 +193,7 @@ def _add_track(commands: Commands) -> None:
 
 
 def _add_replay(commands: Commands) -> None:
-    command = _command(
+    command = add_command(
         commands,
         "replay",
         "run tracking and motion on a session under a simulated clock",
@@ -229,7 +222,7 @@ def _add_replay(commands: Commands) -> None:
 
 
 def _add_import(commands: Commands) -> None:
-    command = _command(
+    command = add_command(
         commands,
         "import",
         "turn a session folder into one MCAP file",
@@ -244,7 +237,7 @@ def _add_import(commands: Commands) -> None:
 
 
 def _add_export(commands: Commands) -> None:
-    command = _command(
+    command = add_command(
         commands,
         "export",
         "turn an MCAP file into a session folder",

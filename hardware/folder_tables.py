@@ -46,7 +46,7 @@ def _rows(path: Path, columns: Sequence[str]) -> list[tuple[int, dict[str, str |
             reader.fieldnames = header
             rows = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "file", error, "a readable CSV file") from error
+        raise InputError(path, "file", checks.why(error), "a readable CSV file") from error
     for column in columns:
         if column not in header:
             raise InputError(path, "header", ",".join(header) or "empty", ",".join(columns))

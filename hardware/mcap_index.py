@@ -12,6 +12,8 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import ChunkIndex
 from mcap.writer import Writer
 
+from estimation.errors import StillbedError
+
 CHUNKS = "_Writer__chunk_indices"  # the list that the library keeps them in, and goes through at the end
 
 
@@ -37,6 +39,10 @@ class PackedIndex:
 
 
 def pack_index(writer: Writer) -> None:
-    """Have a writer that has written no chunk yet keep its index as bytes."""
-    assert getattr(writer, CHUNKS) == []
+    """Have a writer that has written no chunk yet keep its index as bytes.
+
+    StillbedError where the library keeps it elsewhere: another version than the one that was tested.
+    """
+    if getattr(writer, CHUNKS, None) != []:
+        raise StillbedError("this version of mcap keeps its index elsewhere; install the one in constraints.txt")
     setattr(writer, CHUNKS, PackedIndex())

@@ -22,6 +22,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from estimation.errors import InputError
+from hardware.checks import why
 
 _HEAD = struct.Struct("<BQ")  # opcode and length in front of every record
 
@@ -68,7 +69,7 @@ def walk(path: Path) -> Iterator[Part]:
     try:
         file = open(path, "rb")  # noqa: SIM115  (closed by the block below)
     except OSError as error:
-        raise InputError(path, "recording", error, "a readable .mcap file") from error
+        raise InputError(path, "recording", why(error), "a readable .mcap file") from error
     with file:
         size = path.stat().st_size
         magic = file.read(len(MCAP0_MAGIC))

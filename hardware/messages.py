@@ -17,6 +17,7 @@ from estimation.pose import SurfaceMotion, SurfacePose, TrackState
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from estimation.warp import Warp
+from hardware.recorded_tick import RecordedTick
 from hardware.rig_file import rig_from_table, table_from_rig
 from hardware.schemas import camera_frame
 from perception.frames import Roi
@@ -226,28 +227,18 @@ def hold_from_message(message: Message) -> Hold:
     return Hold(message["stamp"], message["duration"], message["reason"])
 
 
-def message_from_tick(
-    stamp: float,
-    pose_stamp: float,
-    asked: bool,
-    begun: float,
-    paused: bool,
-    fraction: float,
-    phase: str,
-    frame: bytes,
-    recalled: Array | None = None,
-) -> Message:
-    """A tick of the motion as a message."""
+def message_from_tick(tick: RecordedTick) -> Message:
+    """A tick of the motion as a message; its command is a message of its own."""
     return {
-        "stamp": stamp,
-        "pose_stamp": _flat(np.array([pose_stamp])),
-        "asked": asked,
-        "begun": _flat(np.array([begun])),
-        "recalled": [] if recalled is None else recalled.ravel().tolist(),
-        "paused": paused,
-        "fraction": fraction,
-        "phase": phase,
-        "frame": base64.b64encode(frame).decode("ascii"),
+        "stamp": tick.stamp,
+        "pose_stamp": _flat(np.array([tick.pose_stamp])),
+        "asked": tick.asked,
+        "begun": _flat(np.array([tick.begun])),
+        "recalled": [] if tick.recalled is None else tick.recalled.ravel().tolist(),
+        "paused": tick.paused,
+        "fraction": tick.fraction,
+        "phase": tick.phase.value,
+        "frame": base64.b64encode(tick.frame).decode("ascii"),
     }
 
 

@@ -110,6 +110,8 @@ def planned_scan(vertices: Array, triangles: Index, step: float, where: object, 
 
 def _subject(request: Request, flat: bool) -> Subject:
     step = float(np.clip(GRID * request.wishes.bead, FINEST, COARSEST))
+    if request.example is not None and request.scan is not None:
+        raise InputError("command line", "SCAN", request.scan, "none beside --example")
     if request.example is not None:
         vertices, triangles = example_scan(request.example)
         file = request.out.with_name(f"{request.out.stem}_example.ply")

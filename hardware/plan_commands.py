@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
+from hardware.command_line import Commands
 from perception.shipped import named_path
-
-Commands = Any  # argparse's own type for this is private
 
 TEXT = """\
 Plan the print of a wound. SCAN is a mesh (.ply, .stl, .obj) of the wound with skin around it, or a flat contour

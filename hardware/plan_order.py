@@ -93,6 +93,7 @@ UNSAID = {
     "bump": "half a layer", "bump_clearance": "half a bead",
 }  # fmt: skip
 RANGES = (
+    ("bead", 0.01, 20), ("inset", 0, 100), ("rims", 0, 100),
     ("layer_height", 0.02, 20), ("overlap_percent", 0, 90), ("speed", 0.1, FASTEST), ("travel", 0.1, FASTEST),
     ("temperature", COLDEST, HOTTEST), ("spacing", 0.05, 50), ("chord", 0.001, 1), ("lift", 0, 50), ("wait", 0, 3600),
     ("sideways", 1, 100_000), ("tilt_deg", 0, 60), ("turning_deg_mm", 0.01, 90), ("spin_deg", -360, 360),

@@ -27,6 +27,7 @@ from hardware.compressed_image import ENCODING, NAME, SCHEMA, SCHEMA_ENCODING, p
 from hardware.images import check_size, encode
 from hardware.mcap_index import pack_index
 from hardware.messages import SURFACE_FRAME, Message
+from hardware.recorded_tick import RecordedTick
 from hardware.schemas import (
     CALIBRATION,
     INFO,
@@ -106,7 +107,7 @@ class Recorder:
             if error is None:
                 raise
 
-    def write(self, record: Frame | Observations | SurfacePose | Command | Roi) -> None:
+    def write(self, record: Frame | Observations | SurfacePose | Command | Roi | RecordedTick) -> None:
         """Write any record that carries its own stamp to its channel."""
         if isinstance(record, Frame):
             self.frame(record)
@@ -116,6 +117,8 @@ class Recorder:
             self._pose(record)
         elif isinstance(record, Roi):
             self._message("/roi", record.stamp, messages.message_from_roi(record))
+        elif isinstance(record, RecordedTick):
+            self._message("/tick", record.stamp, messages.message_from_tick(record))
         elif isinstance(record, Move):
             self._message("/move", record.stamp, messages.message_from_move(record))
         else:
@@ -175,27 +178,6 @@ class Recorder:
         """Write something that happened at `stamp`, s, in words."""
         log_time = self._log_time(stamp)
         self._message("/events", stamp, messages.message_from_event(stamp, level, text, name, log_time))
-
-    def tick(
-        self,
-        stamp: float,
-        pose_stamp: float,
-        asked: bool,
-        begun: float,
-        paused: bool,
-        fraction: float,
-        phase: str,
-        frame: bytes,
-        recalled: Array | None = None,
-    ) -> None:
-        """Write a tick of the motion: s, the stamp of the pose it was given (NaN: none), whether planner and guard were
-        asked, where on the path they were begun anew before it (NaN: they were not), whether they were told to wait
-        above the surface, the place on the path, what the nozzle does, the frame that they gave, and, where they were
-        told before it that moves were called back, (2, 6) mm and rad, where the arm came to rest and where it stands.
-        Places on the path count checkpoints.
-        """
-        given = messages.message_from_tick(stamp, pose_stamp, asked, begun, paused, fraction, phase, frame, recalled)
-        self._message("/tick", stamp, given)
 
     def latency(self, stamp: float, stage: str, width: float, counts: NDArray[np.int64], most: float) -> None:
         """Write how long a stage took until `stamp`, s: counts (N,) in bins of `width` s, and the largest, s."""

@@ -12,6 +12,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
+from hardware.checks import why
 
 HEADER = "# stamp_s x y z qx qy qz qw (mm, base_from_surface)\n"
 ALLOWED = "8 numbers: stamp x y z qx qy qz qw"
@@ -88,6 +89,6 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, "file", error, "a readable text file") from error
+        raise InputError(path, "file", why(error), "a readable text file") from error
     numbered = ((i, line.strip()) for i, line in enumerate(text.splitlines(), 1))
     return [(i, line) for i, line in numbered if line and not line.startswith("#")]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from hardware.command_line import Commands
 
 if TYPE_CHECKING:
     from perception.segmentation import Segmenter
 
-Commands = Any  # argparse's own type for this is private
 
 UNET, SHAPE = "unet", "shape"
 

@@ -45,22 +45,17 @@ LARGE = {
     "aiohttp",
     "mcap",
 }
-COMMANDS = (
-    [],
-    ["simulate"],
-    ["track"],
-    ["plan"],
-    ["replay"],
-    ["arm"],
-    ["cameras"],
-    ["calibrate"],
-    ["smooth"],
-    ["live"],
-    ["doctor"],
-    ["import"],
-    ["export"],
-    ["bench"],
-)
+HELP = """
+import argparse, sys
+from hardware.cli import parser
+
+def told(here):
+    assert here.format_help().startswith("usage: stillbed"), here.prog
+    below = [a.choices.values() for a in here._actions if isinstance(a, argparse._SubParsersAction)]
+    return 1 + sum(told(each) for each in (below[0] if below else ()))
+
+print(told(parser()), *{name.split(".")[0] for name in sys.modules})
+"""
 
 
 def stillbed(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -68,14 +63,10 @@ def stillbed(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_is_there_at_once_as_nothing_large_is_loaded_for_it(command: list[str]) -> None:
-    words = [sys.executable, "-X", "importtime", "-m", "hardware.cli", *command, "--help"]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0
-    assert "usage: stillbed" in done.stdout
-    loaded = {line.split("|")[-1].strip().split(".")[0] for line in done.stderr.splitlines() if "|" in line}
-    assert "argparse" in loaded and not loaded & LARGE
+def test_help_is_there_at_once_as_nothing_large_is_loaded_for_any() -> None:
+    done = subprocess.run([sys.executable, "-c", HELP], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    count, *loaded = done.stdout.split()
+    assert int(count) > 20 and "argparse" in loaded and not set(loaded) & LARGE
 
 
 def test_a_reader_that_goes_away_is_no_error() -> None:
@@ -92,49 +83,6 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
 
 def test_version() -> None:
     assert stillbed("--version").stdout.startswith("stillbed")
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["track", "{missing}", "-o", "{out}"],
-        ["replay", "{missing}", "--path", "{missing}", "-o", "{out}"],
-        ["import", "{missing}", "-o", "{out}"],
-        ["export", "{missing}", "-o", "{out}"],
-        ["track", "{empty}", "-o", "{out}"],
-        ["export", "{empty}", "-o", "{out}"],
-        ["simulate", "{missing}", "-o", "{out}"],
-        ["simulate", "{scenario}", "-o", "{out}", "--threads", "0"],
-        ["arm", "--virtual", "--fault", "dance at 5s"],
-        ["bench", "dance", "-o", "{out}"],
-    ],
-)
-def test_wrong_input_is_one_line_and_exit_code_2(arguments: list[str], tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    names = {name: str(tmp_path / name) for name in ("missing", "empty", "out")}
-    names["scenario"] = str(ROOT / "data" / "scenarios" / "still.toml")
-    done = stillbed(*(argument.format(**names) for argument in arguments))
-    assert done.returncode == 2
-    assert done.stdout == ""
-    lines = done.stderr.splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("stillbed: ")
-    assert "allowed" in lines[0]
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        *([], ["dance"], ["track"], ["track", "x"], ["track", "x", "-o", "y", "--speed"]),
-        *(["simulate", "x"], ["simulate", "x", "-o", "y", "--threads", "many"], ["arm"]),
-        ["arm", "--virtual", "--replies", "loud"],
-    ],
-)
-def test_a_wrong_command_line_is_exit_code_2(arguments: list[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    assert ended.value.code == 2
 
 
 def test_the_exit_code_of_a_simulation_says_whether_its_limits_were_met(

@@ -107,8 +107,8 @@ def test_an_example_needs_no_scan(tmp_path: Path) -> None:
     [
         (["--pattern", "zigzag", "--angle", "steep"], "--angle"),
         (["--speed", "-1"], "--speed"),
-        (["--bead", "0"], "width"),
-        (["--bead", "nan"], "width"),
+        (["--bead", "0"], "--bead"),
+        (["--bead", "nan"], "--bead"),
         (["--material", "a,b"], "--material"),
         (["--tissue", "dermis"], "--tissue"),
         (["--tissue", "dermis=thick:1"], "--tissue"),

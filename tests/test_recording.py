@@ -194,3 +194,9 @@ def test_an_index_kept_as_bytes_gives_the_very_file_and_holds_nothing_of_its_chu
     monkeypatch.setattr("hardware.recording.pack_index", lambda writer: None)
     plain, chunks = record("plain.mcap")
     assert packed == plain and held == 0 and chunks > 2
+
+
+def test_a_library_that_keeps_its_index_elsewhere_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("hardware.mcap_index.CHUNKS", "_kept_elsewhere")
+    with pytest.raises(StillbedError, match="constraints"):
+        Recorder(tmp_path / "x.mcap", rig())

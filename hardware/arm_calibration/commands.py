@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-Commands = Any  # argparse's own type for this is private
+from hardware.command_line import Commands, positive
+
 FAILED = 1  # exit code of a calibration that is not good enough
 SOURCES = ("folder", "device", "virtual", "touched")
 
@@ -39,7 +40,7 @@ def add_calibrate_arm(parts: Commands) -> None:
     part.add_argument("--cameras", type=Path, metavar="RIG.toml", help="the calibrated cameras, with their sources")
     part.add_argument("--arm", type=Path, metavar="ARM.toml", help="its limits, home, dialect, lag as known so far")
     part.add_argument("--record", type=Path, metavar="FOLDER", help="new folder for pictures and commands")
-    part.add_argument("--limit-mm", type=float, default=0.1, metavar="MM", help="of the tip, to pass; default 0.1")
+    part.add_argument("--limit-mm", type=positive, default=0.1, metavar="MM", help="of the tip, to pass; default 0.1")
     part.add_argument("--keep-tool", action="store_true", help="do not seek the tool's offset: nothing is turned")
     part.add_argument("--keep-latency", action="store_true", help="do not seek dead time and lag")
     moves = part.add_argument_group("the moves")

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from hardware.bench.subjects import SUBJECTS, Subject, Subjects
+from hardware.command_line import Commands, Parser
 
-Commands = Any  # argparse's own type for this is private
 WHOLE = Path("out/bench")
 
 
@@ -68,7 +67,7 @@ def _chosen(name: str, subjects: Subjects) -> Subject:
 
 def subject_parser(name: str, subject: Subject) -> argparse.ArgumentParser:
     """The options of one subject: where to save, and its own."""
-    parser = argparse.ArgumentParser(prog=f"stillbed bench {name}", description=subject.summary)
+    parser = Parser(prog=f"stillbed bench {name}", description=subject.summary)
     parser.add_argument("-o", "--out", type=Path, help="folder for figures.json and figures.csv, new or empty")
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     subject.add_options(parser)

@@ -16,6 +16,7 @@ from hardware.bench.machine import Machine, this_machine
 from hardware.bench.saved import saved_figures, whole_table
 from hardware.bench.table import table_text
 from hardware.bench.whole_page import whole_markdown, whole_page
+from hardware.checks import why
 from hardware.clock import WallClock
 from hardware.progress import duration
 
@@ -149,7 +150,7 @@ def read_whole(file: Path) -> dict[tuple[str, str], float]:
         rows = ((name, row["what"], row["value"]) for name, part in subjects.items() for row in part)
         return {(name, what): float(value) for name, what, value in rows if value is not None}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(file, "table", error, "figures.json as `stillbed bench --all` writes it") from error
+        raise InputError(file, "table", why(error), "figures.json as `stillbed bench --all` writes it") from error
 
 
 def _worse(figure: Figure, before: float) -> bool:

@@ -13,6 +13,7 @@ KEYS = ("kind", "squares", "square_mm")
 MORE = ("marker", "dictionary", "inverted", "legacy")
 FEWEST, MOST = 3, 60  # squares along an edge
 SIZES = (0.5, 500.0)  # mm, a square: from under a microscope to a wall
+MARKERS = (0.3, 0.95)  # of a square: bits large enough to be read, and white around them
 
 
 def read_board(path: str | Path) -> Board:
@@ -27,7 +28,7 @@ def read_board(path: str | Path) -> Board:
     if (given != given.round()).any() or (given < FEWEST).any() or (given > MOST).any():
         raise InputError(path, "squares", table["squares"], f"[columns, rows], whole, {FEWEST} to {MOST} each")
     square = _within(path, "square_mm", table["square_mm"], *SIZES)
-    marker = _within(path, "marker", table.get("marker", USUAL.marker), 0.3, 0.95)
+    marker = _within(path, "marker", table.get("marker", USUAL.marker), *MARKERS)
     dictionary = str(table.get("dictionary", USUAL.dictionary)).removeprefix("DICT_")
     if dictionary not in DICTIONARIES:
         raise InputError(path, "dictionary", dictionary, checks.meant(dictionary, DICTIONARIES))

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.calibration.board_file import read_board, write_board
-from perception.boards.board import Board, black, grid_of
+from hardware.calibration.board_file import MARKERS, read_board, write_board
+from hardware.checks import meant
+from perception.boards.board import DICTIONARIES, Board, black, grid_of
 
 PAGES = {"A5": (148, 210), "A4": (210, 297), "A3": (297, 420), "A2": (420, 594), "letter": (215.9, 279.4)}
 MARGIN = 10.0  # mm that no printer prints on, and of white around the board
@@ -66,6 +67,8 @@ def page_size(wish: Print) -> tuple[float, float]:
         width, height = (float(word) for word in words)
     except ValueError:
         raise InputError("--page", "size", wish.page, f"{', '.join(PAGES)}, or WxH in mm") from None
+    if not (width > 0 and height > 0):
+        raise InputError("--page", "size", wish.page, f"{', '.join(PAGES)}, or WxH in mm, both above 0")
     return width, height
 
 
@@ -75,6 +78,10 @@ def board_of(wish: Print) -> Board:
     room = np.array([width - 2 * MARGIN, height - 2 * MARGIN - FOOT])
     if not wish.square > 0:
         raise InputError("--square-mm", "square", wish.square, "> 0 mm")
+    if not MARKERS[0] <= wish.marker <= MARKERS[1]:
+        raise InputError("--marker", "share", wish.marker, f"{MARKERS[0]:g} to {MARKERS[1]:g}")
+    if wish.dictionary not in DICTIONARIES:
+        raise InputError("--dictionary", "name", wish.dictionary, meant(wish.dictionary, DICTIONARIES))
     fits = np.floor(room / wish.square + 1e-9).astype(int)
     if wish.squares is None and wish.kind == "chessboard" and fits.sum() % 2 == 0:
         fits[1] -= 1

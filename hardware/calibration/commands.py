@@ -8,15 +8,15 @@ import sys
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hardware.arm_calibration.commands import add_calibrate_arm
+from hardware.command_line import Commands, add_command, positive
 
 if TYPE_CHECKING:
     from hardware.calibration.waving_page import WavingPage
     from hardware.clock import Clock
 
-Commands = Any  # argparse's own type for this is private
 
 FORMATS = {
     "opencv": "a YAML per camera",
@@ -30,12 +30,12 @@ FAILED = 1  # exit code of a calibration that is not good enough
 
 def add_calibrate(commands: Commands) -> None:
     """Add the sub-command `calibrate`."""
-    command: argparse.ArgumentParser = commands.add_parser(
+    command = add_command(
+        commands,
         "calibrate",
-        help="calibrate cameras from a printed board, and the arm: board, cameras, arm, import, export",
-        description="Print a board, wave it before the cameras, and get a rig that says how far it can be trusted.",
-        epilog="example:\n  stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "calibrate cameras from a printed board, and the arm: board, cameras, arm, import, export",
+        "Print a board, wave it before the cameras, and get a rig that says how far it can be trusted.",
+        "stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
     )
     parts = command.add_subparsers(metavar="WHAT", required=True)
     _add_board(parts)
@@ -46,13 +46,21 @@ def add_calibrate(commands: Commands) -> None:
 
 
 def _add_board(parts: Commands) -> None:
-    part = parts.add_parser("board", help="a printable board at true scale, with a ruler to check the print by")
+    part = add_command(
+        parts,
+        "board",
+        "a printable board at true scale, with a ruler to check the print by",
+        "Draw a calibration board at true scale, and write the board.toml that describes it beside it. Print it at\n"
+        "100 %, measure the ruler and a square, and mount the sheet on something flat.",
+        "stillbed calibrate board -o board.pdf",
+        "stillbed calibrate board -o board.svg --page A3 --square-mm 30 --squares 8x11",
+    )
     part.add_argument(
         "-o", "--out", type=Path, required=True, metavar="X.pdf", help=".pdf or .svg; board.toml beside it"
     )
     part.add_argument("--kind", choices=("charuco", "chessboard"), default="charuco", help="default charuco")
     part.add_argument("--squares", type=_pair, metavar="CxR", help="columns x rows; default: as many as fit the page")
-    part.add_argument("--square-mm", type=float, default=25.0, metavar="MM", help="edge of a square; default 25")
+    part.add_argument("--square-mm", type=positive, default=25.0, metavar="MM", help="edge of a square; default 25")
     part.add_argument("--marker", type=float, default=0.75, metavar="SHARE", help="of a square's edge; default 0.75")
     part.add_argument("--dictionary", default="4X4_50", metavar="NAME", help="of the markers; default 4X4_50")
     part.add_argument("--inverted", action="store_true", help="exchange black and white")
@@ -61,15 +69,15 @@ def _add_board(parts: Commands) -> None:
 
 
 def _add_cameras(parts: Commands) -> None:
-    part = parts.add_parser(
+    part = add_command(
+        parts,
         "cameras",
-        help="lenses, places and clock offsets from a waved board, recorded or live",
-        description="From a recording, or from live cameras while the board is being waved: it then says where to\n"
+        "lenses, places and clock offsets from a waved board, recorded or live",
+        "From a recording, or from live cameras while the board is being waved: it then says where to\n"
         "hold the board next, here and on a page in the browser, and ends once enough was seen. Ctrl-C keeps the\n"
         "corners; the same command goes on.",
-        epilog="examples:\n  stillbed calibrate cameras sessions/board --board board.toml -o rig.toml\n"
-        "  stillbed calibrate cameras /dev/v4l/by-id/CAMERA_A /dev/v4l/by-id/CAMERA_B --board board.toml -o rig.toml",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
+        "stillbed calibrate cameras /dev/v4l/by-id/CAMERA_A /dev/v4l/by-id/CAMERA_B --board board.toml -o rig.toml",
     )
     part.add_argument(
         "which",
@@ -86,7 +94,9 @@ def _add_cameras(parts: Commands) -> None:
     part.add_argument(
         "-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write; report beside it"
     )
-    part.add_argument("--limit-mm", type=float, default=0.1, metavar="MM", help="predicted error to pass; default 0.1")
+    part.add_argument(
+        "--limit-mm", type=positive, default=0.1, metavar="MM", help="predicted error to pass; default 0.1"
+    )
     part.add_argument(
         "--distance-mm", type=_distance, metavar="A,B,MM", help="two cameras and how far apart they are, to check scale"
     )
@@ -100,7 +110,13 @@ def _add_cameras(parts: Commands) -> None:
 
 
 def _add_import(parts: Commands) -> None:
-    part = parts.add_parser("import", help="a rig.toml from another program's calibration")
+    part = add_command(
+        parts,
+        "import",
+        "a rig.toml from another program's calibration",
+        "Turn another program's calibration into a rig.toml. Where each camera's images are is to be added to it.",
+        "stillbed calibrate import camchain.yaml --format kalibr -o rig.toml",
+    )
     part.add_argument("file", type=Path, metavar="FILE", help="its file, or folder of a file per camera")
     part.add_argument(
         "--format", choices=FORMATS, required=True, help="; ".join(f"{k}: {v}" for k, v in FORMATS.items())
@@ -110,7 +126,13 @@ def _add_import(parts: Commands) -> None:
 
 
 def _add_export(parts: Commands) -> None:
-    part = parts.add_parser("export", help="a rig.toml in another program's format")
+    part = add_command(
+        parts,
+        "export",
+        "a rig.toml in another program's format",
+        "Write a rig.toml as another program reads it: lenses and places, and what else its format can hold.",
+        "stillbed calibrate export rig.toml --format kalibr -o camchain.yaml",
+    )
     part.add_argument("rig", type=Path, metavar="rig.toml", help="a calibrated rig")
     part.add_argument(
         "--format", choices=FORMATS, required=True, help="; ".join(f"{k}: {v}" for k, v in FORMATS.items())
@@ -120,17 +142,19 @@ def _add_export(parts: Commands) -> None:
 
 
 def _pair(text: str) -> tuple[int, int]:
-    words = text.lower().split("x")
-    if len(words) != 2:
-        raise argparse.ArgumentTypeError(f"{text!r}, needed is COLUMNSxROWS, as 7x10")
-    return int(words[0]), int(words[1])
+    columns, _, rows = text.lower().partition("x")
+    try:
+        return int(columns), int(rows)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}, needed is COLUMNSxROWS, as 7x10") from None
 
 
 def _distance(text: str) -> tuple[str, str, float]:
-    words = text.split(",")
-    if len(words) != 3:
-        raise argparse.ArgumentTypeError(f"{text!r}, needed is CAMERA,CAMERA,MM")
-    return words[0], words[1], float(words[2])
+    try:
+        one, other, distance = text.split(",")
+        return one, other, float(distance)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}, needed is CAMERA,CAMERA,MM") from None
 
 
 def _board(arguments: argparse.Namespace) -> int:

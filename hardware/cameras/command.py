@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from hardware.command_line import Commands
 
 if TYPE_CHECKING:
     from hardware.cameras.identity import Device
     from hardware.cameras.live import LiveCameras
     from hardware.clock import Clock
 
-Commands = Any  # argparse's own type for this is private
 
 NOTHING_THERE = """no camera is plugged in, or this user may not see it
   plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it

@@ -18,7 +18,10 @@ def run_compare(estimated: str, reference: str | None, delta: int, out: Path | N
     if delta < 1:
         raise InputError("command line", "--delta", delta, "1 or more poses")
     ours = read_posed(estimated)
-    compared = compare(ours, read_truth(estimated) if reference is None else read_posed(reference), delta)
+    theirs = read_truth(estimated) if reference is None else read_posed(reference)
+    if theirs.name == ours.name:
+        raise InputError(ours.name, "poses", "the very ones they are judged by", "two different trajectories")
+    compared = compare(ours, theirs, delta)
     told = text(compared)
     if out is None:
         return told

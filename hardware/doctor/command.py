@@ -6,10 +6,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hardware.command_line import Commands
+
 if TYPE_CHECKING:
     from hardware.operator.view import Check
 
-Commands = Any  # argparse's own type for this is private
 UNWELL = 1  # exit code where something failed
 
 

@@ -112,6 +112,8 @@ def _init(arguments: argparse.Namespace) -> None:
     from hardware.live.settings import settings_text
 
     file = arguments.folder / "session.toml"
+    if arguments.folder.exists() and not arguments.folder.is_dir():
+        raise InputError(arguments.folder, "FOLDER", "a file", "a folder, new or without a session.toml")
     if file.exists():
         raise InputError(file, "FOLDER", "holds a session.toml already", "a folder without one")
     arguments.folder.mkdir(parents=True, exist_ok=True)

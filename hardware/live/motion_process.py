@@ -28,12 +28,13 @@ from hardware.live.motion import LiveMotion
 from hardware.live.motion_names import EXPOSURE_TO_WIRE, FRAMES_TO_WIRE, LATE
 from hardware.live.outbox import Outbox
 from hardware.live.place import Place
-from hardware.live.records import Begin, Handed, LiveMotionReport, Pace, Span, TickEntry, WireEntry
+from hardware.live.records import Begin, Handed, LiveMotionReport, Pace, Span, WireEntry
 from hardware.live.tap import Tap
 from hardware.motion_loop import MotionLoop, Order, Tick
 from hardware.newest import Newest
 from hardware.operator.request import RequestLine
 from hardware.priority import ask_for_real_time
+from hardware.recorded_tick import RecordedTick
 from hardware.rhythm import InStep
 
 EVENTS = 50  # of the last ones that a report holds
@@ -143,7 +144,9 @@ class _Watch:
             asked, begun = motion.asked and motion.last.stamp == tick.stamp, motion.begun
             motion.begun, frame = math.nan, motion.frame if asked else b""
             came_to = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
-            self._outbox.put(TickEntry(tick.stamp, stamp, asked, begun, motion.paused, tick.command, frame, *came_to))
+            self._outbox.put(
+                RecordedTick(tick.stamp, stamp, asked, begun, motion.paused, tick.command, frame, *came_to)
+            )
         spans = (*self.times.spans(), Span(LATE, late.count, late.percentile(50), late.percentile(99), late.most))
         stops = loop.arm.stops
         self._reports.put(

@@ -74,6 +74,8 @@ def prepare_again(record: File, flags: dict[str, Any]) -> Prepared:
     beside = Beside(record)
     if not record.exists():
         raise InputError(record, "--resume", "no such file", "the recording of a run")
+    if not beside.session.exists():
+        raise InputError(record, "--resume", f"no {beside.session.name} beside it", "the recording of a run")
     settings = overridden(read_settings(beside.session), flags)
     found = read_found(beside.surface) if beside.surface.exists() else None
     again = beside.next()

@@ -27,11 +27,11 @@ from hardware.live.records import (
     RoiEntry,
     ScanEntry,
     SetEntry,
-    TickEntry,
     UsedEntry,
     WireEntry,
 )
 from hardware.newest import Newest
+from hardware.recorded_tick import RecordedTick
 from hardware.recording import Recorder
 from hardware.tum import rows_from_trajectory
 
@@ -140,10 +140,9 @@ def _write(recorder: Recorder, entry: Entry) -> None:
             recorder.frame(frame)
     elif isinstance(entry, PoseEntry):
         _write_pose(recorder, entry)
-    elif isinstance(entry, TickEntry):
+    elif isinstance(entry, RecordedTick):
         recorder.write(entry.command)
-        given = entry.pose_stamp, entry.asked, entry.begun, entry.paused
-        recorder.tick(entry.stamp, *given, entry.fraction, entry.phase.value, entry.frame, entry.recalled)
+        recorder.write(entry)
     elif isinstance(entry, WireEntry):
         (recorder.sent if entry.sent else recorder.received)(entry.stamp, entry.data)
     elif isinstance(entry, EventEntry):

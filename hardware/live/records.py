@@ -18,10 +18,10 @@ from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmEvent
 from hardware.live.arrived import Encoded
 from hardware.motion_loop import Tick
+from hardware.recorded_tick import RecordedTick
 from perception.frames import Frame, PrintHead, Roi
-from planning.command import Command
 from planning.path import Path
-from planning.progress import Phase, Progress
+from planning.progress import Progress
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,28 +167,6 @@ class PoseEntry:
     truth: Array | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TickEntry:
-    """A tick of the motion: s, the stamp of the pose that it was given (NaN: none), and what the loop came to.
-
-    asked: whether planner and guard were asked, and the frame that they then gave. begun: where on the path they were
-    begun anew before it, counted in checkpoints (NaN: they were not). paused: whether they were told to wait above the
-    surface. fraction, phase: how far the print then is. recalled: (2, 6) mm and rad, where the arm came to rest and
-    where it stands, if they were told that what was sent had been called back.
-    """
-
-    stamp: float
-    pose_stamp: float
-    asked: bool
-    begun: float
-    paused: bool
-    command: Command
-    frame: bytes
-    fraction: float
-    phase: Phase
-    recalled: Array | None = None
-
-
 @dataclass(frozen=True, slots=True)
 class WireEntry:
     """Bytes that passed the arm's port at `stamp`, s."""
@@ -228,5 +206,5 @@ class UsedEntry:
 
 
 Given = RigEntry | ScanEntry | RoiEntry | UsedEntry
-Happened = SetEntry | PoseEntry | TickEntry | WireEntry | EventEntry | LatencyEntry
+Happened = SetEntry | PoseEntry | RecordedTick | WireEntry | EventEntry | LatencyEntry
 Entry = Given | Happened

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-Commands = Any  # argparse's own type for this is private
+from hardware.command_line import Commands
 
 FAILED = 1  # exit code where one of several sessions could not be smoothed
 
