@@ -1,10 +1,22 @@
-"""What all tests share: fixed examples, so that a run says the same thing twice."""
+"""What all tests share: fixed examples, so that a run says the same thing twice, and the order of the files."""
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import settings
 
 settings.register_profile("fixed", deadline=None, derandomize=True, max_examples=60)
 settings.load_profile("fixed")
 
 pytest_plugins = ["estimation.synthetic.plugin"]  # by name, so that a checkout that is not installed has it too
+
+LONGEST = (  # files that take longest, begun first: of two workers neither then waits long for the other's last file
+    *("test_tracking", "test_live_run", "test_simulate", "test_camera_calibration", "test_world", "test_estimator"),
+    *("test_calibrate_refused", "test_live_page", "test_scene_render", "test_guard_oracle", "test_registration"),
+    *("test_estimator_suite", "test_examples", "test_track", "test_operator_page", "test_wound_network"),
+    *("test_live_faults", "test_growth", "test_fill_laws", "test_odd_camera", "test_outages", "test_fault_bench"),
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))

@@ -288,6 +288,7 @@ def test_views_from_one_side_only_are_refused() -> None:
         calibrate(views)
 
 
+@pytest.mark.slow  # through the command in test_calibrate_refused
 def test_a_wrong_board_is_refused() -> None:
     views, _ = waved(np.random.default_rng(3))
     drawn = views.points * [1.0, 1.2, 1.0]

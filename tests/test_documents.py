@@ -57,6 +57,18 @@ def test_each_command_and_its_options_exist(document: str, text: str) -> None:
     assert set(options(text)) <= known, f"{document}: {text}"
 
 
+def test_each_command_that_is_shown_is_taken_with_its_values() -> None:
+    """As it stands there, on a line of its own; the first page's list has placeholders for values."""
+    shown = [text for file in DOCUMENTS[1:] for text in SHOWN.findall(file.read_text(encoding="utf-8"))]
+    assert len(shown) > 30
+    for text in shown:
+        words = shlex.split(text, comments=True)[1:]
+        if words[0] == "bench" and words[1] in SUBJECTS:
+            subject_parser(words[1], SUBJECTS[words[1]]).parse_args(words[2:])
+        else:
+            parser().parse_args(words)
+
+
 @pytest.mark.parametrize(("document", "text"), [c for c in commands() if c[1].startswith("make")])
 def test_each_make_target_exists(document: str, text: str) -> None:
     targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)

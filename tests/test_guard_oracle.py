@@ -15,19 +15,20 @@ from planning.command import Code, Move, Refusal
 from planning.guard import Guard
 from planning.kinematics import joints_from_axes
 from planning.limits import Limits
+from tests.slowly import slowly
 
 COUNT = 500
 HAIR = 1e-12  # rad, rad/s: the joints are solved anew under each limit, which moves their last bits
 
 
+@pytest.mark.parametrize("seed", [0, *slowly(1, 2, 3)])
 @pytest.mark.parametrize("rules", [simple, jointed])
 def test_no_random_command_that_breaks_a_limit_passes_and_none_that_keeps_all_is_refused(
-    rules: Callable[[], Rules],
+    rules: Callable[[], Rules], seed: int
 ) -> None:
-    for seed in range(2):
-        asked, passed, broken, refused = judge(random_log(seed, COUNT, rules()), rules())
-        assert (asked, broken, refused) == (COUNT, 0, 0)
-        assert 0.3 * COUNT < passed < 0.9 * COUNT  # both sides are tried
+    asked, passed, broken, refused = judge(random_log(seed, COUNT, rules()), rules())
+    assert (asked, broken, refused) == (COUNT, 0, 0)
+    assert 0.3 * COUNT < passed < 0.9 * COUNT  # both sides are tried
 
 
 def loosened(limits: Limits, name: str) -> Limits:
@@ -61,13 +62,10 @@ def test_the_oracle_finds_a_guard_that_is_loose_in_any_limit(name: str) -> None:
         rules = replace(rules, limits=replace(rules.limits, jump=9.0, turn=1.0))
     if name == "stop_distance":  # none is tried for so long
         rules = replace(rules, limits=replace(rules.limits, stop_distance=2.0))
-    found = 0
-    for seed in range(4):
-        log = random_log(seed, COUNT, rules, forgetful(rules, name))
-        found = judge(log, rules)[2]
-        if found:
-            break
-    assert found
+    far = name in ("low", "high")  # a wander from home takes long to get there
+    count = COUNT if far else COUNT // 5
+    logs = (random_log(seed, count, rules, forgetful(rules, name)) for seed in range(4 if far else 20))
+    assert any(judge(log, rules)[2] for log in logs)
 
 
 def test_the_oracle_finds_a_guard_that_refuses_too_much() -> None:

@@ -66,7 +66,7 @@ def last_place(record: Path) -> float:
     return float(str(messages(record, "/tick")[-1]["fraction"]))
 
 
-def test_stopped_paused_home_and_without_its_page_it_goes_on_until_a_signal_and_another_run_takes_over(
+def test_stopped_paused_home_and_without_its_page_it_goes_on_until_ctrl_c_and_another_run_until_its_terminal_closes(
     start: Start, tmp_path: Path
 ) -> None:
     record, second = tmp_path / "run.mcap", tmp_path / "run-2.mcap"
@@ -85,14 +85,18 @@ def test_stopped_paused_home_and_without_its_page_it_goes_on_until_a_signal_and_
     run.press("r")
     at = run.wait_for(r"\nprint\n", at)
     CLOCK.wait_until(CLOCK.now() + 0.5)
-    os.kill(run.process.pid, signal.SIGTERM)
-    assert run.end() == 128 + signal.SIGTERM
-    assert "ended: SIGTERM" in run.said and "go on with: stillbed live --resume" in run.said
+    run.process.send_signal(signal.SIGINT)
+    assert run.end() == 128 + signal.SIGINT
+    assert "ended: Ctrl-C" in run.said and "go on with: stillbed live --resume" in run.said
     stops = summary(record)["latency_ms"]["stop decided to on the wire"]  # type: ignore[index,call-overload]
     assert stops["count"] >= 2
     resumed = begun(start, record, "--resume")
-    resumed.process.send_signal(signal.SIGINT)
-    assert resumed.end() == 128 + signal.SIGINT
+    now = CLOCK.now()
+    os.kill(resumed.process.pid, signal.SIGHUP)  # what the kernel sends when a terminal goes
+    os.close(resumed.keys)
+    resumed.keys = -1
+    assert resumed.end() == 128 + signal.SIGHUP
+    assert rests(second, now, 0.5) and not open_session(second).damage
     printed_once(record, second)
     for file in (record, second):  # with a stop, a pause and a way home in the first
         ticks = list(replay_run(file))
@@ -129,17 +133,6 @@ def test_the_conducting_process_killed_leaves_an_arm_at_rest_and_a_whole_recordi
     assert rests(record, killed, 0.5)
     assert killed - closed(record).sets[-1][0].stamp < 0.5
     assert kept(record, tmp_path / "path.csv") == pytest.approx(last_place(record), abs=0.2)
-
-
-def test_a_closed_terminal_ends_the_run_in_order(start: Start, tmp_path: Path) -> None:
-    record = tmp_path / "run.mcap"
-    run = begun(start, record)
-    now = CLOCK.now()
-    os.kill(run.process.pid, signal.SIGHUP)  # what the kernel sends when a terminal goes
-    os.close(run.keys)
-    run.keys = -1
-    assert run.end() == 128 + signal.SIGHUP
-    assert rests(record, now, 0.5) and not open_session(record).damage
 
 
 def test_an_arm_that_is_unplugged_is_waited_for_and_goes_on_from_home(start: Start, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from planning.kinematics import nozzle_from_axes
 from planning.legs import CLEARANCE
 from planning.progress import Phase
 from tests.moving import Motion, breathing, pose_at, raster, still
+from tests.slowly import slowly
 
 PROFILE = ArmProfile()
 AGE = 0.03  # s of a pose
@@ -46,7 +47,7 @@ class Paused:
             self.phases.append(step.progress.phase)
 
 
-@pytest.mark.parametrize("motion", [still, breathing])
+@pytest.mark.parametrize("motion", [breathing, *slowly(still)])
 @pytest.mark.parametrize("gone", [(9.0, 9.0), (6.1, 6.3)])  # s: the surface is lost on the way up
 def test_it_waits_above_the_surface_and_goes_on_where_it_left_off(motion: Motion, gone: tuple[float, float]) -> None:
     run = Paused(motion, (6.0, 9.0), 13.0, lambda now: gone[0] <= now < gone[1])

@@ -17,6 +17,7 @@ from planning.layers.contour import region
 from planning.layers.grid import Grid, at, grid_over, topmost
 from planning.layers.repair import repaired
 from planning.layers.wound import Wound, wound_in
+from tests.slowly import slowly
 from tests.wounds import scan_of, wound_of
 
 
@@ -25,7 +26,7 @@ def over_scan(wound: Wound, xy: Array) -> Array:
     return se3.transform_points(wound.surface_from_plane, np.column_stack([xy, at(wound.grid, wound.skin, xy)]))
 
 
-@pytest.mark.parametrize("kind", ["forearm", "chest", "foot"])
+@pytest.mark.parametrize("kind", ["forearm", *slowly("chest", "foot")])
 @pytest.mark.parametrize(("size", "depth"), [((24.0, 16.0), 3.0), ((60.0, 40.0), 6.0)])
 def test_outline_and_skin_are_those_of_the_body(kind: str, size: tuple[float, float], depth: float) -> None:
     wound = wound_of(kind, size, depth)

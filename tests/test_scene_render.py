@@ -26,6 +26,7 @@ from hardware.simulator.sensor import Sensor
 from hardware.simulator.shape import cylinder, flat, shape_from_scan
 from hardware.simulator.truth import Truth
 from perception.frames import Image
+from tests.slowly import slowly
 
 TEXEL = 0.15  # mm
 PATCH = (72.0, 54.0)  # mm
@@ -103,9 +104,9 @@ def errors(scene: Scene, at: Instant) -> Array:
     return np.array(out)
 
 
-@pytest.mark.parametrize("radius", [np.inf, 55.0])
-@pytest.mark.parametrize("strain", [0.0, 1.0, -0.7])
-@pytest.mark.parametrize("pose", [REST, MOVED], ids=["rest", "moved"])
+@pytest.mark.parametrize("radius", [55.0, *slowly(np.inf)])
+@pytest.mark.parametrize("strain", [0.0, 1.0, *slowly(-0.7)])
+@pytest.mark.parametrize("pose", [MOVED, *slowly(REST)], ids=["moved", "rest"])
 def test_points_are_imaged_where_the_rig_projects_them(radius: float, strain: float, pose: Array) -> None:
     off = errors(dotted(radius), instant(pose, strain=strain))
     length = np.linalg.norm(off, axis=-1)

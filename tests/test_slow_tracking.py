@@ -17,6 +17,7 @@ from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
 from tests.linked import linked
 from tests.moving import breathing, pose_at, raster
+from tests.slowly import slowly
 
 CAMERA = 1 / 30  # s between frame sets
 SLOW = 5.0  # s: it prints by then
@@ -61,7 +62,7 @@ def printed(slowest: float, seed: int) -> tuple[list[Tick], ArmProfile]:
     return ticks, profile
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, *slowly(1)])
 @pytest.mark.parametrize("slowest", [0.03, 0.2, 0.8])
 def test_what_is_printed_lies_in_its_place_however_slow_the_tracker_is(slowest: float, seed: int) -> None:
     ticks, profile = printed(slowest, seed)

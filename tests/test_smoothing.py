@@ -22,6 +22,7 @@ from estimation.smoothing.prior import STATE, States, drive, links, transition
 from estimation.smoothing.smoothed import Smoothed
 from estimation.synthetic.follow import follow
 from estimation.synthetic.world import World, synthetic_world
+from tests.slowly import slowly
 
 FEW = 40  # landmarks
 
@@ -118,7 +119,7 @@ def test_errors_are_as_large_as_is_claimed() -> None:
     assert 0.7 < np.mean(values) < 1.4
 
 
-@pytest.mark.parametrize("movement", ["breathing", "steps", "still"])
+@pytest.mark.parametrize("movement", ["breathing", *slowly("steps", "still")])
 def test_it_is_better_than_a_causal_run(movement: str) -> None:
     ours, causal = [], []
     for seed in range(2):

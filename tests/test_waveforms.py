@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.se3 import Array
@@ -47,6 +47,7 @@ def test_the_derivative_is_that_of_the_values(kind: str, seed: int, start: float
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), start=st.floats(-700, 1500))
 def test_values_and_slopes_are_continuous(kind: str, seed: int, start: float) -> None:
     wave = every_kind(seed)[kind]

@@ -17,6 +17,7 @@ from hardware.simulator.scenario_file import read_scenario
 from hardware.simulator.world import REST
 from planning.command import HASTE
 from planning.progress import Phase
+from tests.slowly import slowly
 from tests.worlds import HEADER, IDEAL, Heard, errors, heard, inner, world_of, write_path, write_scenario
 
 VELOCITY = np.array([3.0, -2.0, 4.0])  # mm/s of the surface, in the rest frame
@@ -36,7 +37,7 @@ EARLY = (1 - HASTE) * 0.02  # s by which a move ends before the next begins, and
 # -- the measuring is right
 
 
-@pytest.mark.parametrize("motion", [[], [STEADY], [TURNING]], ids=["still", "moving", "turning"])
+@pytest.mark.parametrize("motion", [[TURNING], *slowly([], [STEADY])], ids=["turning", "still", "moving"])
 def test_with_a_perfect_tracker_no_delay_and_an_ideal_arm_every_printed_row_is_within_5_um(
     motion: list[object], tmp_path: Path
 ) -> None:
