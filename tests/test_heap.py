@@ -1,8 +1,11 @@
-"""The heap: what is free goes back to the system, even below what is still in use."""
+"""The heap: what is free goes back to the system, even below what is still in use; or stays, where that was asked."""
 
 from __future__ import annotations
 
 import ctypes
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -18,3 +21,23 @@ def test_what_is_free_below_what_is_in_use_is_given_back() -> None:
     blocks.clear()
     give_back()
     assert full - resident() > 40.0 and last == bytes(5000)
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="this C library cannot be told to keep pages")
+def test_pages_that_are_kept_are_not_asked_for_again() -> None:
+    code = """
+from resource import RUSAGE_SELF, getrusage
+from estimation.heap import keep_pages
+keep_pages(2**25)
+def fill():
+    return [bytearray(b"x") * 2**22 for _ in range(4)]
+for _ in range(3):
+    fill()
+before = getrusage(RUSAGE_SELF).ru_minflt
+for _ in range(10):
+    fill()
+print(getrusage(RUSAGE_SELF).ru_minflt - before)
+"""
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 1000  # of 40,000 pages that were filled

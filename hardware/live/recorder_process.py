@@ -11,6 +11,7 @@ from selectors import EVENT_READ, BaseSelector, DefaultSelector
 import numpy as np
 
 from estimation.errors import StillbedError
+from estimation.heap import keep_pages
 from estimation.rig import Rig
 from estimation.trajectory import Trajectory
 from hardware.clock import ProcessorClock, WallClock
@@ -37,6 +38,7 @@ from hardware.tum import rows_from_trajectory
 
 QUIET = 0.2  # s without anything new after which what is there goes to the disk
 GATHER = 0.08  # s that what comes may gather: woken for each entry, this process took twice as long for all of them
+KEPT = 2**25  # bytes of free pages that are kept: some chunks, as glibc allows at most
 NICE = 10  # below all that moves the arm
 
 
@@ -53,6 +55,7 @@ class RecorderPlan:
 def recorder_process(plan: RecorderPlan, senders: Sequence[Connection], reports: Newest[RecorderReport]) -> None:
     """Record until all senders have closed their end; a fault of the disk ends it, said in the last report."""
     settle("recorder", plan.cores, NICE)
+    keep_pages(KEPT)
     writer = _Writer(plan, reports)
     try:
         writer.run([Inbox(sender) for sender in senders])
