@@ -41,3 +41,23 @@ print(getrusage(RUSAGE_SELF).ru_minflt - before)
     root = Path(__file__).parents[1]
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
     assert int(done.stdout) < 1000  # of 40,000 pages that were filled
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="this C library cannot be told of its heaps")
+def test_threads_that_share_pages_have_no_heap_of_their_own() -> None:
+    code = """
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+from estimation.heap import share_pages
+share_pages()
+before, together = open("/proc/self/maps").read().count("---p"), Barrier(4)
+def fill(_):
+    together.wait()
+    return sum(len(bytes(5000)) for _ in range(1000))
+with ThreadPoolExecutor(4) as threads:
+    list(threads.map(fill, range(4)))
+    print(open("/proc/self/maps").read().count("---p") - before)
+"""
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    assert int(done.stdout) == 4  # a guard page of each stack; a heap of its own would reserve more

@@ -10,12 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hardware.faults import fault_from_text
+from hardware.arm_file import read_arm
+from hardware.faults import fault_from_text, faults_from_texts
 from hardware.live.crew import Crew
 from hardware.live.injected import Begun, Injector
 from hardware.live.replayed import replay_run
+from hardware.simulator.arm_settings import ArmSettings, Replies
 from tests.light_live import prepare_files
 from tests.live_runs import CLOCK, Running, messages
+from tests.test_arm_port import serving
 
 Start = Callable[..., Running]
 
@@ -119,3 +122,18 @@ def test_a_slow_tracking_makes_poses_old_and_ticks_no_later(start: Start, tmp_pa
     assert np.percentile(rows[during, 1], 90) > np.median(calm[:, 1]) + 0.08  # it stands still for 0.16 s of 0.2
     assert np.median(np.diff(rows[during, 0])) == pytest.approx(np.median(np.diff(calm[:, 0])), rel=0.2)
     assert laid_in_order(record)
+
+
+@pytest.mark.slow
+def test_a_run_whose_stalled_arm_was_called_back_is_replayed_to_the_byte(start: Start, tmp_path: Path) -> None:
+    record, link = tmp_path / "run.mcap", tmp_path / "arm"
+    texts = [f"arm stall 300ms at {instant}s" for instant in range(4, 90, 2)]  # whenever it comes to print
+    stalls = faults_from_texts("here", "fault", texts)
+    profile = read_arm(tmp_path / "arm.toml")
+    with serving(link, ArmSettings(replies=Replies.STREAM), profile=profile, faults=stalls):
+        run = start(record, str(link))
+        run.wait_for("the path is printed")
+        assert run.end() == 0
+    assert [tick for tick in messages(record, "/tick") if tick.get("recalled")]
+    replayed = list(replay_run(record))
+    assert len(replayed) > 50 and all(tick.frame == tick.recorded for tick in replayed)

@@ -19,6 +19,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.errors import InputError, StillbedError
+from estimation.heap import share_pages
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
@@ -98,6 +99,7 @@ class TrackingLines:
 def tracking_process(plan: TrackingPlan, lines: TrackingLines) -> None:
     """Track until the frames end, or nobody conducts the run any more; the last report says why."""
     settle("tracking", plan.cores)
+    share_pages()
     ask_to_go_first()  # the process of the map, which stands back behind this one, is then an ordinary one
     signal.signal(signal.SIGTERM, _ended)
     outbox, report = Outbox(lines.record), TrackingReport(WallClock().now())
