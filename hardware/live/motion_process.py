@@ -126,8 +126,9 @@ class _Watch:
 
     def heard(self, data: bytes, sent: bool) -> None:
         """Bytes passed the port."""
-        now = self._clock.now()
-        if sent and self._first and self._given is not None and len(data) > 1 and data[SECOND_BYTE] == MOVE:
+        now, frame = self._clock.now(), b"" if self.motion is None else self.motion.frame
+        made = sent and data == frame and frame[SECOND_BYTE] == MOVE  # the arm's own way home is made of no pose
+        if made and self._first and self._given is not None:
             self._first = False
             self.times.add(FRAMES_TO_WIRE, now - self._given.handed)
             self.times.add(EXPOSURE_TO_WIRE, now - self._given.pose.stamp)
