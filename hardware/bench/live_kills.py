@@ -31,14 +31,14 @@ EXECUTED = 30.0  # s in which the virtual arm has written what it did
 class Kills:
     """What came of them.
 
-    restless, stuck: arms that moved on, runs that did not print again. lost, doubled: in checkpoints, of each resumed
-    run. unread: s before the kill from which the recording cannot be read. noticed: s until the conducting process
-    said so.
+    restless: arms that moved on. stuck: last words of the runs that did not print. lost, doubled: in checkpoints, of
+    each resumed run. unread: s before the kill from which the recording cannot be read. noticed: s until the
+    conducting process said so.
     """
 
     count: int = 0
     restless: int = 0
-    stuck: int = 0
+    stuck: list[str] = field(default_factory=list)
     lost: list[float] = field(default_factory=list)
     doubled: list[float] = field(default_factory=list)
     unread: list[float] = field(default_factory=list)
@@ -66,7 +66,7 @@ def kill_figures(scenario: Path, folder: Path, path: Path, count: int, seed: int
     name = f"{kills.count} kills"
     return [
         Figure(f"{name}: arms not at rest after {WITHIN:g} s", kills.restless, "", at_most(0)),
-        Figure(f"{name}: runs that did not print again", kills.stuck, "", at_most(0)),
+        Figure(f"{name}: runs that did not print again", len(kills.stuck), "", at_most(0), "", "; ".join(kills.stuck)),
         Figure(f"{name}: most left out", max(kills.lost, default=np.nan), "checkpoints", at_most(1)),
         Figure(f"{name}: most printed twice", max(kills.doubled, default=np.nan), "checkpoints", at_most(0)),
         Figure(
@@ -81,7 +81,7 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
     clock = WallClock()
     try:
         if run.wait_for("\nprint\n") < 0:
-            kills.stuck += 1
+            kills.stuck.append(run.last_words)
             return float("nan")
         clock.wait_until(clock.now() + rng.uniform(0, LONGEST))
         victim = str(rng.choice(VICTIMS))

@@ -43,6 +43,13 @@ class LiveSession:
             self._clock.wait_until(self._clock.now() + LOOK)
         return -1
 
+    @property
+    def last_words(self) -> str:
+        """The last two lines that it said, and how it ended."""
+        lines = [line for line in self.said.splitlines() if line.strip()]
+        code = self.process.poll()
+        return f"{' / '.join(lines[-2:]) or 'nothing said'} ({'still runs' if code is None else f'exit code {code}'})"
+
     def press(self, key: str) -> None:
         """Press a key."""
         os.write(self.keys, key.encode())
