@@ -16,6 +16,7 @@ from hardware.simulator.scene import rois
 from hardware.simulator.sensor import Sensor
 from hardware.tum import read_tum
 from perception.features import grey
+from tests.slowly import slowly
 from tests.synthetic import (
     AWAY,
     CLEAN,
@@ -87,7 +88,7 @@ def test_the_views_are_rich_enough_to_track() -> None:
         assert (peaks & (found > 2 * strength(grain).max())).sum() > 150
 
 
-@pytest.mark.parametrize("quality", [95, None])
+@pytest.mark.parametrize("quality", [95, *slowly(None)])
 def test_a_written_session_reads_back(tmp_path: Path, quality: int | None) -> None:
     truth = write_session(tmp_path, 0.1, seed=3, quality=quality, cameras=SMALL)
     session = open_session(tmp_path)

@@ -37,7 +37,7 @@ def segmenter() -> NetworkSegmenter:
 
 @pytest.fixture(scope="module")
 def views() -> list[WoundView]:
-    return [wound_view(seed) for seed in range(4)]
+    return [wound_view(seed) for seed in range(2)]
 
 
 def test_rendered_wounds_are_found_and_their_masks_are_exact(
@@ -52,7 +52,7 @@ def test_rendered_wounds_are_found_and_their_masks_are_exact(
 
 
 def test_rendered_healthy_skin_shows_no_wound(segmenter: NetworkSegmenter) -> None:
-    for seed in range(3):
+    for seed in range(2):
         view = wound_view(seed, wounded=False)
         assert not view.wound.any() and view.area == 0
         assert not segmenter(view.image).found
