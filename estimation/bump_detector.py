@@ -7,13 +7,14 @@ most of what has changed is the one. A shift is a bump, a change of scale a turn
 its axis looks like the latter, as 4 mm of 400 are one percent.
 
 What is usual is learned of all cameras together and taken off the residuals, so that it holds whichever of them see the
-surface; and a number that the pose could take up nearly whole (two cameras of three, along the plane of their rays) is
-not told from a map's small errors, and stays where it is.
+surface; a camera of which it is not known yet is not judged, and tells nothing of the others. A number that the pose
+could take up nearly whole (two cameras of three, along the plane of their rays) is not told from a map's small errors,
+and stays where it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,9 +36,10 @@ BLUNDER = 6.0  # px beside the median of its camera at which a track counts for 
 class BumpSettings:
     """When a change is a bump. quick: s over which it is averaged; usual: s over which it is learned what is usual.
 
-    warm: s after a beginning in which nothing is said. limit: px, root mean square over the tracks, that they may move
-    by at least, and spread: times what is usual of that. sure: times what the next camera explains. lasts: s that it
-    must be so, calm: s that single looks must show half of the limit at most for it to be so no more.
+    warm: s after a beginning, and of what a camera showed, in which nothing is said. limit: px, root mean square over
+    the tracks, that they may move by at least, and spread: times what is usual of that. sure: times what the next
+    camera explains. lasts: s that it must be so, calm: s that single looks must show half of the limit at most for it
+    to be so no more.
     """
 
     quick: float = 0.4
@@ -86,12 +88,21 @@ class BumpDetector:
     def begin(self) -> None:
         """Forget everything, as for a new map."""
         count = len(self._names)
-        self.bumped: dict[int, str] = {}  # cameras, and what is said of them
+        self.bumped: dict[int, str] = {}  # cameras, and what there is to say of them
         self._quick, self._usual = [Told.nothing(NUMBERS)] * count, Told.nothing(NUMBERS * count)
         self._spread = np.zeros(count)  # px^2, usual square of what is off
         self._since = np.full(count, np.nan)  # s, since when a camera is off, or on again
+        self._seen = np.zeros(count)  # s in which it was learned what is usual of a camera
         self._first, self._stamp, self._count = np.nan, np.nan, 0
         self._odd: frozenset[int] = frozenset()
+
+    @property
+    def said(self) -> dict[int, str]:
+        """Cameras, and what is said of them: no more of one whose last look showed it where it stood.
+
+        Nothing is learned before it has stood there for as long as is asked; what a pose is worth waits by itself.
+        """
+        return {c: words for c, words in self.bumped.items() if np.isnan(self._since[c])}
 
     def watch(
         self, rig: Rig, seen: Observations, points: Array, exposed: Array, jacobians: Array, odd: frozenset[int]
@@ -112,14 +123,18 @@ class BumpDetector:
         step, self._stamp = max(seen.stamp - self._stamp, 0.0), seen.stamp
         self._count += 1
         if seen.stamp - self._first < self.settings.warm:
-            self._usual = self._usual.mixed(together(parts, len(rig)), 1 / self._count)
+            self._learn(parts, step, 1 / self._count)
             return
-        self._judge({c: p.without(u) for (c, p), u in zip(parts.items(), self._usual_of(parts), strict=True)}, step)
+        known = [c for c in parts if self._seen[c] + step >= self.settings.warm]
+        usual = self._usual.numbers().reshape(-1, NUMBERS)
+        self._judge({c: parts[c].without(usual[c]) for c in known}, step)
         if not self.bumped and not odd:
-            self._usual = self._usual.mixed(together(parts, len(rig)), min(1.0, step / self.settings.usual))
+            self._learn(parts, step, min(1.0, step / self.settings.usual))
 
-    def _usual_of(self, cameras: Iterable[int]) -> Array:
-        return self._usual.numbers().reshape(-1, NUMBERS)[list(cameras)]
+    def _learn(self, parts: dict[int, PicturePart], step: float, share: float) -> None:
+        """Take it that what cameras show is usual, by a share that is newer."""
+        self._usual = self._usual.mixed(together(parts, len(self._names)), share)
+        self._seen[list(parts)] += step
 
     def _judge(self, parts: dict[int, PicturePart], step: float) -> None:
         """Take what each camera is off by beside what is usual, and decide on each."""

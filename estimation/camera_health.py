@@ -132,7 +132,7 @@ class CameraHealth:
     def _troubled(self, stamp: float, at_once: bool) -> list[int]:
         late = (self._missed >= 2) & (stamp - self._carried > self.settings.away)
         named = (self._missed > 0) & np.isfinite(self._carried) & (late | at_once)
-        off = self.left_out | self.bumps.bumped.keys()
+        off = self.left_out | self.bumps.said.keys()
         return [c for c in range(len(self._names)) if named[c] or c in off or self._apart[c]]
 
     def _why(self, camera: int) -> str:
@@ -140,8 +140,8 @@ class CameraHealth:
             return "shows the same picture again"
         if camera not in self._pictures:
             return "delivers no picture"
-        if camera in self.bumps.bumped:
-            return self.bumps.bumped[camera]
+        if camera in self.bumps.said:
+            return self.bumps.said[camera]
         if camera in self.left_out or self._apart[camera]:
             return f"stands {self._off[camera]:.1f} px off the others"
         return "hardly sees the surface"

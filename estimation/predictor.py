@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from estimation import se3
 from estimation.calibration import Intervals
+from estimation.early import Early
 from estimation.forecast import Forecast, body_rate, prepare
 from estimation.history import History
 from estimation.members import LAGS, LEVER, Members
@@ -28,6 +29,7 @@ HORIZONS = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # s
 STEP = 0.1  # s between samples learned from; a camera that is faster only predicts in between
 GAP = 0.5  # s without a pose, after which the surface may be anywhere
 YOUNG = 8.0  # s of judged forecasts, two breaths: until then errors still to come are not known by those seen
+BREATHS = 10.0  # s in which the fastest motion seen is forgotten to a third
 SETTLE = 50  # samples judged before the first forecast
 SCALE = np.array([LEVER] * 3 + [1.0] * 3)  # rad to mm at the lever
 PROBES = 10  # points at most, at which the intervals are judged
@@ -66,7 +68,8 @@ class Predictor:
         self._samples: deque[_Sample] = deque()
         self._judged = 0
         self._before = -np.inf
-        self._surprise = Surprise()
+        self._surprise, self._early = Surprise(), Early()
+        self._fastest = 0.0  # mm/s at the lever, of the last breaths
         self._last: tuple[Forecast, Array] | None = None  # the newest forecast, and what was claimed of it, mm^2
 
     def add(self, pose: SurfacePose, lasting: Array | None = None) -> Forecast | None:
@@ -80,9 +83,15 @@ class Predictor:
             self._history.clear()
             self._samples.clear()
             self._surprise.forget()
+            self._early.forget()
             self._last = None
-        twist = self._heed(pose)
+        lasting = np.zeros((6, 6)) if lasting is None else lasting
+        seconds, twist = pose.stamp - self._before, self._heed(pose)
         self._before = pose.stamp
+        return self._learned(pose, twist, lasting) or self._unlearned(pose, seconds, twist)
+
+    def _learned(self, pose: SurfacePose, twist: Array, lasting: Array) -> Forecast | None:
+        """Learn from the pose, and forecast by what is learned; None while too little is known."""
         self._history.add(pose.stamp, pose.base_from_surface)
         if self._history.reach < STEP / 2:
             return None
@@ -93,7 +102,18 @@ class Predictor:
         self._learn(due, moved[: len(due)])
         if self._history.reach < LAGS[-1] - EARLY:
             return None
-        return self._forecast(pose, twist, moved[len(due) :], np.zeros((6, 6)) if lasting is None else lasting)
+        return self._forecast(pose, twist, moved[len(due) :], lasting)
+
+    def _unlearned(self, pose: SurfacePose, seconds: float, twist: Array) -> Forecast | None:
+        """Constant velocity, by which the next pose is judged; said only where the pose itself claims too much."""
+        claims = self._early(pose, seconds, twist if self._surprise.active else None, HORIZONS)
+        self._last = (
+            Forecast(HORIZONS, HORIZONS[:, None] * self._early.twist, claims),
+            claims[0] * np.outer(SCALE, SCALE),
+        )
+        if not self._early.calmer:
+            return None
+        return self._with_surprise(replace(self._last[0], covariances=claims + pose.covariance))
 
     def _heed(self, pose: SurfacePose) -> Array:
         """The twist (6,) that forecasts reckon with: what suddenly moves the surface is set aside.
@@ -103,16 +123,26 @@ class Predictor:
         if self._last is None:
             return pose.twist
         (forecast, claim), seconds = self._last, pose.stamp - self._before
-        increments, rates = forecast.at(np.array([seconds]))
-        foretold = self._history.newest @ se3.exp(increments[0])
+        steps, rates = forecast.at(np.array([seconds]))
+        step, rate = self._bounded(steps[0], rates[0], seconds)
+        foretold = self._history.newest @ se3.exp(step)
         off = se3.log(se3.inverse(foretold) @ pose.base_from_surface) * SCALE
         if not self._surprise(off, seconds, float(HORIZONS[0]), claim):
+            self._fastest = max(_size(pose.twist), self._fastest * np.exp(-seconds / BREATHS))
             return pose.twist
         moved = pose.base_from_surface @ se3.inverse(foretold)
         self._history.carry(moved)
         for sample in self._samples:
             sample.pose, sample.spoilt = moved @ sample.pose, True
-        return body_rate(increments[0], rates[0])
+        return body_rate(step, rate)
+
+    def _bounded(self, step: Array, rate: Array, seconds: float) -> tuple[Array, Array]:
+        """A step (6,) of `seconds` s, and its rate, no faster than the surface lately was.
+
+        What is set aside for a second is foretold from what was foretold: a young regression may run away in that.
+        """
+        faster = max(_size(step) / seconds, _size(rate)) / max(self._fastest, 1e-9)
+        return (step, rate) if faster <= 1 else (step / faster, rate / faster)
 
     def _due(self, now: float) -> list[tuple[_Sample, int]]:
         """The samples and horizons whose time has come."""
@@ -135,8 +165,13 @@ class Predictor:
         covariances = spread / np.outer(SCALE, SCALE) + lasting + self._unseen(pose)
         known = Forecast(HORIZONS, expected / SCALE, covariances)
         self._last = known, spread[0] + lasting * np.outer(SCALE, SCALE)
+        return self._with_surprise(known)
+
+    def _with_surprise(self, known: Forecast) -> Forecast:
+        """The forecast with what was set aside on top."""
         sudden, doubt = self._surprise.ahead(HORIZONS)
-        return Forecast(HORIZONS, known.increments + sudden / SCALE, covariances + doubt / np.outer(SCALE, SCALE))
+        covariances = known.covariances + doubt / np.outer(SCALE, SCALE)
+        return Forecast(HORIZONS, known.increments + sudden / SCALE, covariances)
 
     def _unseen(self, pose: SurfacePose) -> Array:
         """Covariances (H, 6, 6) of what errors seen so far do not tell, fading as the first breaths are seen.
@@ -164,6 +199,11 @@ class Predictor:
             if not sample.spoilt:
                 self._members.learn(sample.inputs, sample.experts[:, 1:], sample.moved)
                 self._judged += 1
+
+
+def _size(vector: Array) -> float:
+    """Of a tangent vector (6,), mm, turns at the lever."""
+    return float(np.linalg.norm(vector * SCALE))
 
 
 def _once_each(due: list[tuple[_Sample, int]]) -> Iterator[list[int]]:

@@ -16,7 +16,7 @@ from estimation.se3 import Array
 NOISE = 5.0  # times what poses usually are off what the one before foretold,
 CLAIM = 3.0  # and times the claim for the first horizon, if they went on like that: beyond both it is a surprise
 LATELY = 4.0  # s over which it is learned what is usual
-FADES = 0.06  # s, of the square of what is not known of the velocity
+FADES = 0.012  # s, of the square of what is not known of the velocity
 LASTS = 0.1  # s, of the velocity of what was set aside: what suddenly moves a surface as suddenly stops
 CALM = 0.1  # s without a surprise until all is as before
 PATIENCE = 2.0  # s, after which what goes on surprising is usual
@@ -29,7 +29,7 @@ class Surprise:
     """
 
     def __init__(self) -> None:
-        self._usual = 0.0  # mm^2
+        self._usual, self._seen = 0.0, 0.0  # mm^2, and s over which it was learned
         self._left = 0.0  # s until all is as before, if nothing surprises any more
         self._lasted, self._squares = (
             0.0,
@@ -67,7 +67,9 @@ class Surprise:
             self._left = CALM
         elif self.active and self.drift @ self.drift * ahead**2 < allowed:
             self._left -= seconds
-        self._usual += min(1.0, seconds / LATELY) * (min(square, known) - self._usual) if known else square
+        if not self.active:
+            self._seen = min(self._seen + seconds, LATELY)
+            self._usual += seconds / self._seen * ((min(square, known) if known else square) - self._usual)
         if self._lasted > PATIENCE:
             self._usual, self._left = self._squares, 0.0
         if not self.active:

@@ -66,6 +66,16 @@ def test_a_camera_that_is_put_back_is_trusted_again() -> None:
     assert states[-1] is TrackState.TRACKING and not reasons[-1]
 
 
+def test_a_camera_that_nobody_saw_at_first_is_not_taken_for_bumped_once_it_is_seen() -> None:
+    """Its calibration is off, by 1.6 px here, and nobody has seen it stand elsewhere."""
+    rig, estimator, draw = knocked(2, se3.exp([0, 0, 0, 0.6, 0, 0])), begun(breathing), np.random.default_rng(5)
+    for stamp in np.arange(1, round((CALM + 2) * RATE)) / RATE:
+        seen = observations(rig, LANDMARKS, breathing(stamp), stamp, draw, 0.3)
+        seen = seen.only(seen.camera != 2) if stamp < CALM else seen
+        estimator.accept(estimator.fit(seen, estimator.predict(stamp)), seen)
+        assert not estimator.health.bumps.bumped
+
+
 def test_a_moved_surface_is_no_change_of_a_camera() -> None:
     """Law: what a pose explains to first order is in no camera's numbers."""
     draw, at, stamp = np.random.default_rng(1), breathing(0.0), 0.0

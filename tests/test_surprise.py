@@ -27,12 +27,15 @@ def breathing(jump: Array, noise: float = 0.02) -> Array:
 
 
 def followed(poses: Array) -> list[Forecast | None]:
-    """The forecast at each pose, whose velocity is that since the one before."""
+    """The forecast at each pose, whose velocity is that since the one before, known as well as its noise says."""
     twists = np.zeros((len(STAMPS), 6))
     twists[1:] = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) * RATE
-    predictor, sure = Predictor(), 1e-6 * np.eye(6)
+    predictor, sure, lever = Predictor(), 1e-6 * np.eye(6), np.array([1 / 60] * 3 + [1.0] * 3)
+    known = np.diag(lever**2), 10 * lever**2  # mm^2/s^2 and mm^2/s^3
     rows = zip(STAMPS.tolist(), poses, twists, strict=True)
-    return [predictor.add(SurfacePose(stamp, pose, sure, twist, TrackState.TRACKING)) for stamp, pose, twist in rows]
+    return [
+        predictor.add(SurfacePose(stamp, pose, sure, twist, TrackState.TRACKING, *known)) for stamp, pose, twist in rows
+    ]
 
 
 def claim(forecast: Forecast | None) -> float:
@@ -61,6 +64,31 @@ def test_a_jump_is_forgotten_once_the_surface_goes_on_as_before() -> None:
     calm = max(claim(f) for f in forecasts[begun - 90 : begun])
     assert claim(forecasts[begun]) > 1.0
     assert max(claim(f) for f in forecasts[begun + 120 :]) < 10 * calm
+
+
+def away(begin: float, speed: float, seconds: float) -> Array:
+    """(T,) mm of a surface that runs away from `begin` s on, that fast at most, and is back after so many seconds."""
+    phase = np.clip((STAMPS - begin) / seconds, 0.0, 1.0)
+    return np.asarray(speed * seconds / np.pi * np.sin(np.pi * phase) ** 2)
+
+
+@pytest.mark.parametrize("begin", [3.2, 6.0, 9.5, 14.0])
+def test_what_ran_away_is_over_soon_after_it_is_back_however_little_was_learned(begin: float) -> None:
+    poses = breathing(away(begin, 120.0, 0.5))
+    forecasts, after = followed(poses), int(np.searchsorted(STAMPS, begin + 0.5 + 0.2))
+    for k in range(after, int(np.searchsorted(STAMPS, begin + 5.0)) - 3):
+        if (forecast := forecasts[k]) is not None:
+            off = se3.log(se3.inverse(poses[k] @ se3.exp(forecast.increments[0])) @ poses[k + 3])
+            assert claim(forecast) < 0.5 and np.linalg.norm(off[3:]) < 0.5
+
+
+def test_what_surprises_is_not_what_is_usual() -> None:
+    surprise, draw = Surprise(), np.random.default_rng(2)
+    calm = [0.01 * draw.normal(size=6) for _ in range(200)]
+    for off in [*calm, *draw.normal(size=(30, 6)), *calm[:20]]:
+        surprise(off, 1 / RATE, 0.1, 1e-4 * np.eye(6))
+    assert not surprise.active
+    assert surprise(0.1 * np.ones(6), 1 / RATE, 0.1, 1e-4 * np.eye(6))
 
 
 @given(scale=st.floats(1e-3, 10.0), seed=st.integers(0, 99))
