@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Sequence
+from statistics import median
 
 MARGIN = 0.01  # share of a tick by which it is shorter: 10 ms of phase are gained in a second
 EASE = 0.001, 0.03  # least and greatest share by which the time between two ticks is longer than one
@@ -34,6 +36,17 @@ def tick_in_step(longest: float, interval: float, shortest: float) -> float:
     share = interval * (1 - MARGIN)
     tick = share / math.ceil(share / longest) if share > longest else share * math.floor(longest / share)
     return tick if tick >= shortest else longest
+
+
+def own_interval(between: Sequence[float]) -> float:
+    """The time, s, between two frame sets as cameras make them, from those between the sets that came; NaN of none.
+
+    Where a set was lost on the way, the time to the next is a multiple: of a busy beginning that can be most of them.
+    """
+    if not between:
+        return math.nan
+    least = sorted(between)[len(between) // 4]  # a quarter came one after the other, or nothing can be told
+    return median(each / max(round(each / least), 1) for each in between) if least > 0 else math.nan
 
 
 class Rhythm:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hardware.rhythm import EARLY, EASE, InStep, Rhythm, tick_in_step
+from hardware.rhythm import EARLY, EASE, InStep, Rhythm, own_interval, tick_in_step
 
 LOOK = 0.002  # s between looks of the loop
 
@@ -89,6 +89,17 @@ def test_without_an_interval_a_tick_is_as_long_as_it_may_be(interval: float) -> 
 
 def test_a_line_that_carries_no_shorter_tick_keeps_its_own() -> None:
     assert tick_in_step(0.05, 1 / 30, 0.05) == 0.05
+
+
+@given(st.sampled_from([0.02, 1 / 30, 0.1]), st.lists(st.integers(2, 6), max_size=18), st.floats(0.0, 0.02))
+def test_the_cameras_interval_is_told_though_most_sets_were_lost(own: float, lost: list[int], jitter: float) -> None:
+    kept = max(len(lost) // 2, 3)  # of those one after the other: a third is enough
+    between = [own * (1 + jitter * (-1) ** k) * times for k, times in enumerate([*lost, *[1] * kept])]
+    assert own_interval(between) == pytest.approx(own, rel=jitter + 1e-9)
+
+
+def test_of_no_sets_there_is_no_interval() -> None:
+    assert np.isnan(own_interval([])) and np.isnan(own_interval([0.0, 0.0]))
 
 
 def test_ticks_whose_time_has_passed_are_left_out() -> None:

@@ -20,6 +20,7 @@ from hardware.bench.figure import Figure, at_least, at_most
 from hardware.bench.live_kills import kill_figures
 from hardware.bench.live_session import LiveSession
 from hardware.clock import WallClock
+from hardware.evenness import Evenness, evenness
 from hardware.live.beside import Beside
 from hardware.live.judge import TrueError, judge_run
 from hardware.live.motion_names import EXPOSURE_TO_WIRE, FRAMES_TO_WIRE, LATE
@@ -31,6 +32,7 @@ from planning.path import lengths
 
 SCENARIO = Path("data/live/calm.toml")
 STOP_EVERY = 8.0  # s between stops of the run that is stopped again and again
+PIECES = 20000  # of work that the machine is given before a run: ten seconds
 WEIGH_EVERY = 2.0  # s between looks at the memory
 SETTLED = 0.3  # share of a run after which its memory counts: key frames are full then
 HOMING = "\nhoming\n"  # what a run says once its path is printed
@@ -89,7 +91,7 @@ def to_and_fro(path: Toolpath, seconds: float) -> Toolpath:
 
 def _printing(options: argparse.Namespace, folder: Path, path: Path, arm: Path) -> list[Figure]:
     record, clock = folder / "print.mcap", WallClock()
-    told = _arguments(options.scenario, record, path)
+    told, alone = _arguments(options.scenario, record, path), evenness(clock, PIECES)
     run = LiveSession([*([str(_pinned(folder))] if options.pinned else []), *told])
     load = []
     try:
@@ -105,7 +107,12 @@ def _printing(options: argparse.Namespace, folder: Path, path: Path, arm: Path) 
     error = judge_run(record, path, arm)
     note = f"load {np.mean(load or [np.nan]):.1f} on {os.cpu_count()} cores"
     name = f"live {options.minutes:g} min" + (", pinned" if options.pinned else "")
-    return [*_latencies(name, found, note), *_errors(name, found, error), *_burden(name, found, run.memory)]
+    return [
+        *_latencies(name, found, note),
+        *_machine(name, alone),
+        *_errors(name, found, error),
+        *_burden(name, found, run.memory),
+    ]
 
 
 def _latencies(name: str, found: dict[str, Any], note: str) -> list[Figure]:
@@ -118,6 +125,14 @@ def _latencies(name: str, found: dict[str, Any], note: str) -> list[Figure]:
         Figure(f"{name}: exposure to wire, median", _of(exposure, "p50"), "ms"),
         *(Figure(f"{name}: {stage}, median", _of(times.get(stage, {}), "p50"), "ms") for stage in STAGES),
         Figure(f"{name}: tick late, 99 %", _of(late, "p99"), "ms", at_most(3)),
+    ]
+
+
+def _machine(name: str, alone: Evenness) -> list[Figure]:
+    note = f"{1000 * alone.usual:.1f} ms usually; before the run, nothing else of it running: no run can be more even"
+    return [
+        Figure(f"{name}: the machine alone, a piece of work at the worst", 1000 * alone.largest, "ms", note=note),
+        Figure(f"{name}: the machine alone, time in which work is slow", 100 * alone.slow, "%", note="three times"),
     ]
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from hardware.bench.machine import this_machine
 from hardware.clock import Clock
+from hardware.evenness import evenness
 from hardware.lateness import Lateness
 from hardware.operator.view import Check, Verdict
 
@@ -23,6 +24,8 @@ SHARED = 0.1  # GB: pictures of three 1280x720 cameras go round between two proc
 FLAGS = ("avx2", "fma")  # what compiled loops and networks are fast with
 PERIOD, TICKS = 0.02, 50  # s; a second of the ticks that motion is sent by
 PUNCTUAL = 2.0  # ms: a tenth of a tick
+PIECES = 6000  # of work: two seconds or three, as what disturbs a machine comes every other second
+EVEN = 0.005  # share of the time: once a minute for a third of a second
 LIMITS = "as root: echo 'USER - rtprio 20' > /etc/security/limits.d/stillbed.conf, with your name; then log in anew"
 
 
@@ -36,6 +39,7 @@ def machine_checks(folder: Path, clock: Clock, root: Path = ROOT) -> list[Check]
         shared_check(root),
         priority_check(),
         punctuality_check(clock),
+        evenness_check(clock),
         loopback_check(),
     ]
 
@@ -117,6 +121,15 @@ def punctuality_check(clock: Clock, ticks: int = TICKS) -> Check:
     if worst > PUNCTUAL:
         return Check("clock", Verdict.WARN, told, "stop other work on this machine; let it not save power")
     return Check("clock", Verdict.PASS, told)
+
+
+def evenness_check(clock: Clock, pieces: int = PIECES) -> Check:
+    """Whether the same work takes the same time."""
+    found = evenness(clock, pieces)
+    if found.slow > EVEN:
+        remedy = "stop other work; where nothing else runs, it is the machine: print with one that shares nothing"
+        return Check("evenness", Verdict.WARN, str(found), remedy)
+    return Check("evenness", Verdict.PASS, str(found))
 
 
 def loopback_check(host: str = "127.0.0.1") -> Check:

@@ -12,7 +12,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from statistics import median
 from types import FrameType
 
 import numpy as np
@@ -49,6 +48,7 @@ from hardware.newest import Newest
 from hardware.operator.link import OperatorLink
 from hardware.operator.taker import PictureTaker, Shot
 from hardware.priority import ask_to_go_first, settle_memory
+from hardware.rhythm import own_interval
 from hardware.session import Session, open_session
 from hardware.tracker import tracker
 from perception.frames import FrameSet, PrintHead, Roi
@@ -59,7 +59,7 @@ PATIENCE = 0.1  # s of a wait for frames, after which it looks who else is still
 WAITED, TRACKED, POSED = "frames wait for the tracker", "tracking", "frames handed over to pose"
 EXPOSED, TIDIED = "exposure to frames handed over", "pose handed over to ready for frames"
 REFRESH, LANDMARKS = 15, 300  # sets between two looks at the map, and how many of its landmarks are shown, about
-INTERVALS = 31  # of which the middle one counts: a second of them
+INTERVALS = 31  # between sets, from which the cameras' own is told: a second of them
 HISTOGRAMS = 30.0  # s between histograms in the recording
 
 
@@ -270,7 +270,7 @@ class _Tracking:
         if not np.isnan(self._before):
             self._intervals.append((stamp - self._before) / (1 + arrived.dropped))
         self._before = stamp
-        return median(self._intervals) if self._intervals else float("nan")
+        return own_interval(self._intervals)
 
     def _show(self, frames: FrameSet, pose: SurfacePose) -> None:
         """Offer the pictures to the page, where anybody has it open."""
