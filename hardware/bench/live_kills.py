@@ -19,6 +19,7 @@ from hardware.session import open_session
 
 NOTICED = ("tracking", "motion", "recorder")  # by the process that conducts; the feed's end is the cameras'
 VICTIMS = ("run", "tracking", "motion", "recorder", "feed")
+DONE = "the path is printed"
 LONGEST = 3.0  # s of printing before a kill
 WITHIN = 0.5  # s after a kill in which the arm must have come to rest: noticed in 0.1, queued for 0.05, its servo
 SHORTEST = 0.05  # s of rest that are looked at
@@ -81,7 +82,8 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
     clock = WallClock()
     try:
         if run.wait_for("\nprint\n") < 0:
-            kills.stuck.append(run.last_words)
+            if DONE not in run.said:  # nothing is left where the run before was killed on its way home
+                kills.stuck.append(run.last_words)
             return float("nan")
         clock.wait_until(clock.now() + rng.uniform(0, LONGEST))
         victim = str(rng.choice(VICTIMS))
@@ -91,7 +93,7 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
         run.end(ENDED)
     finally:
         run.close()
-    if not np.isfinite(now) or "the path is printed" in run.said:
+    if not np.isfinite(now) or DONE in run.said:
         return float("nan")
     kills.count += 1
     kills.restless += not _rests(record, now)

@@ -30,7 +30,8 @@ class LiveSession:
         nothing = subprocess.DEVNULL
         self.process = subprocess.Popen(command, stdin=theirs, stdout=nothing, stderr=subprocess.PIPE, text=True)
         os.close(theirs)
-        threading.Thread(target=self._read, daemon=True).start()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
 
     def wait_for(self, words: str, after: int = 0, patience: float = STARTED) -> int:
         """Wait until it said so beyond the first `after` characters; where that ended, -1 where it never did."""
@@ -38,7 +39,7 @@ class LiveSession:
         while self._clock.now() < until:
             if (place := self.said.find(words, after)) >= 0:
                 return place + len(words)
-            if self.process.poll() is not None and not self.said.find(words, after) >= 0:
+            if self.process.poll() is not None and not self._reader.is_alive() and self.said.find(words, after) < 0:
                 return -1
             self._clock.wait_until(self._clock.now() + LOOK)
         return -1
