@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,6 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads only spin over matrices this small
     code: int | None = None
+    out: Path | None = getattr(arguments, "out", None)
+    was_there = out is not None and out.exists()
     try:
         _end_in_order()
         code = arguments.run(arguments)
@@ -52,6 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (StillbedError, OSError) as error:
         print(f"stillbed: {_told(error)}", file=sys.stderr)
+        if out is not None and not was_there:
+            with suppress(OSError):
+                out.rmdir()  # made for what was not done; what holds anything stays
         return WRONG_INPUT
     except KeyboardInterrupt:
         print(f"\nstillbed: interrupted; {kept(getattr(arguments, 'out', None))}", file=sys.stderr)

@@ -21,6 +21,7 @@ track empty -o OUT
 track half.mcap -o OUT
 track junk.mcap -o OUT
 track whole.mcap -o OUT --arm typo.toml
+track whole.mcap -o OUT --record half.mcap
 replay missing --path missing -o OUT
 replay whole.mcap --path bad.csv -o OUT
 replay whole.mcap --path PATH --resume typo.toml -o OUT
