@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hardware.operator.request import SLOTS, Request, RequestLine, Wish, refusal
+from hardware.operator.request import ALWAYS, OTHERS, SLOTS, Request, RequestLine, Wish, refusal
 
-OTHERS = [wish for wish in Wish if wish is not Wish.STOP]
+QUEUED = [wish for wish in Wish if wish is not Wish.STOP]
 
 
-@given(st.lists(st.one_of(st.sampled_from(OTHERS), st.none()), max_size=80))
+@given(st.lists(st.one_of(st.sampled_from(QUEUED), st.none()), max_size=80))
 def test_requests_come_in_order_and_those_that_found_no_room_were_refused(steps: list[Wish | None]) -> None:
     line, asked, taken, waiting = RequestLine(), [], [], 0
     for turn, step in enumerate(steps):
@@ -24,12 +24,21 @@ def test_requests_come_in_order_and_those_that_found_no_room_were_refused(steps:
             waiting = 0
             continue
         number = line.ask(step, turn)
-        assert (number is None) == (waiting == SLOTS)
+        assert (number is None) == (waiting >= (SLOTS if step in ALWAYS else OTHERS))
         if number is not None:
             asked.append(Request(number, step, turn))
             waiting += 1
     assert taken + line.take() == asked
     assert [r.number for r in asked] == list(range(1, len(asked) + 1))
+
+
+@given(st.lists(st.sampled_from([wish for wish in QUEUED if wish not in ALWAYS]), max_size=3 * SLOTS))
+def test_a_flood_of_what_leads_elsewhere_leaves_room_for_what_leads_to_rest(flood: list[Wish]) -> None:
+    line = RequestLine()
+    for wish in flood:
+        line.ask(wish, 1)
+    assert line.ask(Wish.PAUSE, 1) is not None and line.ask(Wish.END, 1) is not None
+    assert [r.wish for r in line.take()][-2:] == [Wish.PAUSE, Wish.END]
 
 
 @given(st.integers(0, 3 * SLOTS), st.integers(1, 3), st.integers(0, 3 * SLOTS))

@@ -28,7 +28,7 @@ from hardware.operator.flood_count import FloodCount
 from hardware.operator.link import OperatorLink
 from hardware.operator.pictures import CameraPicture, Pictures
 from hardware.operator.process import OperatorPage
-from hardware.operator.request import Wish
+from hardware.operator.request import OTHERS, Wish
 from hardware.operator.settings import Limits, OperatorSettings
 from hardware.operator.window import FLOOD
 
@@ -231,7 +231,7 @@ def test_a_window_that_floods_is_closed_and_another_one_is_served_all_the_while(
         code = asyncio.run(flood(page))
         assert code in ((1009, 1006) if what == "too long" else (1008,))
         wishes = [request.wish for request in page.taken()]
-        assert wishes.count(Wish.PAUSE) == 1 and wishes.count(Wish.RESUME) <= 15
+        assert wishes.count(Wish.PAUSE) == 1 and wishes.count(Wish.RESUME) <= OTHERS
 
 
 def test_a_flood_of_stops_is_one_stop_after_another_and_nothing_else() -> None:

@@ -1,7 +1,8 @@
 """What an operator asks of the run, and the line in shared memory by which it comes.
 
-Neither side ever waits: a full line refuses what comes, and a stop has a place of its own that cannot be full. A page
-that is killed in the middle of a word leaves nothing behind that the run would stumble over.
+Neither side ever waits: a full line refuses what comes, what leads towards rest has places that nothing else takes, and
+a stop has one of its own that cannot be full. A page that is killed in the middle of a word leaves nothing behind that
+the run would stumble over.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ class Wish(StrEnum):
 ALWAYS = frozenset({Wish.STOP, Wish.PAUSE, Wish.END})  # lead towards rest: right whatever the asking window showed
 
 SLOTS = 16  # requests that wait; the run takes them every few ms and a hand gives a few in a second
+OTHERS = 8  # of them for what does not lead towards rest: a flood of such requests leaves room for a pause
 _RECORD = struct.Struct("=QQBI")  # number, turn, wish, check sum
 _LAST, _STOP, _WRITTEN, _TAKEN, _WINDOWS = range(5)  # last number given, last stop, records written and taken, windows
 _WISHES = tuple(Wish)
@@ -68,14 +70,14 @@ class RequestLine:
         self._stops_seen = 0
 
     def ask(self, wish: Wish, turn: int) -> int | None:
-        """Number of the request; None where the line is full, which it never is for a stop."""
+        """Number of the request; None where the line is full: for ALWAYS later than for others, for a stop never."""
         number = int(self._counts[_LAST]) + 1
         if wish is Wish.STOP:
             self._counts[_LAST] = number
             self._counts[_STOP] = number
             return number
         written = self._counts[_WRITTEN]
-        if written - self._counts[_TAKEN] >= SLOTS:
+        if written - self._counts[_TAKEN] >= (SLOTS if wish in ALWAYS else OTHERS):
             return None
         body = (number, turn, _WISHES.index(wish))
         _RECORD.pack_into(self._records, _place(written), *body, _check(*body))
