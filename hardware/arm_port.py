@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import io
 import os
@@ -57,7 +58,8 @@ class SerialPort:
         except ValueError as error:
             raise InputError("arm", "port", url, f"a device's path or a URL of pyserial's ({error})") from error
         except (serial.SerialException, OSError) as error:
-            raise UnpluggedError(f"{url}: {error}") from error
+            missing = error.errno == errno.ENOENT
+            raise UnpluggedError(f"{url}: {os.strerror(errno.ENOENT).lower() if missing else error}") from error
         try:
             self._file: int | None = self._serial.fileno()
         except io.UnsupportedOperation:  # loop:// and others that are no file of the system's

@@ -117,7 +117,7 @@ def test_a_log_never_overwrites_a_file(tmp_path: Path) -> None:
     log.write_text("precious")
     with pytest.raises(InputError, match="log"):
         run_virtual_arm(IDEAL, log=log)
-    with pytest.raises(InputError, match="no such folder"):
+    with pytest.raises(InputError, match="no such file"):
         run_virtual_arm(IDEAL, log=tmp_path / "none" / "motion.csv")
     assert log.read_text() == "precious"
 

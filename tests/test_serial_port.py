@@ -83,7 +83,7 @@ def test_a_device_that_goes_is_told_by_reading_and_by_writing() -> None:
     with pytest.raises(UnpluggedError):
         port.write(b"x")
     port.close()
-    with pytest.raises(UnpluggedError):
+    with pytest.raises(UnpluggedError, match=r"^/dev/there-is-none: no such file or directory$"):
         SerialPort("/dev/there-is-none", 115_200)
 
 

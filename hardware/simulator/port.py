@@ -8,11 +8,13 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
 from estimation.errors import InputError
 from hardware.arm_profile import BITS_PER_BYTE, ArmProfile
+from hardware.checks import why
 from hardware.clock import Clock, WallClock
 from hardware.faults import Fault
 from hardware.simulator.arm_settings import ArmSettings
@@ -48,35 +50,46 @@ def run_virtual_arm(
     profile = ArmProfile() if profile is None else profile
     clock, stop = clock or WallClock(), stop or threading.Event()
     arm = VirtualArm(settings, profile.dialect, profile.arm.home, faults, profile.baud)
-    if log is not None and (log.exists() or not log.parent.is_dir()):
-        raise InputError(log, "log", "exists" if log.exists() else "no such folder", "a new file in a folder")
-    ours, theirs, device = open_pty()
-    try:
-        os.set_blocking(ours, False)
-        with _linked(link, device), _ended_by_signals(stop):
-            say(device)
-            try:
+    with _logged(log, arm):
+        ours, theirs, device = open_pty()
+        try:
+            os.set_blocking(ours, False)
+            with _linked(link, device), _ended_by_signals(stop):
+                say(device)
                 _serve(ours, arm, profile.baud / BITS_PER_BYTE, clock, stop)
-            finally:
-                if log is not None:
-                    write_motion(log, arm)
-    finally:
-        os.close(theirs)
-        os.close(ours)
+        finally:
+            os.close(theirs)
+            os.close(ours)
     say(summary(arm))
     return arm
 
 
-def write_motion(path: Path, arm: VirtualArm) -> None:
+@contextmanager
+def _logged(log: Path | None, arm: VirtualArm) -> Iterator[None]:
+    """Write what the arm executed meanwhile into a new file; it is opened before anything moves."""
+    if log is None:
+        yield
+        return
+    try:
+        file = log.open("x", encoding="utf-8")
+    except OSError as error:
+        raise InputError(log, "log", why(error), "a new file in a folder that can be written to") from error
+    with file:
+        try:
+            yield
+        finally:
+            _write_motion(file, arm)
+
+
+def _write_motion(file: TextIO, arm: VirtualArm) -> None:
     """Write the executed axes, a line each millisecond, as CSV."""
     units = np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
     size = int(arm.now / LOG_STEP + 1e-6) + 1  # a whole number of steps may come out just below it
-    with path.open("w", encoding="utf-8") as file:
-        file.write(HEADER + "\n")
-        for start in range(0, size, _ROWS):
-            stamps = np.minimum(np.arange(start, min(start + _ROWS, size)) * LOG_STEP, arm.now)
-            rows = np.column_stack([stamps, arm.axes_at(stamps) * units])
-            np.savetxt(file, rows, ["%.3f"] + ["%.6f"] * 6, delimiter=",")
+    file.write(HEADER + "\n")
+    for start in range(0, size, _ROWS):
+        stamps = np.minimum(np.arange(start, min(start + _ROWS, size)) * LOG_STEP, arm.now)
+        rows = np.column_stack([stamps, arm.axes_at(stamps) * units])
+        np.savetxt(file, rows, ["%.3f"] + ["%.6f"] * 6, delimiter=",")
 
 
 def summary(arm: VirtualArm) -> str:
