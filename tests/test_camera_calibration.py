@@ -138,7 +138,7 @@ def test_offsets_are_found_to_a_millisecond_and_lenses_to_a_percent(known: tuple
 
 
 @pytest.mark.parametrize(
-    ("runs", "low", "high"), [(8, 0.7, 1.35), pytest.param(50, 0.88, 1.12, marks=pytest.mark.slow)]
+    ("runs", "low", "high"), [(5, 0.65, 1.4), pytest.param(50, 0.88, 1.12, marks=pytest.mark.slow)]
 )
 def test_what_is_stated_to_be_uncertain_is_so(runs: int, low: float, high: float) -> None:
     values = []
@@ -148,7 +148,7 @@ def test_what_is_stated_to_be_uncertain_is_so(runs: int, low: float, high: float
         fit = fit_rig(views, state, free_numbers(MODELS), 0.0)
         found = Calibration(Rig(()), fit, views, MODELS, (), 0.0, 0, fit.residuals)
         values.append(nees(errors(found, truth), fit.covariance))
-    # the mean of 50 chi-squares of 29 degrees each, divided by 29, is 1 +- 0.037; of 8, 1 +- 0.09
+    # the mean of 50 chi-squares of 29 degrees each, divided by 29, is 1 +- 0.037; of 5, 1 +- 0.12
     assert low < np.mean(values) < high
 
 

@@ -27,7 +27,7 @@ TRACKING, DEGRADED, COASTING, LOST = (
     TrackState.LOST,
 )
 MOVEMENTS = ("still", "breathing", "shaker", "steps", "turns", "sway", "lively")
-FEW = ("still", "breathing", "turns", "lively")  # that are always tried: at rest, to and fro, about an axis, at random
+FEW = ("still", "breathing", "lively")  # that are always tried: at rest, to and fro, at random
 REST = tuple(name for name in MOVEMENTS if name not in FEW)
 COUNT, SECONDS = 60, 2.0
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from estimation import se3
+from estimation.synthetic.arc_rig import arc_rig
 from estimation.trajectory import Trajectory
 from hardware.path_file import read_path, write_path
 from hardware.tum import write_tum
@@ -23,7 +24,7 @@ def run(name: str, *words: object) -> None:
 
 
 def test_a_folder_of_pictures_is_tracked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_session(tmp_path / "s", seconds=0.7, rate=10.0, seed=2)
+    write_session(tmp_path / "s", seconds=0.7, rate=10.0, seed=2, cameras=arc_rig(size=(640, 360), focal=700.0))
     run("track_videos.py", tmp_path / "s")
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 7 and "TRACKING" in lines[-1]
@@ -53,7 +54,7 @@ def test_another_arm_is_sent_its_own_words(tmp_path: Path, capsys: pytest.Captur
 
 
 def test_a_predictor_of_ones_own_is_compared(capsys: pytest.CaptureFixture[str]) -> None:
-    run("own_predictor.py", 12)
+    run("own_predictor.py", 9)
     rows = [line.replace(",", "").split() for line in capsys.readouterr().out.splitlines()]
     hold, own = (np.array([float(row[k]) for row in rows]) for k in (3, 6))
     assert len(rows) == 4 and (own < hold).all()

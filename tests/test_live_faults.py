@@ -92,6 +92,7 @@ def test_what_is_slow_runs_for_its_share_of_every_period_and_freely_afterwards(t
         crew.kill("tracking")
 
 
+@pytest.mark.slow
 def test_a_flooded_page_turns_windows_away_and_the_print_goes_on_in_its_rhythm(start: Start, tmp_path: Path) -> None:
     record = tmp_path / "run.mcap"
     run = start(record, "--page", "--fault=page flood at 0.3s for 1.5s")

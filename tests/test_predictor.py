@@ -17,6 +17,7 @@ from estimation.history import History
 from estimation.pose import SurfacePose, TrackState
 from estimation.predictor import HORIZONS, Predictor
 from estimation.se3 import Array
+from tests.slowly import slowly
 
 MOVED = se3.exp(np.array([0.7, -1.1, 0.4, 300.0, -200.0, 500.0]))
 
@@ -65,14 +66,14 @@ def test_the_base_frame_does_not_matter(stamps: Array) -> None:
 
 
 def test_the_same_poses_give_the_same_bytes(stamps: Array) -> None:
-    one, other = (forecasts(seen(stamps, breathing(stamps)))[-1] for _ in range(2))
+    one, other = (forecasts(seen(stamps[:200], breathing(stamps[:200])))[-1] for _ in range(2))
     assert one is not None and other is not None
     assert (
         one.increments.tobytes() + one.covariances.tobytes() == other.increments.tobytes() + other.covariances.tobytes()
     )
 
 
-@pytest.mark.parametrize("period", [0.1, 1 / 30, 1 / 60, 0.137])
+@pytest.mark.parametrize("period", [0.1, 1 / 30, 0.137, *slowly(1 / 60)])
 def test_breathing_is_predicted_far_better_than_by_its_velocity(period: float) -> None:
     stamps = np.arange(0, 40, period)
     poses, truth = seen(stamps, breathing(stamps)), breathing(stamps, noise=0.0)
@@ -177,12 +178,12 @@ def test_an_irregular_time_widens_the_intervals(stamps: Array) -> None:
 
 
 def test_memory_stays_what_it_is() -> None:
-    stamps = np.arange(0, 60, 1 / 60)
+    stamps = np.arange(0, 60, 1 / 30)
     predictor = Predictor()
     sizes = []
     for i, pose in enumerate(seen(stamps, breathing(stamps))):
         predictor.add(pose)
-        if i in (900, 3500):
+        if i in (450, 1750):
             sizes.append(len(pickle.dumps(predictor)))
     assert sizes[1] < 1.02 * sizes[0]
 

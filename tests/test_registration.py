@@ -56,7 +56,7 @@ def test_noise_costs_accuracy_as_the_covariance_says(seed: int) -> None:
 
 def test_errors_and_covariance_agree() -> None:
     squared = []
-    for seed in range(8):
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         points = scans.points_on(BODY, 250, rng, MIDDLE)
         truth = se3.exp([0.4, -0.8, 1.1, 100, -50, 400])
@@ -64,7 +64,7 @@ def test_errors_and_covariance_agree() -> None:
         result = register(seen, 0.05, BODY, truth[:3, 2])
         error = se3.log(se3.inverse(result.base_from_surface) @ truth)
         squared.append(error @ np.linalg.solve(result.covariance, error) / 6)
-    assert 0.4 < np.mean(squared) < 2.0  # 48 degrees of freedom: 0.6 to 1.5 in 99 %
+    assert 0.4 < np.mean(squared) < 2.0  # 30 degrees of freedom: 0.46 to 1.79 in 99 %
 
 
 def test_wrong_points_do_not_pull() -> None:

@@ -36,7 +36,7 @@ FAULTY = {  # whatever chance may bring
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with pictures and faults, rendered by one thread."""
     folder = tmp_path_factory.mktemp("recorded")
-    file = write_scenario(folder, SMALL, FAULTY, motion=[BREATHING], seconds=1.4, seed=8, clearance_mm=0.4)
+    file = write_scenario(folder, SMALL, FAULTY, motion=[BREATHING], seconds=1.0, seed=8, clearance_mm=0.4)
     run_simulation(file, folder / "one", Options(threads=1))
     return folder
 
@@ -125,7 +125,7 @@ def test_the_truth_holds_every_exposure_and_each_pose_is_near_it(recorded: Path)
     assert (np.diff(truth.stamps) > 0).all()
     exact = scenario.rest @ scenario.motion(truth.stamps)
     assert truth.base_from_surface == pytest.approx(exact, abs=1e-6)
-    exposed = 0.1 + np.arange(int(1.3 * 15)) / 15  # no clock offsets: a set's mid-exposure
+    exposed = 0.1 + np.arange(int(0.9 * 15)) / 15  # no clock offsets: a set's mid-exposure
     assert np.abs(truth.stamps[:, None] - exposed).min(axis=0).max() < 1e-8
     session = open_session(out / "session")
     assert session.truth is not None
@@ -157,7 +157,7 @@ def test_the_frames_that_were_sent_are_those_of_the_commands(recorded: Path) -> 
     commands = out.joinpath("commands.csv").read_text().splitlines()[1:]
     assert out.joinpath("frames.bin").stat().st_size == 48 * len(commands)
     table = read_nozzle(out / "nozzle.csv")
-    assert np.allclose(table.stamps, np.arange(1, 1401) / 1000, atol=1e-9)
+    assert np.allclose(table.stamps, np.arange(1, 1001) / 1000, atol=1e-9)
     assert table.extrude.any()
 
 

@@ -13,6 +13,7 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.predictor import Predictor
 from estimation.se3 import Array
 from estimation.surprise import PATIENCE, Surprise
+from tests.slowly import slowly
 
 RATE = 30.0
 AT = 30.0  # s at which something happens
@@ -49,7 +50,7 @@ def test_a_breath_is_no_surprise() -> None:
     assert max(claims) < 2 * float(np.median(claims))
 
 
-@pytest.mark.parametrize("speed", [40.0, 80.0, 200.0])
+@pytest.mark.parametrize("speed", [40.0, 200.0, *slowly(80.0)])
 def test_what_runs_away_is_doubted_within_two_poses(speed: float) -> None:
     away = np.clip(STAMPS - AT, 0.0, None)
     forecasts = followed(breathing(speed / np.pi * np.sin(np.pi * np.minimum(away, 1.0)) ** 2))
@@ -72,7 +73,7 @@ def away(begin: float, speed: float, seconds: float) -> Array:
     return np.asarray(speed * seconds / np.pi * np.sin(np.pi * phase) ** 2)
 
 
-@pytest.mark.parametrize("begin", [3.2, 6.0, 9.5, 14.0])
+@pytest.mark.parametrize("begin", [3.2, 9.5, *slowly(6.0, 14.0)])
 def test_what_ran_away_is_over_soon_after_it_is_back_however_little_was_learned(begin: float) -> None:
     poses = breathing(away(begin, 120.0, 0.5))
     forecasts, after = followed(poses), int(np.searchsorted(STAMPS, begin + 0.5 + 0.2))

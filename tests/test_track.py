@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from estimation.rig import Rig
+from estimation.synthetic.arc_rig import arc_rig
 from hardware.channels import read_events
 from hardware.channels import read_poses as read_recorded_poses
 from hardware.cli import main
@@ -27,12 +28,14 @@ from tests.session_files import change
 from tests.started import started
 from tests.synthetic import still, write_session
 
+SMALL = arc_rig(size=(640, 360), focal=700.0)
+
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten frame sets at 10 Hz of a simulated surface, breathing, in videos."""
     folder = tmp_path_factory.mktemp("session") / "breathing"
-    write_session(folder, seconds=1.0, rate=10.0, seed=2)
+    write_session(folder, seconds=1.0, rate=10.0, seed=2, cameras=SMALL)
     for name in ("cam_0", "cam_1", "cam_2"):
         film(folder, name)
     return folder

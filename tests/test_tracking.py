@@ -247,6 +247,7 @@ def test_a_surface_that_comes_back_elsewhere_is_found(sets: list[FrameSet]) -> N
     assert states(poses[14:]) == {TrackState.TRACKING} and errors(poses, jump)[14:].max() < 0.3
 
 
+@pytest.mark.slow  # test_outages freezes cameras too
 def test_repeated_pictures_are_no_measurement(sets: list[FrameSet]) -> None:
     """The cameras' driver hands the last pictures out again, with a stamp of their own."""
     twice = [*sets[:8], FrameSet(sets[7].stamp + 0.05, sets[7].frames), *sets[8:14]]
@@ -275,6 +276,7 @@ def two_patches(motion: Motion, other: Motion, stamps: Array) -> list[FrameSet]:
     return result
 
 
+@pytest.mark.slow
 def test_what_moves_outside_the_region_is_not_followed() -> None:
     def still(stamp: float) -> Array:
         return breathing(0.0)
