@@ -66,9 +66,17 @@ Refused = Callable[..., None]
     ("board", "words"),
     [
         (replace(BOARD, dictionary="6X6_50"), "camera a: .* dictionary 4X4_50"),
-        (replace(BOARD, inverted=True), r"camera a: .* black and white exchanged \(`inverted`\)"),
+        pytest.param(
+            replace(BOARD, inverted=True),
+            r"camera a: .* black and white exchanged \(`inverted`\)",
+            marks=pytest.mark.slow,
+        ),
         (replace(BOARD, squares=(5, 4)), "camera a: .* another board: 4 x 5|markers"),
-        (replace(BOARD, squares=(3, 4)), "board.toml: squares = .*3 x 4.*it has markers 6, 7, 8, 9 too"),
+        pytest.param(
+            replace(BOARD, squares=(3, 4)),
+            "board.toml: squares = .*3 x 4.*it has markers 6, 7, 8, 9 too",
+            marks=pytest.mark.slow,
+        ),
         (replace(BOARD, marker=0.6), r"board.toml: marker = 0.6, allowed what the pictures show"),
         (replace(BOARD, square=43.2), r"board.toml: square_mm = .43.2 mm., allowed about 5\d(\.\d)? mm"),
     ],

@@ -72,7 +72,7 @@ def test_a_contour_without_roughness_is_followed_by_beads_of_the_nominal_width()
     assert np.allclose(outermost.width, 0.4)
 
 
-@settings(few, max_examples=4)
+@settings(few, max_examples=2)
 @given(SMALL, st.floats(0.1, 6.2))
 def test_coverage_does_not_depend_on_how_a_wound_is_turned(wound: Region, angle: float) -> None:
     turned = shapely.affinity.rotate(wound, angle, use_radians=True)

@@ -27,6 +27,7 @@ from perception.frames import Frame, FrameSet, Roi
 from perception.thesis.features import KeyPoints
 from perception.thesis.flow import Corners
 from perception.thesis.step import ThesisStep
+from tests.slowly import slowly
 from tests.synthetic import WIDE, Motion, frame_sets, patch, write_session
 from tests.worlds import SMALL, write_scenario
 
@@ -190,7 +191,7 @@ def test_a_method_that_there_is_not_is_refused_with_those_there_are(capsys: pyte
     assert "theses" in said and all(name in said for name in METHODS)
 
 
-@pytest.mark.parametrize("method", ["thesis", "thesis-flow"])
+@pytest.mark.parametrize("method", ["thesis", *slowly("thesis-flow")])
 def test_a_run_by_the_thesis_leaves_the_same_files_and_says_by_what(method: str, tmp_path: Path) -> None:
     write_session(tmp_path / "session", seconds=0.4, rate=10.0, cameras=RIG)
     out = tmp_path / "out"

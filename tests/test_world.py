@@ -50,7 +50,7 @@ def test_with_a_perfect_tracker_no_delay_and_an_ideal_arm_every_printed_row_is_w
     assert np.rad2deg(errors(file, log).angle[log.extrude].max()) < 0.001 + EARLY * turning
 
 
-@pytest.mark.parametrize("motion", [[], [STEADY], [TURNING]], ids=["still", "moving", "turning"])
+@pytest.mark.parametrize("motion", [[TURNING], *slowly([], [STEADY])], ids=["turning", "still", "moving"])
 def test_at_printing_speed_even_starting_and_stopping_cost_no_more_than_8_um(
     motion: list[object], tmp_path: Path
 ) -> None:
@@ -106,7 +106,7 @@ def test_what_the_loop_knows_of_costs_nothing_at_constant_speed(change: dict[str
     assert np.linalg.norm(difference(log)[inner(log)], axis=1).max() < 0.005
 
 
-@pytest.mark.parametrize("offset", [0.016, -0.016])
+@pytest.mark.parametrize("offset", [0.016, *slowly(-0.016)])
 def test_a_hidden_clock_offset_costs_the_speed_of_the_surface_alone(offset: float, tmp_path: Path) -> None:
     cameras = {"offset_s": [offset] * 3, "transport_s": 0.03}  # no pose may come before its stamp
     file = write_scenario(tmp_path, IDEAL, {"cameras": cameras}, motion=[STEADY], seconds=2.2)
@@ -118,7 +118,7 @@ def test_a_hidden_clock_offset_costs_the_speed_of_the_surface_alone(offset: floa
 
 
 @pytest.mark.parametrize("planted", ["rig_offset_mm", "arm_offset_mm"])
-@pytest.mark.parametrize("motion", [[], [STEADY]], ids=["still", "moving"])
+@pytest.mark.parametrize("motion", [[STEADY], *slowly([])], ids=["moving", "still"])
 def test_a_planted_offset_comes_out_as_that_offset(planted: str, motion: list[object], tmp_path: Path) -> None:
     offset = [0.2, -0.1, 0.3]
     file = write_scenario(tmp_path, IDEAL, planted={planted: offset}, motion=motion, seconds=2.5)
