@@ -17,7 +17,7 @@ def add_compare(commands: Commands) -> None:
         "errors, translation and rotation, as they stand and aligned, without scale; and NEES where there are\n"
         "covariances. Each of the two is a TUM or CSV file, an .mcap file, or a folder that stillbed wrote; of an\n"
         ".mcap file FILE:smoothed, FILE:pose or FILE:truth. Writes report.html and compare.json with -o.",
-        epilog="example:\n  stillbed compare out/smoothed out/calm/truth.tum -o out/compared",
+        epilog="example:\n  stillbed compare out/smoothed out/calm/session/truth.tum -o out/compared",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.add_argument("estimated", metavar="A", help="the poses that are judged")
