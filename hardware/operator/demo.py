@@ -214,8 +214,8 @@ def main() -> None:
     """Serve it and say where."""
     link, clock = OperatorLink(), WallClock()
     page = OperatorPage(link, OperatorSettings())
-    print(page.address, flush=True)
     try:
+        print(page.address, flush=True)
         run(link, page, Stage.CHECK, clock)
     except KeyboardInterrupt:
         page.close()
