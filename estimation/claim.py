@@ -59,16 +59,16 @@ class Claim:
         more = self._tracks.lasting * fit.scatter * fit.tracks + strayed + fit.late @ late @ fit.late.T
         self._more = (more + more.T) / 2
         if self._first is None or pose.stamp - self._trouble < WARY:  # the first pose itself is among these
-            return _widened(pose, self._more)
+            return widened(pose, self._more)
         known, believed = self._first
         first_less = known.covariance(cameras, self._tracks) - believed
         window_less = Averaged(averaged, fit, cameras.unrest).covariance(self._tracks, cameras.unrest) - averaged
-        return _widened(pose, self._more + first_less + window_less)
+        return widened(pose, self._more + first_less + window_less)
 
     def missed(self, pose: SurfacePose) -> SurfacePose:
         """A pose that is only predicted, as it is given out."""
         self._trouble = pose.stamp
-        return _widened(pose, self._more)
+        return widened(pose, self._more)
 
     def _begin(self, believed: Array, fit: Fit, cameras: CameraErrors) -> None:
         assert fit.solution.shared is not None
@@ -85,8 +85,8 @@ class Claim:
         self._usual, self._stamp = self._usual + share * (now - self._usual), pose.stamp
 
 
-def _widened(pose: SurfacePose, more: Array) -> SurfacePose:
-    """The pose with `more` (6, 6) in all its claims."""
+def widened(pose: SurfacePose, more: Array) -> SurfacePose:
+    """The pose with `more` (6, 6) in all its claims of where it is."""
     ahead = pose.forecast
     if ahead is not None:
         ahead = replace(ahead, covariances=ahead.covariances + more)

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.camera_errors import CameraErrors, Clocks
 from estimation.camera_health import CameraHealth, HealthSettings
-from estimation.claim import Claim
-from estimation.fit import Fit
+from estimation.claim import Claim, widened
+from estimation.fit import Fit, no_fit
 from estimation.fit_covariance import MapError, fit_covariance
+from estimation.local_motion import LocalMotion
 from estimation.median import median
 from estimation.motion_detector import MotionDetector
 from estimation.observations import Observations
@@ -69,6 +70,7 @@ class Estimator:
         self._smoother = Smoother()
         self._detector = MotionDetector(np.zeros(3))
         self._warp: WarpFilter | None = None
+        self._local = LocalMotion()
         self._map_error: MapError | None = None
         self._claim = Claim(len(rig))
         self._unlearned: tuple[Fit, Observations, float, bool] | None = None  # accepted, s since the last, and sound
@@ -130,7 +132,8 @@ class Estimator:
         self.learn()
         assert self.map is not None and self._map_error is not None
         if len(observations) < self.settings.least_tracks:
-            return self._no_fit(observations, start)
+            few = f"{len(observations)} tracks found, {self.settings.least_tracks} needed"
+            return no_fit(observations, start, len(self.rig), few, self.health.left_out)
         points = landmarks(self.map, self._warp)[observations.track]
         twist, doubt = self._twist(observations.stamp, start)
         seen, moved = self._together(observations, points, start, twist)
@@ -151,17 +154,6 @@ class Estimator:
         lasting = known.lasting + doubted @ doubted.T
         knowledge = known.noise, known.smear, lasting, twist, doubt, known.scatter, known.tracks, known.late, known.bias
         return Fit(seen.stamp, solution, *knowledge, inlier, used, reason, off, allowed, odd)
-
-    def _no_fit(self, observations: Observations, start: Array) -> Fit:
-        count, cameras = len(observations), len(self.rig)
-        nothing = PoseFit(start, np.zeros((6, 6)), np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2, 6)), 1.0)
-        unknown, off = np.full((6, 6), np.inf), np.full(cameras, np.nan)
-        pulls = np.zeros((6, 6)), np.zeros((6, cameras)), np.zeros((6, 2 * cameras))
-        zeros = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(6), 1.0, *pulls
-        none, used = np.zeros(count, bool), np.zeros(cameras, np.int64)
-        reason = f"{count} tracks found, {self.settings.least_tracks} needed"
-        odd = self.health.left_out
-        return Fit(observations.stamp, nothing, unknown, *zeros, none, used, reason, off, off, odd)
 
     def _solve(
         self,
@@ -247,6 +239,7 @@ class Estimator:
         self._accepted, self._first, self._first_bias, self._bends, self._unlearned = 0, None, None, False, None
         self._smoother.reset()
         self._detector, self._warp = MotionDetector(surface_map.points.mean(0)), WarpFilter(surface_map)
+        self._local = LocalMotion()
         self.health.begin()
         self._predictor = Predictor(surface_map.points)
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
@@ -294,30 +287,32 @@ class Estimator:
 
     def accept(self, fit: Fit, observations: Observations) -> SurfacePose:
         """Take a measured fit into the window and give the pose."""
-        assert fit.measured and fit.solution.shared is not None
+        assert fit.measured and fit.solution.shared is not None and self.map is not None
+        sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
         if self._pose is not None:
             sound = self.sound(fit)
             self._unlearned = fit, observations, fit.stamp - self._pose.stamp, sound
             if self._warp is not None and sound and self._smeared(fit) < SHARP:
-                sigma = np.maximum(observations.sigma, self.settings.floor_sigma)
                 self._warp.learn(observations, fit.solution, sigma, fit.twist, self.cameras.delays.sigma)
         self._accepted += 1
         self._detector(fit.stamp, fit.solution.base_from_surface, fit.noise)
         self._heed(fit)
+        self._local(observations, fit, sigma, self.map, self._smeared(fit))
         lasting = fit.lasting + self._calibration(fit)
         seen = Measurement(
             tuple(self.rig.cameras[c].name for c in self.carriers(fit)),
             int(fit.used.sum()),
             position_sigma(fit.covariance + lasting),
             self.health.trouble(fit.stamp),
-            self._caveat,
+            self._local.said or self._caveat,
             0.0 if self._warp is None or self._warp.warp is None else self._warp.warp.deformation,
         )
         state, reason = self._states.measured(fit.stamp, seen)
         pose = self._enter(fit.stamp, fit.solution.base_from_surface, fit.noise, fit.smear, lasting, state, reason)
         assert self._smoother.newest is not None
         averaged = self._smoother.newest.covariance
-        self._given = self._claim.measured(pose, fit, self.cameras, self._first, averaged)
+        given = self._claim.measured(pose, fit, self.cameras, self._first, averaged)
+        self._given = widened(given, self._local.covariance) if self._local.active else given
         return self._given
 
     def _calibration(self, fit: Fit) -> Array:

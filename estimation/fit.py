@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.observations import Observations
 from estimation.pose_solver import PoseFit
 from estimation.se3 import Array
 
@@ -59,3 +60,14 @@ class Fit:
         noise = float((weighted**2).sum((0, 1)) @ self.twist_doubt)
         whole = float(((weighted @ self.twist) ** 2).sum())
         return max(0.0, 1 - noise / whole) if whole > 0 else 0.0
+
+
+def no_fit(seen: Observations, start: Array, cameras: int, reason: str, odd: frozenset[int]) -> Fit:
+    """No measurement of what was `seen` by a rig of so many cameras: the pose stays `start` (4, 4)."""
+    count = len(seen)
+    nothing = PoseFit(start, np.zeros((6, 6)), np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2, 6)), 1.0)
+    unknown, off = np.full((6, 6), np.inf), np.full(cameras, np.nan)
+    pulls = np.zeros((6, 6)), np.zeros((6, cameras)), np.zeros((6, 2 * cameras))
+    zeros = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(6), 1.0, *pulls
+    none, used = np.zeros(count, bool), np.zeros(cameras, np.int64)
+    return Fit(seen.stamp, nothing, unknown, *zeros, none, used, reason, off, off, odd)
