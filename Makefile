@@ -66,6 +66,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "stillbed needs Python 3.11 or newer; try: make PYTHON=python3.12"; exit 1; }
 	@$(call apt,python3-venv,$(PYTHON) -c 'import ensurepip')
+	@echo "installing into .venv what stillbed needs: some minutes, once"
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	@$(call apt,$(APT),$(BIN)/python -c 'import open3d')
