@@ -8,7 +8,7 @@ anew anywhere. All workers must reach sessions and results under the same paths.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ LOCAL = "local"
 PATIENCE = 15  # s for a scheduler to answer
 SPAWN = "distributed.nanny.pre-spawn-environ"
 SETTINGS = {  # of workers here: Dask's own cost a third of the time of work that makes and drops many arrays
+    "distributed.worker.daemon": False,  # a daemon may have no process of its own, and tracking has one
     "distributed.worker.profile.enabled": False,  # a look at all threads each 10 ms
     f"{SPAWN}.MALLOC_TRIM_THRESHOLD_": str(1 << 28),  # bytes; 64 kB go back to the system and are asked for again
     f"{SPAWN}.MALLOC_MMAP_THRESHOLD_": str(1 << 28),  # bytes; else each array of 128 kB is a mapping of its own
@@ -47,22 +48,26 @@ def on_cluster(jobs: Sequence[Job], wishes: Wishes, cluster: Cluster) -> Iterato
             yield _told(own[future.key], future)
 
 
-def local_cluster(workers: int | None) -> Any:
-    """A Dask cluster of this machine's processes, for a `with`; `workers` of them, None for as many as cores.
+@contextmanager
+def local_cluster(workers: int | None) -> Iterator[Any]:
+    """A Dask cluster of this machine's processes; `workers` of them, None for as many as cores.
 
     A thread each: the work holds Python's lock. Nothing outside this machine can reach it.
     """
     made = _library(LOCAL).LocalCluster
     import dask  # is there where distributed is
 
-    with dask.config.set(SETTINGS):
-        return made(
+    with (
+        dask.config.set(SETTINGS),  # for as long as it stands: a worker that is started again is told by them too
+        made(
             n_workers=workers,
             threads_per_worker=1,
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
             silence_logs="CRITICAL",
-        )
+        ) as cluster,
+    ):
+        yield cluster
 
 
 def _library(scheduler: str) -> Any:
