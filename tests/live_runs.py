@@ -65,12 +65,14 @@ class Running:
         cache: Path,
         limits: Callable[[], None] | None = None,
         program: Sequence[str] = ("hardware.cli", "live"),
+        cwd: Path = ROOT,
     ) -> None:
         self.keys, theirs = pty.openpty()
-        environment = os.environ | {"XDG_CACHE_HOME": str(cache), "OPENBLAS_NUM_THREADS": "1"}
+        more = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+        environment = os.environ | {"PYTHONPATH": more, "XDG_CACHE_HOME": str(cache), "OPENBLAS_NUM_THREADS": "1"}
         self.process = subprocess.Popen(
             [sys.executable, "-m", *program, *arguments],
-            cwd=ROOT,
+            cwd=cwd,
             env=environment,
             stdin=theirs,
             stdout=subprocess.DEVNULL,

@@ -13,38 +13,10 @@ import pytest
 from hardware.bench.command import subject_parser
 from hardware.bench.subjects import SUBJECTS
 from hardware.cli import main, parser
+from tests.documents import DOCUMENTS, ROOT, commands, leaf, shown
+from tests.shown_commands import COMPLETED, INSTEAD, MADE, NAMES, NOT_RUN, to_run
 
-ROOT = Path(__file__).parents[1]
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-COMMAND = re.compile(r"`((?:stillbed|make) [^`]+)`|^ {4}((?:stillbed|make) .+)$", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
-SHOWN = re.compile(r"^ {4}(stillbed .+)$", re.MULTILINE)
-
-
-def commands() -> list[tuple[str, str]]:
-    """(document, command) of everything that a reader may copy; comments and explanations are cut off."""
-    found = []
-    for file in DOCUMENTS:
-        for quoted, shown in COMMAND.findall(file.read_text(encoding="utf-8")):
-            text = re.split(r"\s{2,}|\s#", " ".join(quoted.split()) or shown.strip())[0]
-            found.append((file.name, text))
-    return sorted(set(found))
-
-
-def leaf(words: list[str]) -> argparse.ArgumentParser:
-    """The parser of the sub-command that words begin with; a benched subject has its own."""
-    if words[:1] == ["bench"] and len(words) > 1 and words[1] in SUBJECTS:
-        return subject_parser(words[1], SUBJECTS[words[1]])
-    here = parser()
-    for word in words:
-        below = [a for a in here._actions if isinstance(a, argparse._SubParsersAction)]
-        if not below:
-            break
-        assert word in below[0].choices or word.isupper() or word.startswith("-"), f"no sub-command {word}"
-        if word not in below[0].choices:
-            break
-        here = below[0].choices[word]
-    return here
 
 
 def options(text: str) -> Iterator[str]:
@@ -59,10 +31,10 @@ def test_each_command_and_its_options_exist(document: str, text: str) -> None:
 
 def test_each_command_that_is_shown_is_taken_with_its_values() -> None:
     """As it stands there, on a line of its own; the first page's list has placeholders for values."""
-    shown = [text for file in DOCUMENTS[1:] for text in SHOWN.findall(file.read_text(encoding="utf-8"))]
-    assert len(shown) > 30
-    for text in shown:
-        words = shlex.split(text, comments=True)[1:]
+    texts = [text for file in DOCUMENTS[1:] for text in shown(file) if text.startswith("stillbed")]
+    assert len(texts) > 30
+    for text in texts:
+        words = shlex.split(text)[1:]
         if words[0] == "bench" and words[1] in SUBJECTS:
             subject_parser(words[1], SUBJECTS[words[1]]).parse_args(words[2:])
         else:
@@ -85,9 +57,9 @@ def test_each_link_and_each_file_of_ours_leads_somewhere(file: Path) -> None:
 
 
 def test_the_first_page_names_every_command() -> None:
-    shown = "\n".join(SHOWN.findall((ROOT / "README.md").read_text(encoding="utf-8")))
+    listed = "\n".join(shown(ROOT / "README.md"))
     below = next(a for a in parser()._actions if isinstance(a, argparse._SubParsersAction))
-    missing = [name for name in below.choices if f"stillbed {name}" not in shown and name != "bench"]
+    missing = [name for name in below.choices if f"stillbed {name}" not in listed and name != "bench"]
     assert not missing
 
 
@@ -103,6 +75,34 @@ def test_every_page_can_be_found_from_the_first() -> None:
         named = [ROOT / target for target in re.findall(r"\bdocs/\w+\.md\b", text)]
         left += [target.resolve().relative_to(ROOT).as_posix() for target in near + named]
     assert {f"docs/{file.name}" for file in DOCUMENTS[1:]} <= linked
+
+
+def test_each_command_is_run_as_it_stands_or_in_another_way_that_is_told() -> None:
+    """By tests/test_every_command.py: a new one is run as it stands, with values for its placeholders."""
+    texts = {text for _, text in commands()}
+    tables = [NAMES, COMPLETED, INSTEAD, NOT_RUN]
+    told = [text for table in tables for text in table]
+    assert len(told) == len(set(told)) and set(told) <= texts
+    runs = {text: run for text in texts if (run := to_run(text)) is not None}
+    asked = {word for run in runs.values() for word in run.split() if re.fullmatch(r"[A-Z_]+(\.\w+)?", word)}
+    assert not asked, "a placeholder without a value"
+    assert set(MADE) <= set(runs.values())
+    for name in NAMES:
+        assert not leaf(name.split()[1:]).prog.removeprefix(name), name
+        assert any(run.startswith(name + " ") for run in runs.values()) or name == "stillbed train", name
+    for why in NOT_RUN.values():
+        assert all((ROOT / named).is_file() for named in re.findall(r"tests/\w+\.py", why)), why
+
+
+def test_what_is_run_has_values_that_are_taken() -> None:
+    for run in sorted({run for _, text in commands() if (run := to_run(text)) is not None}):
+        words = shlex.split(run)
+        if words[0] != "stillbed" or "--help" in words:
+            continue
+        if words[1] == "bench" and words[2] in SUBJECTS:
+            subject_parser(words[2], SUBJECTS[words[2]]).parse_args(words[3:])
+        else:
+            parser().parse_args(words[1:])
 
 
 QUICK = {  # commands of the documents that need no device and no recording, each with a file that it leaves behind

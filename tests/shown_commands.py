@@ -1,0 +1,194 @@
+"""How each command of the documents is run: as it stands there, in another size, or not, and then why not."""
+
+from __future__ import annotations
+
+import re
+
+VALUES = {  # what a reader puts in; tests/workspace.py makes the files
+    "SESSION_OR_CAMERAS": "waved",
+    "CAMERAS": "live.toml",
+    "SESSION": "sessions/monday",
+    "SCENARIO.toml": "data/scenarios/breathing_calm.toml",
+    "data/scenarios/NAME.toml": "data/scenarios/breathing_calm.toml",
+    "PICTURES": "pictures",
+    "SHEET.jpg": "sheet.jpg",
+    "RIG.toml": "live.toml",
+    "ARM.toml": "arm.toml",
+    "PATH.csv": "path.csv",
+    "B.toml": "board.toml",
+    "X.mcap": "run.mcap",
+    "FOLDER": "sessions/monday",
+    "/dev/ttyUSB0": "./serving",
+    "DEVICE": "./serving",
+    "MASKS": "out/masks",
+    "SCAN": "wound.stl",
+    "FILE": "moved.tum",
+    "OUT": "out/new",
+    "DIR": "sessions",
+    "A": "out/smoothed",
+    "B": "out/calm/session/truth.tum",
+    "P": "contour",
+    "F": "kalibr",
+}
+NAMES = {  # named in passing, without what it needs; each is run as a part of a longer one
+    *("stillbed arm", "stillbed calibrate cameras", "stillbed live", "stillbed plan", "stillbed reach"),
+    *("stillbed replay", "stillbed segment", "stillbed simulate", "stillbed track", "stillbed train"),
+}
+TRACKED = "stillbed track sessions/monday -o out/new --record new.mcap --arm arm.toml --prefilter bilateral --wound"
+COMPLETED = {  # an option named in passing, and a command with it
+    "stillbed replay --resume progress.toml": (
+        "stillbed replay sessions/monday --path path.csv --resume progress.toml -o out/new"
+    ),
+    "stillbed track --arm ARM.toml": TRACKED,
+    "stillbed track --prefilter bilateral": TRACKED,
+    "stillbed track --wound": TRACKED,
+    "stillbed bench SUBJECT": "stillbed bench planner --updates 20",
+    "stillbed calibrate import FILE --format F -o rig.toml": (
+        "stillbed calibrate import camchain.yaml --format kalibr -o rig.toml"
+    ),
+}
+LONG = "takes minutes to hours as it stands"
+STARTED = "a live run takes half a minute to begin"
+LOOP = "stillbed bench loop --scenario breathing_deep -o out/new"
+LIVE = "stillbed bench live --minutes 0.1 --stops 0 --scenario data/live/small.toml"
+KILLED = "stillbed bench live --minutes 0 --stops 0 --kills 1 --seed 21 --scenario data/live/small.toml"
+SIMULATED = "stillbed simulate data/scenarios/breathing_calm.toml -o out/calm"
+CLUSTER = "stillbed smooth sessions/ -o out/all --scheduler local --workers 4"
+PAGE = (
+    "stillbed live monday/session.toml --page-address 0.0.0.0 --page-port 8443 --page-cert page.pem "
+    "--page-key page.key --page-name printer.local"
+)
+MORE = "the same with more said"
+VIRTUAL = "stillbed calibrate arm --virtual --places 5 --swing-s 2 --record try -o arm.toml"
+WAVED = "stillbed calibrate cameras live.toml --board board.toml -o rig.toml --seconds 4 --no-page"
+FAULTS = "stillbed bench faults --count 1 --jobs 2 --log faults.csv -o out/faults"
+OUTAGES = "stillbed bench outages --count 1 --processes 1"
+INSTALLS = "makes an environment and runs what else is tested; that the target can be made is looked at"
+INSTEAD = {  # (what is run in its place, why)
+    "stillbed bench arm-calibration": ("stillbed bench arm-calibration --rendered 0 --runs 1", LONG),
+    "stillbed bench bumps": ("stillbed bench bumps --count 1 --minutes 0.1", LONG),
+    "stillbed bench calibration": ("stillbed bench calibration --instants 8 --runs 1", LONG),
+    "stillbed bench cameras": ("stillbed bench cameras --minutes 0.05", LONG),
+    "stillbed bench estimator": ("stillbed bench estimator --only 'still, clean' --seeds 1 --seconds 0.5", LONG),
+    "stillbed bench estimator --only 'breathing, [cno]*' --maps seen --seeds 2 --seconds 6": (
+        "stillbed bench estimator --only 'breathing, [c]*' --maps seen --seeds 1 --seconds 0.5",
+        LONG,
+    ),
+    "stillbed bench estimator --soak 3 --maps seen": ("stillbed bench estimator --soak 0.001 --maps seen", LONG),
+    "stillbed bench faults": (FAULTS, LONG),
+    "stillbed bench faults --count 10000 --jobs 2 --log faults.csv -o out/faults": (FAULTS, LONG),
+    "stillbed bench faults --count 42 --seed 1": (FAULTS, LONG),
+    "stillbed bench faults --count 98 --seed 1": (FAULTS, LONG),
+    "stillbed bench fill CSV ...": ("stillbed bench fill contour.csv --count 2", LONG),
+    "stillbed bench fuzz --count 1000000": ("stillbed bench fuzz --count 50", LONG),
+    "stillbed bench fuzz --count 20000": ("stillbed bench fuzz --count 50", LONG),
+    "stillbed bench latency": ("stillbed bench latency sessions/monday", LONG),
+    "stillbed bench link --hours 24 --commands 0": ("stillbed bench link --hours 0.005 --commands 0", LONG),
+    "stillbed bench link --only guard --commands 1000000": ("stillbed bench link --only guard --commands 300", LONG),
+    "stillbed bench live": (LIVE, STARTED),
+    "stillbed bench live --minutes 0 --stops 0 --kills 6 --seed 21": (KILLED, STARTED),
+    "stillbed bench live --minutes 0 --stops 0 --kills 6 --seed 21 --scenario data/live/small.toml": (KILLED, STARTED),
+    "stillbed bench live --minutes 1 --stops 6": (LIVE, STARTED),
+    "stillbed bench loop": (LOOP, LONG),
+    "stillbed bench loop -o OUT": (LOOP, LONG),
+    "stillbed bench map": ("stillbed bench map --seconds 0.5", LONG),
+    "stillbed bench outages": (OUTAGES, LONG),
+    "stillbed bench outages --count 1000 --seed 1": (OUTAGES, LONG),
+    "stillbed bench planner --updates 40000 --seed 1": ("stillbed bench planner --updates 40 --seed 1", LONG),
+    "stillbed bench prediction --traces DIR": ("stillbed bench prediction --traces traces --warm-up 5", LONG),
+    "stillbed bench registration": ("stillbed bench registration --seeds 1", LONG),
+    "stillbed bench segmentation DATASET": ("stillbed bench segmentation dataset --rendered 1", "has a small one"),
+    "stillbed bench smoothing --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios still hand "
+    "breathing_calm breathing_deep turns steps_300um camera_lost --rendered 6": (
+        "stillbed bench smoothing --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios --rendered 6",
+        LONG,
+    ),
+    "stillbed bench smoothing --movements still breathing steps sway --seeds 4 --seconds 4 --sessions 0 "
+    "--minutes 1 3": (
+        "stillbed bench smoothing --movements still --seeds 1 --seconds 1 --sessions 0 --minutes --landmarks "
+        "--adjusted 0 --scenarios",
+        LONG,
+    ),
+    "stillbed bench steps": ("stillbed bench steps --steps 4 --hours 0.005", LONG),
+    "stillbed bench thesis": ("stillbed bench thesis sessions/monday", LONG),
+    "stillbed bench thesis [SESSION...]": ("stillbed bench thesis sessions/monday", LONG),
+    "stillbed bench views --seconds 5": ("stillbed bench views --seconds 0.5", LONG),
+    "stillbed calibrate arm --virtual --record try -o arm.toml": (VIRTUAL, LONG),
+    "stillbed calibrate cameras SESSION --board board.toml -o rig.toml": (
+        "stillbed calibrate cameras waved --board board.toml -o rig.toml",
+        "a session in which a board is waved",
+    ),
+    "stillbed calibrate cameras CAMERAS... --board board.toml -o rig.toml": (WAVED, "nobody waves as long as it asks"),
+    "stillbed cameras rtsp://192.168.0.20/stream": ("stillbed cameras http://CAMERA", "a camera that sends pictures"),
+    "stillbed cameras usb:A1B2C3D4 --seconds 10 --json": (
+        "stillbed cameras http://CAMERA --seconds 1 --json",
+        "a camera that is not plugged in",
+    ),
+    "stillbed live --rig rig.toml --path path.csv --profile arm.toml --arm /dev/ttyUSB0 --record run.mcap": (
+        "stillbed live --rig sessions/monday --path path.csv --arm virtual --record run.mcap",
+        "cameras that see the arm's surface",
+    ),
+    "stillbed live session.toml": (PAGE, "the same in a folder, with more said"),
+    "stillbed live monday/session.toml": (PAGE, MORE),
+    "stillbed live --simulated data/scenarios/breathing_calm.toml --record run.mcap --yes": (
+        "stillbed live --simulated data/scenarios/breathing_calm.toml --record out/run.mcap",
+        "the same with an operator who says yes",
+    ),
+    "stillbed replay SESSION --path PATH.csv -o OUT": (
+        'stillbed replay sessions/monday --path path.csv -o out/replay --fault "camera1 off at 3s for 1s"',
+        MORE,
+    ),
+    "stillbed replay run.mcap -o OUT": ("stillbed replay run.mcap -o out/replay", "the same to another folder"),
+    "stillbed simulate SCENARIO.toml -o OUT": (SIMULATED, "the same to another folder"),
+    "stillbed simulate data/scenarios/NAME.toml -o OUT": (SIMULATED, "the same to another folder"),
+    "stillbed smooth DIR -o OUT --scheduler local": (CLUSTER, MORE),
+    "stillbed smooth SESSION... -o OUT [--rate HZ]": (
+        "stillbed smooth out/calm/session.mcap -o out/smoothed --rate 1000",
+        "the same of another session",
+    ),
+    "stillbed track SESSION -o OUT": (TRACKED, MORE),
+    "stillbed track SESSION -o OUT [--record X.mcap]": (TRACKED, MORE),
+    "stillbed track SESSION --method thesis -o OUT": (
+        "stillbed track sessions/monday -o out/new --method thesis",
+        "the same in another order",
+    ),
+    "stillbed live --resume out/run.mcap": ("stillbed live --resume run.mcap", "the same outside of a folder"),
+    "stillbed smooth sessions/ -o out/all --scheduler tcp://cluster:8786": (CLUSTER, "a cluster of one's own"),
+    **{
+        f"make {target}": (f"make --dry-run {target}", INSTALLS)
+        for target in ("audit", "bench", "check", "demo", "hazards", "outages", "references", "slow", "test")
+    },
+}
+MOVED = "tests/test_arm_live.py moves a virtual arm before cameras that see its needle, which takes a minute"
+MADE = (  # by these tests/workspace.py makes what the others name
+    "stillbed calibrate export rig.toml --format kalibr -o camchain.yaml",
+    VIRTUAL,
+    SIMULATED,
+    "stillbed smooth out/calm/session.mcap -o out/smoothed --rate 1000",
+)
+TRAINED = "tests/test_training.py trains, where torch is installed"
+NOT_RUN = {  # and why not
+    "pip install -c constraints.txt .": "installs what the tests run with, from a network",
+    "stillbed bench --all": "tests/test_bench_whole.py runs the whole with small parts; all of them take 20 minutes",
+    "stillbed calibrate arm --device /dev/ttyUSB0 --cameras rig.toml --record moved --yes -o arm.toml": MOVED,
+    "stillbed calibrate arm --device /dev/ttyUSB0 --cameras rig.toml --record try --yes -o arm.toml": MOVED,
+    "stillbed calibrate arm --device PORT --cameras rig.toml --record DIR --yes -o arm.toml": MOVED,
+    "stillbed calibrate arm --virtual --terminal --record try -o arm.toml": MOVED,
+    "stillbed train DATASET --network thesis": TRAINED,
+    "stillbed train DATASET -o X.onnx": TRAINED,
+}
+
+
+def filled(text: str) -> str:
+    """A command with a value for each of its placeholders, and with all that may be left out."""
+    words = re.sub(r" or NAMES|\.\.\.|[][]", "", text).split(" ")
+    return " ".join(VALUES.get(word, word) for word in words if word)
+
+
+def to_run(text: str) -> str | None:
+    """What is run for a command of the documents; None where nothing is."""
+    if text in NAMES or text in NOT_RUN:
+        return None
+    if text in COMPLETED:
+        return COMPLETED[text]
+    return INSTEAD[text][0] if text in INSTEAD else filled(text)
