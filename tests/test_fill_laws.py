@@ -20,7 +20,7 @@ from planning.fill.fill import fill
 from planning.fill.order import ordered
 from planning.fill.pace import SHARP, Pace, hops, spent, turning
 from planning.fill.pattern import KINDS, Kind, Pattern
-from planning.fill.region import Region, around, region_of, roughness
+from planning.fill.region import GRID, Region, around, joined, region_of, roughness
 
 PACE = Pace()
 WOUNDS = st.integers(0, 10**6).map(lambda seed: random_wound(np.random.default_rng(seed))[1])
@@ -193,3 +193,24 @@ def test_a_closed_bead_begins_anywhere_without_changing() -> None:
 def test_a_pattern_that_cannot_be_laid_is_refused(name: str, value: object) -> None:
     with pytest.raises(InputError, match=name):
         Pattern(**{name: value})  # type: ignore[arg-type]
+
+
+BOXES = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.1, 4), st.floats(0.1, 4))
+
+
+@given(st.lists(BOXES, min_size=1, max_size=8))
+def test_where_exact_arithmetic_finds_no_union_a_grid_does(
+    corners: list[tuple[float, float, float, float]],
+) -> None:
+    shapes = [box(x, y, x + wide, y + high) for x, y, wide, high in corners]
+    exact, union = joined(shapes).area, shapely.union_all
+
+    def finds_none(found: list[Region], grid_size: float | None = None) -> Region:
+        if grid_size is None:
+            raise shapely.GEOSException("TopologyException: Ring edge missing")
+        return union(found, grid_size=grid_size)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shapely, "union_all", finds_none)
+        edges = sum(shape.length for shape in shapes)
+        assert abs(joined(shapes).area - exact) <= edges * GRID

@@ -20,6 +20,7 @@ from hardware.bookmark_file import keep_bookmark
 from hardware.calibration.board_file import write_board
 from hardware.cli import main
 from hardware.clock import WallClock
+from hardware.live.prerender import prerender
 from hardware.path_file import read_path
 from hardware.rig_file import ImageSource, write_rig
 from planning.progress import fingerprint
@@ -126,7 +127,9 @@ def simulated(folder: Path) -> None:
 def interrupted(folder: Path) -> None:
     """run.mcap, of a live run that was interrupted while it printed."""
     words = ("--simulated", "data/scenarios/breathing_calm.toml", "--record", "run.mcap", "--yes", "--no-page")
-    live = Running(*words, cache=folder.parent / "cache", cwd=folder)
+    cache = folder.parent / "cache"
+    prerender(folder / words[1], cache / "stillbed", threads=1)
+    live = Running(*words, cache=cache, cwd=folder)
     try:
         live.wait_for(r"\nprint\n")
         CLOCK.wait_until(CLOCK.now() + PRINTED)

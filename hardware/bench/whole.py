@@ -38,9 +38,9 @@ class Part:
     name: str = ""
 
 
-ONE_WORLD = "--maps", "seen", "--seeds", "1"
+WORLDS = "--maps", "seen", "--only"  # of several seeds: the frame's own error is one draw for a whole world
 PARTS = (
-    Part("estimator", (*ONE_WORLD, "--seconds", "6"), (*ONE_WORLD, "--seconds", "3", "--only", "breathing, c*")),
+    Part("estimator", (*WORLDS, "breathing, [cno]*", "--seeds", "6", "--seconds", "4"), (*WORLDS, "breathing, clean")),
     Part("consistency", ("--scenes", "1")),
     Part("estimator", ("--maps", "seen", "--soak", "0.05"), name="memory"),
     Part("prediction", (), ("--seconds", "90")),

@@ -13,7 +13,7 @@ from shapely.geometry.base import BaseGeometry
 
 from estimation.se3 import Array
 from planning.fill.bead import Bead
-from planning.fill.region import Region, minus, only_areas
+from planning.fill.region import Region, joined, minus, only_areas
 
 PIECE = 32  # steps buffered at once: of a long spiral, which touches itself all along, GEOS makes invalid areas
 
@@ -44,7 +44,7 @@ def coverage(beads: Sequence[Bead], region: Region) -> Coverage:
 
 def covered_by(beads: Sequence[Bead], arc: int = 16) -> BaseGeometry:
     """The area that beads cover. arc: edges that each quarter of a disc is drawn with."""
-    return shapely.union_all([shape for bead in beads for shape in _shapes(bead, arc)])
+    return joined([shape for bead in beads for shape in _shapes(bead, arc)])
 
 
 def _shapes(bead: Bead, arc: int) -> list[BaseGeometry]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -72,3 +73,11 @@ def minus(a: BaseGeometry, b: BaseGeometry) -> BaseGeometry:
         return shapely.difference(a, b)
     except shapely.GEOSException:
         return shapely.difference(shapely.buffer(a, 0), shapely.buffer(b, 0), grid_size=GRID)
+
+
+def joined(shapes: Sequence[BaseGeometry]) -> BaseGeometry:
+    """What lies in any of the shapes, also where exact arithmetic finds no answer."""
+    try:
+        return shapely.union_all(shapes)
+    except shapely.GEOSException:
+        return shapely.union_all(shapely.buffer(shapes, 0), grid_size=GRID)

@@ -21,7 +21,7 @@ from planning.fill.bead import Bead, even
 from planning.fill.corners import widened
 from planning.fill.coverage import covered_by
 from planning.fill.fit import Fit
-from planning.fill.region import Region, minus, points_of
+from planning.fill.region import Region, joined, minus, points_of
 from planning.fill.strokes import strokes
 
 SAMPLED = 0.25  # spacings from point to point of the boundary whose medial axis is sought
@@ -96,7 +96,7 @@ def _middle(left: Region, single: list[Bead], fit: Fit, radius: float) -> Region
         rest = shapely.get_parts(minus(middle, wide))
         lines = shapely.multilinestrings([shapely.linestrings(bead.points) for bead in single])
         shapely.prepare(lines)
-        middle = minus(middle, shapely.union_all(rest[shapely.intersects(lines, rest)]))
+        middle = minus(middle, joined(rest[shapely.intersects(lines, rest)]))
         middle = shapely.buffer(shapely.buffer(middle, -radius, quad_segs=4), radius, quad_segs=4)
     parts = shapely.get_parts(middle)
     return shapely.multipolygons(parts[shapely.area(parts) > SLIVER * spacing**2])
