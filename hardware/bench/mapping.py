@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
@@ -28,6 +29,7 @@ from perception.frames import Frame, FrameSet
 from perception.tracking import TrackingStep
 
 RATE = 10.0  # frame sets a second: key frames are further apart
+LEAST = 1.0  # s: the first pose is given out after half of it
 COVERED = 1.0, 5.0  # s: from when to when all cameras but one are covered,
 GREY = 90, 110  # by what shows these grey levels at random
 DISTANCE, FOCAL = 400.0, 1100.0  # mm, px: of the cameras before the still standing surfaces
@@ -52,7 +54,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> list[Figure]:
     """Maps of a cylinder, a forearm and a chest while they breathe; a surface that passes by; one that turns."""
-    stamps = np.arange(max(3, round(options.seconds * RATE))) / RATE
+    if not options.seconds >= LEAST:
+        raise InputError("command line", "--seconds", options.seconds, f">= {LEAST:g}")
+    stamps = np.arange(round(options.seconds * RATE)) / RATE
     plain = with_wound(cylinder((80.0, 60.0), 70.0), Wound((70.0, 54.0)), 1)
     shapes = {"cylinder": plain, "forearm": shape_of("forearm", 1), "chest": shape_of("chest", 1)}
     figures = [f for name, shape in shapes.items() for f in _map_errors(name, shape, stamps)]
