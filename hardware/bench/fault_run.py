@@ -141,7 +141,7 @@ class FaultRun:
         self._hangs = struck(faults, Part.MOTION)
         self._pose: SurfacePose | None = None
         self._asked, self._stands = -np.inf, False
-        self._judge, self._before = AxesJudge(home, self._profile.limits, self._profile.tick), -np.inf
+        self._judge, self._sent = AxesJudge(home, self._profile.limits, self._profile.tick), -np.inf
         self._ran = Ran()
 
     def __call__(self) -> Ran:
@@ -207,17 +207,14 @@ class FaultRun:
         if status.state is ArmState.STOPPED and (not ran.stopped or now_stopped(ran, tick.stamp)):
             ran.stopped.append(tick.stamp)
         self._ledger.write(tick.command, self._motion.progress)
-        if tick.stamp - self._before > 1.5 * self._profile.tick or self._arm.travels:
-            self._judge.rest()
-        self._before = tick.stamp
+        if tick.stamp - self._sent > 1.5 * self._profile.tick or self._arm.travels:
+            self._judge.rest()  # a tick that sends nothing, just after one that did, is no rest yet
         if tick.recalled is not None:
             self._judge.stands(tick.recalled.stands)
-        if isinstance(tick.command, Move):
-            self._judge(tick.command.axes)
-        elif tick.frame:
-            self._judge(None)
-        else:
-            self._judge.rest()
+        axes = tick.command.axes if isinstance(tick.command, Move) else None
+        if axes is not None or tick.frame:
+            self._judge(axes)
+            self._sent = tick.stamp
         own = self._arm.travels or said == RECALLED
         seen = -np.inf if pose is None else pose.stamp
         ran.words.append(Word(tick.stamp, said, isinstance(tick.command, Move), own, seen))
