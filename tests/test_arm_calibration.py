@@ -98,6 +98,7 @@ def test_errors_are_as_large_as_is_claimed_and_blunders_are_left_out() -> None:
     assert 0.5 < np.mean(squares) < 1.7  # 99.8 % of chi^2 with 44
 
 
+@pytest.mark.slow
 def test_what_is_off_alike_at_a_place_is_in_the_doubt() -> None:
     plain, wide = [], []
     for seed in range(2):

@@ -161,6 +161,7 @@ def _boards(views: Views, truth: Truth) -> Array:
     return np.asarray(truth.base_from_camera[views.camera[first]] @ poses[first])
 
 
+@pytest.mark.slow
 def test_pictures_that_are_late_each_for_itself_are_noticed_and_forgiven() -> None:
     views, truth = waved(np.random.default_rng(3), jitter=0.006)
     found = calibrate(views)

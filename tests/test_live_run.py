@@ -18,6 +18,7 @@ from hardware.path_file import read_path
 from hardware.session import open_session
 from tests.light_live import prepare_files
 from tests.live_runs import CLOCK, Running, closed, messages, printed_once, rests, summary
+from tests.slowly import slowly
 from tests.test_arm_port import serving
 
 Start = Callable[..., Running]
@@ -106,7 +107,7 @@ def test_stopped_paused_home_and_without_its_page_it_goes_on_until_ctrl_c_and_an
         assert np.mean([move in wire for move in moves]) > 0.95
 
 
-@pytest.mark.parametrize("name", ["motion", "tracking", "recorder"])
+@pytest.mark.parametrize("name", ["motion", "tracking", *slowly("recorder")])
 def test_a_process_that_is_killed_is_noticed_the_arm_rests_and_the_place_is_kept(
     name: str, start: Start, tmp_path: Path
 ) -> None:
@@ -135,6 +136,7 @@ def test_the_conducting_process_killed_leaves_an_arm_at_rest_and_a_whole_recordi
     assert kept(record, tmp_path / "path.csv") == pytest.approx(last_place(record), abs=0.2)
 
 
+@pytest.mark.slow  # the bench of the link and test_arm_port_faults unplug it too
 def test_an_arm_that_is_unplugged_is_waited_for_and_goes_on_from_home(start: Start, tmp_path: Path) -> None:
     record, link = tmp_path / "run.mcap", tmp_path / "arm"
     with serving(link):

@@ -198,6 +198,7 @@ def test_landmarks_are_put_where_their_rays_meet_the_scan() -> None:
         assert np.abs(before - after).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_what_the_scan_tells_of_landmarks_is_sharp_across_it_and_shared_in_its_place() -> None:
     found = place("wound")
     there = in_frame(first("wound"), found.base_from_surface)

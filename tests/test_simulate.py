@@ -99,6 +99,7 @@ def test_with_pictures_too_an_offset_planted_in_the_rig_comes_out_as_that_offset
 # -- what others read
 
 
+@pytest.mark.slow  # the process replay holds the like
 def test_the_session_tracks_to_the_very_poses_of_the_run(recorded: Path, tmp_path: Path) -> None:
     tool = read_arm(recorded / "one" / "arm.toml").tool
     for kind in ("session", "session.mcap"):

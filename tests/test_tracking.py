@@ -167,6 +167,7 @@ def test_a_camera_that_goes_black_is_done_without(sets: list[FrameSet]) -> None:
     assert states(poses[7:]) == {TrackState.DEGRADED} and all("cam_1" in p.reason for p in poses[7:])
 
 
+@pytest.mark.slow  # test_alone follows by one camera
 def test_one_camera_left_is_said_to_be_one(sets: list[FrameSet]) -> None:
     poses = run([change(s, lambda c, i: i if c == 0 else None) if 6 <= k < 16 else s for k, s in enumerate(sets[:21])])
     for p in poses[6:16]:
@@ -352,6 +353,7 @@ def test_a_camera_that_runs_late_makes_the_claim_wider_not_wrong() -> None:
     assert np.mean(errors(poses, swinging)[8:] < 3 * np.array(sigma)) > 0.9
 
 
+@pytest.mark.slow
 def test_brightness_may_change_from_set_to_set(sets: list[FrameSet]) -> None:
     draw = np.random.default_rng(3)
 
