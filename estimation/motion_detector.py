@@ -154,10 +154,13 @@ class MotionDetector:
         return None
 
     def _onset(self, since: Array, moved: Array, kind: int) -> float:
-        """Stamp of the first pose of the movement: from it on all have gone a quarter of the way."""
+        """Stamp of the first pose of the movement: from it on all have gone a quarter of the way.
+
+        That of the newest pose where that one is nearly back.
+        """
         along = (self._states.newest(HISTORY)[:, kind] - since[kind]) @ moved[kind] / (moved[kind] @ moved[kind])
         before = np.flatnonzero(along < 0.25)
-        return self._stamps[int(before[-1]) + 1 if len(before) else 0]
+        return self._stamps[min(int(before[-1]) + 1, len(along) - 1) if len(before) else 0]
 
     def _tell(self, moving: bool, onset: float) -> None:
         since = np.zeros((2, 3)) if self._rest is None else self._rest

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
@@ -67,6 +67,16 @@ def test_a_single_wrong_pose_is_no_movement() -> None:
     poses = stepped(np.eye(4))
     poses[START] = REST @ se3.make(np.eye(3), [0.0, 0.0, 2.0])
     assert not any(motion.moving for motion in watched(poses, SIGMA)[40:])
+
+
+@settings(max_examples=20, deadline=None)
+@given(first=st.floats(-6.0, 6.0), second=st.floats(-6.0, 6.0))
+@example(first=4.0, second=0.2)  # back at once, but for a little
+def test_whatever_two_poses_do_a_movement_begins_with_one_that_was_seen(first: float, second: float) -> None:
+    poses = stepped(np.eye(4), START + 2)
+    poses[START:] = REST @ se3.make(np.eye(3), np.array([[0.0, 0.0, first], [0.0, 0.0, second]]))
+    for number, motion in enumerate(watched(poses, SIGMA)[40:], 40):
+        assert not motion.moving or 0.0 <= motion.onset <= number / RATE
 
 
 @pytest.mark.parametrize("speed", [0.02, 0.1, 0.3])  # mm/s
