@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.bench import fault_run
+from hardware.bench import fault_run, faults
 from hardware.bench.fault_draw import KINDS, PLACES, SLOT, drawn_faults
 from hardware.bench.fault_judge import WRONG, judged
 from hardware.bench.fault_page import fault_page
 from hardware.bench.fault_run import Ran, Word
-from hardware.bench.faults import append_log, figures, one_run, read_log, run
+from hardware.bench.faults import Row, append_log, figures, one_run, read_log, run
 from hardware.faults import Fault, Kind, Part, Runner, check_faults, fault_from_text
 from hardware.simulator.nozzle_log import NozzleLog
 
@@ -112,3 +115,35 @@ def test_a_run_of_a_scenario_is_judged_kept_and_not_done_again(tmp_path: Path, m
         read_log(log, 1)
     with pytest.raises(InputError, match="--count"):
         run(Namespace(count=0, jobs=1, log=None, out=None, seed=1, scenarios=None))
+
+
+class Here(Executor):
+    """Does what is submitted at once."""
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(function(*arguments, **named))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def test_a_run_that_ends_in_a_traceback_is_counted_and_shown_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def falls(folder: Path, seed: int, number: int) -> list[Row]:
+        if number == 1:
+            raise IndexError("deque index out of range")
+        verdict = judged(ran(said=(4.06, 4.6)), FAULT, 7.0)
+        assert verdict is not None
+        return [Row(seed, number, "still", 0, 1.0, verdict)]
+
+    monkeypatch.setattr(faults, "one_run", falls)
+    monkeypatch.setattr(faults, "ProcessPoolExecutor", lambda jobs, context: Here())
+    options = Namespace(count=3 * PLACES, jobs=1, log=tmp_path / "x.csv", out=None, seed=1, scenarios=None)
+    found = {figure.what: figure for figure in run(options)}
+    assert found["runs that ended in a traceback"].value == 1
+    assert found["runs that ended in a traceback"].verdict == "MISSED"
+    assert "run 1:" in (said := capsys.readouterr().err) and "IndexError: deque index out of range" in said
+    assert sorted(row.run for row in read_log(tmp_path / "x.csv", 1)) == [0, 2]

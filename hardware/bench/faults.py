@@ -9,8 +9,10 @@ from __future__ import annotations
 import argparse
 import csv
 import math
+import sys
+import traceback
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing import get_context
@@ -18,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from estimation.errors import InputError
+from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
 from hardware.bench.fault_draw import PLACES, drawn_faults
 from hardware.bench.fault_judge import Verdict, judged
@@ -71,34 +73,42 @@ def run(options: argparse.Namespace) -> list[Figure]:
             raise InputError("command line", f"--{name}", getattr(options, name), ">= 1")
     folder = options.scenarios or shipped_file("scenarios", f"{SCENARIOS[0]}.toml").parent
     rows = read_log(options.log, options.seed) if options.log is not None and options.log.exists() else []
-    rows += _missing(options, folder, {row.run for row in rows})
+    more, broken = _missing(options, folder, {row.run for row in rows})
+    rows += more
     verdicts = [row.verdict for row in rows]
     print(kinds_text(verdicts) + "\n")
     if options.out is not None:
         page = options.out / "faults.html"
         page.write_text(fault_page(verdicts), encoding="utf-8")
         print(f"picture: {page}\n")
-    return figures(rows)
+    return [*figures(rows), Figure("runs that ended in a traceback", broken, "", at_most(0))]
 
 
-def _missing(options: argparse.Namespace, folder: Path, done: set[int]) -> list[Row]:
-    """What came of the runs that are still to be done."""
+def _missing(options: argparse.Namespace, folder: Path, done: set[int]) -> tuple[list[Row], int]:
+    """What came of the runs that are still to be done, and how many ended in a traceback, which is shown."""
     rows: list[Row] = []
-    jobs = [k for k in range(-(-options.count // PLACES)) if k not in done]
+    broken, jobs = 0, [k for k in range(-(-options.count // PLACES)) if k not in done]
     with (
         Progress("faults", "runs", WallClock().now) as progress,
         ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool,
     ):
-        waiting = [pool.submit(one_run, folder, options.seed, number) for number in jobs]
+        waiting = {pool.submit(one_run, folder, options.seed, number): number for number in jobs}
         try:
             for count, each in enumerate(as_completed(waiting), 1):
-                rows += each.result()
-                if options.log is not None:
-                    append_log(options.log, each.result())
+                try:
+                    found = each.result()
+                except (StillbedError, BrokenExecutor):
+                    raise
+                except Exception:  # what is looked for: the other runs go on
+                    broken, found = broken + 1, []
+                    print(f"run {waiting[each]}:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
+                rows += found
+                if options.log is not None and found:
+                    append_log(options.log, found)
                 progress(count, len(jobs))
         finally:
             pool.shutdown(cancel_futures=True)
-    return rows
+    return rows, broken
 
 
 def one_run(folder: Path, seed: int, number: int) -> list[Row]:
