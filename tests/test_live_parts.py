@@ -254,6 +254,10 @@ def test_where_the_path_lies_is_kept_to_the_last_digit(tmp_path: Path) -> None:
     found = read_found(tmp_path / "x.toml")
     assert (found.surface_from_path == pose).all() and (found.arm_from_base == se3.inverse(pose)).all()
     assert found.until == 1 / 7
+    for name in ("gone.mcap", 800 * "x"):
+        write_found(tmp_path / "y.toml", Found(tmp_path / name, 0.0, pose, pose))
+        with pytest.raises(InputError, match="map"):
+            read_found(tmp_path / "y.toml")
     assert Beside(tmp_path / "run.mcap").next().record == tmp_path / "run-2.mcap"
     assert Beside(tmp_path / "run-2.mcap").next().record == tmp_path / "run-3.mcap"
 

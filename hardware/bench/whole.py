@@ -55,7 +55,7 @@ PARTS = (
     Part("loop", (), ("--scenario", "breathing_deep")),
     Part("outages", ("--count", "22")),
     Part("faults", ("--count", "42"), ("--count", "7")),
-    Part("fuzz", ("--count", "20000"), ("--count", "2000")),
+    Part("fuzz", ("--count", "10000"), ("--count", "2000")),
     Part("registration", ("--seeds", "1")),
     Part("growth", ("--seconds", "2")),
 )  # fmt: skip

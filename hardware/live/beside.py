@@ -103,6 +103,10 @@ def read_found(file: Path) -> Found:
         if not se3.is_transform(np.asarray(pose)):
             raise InputError(file, key, pose.tolist(), "a finite 4x4 rigid motion, mm")
     recording = Path(checks.text(file, "map", table["map"]))
-    if not recording.exists():
+    try:
+        there = recording.exists()
+    except OSError:  # a name that no file can have
+        there = False
+    if not there:
         raise InputError(file, "map", recording, "the recording that shows the surface")
     return Found(recording, checks.number(file, "until_s", table["until_s"]), poses[0], poses[1])
