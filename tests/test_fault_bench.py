@@ -17,9 +17,9 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.bench import fault_run, faults
 from hardware.bench.fault_draw import KINDS, PLACES, SLOT, drawn_faults
-from hardware.bench.fault_judge import WRONG, judged
+from hardware.bench.fault_judge import LATE, SLOW, WRONG, judged
 from hardware.bench.fault_page import fault_page
-from hardware.bench.fault_run import Ran, Word
+from hardware.bench.fault_run import FaultRun, Ran, Word, stage
 from hardware.bench.faults import Row, append_log, figures, one_run, read_log, run
 from hardware.faults import Fault, Kind, Part, Runner, check_faults, fault_from_text
 from hardware.simulator.nozzle_log import NozzleLog
@@ -70,6 +70,9 @@ def test_what_is_said_in_time_and_over_with_its_cause_is_well() -> None:
     assert verdict is not None and not (verdict.silent or verdict.restless or verdict.operator)
     assert verdict.detected == pytest.approx(0.06) and verdict.seen == pytest.approx(0.01)
     assert verdict.recovered == pytest.approx(0.1) and verdict.worst == 0.0
+    silent = replace(ran(), missed=[Word(4.08, "the motion process has said nothing", False, False, 4.08)])
+    hung = judged(silent, replace(FAULT, part=Part.MOTION, kind=Kind.HANG), 7.0)
+    assert hung is not None and hung.seen == hung.detected == pytest.approx(0.08) and not hung.restless
     jumped = judged(ran(said=(4.06, 4.6)), replace(FAULT, part=Part.CLOCK, kind=Kind.JUMP, amount=1.0), 7.0)
     assert jumped is not None and jumped.seen == jumped.detected and np.isnan(jumped.recovered)
 
@@ -80,7 +83,8 @@ def test_an_error_of_which_nobody_says_a_word_is_silent_and_one_that_is_told_is_
     assert silent is not None and silent.silent and np.isnan(silent.detected) and silent.worst == pytest.approx(1.1)
     assert told is not None and not told.silent
     usual = np.where((ROWS > 1.0) & (ROWS < 1.5), WRONG, 0.0) + error
-    assert not judged(ran(usual), FAULT, 7.0).silent
+    as_usual = judged(ran(usual), FAULT, 7.0)
+    assert as_usual is not None and not as_usual.silent
 
 
 def test_an_arm_that_moves_on_while_it_is_held_is_restless() -> None:
@@ -98,6 +102,18 @@ def test_what_never_comes_back_is_told_and_what_struck_no_print_is_left_out() ->
     never = judged(ran(said=(4.1, 8.0)), FAULT, 7.0)
     assert never is not None and never.recovered == np.inf
     assert judged(ran(held=(3.8, 4.2)), FAULT, 7.0) is None
+
+
+def test_a_process_that_hangs_is_told_within_a_tenth_of_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fault_run, "SECONDS", 6.0)
+    faults = [
+        fault_from_text("x", "y", text) for text in ("motion hang at 3.2s for 0.4s", "tracking hang at 4.7s for 0.3s")
+    ]
+    hung = FaultRun(stage(SCENARIOS / "still.toml"), faults, 1)()
+    for fault, until in zip(faults, (4.7, 6.0), strict=True):
+        verdict = judged(hung, fault, until)
+        assert verdict is not None and 0 < verdict.seen == verdict.detected <= LATE
+        assert verdict.recovered <= SLOW and not (verdict.silent or verdict.restless)
 
 
 def test_a_run_of_a_scenario_is_judged_kept_and_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

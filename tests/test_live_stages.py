@@ -208,3 +208,21 @@ def test_a_path_out_of_reach_is_told_and_not_begun() -> None:
         run.look()
     assert "out of reach: checkpoint 0: X" in run.conductor.ended
     assert run.orders == [Order.STOP]
+
+
+@pytest.mark.parametrize("name", ["motion", "tracking"])
+def test_a_process_that_says_nothing_is_missed_after_two_of_its_words_and_back_with_the_next(name: str) -> None:
+    run = Staged().to_print()
+    conductor, seen = run.conductor, run.seen
+    assert seen.tracking is not None and seen.motion is not None and not conductor.missed
+    interval = PROFILE.tick if name == "motion" else 0.033
+    said = run.now
+    for look in range(1, 40):
+        now = said + look * 0.01
+        tracking = replace(seen.tracking, interval=0.033, stamp=said if name == "tracking" else now)
+        tick = replace(seen.motion.tick, stamp=said if name == "motion" else now)
+        conductor(now, Seen(tracking, replace(seen.motion, tick=tick), seen.recorder), [])
+        assert bool(conductor.missed) == (now - said > 2 * interval + 0.01) and name in (conductor.missed or name)
+    assert "0.39 s" in conductor.missed and conductor.stage is Stage.PRINT
+    run.look()
+    assert not conductor.missed

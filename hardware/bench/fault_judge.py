@@ -18,18 +18,20 @@ REST = 0.25  # s from the last move until the arm must rest: what is queued, its
 STILL = 1.0  # mm/s
 HELD = 0.4  # s of a hold that is looked at
 AFTER = 1.2  # s after its beginning that must have been watched
+LATE, SLOW = 0.1, 0.2  # s: targets of detection, and of going on once the cause is gone
 FINAL = (Kind.KILL,)
+SHOWN = (Part.CAMERA, Part.SURFACE)  # by pictures; the stamp of a pose tells nothing of an arm or a process
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """One fault, judged; times in s, NaN where there is nothing to tell.
 
-    detected: from its beginning until the motion knew. seen: until the exposure of the pose that said so, or, where
-    clocks are what is wrong, until the motion knew. worst: mm, the largest error while extruding from then on, 0 where
-    nothing was. silent: too far off while extruding, and nobody said anything. restless: it held, and the arm moved.
-    recovered: from the end of the cause until moves go out and nothing is to be said; inf where that never came.
-    operator: whether an operator was needed.
+    detected: from its beginning until somebody said something: the motion, or the conducting process of one that is
+    silent. seen: of what pictures show, until the exposure of the pose that said so; of all else, detected. worst: mm,
+    the largest error while extruding from then on, 0 where nothing was. silent: too far off while extruding, and nobody
+    said anything. restless: it held, and the arm moved. recovered: from the end of the cause until moves go out and
+    nothing is to be said; inf where that never came. operator: whether an operator was needed.
     """
 
     fault: Fault
@@ -45,10 +47,11 @@ class Verdict:
 def judged(ran: Ran, fault: Fault, until: float) -> Verdict | None:
     """The verdict on one fault of a run, `until`, s, the next one begins; None where nothing was printed before it."""
     assert ran.log is not None
-    log, stamps = ran.log, np.array([word.stamp for word in ran.words])
-    said = np.array([bool(word.said) for word in ran.words])
-    moving = np.array([word.moving for word in ran.words])
-    own = np.array([word.own for word in ran.words])
+    spoken = sorted(ran.words + ran.missed, key=lambda word: word.stamp)
+    log, stamps = ran.log, np.array([word.stamp for word in spoken])
+    said = np.array([bool(word.said) for word in spoken])
+    moving = np.array([word.moving for word in spoken])
+    own = np.array([word.own for word in spoken])
     ready = (stamps >= fault.start - 0.3) & (stamps < fault.start)
     if not ready.any() or not moving[ready].all() or said[ready].any() or ran.ended < fault.start + AFTER:
         return None
@@ -60,7 +63,7 @@ def judged(ran: Ran, fault: Fault, until: float) -> Verdict | None:
     return Verdict(
         fault=fault,
         detected=detected,
-        seen=_seen(ran.words[first[0]].seen, detected, fault) if len(first) else np.nan,
+        seen=_seen(spoken[first[0]].seen, detected, fault) if len(first) else np.nan,
         worst=float(np.nanmax(np.append(error[during], 0.0))),
         silent=_silent(log.stamps, error, during, stamps[words & said], _usual(log.stamps, error)),
         restless=_restless(ran, stamps[words], (moving | own)[words], log.stamps),
@@ -70,8 +73,8 @@ def judged(ran: Ran, fault: Fault, until: float) -> Verdict | None:
 
 
 def _seen(stamp: float, detected: float, fault: Fault) -> float:
-    """From the beginning until the exposure of a pose with this stamp; where stamps are what is wrong, until known."""
-    return detected if fault.part is Part.CLOCK else max(stamp - fault.start, 0.0)
+    """From the beginning until the exposure of a pose with this stamp; of what pictures do not show, until known."""
+    return max(stamp - fault.start, 0.0) if fault.part in SHOWN else detected
 
 
 def _usual(stamps: Array, error: Array) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.bench.fault_judge import WRONG, Verdict
+from hardware.bench.fault_judge import LATE, SLOW, WRONG, Verdict
 from hardware.bench.fault_table import HEADER, rows_by_kind
 from hardware.chart import Plot
 from hardware.faults import SPECS
@@ -18,19 +18,23 @@ JITTER = 0.3  # of a kind's row, so that dots do not hide each other
 
 
 def fault_page(verdicts: Sequence[Verdict]) -> str:
-    """The table, and a dot for each fault: known after, error while extruding, back after."""
+    """The table, and a dot for each fault: said after, error while extruding, back after."""
     silent = sum(v.silent for v in verdicts)
     lead = f"{silent} of {len(verdicts)} faults did harm in silence."
     names = [f"{part} {kind}" for part, kind in SPECS]
     present = [name for name in names if any(_kind(v) == name for v in verdicts)]
     explained = "; ".join(f"{i + 1} {name}" for i, name in enumerate(present))
     table = figures_table(HEADER, rows_by_kind(verdicts), last_total=True)
-    said = "Times in ms, median and largest; worst: the largest error while extruding; said: share that was told."
+    said = (
+        "Times in ms, median first. said %: share that was told; said ms: until the exposure of the pose that said so, "
+        "of what pictures do not show until somebody did; known: until somebody did; worst: the largest error while "
+        "extruding; back: until moves went out again; late: those that took more than 200 ms."
+    )
     body = [section("What came of each kind", said, table)]
     for title, field, unit, level in (
-        ("Known to the motion after", "detected", "s", 0.1),
+        ("Said after", "seen", "s", LATE),
         ("Largest error while extruding", "worst", "mm", WRONG),
-        ("Going on again after its end", "recovered", "s", 0.2),
+        ("Going on again after its end", "recovered", "s", SLOW),
     ):
         values = np.array([getattr(v, field) for v in verdicts])
         plot = _dots(verdicts, present, values, f"{title.lower()}, {unit}", level)

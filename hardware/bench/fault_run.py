@@ -23,6 +23,7 @@ from hardware.bench.axes_judge import AxesJudge
 from hardware.clock import SimClock
 from hardware.faults import Fault, Kind, Part, struck
 from hardware.link_settings import LinkSettings
+from hardware.live.silence import silence
 from hardware.motion import MotionStep
 from hardware.motion_loop import MotionLoop, Order, Tick
 from hardware.path_file import read_path
@@ -51,6 +52,7 @@ from planning.path import Path
 from planning.progress import Phase
 
 LOOK = 0.005  # s between looks at the line
+CONDUCTED = 0.02  # s between looks of whoever conducts the run
 ABOVE = 3.0  # mm over its first checkpoint, where the nozzle begins
 WATCHED = 1.5  # s that the rest of the world goes on without the motion
 AGAIN = 0.3  # s between an operator's words
@@ -86,7 +88,8 @@ class Word:
     """What was known at one instant, s.
 
     said: a reservation, a hold's reason, or why the arm does not move; "" if all is well. moving: whether a move was
-    sent. own: whether the link moves the arm by itself. seen: stamp of the newest pose, s, -inf before any.
+    sent. own: whether the link moves the arm by itself. seen: stamp of the newest pose, s, -inf before any; of what no
+    pose told, stamp.
     """
 
     stamp: float
@@ -100,10 +103,12 @@ class Word:
 class Ran:
     """One run. words: a tick each. log: of nozzle and target. over: ticks of commands beyond a limit. ended: s.
 
-    stopped: instants, s, at which the arm was stopped and an operator was needed.
+    missed: what the conducting process said of one that was silent. stopped: instants, s, at which the arm was stopped
+    and an operator was needed.
     """
 
     words: list[Word] = field(default_factory=list)
+    missed: list[Word] = field(default_factory=list)
     log: NozzleLog | None = None
     over: int = 0
     ended: float = 0.0
@@ -141,6 +146,9 @@ class FaultRun:
         self._hangs = struck(faults, Part.MOTION)
         self._pose: SurfacePose | None = None
         self._asked, self._stands = -np.inf, False
+        self._interval = scenario.cameras.period
+        self._ticked = self._heard = np.inf  # when motion and tracking last said something, s
+        self._looks = 0.0  # when the conducting process looks next, s
         self._judge, self._sent = AxesJudge(home, self._profile.limits, self._profile.tick), -np.inf
         self._ran = Ran()
 
@@ -178,9 +186,22 @@ class FaultRun:
             raise _KilledError
 
     def _advance(self, instant: float) -> None:
+        while self._looks <= instant:
+            self._pass(self._looks)
+            self._conduct(self._looks)
+            self._looks += CONDUCTED
+        self._pass(instant)
+
+    def _pass(self, instant: float) -> None:
         for _ in self._agenda.run(lambda: instant):
             pass
         self._clock.wait_until(instant)
+
+    def _conduct(self, now: float) -> None:
+        """What a live run's conducting process sees of the others, and says."""
+        motion = silence("motion", self._ticked, self._profile.tick, now)
+        if said := motion or silence("tracking", self._heard, self._interval, now):
+            self._ran.missed.append(Word(now, said, False, False, now))
 
     # -- what the motion is given, and what becomes of it
 
@@ -188,7 +209,7 @@ class FaultRun:
         return self._pose
 
     def _know(self, pose: SurfacePose, frames: FrameSet, seen: object) -> None:
-        self._pose = pose
+        self._pose, self._heard = pose, self._clock.now()
 
     def _orders(self) -> list[Order]:
         """An operator's: the arm stands at home, is armed once there is a pose, and again where it was stopped."""
@@ -203,6 +224,7 @@ class FaultRun:
 
     def _tell(self, tick: Tick) -> None:
         ran, pose, status = self._ran, self._pose, tick.status
+        self._ticked = self._clock.now()
         said = tick.command.reason or reservation(pose)
         if status.state is ArmState.STOPPED and (not ran.stopped or now_stopped(ran, tick.stamp)):
             ran.stopped.append(tick.stamp)

@@ -7,14 +7,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.bench.fault_judge import Verdict
+from hardware.bench.fault_judge import SLOW, Verdict
 from hardware.faults import SPECS
 
-HEADER = ("fault", "count", "silent", "said", "known ms", "max", "worst mm", "restless", "back ms", "max", "operator")
+HEADER = (
+    *("fault", "count", "silent", "said %", "said ms", "99 %", "known ms", "99 %", "worst mm", "restless"),
+    *("back ms", "max", "late", "operator"),
+)
 
 
 def kinds_text(verdicts: Sequence[Verdict]) -> str:
-    """A line for each kind and one for all; times are median and largest, in ms, `inf` for what never came."""
+    """A line for each kind and one for all; times are in ms, medians first, `inf` for what never came.
+
+    said, known: as `Verdict.seen` and `Verdict.detected`. late: how many came back after more than `SLOW`.
+    """
     rows = [HEADER, *rows_by_kind(verdicts)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(HEADER))]
     return "\n".join(
@@ -33,20 +39,28 @@ def rows_by_kind(verdicts: Sequence[Verdict]) -> list[tuple[str, ...]]:
 
 
 def _row(name: str, verdicts: Sequence[Verdict]) -> tuple[str, ...]:
-    detected, back = (np.array([getattr(v, field) for v in verdicts]) for field in ("detected", "recovered"))
+    seen, detected, back = (_known(verdicts, field) for field in ("seen", "detected", "recovered"))
     return (
         name,
         str(len(verdicts)),
         str(sum(v.silent for v in verdicts)),
-        f"{100 * (~np.isnan(detected)).mean():.0f} %",
-        *_times(detected),
+        f"{100 * len(detected) / len(verdicts):.0f}",
+        *_times(seen, 99),
+        *_times(detected, 99),
         f"{max(v.worst for v in verdicts):.2f}",
         str(sum(v.restless for v in verdicts)),
-        *_times(back),
+        *_times(back, 100),
+        str(int((back > SLOW + 1e-9).sum())),
         str(sum(v.operator for v in verdicts)),
     )
 
 
-def _times(seconds: Array) -> tuple[str, str]:
-    known = seconds[~np.isnan(seconds)]
-    return ("-", "-") if not len(known) else (f"{1000 * np.median(known):.0f}", f"{1000 * known.max():.0f}")
+def _known(verdicts: Sequence[Verdict], field: str) -> Array:
+    values = np.array([getattr(v, field) for v in verdicts], float)
+    return np.asarray(values[~np.isnan(values)])
+
+
+def _times(seconds: Array, share: float) -> tuple[str, str]:
+    if not len(seconds):
+        return "-", "-"
+    return f"{1000 * np.median(seconds):.0f}", f"{1000 * np.percentile(seconds, share, method='higher'):.0f}"

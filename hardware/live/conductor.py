@@ -16,6 +16,7 @@ from hardware.arm_status import ArmState
 from hardware.live import checklist
 from hardware.live.laid import Laid, laid_on, lifted
 from hardware.live.records import Begin, LiveMotionReport, Pace, RecorderReport, TrackingReport
+from hardware.live.silence import silence
 from hardware.live.stages import OFFERS, RUNNING
 from hardware.motion_loop import Order
 from hardware.operator.request import Request, Wish, refusal
@@ -69,7 +70,10 @@ class Seen:
 
 @dataclass(slots=True)
 class Conductor:
-    """Where the run is. turn: counts changes. ended: why it is over, "" while it is not. done: the path is printed."""
+    """Where the run is. turn: counts changes. ended: why it is over, "" while it is not. done: the path is printed.
+
+    missed: which process says nothing while the arm may move, "" while both speak.
+    """
 
     task: Task
     stage: Stage = Stage.CHECK
@@ -77,6 +81,7 @@ class Conductor:
     turn: int = 0
     ended: str = ""
     done: bool = False
+    missed: str = ""
     laid: Laid | None = None
     answer: Answer | None = None
     checks: tuple[Check, ...] = ()
@@ -106,6 +111,7 @@ class Conductor:
         self._check(seen, now)
         if not self.ended:
             orders += self._go_on(seen, now)
+        self.missed = self._missed(seen, now) if self.stage in RUNNING else ""
         return orders
 
     def end(self, reason: str, now: float, stage: Stage = Stage.FAILED) -> Orders:
@@ -167,6 +173,13 @@ class Conductor:
         arm, path = checklist.arm_check(seen.motion, task.stands_home), checklist.path_check(task.path, task.start)
         reach, recorder = checklist.reach_check(self.laid), checklist.recorder_check(seen.recorder)
         self.checks = cameras, calibration, arm, path, reach, recorder
+
+    def _missed(self, seen: Seen, now: float) -> str:
+        motion, tracking = seen.motion, seen.tracking
+        silent = "" if motion is None else silence("motion", motion.tick.stamp, self.task.profile.tick, now)
+        if silent or tracking is None:
+            return silent
+        return silence("tracking", tracking.stamp, tracking.interval, now)
 
     def _go_on(self, seen: Seen, now: float) -> Orders:
         tracking, motion = seen.tracking, seen.motion

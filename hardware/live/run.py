@@ -74,7 +74,7 @@ class LiveRun:
         self._turn = 0  # that was told last
         self._said = self._heard = -1e9
         self._found = prepared.found is not None
-        self._halted = False
+        self._halted = self._missing = False
         self._laid: Laid | None = None  # as the page shows it
         self._landmarks = 0  # of the surface that it shows
         self._used: ArmProfile | None = None  # since the path was begun
@@ -251,6 +251,9 @@ class LiveRun:
 
     def _tell(self, now: float) -> None:
         conductor = self._conductor
+        if conductor.missed and not self._missing:
+            self._lines.outbox.put(EventEntry(now, conductor.missed, WARNING, "run"))
+        self._missing = bool(conductor.missed)
         if conductor.turn != self._turn:
             self._turn = conductor.turn
             if conductor.stage is Stage.PRINT and math.isnan(self._lines.begun.instant):

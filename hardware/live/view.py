@@ -70,7 +70,7 @@ class Viewer:
             turn=conductor.turn,
             stage=conductor.stage,
             question=QUESTIONS.get(conductor.stage, ""),
-            reason=conductor.reason,
+            reason=conductor.missed or conductor.reason,
             offers=conductor.offers,
             checks=conductor.checks,
             tracking=None if tracking is None else _tracking(tracking, now),
@@ -89,7 +89,7 @@ class Viewer:
         known = laid is not None and status.axes is not None
         return MotionView(
             activity=_activity(motion, conductor.stage),
-            reason=command.reason,
+            reason=conductor.missed or command.reason,
             error=tally.last_error,
             limit=profile.limits.pose_error,
             true_error=self._true.last,

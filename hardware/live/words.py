@@ -19,4 +19,6 @@ def status_line(conductor: Conductor, seen: Seen) -> str:
         return f"{conductor.stage.value}: {state}"
     progress, command = seen.motion.progress, seen.motion.tick.command
     held = f", holds: {command.reason}" if command.reason else ""
+    if conductor.missed:
+        held = f", {conductor.missed}"
     return f"{conductor.stage.value}: {progress.fraction:.1f} of {progress.total - 1} checkpoints, {state}{held}"
