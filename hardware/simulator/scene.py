@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -13,18 +14,32 @@ from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST
 from hardware.simulator import paint, sheet
 from hardware.simulator.deformation import Deformation
+from hardware.simulator.field import Field
 from hardware.simulator.hits import Relief, relief_of
 from hardware.simulator.ink import Ink
+from hardware.simulator.layers import Layers
 from hardware.simulator.look import Look
 from hardware.simulator.shape import Shape
+from hardware.simulator.sheet import Sheet
 from hardware.simulator.view import View
 from perception.frames import Roi
 
 STILL = Deformation()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Painted:
+    """What takes a second to make. bare: height in mm of the nodes, (H, W); relief: of these, at rest."""
+
+    bare: Field
+    relief: Relief
+    layers: Layers
+    sheet: Sheet
+    ink: Ink
+
+
 class Scene:
-    """A body before the cameras; same arguments, same pictures.
+    """A body before the cameras; same arguments, same pictures. It is painted when somebody first looks.
 
     base_from_rest: (4, 4) mm, base_from_surface when nothing moves: there the far cloth lies and over it hang lamps.
     Only `ink` changes: pictures rendered after a bead was laid show it.
@@ -40,22 +55,47 @@ class Scene:
     ) -> None:
         self.shape, self.look, self.deformation = shape, look or Look(), deformation
         self.base_from_rest = base_from_rest @ shape.surface_from_grid  # of the grid
-        half = paint.half_opening(shape) if self.look.drape else None
-        rng = np.random.default_rng([seed, 23])
-        self.relief = paint.relief(shape, half)
-        self.layers = paint.paint(shape, self.relief, half, self.look, seed)
-        self.sheet = sheet.bare(self.look, rng) if half is None else sheet.draped(shape, half, self.look, rng)
-        self.ink = Ink(self.layers)
-        self._at_rest = relief_of(self.relief)
+        self._seed = seed
+        self._painted: Painted | None = None
         self._views: dict[Camera, View] = {}
         self._lock = threading.Lock()
 
+    @property
+    def layers(self) -> Layers:
+        """What is painted on the shape."""
+        return self._looked_at().layers
+
+    @property
+    def sheet(self) -> Sheet:
+        """The cloth round it."""
+        return self._looked_at().sheet
+
+    @property
+    def ink(self) -> Ink:
+        """What was printed on it."""
+        return self._looked_at().ink
+
+    def _looked_at(self) -> Painted:
+        with self._lock:
+            if self._painted is None:
+                self._painted = self._paint()
+            return self._painted
+
+    def _paint(self) -> Painted:
+        shape, look, rng = self.shape, self.look, np.random.default_rng([self._seed, 23])
+        half = paint.half_opening(shape) if look.drape else None
+        bare = paint.relief(shape, half)
+        layers = paint.paint(shape, bare, half, look, self._seed)
+        cloth = sheet.bare(look, rng) if half is None else sheet.draped(shape, half, look, rng)
+        return Painted(bare, relief_of(bare), layers, cloth, Ink(layers))
+
     def heights(self, amount: float) -> Relief:
         """Heights on the nodes of material points under `amount` of the deformation, the drape's hem among them."""
+        painted = self._looked_at()
         if not amount * self.deformation.bulge:
-            return self._at_rest
+            return painted.relief
         lift = self.deformation.lift(np.stack(sheet.axes(self.shape.size, self.shape.step), -1), amount)
-        return relief_of(self.relief + lift.astype(np.float32))
+        return relief_of(painted.bare + lift.astype(np.float32))
 
     @property
     def opening(self) -> tuple[float, float]:
