@@ -7,6 +7,9 @@ AUDIT  := .venv/audit
 DEMO   := demo
 APT    := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0
 
+# Bytecode is kept whatever the shell says: the tests start some hundred processes, each of which would compile it all anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test slow bench check format install outages faults fuzz hazards references audit browser
 .DEFAULT_GOAL := test
 
