@@ -224,6 +224,8 @@ def is_transform(matrix: ArrayLike, tolerance: float = 1e-5) -> bool:
     if m.shape != (4, 4) or not np.isfinite(m).all() or np.abs(m[3] - [0, 0, 0, 1]).max() > tolerance:
         return False
     r = m[:3, :3]
+    if np.abs(r).max() > 1 + tolerance:  # its square may be too large to be told
+        return False
     return bool(np.abs(r @ r.T - np.eye(3)).max() < tolerance and np.linalg.det(r) > 0)
 
 

@@ -205,8 +205,9 @@ def _check_matrix(where: object, key: str, matrix: Array, longer_side: float) ->
 def _rigid(where: object, key: str, matrix: Array) -> Array:
     if not se3.is_transform(matrix, ROTATION_TOLERANCE):
         rotation = matrix[:3, :3]
-        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        got = f"R R^T off by {error:.3g}, det {np.linalg.det(rotation):.3g}, last row {matrix[3].tolist()}"
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+            got = f"R R^T off by {error:.3g}, det {np.linalg.det(rotation):.3g}, last row {matrix[3].tolist()}"
         raise InputError(where, key, got, "a rotation (orthonormal, right-handed) and a shift in mm, last row 0 0 0 1")
     return matrix if se3.is_transform(matrix, EXACT_ROTATION) else se3.orthonormalise(matrix)
 
@@ -217,6 +218,9 @@ def _check_scale(where: object, cameras: Sequence[Camera]) -> None:
     One camera alone has no baseline, so its unit cannot be told; nor is one near pair among others refused.
     """
     centres = np.stack([c.base_from_camera[:3, 3] for c in cameras])
+    if (farthest := float(np.abs(centres).max())) > WIDEST_RIG:  # what is larger by far has no square
+        allowed = f"at most {WIDEST_RIG:g} mm along each axis (lengths are in mm)"
+        raise InputError(where, "base_from_camera of all cameras", f"up to {farthest:.4g} mm from the base", allowed)
     spread = float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
     if len(cameras) > 1 and spread < NEAREST_RIG:
         allowed = f"{NEAREST_RIG:g} mm or more between the outermost cameras (lengths are in mm, not m)"

@@ -198,8 +198,10 @@ def test_one_call_serves_any_shape() -> None:
         lambda t: t @ np.diag([1.001, 1, 1, 1]),
         lambda t: t + np.eye(4)[3][:, None] * 1e-3,
         lambda t: t[:3],
+        lambda t: t @ np.diag([1e200, 1, 1, 1]),
     ],
 )
+@pytest.mark.filterwarnings("error")
 def test_what_is_not_a_rigid_motion_is_told(spoil) -> None:  # type: ignore[no-untyped-def]
     t = se3.exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]))
     assert se3.is_transform(t)

@@ -116,14 +116,18 @@ def row(camera: str, frame: int, count: int = 6) -> str:
     return f"{camera},{frame},{stamps(count)[frame]!r}\n"
 
 
-def metres(folder: Path) -> None:
-    """The same rig with every length in metres."""
-    from hardware.rig_file import ImageSource, write_rig
+def scaled(by: float) -> Callable[[Path], None]:
+    """The same rig with every length multiplied."""
 
-    small = rig(2)
-    for c in small.cameras:
-        c.base_from_camera[:3, 3] *= 1e-3
-    write_rig(folder / "rig.toml", small, [ImageSource("video", f"{n}.avi") for n in ("left", "top")])
+    def act(folder: Path) -> None:
+        from hardware.rig_file import ImageSource, write_rig
+
+        other = rig(2)
+        for c in other.cameras:
+            c.base_from_camera[:3, 3] *= by
+        write_rig(folder / "rig.toml", other, [ImageSource("video", f"{n}.avi") for n in ("left", "top")])
+
+    return act
 
 
 def second_scan(folder: Path) -> None:
@@ -190,7 +194,8 @@ FAULTS: list[tuple[str, Callable[[Path], None], str, str, str]] = [
     ("size not whole", swap("rig.toml", "[64, 48]", "[64, 48.5]"), "rig.toml", "camera 'left': size", "48.5"),
     ("size other", swap("rig.toml", "[64, 48]", "[48, 64]"), "left.avi", "size of frame 0", "64 x 48 px"),
     ("distortion of 4", swap("rig.toml", "-0.0002, 0.0]", "-0.0002]"), "rig.toml", "distortion", "5 finite"),
-    ("in metres", metres, "rig.toml", "base_from_camera of all cameras", "mm, not m"),
+    ("in metres", scaled(1e-3), "rig.toml", "base_from_camera of all cameras", "mm, not m"),
+    ("in parsecs", scaled(1e200), "rig.toml", "base_from_camera of all cameras", "along each axis"),
     ("roi camera", swap("roi.toml", '"left"', '"lift"'), "roi.toml", "roi[0].camera", "did you mean 'left'"),
     ("roi frame", swap("roi.toml", "frame = 1", "frame = 6"), "roi.toml", "roi[0].frame", "0..5"),
     ("roi frame text", swap("roi.toml", "frame = 1", 'frame = "1"'), "roi.toml", "roi[0].frame", "whole number"),

@@ -141,7 +141,8 @@ def with_rivals(views: Views, fit: RigFit, free: NDArray[np.bool_], jitter: floa
         change = _change(wider, at, 0.0)
         if change is not None:
             away = change[: len(free)]
-            less = size**2 * (_covariance(wider, at) - fit.covariance)
+            less, known = np.zeros_like(fit.covariance), np.isfinite(fit.covariance)  # of what is not, nothing is less
+            less[known] = size**2 * (_covariance(wider, at)[known] - fit.covariance[known])
             covariance = covariance + rival.chance * (less + np.outer(away, away))
     return replace(fit, covariance=covariance)
 
