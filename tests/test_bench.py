@@ -19,8 +19,9 @@ from hardware.bench.machine import this_machine
 from hardware.bench.subjects import SUBJECTS, Subject
 from hardware.bench.table import table_text
 from hardware.cli import main
+from tests import bench_subject
 
-SUBJECT = {"toy": Subject("tests.bench_subject", "one figure of each kind")}
+SUBJECT = {"toy": Subject("tests.bench_subject", bench_subject.add_options, "one figure of each kind")}
 
 
 def _arguments(*words: str) -> argparse.Namespace:

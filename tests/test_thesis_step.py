@@ -17,6 +17,7 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
+from hardware.bench import options as bench_options
 from hardware.bench import thesis, thesis_scenes
 from hardware.cli import main
 from hardware.methods import METHODS
@@ -245,6 +246,10 @@ def test_the_bench_shows_both_on_the_same_frame_sets(tmp_path: Path) -> None:
     assert ratio.value == pytest.approx(theirs.value / ours.value)
     assert str(ratio.target) == ">= 10"
     assert str(figures["pose after, thesis / ours"].target) == ">= 5"
+
+
+def test_the_recordings_that_can_be_asked_for_are_those_that_can_be_made() -> None:
+    assert tuple(thesis_scenes.MADE) == bench_options.MADE
 
 
 @pytest.mark.parametrize("name", [name for name, (body, _) in thesis_scenes.MADE.items() if body is None])

@@ -13,7 +13,8 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
-from hardware.bench.segmentation import add_options, judged_by, run
+from hardware.bench import options as bench_options
+from hardware.bench.segmentation import judged_by, run
 from hardware.bench.subjects import SUBJECTS
 from hardware.cli import main
 from hardware.simulator.wound_views import WoundView, inside, wound_view
@@ -151,7 +152,7 @@ def test_the_bench_runs_without_data_and_says_what_is_missing(capsys: pytest.Cap
     import argparse
 
     parser = argparse.ArgumentParser()
-    add_options(parser)
+    bench_options.segmentation(parser)
     figures = {figure.what: figure for figure in run(parser.parse_args(["--rendered", "2"]))}
     assert "segmentation" in SUBJECTS
     assert "Dice of each picture, mean" not in figures and "no DATASET is named" in capsys.readouterr().err

@@ -28,13 +28,6 @@ END = 0.3  # mm, radius of the drawn needle's end
 REFERENCE = "none"
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How many arms of each kind."""
-    parser.add_argument("--rendered", type=int, default=1, metavar="N", help="arms before rendered cameras; default 1")
-    parser.add_argument("--runs", type=int, default=50, metavar="N", help="arms on drawn tips; default 50")
-    parser.add_argument("--seed", type=int, default=0, help="of the first arm; default 0")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Errors on rendered pictures, and whether the stated doubts are honest."""
     figures: list[Figure] = []

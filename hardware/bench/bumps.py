@@ -66,13 +66,6 @@ KNOCKS = (
 )
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How many knocks, and how long without any."""
-    parser.add_argument("--count", type=int, default=9, metavar="N", help="of each knock; default 9")
-    parser.add_argument("--minutes", type=float, default=10.0, metavar="M", help="of calm; default 10")
-    parser.add_argument("--seed", type=int, default=0, help="of motions and noise; default 0")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Knocks found, named and how soon; and false alarms of a calm run."""
     figures: list[Figure] = []

@@ -58,14 +58,6 @@ class Sway:
         return np.asarray(turned @ se3.make(np.eye(3), -BOARD.corners.mean(0)))
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How long is waved, and how often without pictures."""
-    parser.add_argument(
-        "--instants", type=int, default=60, metavar="N", help="frame sets that are rendered; default 60"
-    )
-    parser.add_argument("--runs", type=int, default=50, metavar="N", help="runs without pictures; default 50")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Accuracy on rendered pictures, and whether the stated doubts are honest."""
     figures = list(_rendered(options.instants))

@@ -102,12 +102,6 @@ def _judged(frames: Sequence[Shown], sets: Sequence[tuple[float, list[Shown]]], 
     )
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `stillbed bench cameras`."""
-    parser.add_argument("--minutes", type=float, default=10.0, help="of three cameras at 30 fps; default 10")
-    parser.add_argument("--seed", type=int, default=0)
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Pairing under the target's jitter, with the rate told and not, and under a normal one; what a frame costs."""
     rng = np.random.default_rng(options.seed)

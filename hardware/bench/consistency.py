@@ -40,13 +40,6 @@ class Run:
     share: float
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How many scenes, and how long each is looked at."""
-    parser.add_argument("--scenes", type=int, default=2, metavar="N", help="rendered first, some 10 s each; default 2")
-    parser.add_argument("--seed", type=int, default=300, help="of the first scene (default: 300)")
-    parser.add_argument("--seconds", type=float, default=5.0, metavar="S", help="of each scene; default 5")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Figures over all scenes, and each scene's own."""
     seeds = range(options.seed, options.seed + options.scenes)

@@ -6,7 +6,6 @@ import argparse
 import sys
 from collections.abc import Sequence
 from fnmatch import fnmatch
-from typing import get_args
 
 import numpy as np
 
@@ -21,17 +20,6 @@ from hardware.clock import CpuClock
 
 CONSISTENT, INSIDE = Target(0.8, 1.25), Target(0.93, 0.97)
 MAPS: dict[Mapping, str] = {"told": "exact map", "seen": "own map"}
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Which worlds, how long and how many of each."""
-    parser.add_argument("--only", default="*", metavar="PATTERN", help="scenes by name, e.g. 'breathing, c*'")
-    parser.add_argument("--maps", nargs="+", choices=get_args(Mapping), default=get_args(Mapping), help="whose map")
-    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="worlds of each scene")
-    parser.add_argument("--seconds", type=float, metavar="S", help="length of each world; 10 s or more without")
-    parser.add_argument("--count", type=int, default=100, metavar="N", help="landmarks")
-    parser.add_argument("--noise", type=float, default=0.25, metavar="PX", help="white, where a scene has no own")
-    parser.add_argument("--soak", type=float, metavar="HOURS", help="instead: one long run of breathing")
 
 
 def run(options: argparse.Namespace) -> list[Figure]:

@@ -53,19 +53,6 @@ class Row:
     verdict: Verdict
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """The campaign's size."""
-    parser.add_argument("--count", type=int, default=60, help="faults, of all kinds in turn (default: 60)")
-    parser.add_argument("--seed", type=int, default=1, help="of all that chance decides (default: 1)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes that share the runs (default: 1)")
-    parser.add_argument(
-        "--log", type=Path, metavar="X.csv", help="what came of each fault; runs in it are not repeated"
-    )
-    parser.add_argument(
-        "--scenarios", type=Path, metavar="FOLDER", help="where the scenarios are (default: the shipped)"
-    )
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Run the campaign, print what came of each kind, and give the figures of all."""
     for name in ("count", "jobs"):

@@ -17,7 +17,7 @@ from hardware.progress import Progress
 from planning.fill.coverage import Coverage, coverage
 from planning.fill.fill import fill
 from planning.fill.pace import Pace, spent
-from planning.fill.pattern import KINDS, Kind, Pattern
+from planning.fill.pattern import Kind, Pattern
 from planning.fill.region import Region, region_of
 
 TURNED = 0.7  # rad: by which each tenth wound is laid again, at no multiple of anything
@@ -27,17 +27,6 @@ PEERS = {  # what other planners reach at PEER_WIDTH and Pace(): covered %, s
     "crescent": "contour-parallel by shapely 97.32 % in 15.0 s, PrusaSlicer concentric 95.37 % in 15.4 s",
 }
 WANTED = {"blob": (99.4, 47.0), "crescent": (98.5, 15.0)}  # covered %, s
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Which contours and how many wounds."""
-    parser.add_argument("contours", nargs="*", type=Path, metavar="CSV", help="x_mm,y_mm; two own without")
-    parser.add_argument("--kind", choices=KINDS, default="best", help="pattern; default best")
-    parser.add_argument("--contour-width", type=float, default=0.8, metavar="MM", help="bead in contours; default 0.8")
-    parser.add_argument("--width", type=float, default=0.4, metavar="MM", help="bead of the wounds; default 0.4")
-    parser.add_argument("--count", type=int, default=1000, metavar="N", help="random wounds; default 1000")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--picture", type=Path, metavar="SVG", help="also draw all patterns side by side")
 
 
 def run(options: argparse.Namespace) -> list[Figure]:

@@ -46,13 +46,6 @@ class Fuzzed:
     cases: list[bytes] = field(default_factory=list)
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How many inputs, and for whom."""
-    parser.add_argument("--count", type=int, default=20_000, help="inputs, of all readers together (default: 20000)")
-    parser.add_argument("--seed", type=int, default=1, help="of what is made wrong (default: 1)")
-    parser.add_argument("--only", metavar="READER", help="one reader; see the table for their names")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Fuzz the readers, one process each, and say what they did."""
     known = readers()

@@ -41,12 +41,6 @@ class Axis:
     cost: Callable[[float], tuple[float, float]]
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How long, and whether pictures are rendered."""
-    parser.add_argument("--seconds", type=float, default=4.0, metavar="S", help="of each world; default 4")
-    parser.add_argument("--no-pictures", action="store_true", help="leave out resolution, which has to be rendered")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Costs along every axis, and how steeply they grow."""
     axes = [axis for axis in axes_for(options.seconds) if axis.name != "pixels" or not options.no_pictures]

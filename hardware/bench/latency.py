@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 
 import numpy as np
 
 from estimation.pose import TrackState
 from estimation.se3 import Array
 from hardware.bench.figure import Figure, Target, at_most
-from hardware.bench.thesis_scenes import MADE, Shown, made, recorded
+from hardware.bench.thesis_scenes import Shown, made, recorded
 from hardware.clock import ProcessorClock, WallClock
 from hardware.images import decode, encode
 from hardware.tracker import tracker
@@ -25,15 +24,6 @@ TRACKS = ("median", 50, at_most(5)), ("99 %", 99, at_most(10))  # 120 a camera
 ESTIMATION = at_most(4)  # ms, 99 %
 QUALITY = 95  # of JPEG: what is held in memory until it is shown
 WARM = 10  # frame sets after the first map that only fill caches and the window
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Sessions to be shown instead of the made recordings, and how long those are."""
-    parser.add_argument("sessions", nargs="*", type=Path, metavar="SESSION", help="recorded sessions to show instead")
-    parser.add_argument("--seconds", type=float, default=5.0, metavar="S", help="of each made recording; default 5")
-    parser.add_argument(
-        "--scene", nargs="+", choices=tuple(MADE), default=["chest, breathing"], metavar="NAME", help="; ".join(MADE)
-    )
 
 
 def run(options: argparse.Namespace) -> list[Figure]:

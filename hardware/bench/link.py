@@ -22,20 +22,6 @@ KINDS = {
 }
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How long each part runs."""
-    parser.add_argument("--hours", type=float, default=1.0, metavar="H", help="of virtual time; default 1")
-    parser.add_argument("--minutes", type=float, default=0.0, metavar="M", help="of real time on a pty; default none")
-    parser.add_argument("--commands", type=int, default=100_000, metavar="N", help="random ones before the guard")
-    parser.add_argument("--baud", type=int, default=115_200, metavar="B", help="of the line in virtual time")
-    parser.add_argument("--only", choices=("guard",), help="the guard alone")
-    parser.add_argument("--seed", type=int, default=0, help="of the first run")
-    parser.add_argument(
-        "--busy", type=int, default=1, metavar="N", help="processes that saturate a core each; default 1"
-    )
-    parser.add_argument("--ordinary", action="store_true", help="do not ask for real-time priority")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """The figures of all parts that were asked for."""
     figures: list[Figure] = []

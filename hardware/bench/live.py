@@ -30,7 +30,6 @@ from hardware.path_file import read_path, write_path
 from planning.path import Path as Toolpath
 from planning.path import lengths
 
-SCENARIO = Path("data/live/calm.toml")
 STOP_EVERY = 8.0  # s between stops of the run that is stopped again and again
 PIECES = 20000  # of work that the machine is given before a run: ten seconds
 WEIGH_EVERY = 2.0  # s between looks at the memory
@@ -39,16 +38,6 @@ HOMING = "\nhoming\n"  # what a run says once its path is printed
 KILLED = 90.0  # s of a path that is printed by runs which are killed after some seconds each
 STAGES = "frames wait for the tracker", "tracking", "frames handed over to pose"
 STOP = "stop decided to on the wire"
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How long, how many, before what."""
-    parser.add_argument("--minutes", type=float, default=1.0, metavar="M", help="of printing; 0: none; default 1")
-    parser.add_argument("--stops", type=int, default=3, metavar="N", help="in a run of their own; default 3")
-    parser.add_argument("--kills", type=int, default=0, metavar="N", help="of random processes; default none")
-    parser.add_argument("--seed", type=int, default=0, help="of what is killed when")
-    parser.add_argument("--pinned", action="store_true", help="motion and recorder on one core, tracking on the other")
-    parser.add_argument("--scenario", type=Path, default=SCENARIO, metavar="SCENARIO.toml", help="which world")
 
 
 def run(options: argparse.Namespace) -> list[Figure]:

@@ -27,7 +27,6 @@ from hardware.progress import Progress
 from perception.frames import FrameSet
 from perception.shipped import shipped_file
 
-SCENARIOS = ("breathing_calm", "breathing_deep", "breathing_irregular")
 WIDTH, HEIGHT = 900, 150  # px
 LEAST = 0.01  # mm, where the logarithmic axis begins
 P95, LARGEST, DUTY = 0.5, 1.0, 0.8  # mm, mm, part of the time: asked of a live run
@@ -107,13 +106,6 @@ class LoopRun(FaultRun):
 
     def _know(self, pose: SurfacePose, frames: FrameSet, seen: object) -> None:
         super()._know(self._told(pose), frames, seen)
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Which scenarios, and how chance falls."""
-    parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS), choices=SCENARIOS, metavar="NAME", help="of "
-                        f"{', '.join(SCENARIOS)} (default: all)")  # fmt: skip
-    parser.add_argument("--seed", type=int, default=1, help="of the tracks' noise (default: 1)")
 
 
 def run(options: argparse.Namespace) -> list[Figure]:

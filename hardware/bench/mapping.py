@@ -47,11 +47,6 @@ class Ran:
     maps: list[SurfaceMap]
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How long each surface is looked at."""
-    parser.add_argument("--seconds", type=float, default=3.0, metavar="S", help="of each still standing; default 3")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Maps of a cylinder, a forearm and a chest while they breathe; a surface that passes by; one that turns."""
     if not options.seconds >= LEAST:

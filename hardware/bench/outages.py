@@ -25,19 +25,6 @@ REFERENCE = "FoundationPose #136, #103: the target is lost and nothing says so"
 Judged = tuple[Watched, Verdict]
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """The campaign's size."""
-    parser.add_argument("--count", type=_positive, default=66, help="outages, of all kinds in turn (default: 66)")
-    parser.add_argument("--seed", type=int, default=0, help="of scenes, motions and outages (default: 0)")
-    parser.add_argument("--processes", type=_positive, default=2, help="that share the scenes (default: 2)")
-
-
-def _positive(text: str) -> int:
-    if int(text) < 1:
-        raise ValueError(text)
-    return int(text)
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Run the campaign, print what came of each kind, and give the figures of all."""
     jobs = shares(options.count, options.processes, options.seed)

@@ -46,11 +46,6 @@ class Measured:
     double: float
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Which body."""
-    parser.add_argument("--body", choices=("forearm", "chest", "foot"), default="forearm", help="default forearm")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Plans of one wound by pattern and by way of layering."""
     cases = [(pattern, "skin") for pattern in PATTERNS] + [("hybrid", mode) for mode in MODES[1:]]

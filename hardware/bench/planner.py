@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, field, replace
-from pathlib import Path as File
 
 import numpy as np
 
@@ -53,13 +52,6 @@ class Tally:
     errors: list[str] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     timed: list[bool] = field(default_factory=list)
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How many updates, and which."""
-    parser.add_argument("--updates", type=int, default=10_000, metavar="N", help="in all; default 10000")
-    parser.add_argument("--arm", type=File, metavar="ARM.toml", help="instead of the default arm")
-    parser.add_argument("--seed", type=int, default=0, help="of the streams; runs with other seeds may go side by side")
 
 
 def run(options: argparse.Namespace) -> list[Figure]:

@@ -21,6 +21,7 @@ from estimation.predictor import Predictor
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
 from hardware.bench.figure import Figure, Target, at_most
+from hardware.bench.options import BREATHING
 from hardware.bench.plain_ensemble import plain_forecasts
 from hardware.clock import CpuClock
 from hardware.simulator.scenario_file import read_scenario
@@ -35,7 +36,6 @@ COVERED = Target(0.88, 0.92)
 LEAST = 1e-9  # rad^2 and mm^2: what the trace's own pose is claimed to be known to
 SPREAD = 60.0  # mm
 AROUND = SPREAD * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])  # where no markers are told
-SCENARIOS = ("breathing_calm", "breathing_deep", "breathing_irregular")
 RATE, NOISE = 10.0, 0.1  # Hz, and mm: of the recorded chests
 
 
@@ -61,21 +61,12 @@ class Chest:
     points: Array
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Where the traces are, and how much of each is only learned from."""
-    parser.add_argument("--traces", type=Path, metavar="DIR", help="folder of traces: breathing*.tum (default: the "
-                        "simulator's breathing)")  # fmt: skip
-    parser.add_argument("--pattern", default="breathing*.tum", help="names of the traces in it")
-    parser.add_argument("--warm-up", type=float, default=60.0, metavar="S", help="beginning that is not judged")
-    parser.add_argument("--seconds", type=float, default=240.0, metavar="S", help="of the simulator's; default 240")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """All figures over the traces of a folder, or over the simulator's."""
     if options.traces is None:
         if options.seconds < options.warm_up + 2:
             raise InputError("command line", "--seconds", options.seconds, f"at least {options.warm_up + 2:g}")
-        chests = [simulated(name, options.seconds) for name in SCENARIOS]
+        chests = [simulated(name, options.seconds) for name in BREATHING]
         return figures([errors_of(chest, options.warm_up) for chest in chests], SIMULATED)
     files = sorted(options.traces.glob(options.pattern))
     if not files:

@@ -43,11 +43,6 @@ class Case:
     late: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How many different bodies of each kind."""
-    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="bodies of each kind; default 2")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Errors over the wound on bodies that hold a scan, verdicts on those that do not."""
     seeds = range(1, options.seeds + 1)

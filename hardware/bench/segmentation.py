@@ -36,15 +36,6 @@ NO_DATA = "no DATASET is named: figures of real pictures are left out (docs/segm
 PUBLISHED = "thesis U-Net 0.765; FUSeg winner 0.844 public, 0.888 hidden; two people 0.931"
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Where the labelled pictures are, and how many rendered ones are looked at."""
-    parser.add_argument("dataset", type=Path, nargs="?", metavar="DATASET", help="folder with images/ and labels/")
-    parser.add_argument("--model", type=Path, metavar="X.onnx", help="another network than the one that comes along")
-    parser.add_argument("--rendered", type=int, default=60, metavar="N", help="rendered pictures of each kind")
-    parser.add_argument("--sheet", type=Path, metavar="X.jpg", help="also draw best, median and worst, 8 of each")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of pieces, covers and sizes drawn")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """All figures; those of real pictures only where a data set is named."""
     network = WoundNetwork(shipped() if options.model is None else options.model)

@@ -18,11 +18,10 @@ from estimation.synthetic.world import World, synthetic_world
 from hardware.bench.bundle_adjustment import ceres_figures
 from hardware.bench.figure import Figure, Target, at_most
 from hardware.bench.smoothing_many import many_figures
-from hardware.bench.smoothing_rendered import SCENARIOS, rendered_figures
+from hardware.bench.smoothing_rendered import rendered_figures
 from hardware.clock import CpuClock
 from hardware.evaluation import best_constant
 
-MOVEMENTS = ("still", "breathing", "irregular", "steps", "turns", "sway", "lively")
 CONSISTENT = Target(0.8, 1.25)
 NEES_NOTE = "from the first pose on, whose one draw is in all others: many seeds make it sure"
 LATE = (0.016, 0.0, -0.016)  # s
@@ -36,38 +35,6 @@ class Pair:
     smoothed: float
     causal: float
     nees: float
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Which worlds, how many and how long; and the lengths of the runs that are timed."""
-    parser.add_argument(
-        "--movements", nargs="*", choices=MOVEMENTS, default=MOVEMENTS, help="of the worlds; none: no worlds"
-    )
-    parser.add_argument(
-        "--scenarios", nargs="*", choices=SCENARIOS, default=SCENARIOS, help="rendered, tracked and smoothed"
-    )
-    parser.add_argument(
-        "--rendered", type=float, default=8.0, metavar="S", help="of each scenario; kept rendered; default 8"
-    )
-    parser.add_argument("--seeds", type=int, default=4, metavar="N", help="worlds of each movement; default 4")
-    parser.add_argument("--seconds", type=float, default=6.0, metavar="S", help="of each world; default 6")
-    parser.add_argument("--count", type=int, default=100, metavar="N", help="landmarks; default 100")
-    parser.add_argument(
-        "--minutes", type=float, nargs="*", default=[1.0, 3.0, 10.0], metavar="M", help="runs that are timed"
-    )
-    parser.add_argument(
-        "--landmarks", type=int, nargs="*", default=[200, 400], metavar="N", help="of more runs, a minute each"
-    )
-    parser.add_argument(
-        "--adjusted",
-        type=float,
-        default=4.0,
-        metavar="S",
-        help="of the bundle adjustment beside Ceres's; default 4, 0: none",
-    )
-    parser.add_argument(
-        "--sessions", type=int, default=40, metavar="N", help="smoothed by one and by two workers; default 40, 0: none"
-    )
 
 
 def run(options: argparse.Namespace) -> list[Figure]:

@@ -21,11 +21,6 @@ from hardware.smoothing.run import session_hash
 from hardware.smoothing.tracks import Tracks, tracks_of
 from perception.shipped import shipped_file
 
-SCENARIOS = (
-    *("still", "breathing_calm", "breathing_deep", "breathing_irregular", "shaking_table_0_5_hz", "steps_300um"),
-    *("turns", "hand", "camera_lost", "clock_offsets", "wet_glare", "deformation"),
-)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judgement:

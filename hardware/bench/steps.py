@@ -26,14 +26,6 @@ SOON = 2  # frames
 SIZES = np.array([np.deg2rad(0.1), 0.3])  # rad, mm
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How many steps, and how many hours at rest."""
-    parser.add_argument("--steps", type=int, default=2000, help="of each kind (default: %(default)s)")
-    parser.add_argument("--hours", type=float, default=1.0, help="at rest (default: %(default)s)")
-    parser.add_argument("--noise", type=float, default=0.1, help="px of a track in a frame (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0)
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Measure steps, turns and rest."""
     rng = np.random.default_rng(options.seed)

@@ -14,7 +14,7 @@ from hardware.bench.figure import Figure, Target, at_least
 from hardware.bench.thesis_scenes import MADE, Shown, made, recorded
 from hardware.clock import ProcessorClock, WallClock
 from hardware.evaluation import Evaluation, evaluate, spread
-from hardware.methods import MAP, THESIS, THESIS_FLOW, step_by
+from hardware.methods import MAP, step_by
 from hardware.pose_file import PoseWriter, read_poses
 from hardware.summary import measured_share, percent
 from perception.tracking import STAGES
@@ -42,13 +42,6 @@ class Judged:
         """RMSE of the measured poses' rotation from the start; NaN without a truth."""
         comparison = self.run.comparison
         return float("nan") if comparison is None else float(np.degrees(spread(comparison.start.rotation).rmse))
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Sessions to be shown instead of the made recordings, and how long those are."""
-    parser.add_argument("sessions", nargs="*", type=Path, metavar="SESSION", help="recorded sessions to show instead")
-    parser.add_argument("--seconds", type=float, default=4.0, metavar="S", help="of each made recording; default 4")
-    parser.add_argument("--method", choices=(THESIS, THESIS_FLOW), default=THESIS, help="which of the thesis's ways")
 
 
 def run(options: argparse.Namespace) -> list[Figure]:

@@ -24,12 +24,6 @@ from perception.patches import project_squares, pyramid, take_templates
 MINUTE, DRIFT = 60.0, 0.15  # s; of the light, from the first picture to the last
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How long, and how many pictures of it."""
-    parser.add_argument("--minutes", type=float, default=10.0, metavar="M", help="that are stood for; default 10")
-    parser.add_argument("--pictures", type=int, default=240, metavar="N", help="evenly over them; default 240")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """Tracks on a forearm and a chest, one camera, every picture with its own noise and a light that drifts."""
     stamps = np.linspace(0.0, options.minutes * MINUTE, max(4, options.pictures))

@@ -104,11 +104,6 @@ VIEWS = (
 )
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """How long each is looked at."""
-    parser.add_argument("--seconds", type=float, default=8.0, metavar="S", help="of each sequence; default 8")
-
-
 def run(options: argparse.Namespace) -> list[Figure]:
     """All sequences."""
     return [figure for view in VIEWS for figure in _figures(view, options.seconds)]
