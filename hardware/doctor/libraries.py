@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
+from pathlib import Path
 
 from packaging.requirements import Requirement
 
@@ -18,7 +20,16 @@ for name in sys.argv[1:]:
     print({LOADED!r}, name, flush=True)
 """
 REMEDY = "make a new environment and `pip install .` there again, with constraints.txt"
+SLOW_REMEDY = "ask again while less runs on this machine"
 SYSTEM_REMEDY = "sudo apt-get install -y libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0"
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """Why a module did not load. slow: it was still at it when the time was up, which says nothing against it."""
+
+    reason: str
+    slow: bool = False
 
 
 def library_checks(names: list[str] | None = None) -> list[Check]:
@@ -50,34 +61,42 @@ def modules_of(names: list[str]) -> dict[str, str]:
     }
 
 
-def failures(modules: list[str], patience: float = PATIENCE) -> dict[str, str]:
-    """Why modules do not load, by name. What kills or stops the process that loads it is named; the rest is tried.
+def failures(modules: list[str], patience: float = PATIENCE) -> dict[str, Trouble]:
+    """Why modules did not load, by name. What kills or stops the process that loads it is named; the rest is tried.
 
     patience: s for all that one process loads.
     """
-    found: dict[str, str] = {}
+    found: dict[str, Trouble] = {}
     left = list(modules)
     while left:
-        loaded, reason = _tried(left, patience)
+        loaded, trouble = _tried(left, patience)
         left = left[loaded:]
         if left:
-            found[left[0]] = reason
+            found[left[0]] = trouble
             left = left[1:]
     return found
 
 
-def _tried(modules: list[str], patience: float) -> tuple[int, str]:
+def _tried(modules: list[str], patience: float) -> tuple[int, Trouble]:
     """How many of the modules a process loaded before it ended, and why it went no further."""
     command = [sys.executable, "-c", LOADER, *modules]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             told, complaint = process.communicate(timeout=patience)
-            reason = _reason(process.returncode, complaint)
+            trouble = Trouble(_reason(process.returncode, complaint))
         except subprocess.TimeoutExpired:
+            trouble = _unfinished(process.pid, patience)
             process.kill()
             told, _ = process.communicate()
-            reason = f"takes longer than {patience:g} s to load"
-    return sum(line.startswith(LOADED) for line in told.splitlines()), reason
+    return sum(line.startswith(LOADED) for line in told.splitlines()), trouble
+
+
+def _unfinished(process: int, patience: float) -> Trouble:
+    """Of a process that has not ended: slow where it computes, or waits for processor or disk; else it hangs."""
+    state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+    if state in ("R", "D"):
+        return Trouble(f"still loading after {patience:g} s", slow=True)
+    return Trouble(f"hangs: not loaded after {patience:g} s, and waits for something")
 
 
 def _reason(code: int, complaint: str) -> str:
@@ -86,12 +105,14 @@ def _reason(code: int, complaint: str) -> str:
     return (complaint.strip().splitlines() or [f"exit code {code}"])[-1]
 
 
-def _check(name: str, module: str, failed: dict[str, str]) -> Check:
+def _check(name: str, module: str, failed: dict[str, Trouble]) -> Check:
     try:
         have = version(name)
     except PackageNotFoundError:
         return Check(name, Verdict.FAIL, "not installed", REMEDY)
     if module not in failed:
         return Check(name, Verdict.PASS, have)
-    reason = failed[module]
-    return Check(name, Verdict.FAIL, f"{have}: {reason}", SYSTEM_REMEDY if ".so" in reason else REMEDY)
+    trouble = failed[module]
+    if trouble.slow:
+        return Check(name, Verdict.WARN, f"{have}: {trouble.reason}", SLOW_REMEDY)
+    return Check(name, Verdict.FAIL, f"{have}: {trouble.reason}", SYSTEM_REMEDY if ".so" in trouble.reason else REMEDY)
