@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
+from estimation.synthetic.world import synthetic_world
 from hardware.bench.command import add_bench, run_bench, subject_parser
 from hardware.bench.figure import Figure, Target, at_least, at_most
 from hardware.bench.live import growth
 from hardware.bench.machine import this_machine
+from hardware.bench.solve_pnp import best_camera, pnp_pose
 from hardware.bench.subjects import SUBJECTS, Subject
 from hardware.bench.table import table_text
 from hardware.cli import main
@@ -136,3 +138,17 @@ def test_what_grows_is_told_process_by_process() -> None:
     assert grown["run"] == pytest.approx((0.0, 50.0), abs=1e-6)
     assert grown["recorder"] == pytest.approx((36.0, 85.98), abs=1e-6) and grown["map"][1] == 100.0
     assert growth(held[:4]) == {}
+
+
+def test_solve_pnp_finds_exact_tracks_exactly_and_no_pose_of_too_few() -> None:
+    world = synthetic_world("still", seconds=0.1, noise=1e-6, seed=2)
+    place, turn = best_camera([world])
+    assert place < 1e-4 and turn < 1e-4
+    camera = world.rig.cameras[0]
+    assert pnp_pose(camera, world.map.points[:3], np.zeros((3, 2))) is None
+
+
+def test_solve_pnp_by_one_camera_is_off_by_more_than_the_bound_of_all() -> None:
+    world = synthetic_world("breathing", seconds=0.5, outliers=0.1, seed=3)
+    place, turn = best_camera([world])
+    assert 0.02 < place < 1.0 and 0.05 < turn < 3.0

@@ -18,6 +18,7 @@ OWNERS = {  # library: the files that may import it
     "aiohttp": ("hardware/operator/*.py", "hardware/viewing/server.py"),
     "cv2": (
         "perception/*.py",
+        "hardware/bench/solve_pnp.py",  # OpenCV's own pose, to compare with
         "hardware/cameras/capture.py",  # VideoCapture: devices, streams, files
         "hardware/cameras/controls.py",  # its numbers for exposure, gain, focus, white balance
         "hardware/cameras/sheet.py",  # draws the preview

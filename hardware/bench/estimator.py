@@ -16,6 +16,7 @@ from hardware.bench.figure import Figure, Target, at_most
 from hardware.bench.pooled import Pooled, pooled
 from hardware.bench.scenes import SCENES, Scene
 from hardware.bench.soak import soak_figures
+from hardware.bench.solve_pnp import best_camera
 from hardware.clock import CpuClock
 
 CONSISTENT, INSIDE = Target(0.8, 1.25), Target(0.93, 0.97)
@@ -30,11 +31,12 @@ def run(options: argparse.Namespace) -> list[Figure]:
     runs: dict[Mapping, list[Followed]] = {mapping: [] for mapping in options.maps}
     for scene in _asked(options.only):
         worlds = [world_of(scene, seed, options) for seed in range(options.seeds)]
+        beside = best_camera(worlds)
         for mapping in options.maps:
             followed = [follow(world, mapping, CpuClock().now) for world in worlds]
             found = pooled(followed)
             print(f"{scene.name + ', ' + MAPS[mapping]:<48}{found}", file=sys.stderr, flush=True)
-            figures += scene_figures(scene, MAPS[mapping], found)
+            figures += scene_figures(scene, MAPS[mapping], found, beside)
             figures += _offset_figures(scene, MAPS[mapping], followed)
             runs[mapping] += followed
     return figures + [f for mapping in options.maps for f in _work_figures(mapping, runs[mapping])]
@@ -54,13 +56,13 @@ def world_of(scene: Scene, seed: int, options: argparse.Namespace) -> World:
     return synthetic_world(scene.movement, seconds, count=options.count, surface=scene.surface, seed=seed, **conditions)
 
 
-def scene_figures(scene: Scene, of_map: str, found: Pooled) -> list[Figure]:
-    """The figures of one scene with one kind of map."""
+def scene_figures(scene: Scene, of_map: str, found: Pooled, beside: tuple[float, float]) -> list[Figure]:
+    """The figures of one scene with one kind of map. beside: RMSE by solvePnP with the exact one, mm and degrees."""
     name = f"{scene.name}, {of_map}"
     rigid = scene.rigid and scene.error is not None
     near = at_most(1.3) if scene.rigid else None
-    moved = f"bound {found.bound_mm:.4f}, filtered {found.filtered_mm:.4f}"
-    turned = f"bound {found.bound_deg:.4f}, filtered {found.filtered_deg:.4f}"
+    moved = f"bound {found.bound_mm:.4f}, filtered {found.filtered_mm:.4f}, solvePnP {beside[0]:.3f}"
+    turned = f"bound {found.bound_deg:.4f}, filtered {found.filtered_deg:.4f}, solvePnP {beside[1]:.3f}"
     return [
         Figure(f"{name}: error", found.error_mm, "mm", scene.error, moved),
         Figure(f"{name}: turn", found.error_deg, "deg", at_most(0.05) if rigid else None, turned),
