@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,6 +70,10 @@ def test_the_page_counts_colours_and_leads_to_the_pictures(tmp_path: Path) -> No
     page = whole_page(parts, {"<odd>": "why & not"}, {"toy": "toy/toy.html"}, this_machine())
     assert page.count('<td class="met">') == 3 and page.count('<td class="missed">') == 1
     assert 'href="toy/toy.html"' in page and "&lt;odd&gt;" in page and "why &amp; not" in page
+    missed = next(figure.what for figure in FIGURES if figure.verdict == "MISSED")
+    assert f'class="words">{missed}</td>' in page  # in the overview, too
+    for link in re.findall(r'href="#([^"]+)"', page):
+        assert f'id="{link}"' in page
 
 
 def test_a_table_in_markdown_has_a_line_for_each_figure() -> None:

@@ -11,6 +11,7 @@ from hardware.page import document, row_of_tiles, section, tile
 from hardware.summary import figure as digits
 
 Parts = Mapping[str, Sequence[Figure]]  # by the name of the part
+NAMED = 3  # figures of a part that are named where they miss their target; of more, the count is
 HEADER = ("figure", "value", "target", "", "reference", "note")
 
 
@@ -23,9 +24,13 @@ def whole_page(parts: Parts, troubles: Mapping[str, str], pages: Mapping[str, st
         tile(str(plain), "", "figures without a target"),
         tile(str(len(troubles)), "", "parts that could not be measured"),
     ]
-    cards = [section(name, troubles.get(name, ""), _body(name, parts[name], pages)) for name in parts]
+    cards = [_card(name, parts[name], troubles, pages) for name in parts]
     return document(
-        "Bench", "All that is measured", measured_on(machine), [row_of_tiles(tiles), *cards], _made(machine)
+        "Bench",
+        "All that is measured",
+        measured_on(machine),
+        [row_of_tiles(tiles), _overview(parts, troubles), *cards],
+        _made(machine),
     )
 
 
@@ -47,6 +52,32 @@ def _made(machine: Machine) -> str:
     return f"Made by stillbed bench --all with {versions}."
 
 
+def _overview(parts: Parts, troubles: Mapping[str, str]) -> str:
+    """A line for each part: how its figures fare, and which of them miss their target; its name leads to its card."""
+    rows = []
+    for name, figures in parts.items():
+        judged, missed, plain = counted({name: figures})
+        what = [escape(figure.what) for figure in figures if figure.verdict == "MISSED"]
+        told = "; ".join(what[:NAMED]) + (f"; and {len(what) - NAMED} more" if len(what) > NAMED else "")
+        link = f'<td><a href="#{escape(_place(name))}">{escape(name)}</a></td>'
+        alarm = f'<span class="missed">{missed}</span>' if missed else "0"
+        counts = f"<td>{judged - missed}</td><td>{alarm}</td><td>{plain}</td>"
+        rows.append(f'<tr>{link}{counts}<td class="words">{escape(troubles.get(name, "")) or told}</td></tr>')
+    head = '<th>part</th><th>met</th><th>missed</th><th>without a target</th><th class="words">which miss it</th>'
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    return section("Overview", "How many figures of each part meet their target.", table)
+
+
+def _card(name: str, figures: Sequence[Figure], troubles: Mapping[str, str], pages: Mapping[str, str]) -> str:
+    card = section(name, troubles.get(name, ""), _body(name, figures, pages))
+    return f'<div id="{escape(_place(name))}">{card}</div>'
+
+
+def _place(name: str) -> str:
+    """What a part is found by in the page."""
+    return f"part-{name.replace(' ', '-')}"
+
+
 def _body(name: str, figures: Sequence[Figure], pages: Mapping[str, str]) -> str:
     if not figures:
         return ""
@@ -59,8 +90,9 @@ def _body(name: str, figures: Sequence[Figure], pages: Mapping[str, str]) -> str
 def _cells(figure: Figure) -> str:
     what, value, target, verdict, *words = map(escape, _row(figure))
     colour = {"met": ' class="met"', "MISSED": ' class="missed"'}.get(verdict, "")
-    plain = "".join(f"<td>{cell}</td>" for cell in (what, value, target))
-    return f"{plain}<td{colour}>{verdict}</td>" + "".join(f'<td class="words">{cell}</td>' for cell in words)
+    numbers = "".join(f'<td class="whole">{cell}</td>' for cell in (value, target))
+    said = "".join(f'<td class="words">{cell}</td>' for cell in words)
+    return f"<td>{what}</td>{numbers}<td{colour}>{verdict}</td>{said}"
 
 
 def _row(figure: Figure) -> tuple[str, ...]:
