@@ -125,6 +125,38 @@ def condensed(
     step: (S,) of the shared unknowns, where that is known; then the gradient holds it, and nothing is said of `cross`,
     `own` and `shared`.
     """
+    summed = _summed(problem, first, last, states, cameras, points, noise, step)
+    return _eliminated(summed, noise, len(cameras), step is None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Summed:
+    """F frame sets' normal equations, nothing eliminated, in M columns: state, each camera's own, free corrections.
+
+    whole: (F, M, M), right: (F, M). by_landmark: (F, 3L, M), without rows where the step is known. known: (L, 3, 3) and
+    pull: (L, 3), the landmarks'. seeing: (F, C), whether a camera has tracks. cost: robust.
+    """
+
+    whole: Array
+    right: Array
+    by_landmark: Array
+    known: Array
+    pull: Array
+    seeing: NDArray[np.bool_]
+    cost: float
+
+
+def _summed(
+    problem: Problem,
+    first: int,
+    last: int,
+    states: States,
+    cameras: Cameras,
+    points: Array,
+    noise: Noise,
+    step: Array | None,
+) -> _Summed:
+    """As in `condensed`."""
     data, n, free = problem.data, len(cameras), problem.free
     part = data.between(first, last)
     mine = States(*(a[first:last] for a in (states.poses, states.twists, states.accelerations)))
@@ -156,21 +188,27 @@ def condensed(
     weighted = (grams[..., :10, :10] @ columns).reshape(frames, 10 * n, width)
     whole = np.swapaxes(tall, 1, 2) @ weighted  # (F, M, M)
     right = (np.swapaxes(tall, 1, 2) @ np.ascontiguousarray(grams[..., :10, 10]).reshape(frames, -1, 1))[..., 0]
-    state, own, rest = slice(0, STATE), slice(STATE, STATE + 3 * n), slice(STATE + 3 * n, width)
     empty = np.zeros((frames, 0, width))
-    by_landmark = products.reshape(frames, -1, 10 * n) @ tall if step is None else empty  # (F, 3L, M)
+    by_landmark = products.reshape(frames, -1, 10 * n) @ tall if step is None else empty
+    return _Summed(whole, right, by_landmark, known, pull, grams[..., 8, 8] > 0, cost)
+
+
+def _eliminated(summed: _Summed, noise: Noise, n: int, coupled: bool) -> Condensed:
+    """What is left when each of the n cameras' own unknowns are eliminated. coupled: whether `shared` is wanted."""
+    whole, right, by_landmark = summed.whole, summed.right, summed.by_landmark
+    frames, width = right.shape
+    state, own, rest = slice(0, STATE), slice(STATE, STATE + 3 * n), slice(STATE + 3 * n, width)
     cross = np.concatenate([whole[:, state, rest], np.swapaxes(by_landmark[..., state], 1, 2)], axis=2)
     own_cross = np.concatenate([whole[:, own, rest], np.swapaxes(by_landmark[..., own], 1, 2)], axis=2)
-    seeing = grams[..., 8, 8] > 0  # (F, C)
-    root = np.linalg.inv(np.linalg.cholesky(whole[:, own, own] + _own_prior(noise, seeing)))
+    root = np.linalg.inv(np.linalg.cholesky(whole[:, own, own] + _own_prior(noise, summed.seeing)))
     by_state, by_shared, by_right = root @ whole[:, own, state], root @ own_cross, root @ right[:, own, None]
     turned = np.swapaxes(by_state, 1, 2)
     held = np.swapaxes(root, 1, 2)
     size = by_shared.shape[2]
     shared = np.zeros((size, size))
-    gradient = np.concatenate([right[:, rest].sum(0), pull.ravel()[: size - len(free)]])
-    if step is None:
-        shared = _shared(whole[:, rest, rest].sum(0), by_landmark[..., rest].sum(0), known)
+    gradient = np.concatenate([right[:, rest].sum(0), summed.pull.ravel()[: by_landmark.shape[1]]])
+    if coupled:
+        shared = _shared(whole[:, rest, rest].sum(0), by_landmark[..., rest].sum(0), summed.known)
     return Condensed(
         whole[:, state, state] - turned @ by_state,
         (right[:, state, None] - turned @ by_right)[..., 0],
@@ -181,7 +219,7 @@ def condensed(
         -(held @ by_right)[..., 0],
         (root**2).sum(1),
         -(held @ by_state),
-        cost,
+        summed.cost,
     )
 
 
