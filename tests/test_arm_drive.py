@@ -13,7 +13,8 @@ from estimation.errors import InputError
 from hardware.arm import Arm
 from hardware.arm_calibration.commanded import HEADER, NAME, read_commanded
 from hardware.arm_calibration.moves import MoveWishes, check_moves, places, planned
-from hardware.arm_calibration.run import Wishes, check_out, check_record, move_arm, run_folder
+from hardware.arm_calibration.record import move_arm
+from hardware.arm_calibration.run import Wishes, check_out, check_record, run_folder
 from hardware.arm_calibration.solve import ARM
 from hardware.arm_file import read_arm
 from hardware.arm_profile import ArmProfile

@@ -134,7 +134,8 @@ def _virtual(a: argparse.Namespace) -> Any:
 
 def _live(a: argparse.Namespace) -> Any:
     from estimation.errors import InputError
-    from hardware.arm_calibration.run import check_out, check_record, keep_rig_json, record_live
+    from hardware.arm_calibration.record import record_live
+    from hardware.arm_calibration.run import check_out, check_record, keep_rig_json
     from hardware.arm_console import axes_from_text
     from hardware.arm_port import Device
     from hardware.cameras.live import LiveCameras

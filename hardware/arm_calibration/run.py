@@ -1,9 +1,8 @@
-"""`stillbed calibrate arm`: a moved arm before cameras, a recorded folder, or touched points in; an arm file out."""
+"""`stillbed calibrate arm`: a recorded folder or touched points in; an arm file, its numbers and a report out."""
 
 from __future__ import annotations
 
 import shutil
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,15 +13,10 @@ from estimation import se3
 from estimation.arm_calibration.fit import Asked
 from estimation.arm_calibration.touch import Touched, fit_touched
 from estimation.errors import InputError
-from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware.arm import Arm
-from hardware.arm_calibration.commanded import NAME, CommandedFile
-from hardware.arm_calibration.drive import Drive
-from hardware.arm_calibration.moves import MoveWishes, check_moves, planned
+from hardware.arm_calibration.moves import MoveWishes
 from hardware.arm_calibration.report import page
 from hardware.arm_calibration.solve import (
-    ARM,
     ArmCalibration,
     calibrated,
     kinematics_of,
@@ -33,19 +27,11 @@ from hardware.arm_calibration.solve import (
 from hardware.arm_calibration.touched_file import TouchedPoints, read_touched
 from hardware.arm_calibration.verdict import LIMIT, judge, seen_words
 from hardware.arm_file import write_arm
-from hardware.arm_port import Opener
 from hardware.arm_profile import ArmProfile
 from hardware.calibration.verdict import Verdict
-from hardware.cameras.live import LiveCameras
-from hardware.clock import Clock
-from hardware.images import encode
-from hardware.link_settings import LinkSettings
 from hardware.progress import Report
 from hardware.rig_file import read_rig
-from hardware.simulator.session_folder import SessionFolder
 
-FIRST = 20.0  # s that the cameras may take for their first pictures; one on a network takes five to open
-FEWEST_SETS = 5  # frame sets before the arm begins to move
 RIG_JSON = "rig.json"  # of a recorded calibration: what the rig's own calibration was worth
 WORST = 4.0  # times its sigma that a touched point may lie beside
 
@@ -83,81 +69,6 @@ def check_record(folder: Path) -> None:
     if not folder.parent.is_dir():
         raise InputError(folder, "--record", "no such folder", "a folder in one that exists")
     folder.mkdir(exist_ok=True)
-
-
-def move_arm(arm: Arm, clock: Clock, folder: Path, stands: Array | None, wishes: MoveWishes, report: Report) -> Array:
-    """Make the moves; writes commanded.csv. All are checked before the first; where it begins, (6,), and comes back.
-
-    However it ends, the arm is at rest and disarmed, and what was done stays recorded.
-    """
-    with CommandedFile(folder / NAME) as log:
-        drive = Drive(arm, clock, log)
-        try:
-            start = drive.ready(stands)
-            targets = planned(start, arm.profile.limits, arm.profile.tick, wishes)
-            check_moves(arm.profile, start, targets)
-            drive.follow(targets, report)
-        finally:
-            drive.halt("the calibration was ended") if arm.travels else arm.disarm(clock.now())
-            log.note(arm, clock.now())
-    return start
-
-
-def record_live(
-    live: LiveCameras,
-    rig: Rig,
-    opener: Opener,
-    profile: ArmProfile,
-    clock: Clock,
-    folder: Path,
-    stands: Array | None,
-    wishes: MoveWishes,
-    report: Report,
-    link: LinkSettings,
-) -> None:
-    """Move an arm before live cameras and record both in a session folder; Ctrl-C stops the arm and keeps what is."""
-    write_arm(folder / ARM, profile, "the arm as it was taken to be while it was calibrated")
-    ended, failed = threading.Event(), list[Exception]()
-    count = [0]
-
-    def keep() -> None:
-        try:
-            with SessionFolder(folder, rig, ()) as session:
-                while not ended.is_set():
-                    frames = live.next_set(clock.now() + 0.2)
-                    for frame in frames.frames if frames is not None else ():
-                        stamp = frame.stamp - rig.cameras[frame.camera].clock_offset
-                        # exactly: JPEG stores a thin needle's colour at half the resolution
-                        session.picture(frame.camera, stamp, *encode(frame.image))
-                    count[0] += frames is not None
-        except Exception as error:  # told by the thread that moves the arm
-            failed.append(error)
-
-    with live:
-        keeper = threading.Thread(target=keep, name="pictures", daemon=True)
-        keeper.start()
-        arm = Arm(opener, profile, clock.now(), link)
-        try:
-            end = clock.now() + FIRST
-            while count[0] < FEWEST_SETS and not failed:
-                if clock.now() > end:
-                    allowed = "cameras that deliver: stillbed cameras RIG.toml shows what they do"
-                    raise InputError("cameras", "frame sets", count[0], allowed)
-                arm.poll(clock.now())
-                clock.wait_until(clock.now() + 0.01)
-
-            def told(done: int, total: int) -> None:
-                if failed:
-                    raise failed[0]
-                report(done, total)
-
-            move_arm(arm, clock, folder, stands, wishes, told)
-        finally:
-            ended.set()
-            keeper.join()
-            arm.close()
-    if failed:
-        raise failed[0]
 
 
 def keep_rig_json(rig: Path, folder: Path) -> None:

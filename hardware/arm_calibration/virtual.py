@@ -14,7 +14,8 @@ from estimation.se3 import Array
 from hardware.arm import Arm
 from hardware.arm_calibration.commanded import NAME, read_commanded
 from hardware.arm_calibration.moves import MoveWishes
-from hardware.arm_calibration.run import ArmTruth, move_arm
+from hardware.arm_calibration.record import move_arm
+from hardware.arm_calibration.run import ArmTruth
 from hardware.arm_calibration.solve import ARM
 from hardware.arm_file import write_arm
 from hardware.arm_port import Device
