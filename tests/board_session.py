@@ -10,8 +10,8 @@ from boards import motion, places
 from estimation.camera_calibration.lens_model import matrix_of
 from estimation.rig import Camera, Rig
 from hardware.images import encode
+from hardware.session_folder import SessionFolder
 from hardware.simulator.board_picture import BoardView
-from hardware.simulator.session_folder import SessionFolder
 from perception.boards.board import Board
 
 BOARD = Board(squares=(4, 5), square=54.0)

@@ -19,13 +19,13 @@ from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.trajectory import Trajectory
 from hardware.images import encode
 from hardware.ply_file import write_ply
+from hardware.session_folder import SessionFolder
 from hardware.simulator.bodies import Wound, with_wound
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look
 from hardware.simulator.render import render
 from hardware.simulator.scene import Scene, rois
 from hardware.simulator.sensor import Sensor
-from hardware.simulator.session_folder import SessionFolder
 from hardware.simulator.shape import cylinder, flat
 from perception.frames import Frame, FrameSet, Image
 

@@ -18,13 +18,13 @@ from hardware.images import encode
 from hardware.path_file import read_path
 from hardware.pose_file import read_poses
 from hardware.session import open_session
+from hardware.session_folder import SessionFolder
 from hardware.simulator.cameras import Fate, Shot
 from hardware.simulator.nozzle_file import read_nozzle
 from hardware.simulator.planned_line import planned_line
 from hardware.simulator.run_folder import RunFolder
 from hardware.simulator.scenario import Scenario
 from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.session_folder import SessionFolder
 from hardware.tum import read_tum
 from perception.frames import Frame, FrameSet, PrintHead, Roi
 from perception.tracking import STAGES, StepReport, trusting_report

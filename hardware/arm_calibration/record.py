@@ -21,7 +21,7 @@ from hardware.clock import Clock
 from hardware.images import encode
 from hardware.link_settings import LinkSettings
 from hardware.progress import Report
-from hardware.simulator.session_folder import SessionFolder
+from hardware.session_folder import SessionFolder
 
 FIRST = 20.0  # s that the cameras may take for their first pictures; one on a network takes five to open
 FEWEST_SETS = 5  # frame sets before the arm begins to move

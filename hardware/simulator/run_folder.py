@@ -28,12 +28,12 @@ from hardware.pose_file import PoseWriter
 from hardware.recording import Recorder
 from hardware.replay import CommandWriter
 from hardware.schemas import INFO, WARNING
+from hardware.session_folder import SessionFolder
 from hardware.simulator.cameras import JITTER_LIMIT, Shot
 from hardware.simulator.nozzle_file import NozzleWriter
 from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.planned_line import PlannedLine
 from hardware.simulator.scenario import Scenario
-from hardware.simulator.session_folder import SessionFolder
 from hardware.simulator.watch import Watch
 from hardware.tum import rows_from_trajectory
 from perception.frames import FrameSet, PrintHead, Roi

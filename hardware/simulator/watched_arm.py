@@ -24,6 +24,7 @@ from hardware.arm_profile import ArmProfile, placed
 from hardware.clock import Clock, RememberingClock
 from hardware.images import encode
 from hardware.progress import Report, silent
+from hardware.session_folder import SessionFolder
 from hardware.simulator.arm_settings import ArmSettings
 from hardware.simulator.camera_settings import CameraSettings
 from hardware.simulator.cameras import Shot, SimulatedCameras
@@ -35,7 +36,6 @@ from hardware.simulator.port import run_virtual_arm
 from hardware.simulator.render import StillScene
 from hardware.simulator.scene import Scene
 from hardware.simulator.sensor import Sensor
-from hardware.simulator.session_folder import SessionFolder
 from hardware.simulator.shape import cylinder
 from planning.kinematics import SimpleArm, nozzle_from_axes
 

@@ -1,4 +1,4 @@
-"""Writes a simulated session as a plain session folder, as its pictures come."""
+"""Writes a session folder, as its pictures come."""
 
 from __future__ import annotations
 
