@@ -5,7 +5,6 @@ BIN    := .venv/bin
 STAMP  := .venv/.installed
 AUDIT  := .venv/audit
 DEMO   := demo
-APT    := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0
 
 # Bytecode is kept whatever the shell says: the tests start some hundred processes, each of which would compile it all anew.
 unexport PYTHONDONTWRITEBYTECODE
@@ -72,7 +71,6 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "installing into .venv what stillbed needs: some minutes, once"
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
-	@$(call apt,$(APT),$(BIN)/python -c 'import open3d')
 	@touch $@
 
 # $(call apt,PACKAGES,CHECK): where CHECK fails, install PACKAGES if we may, else say the one line to run, and go on.

@@ -1,7 +1,7 @@
 """MotionStep: the newest surface pose in, the bytes for the arm out; no I/O and no clock of its own.
 
-Planner, guard, protocol, in this order. The motion process imports this module; it must never need gtsam, cv2, open3d
-or onnxruntime: a call of gtsam was measured to stop every other thread for as long as it takes.
+Planner, guard, protocol, in this order. The motion process imports this module; it must never need gtsam, cv2 or
+onnxruntime: a call of gtsam was measured to stop every other thread for as long as it takes.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The body of the motion process: opens the arm, builds the motion, and loops until it is told to end.
 
-Imports nothing that holds Python's lock for long: no gtsam, cv2, open3d or onnxruntime. It is to be started by `spawn`,
+Imports nothing that holds Python's lock for long: no gtsam, cv2 or onnxruntime. It is to be started by `spawn`,
 as a forked child would have loaded all that its parent has.
 """
 

@@ -18,6 +18,7 @@ from estimation.se3 import Array
 from hardware.clock import WallClock
 from hardware.contour_file import read_contour
 from hardware.gcode_file import gcode_text
+from hardware.mesh_file import read_raw_mesh
 from hardware.path_file import write_path
 from hardware.plan_findings import NOT_ASKED, bump_facts, bumps_text, bumpy, findings_rows, notes_of
 from hardware.plan_layer_picture import bounds_of, layer_svg, len_text
@@ -125,8 +126,6 @@ def _subject(request: Request, flat: bool) -> Subject:
         if contour.shape[1] != 2:
             raise InputError(request.scan, "header", "x_mm,y_mm,z_mm", "x_mm,y_mm: a flat contour")
         return Subject(request.scan.name, flat_wound(contour, height, request.scan), None)
-    from hardware.mesh_file import read_raw_mesh  # loads open3d, which nothing without a scan may need
-
     raw = read_raw_mesh(request.scan)
     vertices = in_mm(raw.vertices, raw.triangles, request.unit, request.scan)
     scan, repairs = repaired(vertices, raw.triangles, request.scan, request.flip)

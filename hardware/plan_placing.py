@@ -59,7 +59,7 @@ class Placing:
 
 def placing_in(session_path: Path, scan_file: Path, outline: Array) -> Placing:
     """Where a scan lies in a session's first pictures. outline: (N, 3) mm, of the planned wound, scan frame."""
-    from hardware.tracker import tracker  # loads gtsam, cv2 and open3d, which a plan alone does not need
+    from hardware.tracker import tracker  # loads gtsam and cv2, which a plan alone does not need
 
     session = open_session(session_path)
     pose, frames = None, None

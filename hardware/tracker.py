@@ -12,6 +12,7 @@ from pathlib import Path
 
 from estimation.rig import Rig
 from estimation.se3 import Array
+from hardware.mesh_file import read_mesh
 from perception.frames import Roi
 from perception.prefilter import NONE, PREFILTERS
 from perception.tool import Tool
@@ -39,8 +40,6 @@ def tracker(
     """
     scan = None
     if surface is not None:
-        from hardware.mesh_file import read_mesh  # loads open3d, which nothing without a scan may need
-
         scan = read_mesh(surface).scan
     with ProcessPoolExecutor(1, get_context("spawn"), _settle) as executor:
         executor.submit(int).result()  # started before the first frame set, not beside it

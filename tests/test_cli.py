@@ -37,7 +37,6 @@ LARGE = {
     "numba",
     "gtsam",
     "cv2",
-    "open3d",
     "onnxruntime",
     "toppra",
     "ruckig",
@@ -225,4 +224,4 @@ def test_durations_are_said_as_people_do(seconds: float, words: str) -> None:
 def test_help_needs_no_library() -> None:
     code = "import sys, hardware.cli; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, env=os.environ)
-    assert {"numpy", "cv2", "gtsam", "mcap", "open3d"}.isdisjoint(done.stdout.split())
+    assert {"numpy", "cv2", "gtsam", "mcap"}.isdisjoint(done.stdout.split())

@@ -39,7 +39,6 @@ OWNERS = {  # library: the files that may import it
     "numba": ("estimation/compiled.py",),
     "onnx": ("perception/training/*.py",),
     "onnxruntime": ("perception/*.py",),
-    "open3d": ("hardware/mesh_file.py",),
     "orjson": ("hardware/recording.py",),
     "packaging": ("hardware/doctor/libraries.py",),
     "pycolmap": ("hardware/bench/bundle_adjustment.py",),
@@ -62,7 +61,7 @@ FREE = {"numpy", "scipy"}  # arrays are everywhere
 ALLOWED = {*FLOORS, "tests", "data", "docs", "pyproject.toml", "constraints.txt", "README.md", "LICENSE", "Makefile"}
 ALLOWED |= {"CHANGELOG.md", "CITATION.cff"}
 LEFTOVERS = ("build", "dist", "demo", "out", "__pycache__", "*.egg-info")  # .gitignore names them
-MOTION_NEVER = {"gtsam", "numba", "cv2", "open3d", "onnxruntime"}
+MOTION_NEVER = {"gtsam", "numba", "cv2", "onnxruntime"}
 
 FILES = sorted(path.relative_to(ROOT).as_posix() for floor in FLOORS for path in (ROOT / floor).rglob("*.py"))
 
@@ -113,7 +112,7 @@ def test_every_dependency_is_imported_by_someone_and_declared() -> None:
     import tomllib
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    packages = {"opencv-python-headless": "cv2", "open3d-cpu": "open3d", "pyserial": "serial", "pyyaml": "yaml"}
+    packages = {"opencv-python-headless": "cv2", "pyserial": "serial", "pyyaml": "yaml"}
     extras = [line for extra in ("bench", "cluster", "train") for line in project["optional-dependencies"][extra]]
     declared = {line.split(">")[0] for line in project["dependencies"] + extras}
     declared = {packages.get(name, name) for name in declared}

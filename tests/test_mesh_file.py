@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from estimation import se3
-from estimation.errors import InputError, StillbedError
+from estimation.errors import InputError
 from estimation.scan import Scan
-from hardware.mesh_file import APT_LINE, read_mesh
+from hardware import mesh_file
+from hardware.mesh_file import read_mesh
 from hardware.ply_file import write_ply
 from tests import scans
 from tests.synthetic import RADIUS, SCAN_FROM_SURFACE, patch, scan_of
 
-try:
-    import open3d  # noqa: F401
-except (ImportError, OSError) as error:  # a bare machine lacks its shared libraries
-    NO_OPEN3D = str(error)
-else:
-    NO_OPEN3D = ""
-
-needs_open3d = pytest.mark.skipif(bool(NO_OPEN3D), reason=f"open3d cannot be imported: {NO_OPEN3D}")
-ROOT = Path(__file__).parent.parent
 BALL = scans.ball(30.0, 12)
 
 
@@ -54,7 +44,6 @@ def refusal(path: Path) -> str:
     return text
 
 
-@needs_open3d
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj"])
 def test_every_format_gives_the_same_scan(tmp_path: Path, suffix: str) -> None:
     mesh = read_mesh(write(tmp_path / f"surface{suffix}", BALL))
@@ -65,7 +54,6 @@ def test_every_format_gives_the_same_scan(tmp_path: Path, suffix: str) -> None:
     assert np.einsum("ni,ni->n", mesh.scan.normals, mesh.scan.vertices / 30).min() > 0.98
 
 
-@needs_open3d
 def test_the_synthetic_scan_comes_back_in_its_own_frame(tmp_path: Path) -> None:
     write_ply(tmp_path / "surface.ply", *scan_of(patch(), 4.0))
     mesh = read_mesh(tmp_path / "surface.ply")
@@ -75,7 +63,6 @@ def test_the_synthetic_scan_comes_back_in_its_own_frame(tmp_path: Path) -> None:
     assert mesh.open_edges == 2 * (20 + 15)
 
 
-@needs_open3d
 def test_a_hole_is_counted_not_refused(tmp_path: Path) -> None:
     holed = Scan(BALL.vertices, BALL.triangles[1:], BALL.normals)
     assert read_mesh(write(tmp_path / "holed.ply", holed)).open_edges == 3
@@ -87,16 +74,14 @@ def test_a_file_that_is_not_there_or_of_no_known_kind(tmp_path: Path, name: str)
     assert (".ply, .stl, .obj" in text) and ("no such file" in text or not name.endswith(".ply"))
 
 
-@needs_open3d
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj"])
 def test_garbage_and_emptiness_are_refused(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"surface{suffix}"
     for data in (b"", b"\n", np.random.default_rng(0).bytes(5000)):
         path.write_bytes(data)
-        assert f"{len(data)} bytes" in refusal(path)
+        assert f"{len(data)} bytes" in refusal(path) or "line 1 = " in refusal(path)
 
 
-@needs_open3d
 @pytest.mark.parametrize("part", [0.02, 0.3, 0.6, 0.9, 0.998])
 @pytest.mark.parametrize("suffix", [".ply", ".stl"])
 def test_a_file_cut_short_is_refused_not_read_in_part(tmp_path: Path, suffix: str, part: float) -> None:
@@ -106,7 +91,6 @@ def test_a_file_cut_short_is_refused_not_read_in_part(tmp_path: Path, suffix: st
     refusal(path)
 
 
-@needs_open3d
 @pytest.mark.parametrize("suffix", [".ply", ".obj"])
 @pytest.mark.parametrize("value", ["nan", "inf"])
 def test_a_vertex_that_is_not_finite_is_named(tmp_path: Path, suffix: str, value: str) -> None:
@@ -116,35 +100,29 @@ def test_a_vertex_that_is_not_finite_is_named(tmp_path: Path, suffix: str, value
     words = lines[first + 2].split()
     lines[first + 2] = " ".join([*words[:-1], value])
     path.write_text("\n".join(lines) + "\n")
-    text = refusal(path)
-    assert value in text or (suffix, value) == (".ply", "inf")  # open3d's PLY reader stops at an inf by itself
+    assert "vertex 2 = " in (text := refusal(path)) and value in text
 
 
-@needs_open3d
 def test_a_triangle_without_its_vertices_is_named(tmp_path: Path) -> None:
     bad = Scan(BALL.vertices, np.r_[BALL.triangles, [[0, 1, len(BALL.vertices)]]], BALL.normals)
     assert f"triangle {len(BALL.triangles)}" in refusal(write(tmp_path / "surface.ply", bad))
 
 
-@needs_open3d
 def test_points_without_triangles_are_refused(tmp_path: Path) -> None:
     points = Scan(BALL.vertices, BALL.triangles[:0], BALL.normals)
     assert "no triangles" in refusal(write(tmp_path / "cloud.ply", points))
 
 
-@needs_open3d
 def test_triangles_without_area_are_refused(tmp_path: Path) -> None:
     line = Scan(np.array([[0.0, 0, 0], [5, 0, 0], [10, 0, 0]]), np.array([[0, 1, 2]]), np.zeros((3, 3)))
     assert "without area" in refusal(write(tmp_path / "line.ply", line))
 
 
-@needs_open3d
 def test_a_scan_in_metres_is_called_one(tmp_path: Path) -> None:
     text = refusal(write(tmp_path / "surface.ply", BALL, 0.001))
     assert "metres" in text and "60 mm" in text
 
 
-@needs_open3d
 @pytest.mark.parametrize(("side", "allowed"), [(0.999, False), (1.001, True), (1999.0, True), (2001.0, False)])
 def test_the_size_that_is_allowed_ends_where_it_says(tmp_path: Path, side: float, allowed: bool) -> None:
     path = write(tmp_path / "surface.ply", BALL, side / 60)
@@ -154,31 +132,9 @@ def test_the_size_that_is_allowed_ends_where_it_says(tmp_path: Path, side: float
         assert "1 to 2000 mm" in refusal(path)
 
 
-@pytest.mark.parametrize(
-    ("module", "said"),
-    [
-        ("import ctypes; ctypes.CDLL('libGL-that-is-not-here.so.1')", APT_LINE),
-        ("import a_module_that_is_not_here", "pip install open3d-cpu"),
-    ],
-)
-def test_what_open3d_lacks_is_said_with_the_line_to_run(tmp_path: Path, module: str, said: str) -> None:
-    (tmp_path / "open3d").mkdir()
-    (tmp_path / "open3d" / "__init__.py").write_text(module + "\n")
-    path = write(tmp_path / "surface.ply", BALL)
-    code = f"""import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]
-from estimation.errors import StillbedError
-from hardware.mesh_file import read_mesh
-try:
-    read_mesh({str(path)!r})
-except StillbedError as error:
-    print(error)
-"""
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said in out and out.count("\n") == 1 and str(path) in out
-
-
-def test_open3d_is_not_imported_before_a_scan_is_read() -> None:
-    code = "import sys, hardware.mesh_file; print('open3d' in sys.modules)"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert out.stdout.strip() == "False"
-    assert issubclass(InputError, StillbedError)
+def test_a_file_that_is_too_large_is_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "surface.stl", BALL)
+    monkeypatch.setattr(mesh_file, "LARGEST_FILE", path.stat().st_size - 1)
+    assert "size of the file" in refusal(path)
+    monkeypatch.setattr(mesh_file, "LARGEST_FILE", path.stat().st_size)
+    assert read_mesh(path).open_edges == 0

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-HEAVY = {"gtsam", "cv2", "open3d", "onnxruntime"}
+HEAVY = {"gtsam", "cv2", "onnxruntime"}
 RUN = """
 import sys
 from hardware.motion import MotionStep

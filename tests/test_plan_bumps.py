@@ -20,7 +20,6 @@ from planning.layers.plan import Order, Plan, make_plan
 from planning.layers.tissue import Tissue
 from planning.layers.wound import Wound, wound_in
 from tests.scans import height_field
-from tests.test_mesh_file import needs_open3d
 
 DEEP, FLOOR = 2.0, 9.0  # mm deep, and radius of the flat bed
 LAYERS = (Tissue("dermis", None, "1", height=0.4),)  # five
@@ -99,7 +98,6 @@ def test_a_bump_is_measured_from_the_layers_top() -> None:
     assert walled.over.is_empty and walled.around.is_empty
 
 
-@needs_open3d
 def test_pictures_summary_and_report_show_the_bumps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scan = height_field(lambda x, y: pit(x, y, 1.4, 1.5), (60.0, 60.0), 1.0)
     write_ply(tmp_path / "scan.ply", scan.vertices, scan.triangles)

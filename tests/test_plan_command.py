@@ -26,7 +26,6 @@ from planning.kinematics import SimpleArm
 from planning.limits import Limits
 from planning.planner import Planner
 from tests.moving import pose_at, still
-from tests.test_mesh_file import needs_open3d
 from tests.wounds import scan_of
 
 SQUARE = "x_mm,y_mm\n0,0\n12,0\n12,8\n0,8\n"
@@ -81,7 +80,6 @@ def test_the_report_needs_no_network_and_holds_every_checkpoint(tmp_path: Path) 
     assert len(held["extrude"]) == -(-len(read_path(out)) // 3) * 4  # a byte each, as base64
 
 
-@needs_open3d
 def test_a_scan_in_metres_is_recognised_and_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     vertices, triangles = scan_of()
     write_ply(tmp_path / "scan.ply", vertices / 1000, triangles)

@@ -37,7 +37,6 @@ def test_a_table_says_what_is_built() -> None:
 
 
 def test_a_scan_is_read_beside_the_file_and_keeps_its_frame(tmp_path: Path) -> None:
-    pytest.importorskip("open3d")
     source = scene_from_table("a.toml", {**COARSE, "body": "chest", "wound": False}, tmp_path, 0).shape
     vertices, triangles = source.mesh(3.0)
     write_ply(tmp_path / "scan.ply", vertices + [100.0, -20.0, 40.0], triangles)
@@ -49,7 +48,6 @@ def test_a_scan_is_read_beside_the_file_and_keeps_its_frame(tmp_path: Path) -> N
 
 
 def test_a_scan_that_is_closed_has_no_outside_and_is_refused(tmp_path: Path) -> None:
-    pytest.importorskip("open3d")
     corners = np.array([[0.0, 0, 0], [40, 0, 0], [0, 40, 0], [0, 0, 40]])
     write_ply(tmp_path / "scan.ply", corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
     with pytest.raises(InputError, match="mean normal") as caught:
@@ -58,7 +56,6 @@ def test_a_scan_that_is_closed_has_no_outside_and_is_refused(tmp_path: Path) -> 
 
 
 def test_a_scan_too_small_for_a_drape_is_taken_without_one(tmp_path: Path) -> None:
-    pytest.importorskip("open3d")
     write_ply(tmp_path / "scan.ply", *flat((30.0, 60.0)).mesh(5.0))
     table = {**COARSE, "scan": "scan.ply", "wound": False}
     with pytest.raises(InputError, match=r"30\.0 x 60\.0 mm") as caught:

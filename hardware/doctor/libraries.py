@@ -21,7 +21,7 @@ for name in sys.argv[1:]:
 """
 REMEDY = "make a new environment and `pip install .` there again, with constraints.txt"
 SLOW_REMEDY = "ask again while less runs on this machine"
-SYSTEM_REMEDY = "sudo apt-get install -y libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0"
+SYSTEM_REMEDY = "install the system's package that has this file: `apt-file search` with its name tells which"
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """The body of the motion process of a live run: arm, MotionLoop, reports, and what is recorded of them.
 
-Loads nothing that holds Python's lock for long: no gtsam, cv2, open3d or onnxruntime.
+Loads nothing that holds Python's lock for long: no gtsam, cv2 or onnxruntime.
 """
 
 from __future__ import annotations

@@ -33,6 +33,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST
 from hardware.checks import Table
+from hardware.mesh_file import read_mesh
 from hardware.simulator.bodies import BODIES, MARGIN, Wound, body, with_wound
 from hardware.simulator.deformation import BULGE, RADIUS, STRETCH, Deformation
 from hardware.simulator.keys import Keys
@@ -126,8 +127,6 @@ def _deformation(scene: Keys) -> Deformation:
 
 
 def _scanned(path: Path, wound: Wound | None, seed: int) -> Shape:
-    from hardware.mesh_file import read_mesh  # a scenario without a scan needs no open3d
-
     scan = read_mesh(path).scan
     longest = float(np.ptp(scan.vertices, axis=0).max())
     if longest > LARGEST_SCAN:
