@@ -31,7 +31,7 @@ faults: $(STAMP)
 	$(BIN)/stillbed bench faults --count 10000 --seed 1 --jobs 2 --log out/faults.csv -o out/faults --force
 
 fuzz: $(STAMP)
-	$(BIN)/stillbed bench fuzz --count 1000000 -o out/fuzz --force
+	$(BIN)/stillbed bench fuzz --count 1000000 --jobs 2 --log out/fuzz.csv -o out/fuzz --force
 
 hazards: $(STAMP)
 	$(BIN)/python -m tests.hazard_table --run

@@ -47,16 +47,16 @@ class TextRows:
         """As `Rows.columns`."""
         whole = [element.properties[k].letter in WHOLE for k in wanted]
         counts, values = _arrays(["q" if each else "d" for each in whole])
-        read = [int if each else float for each in whole]
+        places = [(k, counts[n], values[n], int if whole[n] else float) for n, k in enumerate(wanted)]
         for row in range(element.rows):
             number, words = next(self.lines, (0, []))
             if not words:
                 raise _cut_short(self.path, element, row)
             try:
                 fields = _fields(element, words)
-                for k, column in enumerate(wanted):
-                    counts[k].append(len(fields[column]))
-                    values[k].extend(map(read[k], fields[column]))
+                for k, lengths, numbers, read in places:
+                    lengths.append(len(fields[k]))
+                    numbers.extend(map(read, fields[k]))
             except (ValueError, IndexError, OverflowError):
                 names = [f"COUNT {one.name}..." if one.count else one.name for one in element.properties]
                 raise wrong_line(self.path, number, words, f"{' '.join(names)}, in numbers") from None

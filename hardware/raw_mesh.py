@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,7 +25,7 @@ class RawMesh:
 
 def text_rows(file: BinaryIO, path: Path, first: int = 1) -> Iterator[tuple[int, list[bytes]]]:
     """The number and the words of each line that has any. first: number of the next line of the file."""
-    for number, line in enumerate(iter(lambda: file.readline(LONGEST), b""), first):
+    for number, line in enumerate(iter(partial(file.readline, LONGEST), b""), first):
         if len(line) == LONGEST and not line.endswith(b"\n"):
             raise InputError(path, f"line {number}", f"{LONGEST} bytes or more", f"fewer than {LONGEST}")
         words = line.split()

@@ -37,11 +37,10 @@ def _text_corners(file: BinaryIO, path: Path) -> array[float]:
     """Nine numbers for each triangle of a text STL file, of all its solids."""
     corners, step, solid = array("d"), 0, False
     for number, words in text_rows(file, path):
-        word = words[0].lower()
+        word, expected = words[0].lower(), FACET[step]
         if step == 0 and word == (b"endsolid" if solid else b"solid"):
             solid = not solid
             continue
-        expected = FACET[step]
         try:
             if not solid or word != expected:
                 raise ValueError

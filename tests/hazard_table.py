@@ -125,7 +125,7 @@ def main(arguments: list[str]) -> int:
     if "--run" in arguments:
         import pytest
 
-        if code := pytest.main(["-o", "addopts=--strict-markers --strict-config -p no:dash", *dict.fromkeys(names)]):
+        if code := pytest.main(["-o", "addopts=--strict-markers --strict-config", *dict.fromkeys(names)]):
             return int(code)
     DOCUMENT.write_text(document(), encoding="utf-8")
     return 0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import time
+import argparse
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.bench import fuzz
-from hardware.bench.fuzz import Fuzzed, figures, fuzzed
-from hardware.bench.fuzz_readers import PATH, Reader, readers
+from hardware.bench import fuzz, fuzz_try
+from hardware.bench.fuzz import Sum, figures
+from hardware.bench.fuzz_log import read_log
+from hardware.bench.fuzz_readers import PATH, readers
+from hardware.bench.fuzz_run import Task, run_tasks
+from hardware.bench.fuzz_try import Block, Reader, fuzzed
 from hardware.bench.mutate import mutated
 from hardware.checks import read_toml
 from hardware.faults import fault_from_text
 from hardware.operator.words import parsed
 from hardware.protocol import LENGTH, TAILS, FrameStream, decode
+from tests.deadly import deadly_readers
 
 READERS = readers()
 
@@ -27,14 +33,14 @@ READERS = readers()
 def test_every_reader_takes_or_refuses_what_is_nearly_valid(
     name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    reader = READERS[name]
-    result = fuzzed(name, reader, range(max(3, round(150 * reader.weight))), 7, tmp_path)
-    assert not result.wrong
+    blocks = list(fuzzed(name, READERS[name], range(60), 7, tmp_path))
+    assert sum(block.count for block in blocks) == 60 and not [block.wrong for block in blocks if block.wrong]
 
 
 @pytest.mark.parametrize("number", [324, 549])  # a zip of a version, and of a compression, that nobody has
 def test_a_file_of_corners_that_no_zip_reader_knows_holds_none(number: int, tmp_path: Path) -> None:
-    assert not fuzzed("corners", READERS["corners"], range(number, number + 1), 1, tmp_path).wrong
+    (block,) = fuzzed("corners", READERS["corners"], range(number, number + 1), 1, tmp_path)
+    assert not block.wrong and block.number == number
 
 
 @given(st.binary(max_size=200), st.integers(0, 2**32))
@@ -66,22 +72,59 @@ def wrong_reader(path: Path) -> object:
     if b"fall" in data:
         raise KeyError("fall")
     while b"hang" in data:
-        time.sleep(0)
+        pass
     return bytearray(8 << 30) if b"eat" in data else None
 
 
-@pytest.mark.parametrize(("word", "said"), [("fall", "KeyError"), ("hang", "more than 0.2 s"), ("eat", "MemoryError")])
+@pytest.mark.parametrize(("word", "said"), [("fall", "KeyError"), ("hang", "more than 0.05 s"), ("eat", "MemoryError")])
 def test_a_reader_that_falls_hangs_or_eats_is_found(
     word: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fuzz, "SECONDS", 0.2)
-    monkeypatch.setattr(fuzz, "mutated", lambda valid, rng: word.encode())
+    monkeypatch.setattr(fuzz_try, "SECONDS", 0.05)
+    monkeypatch.setattr(fuzz_try, "mutated", lambda valid, rng: word.encode())
     reader = Reader("x.csv", lambda folder: (folder / "x.csv").write_text(PATH) and None, wrong_reader)
-    result = fuzzed("x", reader, range(1), 1, tmp_path)
-    assert len(result.wrong) == 1 and said in result.wrong[0] and result.cases == [word.encode()]
+    blocks = list(fuzzed("x", reader, range(2), 1, tmp_path))
+    assert [(block.count, block.number, block.case) for block in blocks] == [(1, k, word.encode()) for k in range(2)]
+    assert all(said in block.wrong for block in blocks)
 
 
 def test_the_figures_count_what_went_wrong() -> None:
-    one, other = Fuzzed("a", 10, 4, 0.1, ["input 3: x"], [b"x"]), Fuzzed("b", 5, 5, 0.1)
-    values = {figure.what: figure.value for figure in figures([one, other])}
+    values = {figure.what: figure.value for figure in figures([Sum(10, 4, 0.1, 1), Sum(5, 5, 0.1, 0)])}
     assert values["inputs"] == 15 and values["inputs that went wrong"] == 1
+
+
+def test_a_reader_that_ends_its_process_is_found_and_the_rest_goes_on() -> None:
+    blocks = list(run_tasks([Task("deadly", range(3)), Task("fine", range(2500))], 1, 2, deadly_readers))
+    deaths = [block for block in blocks if block.wrong]
+    assert [(block.name, block.number, block.count) for block in deaths] == [("deadly", k, 1) for k in range(3)]
+    assert all(block.wrong == f"the process ended with {-signal.SIGSEGV}" for block in deaths)
+    assert [block.case for block in deaths] == [mutated(b"valid", np.random.default_rng([1, k])) for k in range(3)]
+    assert [block.count for block in blocks if block.name == "fine"] == [1000, 1000, 500]
+
+
+def test_a_run_goes_on_where_it_was_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(fuzz, "readers", lambda: dict.fromkeys(["a", "b"]))
+    asked: list[Task] = []
+
+    def stopped(tasks: list[Task], *rest: object) -> Iterator[Block]:
+        asked.extend(tasks)
+        yield Block("a", 4, 2, 0.1, "fell", 3, b"case")
+        yield Block("a", 2, 2, 0.1)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fuzz, "run_tasks", stopped)
+    log = tmp_path / "x.csv"
+    options = argparse.Namespace(count=20, seed=1, only=None, jobs=1, log=log, out=tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        fuzz.run(options)
+    assert (tmp_path / "a_3.bin").read_bytes() == b"case" and "fell; kept as" in capsys.readouterr().out
+    monkeypatch.setattr(fuzz, "run_tasks", lambda tasks, *rest: iter([Block(t.name, len(t.numbers)) for t in tasks]))
+    values = {figure.what: figure.value for figure in fuzz.run(options)}
+    assert asked == [Task("a", range(10)), Task("b", range(10))]
+    assert values["inputs"] == 20 and values["inputs that went wrong"] == 1 and "fell" in capsys.readouterr().out
+    assert sum(block.count for block in read_log(log, 1)) == 20 and not read_log(log, 2)
+    log.write_text(log.read_text() + "1,a,x,0,0,0,\n")
+    with pytest.raises(InputError, match="line 6"):
+        fuzz.run(options)

@@ -86,11 +86,11 @@ def _picture(number: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     return np.random.default_rng(number).integers(0, 256, (SMALL[1], SMALL[0], 3), np.uint8)
 
 
-Entry = tuple[str, Callable[[Path], None], Callable[[Path], object], float]
-FOLDERS: dict[str, Entry] = {  # the file that is struck, who makes it, who reads it, share of the inputs
-    "video": ("cam_0.avi", make_videos, whole_session, 0.2),
-    "print head": ("head.csv", make_heads, read_heads, 1.0),
-    "corners": ("corners.npz", make_corners, corners, 0.5),
-    "smoothed": ("smoothed.csv", make_smoothed, trajectory, 0.5),
-    "trajectory": ("x.csv", make_trajectory, trajectory, 0.5),
+Entry = tuple[str, Callable[[Path], None], Callable[[Path], object]]
+FOLDERS: dict[str, Entry] = {  # the file that is struck, who makes it, who reads it
+    "video": ("cam_0.avi", make_videos, whole_session),
+    "print head": ("head.csv", make_heads, read_heads),
+    "corners": ("corners.npz", make_corners, corners),
+    "smoothed": ("smoothed.csv", make_smoothed, trajectory),
+    "trajectory": ("x.csv", make_trajectory, trajectory),
 }

@@ -6,7 +6,6 @@ import hashlib
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,8 @@ from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.arm_file import read_arm, write_arm
 from hardware.arm_profile import ArmProfile
 from hardware.bench.fuzz_folders import FOLDERS
+from hardware.bench.fuzz_meshes import make_binary_ply, make_binary_stl, make_obj, make_ply, make_skin, make_stl, skin
+from hardware.bench.fuzz_try import Reader
 from hardware.bookmark_file import keep_bookmark, read_start
 from hardware.calibration.board_file import read_board, write_board
 from hardware.calibration.formats import formats
@@ -29,7 +30,6 @@ from hardware.live.settings import read_settings, settings_text
 from hardware.mesh_file import read_mesh
 from hardware.operator.words import parsed
 from hardware.path_file import read_path
-from hardware.ply_file import write_ply
 from hardware.pose_file import PoseWriter, read_poses
 from hardware.protocol import G1, LENGTH, TAILS, THESIS, FrameStream, decode
 from hardware.protocol import encode as frame_of
@@ -49,7 +49,6 @@ from perception.tracking import STAGES, trusting_report
 from perception.wound_network import WoundNetwork, shipped
 from planning.progress import fingerprint
 
-Read = Callable[[Path], object]
 SMALL = 48, 32  # px
 FRAMES = 3
 PATH = (
@@ -79,18 +78,6 @@ p95_mm = 0.5
 """
 POSES = "t_s,tx_mm,ty_mm,tz_mm\n" + "".join(f"{k / 10},{k / 5},0,0\n" for k in range(12))
 MESSAGE = b'{"ask": "pause", "turn": 3, "tag": 5}'
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Reader:
-    """One reader. make: writes valid input into a folder. struck: the file in it that is made wrong. read: the reader,
-    given that file. weight: of its share of the inputs; what costs more gets less.
-    """
-
-    struck: str
-    make: Callable[[Path], None]
-    read: Read
-    weight: float = 1.0
 
 
 def _text(text: str | bytes, name: str) -> Callable[[Path], None]:
@@ -140,21 +127,6 @@ def _make_recording(folder: Path) -> None:
             for camera in range(len(rig)):
                 recorder.frame(Frame(camera, k / 30, _picture(k)))
             recorder.event(k / 30, "something", 1)
-
-
-def _make_mesh(folder: Path) -> None:
-    vertices = np.array([[0.0, 0, 0], [20, 0, 1], [20, 20, 0], [0, 20, 2], [10, 10, 3]])
-    write_ply(folder / "x.ply", vertices, np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]))
-
-
-def _make_stl(folder: Path) -> None:
-    corner = "vertex 0 0 0\nvertex 20 0 0\nvertex 0 20 0\n"
-    facet = f"facet normal 0 0 1\nouter loop\n{corner}endloop\nendfacet\n"
-    (folder / "x.stl").write_text(f"solid x\n{facet}endsolid x\n")
-
-
-def _make_obj(folder: Path) -> None:
-    (folder / "x.obj").write_text("v 0 0 0\nv 20 0 0\nv 0 20 0\nv 20 20 1\nf 1 2 3\nf 2 4 3\n")
 
 
 def _make_scenario(folder: Path) -> None:
@@ -223,7 +195,7 @@ def readers() -> dict[str, Reader]:
         ),
         "arm": Reader("x.toml", lambda f: write_arm(f / "x.toml", ArmProfile(), "an arm"), read_arm),
         "session.toml": Reader("x.toml", lambda f: _text(settings_text(), "x.toml")(f), read_settings),
-        "scenario": Reader("x.toml", _make_scenario, read_scenario, 0.5),
+        "scenario": Reader("x.toml", _make_scenario, read_scenario),
         "virtual arm": Reader("x.toml", lambda f: write_virtual_arm(f / "x.toml", ArmSettings(), ()), read_virtual_arm),
         "path": Reader("x.csv", _text(PATH, "x.csv"), read_path),
         "contour": Reader("x.csv", _text("x_mm,y_mm\n0,0\n10,0\n10,8\n0,8\n", "x.csv"), read_contour),
@@ -233,21 +205,24 @@ def readers() -> dict[str, Reader]:
         "poses": Reader("poses.csv", _make_poses, read_poses),
         "TUM": Reader("x.tum", _text("".join(f"{k} 1 2 3 0 0 0 1\n" for k in range(5)), "x.tum"), read_rows),
         "trace": Reader("x.csv", _text(POSES, "x.csv"), read_trace),
-        "table of frames": Reader("frames.csv", _make_session, lambda p: open_session(p.parent), 0.3),
-        "region": Reader("roi.toml", _make_session, lambda p: open_session(p.parent), 0.3),
-        "picture": Reader("cam_0/1.png", _make_session, lambda p: _whole_session(p.parent.parent), 0.2),
-        "recording": Reader("x.mcap", _make_recording, _whole_session, 0.3),
-        "PLY": Reader("x.ply", _make_mesh, read_mesh, 0.3),
-        "STL": Reader("x.stl", _make_stl, read_mesh, 0.3),
-        "OBJ": Reader("x.obj", _make_obj, read_mesh, 0.3),
-        "settings of a network": Reader("wound.toml", _make_model, _model, 0.1),
-        "network": Reader("wound.onnx", _make_model, _model, 0.1),
-        "shape model": Reader("shape.toml", _make_shape, _shape_model, 0.3),
+        "table of frames": Reader("frames.csv", _make_session, lambda p: open_session(p.parent)),
+        "region": Reader("roi.toml", _make_session, lambda p: open_session(p.parent)),
+        "picture": Reader("cam_0/1.png", _make_session, lambda p: _whole_session(p.parent.parent)),
+        "recording": Reader("x.mcap", _make_recording, _whole_session),
+        "PLY": Reader("x.ply", make_ply, read_mesh),
+        "binary PLY": Reader("x.ply", make_binary_ply, read_mesh),
+        "STL": Reader("x.stl", make_stl, read_mesh),
+        "binary STL": Reader("x.stl", make_binary_stl, read_mesh),
+        "OBJ": Reader("x.obj", make_obj, read_mesh),
+        "scan to plan on": Reader("x.ply", make_skin, skin),
+        "settings of a network": Reader("wound.toml", _make_model, _model),
+        "network": Reader("wound.onnx", _make_model, _model),
+        "shape model": Reader("shape.toml", _make_shape, _shape_model),
     }
-    found |= {name: Reader(struck, make, read, weight) for name, (struck, make, read, weight) in FOLDERS.items()}
+    found |= {name: Reader(*entry) for name, entry in FOLDERS.items()}
     for name, each in formats().items():
         file = "cam_0.yaml" if each.folder else f"x{SUFFIX[name]}"
-        found[f"rig of {name}"] = Reader(file, _exported(name, "." if each.folder else file), each.read, 0.2)
+        found[f"rig of {name}"] = Reader(file, _exported(name, "." if each.folder else file), each.read)
     return found
 
 

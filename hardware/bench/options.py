@@ -95,9 +95,15 @@ def fill(parser: argparse.ArgumentParser) -> None:
 
 def fuzz(parser: argparse.ArgumentParser) -> None:
     """How many inputs, and for whom."""
-    parser.add_argument("--count", type=int, default=20_000, help="inputs, of all readers together (default: 20000)")
+    parser.add_argument(
+        "--count", type=int, default=20_000, help="inputs, of all readers in equal shares (default: 20000)"
+    )
     parser.add_argument("--seed", type=int, default=1, help="of what is made wrong (default: 1)")
     parser.add_argument("--only", metavar="READER", help="one reader; see the table for their names")
+    parser.add_argument("--jobs", type=int, default=1, help="readers at a time, a process each (default: 1)")
+    parser.add_argument(
+        "--log", type=Path, metavar="X.csv", help="how far each reader is, and what went wrong; goes on from there"
+    )
 
 
 def growth(parser: argparse.ArgumentParser) -> None:
