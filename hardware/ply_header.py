@@ -89,7 +89,7 @@ def _name(word: bytes) -> str:
 
 def _check(path: Path, number: int, elements: list[Element]) -> None:
     """InputError where two of a kind have one name, or an element has no property."""
-    for ones in (elements, *(element.properties for element in elements)):
-        names = [one.name for one in ones]
+    own = [[one.name for one in element.properties] for element in elements]
+    for names in ([element.name for element in elements], *own):
         if len(set(names)) < len(names) or not names:
             raise wrong_line(path, number, [b"end_header"], "it behind elements with properties, no name twice")
