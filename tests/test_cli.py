@@ -104,7 +104,7 @@ def test_a_simulation_ended_by_ctrl_c_keeps_what_there_was(tmp_path: Path) -> No
     file, out = write_scenario(tmp_path, SMALL, small, seconds=600.0), tmp_path / "out"
     running = started(["simulate", str(file), "-o", str(out), "--threads", "1"])
     try:
-        for _ in range(600):
+        for _ in range(2000):
             if (out / "nozzle.csv").exists() and (out / "nozzle.csv").stat().st_size > 30_000:
                 break
             CLOCK.wait_until(CLOCK.now() + 0.05)
