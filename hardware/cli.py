@@ -22,7 +22,7 @@ from hardware.comparing.command import add_compare
 from hardware.doctor.command import add_doctor
 from hardware.live.command import add_init, add_live
 from hardware.methods import MAP, METHODS
-from hardware.plan_commands import add_plan
+from hardware.plan.command import add_plan
 from hardware.reach_command import add_reach
 from hardware.smoothing.command import add_smooth
 from hardware.viewing.command import add_view

@@ -32,7 +32,7 @@ def test_a_folder_of_pictures_is_tracked(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_a_scanned_wound_is_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from hardware.plan import example_scan
+    from hardware.plan.run import example_scan
     from hardware.ply_file import write_ply
 
     vertices, triangles = example_scan("forearm")

@@ -47,7 +47,7 @@ OWNERS = {  # library: the files that may import it
     "serial": ("hardware/*.py",),
     "shapely": (
         "hardware/bench/wounds.py",
-        "hardware/plan_layer_picture.py",
+        "hardware/plan/layer_picture.py",
         "planning/fill/*.py",
         "planning/layers/*.py",
     ),

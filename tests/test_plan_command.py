@@ -18,7 +18,7 @@ from hardware import plan as planning_command
 from hardware.cli import main
 from hardware.contour_file import read_contour
 from hardware.path_file import read_path
-from hardware.plan_order import RANGES, Wishes, order_of
+from hardware.plan.order import RANGES, Wishes, order_of
 from hardware.ply_file import write_ply
 from hardware.scan_units import UNITS, in_mm
 from planning.command import Move

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.plan_placing import FAR, Placing, Sight, _sight
+from hardware.plan.placing import FAR, Placing, Sight, _sight
 from perception.lens import Lenses
 
 AROUND = np.linspace(0, 2 * np.pi, 200, endpoint=False)

@@ -20,10 +20,10 @@ from hardware.contour_file import read_contour
 from hardware.gcode_file import gcode_text
 from hardware.mesh_file import read_raw_mesh
 from hardware.path_file import write_path
-from hardware.plan_findings import NOT_ASKED, bump_facts, bumps_text, bumpy, findings_rows, notes_of
-from hardware.plan_layer_picture import bounds_of, layer_svg, len_text
-from hardware.plan_order import Wishes, check_out, order_of
-from hardware.plan_page import Story, material_text, page_text
+from hardware.plan.findings import NOT_ASKED, bump_facts, bumps_text, bumpy, findings_rows, notes_of
+from hardware.plan.layer_picture import bounds_of, layer_svg, len_text
+from hardware.plan.order import Wishes, check_out, order_of
+from hardware.plan.page import Story, material_text, page_text
 from hardware.ply_file import write_ply
 from hardware.progress import Progress, duration
 from hardware.reach import with_feasible
@@ -257,7 +257,7 @@ def _check_session(session: Path, flat: bool) -> None:
 
 def _placed(session: Path, out: Path, plan: Plan) -> list[str]:
     """Where the scan lies in a session's pictures, in words."""
-    from hardware.plan_placing import placing_in
+    from hardware.plan.placing import placing_in
 
     ring = plan.wound.rim
     return placing_in(session, out.with_name(f"{out.stem}_scan.ply"), ring).lines()

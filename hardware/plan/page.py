@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from estimation.se3 import Array
 from hardware.page import document, figures_table, row_of_tiles, section, tile
-from hardware.plan_layer_picture import len_text
+from hardware.plan.layer_picture import len_text
 from hardware.progress import duration
 from planning.layers.figures import LayerFigures, Total, seconds_to
 from planning.layers.grid import at
@@ -85,7 +85,7 @@ def page_text(plan: Plan, layers: Sequence[LayerFigures], total: Total, story: S
             "The beads",
             "Drag to turn, shift and drag to move, wheel to come nearer. The slider prints as far as it is moved.",
             f'{CONTROLS}<script type="application/json" id="plan-data">{_data(plan)}</script><script>'
-            f"{(files('hardware') / 'plan_view.js').read_text(encoding='utf-8')}</script>",
+            f"{(files('hardware.plan') / 'view.js').read_text(encoding='utf-8')}</script>",
         )
     )
     body.append(section("Layers", LAYER_WORDS, f'<div class="sideways">{_layer_table(layers, total)}</div>'))

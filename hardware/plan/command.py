@@ -134,8 +134,8 @@ def _add_way(command: argparse.ArgumentParser) -> None:
 
 
 def _plan(arguments: argparse.Namespace) -> None:
-    from hardware.plan import Request, run_plan
-    from hardware.plan_order import Wishes
+    from hardware.plan.order import Wishes
+    from hardware.plan.run import Request, run_plan
 
     a = arguments
     wishes = Wishes(

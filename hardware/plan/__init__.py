@@ -1,0 +1,1 @@
+"""`stillbed plan`: a scan or a contour made a path, and what is told of it."""
