@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware import plan as planning_command
 from hardware.cli import main
 from hardware.contour_file import read_contour
 from hardware.path_file import read_path
+from hardware.plan import run as planning_command
 from hardware.plan.order import RANGES, Wishes, order_of
 from hardware.ply_file import write_ply
 from hardware.scan_units import UNITS, in_mm
