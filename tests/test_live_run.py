@@ -171,6 +171,8 @@ def test_what_goes_wrong_on_purpose_is_said_held_through_and_in_the_end_stops_th
     assert "recording stopped" in run.said and "go on with: stillbed live --resume" in run.said
     holds = [m for m in messages(record, "/hold") if hung < float(str(m["stamp"])) < hung + 1.2]
     assert any("pose is" in str(m["reason"]) for m in holds)
+    missed = [m for m in messages(record, "/events") if "the tracking process has said nothing" in str(m["message"])]
+    assert any(hung < float(str(m["stamp"])) < hung + 1.2 for m in missed)
     went_on = [m for m in messages(record, "/move") if hung + 1.0 < float(str(m["stamp"])) < struck]
     assert len(went_on) > 20
     assert rests(record, struck, 1.0)
