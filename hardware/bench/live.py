@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> list[Figure]:
         if options.kills:
             killed = folder / "killed.csv"
             write_path(killed, to_and_fro(read_path(rendered.path), KILLED))
-            figures += kill_figures(options.scenario, folder, killed, options.kills, options.seed)
+            figures += kill_figures(options.scenario, folder, killed, options.kills, options.seed, options.out)
     return figures
 
 

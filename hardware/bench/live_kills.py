@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import csv
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from estimation.errors import InputError
+from estimation.se3 import Array
 from hardware.bench.figure import Figure, at_most
 from hardware.bench.live_session import LiveSession
 from hardware.checks import read_toml
@@ -23,7 +26,7 @@ DONE = "the path is printed"
 LONGEST = 3.0  # s of printing before a kill
 WITHIN = 0.5  # s after a kill in which the arm must have come to rest: noticed in 0.1, queued for 0.05, its servo
 SHORTEST = 0.05  # s of rest that are looked at
-STILL = 0.05  # mm
+STILL = 0.05  # mm from where it ended
 ENDED = 60.0  # s in which the others must have ended
 EXECUTED = 30.0  # s in which the virtual arm has written what it did
 
@@ -32,23 +35,39 @@ EXECUTED = 30.0  # s in which the virtual arm has written what it did
 class Kills:
     """What came of them.
 
-    restless: arms that moved on. stuck: last words of the runs that did not print. lost, doubled: in checkpoints, of
-    each resumed run. unread: s before the kill from which the recording cannot be read. noticed: s until the
-    conducting process said so.
+    out: folder for a table of them, and for what is left of runs whose arm moved on; None: nothing is kept. rests: s
+    after each kill until the arm rested. stuck: last words of the runs that did not print. lost, doubled: in
+    checkpoints, of each resumed run. unread: s before the kill from which the recording cannot be read. noticed: s
+    until the conducting process said so.
     """
 
+    out: Path | None = None
     count: int = 0
-    restless: int = 0
+    rests: list[float] = field(default_factory=list)
     stuck: list[str] = field(default_factory=list)
     lost: list[float] = field(default_factory=list)
     doubled: list[float] = field(default_factory=list)
     unread: list[float] = field(default_factory=list)
     noticed: list[float] = field(default_factory=list)
 
+    def keep(self, record: Path, victim: str, place: float) -> None:
+        """Add the last kill to the table; where the arm moved on, keep all that the run has left."""
+        if self.out is None:
+            return
+        file, late = self.out / "kills.csv", self.rests[-1] > WITHIN
+        new = not file.exists()
+        with file.open("a", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            if new:
+                writer.writerow(("record", "killed", "rests_s", "place"))
+            writer.writerow((record.name, victim, f"{self.rests[-1]:.3f}", f"{place:.3f}"))
+        for left in record.parent.glob(f"{record.stem}.*") if late else ():
+            shutil.copy(left, self.out)
 
-def kill_figures(scenario: Path, folder: Path, path: Path, count: int, seed: int) -> list[Figure]:
+
+def kill_figures(scenario: Path, folder: Path, path: Path, count: int, seed: int, out: Path | None) -> list[Figure]:
     """Kill `count` processes, each in the run that resumes the one before; after a finished print a new one begins."""
-    rng, clock, kills = np.random.default_rng(seed), WallClock(), Kills()
+    rng, clock, kills = np.random.default_rng(seed), WallClock(), Kills(out)
     record: Path | None = None
     place = float("nan")
     with Progress("kills", "kills", clock.now) as progress:
@@ -66,10 +85,13 @@ def kill_figures(scenario: Path, folder: Path, path: Path, count: int, seed: int
             progress(number + 1, count)
     name = f"{kills.count} kills"
     return [
-        Figure(f"{name}: arms not at rest after {WITHIN:g} s", kills.restless, "", at_most(0)),
+        Figure(f"{name}: arms not at rest after {WITHIN:g} s", sum(s > WITHIN for s in kills.rests), "", at_most(0)),
+        Figure(f"{name}: arm at rest after, median", 1000 * float(np.median(kills.rests or np.nan)), "ms"),
+        Figure(f"{name}: arm at rest after, most", 1000 * max(kills.rests, default=np.nan), "ms"),
         Figure(f"{name}: runs that did not print again", len(kills.stuck), "", at_most(0), "", "; ".join(kills.stuck)),
         Figure(f"{name}: most left out", max(kills.lost, default=np.nan), "checkpoints", at_most(1)),
         Figure(f"{name}: most printed twice", max(kills.doubled, default=np.nan), "checkpoints", at_most(0)),
+        Figure(f"{name}: death of a process noticed, median", 1000 * float(np.median(kills.noticed or np.nan)), "ms"),
         Figure(
             f"{name}: death of a process noticed, most", 1000 * max(kills.noticed, default=np.nan), "ms", at_most(100)
         ),
@@ -96,7 +118,7 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
     if not np.isfinite(now) or DONE in run.said:
         return float("nan")
     kills.count += 1
-    kills.restless += not _rests(record, now)
+    kills.rests.append(_rest(record, now))
     first, last = printed(record)
     if before is not None and np.isfinite(first):
         kills.lost.append(max(first - before, 0.0))
@@ -107,11 +129,12 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
         kills.unread.append(float("inf"))
     if victim == "recorder":  # its recording ends before the arm did: what is kept of the place is all that is known
         last = float(read_toml(Beside(record).progress)["fraction"])
+    kills.keep(record, victim, last)
     return last if np.isfinite(last) else before if before is not None else float("nan")
 
 
-def _rests(record: Path, killed: float) -> bool:
-    """Whether the virtual arm stood still from WITHIN after the kill on."""
+def _rest(record: Path, killed: float) -> float:
+    """How long, s, after the kill the virtual arm came to where it ended; inf where it ended in motion."""
     clock, file = WallClock(), Beside(record).executed
     until = clock.now() + EXECUTED
     while not file.exists() and clock.now() < until:
@@ -119,5 +142,16 @@ def _rests(record: Path, killed: float) -> bool:
     clock.wait_until(clock.now() + 0.3)
     with np.load(file) as executed:
         stamps, axes = executed["stamps"], executed["axes"]
-    after = axes[stamps > min(killed + WITHIN, stamps[-1] - SHORTEST)]  # a run may have ended all before
-    return bool(np.ptp(after[:, :3], axis=0).max() < STILL)
+    return rest(stamps, axes, killed)
+
+
+def rest(stamps: Array, axes: Array, since: float) -> float:
+    """How long, s, after `since` an arm that was at `axes` (N, 6) at `stamps` (N,), s, came to rest; inf: never.
+
+    Rest is to stay within `STILL` of where it ended, for the last `SHORTEST` at least.
+    """
+    away = np.linalg.norm(axes[:, :3] - axes[-1, :3], axis=1) > STILL
+    if not away.any():
+        return 0.0
+    last = float(stamps[away][-1])
+    return max(last - since, 0.0) if last < stamps[-1] - SHORTEST else float("inf")
