@@ -102,19 +102,20 @@ def tracking_process(plan: TrackingPlan, lines: TrackingLines) -> None:
     share_pages()
     ask_to_go_first()  # the process of the map, which stands back behind this one, is then an ordinary one
     signal.signal(signal.SIGTERM, _ended)
-    outbox, report = Outbox(lines.record), TrackingReport(WallClock().now())
+    outbox = Outbox(lines.record)
     try:
         with ExitStack() as stack:
             run = _Tracking(plan, lines, outbox, stack)
-            report = run.report
             try:
                 run()
+            except (StillbedError, OSError) as error:  # told before anything is put away, as the arm is stopped for it
+                lines.reports.put(replace(run.report, ended=str(error), wrong=isinstance(error, InputError)))
             finally:
-                report = run.report
                 for entry in run.times.entries(WallClock().now()):
                     outbox.put(entry)
     except (StillbedError, OSError) as error:
-        lines.reports.put(replace(report, ended=str(error), wrong=isinstance(error, InputError)))
+        nothing = TrackingReport(WallClock().now())
+        lines.reports.put(replace(nothing, ended=str(error), wrong=isinstance(error, InputError)))
     except _Ended:
         pass
     finally:
