@@ -74,6 +74,10 @@ INSTEAD = {  # (what is run in its place, why)
         "stillbed bench estimator --only 'breathing, [c]*' --maps seen --seeds 1 --seconds 0.5",
         LONG,
     ),
+    "stillbed bench estimator --only 'breathing, clean' --maps seen --seeds 6 --seconds 4": (
+        "stillbed bench estimator --only 'breathing, [c]*' --maps seen --seeds 1 --seconds 0.5",
+        LONG,
+    ),
     "stillbed bench estimator --soak 3 --maps seen": ("stillbed bench estimator --soak 0.001 --maps seen", LONG),
     "stillbed bench faults": (FAULTS, LONG),
     "stillbed bench faults --count 10000 --jobs 2 --log faults.csv -o out/faults": (FAULTS, LONG),
