@@ -14,6 +14,7 @@ from hardware.raw_mesh import RawMesh, text_rows, wrong_line
 HEAD = 84  # bytes: eighty of anything, and the number of triangles
 TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 FACET = (b"facet", b"outer", b"vertex", b"vertex", b"vertex", b"endloop", b"endfacet")  # a triangle, line by line
+MORE = {b"facet": " or endsolid", b"vertex": " and three numbers"}  # what belongs to these, or may stand there as well
 
 
 def read_stl(path: Path) -> RawMesh:
@@ -48,9 +49,7 @@ def _text_corners(file: BinaryIO, path: Path) -> array[float]:
                 x, y, z = words[1:]
                 corners.extend((float(x), float(y), float(z)))
         except ValueError:
-            allowed = (
-                f"{expected.decode()}{' and three numbers' if expected == b'vertex' else ''}" if solid else "solid"
-            )
+            allowed = expected.decode() + MORE.get(expected, "") if solid else "solid"
             raise wrong_line(path, number, words, allowed) from None
         step = (step + 1) % len(FACET)
     if solid:
