@@ -144,8 +144,10 @@ def read_shape_model(file: Path) -> ShapeModel:
         colour, rank, usual = (np.array(table[key], float) for key in ("colour", "rank", "rank_usual"))
         patterns = tuple(np.array(each, np.int32).reshape(-1, 1, 2) for each in table["patterns"])
         trust = float(table["trust"])
-    except (OSError, KeyError, ValueError, TypeError, RecursionError) as error:
+    except (OSError, KeyError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(file, "shape model", str(error), "the file that comes with stillbed") from None
     if colour.shape != (COLOUR_TERMS,) or rank.shape != (TERMS,) or usual.shape != (TERMS,):
         raise InputError(file, "shape model", (colour.shape, rank.shape), f"{COLOUR_TERMS} and {TERMS} numbers")
+    if not np.isfinite([*colour, *rank, *usual, trust]).all():
+        raise InputError(file, "shape model", "a number that is not finite", "the file that comes with stillbed")
     return ShapeModel(colour, rank, usual, trust, patterns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,7 @@ from perception.shipped import shipped_file
 MODEL = "wound"
 REFERENCE = "thesis_unet"
 THREADS = 2
+LARGEST = sys.float_info.max
 OURS = "an ONNX file written by stillbed train"
 
 
@@ -85,12 +87,14 @@ def read_settings(file: Path, found: str) -> Settings:
 
 
 def _of(file: Path, kind: type, table: Any) -> dict[str, Any]:
-    """A table's values for a dataclass of plain fields, each checked for its type."""
+    """A table's values for a dataclass of plain fields, each checked for its type and to be finite."""
     usual = kind()
     for key, value in table.items():
         kind_of = type(getattr(usual, key, None))
         if isinstance(value, bool) or kind_of not in (int, float) or not isinstance(value, (kind_of, int)):
             raise InputError(file, key, value, f"a setting of {kind.__name__}")
+        if not abs(value) <= LARGEST:  # nan is not either
+            raise InputError(file, key, value, "a finite number")
     return {key: type(getattr(usual, key))(value) for key, value in table.items()}
 
 

@@ -12,6 +12,7 @@ from estimation.errors import InputError
 from estimation.scan import scan_from_triangles
 from perception.dice import dice
 from perception.shape_matching import (
+    TERMS,
     ShapeSegmenter,
     pattern_of,
     pattern_of_scan,
@@ -20,7 +21,7 @@ from perception.shape_matching import (
     read_shape_model,
     settled,
 )
-from perception.wound_candidates import FEATURES, described, outlines, scene_of
+from perception.wound_candidates import COLOUR_TERMS, FEATURES, described, outlines, scene_of
 from perception.wound_network import shipped
 from tests.test_segmentation import disc, picture
 
@@ -97,6 +98,23 @@ def test_a_model_that_is_none_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "shape.toml"
     for text in ("", "colour = 3", "colour = [1.0]\nrank = [1.0]\nrank_usual = [1.0]\ntrust = 0.4\npatterns = []"):
         file.write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match="shape model"):
+            read_shape_model(file)
+
+
+def model_text(trust: str = "0.4", colour: str = "1.0", corner: str = "1") -> str:
+    rank = ", ".join(["1.0"] * TERMS)
+    lists = f"colour = [{', '.join([colour] * COLOUR_TERMS)}]\nrank = [{rank}]\nrank_usual = [{rank}]\n"
+    return f"trust = {trust}\n{lists}patterns = [[[{corner}, 1], [2, 2], [3, 1]]]\n"
+
+
+def test_a_model_with_a_number_that_is_not_finite_or_too_large_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "shape.toml"
+    file.write_text(model_text(), encoding="utf-8")
+    assert len(read_shape_model(file).patterns) == 1
+    wrong = [{key: word} for key in ("trust", "colour", "corner") for word in ("inf", "nan", "9" * 400)]
+    for each in [*wrong, {"corner": "9" * 30}]:
+        file.write_text(model_text(**each), encoding="utf-8")
         with pytest.raises(InputError, match="shape model"):
             read_shape_model(file)
 

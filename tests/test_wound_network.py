@@ -82,7 +82,10 @@ def test_what_is_wrong_with_a_network_is_told_by_its_file(tmp_path: Path) -> Non
     bad.write_bytes(b"no network")
     with pytest.raises(InputError, match="settings"):
         WoundNetwork(bad)
-    for extra, match in (("", "network"), ("edge = true", "edge"), ("colour = 3", "colour"), ("[looks]\nx = 1", "x")):
+    wrong = [("", "network"), ("edge = true", "edge"), ("colour = 3", "colour"), ("[looks]\nx = 1", "x")]
+    wrong += [(f"edge = {value}", "finite") for value in ("nan", "-inf", "9" * 400)]
+    wrong += [(f"[looks]\nwindow = {'9' * 400}", "finite")]
+    for extra, match in wrong:
         bad.with_suffix(".toml").write_text(f'sha256 = "{hash_of(bad)}"\n{extra}\n', encoding="utf-8")
         with pytest.raises(InputError, match=match):
             WoundNetwork(bad)
