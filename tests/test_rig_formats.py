@@ -15,6 +15,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
 from hardware.calibration.formats import formats
+from hardware.calibration.formats.yaml_file import read_yaml
 from hardware.cli import main
 from hardware.rig_file import read_rig, write_rig
 
@@ -126,3 +127,9 @@ def test_the_commands_carry_a_rig_there_and_back(tmp_path: Path) -> None:
     )
     assert main(["calibrate", "import", str(tmp_path / "ros"), "--format", "ros", "-o", str(tmp_path / "b.toml")]) == 0
     assert np.array_equal(read_rig(tmp_path / "b.toml").rig.cameras[0].matrix, one().cameras[0].matrix)
+
+
+def test_brackets_in_brackets_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.yaml").write_text("a: " + 2000 * "[", encoding="utf-8")
+    with pytest.raises(InputError, match="a YAML file"):
+        read_yaml(tmp_path / "x.yaml")

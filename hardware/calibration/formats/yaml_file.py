@@ -44,7 +44,7 @@ def read_yaml(path: Path) -> Table:
         text = text.partition("\n")[2]
     try:
         table = yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # the last: brackets in brackets
         raise InputError(path, "file", " ".join(str(error).split())[:100], "a YAML file") from None
     if not isinstance(table, dict):
         raise InputError(path, "file", type(table).__name__, "a YAML table")
