@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ SIZE, FOCAL = (1280, 720), 1100.0
 SCENE = "chest, breathing"
 CARRIES = 50
 RATE = 30.0  # Hz
+MINUTES = 0.25, 0.5, 1.0, 2.0  # of one world
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,19 +69,29 @@ def axes_for(seconds: float) -> tuple[Axis, ...]:
     return (
         Axis("tracks", "landmarks", pose, (25, 50, 100, 200, 400), lambda n: _estimator(seconds, count=round(n))),
         Axis("cameras", "cameras", pose, (2, 3, 4, 6), lambda n: _estimator(seconds, cameras=round(n))),
-        Axis("minutes", "min behind", pose, (0.25, 0.5, 1, 2), lambda n: _estimator(60 * n, last=seconds)),
+        Axis("minutes", "min behind", pose, MINUTES, lambda n: _behind(n, seconds)),
         Axis("checkpoints", "checkpoints", path, (1e3, 1e4, 5e4, 2e5), _carried),
         Axis("pixels", "Mpx a camera", "three decoded frames to the pose, by the clock", (0.23, 0.52, 0.92, 2.07),
              lambda n: _pictures(n, seconds)),
     )  # fmt: skip
 
 
-def _estimator(seconds: float, count: int = 100, cameras: int = 3, last: float | None = None) -> tuple[float, float]:
-    """ms a step in a breathing world. last: s of its end that are judged; all without."""
-    rig = arc_rig(ANGLES_DEG[:cameras])
-    world = synthetic_world(seconds=seconds, rate=RATE, count=count, rig=rig)
-    spent = np.array([step.seconds for step in steps(world, "told", CpuClock().now)][WARM:])
-    return _two(spent if last is None else spent[-round(last * RATE) :])
+def _estimator(seconds: float, count: int = 100, cameras: int = 3) -> tuple[float, float]:
+    """ms a step in a breathing world."""
+    return _two(_spent(seconds, count, cameras)[WARM:])
+
+
+def _behind(minutes: float, last: float) -> tuple[float, float]:
+    """ms a step in the `last` s before so many minutes of a breathing world have passed."""
+    end = round(60 * minutes * RATE)
+    return _two(_spent(60 * MINUTES[-1])[end - round(last * RATE) : end])
+
+
+@lru_cache(maxsize=1)
+def _spent(seconds: float, count: int = 100, cameras: int = 3) -> Array:
+    """s of processor time of each step (N,) in a breathing world."""
+    world = synthetic_world(seconds=seconds, rate=RATE, count=count, rig=arc_rig(ANGLES_DEG[:cameras]))
+    return np.array([step.seconds for step in steps(world, "told", CpuClock().now)])
 
 
 def _carried(checkpoints: float) -> tuple[float, float]:
