@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg's own lines on stderr: our errors say it instead
@@ -23,7 +24,9 @@ class Video:
         if not path.is_file():
             raise InputError(path, "video", "no such file", "a video file that OpenCV decodes")
         self.path, self.next = path, 0
-        self._capture = cv2.VideoCapture(str(path))
+        self._capture = cv2.VideoCapture()
+        with suppress(cv2.error):
+            self._capture.open(str(path))
         if not self._capture.isOpened():
             raise InputError(path, "video", f"{path.stat().st_size} bytes, undecodable", "a video that OpenCV decodes")
 
@@ -38,18 +41,24 @@ class Video:
         """
         if self.told_count() != count:
             return False
-        self._capture.set(cv2.CAP_PROP_POS_FRAMES, count - 1)
-        return bool(self._capture.grab())
+        with suppress(cv2.error):
+            self._capture.set(cv2.CAP_PROP_POS_FRAMES, count - 1)
+            return bool(self._capture.grab())
+        return False
 
     def read(self) -> Image | None:
         """The next frame, None at the end (of the video, or of what can be decoded of it)."""
-        ok, image = self._capture.read()
+        ok, image = False, None
+        with suppress(cv2.error):  # of a damaged container; as much as its end
+            ok, image = self._capture.read()
         self.next += ok
         return np.asarray(image, np.uint8) if ok else None
 
     def skip(self) -> bool:
         """Step over the next frame; False at the end."""
-        ok = bool(self._capture.grab())
+        ok = False
+        with suppress(cv2.error):
+            ok = bool(self._capture.grab())
         self.next += ok
         return ok
 
