@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import shapely
@@ -28,27 +29,46 @@ CORNER = 0.05  # spacings by which corners are cut: what that leaves open is les
 ROUGH = 0.001  # of the area, lost in corners of the contour: below, gaps come to half a percent at most
 TWICE = 5  # mm2 laid twice are as bad as one left open, as the limits of both are: 5 and 1 % of a wound
 AS_GOOD = 0.001  # of what is covered: less is no difference
+LINED = ("zigzag", "raster", "hybrid")  # patterns with straight lines, whose angle matters
+NOTHING = shapely.MultiPolygon()
 
 Lines = Callable[[Boundary, float, float], tuple[list[Array], float]]
 
 
 def fill(region: Region, pattern: Pattern, pace: Pace) -> list[Bead]:
     """Beads that fill a region, mm, in printing order; none where it is empty. InputError where contours cross."""
+    rim, core = _rim(_within(region, pattern), pattern, pace)
+    return rim + _lines(core, pattern, pace)
+
+
+def turned(region: Region, pattern: Pattern, pace: Pace) -> Pattern:
+    """The pattern with the angle of its lines settled, by which the region is filled fastest or the way is shortest."""
+    if pattern.kind not in LINED:
+        return pattern
+    rim, core = _rim(_within(region, pattern), pattern, pace)
+    tried = [replace(pattern, angle=angle) for angle in _angles(pattern)]
+    costs = [spent(rim + _lines(core, one, pace), pace) for one in tried]
+    shorter = pattern.angle == "shorter"
+    return tried[int(np.argmin([c.printed + c.travelled if shorter else c.seconds for c in costs]))]
+
+
+def _within(region: Region, pattern: Pattern) -> Region:
+    """The part of a region that is filled."""
     region = checked(region)
-    if pattern.inset:
-        region = shapely.buffer(region, -pattern.inset)
-    if region.is_empty:
-        return []
-    corner = _corner(region, pattern)
-    if pattern.kind in ("zigzag", "raster"):
-        return _lines(region, pattern, pace)
+    return shapely.buffer(region, -pattern.inset) if pattern.inset else region
+
+
+def _rim(region: Region, pattern: Pattern, pace: Pace) -> tuple[list[Bead], Region]:
+    """Beads along the contour, in printing order, and the region that they leave for lines."""
+    if region.is_empty or pattern.kind in ("zigzag", "raster"):
+        return [], region
     hybrid = pattern.kind == "hybrid"
     lost = roughness(region, pattern.spacing)
     levels, core = _levels(region, lost, pattern, pattern.rims if hybrid else None)
-    runs = _runs(levels, lost, pattern, pace)
+    runs, corner = _runs(levels, lost, pattern, pace), _corner(region, pattern)
     if not hybrid:
-        return ordered(_mended(runs, region, lost, pattern), corner)
-    return ordered(runs, corner) + _lines(shapely.buffer(core, INTO_RIM * pattern.spacing), pattern, pace)
+        return ordered(_mended(runs, region, lost, pattern), corner), NOTHING
+    return ordered(runs, corner), shapely.buffer(core, INTO_RIM * pattern.spacing)
 
 
 def _corner(region: Region, pattern: Pattern) -> Array:

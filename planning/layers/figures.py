@@ -14,6 +14,8 @@ from planning.fill.pace import SHARP
 from planning.layers.checkpoints import Laid
 from planning.layers.plan import TURN, Plan, PlannedLayer
 
+DISC = 0.75  # widths squared: a part of less area holds no disc of that width, which has pi / 4 of them
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LayerFigures:
@@ -93,8 +95,10 @@ def _figures(plan: Plan, layer: PlannedLayer, moments: Array) -> LayerFigures:
 
 def _wider(gaps: shapely.MultiPolygon, width: float) -> float:
     """Area, mm^2, of the parts of gaps into which a disc `width` mm wide fits."""
-    core = shapely.buffer(gaps, -width / 2)
-    return float(shapely.intersection(shapely.buffer(core, width / 2), gaps).area) if not core.is_empty else 0.0
+    parts = shapely.get_parts(gaps)
+    large = shapely.multipolygons(parts[shapely.area(parts) > DISC * width**2])
+    core = shapely.buffer(large, -width / 2)
+    return float(shapely.intersection(shapely.buffer(core, width / 2), large).area) if not core.is_empty else 0.0
 
 
 def total_of(layers: Iterable[LayerFigures]) -> Total:

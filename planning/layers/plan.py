@@ -12,8 +12,8 @@ from shapely import MultiPolygon
 from estimation.errors import InputError
 from planning.fill.bead import Bead
 from planning.fill.coverage import Coverage, coverage
-from planning.fill.fill import fill
-from planning.fill.pace import Pace, spent
+from planning.fill.fill import fill, turned
+from planning.fill.pace import Pace
 from planning.fill.pattern import Pattern
 from planning.layers.bumps import Passing
 from planning.layers.chart import Chart, flat, unrolled
@@ -29,9 +29,6 @@ Report = Callable[[int, int], None]  # (layers done, layers)
 TURN = 0.05  # s for each sharp turn, as other planners' times are counted
 GOLDEN = 0.6180339887498949  # of a closed line's length: by so much the seam moves on from layer to layer,
 # which puts no two of them near one another for as long as can be (the three-distance theorem)
-
-
-LINED = ("zigzag", "raster", "hybrid")  # patterns with straight lines, whose angle matters
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,21 +100,10 @@ def make_plan(wound: Wound, order: Order, where: object = "plan", report: Report
 
 def _turned(stack: Stack, chart: Chart, order: Order) -> Pattern:
     """The pattern with the angle of its lines settled: for all layers by the largest."""
-    pattern = order.pattern
-    if not isinstance(pattern.angle, str) or pattern.kind not in LINED:
-        return pattern
+    if not isinstance(order.pattern.angle, str):
+        return order.pattern
     layer = max(stack.layers, key=lambda layer: layer.region.area)
-    region, pace = _charted(layer.region, chart), _pace(layer, order)
-    turns = (
-        [0.0, np.pi / 2] if pattern.angle == "shorter" else [np.pi * k / pattern.angles for k in range(pattern.angles)]
-    )
-    tried = [
-        (replace(pattern, angle=float(turn)), spent(fill(region, replace(pattern, angle=float(turn)), pace), pace))
-        for turn in turns
-    ]
-    if pattern.angle == "shorter":
-        return min(tried, key=lambda t: t[1].printed + t[1].travelled)[0]
-    return min(tried, key=lambda t: t[1].seconds)[0]
+    return turned(_charted(layer.region, chart), order.pattern, _pace(layer, order))
 
 
 def _charted(shape: MultiPolygon, chart: Chart) -> MultiPolygon:
