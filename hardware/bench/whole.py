@@ -54,8 +54,8 @@ PARTS = (
     Part("link", ("--hours", "0.5", "--commands", "20000"), ("--hours", "0.02", "--commands", "1000")),
     Part("loop", (), ("--scenario", "breathing_deep")),
     Part("outages", ("--count", "22")),
-    Part("faults", ("--count", "42"), ("--count", "7")),
-    Part("fuzz", ("--count", "10000"), ("--count", "2000")),
+    Part("faults", ("--count", "42", "--jobs", "2"), ("--count", "7")),
+    Part("fuzz", ("--count", "10000", "--jobs", "2"), ("--count", "2000", "--jobs", "2")),
     Part("registration", ("--seeds", "1")),
     Part("growth", ("--seconds", "2")),
 )  # fmt: skip

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,13 +71,18 @@ def seconds_to(points: Laid) -> Array:
 
 
 def figures_of(plan: Plan, report: Callable[[int, int], None] = lambda done, total: None) -> list[LayerFigures]:
-    """The figures of each layer that has beads."""
+    """The figures of each layer that has beads, of as many at once as there are cores: joining beads is GEOS's work,
+    which needs no lock of Python's."""
     moments = seconds_to(plan.points)
     laid = [layer for layer in plan.layers if layer.beads]
     found = []
-    for i, layer in enumerate(laid):
-        found.append(_figures(plan, layer, moments))
-        report(i + 1, len(laid))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        try:
+            for figures in pool.map(lambda layer: _figures(plan, layer, moments), laid):
+                found.append(figures)
+                report(len(found), len(laid))
+        finally:
+            pool.shutdown(cancel_futures=True)  # Ctrl-C waits for no layer that is not begun
     return found
 
 
