@@ -50,7 +50,7 @@ def test_a_breath_is_no_surprise() -> None:
     assert max(claims) < 2 * float(np.median(claims))
 
 
-@pytest.mark.parametrize("speed", [40.0, 200.0, *slowly(80.0)])
+@pytest.mark.parametrize("speed", [40.0, *slowly(80.0, 200.0)])
 def test_what_runs_away_is_doubted_within_two_poses(speed: float) -> None:
     away = np.clip(STAMPS - AT, 0.0, None)
     forecasts = followed(breathing(speed / np.pi * np.sin(np.pi * np.minimum(away, 1.0)) ** 2))
