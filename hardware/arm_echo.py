@@ -21,6 +21,8 @@ ENOUGH = 3  # answers before their absence means anything, as noise that looks l
 SPAN = 0.05  # s over which the set-point's speed is taken, and the slowest answers of a public driver come
 FORGET = 0.98  # of the lag's sums with each answer: two or three seconds of them
 STILL = 0.15, float(np.deg2rad(0.015))  # mm and rad between answers of an arm at rest: one count of rounding
+NEAR = 0.07  # mm by which rounding puts an answer beside its way at most, and a little: what is wider tells late
+TWICE = 0.6  # of the slack, which an arm that goes too slowly passes in two answers before one passes all of it
 MISSED = 3  # answers: noise spoils one of them now and then, and the next may come late
 RESTS = 0.2  # s after which it counts as at rest: four of the slowest answers
 SETTLED = 0.04  # s after which one that was called back does: two of the slowest answers that agree
@@ -51,12 +53,14 @@ class ArmEcho:
     """Answers so far. late: s that the arm is known to be behind its set-point. count: of places.
 
     behind: an answer that is on the way of the last second tells it by itself: what is garbled is hardly ever there.
+    lasting: the less of it and of what the answer before told, once the lag is known.
     """
 
     settings: LinkSettings
     late: float
     count: int = 0
     behind: float = 0.0  # s that the last answer on its way was later there than its lag
+    lasting: float = 0.0  # s
     _period: float = math.nan  # s between places, smoothed
     _place: _Part = field(default_factory=_Part)
     _turn: _Part = field(default_factory=_Part)
@@ -120,7 +124,7 @@ class ArmEcho:
 
     def forgive(self) -> None:
         """Where it stands is its place from now on: what was said against it no longer counts."""
-        self.behind = 0.0
+        self.behind = self.lasting = 0.0
         for part in (self._place, self._turn):
             part.off = part.before = 0.0
 
@@ -131,9 +135,11 @@ class ArmEcho:
         quiet = min(self.settings.silence, max(MISSED * self._period, self.settings.slack))
         if (since := now - self._place.stamp) > quiet:
             return f"the arm has not answered for {since:.2f} s, limit {quiet:.2g} s"
-        if self.behind > self.settings.slack:
-            limit = 1000 * self.settings.slack
-            return f"the arm is {1000 * self.behind:.0f} ms later on its way than its lag, limit {limit:g} ms"
+        slack = self.settings.slack
+        for late, limit, often in (self.behind, slack, ""), (self.lasting, TWICE * slack, " twice in a row"):
+            if late > limit:
+                words = f"the arm is {1000 * late:.0f} ms later on its way than its lag"
+                return f"{words}, limit {1000 * limit:g} ms{often}"
         if self.off > self.settings.off:
             return f"the arm is {self.off:.1f} mm off its way, limit {self.settings.off:g} mm"
         if (turn := self._turn.off) > self.settings.off_turn:
@@ -143,7 +149,7 @@ class ArmEcho:
 
     def restart(self) -> None:
         """Forget what was answered before: a device was away, or the arm was told where it stands."""
-        self.count, self.behind, self._period, self._sums = 0, 0.0, math.nan, (0.0, 0.0)
+        self.count, self.behind, self.lasting, self._period, self._sums = 0, 0.0, 0.0, math.nan, (0.0, 0.0)
         self._place, self._turn = _Part(), _Part()
 
     def _deviation(self, values: Array, axes: slice, queue: ArmQueue, now: float) -> float:
@@ -153,9 +159,13 @@ class ArmEcho:
 
     def _time(self, place: Array, queue: ArmQueue, now: float) -> None:
         """How late the arm is where it answers from."""
-        passed = queue.passed(place.tolist(), STILL[0], now)
+        passed = queue.passed(place.tolist(), NEAR, now)
+        if math.isnan(passed):
+            passed = queue.passed(place.tolist(), STILL[0], now)
         if not math.isnan(passed):
-            self.behind = now - passed - (self.late if math.isnan(self.lag) else max(self.late, self.lag))
+            behind = now - passed - (self.late if math.isnan(self.lag) else max(self.late, self.lag))
+            self.lasting = 0.0 if math.isnan(self.lag) else min(behind, self.behind)
+            self.behind = behind
 
     def _learn(self, place: Array, queue: ArmQueue, now: float) -> None:
         """Fit the lag: the set-point's lead over the answer is its speed times that."""

@@ -305,6 +305,14 @@ def test_an_arm_that_stays_behind_is_stopped() -> None:
     assert "called back" in link.arm.reason and link.virtual.deepest < 0.15
 
 
+@pytest.mark.parametrize(("share", "within"), [(50, 0.25), (70, 0.29), (80, 0.37)])
+@pytest.mark.parametrize("begin", [2.0, 2.013, 2.031])
+def test_an_arm_that_moves_too_slowly_is_held_before_it_is_far_behind(share: int, within: float, begin: float) -> None:
+    link = linked(ANSWERING, arm_fault(f"slow {share}% at {begin}s for 3s"))
+    assert link.follow(begin) == []
+    assert any("called back" in reason for reason in link.follow(within))
+
+
 def test_an_arm_that_runs_away_is_stopped_at_once() -> None:
     link = linked(ANSWERING)
     link.follow(1.0)
