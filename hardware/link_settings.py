@@ -20,9 +20,9 @@ class LinkSettings:
     flight: of motion that may be under way, on the wire and in the arm's queue, and frames: that many at most.
     ease: share of a tick by which ticks are longer than the moves of one. poll: between looks at the line.
     write_timeout: that the port may take no bytes. off: mm, and off_turn: rad, that the arm may answer from beside its
-    way. slack: that it may be later on its way than its lag, and six tenths of that twice in a row. lost: mm, beyond which it
-    is not held but stopped. silence: without an answer, after some have come. patience: of a hold by the link before it
-    is a stop.
+    way. slack: that it may be later on its way than its lag, and six tenths of that twice in a row. lost: mm, beyond
+    which it is not held but stopped. silence: without an answer, after some have come. patience: of a hold by the link
+    before it is a stop.
     reopen: between looks for a device that is gone. speed: mm/s, and turning: rad/s, of the link's own moves.
     pause_frame: whether the arm understands the control frame that stops it at once.
     """
