@@ -60,7 +60,7 @@ PAGE = (
 )
 MORE = "the same with more said"
 VIRTUAL = "stillbed calibrate arm --virtual --places 5 --swing-s 2 --record try -o arm.toml"
-WAVED = "stillbed calibrate cameras live.toml --board board.toml -o rig.toml --seconds 4 --no-page"
+WAVED = "stillbed calibrate cameras live.toml --board board.toml -o rig.toml --seconds 8 --no-page"
 FAULTS = "stillbed bench faults --count 1 --jobs 2 --log faults.csv -o out/faults"
 OUTAGES = "stillbed bench outages --count 1 --processes 1"
 INSTALLS = "makes an environment and runs what else is tested; that the target can be made is looked at"
@@ -161,7 +161,7 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed smooth sessions/ -o out/all --scheduler tcp://cluster:8786": (CLUSTER, "a cluster of one's own"),
     **{
         f"make {target}": (f"make --dry-run {target}", INSTALLS)
-        for target in ("audit", "bench", "check", "demo", "hazards", "outages", "references", "slow", "test")
+        for target in ("audit", "bench", "check", "demo", "fuzz", "hazards", "outages", "references", "slow", "test")
     },
 }
 MOVED = "tests/test_arm_live.py moves a virtual arm before cameras that see its needle, which takes a minute"

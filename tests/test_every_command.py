@@ -40,7 +40,7 @@ READY = re.compile(r"http://\S+/|/dev/pts/\d+")  # where they can be found
 @pytest.fixture(scope="module")
 def cameras(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[str]]:
     """Where three cameras on the network show a board."""
-    board = rendered(tmp_path_factory.mktemp("shown") / "session", instants=8)
+    board = rendered(tmp_path_factory.mktemp("shown") / "session", instants=20)
     ways = [[cv2.imread(str(file)) for file in sorted((board / name).glob("*.png"))] for name in "abc"]
     three = [HttpCamera(8.0, lambda n, way=way: np.asarray(way[n % len(way)], np.uint8)) for way in ways]
     with served(*three):
