@@ -36,10 +36,10 @@ BLUNDER = 6.0  # px beside the median of its camera at which a track counts for 
 class BumpSettings:
     """When a change is a bump. quick: s over which it is averaged; usual: s over which it is learned what is usual.
 
-    warm: s after a beginning, and of what a camera showed, in which nothing is said. limit: px, root mean square over
-    the tracks, that they may move by at least, and spread: times what is usual of that. sure: times what the next
-    camera explains. lasts: s that it must be so, calm: s that single looks must show half of the limit at most for it
-    to be so no more.
+    warm: s after a beginning, and of what a camera showed, in which nothing is said; in their second half it is learned
+    how far it usually wanders. limit: px, root mean square over the tracks, that they may move by at least, and spread:
+    times what is usual of that. sure: times what the next camera explains. lasts: s that it must be so, calm: s that
+    single looks must show half of the limit at most for it to be so no more.
     """
 
     quick: float = 0.4
@@ -90,7 +90,7 @@ class BumpDetector:
         count = len(self._names)
         self.bumped: dict[int, str] = {}  # cameras, and what there is to say of them
         self._quick, self._usual = [Told.nothing(NUMBERS)] * count, Told.nothing(NUMBERS * count)
-        self._spread = np.zeros(count)  # px^2, usual square of what is off
+        self._spread, self._looks = np.zeros(count), np.zeros(count)  # px^2, usual square of what is off; of how many
         self._since = np.full(count, np.nan)  # s, since when a camera is off, or on again
         self._seen = np.zeros(count)  # s in which it was learned what is usual of a camera
         self._first, self._stamp, self._count = np.nan, np.nan, 0
@@ -122,13 +122,13 @@ class BumpDetector:
             self._first = self._stamp = seen.stamp
         step, self._stamp = max(seen.stamp - self._stamp, 0.0), seen.stamp
         self._count += 1
-        if seen.stamp - self._first < self.settings.warm:
+        warm = self.settings.warm
+        if young := seen.stamp - self._first < warm:
             self._learn(parts, step, 1 / self._count)
-            return
-        known = [c for c in parts if self._seen[c] + step >= self.settings.warm]
         usual = self._usual.numbers().reshape(-1, NUMBERS)
-        self._judge({c: parts[c].without(usual[c]) for c in known}, step)
-        if not self.bumped and not odd:
+        known = {c: part.without(usual[c]) for c, part in parts.items() if self._seen[c] + step >= warm / 2}
+        self._judge(known, step, [c for c in known if not young and self._seen[c] + step >= warm])
+        if not (young or self.bumped or odd):
             self._learn(parts, step, min(1.0, step / self.settings.usual))
 
     def _learn(self, parts: dict[int, PicturePart], step: float, share: float) -> None:
@@ -136,8 +136,8 @@ class BumpDetector:
         self._usual = self._usual.mixed(together(parts, len(self._names)), share)
         self._seen[list(parts)] += step
 
-    def _judge(self, parts: dict[int, PicturePart], step: float) -> None:
-        """Take what each camera is off by beside what is usual, and decide on each."""
+    def _judge(self, parts: dict[int, PicturePart], step: float, ripe: Collection[int]) -> None:
+        """Take what each camera is off by beside what is usual, and decide on those of which enough is known."""
         steady, now = parts.keys() - self.bumped.keys() - self._odd, {}
         for camera in parts:
             told = alone(parts, camera, steady)
@@ -146,15 +146,16 @@ class BumpDetector:
         changes = {c: self._quick[c].numbers() for c in parts}
         moved = {c: parts[c].moved(v) for c, v in changes.items()}
         gains = {c: float(v @ self._quick[c].pull) for c, v in changes.items()}
-        for camera in parts:
+        for camera in ripe:
             others = [g for c, g in gains.items() if c != camera and c not in self.bumped]
             clear = gains[camera] > self.settings.sure * max(others, default=0.0)
             self._decide(camera, now[camera] if camera in self.bumped else moved[camera], clear)
             if camera in self.bumped:
                 self.bumped[camera] = _words(changes[camera], parts[camera], moved[camera])
         if not self.bumped:
-            share = min(1.0, step / self.settings.usual)
             for camera in parts:
+                self._looks[camera] += 1
+                share = min(1.0, step / self.settings.usual) if camera in ripe else 1 / self._looks[camera]
                 self._spread[camera] += share * (moved[camera] ** 2 - self._spread[camera])
 
     def _forget(self, cameras: frozenset[int]) -> None:

@@ -9,7 +9,7 @@ import pytest
 from test_estimator import LANDMARKS, RATE, RIG, begun
 
 from estimation import se3
-from estimation.bump_detector import alone, picture_parts, together
+from estimation.bump_detector import BumpDetector, alone, picture_parts, together
 from estimation.pose import TrackState
 from estimation.pose_solver import project
 from estimation.rig import Rig
@@ -74,6 +74,23 @@ def test_a_camera_that_nobody_saw_at_first_is_not_taken_for_bumped_once_it_is_se
         seen = seen.only(seen.camera != 2) if stamp < CALM else seen
         estimator.accept(estimator.fit(seen, estimator.predict(stamp)), seen)
         assert not estimator.health.bumps.bumped
+
+
+@pytest.mark.parametrize("unrest", [0.2, 0.5, 1.0])
+@pytest.mark.parametrize("rate", [6.0, 30.0])
+def test_a_picture_that_never_stood_still_is_not_taken_for_bumped_but_its_jump_is(unrest: float, rate: float) -> None:
+    """A camera that exposes late before a waving surface: its picture is off to and fro, px, from the first on."""
+    draw, at, detector = np.random.default_rng(6), breathing(0.0), BumpDetector([c.name for c in RIG.cameras])
+    exposed = np.broadcast_to(at, (3, 4, 4))
+    for stamp in np.arange(round(20 * rate)) / rate:
+        seen = observations(RIG, LANDMARKS, at, stamp, draw, 0.3)
+        off = unrest * np.sin(4.4 * stamp) + 16 * unrest * (stamp > 16)
+        seen = replace(seen, pixels=seen.pixels + np.outer(seen.camera == 1, [off, 0]))
+        points = LANDMARKS[seen.track]
+        _, _, jacobians = project(RIG, seen.camera, at, points)
+        detector.watch(RIG, seen, points, exposed, jacobians, frozenset())
+        assert stamp > 16 or not detector.bumped
+    assert list(detector.bumped) == [1]
 
 
 def test_a_moved_surface_is_no_change_of_a_camera() -> None:
