@@ -11,7 +11,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import get_context
 
 import numpy as np
 
@@ -112,18 +115,26 @@ def run(options: argparse.Namespace) -> list[Figure]:
     """Print every scenario in every way; with an output folder, the errors over time as a page."""
     if options.seed < 0:
         raise InputError("command line", "--seed", options.seed, ">= 0")
-    prints: dict[tuple[str, str], Print] = {}
-    with Progress("loop", "prints", WallClock().now) as progress:
-        for name in options.scenario:
-            on = stage(shipped_file("scenarios", f"{name}.toml"))
-            for way, told in WAYS.items():
-                prints[name, way] = printed(on, told(), options.seed)
-                progress(len(prints), len(options.scenario) * len(WAYS))
+    if options.jobs < 1:
+        raise InputError("command line", "--jobs", options.jobs, ">= 1")
+    asked, done = [(name, way) for name in options.scenario for way in WAYS], list[Print]()
+    with (
+        Progress("loop", "prints", WallClock().now) as progress,
+        ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool,
+    ):
+        for one in pool.map(partial(_one_print, options.seed), *zip(*asked, strict=True)):
+            done.append(one)
+            progress(len(done), len(asked))
+    prints = dict(zip(asked, done, strict=True))
     if options.out is not None:
         page = options.out / "loop.html"
         page.write_text(loop_page(prints), encoding="utf-8")
         print(f"picture: {page}\n")
     return [figure for name in options.scenario for figure in _figures(name, prints)]
+
+
+def _one_print(seed: int, scenario: str, way: str) -> Print:
+    return printed(stage(shipped_file("scenarios", f"{scenario}.toml")), WAYS[way](), seed)
 
 
 def printed(on: Stage, told: Told, seed: int) -> Print:

@@ -152,6 +152,7 @@ def loop(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenario", nargs="+", default=list(BREATHING), choices=BREATHING, metavar="NAME", help="of "
                         f"{', '.join(BREATHING)} (default: all)")  # fmt: skip
     parser.add_argument("--seed", type=int, default=1, help="of the tracks' noise (default: 1)")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that share the prints (default: 1)")
 
 
 def mapping(parser: argparse.ArgumentParser) -> None:

@@ -52,7 +52,7 @@ PARTS = (
     Part("fill", ("--count", "60"), ("--count", "5")),
     Part("planner", ("--updates", "20000"), ("--updates", "2000")),
     Part("link", ("--hours", "0.5", "--commands", "20000"), ("--hours", "0.02", "--commands", "1000")),
-    Part("loop", (), ("--scenario", "breathing_deep")),
+    Part("loop", ("--jobs", "2"), ("--jobs", "2", "--scenario", "breathing_deep")),
     Part("outages", ("--count", "22")),
     Part("faults", ("--count", "42", "--jobs", "2"), ("--count", "7")),
     Part("fuzz", ("--count", "10000", "--jobs", "2"), ("--count", "2000", "--jobs", "2")),
