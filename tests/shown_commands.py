@@ -175,6 +175,7 @@ TRAINED = "tests/test_training.py trains, where torch is installed"
 NOT_RUN = {  # and why not
     "pip install -c constraints.txt .": "installs what the tests run with, from a network",
     "stillbed bench --all": "tests/test_bench_whole.py runs the whole with small parts; all of them take 20 minutes",
+    "stillbed bench --quick": "the same of fewer",
     "stillbed calibrate arm --device /dev/ttyUSB0 --cameras rig.toml --record moved --yes -o arm.toml": MOVED,
     "stillbed calibrate arm --device /dev/ttyUSB0 --cameras rig.toml --record try --yes -o arm.toml": MOVED,
     "stillbed calibrate arm --device PORT --cameras rig.toml --record DIR --yes -o arm.toml": MOVED,

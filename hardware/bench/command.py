@@ -17,17 +17,19 @@ def add_bench(commands: Commands) -> None:
         "bench",
         help="measure a part, and print each figure beside its target",
         description="Measure a part of stillbed and print each figure beside its target and its reference.",
-        epilog="examples:\n  stillbed bench estimator -o out/estimator\n  stillbed bench --all --quick",
+        epilog="examples:\n  stillbed bench estimator -o out/estimator\n  stillbed bench --quick",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.add_argument("--list", action="store_true", help="list the subjects and exit")
     command.add_argument(
         "--all", action="store_true", help="measure all subjects, each in short; what is there is kept"
     )
-    command.add_argument("--quick", action="store_true", help="with --all: a look in a few minutes")
-    command.add_argument("--out", "-o", type=Path, default=WHOLE, help=f"with --all: folder; default {WHOLE}")
+    command.add_argument("--quick", action="store_true", help="the same of fewer subjects, in two minutes")
     command.add_argument(
-        "--against", type=Path, metavar="figures.json", help="with --all: tell what is worse than there"
+        "--out", "-o", type=Path, default=WHOLE, help=f"with --all or --quick: folder; default {WHOLE}"
+    )
+    command.add_argument(
+        "--against", type=Path, metavar="figures.json", help="with --all or --quick: tell what is worse than there"
     )
     command.add_argument("subject", nargs="?", metavar="SUBJECT", help="what to measure; see --list")
     command.add_argument("rest", nargs=argparse.REMAINDER, metavar="...", help="its options; see SUBJECT --help")
@@ -36,7 +38,7 @@ def add_bench(commands: Commands) -> None:
 
 def run_bench(arguments: argparse.Namespace, subjects: Subjects = SUBJECTS) -> None:
     """List the subjects, or measure one or all, print the table and, where a folder was named, save it there."""
-    if arguments.all:
+    if arguments.all or arguments.quick:
         from hardware.bench.whole import run_whole
 
         run_whole(arguments.out, arguments.quick, arguments.against)

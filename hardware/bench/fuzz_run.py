@@ -69,10 +69,11 @@ def run_tasks(tasks: list[Task], seed: int, jobs: int, known: Readers) -> Iterat
 
 
 def _started(task: Task, seed: int, known: Readers) -> tuple[Connection, _Running]:
-    spawn = get_context("spawn")
+    context = get_context("forkserver")
+    context.set_forkserver_preload([known.__module__])
     folder = TemporaryDirectory(dir=MEMORY_DISK if os.access(MEMORY_DISK, os.W_OK) else None)
-    ours, theirs = spawn.Pipe(duplex=False)
-    process = spawn.Process(target=_work, args=(task, seed, Path(folder.name), known, theirs), daemon=True)
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_work, args=(task, seed, Path(folder.name), known, theirs), daemon=True)
     process.start()
     theirs.close()
     return ours, _Running(task, process, folder)

@@ -39,22 +39,23 @@ class Part:
 
 
 WORLDS = "--maps", "seen", "--only"  # of several seeds: the frame's own error is one draw for a whole world
+QUICK = *WORLDS, "breathing, clean", "--seeds", "2", "--seconds", "4"
 PARTS = (
-    Part("estimator", (*WORLDS, "breathing, [cno]*", "--seeds", "6", "--seconds", "4"), (*WORLDS, "breathing, clean")),
+    Part("estimator", (*WORLDS, "breathing, [cno]*", "--seeds", "6", "--seconds", "4"), QUICK),
     Part("consistency", ("--scenes", "1")),
     Part("estimator", ("--maps", "seen", "--soak", "0.05"), name="memory"),
-    Part("prediction", (), ("--seconds", "90")),
-    Part("steps", ("--steps", "500", "--hours", "0.2"), ("--steps", "50", "--hours", "0.02")),
+    Part("prediction", (), ("--seconds", "75")),
+    Part("steps", ("--steps", "500", "--hours", "0.2"), None),
     Part("latency", ("--seconds", "4")),
     Part("thesis", ("--seconds", "2")),
-    Part("segmentation", ("--rendered", "30"), ("--rendered", "4")),
+    Part("segmentation", ("--rendered", "30"), ("--rendered", "2")),
     Part("plan", (), None),
-    Part("fill", ("--count", "60"), ("--count", "5")),
+    Part("fill", ("--count", "60"), ("--count", "3")),
     Part("planner", ("--updates", "20000"), ("--updates", "2000")),
-    Part("link", ("--hours", "0.5", "--commands", "20000"), ("--hours", "0.02", "--commands", "1000")),
+    Part("link", ("--hours", "0.5", "--commands", "20000"), ("--hours", "0.01", "--commands", "500")),
     Part("loop", ("--jobs", "2"), ("--jobs", "2", "--scenario", "breathing_deep")),
     Part("outages", ("--count", "22")),
-    Part("faults", ("--count", "42", "--jobs", "2"), ("--count", "7")),
+    Part("faults", ("--count", "42", "--jobs", "2"), None),
     Part("fuzz", ("--count", "10000", "--jobs", "2"), ("--count", "2000", "--jobs", "2")),
     Part("registration", ("--seeds", "1")),
     Part("growth", ("--seconds", "2")),
