@@ -19,6 +19,7 @@ from hardware.bench.saved import save, saved_figures, whole_table
 from hardware.bench.subjects import SUBJECTS
 from hardware.bench.whole import PARTS, Measured, Part, measure_all, read_whole, regressions, summary
 from hardware.bench.whole_page import counted, whole_markdown, whole_page
+from hardware.cli import main
 
 FIGURES = [
     Figure("error", 0.02, "mm", at_most(0.03), "thesis", "a note"),
@@ -95,6 +96,16 @@ def test_what_was_measured_of_the_same_code_is_kept(tmp_path: Path, monkeypatch:
     assert whole._kept(tmp_path / "plan", ["--body", "chest"], machine) is None
     other = replace(machine, commit="abd")
     assert whole._kept(tmp_path / "plan", ["--body", "foot"], other) is None
+
+
+@pytest.mark.parametrize(("line", "quick"), [(["--all"], False), (["--quick"], True), (["--all", "--quick"], True)])
+def test_the_whole_is_asked_for_by_either_word(
+    line: list[str], quick: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[tuple[Path, bool]]()
+    monkeypatch.setattr(whole, "measure_all", lambda out, quick: asked.append((out, quick)) or [])
+    assert main(["bench", *line, "-o", str(tmp_path)]) == 0
+    assert asked == [(tmp_path, quick)]
 
 
 def table(tmp_path: Path, figures: list[Figure]) -> Path:

@@ -69,7 +69,7 @@ def run_tasks(tasks: list[Task], seed: int, jobs: int, known: Readers) -> Iterat
 
 
 def _started(task: Task, seed: int, known: Readers) -> tuple[Connection, _Running]:
-    context = get_context("forkserver")
+    context = get_context("forkserver")  # which loads all readers once: a process each costs a fork, not seconds
     context.set_forkserver_preload([known.__module__])
     folder = TemporaryDirectory(dir=MEMORY_DISK if os.access(MEMORY_DISK, os.W_OK) else None)
     ours, theirs = context.Pipe(duplex=False)

@@ -122,9 +122,12 @@ def run(options: argparse.Namespace) -> list[Figure]:
         Progress("loop", "prints", WallClock().now) as progress,
         ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool,
     ):
-        for one in pool.map(partial(_one_print, options.seed), *zip(*asked, strict=True)):
-            done.append(one)
-            progress(len(done), len(asked))
+        try:
+            for one in pool.map(partial(_one_print, options.seed), *zip(*asked, strict=True)):
+                done.append(one)
+                progress(len(done), len(asked))
+        finally:
+            pool.shutdown(cancel_futures=True)
     prints = dict(zip(asked, done, strict=True))
     if options.out is not None:
         page = options.out / "loop.html"
