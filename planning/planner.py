@@ -147,17 +147,20 @@ class Planner:
         if leg is None:
             return self._begin(pose, now)
         self._asked = leg, self._look(pose, leg, now)
-        off = np.linalg.norm(self._follower.position[:3] - self._asked[1][0, :3]) > self._limits.on_path
-        if off and leg.phase is Phase.PRINTING:
+        off = float(np.linalg.norm(self._follower.position[:3] - self._asked[1][0, :3]))
+        if off > self._limits.on_path and leg.phase is Phase.PRINTING:
             return self._begin(pose, now)
         left = leg.timing.end - now
         if left > RENEW and now < leg.timing.times[0] + HORIZON:
             return ""
         if leg.timing.places[-1] < leg.curve.length or left > RENEW:
             return self._renew(pose, leg, now)
-        if now < leg.timing.end or (off and leg.phase is Phase.ENTERING):
-            return ""
-        return self._next(pose, leg.phase, now)
+        if leg.phase is Phase.ENTERING:  # the next leg begins where the follower looks: as this one comes to rest
+            away = off + leg.curve.length - float(leg.timing.at(np.array([now]))[0])
+            over = left <= LEAD and away <= self._limits.on_path
+        else:
+            over = left <= 0
+        return self._next(pose, leg.phase, now) if over else ""
 
     def _begin(self, pose: SurfacePose, now: float) -> str:
         """Go from where the nozzle is to where the path goes on, or up if it is done."""
