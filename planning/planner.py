@@ -168,12 +168,12 @@ class Planner:
         nozzle = self._nozzle(pose, now)
         if self._place > self._curve.length - NOTHING:
             self._place = self._curve.length
-            return self._start(pose, Phase.LEAVING, exit_from(nozzle), 0.0, now)
+            return self._start(pose, Phase.LEAVING, exit_from(nozzle), 0.0, now + LEAD)
         goal = self._curve.poses(np.array([self._place]))[0]
         way = entry(nozzle, goal, float(self._path.speed[self._checkpoint()]))
         if way is None:
             return self._next(pose, Phase.ENTERING, now)
-        return self._start(pose, Phase.ENTERING, way, 0.0, now)
+        return self._start(pose, Phase.ENTERING, way, 0.0, now + self._tick)  # at once: nothing is printed yet
 
     def _nozzle(self, pose: SurfacePose, now: float) -> Array:
         """surface_from_nozzle (4, 4) as commanded, on the surface as it is at `now`, s."""
@@ -193,7 +193,7 @@ class Planner:
         if curve is None:
             return self._stop(now, PAUSED)
         begins = leg is None or leg.phase is not Phase.RETREATING
-        if begins and (reason := self._start(pose, Phase.RETREATING, curve, 0.0, now)):
+        if begins and (reason := self._start(pose, Phase.RETREATING, curve, 0.0, now + LEAD)):
             return self._stop(now, f"{PAUSED}; {reason}")
         return self._follow(pose, now)
 
@@ -205,20 +205,23 @@ class Planner:
     def _next(self, pose: SurfacePose, phase: Phase, now: float) -> str:
         """Begin the leg after one of `phase`."""
         if phase is Phase.ENTERING:
-            return self._start(pose, Phase.PRINTING, self._curve, self._place, now)
+            return self._start(pose, Phase.PRINTING, self._curve, self._place, now + LEAD)
         if phase is Phase.PRINTING:
             self._place = self._curve.length
             return self._begin(pose, now)
         self._finished = True
         return ""
 
-    def _start(self, pose: SurfacePose, phase: Phase, curve: Curve, place: float, now: float) -> str:
-        """Begin a leg from rest at `place`, mm; why that cannot be, or "". It begins where the follower looks."""
-        grid, asked = self._ask(pose, curve, place, now + LEAD)
+    def _start(self, pose: SurfacePose, phase: Phase, curve: Curve, place: float, begin: float) -> str:
+        """Begin a leg from rest at `place`, mm, at `begin`, s; why that cannot be, or "".
+
+        What begins no sooner than where the follower looks is followed from its first instant on.
+        """
+        grid, asked = self._ask(pose, curve, place, begin)
         if reason := self._unreachable(asked.axes[:, :6]):
             self._leg = None
             return reason
-        timing = self._timed(grid, asked, 0.0, now + LEAD)
+        timing = self._timed(grid, asked, 0.0, begin)
         self._leg = None if isinstance(timing, str) else Leg(phase, curve, timing)
         return timing if isinstance(timing, str) else ""
 

@@ -197,6 +197,18 @@ def test_an_outage_is_braked_held_and_resumed_where_it_stopped() -> None:
     assert (np.diff(printed) >= 0).all()  # nor printed twice
 
 
+@pytest.mark.parametrize("motion", [still, breathing])
+def test_one_pose_that_is_worth_nothing_costs_a_fifth_of_a_second(motion: Motion) -> None:
+    seen = ((now, None if abs(now - 18.0) < TICK / 2 else pose) for now, pose in exact(motion, 9))
+    result = run(raster(), seen)
+    stamps, printing = np.array([c.stamp for c in result.commands]), extruding(result)
+    assert printing[stamps < 18.0 - TICK / 2][-1] and not printing[abs(stamps - 18.0) < TICK / 2].any()
+    assert stamps[printing & (stamps > 18.0)][0] <= 18.2 + TICK / 2
+    off = distance_to(tips(result, motion)[printing & (stamps > 18.0)], raster())
+    assert off.max() < 0.06  # mm, as in a whole print: it is there when it prints
+    assert over_limit(result.axes, LIMITS) <= 1
+
+
 def test_a_surface_that_jumps_is_found_again_before_printing_goes_on() -> None:
     def jumping(t: float) -> Array:
         return REST @ se3.exp([0, 0, 0, 0, 0, 0 if t < 18.0 else -4.0])
