@@ -205,7 +205,9 @@ class Planner:
     def _next(self, pose: SurfacePose, phase: Phase, now: float) -> str:
         """Begin the leg after one of `phase`."""
         if phase is Phase.ENTERING:
-            return self._start(pose, Phase.PRINTING, self._curve, self._place, now + LEAD)
+            there = -np.inf if self._leg is None else self._leg.timing.end  # within the tick that ends LEAD from now
+            begin = max(there, now + LEAD - self._tick)
+            return self._start(pose, Phase.PRINTING, self._curve, self._place, begin)
         if phase is Phase.PRINTING:
             self._place = self._curve.length
             return self._begin(pose, now)
@@ -215,7 +217,7 @@ class Planner:
     def _start(self, pose: SurfacePose, phase: Phase, curve: Curve, place: float, begin: float) -> str:
         """Begin a leg from rest at `place`, mm, at `begin`, s; why that cannot be, or "".
 
-        What begins no sooner than where the follower looks is followed from its first instant on.
+        What begins no sooner than where the follower looks, LEAD from now, is followed from its first instant on.
         """
         grid, asked = self._ask(pose, curve, place, begin)
         if reason := self._unreachable(asked.axes[:, :6]):
