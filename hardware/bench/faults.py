@@ -12,10 +12,9 @@ import math
 import sys
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, as_completed
 from dataclasses import dataclass
 from functools import lru_cache
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,7 @@ from hardware.bench.fault_page import fault_page
 from hardware.bench.fault_run import FaultRun, Stage, stage
 from hardware.bench.fault_table import kinds_text
 from hardware.bench.figure import Figure, at_least, at_most
+from hardware.bench.workers import workers
 from hardware.clock import ProcessorClock, WallClock
 from hardware.faults import fault_from_text
 from hardware.progress import Progress
@@ -75,26 +75,20 @@ def _missing(options: argparse.Namespace, folder: Path, done: set[int]) -> tuple
     """What came of the runs that are still to be done, and how many ended in a traceback, which is shown."""
     rows: list[Row] = []
     broken, jobs = 0, [k for k in range(-(-options.count // PLACES)) if k not in done]
-    with (
-        Progress("faults", "runs", WallClock().now) as progress,
-        ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool,
-    ):
+    with Progress("faults", "runs", WallClock().now) as progress, workers(options.jobs) as pool:
         waiting = {pool.submit(one_run, folder, options.seed, number): number for number in jobs}
-        try:
-            for count, each in enumerate(as_completed(waiting), 1):
-                try:
-                    found = each.result()
-                except (StillbedError, BrokenExecutor):
-                    raise
-                except Exception:  # what is looked for: the other runs go on
-                    broken, found = broken + 1, []
-                    print(f"run {waiting[each]}:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
-                rows += found
-                if options.log is not None and found:
-                    append_log(options.log, found)
-                progress(count, len(jobs))
-        finally:
-            pool.shutdown(cancel_futures=True)
+        for count, each in enumerate(as_completed(waiting), 1):
+            try:
+                found = each.result()
+            except (StillbedError, BrokenExecutor):
+                raise
+            except Exception:  # what is looked for: the other runs go on
+                broken, found = broken + 1, []
+                print(f"run {waiting[each]}:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
+            rows += found
+            if options.log is not None and found:
+                append_log(options.log, found)
+            progress(count, len(jobs))
     return rows, broken
 
 

@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
 
 import numpy as np
 
@@ -23,6 +21,7 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.bench.fault_run import FaultRun, Stage, stage
 from hardware.bench.figure import Figure, at_least, at_most
+from hardware.bench.workers import workers
 from hardware.chart import Plot
 from hardware.clock import WallClock
 from hardware.page import document, legend, line_key, section
@@ -118,16 +117,10 @@ def run(options: argparse.Namespace) -> list[Figure]:
     if options.jobs < 1:
         raise InputError("command line", "--jobs", options.jobs, ">= 1")
     asked, done = [(name, way) for name in options.scenario for way in WAYS], list[Print]()
-    with (
-        Progress("loop", "prints", WallClock().now) as progress,
-        ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool,
-    ):
-        try:
-            for one in pool.map(partial(_one_print, options.seed), *zip(*asked, strict=True)):
-                done.append(one)
-                progress(len(done), len(asked))
-        finally:
-            pool.shutdown(cancel_futures=True)
+    with Progress("loop", "prints", WallClock().now) as progress, workers(options.jobs) as pool:
+        for one in pool.map(partial(_one_print, options.seed), *zip(*asked, strict=True)):
+            done.append(one)
+            progress(len(done), len(asked))
     prints = dict(zip(asked, done, strict=True))
     if options.out is not None:
         page = options.out / "loop.html"

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,9 @@ from hardware.bench.figure import Figure, at_most
 from hardware.bench.outage_judge import GOOD, Verdict, judge
 from hardware.bench.outage_page import outage_page
 from hardware.bench.outage_run import Watched, make_pictures, run_stretch
+from hardware.bench.workers import workers
+from hardware.clock import WallClock
+from hardware.progress import Progress
 from hardware.simulator.outage import Kind
 
 SCENE = 64  # outages before one scene, whose pictures take as long to render as ten of them to track
@@ -28,8 +29,11 @@ Judged = tuple[Watched, Verdict]
 def run(options: argparse.Namespace) -> list[Figure]:
     """Run the campaign, print what came of each kind, and give the figures of all."""
     jobs = shares(options.count, options.processes, options.seed)
-    with ProcessPoolExecutor(options.processes, get_context("spawn")) as pool:
-        judged = [pair for part in pool.map(_scene, jobs) for pair in part]
+    judged = list[Judged]()
+    with Progress("outages", "scenes", WallClock().now) as progress, workers(options.processes) as pool:
+        for done, part in enumerate(pool.map(_scene, jobs), 1):
+            judged += part
+            progress(done, len(jobs))
     print(kinds_text([(w.outage.kind, v) for w, v in judged]) + "\n")
     if options.out is not None:
         page: Path = options.out / "outages.html"
