@@ -12,6 +12,7 @@ from pathlib import Path
 
 from estimation.rig import Rig
 from estimation.se3 import Array
+from hardware.end_with_parent import end_with_parent
 from hardware.mesh_file import read_mesh
 from perception.frames import Roi
 from perception.prefilter import NONE, PREFILTERS
@@ -63,4 +64,5 @@ def tracker(
 def _settle() -> None:
     """Ctrl-C is for the parent, which then ends this process in good order; frames go before the map."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     os.nice(NICE)
