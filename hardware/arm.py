@@ -7,6 +7,7 @@ answers is compared with that (arm_echo.py) where it answers at all.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from itertools import chain
@@ -16,6 +17,7 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm_echo import ArmEcho
+from hardware.arm_insistence import Insistence
 from hardware.arm_line import ArmLine
 from hardware.arm_pace import Pace
 from hardware.arm_port import Opener, UnpluggedError
@@ -51,6 +53,7 @@ class Arm:
         self._queue: ArmQueue | None = None  # None while nobody knows where the arm stands
         self._echo, self._pace = ArmEcho(settings, profile.lag), Pace(profile, settings)
         self._own, self._recall = OwnMoves(), Recall(self._pace.flight - profile.tick, settings.speed, profile.lag)
+        self._insistence = Insistence()
         self._look = now  # when the device is looked for next
         self._doubt_since: float | None = None
         self._open(now)
@@ -99,6 +102,7 @@ class Arm:
             return
         self._halt()
         if self.settings.pause_frame:
+            self._insistence.begin(now)
             self._give(Pause(), now, decided=now)
         if self._line is not None:  # it was not lost over that
             self._change(ArmState.STOPPED, reason, now)
@@ -145,6 +149,7 @@ class Arm:
         except UnpluggedError as error:
             self._unplugged(str(error), now)
             return
+        self._insist(self._line, now)
         if self.state is ArmState.ARMED:
             self._judge(now)
         if self.state is ArmState.ARMED and self.travels and not self._wait(now):
@@ -285,8 +290,10 @@ class Arm:
 
     # -- sending
 
-    def _give(self, instruction: Instruction, now: float, frame: bytes | None = None, decided: float = 0.0) -> None:
-        """Put a frame on the line. Machine axes are told from the arm's origin."""
+    def _give(
+        self, instruction: Instruction, now: float, frame: bytes | None = None, decided: float = math.nan
+    ) -> None:
+        """Put a frame on the line. Machine axes are told from the arm's origin. decided: s, of a stop."""
         assert self._line is not None
         if frame is None:
             told = instruction
@@ -316,7 +323,8 @@ class Arm:
             if self._queue is not None:
                 self._queue.stop()
             on_wire = now + share * self.profile.frame_time if self._queue is None else self._queue.wire_free
-            self.stops.append((decided, on_wire))
+            if not math.isnan(decided):
+                self.stops.append((decided, on_wire))
 
     # -- its own moves, and what stops them
 
@@ -379,7 +387,14 @@ class Arm:
                 self._own.start(chain(back, recall.rest))
                 recall.drop()
 
+    def _insist(self, line: ArmLine, now: float) -> None:
+        """Tell an arm that was told to stop, and does not, once more."""
+        told = self.state is ArmState.STOPPED or (self.state is ArmState.ARMED and self._recall.waits)
+        if told and self.settings.pause_frame and not line.blocked and self._insistence.due(self._echo, now):
+            self._give(Pause(), now)
+
     def _call_back(self, line: ArmLine, now: float) -> None:
+        self._insistence.begin(now)
         line.recall()
         self._give(Pause(), now, decided=now)
 

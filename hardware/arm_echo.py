@@ -122,6 +122,10 @@ class ArmEcho:
         """Whether a place that came after `since`, s, was another than the one before."""
         return self.count > 0 and self._place.since > since
 
+    def restless(self, since: float) -> bool:
+        """Whether an answer that came after `since`, s, was another than the one before, in place or angles."""
+        return any(part.first is not None and part.since > since for part in (self._place, self._turn))
+
     def forgive(self) -> None:
         """Where it stands is its place from now on: what was said against it no longer counts."""
         self.behind = self.lasting = 0.0

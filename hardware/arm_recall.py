@@ -58,6 +58,11 @@ class Recall:
         self.obeys = False
         self._stood: Array | None = None  # where the last step began
 
+    @property
+    def waits(self) -> bool:
+        """Whether it is waited for that the arm comes to rest, and nothing was asked of it since."""
+        return self.goal is not None and self.stepped is None and not self.obeys
+
     def begin(self, why: str, goal: Array, rest: Iterator[G1] | None, now: float) -> None:
         """What was sent, to `goal` (6,), is called back at `now`, s."""
         self.drop()

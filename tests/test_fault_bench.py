@@ -156,7 +156,7 @@ def test_a_run_that_ends_in_a_traceback_is_counted_and_shown_and_the_others_go_o
         return [Row(seed, number, "still", 0, 1.0, verdict)]
 
     monkeypatch.setattr(faults, "one_run", falls)
-    monkeypatch.setattr(faults, "ProcessPoolExecutor", lambda jobs, context: Here())
+    monkeypatch.setattr(faults, "workers", lambda jobs: Here())
     options = Namespace(count=3 * PLACES, jobs=1, log=tmp_path / "x.csv", out=None, seed=1, scenarios=None)
     found = {figure.what: figure for figure in run(options)}
     assert found["runs that ended in a traceback"].value == 1
