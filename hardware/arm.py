@@ -7,10 +7,7 @@ answers is compared with that (arm_echo.py) where it answers at all.
 
 from __future__ import annotations
 
-import math
 from collections import deque
-from collections.abc import Iterator
-from itertools import chain
 
 import numpy as np
 
@@ -25,7 +22,7 @@ from hardware.arm_profile import BITS_PER_BYTE, ArmProfile
 from hardware.arm_queue import ArmQueue, Stretch
 from hardware.arm_recall import Recall, Recalled, near
 from hardware.arm_status import ArmEvent, ArmState, ArmStatus, told
-from hardware.arm_travel import OwnMoves, lifted, travel
+from hardware.arm_travel import OwnMoves
 from hardware.link_settings import LinkSettings
 from hardware.protocol import G1, G4, G54, Instruction, Pause, decode, encode
 from hardware.replies import REPLY_LENGTH, Reply, ReplyKind
@@ -45,15 +42,16 @@ class Arm:
         self.state, self.reason = ArmState.UNPLUGGED, "not opened yet"
         self.frames, self.strays = 0, 0
         self.stray_bytes: deque[tuple[float, bytes]] = deque(maxlen=REMEMBERED)
-        self.stops: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)  # decided, and on the wire, s
         self.origin = np.zeros(3)
         self._events: deque[ArmEvent] = deque(maxlen=REMEMBERED)
         self._opener = opener
         self._line: ArmLine | None = None
         self._queue: ArmQueue | None = None  # None while nobody knows where the arm stands
         self._echo, self._pace = ArmEcho(settings, profile.lag), Pace(profile, settings)
-        self._own, self._recall = OwnMoves(), Recall(self._pace.flight - profile.tick, settings.speed, profile.lag)
+        self._own = OwnMoves(settings.speed, settings.turning, profile.tick)
+        self._recall = Recall(self._pace.flight - profile.tick, settings.speed, profile.lag)
         self._insistence = Insistence()
+        self.stops = self._insistence.stops  # decided, and on the wire, s
         self._look = now  # when the device is looked for next
         self._doubt_since: float | None = None
         self._open(now)
@@ -85,7 +83,7 @@ class Arm:
         if goal is not None:
             if (away := float(np.linalg.norm((goal - place)[:3]))) > self.settings.lost:
                 return f"the arm is {away:.1f} mm from where the motion left off, limit {self.settings.lost:g} mm"
-            self._own.start(self._travel(place, goal, lift=False))
+            self._own.go(place, goal)
         self._doubt_since = None
         self._change(ArmState.ARMED, "by the operator", now)
         return ""
@@ -102,8 +100,7 @@ class Arm:
             return
         self._halt()
         if self.settings.pause_frame:
-            self._insistence.begin(now)
-            self._give(Pause(), now, decided=now)
+            self._call_back(self._line, now)
         if self._line is not None:  # it was not lost over that
             self._change(ArmState.STOPPED, reason, now)
 
@@ -114,7 +111,7 @@ class Arm:
             return f"the arm is {self.state.value}: {self.reason}"
         if axes.shape != (6,) or not ((axes >= limits.low) & (axes <= limits.high)).all():
             return f"{axes.tolist()} is out of bounds"
-        self._own.start(self._travel(np.array(self._queue.target), axes, lift))
+        self._own.go(np.array(self._queue.target), axes, lift)
         return ""
 
     def home(self, now: float) -> str:
@@ -152,8 +149,9 @@ class Arm:
         self._insist(self._line, now)
         if self.state is ArmState.ARMED:
             self._judge(now)
-        if self.state is ArmState.ARMED and self.travels and not self._wait(now):
-            self._advance(now)
+        nearly_done = self.in_flight(now) <= self.profile.tick  # the step before
+        if self.state is ArmState.ARMED and self.travels and nearly_done and not self._wait(now):
+            self._give(self._own.take(), now)
 
     def hold(self, now: float) -> str:
         """Why no frame may be sent now, "" where one may."""
@@ -290,10 +288,8 @@ class Arm:
 
     # -- sending
 
-    def _give(
-        self, instruction: Instruction, now: float, frame: bytes | None = None, decided: float = math.nan
-    ) -> None:
-        """Put a frame on the line. Machine axes are told from the arm's origin. decided: s, of a stop."""
+    def _give(self, instruction: Instruction, now: float, frame: bytes | None = None) -> None:
+        """Put a frame on the line. Machine axes are told from the arm's origin."""
         assert self._line is not None
         if frame is None:
             told = instruction
@@ -303,7 +299,7 @@ class Arm:
 
         def sent(at: float, share: float) -> None:
             self.frames += 1
-            self._book(instruction, at, share, decided)
+            self._book(instruction, at, share)
 
         try:
             share = self._line.send(frame, sent, now)
@@ -312,7 +308,7 @@ class Arm:
         except UnpluggedError as error:
             self._unplugged(str(error), now)
 
-    def _book(self, instruction: Instruction, now: float, share: float, decided: float) -> None:
+    def _book(self, instruction: Instruction, now: float, share: float) -> None:
         """The last byte of a frame is gone: what the arm will do because of it."""
         if isinstance(instruction, G1 | G4):
             assert self._queue is not None
@@ -323,20 +319,9 @@ class Arm:
             if self._queue is not None:
                 self._queue.stop()
             on_wire = now + share * self.profile.frame_time if self._queue is None else self._queue.wire_free
-            if not math.isnan(decided):
-                self.stops.append((decided, on_wire))
+            self._insistence.heard(on_wire)
 
     # -- its own moves, and what stops them
-
-    def _travel(self, start: Array, goal: Array, lift: bool) -> Iterator[G1]:
-        rates = self.settings.speed, self.settings.turning, self.profile.tick
-        return lifted(start, goal, *rates) if lift else travel(start, goal, *rates)
-
-    def _advance(self, now: float) -> None:
-        """Send the next step of its own move, when the one before is nearly done."""
-        assert self._queue is not None
-        if self._queue.in_flight(now) <= self.profile.tick:
-            self._give(self._own.take(), now)
 
     def _halt(self) -> None:
         """Drop its own moves, and the frames of which nothing is on the wire."""
@@ -383,8 +368,7 @@ class Arm:
             elif following is not None:
                 self._give(following, now)
             if recall.obeys and recall.rest is not None:
-                back = self._travel(np.array(self._queue.target), recall.goal, lift=False)
-                self._own.start(chain(back, recall.rest))
+                self._own.go(np.array(self._queue.target), recall.goal, then=recall.rest)
                 recall.drop()
 
     def _insist(self, line: ArmLine, now: float) -> None:
@@ -396,7 +380,7 @@ class Arm:
     def _call_back(self, line: ArmLine, now: float) -> None:
         self._insistence.begin(now)
         line.recall()
-        self._give(Pause(), now, decided=now)
+        self._give(Pause(), now)
 
     def _believe(self, now: float) -> None:
         """What the arm answers at rest is where it stands, unless that is what was known, to rounding."""

@@ -3,22 +3,35 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 from hardware.arm_echo import ArmEcho
 
 AGAIN = 0.1  # s: a frame on the wire, the lag, the way to rest, and the slowest answer of a public driver
+REMEMBERED = 1000  # stops
 BLIND = 3  # times, to an arm that does not answer
 
 
 class Insistence:
-    """When an arm that was told to stop is to be told so again."""
+    """When an arm that was told to stop is to be told so again.
+
+    stops: the instants, s, at which each stop was decided, and at which it was on the wire.
+    """
 
     def __init__(self) -> None:
+        self.stops: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)
         self._told, self._left = -math.inf, 0
+        self._decided: float | None = None
 
     def begin(self, now: float) -> None:
-        """It is told for the first time, at `now`, s."""
-        self._told, self._left = now, BLIND
+        """A stop is decided, and the arm told for the first time, at `now`, s."""
+        self._told, self._left, self._decided = now, BLIND, now
+
+    def heard(self, on_wire: float) -> None:
+        """A frame that stops the arm is on the wire at `on_wire`, s."""
+        if self._decided is not None:
+            self.stops.append((self._decided, on_wire))
+        self._decided = None
 
     def due(self, echo: ArmEcho, now: float) -> bool:
         """Whether to tell it again: AGAIN after it was told it still moves by its answers, or there are none."""

@@ -7,7 +7,7 @@ its speed: it begins with a step to where the arm should be, and moves and turns
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain
 
 import numpy as np
@@ -59,15 +59,16 @@ def _turned(start: Array, goal: Array, turning: float, tick: float) -> Iterator[
 class OwnMoves:
     """What the link moves by itself. step: the next one, None without. ours: whether the last move sent was a step."""
 
-    def __init__(self) -> None:
+    def __init__(self, speed: float, turning: float, tick: float) -> None:
+        """speed: mm/s. turning: rad/s. tick: s of a step at most."""
+        self._rates = speed, turning, tick
         self.step: G1 | None = None
         self.ours = False
         self._steps: Iterator[G1] = iter(())
 
-    def start(self, steps: Iterator[G1]) -> None:
-        """Make these the next steps."""
-        self._steps = steps
-        self.step = next(steps, None)
+    def go(self, start: Array, goal: Array, lift: bool = False, then: Iterable[G1] = ()) -> None:
+        """From `start` (6,) to `goal` (6,), mm and rad, are the next steps, and `then` those. lift: by way of above."""
+        self._begin(chain((lifted if lift else travel)(start, goal, *self._rates), then))
 
     def take(self) -> G1:
         """The next step, once."""
@@ -86,5 +87,9 @@ class OwnMoves:
 
     def drop(self) -> None:
         """Forget all."""
-        self.start(iter(()))
+        self._begin(iter(()))
         self.ours = False
+
+    def _begin(self, steps: Iterator[G1]) -> None:
+        self._steps = steps
+        self.step = next(steps, None)
