@@ -20,7 +20,7 @@ from hardware.arm_pace import Pace
 from hardware.arm_port import Opener, UnpluggedError
 from hardware.arm_profile import BITS_PER_BYTE, ArmProfile
 from hardware.arm_queue import ArmQueue, Stretch
-from hardware.arm_recall import Recall, Recalled, near
+from hardware.arm_recall import Recall, Recalled
 from hardware.arm_status import ArmEvent, ArmState, ArmStatus, told
 from hardware.arm_travel import OwnMoves
 from hardware.link_settings import LinkSettings
@@ -383,12 +383,12 @@ class Arm:
         self._give(Pause(), now)
 
     def _believe(self, now: float) -> None:
-        """What the arm answers at rest is where it stands, unless that is what was known, to rounding."""
-        answered, known = self._echo.axes(now), self._queue
-        if answered is None or (known is not None and near(answered, np.array(known.target))):
-            return
-        self._queue = ArmQueue(answered.tolist(), self.profile.frame_time, now)
-        self._note(f"stands at {told(answered)} by its own answer", now)
+        """Where the arm stands is for its answers to say, as far as their rounding tells it from what was known."""
+        known = self.target
+        stands = self._echo.stands(known, now)
+        if stands is not None and (known is None or (stands != known).any()):
+            self._queue = ArmQueue(stands.tolist(), self.profile.frame_time, now)
+            self._note(f"stands at {told(stands)} by its own answer", now)
 
     def _change(self, state: ArmState, reason: str, now: float) -> None:
         if (state, reason) != (self.state, self.reason):

@@ -15,12 +15,13 @@ import numpy as np
 from estimation.se3 import Array
 from hardware.arm_queue import ArmQueue, Axes
 from hardware.link_settings import LinkSettings
-from hardware.replies import Reply, ReplyKind
+from hardware.replies import Reply, ReplyKind, unit
 
 ENOUGH = 3  # answers before their absence means anything, as noise that looks like one comes alone
 SPAN = 0.05  # s over which the set-point's speed is taken, and the slowest answers of a public driver come
 FORGET = 0.98  # of the lag's sums with each answer: two or three seconds of them
 STILL = 0.15, float(np.deg2rad(0.015))  # mm and rad between answers of an arm at rest: one count of rounding
+HALF = 0.5001 * np.repeat([unit(ReplyKind.PLACE), unit(ReplyKind.TOOL)], 3)  # mm and rad, by which it rounds
 NEAR = 0.07  # mm by which rounding puts an answer beside its way at most, and a little: what is wider tells late
 TWICE = 0.6  # of the slack, which an arm that goes too slowly passes in two answers before one passes all of it
 MISSED = 3  # answers: noise spoils one of them now and then, and the next may come late
@@ -104,6 +105,16 @@ class ArmEcho:
             return None
         return np.concatenate([place.values, turn.values])
 
+    def stands(self, known: Array | None, now: float) -> Array | None:
+        """Where an arm at rest is (6,), by its answers: where it is `known` to be (6,) as far as rounding allows.
+
+        None where it does not answer.
+        """
+        answered = self.axes(now)
+        if answered is None or known is None or not near(answered, known):
+            return answered
+        return np.clip(known, answered - HALF, answered + HALF)
+
     def still(self, now: float) -> bool:
         """Whether its answers say that it is at rest; an arm that does not answer says nothing against it."""
         return self.axes(now) is None or now - max(self._place.since, self._turn.since) >= RESTS
@@ -181,6 +192,14 @@ class ArmEcho:
         product = sum(v * e for v, e in zip(speed, lead, strict=True))
         square = sum(v * v for v in speed)
         self._sums = FORGET * self._sums[0] + product, FORGET * self._sums[1] + square
+
+
+def near(answered: Array | None, axes: Array | None) -> bool:
+    """Whether an arm answers from `axes` (6,), mm and rad, to rounding."""
+    if answered is None or axes is None:
+        return False
+    away = np.abs(answered - axes)
+    return bool(away[:3].max() <= STILL[0] and away[3:].max() <= STILL[1])
 
 
 def _beyond(values: Sequence[float], low: Axes, high: Axes) -> float:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.arm_echo import STILL, ArmEcho
+from hardware.arm_echo import STILL, ArmEcho, near
 from hardware.protocol import G1, Pause
 
 TOLD = 2 * STILL[0]  # mm of a step that answers tell from none
@@ -103,11 +103,3 @@ class Recall:
     def _obey(self, echo: ArmEcho) -> None:
         self.obeys = True
         echo.forgive()
-
-
-def near(answered: Array | None, axes: Array | None) -> bool:
-    """Whether an arm answers from `axes` (6,), mm and rad, to rounding."""
-    if answered is None or axes is None:
-        return False
-    away = np.abs(answered - axes)
-    return bool(away[:3].max() <= STILL[0] and away[3:].max() <= STILL[1])

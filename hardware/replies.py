@@ -43,7 +43,7 @@ class Reply:
 
 def encode_reply(reply: Reply) -> bytes:
     """The 9 bytes of a reply, its numbers rounded to what they count in; InputError for one that does not fit."""
-    counts = np.asarray(reply.values) / _unit(reply.kind)
+    counts = np.asarray(reply.values) / unit(reply.kind)
     if not (np.abs(counts) < _MOST + 0.5).all():  # NaN too
         allowed = f"at most {_MOST / 10:g} mm or {_MOST / 100:g} degrees either way"
         raise InputError("reply", reply.kind.name.lower(), reply.values.tolist(), allowed)
@@ -61,7 +61,7 @@ def decode_reply(frame: bytes) -> Reply:
         raise InputError("reply", "kind", kind, "0 to 3")
     if min(counts) < -_MOST:
         raise InputError("reply", "values", counts, f"-{_MOST} to {_MOST}")
-    return Reply(ReplyKind(kind), np.array(counts) * _unit(ReplyKind(kind)))
+    return Reply(ReplyKind(kind), np.array(counts) * unit(ReplyKind(kind)))
 
 
 def reply_stream() -> FrameStream[Reply]:
@@ -72,5 +72,6 @@ def reply_stream() -> FrameStream[Reply]:
     return FrameStream(REPLY_LENGTH, REPLY_TAILS, decode_reply)
 
 
-def _unit(kind: ReplyKind) -> float:
+def unit(kind: ReplyKind) -> float:
+    """What its values count in, mm or rad."""
     return 0.1 if kind in (ReplyKind.PLACE, ReplyKind.ORIGIN) else float(np.deg2rad(0.01))

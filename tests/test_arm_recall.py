@@ -9,10 +9,14 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from hardware.arm import RECALLED
+from hardware.arm_echo import ArmEcho, near
 from hardware.arm_profile import ArmProfile
-from hardware.arm_recall import TOLD, near
+from hardware.arm_queue import ArmQueue
+from hardware.arm_recall import TOLD
 from hardware.arm_status import ArmState
+from hardware.link_settings import LinkSettings
 from hardware.motion_loop import Order, Tick
+from hardware.replies import Reply, ReplyKind
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from planning.command import Move
 from planning.kinematics import nozzle_from_axes
@@ -148,3 +152,27 @@ def test_where_moves_passed_is_told_by_the_last_time_they_did() -> None:
 def test_an_answer_is_near_within_its_rounding_alone() -> None:
     assert near(HOME + 0.1, HOME) is False and near(HOME + [0.1, 0, 0, 0, 0, 0], HOME)
     assert not near(HOME + [0.2, 0, 0, 0, 0, 0], HOME) and not near(None, HOME) and not near(HOME, None)
+
+
+SIX = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(np.array)
+COUNT = np.array([*[0.1] * 3, *[np.deg2rad(0.01)] * 3])  # of answers, mm and rad
+
+
+@given(place=SIX, beside=SIX, far=st.booleans())
+def test_where_it_rests_is_what_was_known_as_far_as_its_answer_allows(
+    place: np.ndarray, beside: np.ndarray, far: bool
+) -> None:
+    true = HOME + 100 * COUNT * place
+    known = true + (20 if far else 1) * COUNT * beside
+    answered, echo = np.round(true / COUNT) * COUNT, ArmEcho(LinkSettings(), 0.02)
+    assert echo.stands(known, 0.0) is None  # it has not answered
+    queue = ArmQueue(known.tolist(), 0.004, 0.0)
+    echo.take(Reply(ReplyKind.PLACE, answered[:3]), queue, np.zeros(3), 0.1)
+    echo.take(Reply(ReplyKind.TOOL, answered[3:]), queue, np.zeros(3), 0.1)
+    stands = echo.stands(known, 0.1)
+    assert stands is not None and (np.abs(stands - answered) <= 0.501 * COUNT).all()
+    if near(answered, known):
+        assert (np.abs(stands - true) <= np.abs(known - true) + 1e-3 * COUNT).all()  # never farther off than before
+    else:
+        assert (stands == answered).all()
+    assert np.array_equal(echo.stands(None, 0.1), answered)
