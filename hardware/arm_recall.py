@@ -80,7 +80,7 @@ class Recall:
             return self._rested(echo, target, now) if echo.settled(self.since) else None
         if near(answered, target):
             self._obey(echo)
-        elif echo.answered(self.stepped + self._lag + STARTED) and near(answered, self._stood):
+        elif echo.answered(self.stepped + self._lag + STARTED) and not underway(answered, self._stood, target):
             self.since, self.stepped = now, None
             return Pause()
         return None
@@ -103,3 +103,10 @@ class Recall:
     def _obey(self, echo: ArmEcho) -> None:
         self.obeys = True
         echo.forgive()
+
+
+def underway(answered: Array | None, start: Array | None, end: Array) -> bool:
+    """Whether an arm that went from `start` (6,) to `end` (6,), mm and rad, has left and answers from between them."""
+    if answered is None or start is None or near(answered, start):
+        return False
+    return near(answered, np.clip(answered, np.minimum(start, end), np.maximum(start, end)))

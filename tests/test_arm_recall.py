@@ -12,7 +12,7 @@ from hardware.arm import RECALLED
 from hardware.arm_echo import ArmEcho, near
 from hardware.arm_profile import ArmProfile
 from hardware.arm_queue import ArmQueue
-from hardware.arm_recall import TOLD
+from hardware.arm_recall import TOLD, underway
 from hardware.arm_status import ArmState
 from hardware.link_settings import LinkSettings
 from hardware.motion_loop import Order, Tick
@@ -176,3 +176,12 @@ def test_where_it_rests_is_what_was_known_as_far_as_its_answer_allows(
     else:
         assert (stands == answered).all()
     assert np.array_equal(echo.stands(None, 0.1), answered)
+
+
+def test_an_arm_is_under_way_between_the_ends_of_its_step_alone() -> None:
+    end = HOME + [0.6, -0.3, 0, 0, 0, 0]
+    assert underway(HOME + [0.3, -0.1, 0, 0, 0, 0], HOME, end) and underway(end, HOME, end)
+    assert not underway(HOME, HOME, end)  # it has not left
+    assert not underway(HOME + [0.3, 0.4, 0, 0, 0, 0], HOME, end)  # it goes elsewhere
+    assert not underway(HOME + [0.3, -0.1, 0, 0, 0, 0.01], HOME, end)
+    assert not underway(None, HOME, end) and not underway(end, None, end)
