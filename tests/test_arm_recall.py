@@ -12,10 +12,11 @@ from hardware.arm import RECALLED
 from hardware.arm_echo import ArmEcho, near
 from hardware.arm_profile import ArmProfile
 from hardware.arm_queue import ArmQueue
-from hardware.arm_recall import TOLD, underway
+from hardware.arm_recall import TOLD, Recall, underway
 from hardware.arm_status import ArmState
 from hardware.link_settings import LinkSettings
 from hardware.motion_loop import Order, Tick
+from hardware.protocol import G1, Pause
 from hardware.replies import Reply, ReplyKind
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from planning.command import Move
@@ -185,3 +186,24 @@ def test_an_arm_is_under_way_between_the_ends_of_its_step_alone() -> None:
     assert not underway(HOME + [0.3, 0.4, 0, 0, 0, 0], HOME, end)  # it goes elsewhere
     assert not underway(HOME + [0.3, -0.1, 0, 0, 0, 0.01], HOME, end)
     assert not underway(None, HOME, end) and not underway(end, None, end)
+
+
+@pytest.mark.parametrize(
+    ("away", "again"), [([0.3, 0, 0], False), ([0.6, 0, 0], False), ([0, 0, 0], True), ([0, 0.3, 0], True)]
+)
+def test_an_arm_that_answers_from_elsewhere_than_its_step_is_called_back_again(away: list[float], again: bool) -> None:
+    recall, echo = Recall(0.03, 20.0, 0.02), ArmEcho(LinkSettings(), 0.02)
+
+    def answer(place: np.ndarray, now: float) -> None:
+        for kind, values in (ReplyKind.PLACE, place[:3]), (ReplyKind.TOOL, place[3:]):
+            echo.take(Reply(kind, values), ArmQueue(HOME.tolist(), 0.004, 0.0), np.zeros(3), now)
+
+    recall.begin("a stall", HOME + [5, 0, 0, 0, 0, 0], None, 1.0)
+    for now in 0.95, 1.05, 1.1:
+        answer(HOME, now)
+    step = recall.next(echo, HOME, 1.1)
+    assert isinstance(step, G1) and np.allclose(step.axes - HOME, [0.6, 0, 0, 0, 0, 0]) and not recall.waits
+    answer(HOME + [*away, 0, 0, 0], 1.2)
+    following = recall.next(echo, step.axes, 1.2)
+    assert isinstance(following, Pause) if again else following is None
+    assert recall.waits == again and recall.obeys == (away[0] == 0.6)
