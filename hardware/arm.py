@@ -149,8 +149,8 @@ class Arm:
         self._insist(self._line, now)
         if self.state is ArmState.ARMED:
             self._judge(now)
-        nearly_done = self.in_flight(now) <= self.profile.tick  # the step before
-        if self.state is ArmState.ARMED and self.travels and nearly_done and not self._wait(now):
+        travels = self.state is ArmState.ARMED and self.travels
+        if travels and self.in_flight(now) <= self.profile.tick and not self._wait(now):  # the step before nearly done
             self._give(self._own.take(), now)
 
     def hold(self, now: float) -> str:
@@ -259,6 +259,7 @@ class Arm:
         self._line, self._queue = None, None
         self._own.drop()
         self._recall.drop()
+        self._insistence.drop()
         self.origin = np.zeros(3)
         self._look = now + self.settings.reopen
         self._change(ArmState.UNPLUGGED, reason, now)

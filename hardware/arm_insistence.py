@@ -24,13 +24,18 @@ class Insistence:
         self._decided: float | None = None
 
     def begin(self, now: float) -> None:
-        """A stop is decided, and the arm told for the first time, at `now`, s."""
-        self._told, self._left, self._decided = now, BLIND, now
+        """A stop is decided at `now`, s, if none is that has yet to go out; the arm is told for the first time."""
+        self._told, self._left = now, BLIND
+        self._decided = now if self._decided is None else self._decided
 
     def heard(self, on_wire: float) -> None:
         """A frame that stops the arm is on the wire at `on_wire`, s."""
         if self._decided is not None:
             self.stops.append((self._decided, on_wire))
+        self._decided = None
+
+    def drop(self) -> None:
+        """What was decided never goes out: the device is gone."""
         self._decided = None
 
     def due(self, echo: ArmEcho, now: float) -> bool:

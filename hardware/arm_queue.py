@@ -85,6 +85,8 @@ class ArmQueue:
 
     def stop(self) -> None:
         """A frame that stops the arm was given out: it rests where the set-point is when that arrives."""
+        if self._stretches[-1].end <= self._wire:
+            return  # it rests already
         arrival, place = self._wire, self.at(self._wire)
         while self._stretches and self._stretches[-1].end > arrival:
             cut = self._stretches.pop()
