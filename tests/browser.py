@@ -112,7 +112,10 @@ class Page:
         self._tell("Page.navigate", url=address)
 
     def reload(self) -> None:
+        """Load it anew, and wait until nothing of what it was is left to be asked."""
+        self.js("window.before = true")
         self._tell("Page.reload")
+        self.until("!window.before")
 
     def js(self, expression: str) -> Any:
         """Value of an expression in the page, awaited where it is a promise."""

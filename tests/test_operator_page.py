@@ -206,7 +206,7 @@ def test_a_reloaded_window_shows_the_same_and_knows_the_last_minute(run: Run) ->
     page.reload()
     page.until(f"{LIVE} && document.body.dataset.turn === '{run.view.turn}'")
     assert texts == {name: page.text(name) for name in texts}
-    assert page.js("Number(document.querySelector('#course').dataset.rows)") == 6
+    page.until("document.querySelector('#course').dataset.rows === '6'")  # drawn in the next frame
     page.click('[data-wish="pause"]')
     assert run.served.taken() == [Request(1, Wish.PAUSE, run.view.turn)]
 
