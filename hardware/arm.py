@@ -363,11 +363,11 @@ class Arm:
         elif recall.goal is not None and not (recall.obeys or self._line.blocked or self._queue.in_flight(now) > 0):
             if recall.stepped is None and echo.settled(recall.since):
                 self._believe(now)
-            following = recall.next(echo, np.array(self._queue.target), now)
-            if isinstance(following, Pause):
-                self._call_back(self._line, now)
-            elif following is not None:
-                self._give(following, now)
+            for following in recall.next(echo, np.array(self._queue.target), now):
+                if isinstance(following, Pause):
+                    self._call_back(self._line, now)
+                else:
+                    self._give(following, now)
             if recall.obeys and recall.rest is not None:
                 self._own.go(np.array(self._queue.target), recall.goal, then=recall.rest)
                 recall.drop()

@@ -7,7 +7,7 @@ from collections import deque
 
 from hardware.arm_echo import ArmEcho
 
-AGAIN = 0.1  # s: a frame on the wire, the lag, the way to rest, and the slowest answer of a public driver
+AGAIN = 0.09  # s: a frame on the wire, the lag, the way to rest, and the slowest answer of a public driver
 REMEMBERED = 1000  # stops
 BLIND = 3  # times, to an arm that does not answer
 

@@ -2,9 +2,9 @@
 
 An arm that stalls, that frames do not reach or that a garbled one sent astray is told by its answers. What it has
 queued is called back, so that it rests; where it rests, its answers tell. One short step towards where it had been
-sent, given again for as long as nothing comes of it, tells when it obeys again: axes are absolute, so a step given
-twice goes no farther than one. Only then may whoever sends go on, from where the arm stands: what was called back was
-not done, and is to be done from where the arm came to rest.
+sent, given again with a pause before it for as long as nothing comes of it, tells when it obeys again: axes are
+absolute, so a step given twice goes no farther than one. As soon as it has begun whoever sends may go on, from the end
+of it: what was called back was not done, and is to be done from where the arm came to rest.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ STARTED = 0.01  # s of a step, its lag aside, after which an answer from where i
 class Recalled:
     """What whoever sends must know before anything more is sent. place: (6,) mm and rad, where the arm came to rest.
 
-    stands: (6,) where it is now, and the next move begins.
+    stands: (6,) where it is by now, or a part of a step before, and the next move begins.
     """
 
     place: Array
@@ -73,19 +73,22 @@ class Recall:
         self.goal = self.place = self._stood = self.rest = self.stepped = None
         self.why, self.obeys = "", False
 
-    def next(self, echo: ArmEcho, target: Array, now: float) -> G1 | Pause | None:
+    def next(self, echo: ArmEcho, target: Array, now: float) -> tuple[G1 | Pause, ...]:
         """What is to be sent to an arm with nothing under way, which by what is known stands at `target` (6,)."""
         answered = echo.axes(now)
         if self.stepped is None:
-            return self._rested(echo, target, now) if echo.settled(self.since) else None
-        if near(answered, target):
+            return self._rested(echo, target, now) if echo.settled(self.since) else ()
+        if near(answered, target) or underway(answered, self._stood, target):
             self._obey(echo)
-        elif echo.answered(self.stepped + self._lag + STARTED) and not underway(answered, self._stood, target):
+        elif echo.answered(self.stepped + self._lag + STARTED):
+            if near(answered, self._stood):  # nothing came of it: once more, after what may have come instead
+                self.stepped = now
+                return Pause(), G1(target, self._speed)
             self.since, self.stepped = now, None
-            return Pause()
-        return None
+            return (Pause(),)
+        return ()
 
-    def _rested(self, echo: ArmEcho, stands: Array, now: float) -> G1 | None:
+    def _rested(self, echo: ArmEcho, stands: Array, now: float) -> tuple[G1, ...]:
         """It rests: the step, unless it has moved since it was called back, or no step could be told."""
         echo.forgive()
         self._stood, self.place = stands, stands if self.place is None else self.place
@@ -97,8 +100,8 @@ class Recall:
         elif length > TOLD:
             self.stepped = now
             share = min(self._longest * self._speed / length, 1.0)
-            return G1(np.concatenate([stands[:3] + share * way, stands[3:]]), self._speed)
-        return None
+            return (G1(np.concatenate([stands[:3] + share * way, stands[3:]]), self._speed),)
+        return ()
 
     def _obey(self, echo: ArmEcho) -> None:
         self.obeys = True
