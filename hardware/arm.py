@@ -2,30 +2,27 @@
 
 Nothing here waits and nothing knows the time: the loop that owns an Arm calls `poll` every few milliseconds and `send`
 once a tick, with the instant. What the arm has yet to do is known by a model of its queue (arm_queue.py); what it
-answers is compared with that (arm_echo.py) where it answers at all.
+answers is compared with that (arm_echo.py) where it answers at all; both are kept beside its device (arm_device.py).
 """
 
 from __future__ import annotations
-
-from collections import deque
 
 import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm_echo import ArmEcho
-from hardware.arm_insistence import Insistence
+from hardware.arm_device import ArmDevice
 from hardware.arm_line import ArmLine
 from hardware.arm_pace import Pace
 from hardware.arm_port import Opener, UnpluggedError
-from hardware.arm_profile import BITS_PER_BYTE, ArmProfile
-from hardware.arm_queue import ArmQueue, Stretch
+from hardware.arm_profile import ArmProfile
+from hardware.arm_queue import ArmQueue
 from hardware.arm_recall import Recall, Recalled
-from hardware.arm_status import ArmEvent, ArmState, ArmStatus, told
+from hardware.arm_status import ArmState, ArmStatus
 from hardware.arm_travel import OwnMoves
 from hardware.link_settings import LinkSettings
-from hardware.protocol import G1, G4, G54, Instruction, Pause, decode, encode
-from hardware.replies import REPLY_LENGTH, Reply, ReplyKind
+from hardware.protocol import G1, G4, G54, Pause, decode, encode
+from hardware.replies import Reply
 
 DEFAULT = LinkSettings()
 REMEMBERED = 1000  # events and stray bytes that are kept until somebody takes them
@@ -33,28 +30,16 @@ RECALLED = "what was queued is called back"
 ORIGIN_ROUNDING = 0.11  # mm, twice half of what an answer counts
 
 
-class Arm:
+class Arm(ArmDevice):
     """One arm on one line. The methods that an operator's word calls for say why not, "" where it was done."""
 
     def __init__(self, opener: Opener, profile: ArmProfile, now: float, settings: LinkSettings = DEFAULT) -> None:
         """opener: opens the device, and opens it again when it was away. InputError where another program has it."""
-        self.profile, self.settings = profile, settings
-        self.state, self.reason = ArmState.UNPLUGGED, "not opened yet"
-        self.frames, self.strays = 0, 0
-        self.stray_bytes: deque[tuple[float, bytes]] = deque(maxlen=REMEMBERED)
-        self.origin = np.zeros(3)
-        self._events: deque[ArmEvent] = deque(maxlen=REMEMBERED)
-        self._opener = opener
-        self._line: ArmLine | None = None
-        self._queue: ArmQueue | None = None  # None while nobody knows where the arm stands
-        self._echo, self._pace = ArmEcho(settings, profile.lag), Pace(profile, settings)
+        self._pace = Pace(profile, settings)
         self._own = OwnMoves(settings.speed, settings.turning, profile.tick)
         self._recall = Recall(self._pace.flight - profile.tick, settings.speed, profile.lag)
-        self._insistence = Insistence()
-        self.stops = self._insistence.stops  # decided, and on the wire, s
-        self._look = now  # when the device is looked for next
         self._doubt_since: float | None = None
-        self._open(now)
+        super().__init__(opener, profile, now, settings)
 
     # -- what an operator asks for
 
@@ -80,19 +65,26 @@ class Arm:
         if self._queue is None:
             return "nobody knows where the arm stands: it does not answer, and was not told"
         place = np.array(self._queue.target)
-        if goal is not None:
-            if (away := float(np.linalg.norm((goal - place)[:3]))) > self.settings.lost:
-                return f"the arm is {away:.1f} mm from where the motion left off, limit {self.settings.lost:g} mm"
+        if goal is not None and (away := float(np.linalg.norm((goal - place)[:3]))) > self.settings.lost:
+            return f"the arm is {away:.1f} mm from where the motion left off, limit {self.settings.lost:g} mm"
+        self._recall.resume(place)
+        if goal is not None and not self._recall.undone:
             self._own.go(place, goal)
+        self._echo.forgive()
+        self._insistence.drop()
         self._doubt_since = None
         self._change(ArmState.ARMED, "by the operator", now)
         return ""
 
     def disarm(self, now: float) -> None:
-        """Send nothing more; what is under way, 50 ms at most, is done."""
-        if self.state in (ArmState.ARMED, ArmState.STOPPED):
+        """Send nothing more but a stop that the arm has not heard; what is under way, 50 ms at most, is done."""
+        if self.state in (ArmState.ARMED, ArmState.STOPPED) and self._line is not None:
+            unheard = self.insists(now)
             self._halt()
-            self._change(ArmState.DISARMED, "by the operator", now)
+            if unheard:
+                self._call_back(self._line, now)
+            if self._line is not None:
+                self._change(ArmState.DISARMED, "by the operator", now)
 
     def stop(self, reason: str, now: float) -> None:
         """Stop at once: what waits is called back, and the control frame that stops the arm goes next."""
@@ -109,6 +101,8 @@ class Arm:
         limits = self.profile.limits
         if self.state is not ArmState.ARMED or self._queue is None:
             return f"the arm is {self.state.value}: {self.reason}"
+        if self._recall.goal is not None:
+            return RECALLED
         if axes.shape != (6,) or not ((axes >= limits.low) & (axes <= limits.high)).all():
             return f"{axes.tolist()} is out of bounds"
         self._own.go(np.array(self._queue.target), axes, lift)
@@ -140,7 +134,10 @@ class Arm:
                     self._look, self.reason = now + self.settings.reopen, str(error)
             return
         try:
-            self._read(self._line, now)
+            for reply in self._read(self._line, now):
+                self._check_origin(reply, now)
+            if self._line is None:  # lost over what an answer called for
+                return
             if (share := self._line.flush(now)) and self._queue is not None:
                 self._queue.occupy(now, share)
         except UnpluggedError as error:
@@ -175,7 +172,7 @@ class Arm:
         if reason := self._pace.excess(instruction, self._queue, now):
             self.stop(reason, now)
             return reason
-        self._own.ours = False
+        self._own.last = None
         self._give(instruction, now, frame if not self.origin.any() else None)
         return ""
 
@@ -192,11 +189,6 @@ class Arm:
         """Whether the arm makes a move of its own: home, or back to where it was stopped."""
         return self._own.step is not None
 
-    @property
-    def target(self) -> Array | None:
-        """Where the arm was last sent (6,), mm and rad; None where nobody knows."""
-        return None if self._queue is None else np.array(self._queue.target)
-
     def arrived(self, now: float) -> bool:
         """Whether it stands where it was sent: by dead reckoning, and by its answers where it answers."""
         if self._queue is None or self.travels or self._recall.goal is not None or self._queue.in_flight(now) > 0:
@@ -206,24 +198,10 @@ class Arm:
             return self._echo.count == 0
         return self._echo.still(now) and not self._echo.doubt(now)
 
-    def in_flight(self, now: float) -> float:
-        """Seconds of motion that was sent and not done, wire included."""
-        return 0.0 if self._queue is None else self._queue.in_flight(now)
-
-    def reckoned(self, instant: float) -> Array | None:
-        """Where the arm is at `instant`, s, by what was sent (6,), the servo's lag included; None if not known."""
-        late = self.profile.lag - self.profile.frame_time
-        return None if self._queue is None else np.array(self._queue.at(instant - max(late, 0.0)))
-
-    def ways(self, since: float) -> list[Stretch]:
-        """The ways of the set-point that end after `since`, s, as far as they are known."""
-        return [] if self._queue is None else self._queue.ways(since)
-
-    def events(self) -> list[ArmEvent]:
-        """What happened since the last call."""
-        taken = list(self._events)
-        self._events.clear()
-        return taken
+    def insists(self, now: float) -> bool:
+        """Whether it was told to stop, and is not known to have heard it."""
+        line, insistence = self._line, self._insistence
+        return line is not None and insistence.active and (line.blocked or insistence.pending(self._echo, now))
 
     def status(self, now: float) -> ArmStatus:
         """All that is known."""
@@ -234,102 +212,24 @@ class Arm:
             *(self.in_flight(now), queued, self.frames, echo.count, self.strays),
         )
 
-    def close(self) -> None:
-        """Let the device go, without a word to the arm."""
-        if self._line is not None:
-            self._line.port.close()
-        self._line, self.state, self.reason = None, ArmState.UNPLUGGED, "closed"
-        self._look = float("inf")
-
-    # -- the device
-
-    def _open(self, now: float) -> None:
-        try:
-            self._line = ArmLine(self._opener())
-        except UnpluggedError as error:
-            self._look, self.reason = now + self.settings.reopen, str(error)
-            return
-        self._echo.restart()
-        self._change(ArmState.DISARMED, "connected; the operator has not armed it", now)
+    # -- its own moves, and what stops them
 
     def _unplugged(self, reason: str, now: float) -> None:
-        """The device is gone: where the arm stands when it comes back, nobody knows."""
-        if self._line is not None:
-            self._line.port.close()
-        self._line, self._queue = None, None
+        """The device is gone, and what was under way with it."""
         self._own.drop()
-        self._recall.drop()
-        self._insistence.drop()
-        self.origin = np.zeros(3)
-        self._look = now + self.settings.reopen
-        self._change(ArmState.UNPLUGGED, reason, now)
-
-    def _read(self, line: ArmLine, now: float) -> None:
-        replies, strays = line.receive()
-        now -= REPLY_LENGTH * BITS_PER_BYTE / self.profile.baud  # that an answer took on the wire
-        if strays:
-            self.strays += len(strays)
-            self.stray_bytes.append((now, strays))
-        for reply in replies:
-            if reply.kind is ReplyKind.ORIGIN:
-                self._check_origin(reply, now)
-            elif self._queue is not None:
-                self._echo.take(reply, self._queue, self.origin, now)
-            else:
-                self._find(reply, now)
-
-    def _find(self, reply: Reply, now: float) -> None:
-        """While nobody knows where the arm stands, its answers say so; they are believed when it is armed."""
-        place = [*reply.values, 0, 0, 0] if reply.kind is ReplyKind.PLACE else [0, 0, 0, *reply.values]
-        self._echo.take(reply, ArmQueue(place, self.profile.frame_time, now), np.zeros(3), now)
+        self._recall.break_off()
+        super()._unplugged(reason, now)
 
     def _check_origin(self, reply: Reply, now: float) -> None:
         if np.abs(reply.values - self.origin).max() > ORIGIN_ROUNDING and self.state is ArmState.ARMED:
             self.stop(f"the arm's origin is {reply.values.tolist()}, not {self.origin.tolist()}", now)
-
-    # -- sending
-
-    def _give(self, instruction: Instruction, now: float, frame: bytes | None = None) -> None:
-        """Put a frame on the line. Machine axes are told from the arm's origin."""
-        assert self._line is not None
-        if frame is None:
-            told = instruction
-            if isinstance(instruction, G1) and self.origin.any():
-                told = G1(instruction.axes - np.concatenate([self.origin, np.zeros(3)]), instruction.feed)
-            frame = encode(told, self.profile.dialect)
-
-        def sent(at: float, share: float) -> None:
-            self.frames += 1
-            self._book(instruction, at, share)
-
-        try:
-            share = self._line.send(frame, sent, now)
-            if share and self._queue is not None:
-                self._queue.occupy(now, share)
-        except UnpluggedError as error:
-            self._unplugged(str(error), now)
-
-    def _book(self, instruction: Instruction, now: float, share: float) -> None:
-        """The last byte of a frame is gone: what the arm will do because of it."""
-        if isinstance(instruction, G1 | G4):
-            assert self._queue is not None
-            self._queue.add(instruction, now, share)
-        elif self._queue is not None:
-            self._queue.occupy(now, share)
-        if isinstance(instruction, Pause):
-            if self._queue is not None:
-                self._queue.stop()
-            on_wire = now + share * self.profile.frame_time if self._queue is None else self._queue.wire_free
-            self._insistence.heard(on_wire)
-
-    # -- its own moves, and what stops them
 
     def _halt(self) -> None:
         """Drop its own moves, and the frames of which nothing is on the wire."""
         if self._line is not None:
             self._line.recall()
         self._own.drop()
-        self._recall.drop()
+        self._recall.break_off()
 
     def _wait(self, now: float) -> str:
         """Why no frame of a tick may go out now."""
@@ -368,33 +268,19 @@ class Arm:
                     self._call_back(self._line, now)
                 else:
                     self._give(following, now)
-            if recall.obeys and recall.rest is not None:
-                self._own.go(np.array(self._queue.target), recall.goal, then=recall.rest)
-                recall.drop()
+            if recall.obeys:
+                self._insistence.drop()
+                if recall.rest is not None:
+                    self._own.go(np.array(self._queue.target), recall.goal, then=recall.rest)
+                    recall.drop()
 
     def _insist(self, line: ArmLine, now: float) -> None:
         """Tell an arm that was told to stop, and does not, once more."""
-        told = self.state is ArmState.STOPPED or (self.state is ArmState.ARMED and self._recall.waits)
-        if told and self.settings.pause_frame and not line.blocked and self._insistence.due(self._echo, now):
+        told = self.state is not ArmState.ARMED or self._recall.waits
+        if told and not line.blocked and self._insistence.due(self._echo, now):
             self._give(Pause(), now)
 
     def _call_back(self, line: ArmLine, now: float) -> None:
         self._insistence.begin(now)
         line.recall()
         self._give(Pause(), now)
-
-    def _believe(self, now: float) -> None:
-        """Where the arm stands is for its answers to say, as far as their rounding tells it from what was known."""
-        known = self.target
-        stands = self._echo.stands(known, now)
-        if stands is not None and (known is None or (stands != known).any()):
-            self._queue = ArmQueue(stands.tolist(), self.profile.frame_time, now)
-            self._note(f"stands at {told(stands)} by its own answer", now)
-
-    def _change(self, state: ArmState, reason: str, now: float) -> None:
-        if (state, reason) != (self.state, self.reason):
-            self._note(f"{state.value}: {reason}", now)
-        self.state, self.reason = state, reason
-
-    def _note(self, text: str, now: float) -> None:
-        self._events.append(ArmEvent(now, text))

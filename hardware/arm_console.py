@@ -15,6 +15,7 @@ from hardware.arm_port import Opener
 from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmState, ArmStatus
 from hardware.clock import Clock
+from hardware.farewell import farewell
 from hardware.link_settings import LinkSettings
 
 AXES = "XYZABC"
@@ -73,8 +74,7 @@ def run_arm(
         else:
             console.watch(request.seconds)
     finally:
-        if arm.state is ArmState.ARMED:
-            arm.stop("interrupted", clock.now())
+        farewell(arm, "interrupted", clock, settings.poll)
         status = arm.status(clock.now())
         arm.close()
     say(findings(status, profile))

@@ -117,7 +117,8 @@ class ArmEcho:
 
     def still(self, now: float) -> bool:
         """Whether its answers say that it is at rest; an arm that does not answer says nothing against it."""
-        return self.axes(now) is None or now - max(self._place.since, self._turn.since) >= RESTS
+        fresh = [part for part in (self._place, self._turn) if now - part.stamp <= self.settings.silence]
+        return all(now - part.since >= RESTS for part in fresh)
 
     def settled(self, since: float) -> bool:
         """Whether answers agree that it is at rest, of which the newest was given after `since`, s, and its lag."""

@@ -43,7 +43,8 @@ class Recall:
 
     why: for a person. since: s, when it was called back. place: (6,) where it first came to rest, None until it has.
     rest: of a travel that was broken off, None where a motion was. stepped: s, when the last step was given, None where
-    none is. obeys: whether the arm is known to move again.
+    none is. obeys: whether the arm is known to move again. undone: whether a motion's moves were called back, and a
+    stop came before it was told so.
     """
 
     def __init__(self, longest: float, speed: float, lag: float) -> None:
@@ -55,7 +56,7 @@ class Recall:
         self.place: Array | None = None
         self.rest: Iterator[G1] | None = None
         self.stepped: float | None = None
-        self.obeys = False
+        self.obeys = self.undone = False
         self._stood: Array | None = None  # where the last step began
 
     @property
@@ -71,7 +72,17 @@ class Recall:
     def drop(self) -> None:
         """Nothing is called back any more."""
         self.goal = self.place = self._stood = self.rest = self.stepped = None
-        self.why, self.obeys = "", False
+        self.why, self.obeys, self.undone = "", False, False
+
+    def break_off(self) -> None:
+        """It ends in a stop, or the device is gone: what was called back stays undone."""
+        undone = self.undone or (self.goal is not None and self.rest is None)
+        self.drop()
+        self.undone = undone
+
+    def resume(self, place: Array) -> None:
+        """The arm obeys again, from rest at `place` (6,): whoever sends is to be told what is undone."""
+        self.place, self.obeys = place, self.undone
 
     def next(self, echo: ArmEcho, target: Array, now: float) -> tuple[G1 | Pause, ...]:
         """What is to be sent to an arm with nothing under way, which by what is known stands at `target` (6,)."""

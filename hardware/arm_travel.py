@@ -57,13 +57,13 @@ def _turned(start: Array, goal: Array, turning: float, tick: float) -> Iterator[
 
 
 class OwnMoves:
-    """What the link moves by itself. step: the next one, None without. ours: whether the last move sent was a step."""
+    """What the link moves by itself. step: the next one, None without. last: the step that was the last move sent."""
 
     def __init__(self, speed: float, turning: float, tick: float) -> None:
         """speed: mm/s. turning: rad/s. tick: s of a step at most."""
         self._rates = speed, turning, tick
         self.step: G1 | None = None
-        self.ours = False
+        self.last: G1 | None = None
         self._steps: Iterator[G1] = iter(())
 
     def go(self, start: Array, goal: Array, lift: bool = False, then: Iterable[G1] = ()) -> None:
@@ -74,21 +74,23 @@ class OwnMoves:
         """The next step, once."""
         step = self.step
         assert step is not None
-        self.step, self.ours = next(self._steps, None), True
+        self.step, self.last = next(self._steps, None), step
         return step
 
     def break_off(self) -> Iterator[G1] | None:
-        """The steps that come no more, as what was sent last is called back; None where that was not a step's way."""
-        rest = None
-        if self.step is not None or self.ours:
-            rest = iter(()) if self.step is None else chain([self.step], self._steps)
+        """The steps that come no more, as what was sent last is called back; None where that was not a step's way.
+
+        The last one is among them, as none of it may have gone out; given twice it goes no farther.
+        """
+        known = [step for step in (self.last, self.step) if step is not None]
+        rest = chain(known, self._steps) if known else None
         self.drop()
         return rest
 
     def drop(self) -> None:
         """Forget all."""
         self._begin(iter(()))
-        self.ours = False
+        self.last = None
 
     def _begin(self, steps: Iterator[G1]) -> None:
         self._steps = steps

@@ -18,11 +18,10 @@ from hardware.arm import Arm
 from hardware.arm_recall import Recalled
 from hardware.arm_status import ArmState, ArmStatus
 from hardware.clock import Clock
+from hardware.farewell import farewell
 from hardware.lateness import Lateness
 from hardware.rhythm import Rhythm
 from planning.command import Command, Hold, Move
-
-FAREWELL = 0.05  # s in which the last frame, which stops the arm, goes out
 
 
 class Motion(Protocol):
@@ -122,15 +121,7 @@ class MotionLoop:
                     self.skipped += rhythm.made(self._clock.now())
                 self._clock.wait_until(min(rhythm.due, self._clock.now() + self._look))
         finally:
-            self._end()
-
-    def _end(self) -> None:
-        if self.arm.state is ArmState.ARMED:
-            self.arm.stop("the motion has ended", self._clock.now())
-        until = self._clock.now() + FAREWELL
-        while (now := self._clock.now()) < until:
-            self.arm.poll(now)
-            self._clock.wait_until(now + self._look)
+            farewell(self.arm, "the motion has ended", self._clock, self._look)
 
     def _obey(self, now: float) -> None:
         for order in self._orders():
@@ -140,7 +131,7 @@ class MotionLoop:
             if self.arm.state is ArmState.ARMED:
                 self._left_off = self.arm.profile.arm.home
                 self._homed()
-            self.arm.disarm(now)
+                self.arm.disarm(now)
 
     def _do(self, order: Order, now: float) -> str:
         """Follow an order; why it cannot be followed, or ""."""

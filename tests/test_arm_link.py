@@ -339,3 +339,18 @@ def test_one_wrong_answer_alone_is_not_believed() -> None:
     link.arm._echo.take(Reply(ReplyKind.PLACE, HOME[:3] + 100), link.arm._queue, np.zeros(3), 1.0)
     assert link.arm.hold(1.0) == ""
     assert link.follow(1.0) == []
+
+
+@pytest.mark.parametrize("off", [3.0, 14.0])
+def test_what_was_said_against_an_arm_before_it_was_armed_again_does_not_count(off: float) -> None:
+    link = linked(ArmSettings(servo_lag=0.02, replies=Replies.STREAM))
+    link.run(1.0)
+    link.virtual.receive(encode(G1(HOME + [off, 0, 0, 0, 0, 0], 200.0)), link.virtual.now)
+    link.run(0.06)
+    link.arm.stop("by the operator", link.clock.now())
+    link.run(1.0)
+    assert link.arm.arm(link.clock.now()) == "" and link.arm.home(link.clock.now()) == ""
+    link.arm.events()
+    link.run(3.0)
+    assert link.arm.state is ArmState.ARMED and link.arm.events() == []
+    assert link.arm.arrived(link.clock.now()) and link.executed() == pytest.approx(HOME, abs=0.01)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from hardware.arm import Arm
+from hardware.arm_port import UnpluggedError
 from hardware.arm_profile import ArmProfile, at_baud
 from hardware.arm_status import ArmState
 from hardware.arm_travel import lifted, travel
@@ -52,6 +55,35 @@ def test_a_port_that_takes_nothing_for_long_is_a_stop_and_a_torn_frame_is_comple
     assert link.arm.frames == link.virtual.frames
     assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
     assert link.virtual.deepest <= 0.05
+
+
+def test_a_port_that_goes_while_a_wrong_origin_is_stopped_is_an_arm_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
+    link = linked(ANSWERING)
+    link.run(0.5)
+    line = link.arm._line
+    assert line is not None
+
+    def gone(data: bytes) -> int:
+        raise UnpluggedError("the device is gone")
+
+    monkeypatch.setattr(line.port, "write", gone)
+    monkeypatch.setattr(line, "receive", lambda: ([Reply(ReplyKind.ORIGIN, np.array([5.0, 0, 0]))], b""))
+    link.arm.poll(link.clock.now())
+    assert link.arm.state is ArmState.UNPLUGGED and "gone" in link.arm.reason
+
+
+@settings(max_examples=40)
+@given(blocked=st.floats(0.84, 0.98), stalls=st.floats(0.80, 0.96))
+def test_a_step_home_that_waited_in_the_port_as_it_was_called_back_is_made_after_all(
+    blocked: float, stalls: float
+) -> None:
+    port = PortFaults(blocked=[(blocked, blocked + 0.15)])
+    link = linked(ANSWERING, arm_fault(f"stall 200ms at {stalls}s"), port=port)
+    goal = HOME + [8, 0, 0, 0, 0, 0]
+    link.run(0.5)
+    assert link.arm.go(goal, link.clock.now()) == ""
+    link.run(3.0)
+    assert link.arm.arrived(link.clock.now()) and link.executed() == pytest.approx(goal, abs=0.05)
 
 
 def test_bytes_that_wait_in_the_port_are_a_hold() -> None:

@@ -116,12 +116,54 @@ def test_of_the_path_nothing_is_left_out_and_it_is_done_as_soon_as_it_can_be() -
     assert len(recalls) == 1 and 6.5 < recalls[0].stamp < 6.5 + SOON
     done = printed(ticks, link)
     path = looping.motion.progress.place
+    assert path > 20 and unprinted(done, path) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("fault", "orders"),
+    [
+        ("stall 3s at 6s", {10.0: Order.ARM}),
+        ("stall 500ms at 6s", {6.2: Order.STOP, 8.0: Order.ARM}),
+        ("stall 500ms at 6s", {6.2: Order.DISARM, 8.0: Order.ARM}),
+    ],
+    ids=["stopped by patience", "stopped", "disarmed"],
+)
+def test_nothing_is_left_out_where_a_call_back_ends_in_a_stop(fault: str, orders: dict[float, Order]) -> None:
+    link = linked(ANSWERING, arm_fault(fault), stand=False, profile=ArmProfile())
+    looping = Looping({0.0: Order.AT_HOME, 0.5: Order.ARM, **orders}, link, seen)
+    done = printed(looping.run(max(orders) + 6.0), link)
+    path = looping.motion.progress.place
+    assert path > 20 and unprinted(done, path) < 0.2
+
+
+def test_what_is_undone_is_told_though_the_arm_goes_home_first() -> None:
+    link = linked(ANSWERING, arm_fault("stall 500ms at 6s"), stand=False, profile=ArmProfile())
+    orders = {0.0: Order.AT_HOME, 0.5: Order.ARM, 6.2: Order.STOP, 8.0: Order.HOME}
+    looping = Looping(orders, link, seen)
+    ticks = looping.run(12.0)
+    (told,) = [t for t in ticks if t.recalled is not None]
+    assert 8.0 < told.stamp < 8.05 and told.recalled is not None
+    assert np.abs(told.recalled.place - link.virtual.axes_at(np.array([7.9]))[0])[:3].max() < ROUNDING
+    path = looping.motion.progress.place
+    assert path > 10 and unprinted(printed(ticks, link), path) < 0.2
+    assert link.arm.arrived(link.clock.now()) and link.arm.state is ArmState.DISARMED
+
+
+def unprinted(done: np.ndarray, path: float) -> float:
+    """The largest distance, mm, of a place on the first `path` mm of the raster from where it was printed."""
     ways = raster(speed=10.0).surface_from_nozzle[:, :3, 3]
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ways, axis=0), axis=1))])
-    asked = np.arange(0.0, path - 0.5, 0.2)
+    asked = np.arange(0.0, path - 0.5, 0.05)
     places = np.stack([np.interp(asked, along, ways[:, i]) for i in range(3)], 1)
-    gaps = np.linalg.norm(places[:, None] - done[None], axis=2).min(1)
-    assert path > 20 and gaps.max() < 0.4
+    return float(np.linalg.norm(places[:, None] - done[None], axis=2).min(1).max())
+
+
+def test_home_waits_until_the_arm_is_known_to_obey() -> None:
+    link = linked(ANSWERING, arm_fault("stall 600ms at 1s"))
+    recalled_by(link, 1.3)
+    assert link.arm.home(link.clock.now()) == RECALLED
+    link.run(0.6)
+    assert link.arm.take_up() is not None and link.arm.home(link.clock.now()) == ""
 
 
 def test_the_path_goes_on_where_the_arm_came_to_rest() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from estimation.pose import SurfacePose, TrackState
+from hardware.arm_insistence import BLIND
 from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmState
 from hardware.clock import SimClock, WallClock
@@ -135,9 +136,8 @@ def test_a_lost_surface_is_a_pause_on_the_wire_and_the_arm_at_rest() -> None:
     looping = Looping(START, linked(stand=False), lost)
     ticks = looping.run(3.0)
     assert isinstance(ticks[-1].command, Hold) and len(ticks[-1].frame) == 48
-    assert (
-        looping.link.virtual.frames == sum(bool(t.frame) for t in ticks) + 2
-    )  # the first step, and the stop at the end
+    first, stop = 1, 1 + BLIND  # the step to where it stands; and the end, said again to an arm that does not answer
+    assert looping.link.arm.frames == first + sum(bool(t.frame) for t in ticks) + stop
 
 
 def test_a_late_tick_is_made_once_and_missed_ones_are_not_made_up() -> None:
