@@ -25,7 +25,6 @@ from hardware.protocol import G1, G4, G54, Pause, decode, encode
 from hardware.replies import Reply
 
 DEFAULT = LinkSettings()
-REMEMBERED = 1000  # events and stray bytes that are kept until somebody takes them
 RECALLED = "what was queued is called back"
 ORIGIN_ROUNDING = 0.11  # mm, twice half of what an answer counts
 
@@ -266,7 +265,7 @@ class Arm(ArmDevice):
             for following in recall.next(echo, np.array(self._queue.target), now):
                 if isinstance(following, Pause):
                     self._call_back(self._line, now)
-                else:
+                elif self._line is not None:  # it was not lost over the pause
                     self._give(following, now)
             if recall.obeys:
                 self._insistence.drop()

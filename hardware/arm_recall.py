@@ -82,7 +82,8 @@ class Recall:
 
     def resume(self, place: Array) -> None:
         """The arm obeys again, from rest at `place` (6,): whoever sends is to be told what is undone."""
-        self.place, self.obeys = place, self.undone
+        if self.undone:
+            self.place, self.obeys = place, True
 
     def next(self, echo: ArmEcho, target: Array, now: float) -> tuple[G1 | Pause, ...]:
         """What is to be sent to an arm with nothing under way, which by what is known stands at `target` (6,)."""

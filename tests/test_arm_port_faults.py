@@ -72,6 +72,22 @@ def test_a_port_that_goes_while_a_wrong_origin_is_stopped_is_an_arm_unplugged(mo
     assert link.arm.state is ArmState.UNPLUGGED and "gone" in link.arm.reason
 
 
+def test_a_port_that_goes_while_an_arm_is_asked_whether_it_obeys_is_an_arm_unplugged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    link = linked(ANSWERING, arm_fault("drop at 1s for 900ms"))
+    link.follow(1.4)
+    line, frames = link.arm._line, link.arm.frames
+    assert line is not None
+
+    def gone(data: bytes) -> int:
+        raise UnpluggedError("the device is gone")
+
+    monkeypatch.setattr(line.port, "write", gone)
+    link.run(0.2)
+    assert link.arm.frames == frames and any("gone" in event.text for event in link.arm.events())
+
+
 @settings(max_examples=40)
 @given(blocked=st.floats(0.84, 0.98), stalls=st.floats(0.80, 0.96))
 def test_a_step_home_that_waited_in_the_port_as_it_was_called_back_is_made_after_all(
