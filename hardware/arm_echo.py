@@ -185,7 +185,7 @@ class ArmEcho:
 
     def _learn(self, place: Array, queue: ArmQueue, now: float) -> None:
         """Fit the lag: the set-point's lead over the answer is its speed times that."""
-        ahead, before = queue.at(now)[:3], queue.at(now - SPAN)[:3]
+        ahead, before = (np.asarray(queue.at(t)[:3]).tolist() for t in (now, now - SPAN))
         speed = [(a - b) / SPAN for a, b in zip(ahead, before, strict=True)]
         lead = [a - p for a, p in zip(ahead, place.tolist(), strict=True)]
         if math.hypot(*speed) < MOVING or self.off > self.settings.off:

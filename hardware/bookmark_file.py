@@ -52,7 +52,7 @@ def read_start(file: File, path: Path) -> float:
 
 def _replace(file: File, mark: Bookmark, printed: int, sure: bool = False) -> None:
     """Write beside the file and rename: there is always one that can be read. sure: it is on the disk on return."""
-    text = f'path = "{mark.path}"\nfraction = {mark.fraction!r}\nprinted = {printed}\n'
+    text = f'path = "{mark.path}"\nfraction = {checks.toml_number(mark.fraction)}\nprinted = {printed}\n'
     beside = file.with_name(file.name + ".new")
     with beside.open("w", encoding="utf-8") as stream:
         stream.write(text)

@@ -132,6 +132,11 @@ def _all_numbers(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
+def toml_number(value: float) -> str:
+    """A number as TOML, numpy's too, with the digits that give the same float64 back."""
+    return repr(float(value))
+
+
 def toml_numbers(array: Array) -> str:
     """An array as TOML, every number with the digits that give the same float64 back."""
     return json.dumps(array.tolist())

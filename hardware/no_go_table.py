@@ -29,7 +29,7 @@ def no_go_lines(zones: tuple[NoGo, ...]) -> list[str]:
     for zone in zones:
         lines += ["", "[[no_go]]", f'name = "{zone.name}"']
         if zone.radius < float("inf"):
-            lines += [f"cylinder = {checks.toml_numbers(zone.axis)}", f"radius = {zone.radius!r}"]
+            lines += [f"cylinder = {checks.toml_numbers(zone.axis)}", f"radius = {checks.toml_number(zone.radius)}"]
         elif len(zone.offsets) == 1:
             lines.append(f"half_space = {checks.toml_numbers(_plane(zone))}")
         else:

@@ -28,6 +28,7 @@ REST = ("material", "temperature_c")
 OPTIONAL = ("layer", "extrude")
 HEADER = (*POSE, "speed_mm_s", *REST, *OPTIONAL)
 STEMS = {name.split("_")[0]: name for name in ("temperature_c", *SPEEDS, *POSE)}  # x, alpha, speed: they need units
+SMALLEST = 0.5  # mm, corner to corner: less than any wound, and more than one of half a metre in metres
 Words = dict[str, list[str]]
 
 
@@ -47,7 +48,12 @@ def read_path(file: str | File) -> Path:
         extrude=_whole(file, lines, "extrude", words.get("extrude", ["1"] * len(lines)), (0, 1)) == 1,
         extra={name: np.array(words[name]) for name in words if name not in (*HEADER, *SPEEDS)},
     )
-    return check_path(path, file, lines)
+    check_path(path, file, lines)
+    span = float(np.linalg.norm(np.ptp(pose[:, :3], axis=0)))
+    if span < SMALLEST:
+        allowed = f"{SMALLEST:g} mm or more from corner to corner: are they in metres?"
+        raise InputError(file, "positions", f"{span:.3g} mm from corner to corner", allowed)
+    return path
 
 
 def write_path(file: str | File, path: Path) -> None:

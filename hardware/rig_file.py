@@ -141,7 +141,7 @@ def write_rig(
             lines.append(f"{key} = {checks.toml_numbers(array)}")
         lines.append(f"base_from_camera = {checks.toml_numbers(camera.base_from_camera)}")
         if camera.clock_offset:
-            lines.append(f"clock_offset_s = {float(camera.clock_offset)!r}")
+            lines.append(f"clock_offset_s = {checks.toml_number(camera.clock_offset)}")
         if sigma is not None:
             lines.append(f"{SIGMA_KEY} = {checks.toml_numbers(sigma)}")
         blocks.append("\n".join(lines) + "\n")

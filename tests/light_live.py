@@ -85,6 +85,13 @@ def png() -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
+def unkept(order: Any) -> Any:
+    """A path that, carried to where it lies, is refused by the reader of paths."""
+    from estimation.errors import InputError
+
+    raise InputError("kept", "line 6: position", [1.0, 2.0, 3.0], "0.001 mm or more from line 5")
+
+
 def main(folder: Path, record: Path, *flags: str) -> int:
     """Run; the exit code is the run's."""
     from dataclasses import replace
@@ -105,6 +112,10 @@ def main(folder: Path, record: Path, *flags: str) -> int:
         texts = [flag.partition("=")[2] for flag in flags if flag.startswith("--fault=")]
         faults = faults_from_texts("command line", "--fault", texts)  # allowed, as what is tracked is simulated
         prepared = replace(prepare(given, "the test", False), faults=faults)
+    if "--unkept" in flags:
+        from hardware.live import run
+
+        run.kept_begin = unkept
     with Console() as console:
         outcome = LiveRun(prepared, console, track_nothing)()
         outcome.write()

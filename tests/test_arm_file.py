@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,12 @@ def same(a: ArmProfile, b: ArmProfile) -> bool:
     numbers = all(np.allclose(x, y, rtol=1e-14, atol=1e-14) for x, y in pairs)
     numbers &= np.array_equal(a.tool, b.tool)
     return numbers and (a.dialect, a.baud, a.tick, a.lag) == (b.dialect, b.baud, b.tick, b.lag)
+
+
+def test_numbers_of_numpy_are_written_as_numbers(tmp_path: Path) -> None:
+    profile = replace(ArmProfile(), lag=np.float64(0.0261), tick=np.float64(0.02))  # measured, and brought in step
+    write_arm(tmp_path / "arm.toml", profile)
+    assert same(read_arm(tmp_path / "arm.toml"), profile)
 
 
 @given(st.integers(0, 10_000))

@@ -80,7 +80,7 @@ def run_live(words: list[str], cache: Path) -> int:
     """A live run with an operator who agrees to whatever is asked."""
     live = Running(*words, cache=cache, cwd=Path.cwd())
     try:
-        if not {"--yes", "--resume"} & set(words):  # what is resumed here was begun with --yes
+        if "--yes" not in words:
             at = live.wait_for("confirm")
             live.press("y")
             live.wait_for("ready", at)

@@ -136,6 +136,25 @@ def test_the_conducting_process_killed_leaves_an_arm_at_rest_and_a_whole_recordi
     assert kept(record, tmp_path / "path.csv") == pytest.approx(last_place(record), abs=0.2)
 
 
+def test_who_resumes_is_asked_again_though_the_run_before_asked_nobody(start: Start, tmp_path: Path) -> None:
+    record = tmp_path / "run.mcap"
+    first = begun(start, record)
+    first.process.send_signal(signal.SIGINT)
+    assert first.end() == 128 + signal.SIGINT
+    again = start(record, "--resume")
+    again.wait_for("confirm")
+    CLOCK.wait_until(CLOCK.now() + 0.5)
+    again.press("q")
+    assert again.end() == 1 and "\nready" not in again.said and "\nprint\n" not in again.said
+
+
+def test_a_path_that_cannot_be_kept_where_it_lies_ends_the_run_as_anything_does(start: Start, tmp_path: Path) -> None:
+    run = start(tmp_path / "run.mcap", "--yes", "--unkept")
+    assert run.end() == 1
+    assert "failed: what lies on the surface cannot be printed: line 6: position = [1.0, 2.0, 3.0], allowed" in run.said
+    assert (tmp_path / "run.report.html").exists() and not open_session(tmp_path / "run.mcap").damage
+
+
 @pytest.mark.slow  # the bench of the link and test_arm_port_faults unplug it too
 def test_an_arm_that_is_unplugged_is_waited_for_and_goes_on_from_home(start: Start, tmp_path: Path) -> None:
     record, link = tmp_path / "run.mcap", tmp_path / "arm"

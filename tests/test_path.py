@@ -100,6 +100,7 @@ def test_the_sample_path_is_a_square_of_10_mm() -> None:
         ([HEAD, GOOD[0], "1,0,0,0,0,0,5,1,20,0"], ["line 3", "10 values", "11"]),
         ([HEAD, GOOD[0], GOOD[1] + ",7"], ["line 3", "12 values", "11"]),
         ([HEAD, *GOOD, GOOD[2]], ["line 5", "position", "line 4"]),
+        ([HEAD, *(f"{x},0,0,0,0,0,5,1,20,0,1" for x in (0, 0.01, 0.05))], ["positions", "0.05 mm", "in metres?"]),
         ([HEAD, GOOD[0], "1,0,0,0,0,0,5,,20,0,1"], ["line 3", "material"]),
         ([HEAD, GOOD[0], "1,0,0,0,0,0,5,1,20,0.5,1"], ["line 3", "layer", "whole number"]),
         ([HEAD, GOOD[0], "1,0,0,0,0,0,5,1,20,0,yes"], ["line 3", "extrude", "0 or 1"]),

@@ -41,9 +41,13 @@ def read_board(path: str | Path) -> Board:
 
 def write_board(path: Path, board: Board) -> None:
     """Write a board.toml that `read_board` reads back to the same board."""
-    lines = [f'kind = "{board.kind}"', f"squares = {list(board.squares)}", f"square_mm = {board.square!r}"]
+    lines = [
+        f'kind = "{board.kind}"',
+        f"squares = {list(board.squares)}",
+        f"square_mm = {checks.toml_number(board.square)}",
+    ]
     if board.kind == "charuco":
-        lines += [f"marker = {board.marker!r}  # of a square", f'dictionary = "{board.dictionary}"']
+        lines += [f"marker = {checks.toml_number(board.marker)}  # of a square", f'dictionary = "{board.dictionary}"']
         lines += [f"legacy = {str(board.legacy).lower()}"]
     lines.append(f"inverted = {str(board.inverted).lower()}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

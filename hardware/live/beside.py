@@ -85,7 +85,7 @@ def write_found(file: Path, found: Found) -> None:
     """Write beside the file and rename: there is always one that can be read, or none."""
     lines = [
         f'map = "{found.map.resolve()}"',
-        f"until_s = {found.until!r}",
+        f"until_s = {checks.toml_number(found.until)}",
         f"surface_from_path = {checks.toml_numbers(found.surface_from_path)}",
         f"arm_from_base = {checks.toml_numbers(found.arm_from_base)}",
     ]

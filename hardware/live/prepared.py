@@ -70,13 +70,16 @@ def prepare(settings: LiveSettings, where: object, force: bool) -> Prepared:
 
 
 def prepare_again(record: File, flags: dict[str, Any]) -> Prepared:
-    """The run that goes on where the one recorded in `record` stopped, with its settings and what `flags` overrides."""
+    """The run that goes on where the one recorded in `record` stopped, with its settings and what `flags` overrides.
+
+    That somebody confirms is asked anew: nobody has looked at this run yet, whoever did without at the one before.
+    """
     beside = Beside(record)
     if not record.exists():
         raise InputError(record, "--resume", "no such file", "the recording of a run")
     if not beside.session.exists():
         raise InputError(record, "--resume", f"no {beside.session.name} beside it", "the recording of a run")
-    settings = overridden(read_settings(beside.session), flags)
+    settings = overridden(replace(read_settings(beside.session), unattended=False), flags)
     found = read_found(beside.surface) if beside.surface.exists() else None
     again = beside.next()
     settings = check_settings(replace(settings, record=again.record), beside.session)

@@ -18,6 +18,7 @@ from pathlib import Path as File
 from types import FrameType
 from typing import TYPE_CHECKING
 
+from estimation.errors import InputError
 from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmState
 from hardware.clock import WallClock
@@ -184,7 +185,14 @@ class LiveRun:
             if order is Order.STOP:
                 self._stopped_at.append(self._clock.now())
             if isinstance(order, Begin):
-                order = self._noted(order)
+                try:
+                    order = self._noted(order)
+                except InputError as error:
+                    why = f"{error.what} = {error.got}, allowed {error.allowed}"
+                    self._give(
+                        self._conductor.end(f"what lies on the surface cannot be printed: {why}", self._clock.now())
+                    )
+                    return
             with suppress(OSError):  # nobody is there: seen by its end
                 self._lines.orders.send(order)
 
