@@ -104,6 +104,20 @@ def test_honest_covariances_have_a_nees_of_six() -> None:
     assert bold.absolute.mean_nees == pytest.approx(4 * judged[0].absolute.mean_nees)
 
 
+@pytest.mark.parametrize("held", [0, 17])
+def test_covariances_relative_to_a_pose_that_is_held_are_judged_in_its_frame(held: int) -> None:
+    draw, truth = np.random.default_rng(4), breathing(np.arange(600) / 30)
+    sigma = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.05])
+    off = draw.normal(size=(600, 6)) * sigma
+    off[held] = 0.0
+    covariance = np.tile(np.diag(sigma**2), (600, 1, 1))
+    covariance[held] *= 1e-6
+    frame = se3.exp(np.array([0.1, -0.2, 0.3, 5.0, -3.0, 2.0]))  # the truth's surface frame is another
+    stamps = np.arange(600) / 30
+    judged = compare(posed(truth @ se3.exp(off), covariance, stamps), posed(truth @ frame, stamps=stamps)).laid
+    assert judged.absolute.mean_nees / 6 == pytest.approx(1.0, abs=0.05)
+
+
 def test_positions_on_a_line_determine_no_alignment() -> None:
     truth = np.tile(np.eye(4), (30, 1, 1))
     truth[:, 2, 3] = np.arange(30)

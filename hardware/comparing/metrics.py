@@ -17,7 +17,8 @@ from estimation.se3 import Array
 from hardware.comparing.posed import Posed
 from hardware.evaluation import Errors, associate, best_constant, errors_under
 
-ALIGNMENTS = ("as they stand", "aligned, SE(3)", "one surface frame", "laid at the first pose")
+ALIGNMENTS = ("as they stand", "aligned, SE(3)", "one surface frame", "laid at one pose")
+HELD = 1e-3  # mm, one standard deviation in all: less is claimed of no pose that was measured
 CLAIMED = ALIGNMENTS[0], ALIGNMENTS[3]  # under which covariances mean what they say: nothing is fitted
 Rows = NDArray[np.int64]
 FEWEST = 3  # pairs: of fewer an alignment would leave nothing
@@ -82,7 +83,7 @@ class Compared:
 
     @property
     def laid(self) -> Judged:
-        """In the surface frame of the first pose."""
+        """In the surface frame of one pose."""
         return self.judged[-1]
 
 
@@ -100,9 +101,9 @@ def compare(estimated: Posed, reference: Posed, delta: int = 1) -> Compared:
 
     "As they stand": evo without options. "Aligned, SE(3)": `evo_ape -a`, the rigid motion of the base that brings the
     positions nearest (Umeyama 1991), left out where they lie on a line and do not determine it. "One surface frame":
-    the constant between the two surface frames, which are each run's own, that brings the poses nearest. "Laid at the
-    first pose": that constant as the first pose tells it, whose own error then is in all others; so a run that lays its
-    surface frame by its first pose claims its covariances.
+    the constant between the two surface frames, which are each run's own, that brings the poses nearest. "Laid at one
+    pose": that constant as one pose tells it, whose own error then is in all others; so a run claims its covariances
+    that lays its surface frame by its first pose, or, smoothed, holds the pose that did.
     delta: poses between the two of a relative error; the pairs follow one another, as evo's do. Raises InputError where
     fewer than FEWEST poses belong together.
     """
@@ -118,13 +119,22 @@ def compare(estimated: Posed, reference: Posed, delta: int = 1) -> Compared:
         motion = se3.rigid_from_points(ours[:, :3, 3], target[:, :3, 3])
         pairs.append((ALIGNMENTS[1], motion @ ours, target))
     changes = se3.inverse(target) @ ours
-    pairs += [(ALIGNMENTS[2], ours, target @ best_constant(changes)), (ALIGNMENTS[3], ours, target @ changes[0])]
+    pairs += [
+        (ALIGNMENTS[2], ours, target @ best_constant(changes)),
+        (ALIGNMENTS[3], ours, target @ changes[_held(covariance)]),
+    ]
     judged = tuple(
         Judged(name, a, b, errors_under(np.eye(4), b, a, covariance), relative_errors(a, b, delta))
         for name, a, b in pairs
     )
     gaps = np.abs(estimated.trajectory.stamps[rows] - reference.trajectory.stamps[theirs])
     return Compared(estimated, reference, estimated.trajectory.stamps[rows], float(np.median(gaps)), delta, judged)
+
+
+def _held(covariance: Array) -> int:
+    """The pose that a smoothed run holds, of which next to nothing is claimed (M, 6, 6); the first where none is."""
+    size = np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2)
+    return int(np.argmin(size)) if np.isfinite(size).all() and size.min() < HELD**2 else 0
 
 
 def relative_errors(estimated: Array, reference: Array, delta: int) -> Relative:

@@ -21,7 +21,7 @@ STYLES = dict(zip(ALIGNMENTS, ("series c3", "series c1", "series c0", "series c2
 EXPLAINED = (
     "As they stand: nothing is fitted. Aligned, SE(3): the base of the first is moved until the positions lie nearest "
     "(Umeyama, without scale; evo_ape -a). One surface frame: the two runs' surface frames differ by a constant, the "
-    "one that fits best is taken out, or the one that the first pose tells."
+    "one that fits best is taken out, or the one that one pose tells."
 )
 
 
@@ -47,7 +47,7 @@ def lead(compared: Compared) -> str:
         words.append("The positions lie on a line and determine no SE(3) alignment.")
     nees = compared.laid.absolute.mean_nees / 6
     if np.isfinite(nees):
-        words.append(f"NEES/6: {figure(nees)} laid at the first pose, 1 where covariances are honest.")
+        words.append(f"NEES/6: {figure(nees)} laid at one pose, 1 where covariances are honest.")
     return " ".join(words)
 
 
