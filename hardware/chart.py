@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from estimation.se3 import Array
 
 MOST_POINTS = 3000  # a line is thinned to its extremes beyond: no screen shows more
+APART = 2.0  # px between the points of a curve that is drawn
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +133,13 @@ class Plot:
                 self.dots(x[part], y[part], f"{style} lone")
             else:
                 self._parts.append(f'<path class="{style}" d="M{"L".join(points)}"/>')
+
+    def way(self, x: Array, y: Array, style: str) -> None:
+        """A curve through (N,) finite points that may turn back in x, of each APART px along it one point."""
+        across, down = self.x(x), self.y(y)
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(across), np.diff(down)))])
+        rows = np.append(np.unique(along // APART, return_index=True)[1], len(x) - 1)
+        self._parts.append(f'<path class="{style}" d="M{"L".join(self._points(x[rows], y[rows]))}"/>')
 
     def band(self, x: Array, low: Array, high: Array, style: str) -> None:
         """The area between low and high (N,), broken where either is not finite."""

@@ -7,7 +7,7 @@ from html import escape
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.chart import Plot, spanning
+from hardware.chart import MOST_POINTS, Plot, spanning
 from hardware.page import document, dot_key, figures_table, legend, line_key, section
 from planning.path import Path
 from planning.reach import REASONS, Reach
@@ -36,11 +36,12 @@ def _above(path: Path, found: Reach) -> str:
     half = max(float(np.ptp(places, axis=0).max()) / 2, 1.0) * 1.08
     box = [(float(m - half), float(m + half)) for m in middle]
     plot = Plot(WIDTH, WIDTH * 2 // 3, (box[0][0] - half / 2, box[0][1] + half / 2), box[1], label="y, mm")
-    plot.line(places[:, 0], places[:, 1], WAY)
-    for style, rows, radius in ((GOOD, found.feasible, 1.6), (BAD, ~found.feasible, 4.0)):
+    many = len(places) > MOST_POINTS  # no dot could be told from the next
+    plot.way(places[:, 0], places[:, 1], GOOD if many else WAY)
+    for style, rows, radius in ((GOOD, found.feasible & (not many), 1.6), (BAD, ~found.feasible, 4.0)):
         plot.dots(places[rows, 0], places[rows, 1], style, radius)
-    keys = [dot_key(GOOD, "can be printed"), dot_key(BAD, "cannot"), line_key(WAY, "path")]
-    return legend(keys) + plot.svg()
+    good = [line_key(GOOD, "can be printed")] if many else [dot_key(GOOD, "can be printed"), line_key(WAY, "path")]
+    return legend([*good, dot_key(BAD, "cannot")]) + plot.svg()
 
 
 def _along(found: Reach) -> str:

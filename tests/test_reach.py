@@ -13,6 +13,7 @@ from estimation import se3
 from estimation.se3 import Array
 from hardware.arm_file import read_arm
 from hardware.arm_profile import BENCH
+from hardware.chart import Plot
 from hardware.cli import main
 from hardware.path_file import read_path, write_path
 from planning.inverse import POSTURES
@@ -120,3 +121,16 @@ def test_an_arm_file_without_joints_cannot_answer(tmp_path: Path, capsys: pytest
     (tmp_path / "arm.toml").write_text("baud = 115200\n")
     assert main(["reach", str(tmp_path / "path.csv"), "--arm", str(tmp_path / "arm.toml")]) == 2
     assert "kinematics = 'missing'" in capsys.readouterr().err
+
+
+def test_a_dense_path_is_drawn_as_the_curve_that_it_is() -> None:
+    turn = np.linspace(0.0, 2 * np.pi * 20, 50_000)
+    x, y = (1 + turn / 100) * np.cos(turn), (1 + turn / 100) * np.sin(turn)
+    plot = Plot(900, 600, (-12, 12), (-8, 8))
+    plot.way(x, y, "aside")
+    drawn = plot.svg().rpartition('class="aside" d="M')[2].partition('"')[0]
+    points = np.array([[float(word) for word in point.split()] for point in drawn.replace(",", " ").split("L")])
+    assert 1000 < len(points) < 20_000
+    assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() < 4.0  # px: no chord leaves the curve
+    true = np.stack([plot.x(x), plot.y(y)], axis=1)
+    assert points[[0, -1]] == pytest.approx(true[[0, -1]], abs=0.06)
