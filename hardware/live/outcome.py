@@ -8,15 +8,20 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
+import numpy as np
+
+from hardware.chart import Plot, spanning, stretches
 from hardware.live.checklist import table
 from hardware.live.conductor import Conductor, Seen
+from hardware.live.course import Course
 from hardware.live.prepared import Prepared
 from hardware.live.records import Span
 from hardware.live.tally import Tally
-from hardware.page import document, figures_table, row_of_tiles, section, tile
+from hardware.page import area_key, document, figures_table, legend, line_key, row_of_tiles, section, tile
 from hardware.summary import figure, finite, percent
 
 DONE, CUT_SHORT, SIGNALLED = 0, 1, 128
+OVER = "Predicted, the largest of each moment while material left, over the seconds since the approach."
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,13 +119,18 @@ class Outcome:
             [s.name, str(s.count), *(f"{1000 * value:.1f}" for value in (s.median, s.p99, s.most))]
             for s in self.spans()
         ]
-        holds = [[h["reason"], str(h["count"]), f"{h['total_s']:.2f}"] for h in summary["holds"]]
+        holds = [[h["reason"], str(h["count"]), f"{h['total_s']:.2f}"] for h in summary["holds"]] or [
+            ["none", "0", "0"]
+        ]
         stages = [[name, f"{seconds:.1f}"] for name, seconds in self.tally.stages.items()]
         states = [[name, str(count)] for name, count in self.tally.states.items()]
         checks = f"<pre>{escape(table(self.conductor.checks))}</pre>" if self.conductor.checks else ""
         heads = ("stage", "times", "median", "99 %", "largest"), ("reason", "times", "s"), ("stage", "s")
         body = [
             row_of_tiles(tiles),
+            section(
+                "Error at the nozzle", OVER, _course(self.tally.course, self.prepared.task.profile.limits.pose_error)
+            ),
             section("How long each stage took", "Milliseconds.", figures_table(heads[0], rows)),
             section("Holds", "Why the nozzle stood, and for how long.", figures_table(heads[1], holds)),
             section("Stages", "Of the run.", figures_table(heads[2], stages)),
@@ -129,3 +139,18 @@ class Outcome:
         ]
         lead = f"{self.conductor.ended}. {'. '.join(self.prepared.notes)}"
         return document("live run", self.prepared.beside.record.stem, lead, body, "stillbed")
+
+
+def _course(course: Course, limit: float) -> str:
+    """The predicted error over the run, beside its limit, mm."""
+    stamps = course.stamps
+    error, held = course.error[: len(stamps)], course.held[: len(stamps)] > course.width / 2
+    if not np.isfinite(error).any():
+        return "<p>Nothing was extruded.</p>"
+    end = len(stamps) * course.width
+    plot = Plot(900, 220, (0.0, end), spanning([error, np.array([0.0, limit])]), label="predicted error, mm")
+    runs = np.array([(run.start, run.stop) for run in stretches(held)], float).reshape(-1, 2) * course.width
+    plot.shade(runs[:, 0], runs[:, 1], "holding")
+    plot.level(limit, "limit", "limit")
+    plot.line(stamps, error, "estimate")
+    return legend([line_key("estimate", "predicted error"), area_key("holding", "held")]) + plot.svg()

@@ -9,6 +9,7 @@ import numpy as np
 
 from estimation import se3
 from hardware.live.conductor import Seen
+from hardware.live.course import Course
 from hardware.live.histograms import Histograms
 from hardware.operator.view import Stage
 from planning.command import Move
@@ -43,6 +44,7 @@ class Tally:
     errors: np.ndarray = field(default_factory=lambda: np.zeros(ERROR_BINS, np.int64))
     most_error: float = 0.0
     last_error: float = float("nan")
+    course: Course = field(default_factory=Course)
     _looked: float = float("nan")
     _ticked: float = float("nan")
     _sets: int = 0
@@ -86,10 +88,12 @@ class Tally:
         self._reason = reason
         if progress.place > 0 and progress.phase not in (Phase.LEAVING, Phase.FINISHED):
             self.due += step
+        error = float("nan")
         if isinstance(command, Move) and command.extrude:
             self.extruding += step
             if arm is not None:
-                self._error(seen, command, arm)
+                error = self._error(seen, command, arm)
+        self.course.add(self._ticked, error, step if reason else 0.0)
 
     def _hold(self, reason: str, step: float) -> None:
         if reason not in self.holds and len(self.holds) >= KINDS:
@@ -98,13 +102,14 @@ class Tally:
         held.count += reason != self._reason
         held.seconds += step
 
-    def _error(self, seen: Seen, move: Move, arm: SimpleArm) -> None:
-        """One standard deviation of the place under the nozzle, where the nozzle is to be after this move."""
+    def _error(self, seen: Seen, move: Move, arm: SimpleArm) -> float:
+        """One standard deviation, mm, of the place under the nozzle, where it is to be after this move; NaN of none."""
         assert seen.tracking is not None
         if (pose := seen.tracking.pose) is None:
-            return
+            return float("nan")
         then = pose.predict(max(move.stamp, pose.stamp), onwards=False)
         nozzle = se3.inverse(pose.base_from_surface) @ nozzle_from_axes(arm, move.axes)
         error = float(then.error_at(nozzle[None, :3, 3])[0])
         self.errors[min(int(error / ERROR_BIN), ERROR_BINS - 1)] += 1
         self.most_error, self.last_error = max(self.most_error, error), error
+        return error
