@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Message
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
@@ -63,9 +63,31 @@ class Damage:
 Part = ChunkOf | Attached | Damage
 
 
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """The records of a chunk that begins at byte `offset`, or the one attachment or metadata there."""
+
+    offset: int
+    records: tuple[McapRecord, ...]
+
+
 def walk(path: Path) -> Iterator[Part]:
     """The parts of a recording in the order of the file; a Damage, if any, is the last one."""
     channels: dict[int, Channel] = {}
+    for piece in pieces(path):
+        if isinstance(piece, Damage):
+            yield piece
+            continue
+        first = next(iter(piece.records), None)
+        if isinstance(first, Attachment):
+            yield Attached(first.name, first.data)
+        elif not isinstance(first, Metadata):
+            yield ChunkOf(piece.offset, _stored(piece, channels))
+
+
+def pieces(path: Path) -> Iterator[Piece | Damage]:
+    """The same parts as the library's records, and the metadata."""
+    known: set[int] = set()
     try:
         file = open(path, "rb")  # noqa: SIM115  (closed by the block below)
     except OSError as error:
@@ -90,12 +112,14 @@ def walk(path: Path) -> Iterator[Part]:
                 if file.read() != MCAP0_MAGIC:
                     yield _damage(offset, size, "the end is not an MCAP file's")
                 return
-            if opcode not in (Opcode.CHUNK, Opcode.ATTACHMENT):
+            if opcode not in (Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA):
                 file.seek(length, 1)
                 continue
-            part = _part(opcode, offset, file.read(length), channels)
-            yield part or _damage(offset, size, "a record is broken")
-            if part is None:
+            records = _records(opcode, file.read(length), known)
+            if records is not None:
+                yield Piece(offset, records)
+            elif opcode != Opcode.METADATA:
+                yield _damage(offset, size, "a record is broken")
                 return
 
 
@@ -103,22 +127,26 @@ def _damage(offset: int, size: int, why: str) -> Damage:
     return Damage(f"{why}: read up to byte {offset} of {size}")
 
 
-def _part(opcode: int, offset: int, data: bytes, channels: dict[int, Channel]) -> Part | None:
-    """A chunk or an attachment with its checksum checked, None if it is broken; channels: learnt on the way."""
+def _records(opcode: int, data: bytes, known: set[int]) -> tuple[McapRecord, ...] | None:
+    """What a record holds, its checksum checked; None if it is broken. known: channels, learnt on the way."""
+    stream = ReadDataStream(BytesIO(data))
     try:
+        if opcode == Opcode.METADATA:
+            return (Metadata.read(stream),)
         if opcode == Opcode.ATTACHMENT:
-            attachment = Attachment.read(ReadDataStream(BytesIO(data)))
             (crc,) = struct.unpack("<I", data[-4:])
-            return Attached(attachment.name, attachment.data) if crc in (0, zlib.crc32(data[:-4])) else None
-        return ChunkOf(offset, _unpack(data, channels))
+            return (Attachment.read(stream),) if crc in (0, zlib.crc32(data[:-4])) else None
+        records = tuple(breakup_chunk(Chunk.read(stream), validate_crc=True))
     except Exception:  # whatever the library, its decompressors and struct say of broken bytes: the same thing
         return None
+    known.update(r.id for r in records if isinstance(r, Channel))
+    return records if all(r.channel_id in known for r in records if isinstance(r, Message)) else None
 
 
-def _unpack(data: bytes, channels: dict[int, Channel]) -> tuple[Stored, ...]:
-    records = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(data))), validate_crc=True)
-    channels.update((r.id, r) for r in records if isinstance(r, Channel))
-    said = ((channels[r.channel_id], r) for r in records if isinstance(r, Message))
+def _stored(chunk: Piece, channels: dict[int, Channel]) -> tuple[Stored, ...]:
+    """The messages of a chunk; channels: learnt on the way."""
+    channels.update((r.id, r) for r in chunk.records if isinstance(r, Channel))
+    said = ((channels[r.channel_id], r) for r in chunk.records if isinstance(r, Message))
     return tuple(Stored(of.topic, r.sequence, r.data, of.message_encoding) for of, r in said)
 
 

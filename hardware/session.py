@@ -92,6 +92,11 @@ class Session:
             reader.close()
 
 
+def damage_told(damage: str) -> str:
+    """A session's damage as a sentence; "" where there is none."""
+    return f"The recording is damaged: {damage}." if damage else ""
+
+
 def open_session(path: str | Path) -> Session:
     """Open a session folder or an .mcap file; InputError says what is wrong with it."""
     path = Path(path)

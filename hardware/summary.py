@@ -13,6 +13,7 @@ import numpy as np
 from estimation.pose import TrackState
 from hardware.evaluation import OFF_MM, Comparison, Errors, Evaluation, Spread, spread
 from hardware.pose_file import PoseTable
+from hardware.session import damage_told
 
 
 def measured_share(result: Evaluation) -> float:
@@ -28,7 +29,7 @@ def verdict(result: Evaluation) -> list[str]:
     if not result.complete:
         sentences.insert(0, "This run was cut short; what follows is about the part that was done.")
     if result.damage:
-        sentences.insert(0, f"The recording is damaged: {result.damage}.")
+        sentences.insert(0, damage_told(result.damage))
     if result.comparison is not None:
         sentences += _judgement(result.comparison)
     if len(result.latency.total):

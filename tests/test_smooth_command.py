@@ -110,6 +110,20 @@ def test_what_is_done_is_not_done_again(
     assert asked[0] != asked[1]
 
 
+@pytest.mark.parametrize("share", [0.5, 0.9, 0.999])
+def test_a_damaged_recording_is_smoothed_and_copied_up_to_its_damage(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], share: float
+) -> None:
+    cut, out, data = tmp_path / "cut.mcap", tmp_path / "out", recording.read_bytes()
+    cut.write_bytes(data[: int(share * len(data))])
+    assert main(["smooth", str(cut), "-o", str(out), "--no-relink"]) == 0
+    damage = open_session(cut).damage
+    assert damage and capsys.readouterr().out.startswith(f"The recording is damaged: {damage}. ")
+    copied = open_session(out / "smoothed.mcap")
+    assert copied.damage == "" and len(copied) == len(open_session(cut))
+    assert len(list(read_smoothed(out / "smoothed.mcap"))) == len(list(read_poses(cut)))
+
+
 def test_wrong_wishes_are_named(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["smooth", str(recording), "-o", str(tmp_path / "x"), "--rate", "0"]) == 2
     assert "--rate" in capsys.readouterr().err

@@ -38,12 +38,12 @@ def lead(result: Smoothed, judged: Judged) -> str:
     return " ".join(words)
 
 
-def page(title: str, result: Smoothed, judged: Judged, besides: str = "") -> str:
-    """The page as HTML text. besides: said behind the verdict."""
+def page(title: str, words: str, result: Smoothed, judged: Judged) -> str:
+    """The page as HTML text. words: the verdict."""
     body = [_tiles(result, judged), _trajectory(result, judged), _live(result, judged), _errors(judged)]
     body += [_residuals(result), _spectrum(judged.rhythms), _what_if(judged), _cameras(result)]
     footer = "Lengths in mm, time in s from the session's own clock; poses are base_from_surface."
-    return document("stillbed smooth", title, lead(result, judged) + besides, [part for part in body if part], footer)
+    return document("stillbed smooth", title, words, [part for part in body if part], footer)
 
 
 def _other(judged: Judged) -> str:

@@ -18,7 +18,7 @@ from hardware.clock import WallClock
 from hardware.evaluation import spread
 from hardware.progress import Progress
 from hardware.rig_file import write_rig
-from hardware.session import Session, open_session
+from hardware.session import Session, damage_told, open_session
 from hardware.smoothing.files import write_instants, write_map
 from hardware.smoothing.judged import Judged, judge
 from hardware.smoothing.recording_copy import write_copy
@@ -71,8 +71,9 @@ def smooth_session(path: Path, out: Path, wishes: Wishes, stream: TextIO | None 
         result = _solved(session, found.tracks, wishes, stream)
     judged = judge(result, tracks, session.truth)
     _write(out, session, result, wishes)
-    text = f"{lead(result, judged)}{found.text}\nreport: {out / 'report.html'}"
-    (out / "report.html").write_text(page(session.path.name, result, judged, found.text), encoding="utf-8")
+    words = " ".join(filter(None, (damage_told(session.damage), lead(result, judged)))) + found.text
+    text = f"{words}\nreport: {out / 'report.html'}"
+    (out / "report.html").write_text(page(session.path.name, words, result, judged), encoding="utf-8")
     summary = {"contents": contents, "text": text, **_figures(result, judged, session), **found.figures}
     (out / SUMMARY).write_text(json.dumps(finite(summary), indent=2) + "\n", encoding="utf-8")
     return False, text
