@@ -284,7 +284,7 @@ def _replay(arguments: argparse.Namespace) -> int | None:
     from hardware.out_folder import prepare_out
     from hardware.path_file import read_path
     from hardware.replay import replay_session
-    from hardware.session import open_session
+    from hardware.session import damage_told, open_session
 
     faults = faults_from_texts("command line", "--fault", arguments.fault)
     if arguments.path is None:
@@ -301,19 +301,20 @@ def _replay(arguments: argparse.Namespace) -> int | None:
         replay_session(session, arguments.path, arguments.out, progress, profile, arguments.resume, faults)
     rows = (arguments.out / "commands.csv").read_text(encoding="utf-8").splitlines()[1:]
     moves = sum(row.split(",", 2)[1] == "move" for row in rows)
+    _say(damage_told(session.damage))
     print(f"{moves} moves and {len(rows) - moves} holds: commands.csv and frames.bin in {arguments.out}")
     return None
 
 
 def _replay_run(arguments: argparse.Namespace) -> int:
     from hardware.live.replayed import write_replay
-    from hardware.out_folder import prepare_out
+    from hardware.session import damage_told
 
-    prepare_out(arguments.out, arguments.force)
-    count, other = write_replay(arguments.session, arguments.out)
-    same = "all as they were given" if not other else f"{other} of them not as they were given"
-    print(f"{count} frames, {same}: commands.csv and frames.bin in {arguments.out}")
-    return MISSED if other else 0
+    count = write_replay(arguments.session, arguments.out, arguments.force)
+    same = "all as they were given" if not count.other else f"{count.other} of them not as they were given"
+    _say(damage_told(count.damage))
+    print(f"{count.frames} frames, {same}: commands.csv and frames.bin in {arguments.out}")
+    return MISSED if count.other else 0
 
 
 def _import(arguments: argparse.Namespace) -> None:
@@ -326,10 +327,18 @@ def _import(arguments: argparse.Namespace) -> None:
 
 def _export(arguments: argparse.Namespace) -> None:
     from hardware.convert import export_recording
+    from hardware.session import damage_told
 
     with _progress("export", "images") as progress:
-        export_recording(arguments.mcap, arguments.out, progress)
+        damage = export_recording(arguments.mcap, arguments.out, progress)
+    _say(damage_told(damage))
     print(f"a session folder is in {arguments.out}")
+
+
+def _say(sentence: str) -> None:
+    """Print a sentence, where there is one."""
+    if sentence:
+        print(sentence)
 
 
 def _progress(what: str, unit: str) -> Progress:

@@ -70,9 +70,10 @@ def import_folder(
             part.unlink()
 
 
-def export_recording(mcap_path: str | Path, folder: str | Path, progress: Progress = _silent) -> None:
-    """Turn an .mcap file into a session folder with a picture per image; InputError unless `folder` is new or empty.
+def export_recording(mcap_path: str | Path, folder: str | Path, progress: Progress = _silent) -> str:
+    """Turn an .mcap file into a session folder with a picture per image; returns what was lost of it, "" if nothing.
 
+    InputError unless `folder` is new or empty.
     Poses, commands and arm bytes of a run have no place in a session folder; they stay in the recording.
     """
     source, target = Path(mcap_path), Path(folder)
@@ -92,6 +93,7 @@ def export_recording(mcap_path: str | Path, folder: str | Path, progress: Progre
         raise StillbedError(f"{target}: cannot write: {error}") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
+    return session.damage
 
 
 def _part_name(target: Path) -> Path:

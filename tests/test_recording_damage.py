@@ -20,10 +20,16 @@ from session_files import image, rig, stamps
 
 from estimation.errors import InputError, StillbedError
 from hardware import channels
+from hardware.arm_file import write_arm
+from hardware.arm_profile import ArmProfile
+from hardware.cli import main
 from hardware.mcap_walk import ChunkOf, walk
 from hardware.recording import CHUNK_SECONDS, Recorder
 from hardware.session import open_session
 from tests.recorded import whole_recording, write_frames
+from tests.started import ROOT
+
+SQUARE = ROOT / "data" / "paths" / "square_10mm.csv"
 
 
 @pytest.fixture(scope="module")
@@ -153,3 +159,29 @@ def test_an_error_inside_the_block_is_not_hidden_and_the_file_is_closed(tmp_path
         write_frames(recorder, 3)
         raise KeyboardInterrupt
     assert open_session(tmp_path / "x.mcap").damage == ""
+
+
+@pytest.mark.parametrize("flags", [["export"], ["replay", "--path", str(SQUARE)], ["replay"]])
+def test_what_is_made_of_a_damaged_recording_says_so(
+    flags: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_arm(tmp_path / "arm.toml", ArmProfile(), "of a run")
+    with Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
+        recorder.attach("path.csv", SQUARE.read_bytes())
+        recorder.attach("arm.toml", (tmp_path / "arm.toml").read_bytes())
+        write_frames(recorder, 3)
+    whole, cut = tmp_path / "x.mcap", tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[:-100])
+    assert main([*flags, str(whole), "-o", str(tmp_path / "whole")]) == 0
+    assert "is damaged" not in capsys.readouterr().out
+    assert main([*flags, str(cut), "-o", str(tmp_path / "cut")]) == 0
+    assert capsys.readouterr().out.startswith(f"The recording is damaged: {open_session(cut).damage}.\n")
+
+
+def test_a_replay_without_a_path_that_was_recorded_leaves_nothing_and_says_what_to_give(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "out").mkdir()
+    assert main(["replay", str(whole), "-o", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.endswith("or give --path\n")
+    assert list((tmp_path / "out").iterdir()) == []

@@ -25,6 +25,8 @@ track whole.mcap -o OUT --record half.mcap
 replay missing --path missing -o OUT
 replay whole.mcap --path bad.csv -o OUT
 replay whole.mcap --path PATH --resume typo.toml -o OUT
+replay whole.mcap -o OUT
+replay empty -o OUT
 import missing -o OUT
 import whole.mcap -o OUT
 export missing -o OUT

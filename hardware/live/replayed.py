@@ -10,12 +10,17 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
-from hardware.live.kept import used
-from hardware.mcap_walk import Attached, ChunkOf, parse, walk
+from hardware.arm_profile import ArmProfile
+from hardware.live.kept import PATH, used
+from hardware.mcap_walk import Attached, ChunkOf, Damage, parse, walk
 from hardware.messages import Message, bytes_from_message, pose_from_message
 from hardware.motion import MotionStep
+from hardware.out_folder import prepare_out
 from hardware.replay import CommandWriter
 from planning.command import Command
+from planning.path import Path
+
+RUN = "the recording of a run that began to print, or give --path"
 
 
 @dataclass(slots=True)
@@ -25,6 +30,16 @@ class _Run:
     texts: dict[str, str] = field(default_factory=dict)
     poses: dict[float, SurfacePose] = field(default_factory=dict)
     ticks: list[Message] = field(default_factory=list)
+    damage: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Count:
+    """How many frames were replayed, how many of them not as recorded, and what was lost of the file, "" if nothing."""
+
+    frames: int
+    other: int
+    damage: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +55,10 @@ class Replayed:
 def replay_run(record: File) -> Iterator[Replayed]:
     """Every tick of a recorded run in which planner and guard were asked, decided anew from the recorded poses."""
     run = _read(record)
-    path, profile = used(run.texts, record)
+    return _decided(run, *used(run.texts, record), record)
+
+
+def _decided(run: _Run, path: Path, profile: ArmProfile, record: File) -> Iterator[Replayed]:
     step: MotionStep | None = None
     for tick in sorted(run.ticks, key=lambda tick: float(tick["stamp"])):
         if tick["begun"]:
@@ -61,7 +79,9 @@ def replay_run(record: File) -> Iterator[Replayed]:
 def _read(record: File) -> _Run:
     run = _Run()
     for part in walk(record):
-        if isinstance(part, Attached):
+        if isinstance(part, Damage):
+            run.damage = part.text
+        elif isinstance(part, Attached):
             run.texts[part.name] = part.data.decode("utf-8", "replace")
         elif isinstance(part, ChunkOf):
             for stored in part.messages:
@@ -73,12 +93,22 @@ def _read(record: File) -> _Run:
     return run
 
 
-def write_replay(record: File, out: File) -> tuple[int, int]:
-    """Replay a run into commands.csv and frames.bin of the folder `out`: how many frames, how many not as recorded."""
-    count = other = 0
+def write_replay(record: File, out: File, force: bool = False) -> Count:
+    """Replay a run into commands.csv and frames.bin of the folder `out`.
+
+    InputError where the recording holds no run, or `out` holds something and `force` is not set; nothing is made then.
+    """
+    if record.is_dir():
+        raise InputError(record, "recording", "a session folder", RUN)
+    run = _read(record)
+    if PATH not in run.texts:
+        raise InputError(record, "recording", "no path", RUN)
+    path, profile = used(run.texts, record)
+    prepare_out(out, force)
+    frames = other = 0
     with CommandWriter(out) as writer:
-        for tick in replay_run(record):
+        for tick in _decided(run, path, profile, record):
             writer.write(tick.command, tick.frame)
-            count += 1
+            frames += 1
             other += tick.frame != tick.recorded
-    return count, other
+    return Count(frames, other, run.damage)
