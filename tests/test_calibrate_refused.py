@@ -123,10 +123,16 @@ def test_a_truncated_recording_is_named(session: Path, refused: Refused) -> None
     refused("number of frames of camera 'b' = 12, allowed 11")
 
 
+def test_a_board_that_most_pictures_do_not_show_is_not_taken_for_another(session: Path, refused: Refused) -> None:
+    for path in sorted((session / "b").glob("*.png"))[4:]:
+        cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 60, (480, 640)).astype(np.uint8))
+    refused("camera b: pictures that show the board = 4, allowed .* it has 12 pictures: the others do not show it")
+
+
 def test_too_few_pictures_are_named(tmp_path: Path, session: Path, refused: Refused) -> None:
     shutil.rmtree(session)
     rendered(session, instants=6)
-    refused("camera a: pictures that show the board = 6, allowed 10 or more")
+    refused("camera a: pictures that show the board = 6, allowed 10 or more; it has 6 pictures: record more\n")
 
 
 TABLE = {

@@ -32,8 +32,12 @@ def check_table(table: CornerTable, board: Board, board_file: Path, names: Seque
         views = int((table.camera == c).sum())
         where = f"camera {name}"
         if views < FEWEST:
-            allowed = f"{FEWEST} or more of its {table.looked[c]} pictures; {why_unseen(pictures(c), board)}"
-            raise InputError(where, "pictures that show the board", views, allowed)
+            looked = int(table.looked[c])
+            few = 0 < looked <= 2 * views
+            why = "record more" if few else why_unseen(pictures(c), board)
+            raise InputError(
+                where, "pictures that show the board", views, f"{FEWEST} or more; it has {looked} pictures: {why}"
+            )
         blur = float(np.median(table.blur[table.camera == c]))
         if blur > BLURRED:
             allowed = f"{BLURRED:g} px or less: focus the lens, more light, slower hands"
@@ -62,16 +66,23 @@ def why_unseen(pictures: list[Image], board: Board) -> str:
     """Why pictures do not show the board, as far as other boards and mirrors tell."""
     if not pictures:
         return "it has no pictures"
-    known = CornerFinder(board)
+    half, shown = len(pictures) // 2, _showing(pictures, board)
     for words, other in _others(board).items():
-        finder = CornerFinder(other)
-        if sum(finder(picture).count >= LEAST for picture in pictures) > len(pictures) // 2:
+        if _showing(pictures, other) > max(half, shown):
             return f"they show another board: {words}"
-    if sum(known(np.ascontiguousarray(p[:, ::-1])).count >= LEAST for p in pictures) > len(pictures) // 2:
+    if _showing([np.ascontiguousarray(p[:, ::-1]) for p in pictures], board) > max(half, shown):
         return "they are mirrored: switch the camera's mirroring off"
     if max(float(picture.std()) for picture in pictures) < 5:
         return "they are of one grey, as behind a cover"
+    if shown:
+        return "the others do not show it; is it in view, sharp and lit?"
     return "none of them shows a board that is known; is it in view, sharp and lit?"
+
+
+def _showing(pictures: list[Image], board: Board) -> int:
+    """How many pictures show a board."""
+    finder = CornerFinder(board)
+    return sum(finder(picture).count >= LEAST for picture in pictures)
 
 
 def pictures_of(session: Session, camera: int) -> list[Image]:
