@@ -140,6 +140,18 @@ def test_a_printed_svg_shows_the_board_that_its_file_describes(tmp_path: Path) -
     assert CornerFinder(board)(picture).count == 12
 
 
+def test_a_board_file_that_was_edited_is_kept_unless_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command, file = ["calibrate", "board", "-o", str(tmp_path / "b.pdf")], tmp_path / "b.toml"
+    assert main(command) == 0
+    file.write_text(file.read_text().replace("square_mm = 25.0", "square_mm = 24.9"))
+    (tmp_path / "b.pdf").unlink()
+    assert main(command) == 2
+    assert "b.toml: --out = 'a file that exists', allowed a new one, or --force" in capsys.readouterr().err
+    assert read_board(file).square == 24.9 and not (tmp_path / "b.pdf").exists()
+    assert main([*command, "--force"]) == 0 and read_board(file).square == 25
+    assert main(command) == 2 and "b.pdf: --out" in capsys.readouterr().err
+
+
 def test_a_board_that_does_not_fit_its_page_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"3 x 3 to 7 x 10 squares on A4"):
         write_print(tmp_path / "b.pdf", Print(squares=(9, 12)))
@@ -171,7 +183,10 @@ def test_the_files_that_are_written_can_be_read(outcome: Outcome, session: Path)
 
 def test_the_command_ends_with_the_verdict(session: Path, board_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["calibrate", "cameras", str(session), "--board", str(board_file), "-o", str(session.parent / "rig.toml")]
-    assert main([*command, "--limit-mm", "0.001"]) == 1
+    written = (session.parent / "rig.toml").read_bytes()
+    assert main(command) == 2 and "--force" in capsys.readouterr().err
+    assert (session.parent / "rig.toml").read_bytes() == written
+    assert main([*command, "--limit-mm", "0.001", "--force"]) == 1
     said = capsys.readouterr().out
     assert re.search(r"away from where the rig.toml had it: b \d\.\d mm, 0\.\d\d degrees; c \d\.\d mm, 0\.", said)
     assert said.startswith("FAIL") and "hold the board in its picture's" in said

@@ -129,6 +129,23 @@ def test_the_commands_carry_a_rig_there_and_back(tmp_path: Path) -> None:
     assert np.array_equal(read_rig(tmp_path / "b.toml").rig.cameras[0].matrix, one().cameras[0].matrix)
 
 
+@pytest.mark.parametrize("name", ["anipose", "ros"])
+def test_a_rig_that_stands_there_is_kept_unless_told(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig, out, back = tmp_path / "rig.toml", tmp_path / "other", tmp_path / "back.toml"
+    write_rig(rig, one(), [None])
+    there = ["calibrate", "export", str(rig), "--format", name, "-o", str(out)]
+    here = ["calibrate", "import", str(out), "--format", name, "-o", str(back)]
+    for command, file in ((there, out), (here, back)):
+        assert main(command) == 0
+        kept = {path: path.stat().st_mtime_ns for path in (file, *file.glob("*"))}
+        assert main(command) == 2
+        assert "--force" in capsys.readouterr().err
+        assert all(path.stat().st_mtime_ns == before for path, before in kept.items())
+        assert main([*command, "--force"]) == 0
+
+
 def test_brackets_in_brackets_are_refused(tmp_path: Path) -> None:
     (tmp_path / "x.yaml").write_text("a: " + 2000 * "[", encoding="utf-8")
     with pytest.raises(InputError, match="a YAML file"):

@@ -13,6 +13,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.calibration.board_file import MARKERS, read_board, write_board
 from hardware.checks import meant
+from hardware.out_folder import check_new
 from perception.boards.board import DICTIONARIES, Board, black, grid_of
 
 PAGES = {"A5": (148, 210), "A4": (210, 297), "A3": (297, 420), "A2": (420, 594), "letter": (215.9, 279.4)}
@@ -44,15 +45,20 @@ class Drawing:
     words: tuple[tuple[float, float, str], ...]
 
 
-def write_print(out: Path, wish: Print) -> str:
-    """Write the page, and board.toml beside it; returns what was written, in words."""
+def write_print(out: Path, wish: Print, force: bool = False) -> str:
+    """Write the page, and board.toml beside it; returns what was written, in words.
+
+    InputError where the wish makes no sense, or one of the two exists and `force` is not set.
+    """
     if out.suffix not in (".svg", ".pdf"):
         raise InputError(out, "--out", out.name, "a file that ends in .svg or .pdf")
     board, size = board_of(wish), page_size(wish)
     made = drawing(board, size)
+    beside = out.with_suffix(".toml")
+    for file in (out, beside):
+        check_new(file, force)
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_bytes(svg(made).encode() if out.suffix == ".svg" else pdf(made))
-    beside = out.with_suffix(".toml")
     write_board(beside, board)
     read_board(beside)  # what was wished is told to be wrong as it would be when read
     return f"{out}: {board}, on {size[0]:g} x {size[1]:g} mm; {beside} describes it. Print at 100 %, measure the ruler."

@@ -65,6 +65,7 @@ def _add_board(parts: Commands) -> None:
     part.add_argument("--dictionary", default="4X4_50", metavar="NAME", help="of the markers; default 4X4_50")
     part.add_argument("--inverted", action="store_true", help="exchange black and white")
     part.add_argument("--page", default="A4", metavar="SIZE", help="A5, A4, A3, A2, letter, or WxH in mm; default A4")
+    part.add_argument("--force", action="store_true", help="overwrite X.pdf and the board.toml beside it")
     part.set_defaults(run=_board)
 
 
@@ -106,6 +107,7 @@ def _add_cameras(parts: Commands) -> None:
         help="take the session's lenses, within their lens_sigma; seek places and clocks",
     )
     part.add_argument("--new-rig", action="store_true", help="do not compare with the session's own rig")
+    part.add_argument("--force", action="store_true", help="overwrite rig.toml and what stands beside it")
     part.set_defaults(run=_cameras)
 
 
@@ -122,6 +124,7 @@ def _add_import(parts: Commands) -> None:
         "--format", choices=FORMATS, required=True, help="; ".join(f"{k}: {v}" for k, v in FORMATS.items())
     )
     part.add_argument("-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write")
+    part.add_argument("--force", action="store_true", help="overwrite the file")
     part.set_defaults(run=_import)
 
 
@@ -138,6 +141,9 @@ def _add_export(parts: Commands) -> None:
         "--format", choices=FORMATS, required=True, help="; ".join(f"{k}: {v}" for k, v in FORMATS.items())
     )
     part.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="file, or folder, to write")
+    part.add_argument(
+        "--force", action="store_true", help="overwrite the file, or write into a folder that is not empty"
+    )
     part.set_defaults(run=_export)
 
 
@@ -162,16 +168,18 @@ def _board(arguments: argparse.Namespace) -> int:
 
     a = arguments
     wish = Print(a.kind, a.squares, a.square_mm, a.marker, a.dictionary, a.inverted, a.page)
-    print(write_print(a.out, wish))
+    print(write_print(a.out, wish, a.force))
     return 0
 
 
 def _cameras(arguments: argparse.Namespace) -> int:
     from hardware.calibration.run import Wishes, corners_of, run_calibration, run_live
     from hardware.clock import WallClock
+    from hardware.out_folder import check_new
     from hardware.progress import Progress
 
     a, clock = arguments, WallClock()
+    check_new(a.out, a.force)
     recorded = _recorded(a.which)
     wishes = Wishes(a.limit_mm, a.distance_mm, a.keep_lenses, a.new_rig)
     _check_seconds(a.seconds, recorded)
@@ -215,8 +223,10 @@ def _check_seconds(seconds: float | None, recorded: Path | None) -> None:
 
 def _import(arguments: argparse.Namespace) -> int:
     from hardware.calibration.formats import formats
+    from hardware.out_folder import check_new
     from hardware.rig_file import write_rig
 
+    check_new(arguments.out, arguments.force)
     rig = formats()[arguments.format].read(arguments.file)
     write_rig(arguments.out, rig, [None] * len(rig))
     print(f"{arguments.out}: {', '.join(c.name for c in rig.cameras)}; where their images are is to be added")
@@ -225,8 +235,10 @@ def _import(arguments: argparse.Namespace) -> int:
 
 def _export(arguments: argparse.Namespace) -> int:
     from hardware.calibration.formats import formats
+    from hardware.out_folder import check_new
     from hardware.rig_file import read_rig
 
+    check_new(arguments.out, arguments.force)
     rig = read_rig(arguments.rig).rig
     formats()[arguments.format].write(arguments.out, rig)
     print(f"{arguments.out}: {', '.join(c.name for c in rig.cameras)}")
