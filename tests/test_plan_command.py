@@ -138,6 +138,15 @@ def test_a_contour_that_is_none_is_one_line(tmp_path: Path, text: str, capsys: p
     assert "allowed" in capsys.readouterr().err
 
 
+def test_a_good_scan_that_is_turned_over_is_answered_without_flip(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_ply(tmp_path / "scan.ply", *scan_of(size=(60.0, 40.0), depth=6.0))
+    assert main(["plan", str(tmp_path / "scan.ply"), "-o", str(tmp_path / "path.csv"), "--flip"]) == 2
+    told = capsys.readouterr().err
+    assert "mm: leave --flip out" in told and "say --flip" not in told
+
+
 def test_a_path_that_is_there_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "path.csv"
     out.write_text("mine")

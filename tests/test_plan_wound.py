@@ -91,7 +91,7 @@ def test_healthy_skin_has_no_wound() -> None:
 def test_a_scan_that_is_inside_out_is_refused_and_with_flip_it_is_not() -> None:
     vertices, triangles = scan_of(size=(60.0, 40.0), depth=6.0)
     outside_in = triangles[:, ::-1]
-    with pytest.raises(InputError, match="--flip"):
+    with pytest.raises(InputError, match="if it was scanned inside out, say --flip"):
         wound_in(repaired(vertices, outside_in, "scan")[0], 0.5, "scan")
     wound = wound_in(repaired(vertices, outside_in, "scan", flip=True)[0], 0.5, "scan")
     assert wound.findings.area == pytest.approx(wound_of(size=(60.0, 40.0), depth=6.0).findings.area, rel=0.02)

@@ -106,7 +106,7 @@ def run_plan(request: Request) -> str:
 def planned_scan(vertices: Array, triangles: Index, step: float, where: object, flip: bool = False) -> Subject:
     """The wound in a mesh, vertices (V, 3) mm, triangles (T, 3), that may be damaged."""
     scan, repairs = repaired(vertices, triangles, where, flip)
-    return Subject(str(where), wound_in(scan, step, where), repairs)
+    return Subject(str(where), wound_in(scan, step, where, flipped=flip), repairs)
 
 
 def _subject(request: Request, flat: bool) -> Subject:
@@ -130,7 +130,7 @@ def _subject(request: Request, flat: bool) -> Subject:
     vertices = in_mm(raw.vertices, raw.triangles, request.unit, request.scan)
     scan, repairs = repaired(vertices, raw.triangles, request.scan, request.flip)
     outline = None if request.outline is None else _outline(request.outline, scan.vertices)
-    return Subject(request.scan.name, wound_in(scan, step, request.scan, outline), repairs)
+    return Subject(request.scan.name, wound_in(scan, step, request.scan, outline, request.flip), repairs)
 
 
 def _outline(file: Path, vertices: Array) -> Array:

@@ -92,14 +92,15 @@ class Findings:
     notes: tuple[str, ...]
 
 
-def wound_in(scan: Scan, step: float, where: object, outline: Array | None = None) -> Wound:
+def wound_in(scan: Scan, step: float, where: object, outline: Array | None = None, flipped: bool = False) -> Wound:
     """The wound in a scan, over a grid `step` mm fine. outline: (N, 3) mm, scan frame; None: it is looked for.
 
-    InputError where there is none, or where the scan does not hold it.
+    flipped: whether the scan was turned over, as a refusal says then. InputError where there is none, or where the scan
+    does not hold it.
     """
     first = height_map(scan, _first_plane(scan, where), FIRST_STEP)
     if outline is None:
-        found, others = _searched(first, where)
+        found, others = _searched(first, where, flipped)
     else:
         found, others = _given(outline, first.surface_from_plane, where), 0
     surface_from_plane = _plane_over(first, found)
@@ -111,7 +112,7 @@ def wound_in(scan: Scan, step: float, where: object, outline: Array | None = Non
     fine = height_map(scan, surface_from_plane, step, box)
     if outline is None:
         moved = shapely.transform(found, lambda xy: _moved(xy, first, turn))
-        shape, skin, scatter, level = _refined(fine, as_multi(shapely.make_valid(moved)), where)
+        shape, skin, scatter, level = _refined(fine, as_multi(shapely.make_valid(moved)), where, flipped)
     else:
         shape = _given(outline, surface_from_plane, where)
         skin, scatter = _skin_beside(fine, shape)
@@ -149,7 +150,7 @@ def _plane_over(first: HeightMap, outline: MultiPolygon) -> Array:
     return se3.make(axes, se3.transform_points(first.surface_from_plane, origin)[0])
 
 
-def _searched(first: HeightMap, where: object) -> tuple[MultiPolygon, int]:
+def _searched(first: HeightMap, where: object, flipped: bool) -> tuple[MultiPolygon, int]:
     """The largest depression, and how many others there are."""
     coarse = first.grid.coarser(max(COARSE, first.grid.step))
     known = downsampled(first.grid, coarse, first.known.astype(float)) > 0.99
@@ -163,7 +164,7 @@ def _searched(first: HeightMap, where: object) -> tuple[MultiPolygon, int]:
     pieces, volumes = _depressions(first.grid, depth, level)
     raised = _depressions(first.grid, np.where(first.known, -depth, 0.0), level)[1]
     if not len(volumes) or volumes.max() < BULGE * raised.max(initial=0.0):
-        _refuse(depth[first.known], where)
+        _refuse(depth[first.known], where, flipped)
     deepest = int(np.argmax(volumes)) + 1
     found = region(first.grid, np.where(pieces == deepest, depth - level, -level), LEAST_PIECE, SLACK)
     return found, int(np.sum(volumes > 0.1 * volumes.max())) - 1
@@ -181,12 +182,13 @@ def _depressions(grid: Grid, depth: Array, level: float) -> tuple[Index, Array]:
     return pieces, np.asarray(volume[: count if volume.any() else 0])
 
 
-def _refuse(depth: Array, where: object) -> None:
+def _refuse(depth: Array, where: object, flipped: bool) -> None:
     low, high = np.percentile(depth, [1, 99])
     got = f"none found: hardly any of the scan lies deeper than {max(high, 0):.2g} mm under the skin"
     allowed = f"{LEAST_AREA:g} mm^2 deeper than {LEAST_DEPTH:g} mm, or an outline (--outline)"
     if -low > LEAST_DEPTH:
-        allowed += f"; it bulges by {-low:.2g} mm: if it was scanned inside out, say --flip"
+        inside_out = "leave --flip out" if flipped else "if it was scanned inside out, say --flip"
+        allowed += f"; it bulges by {-low:.2g} mm: {inside_out}"
     raise InputError(where, "wound", got, allowed)
 
 
@@ -224,7 +226,9 @@ def _skin_beside(fine: HeightMap, outline: MultiPolygon) -> tuple[Array, float]:
     return upsampled(fine.grid, coarse, surface), scatter
 
 
-def _refined(fine: HeightMap, found: MultiPolygon, where: object) -> tuple[MultiPolygon, Array, float, float]:
+def _refined(
+    fine: HeightMap, found: MultiPolygon, where: object, flipped: bool
+) -> tuple[MultiPolygon, Array, float, float]:
     """Outline, restored skin, its scatter and the level of the rim."""
     skin, scatter, level = fine.heights, 0.0, LEAST_LEVEL
     for _ in range(ROUNDS):
@@ -235,12 +239,12 @@ def _refined(fine: HeightMap, found: MultiPolygon, where: object) -> tuple[Multi
         pieces, _ = label(depth > level)
         share = np.bincount(pieces[inside], minlength=2)
         if len(share) < 2 or not share[1:].any():
-            _refuse(depth[fine.known], where)
+            _refuse(depth[fine.known], where, flipped)
         own = pieces == int(np.argmax(share[1:])) + 1
         wider = region(fine.grid, np.where(own | ~(depth > level), depth - level, -level), LEAST_PIECE, SLACK)
         opened = as_multi(shapely.buffer(shapely.buffer(wider, -OPENING), OPENING), LEAST_PIECE)
         if opened.is_empty:
-            _refuse(depth[fine.known], where)
+            _refuse(depth[fine.known], where, flipped)
         before, found = found, as_multi(shapely.simplify(opened, SLACK))
         if shapely.symmetric_difference(before, found).area < 0.01 * found.area:
             break
