@@ -91,10 +91,20 @@ def test_a_scan_in_metres_is_recognised_and_planned(tmp_path: Path, capsys: pyte
     assert np.abs(read_path(tmp_path / "path.csv").surface_from_nozzle[:, :3, 3]).max() < 100
 
 
-def test_an_example_needs_no_scan(tmp_path: Path) -> None:
+def test_an_example_needs_no_scan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
     out = tmp_path / "path.csv"
     command = ["plan", "--example", "chest", "-o", str(out), "--bead", "1.5", "--pattern", "zigzag", "--no-pictures"]
+    with monkeypatch.context() as patched:
+        patched.setattr(planning_command, "make_plan", interrupted)
+        assert main(command) == 130
+    assert "nothing was written" in capsys.readouterr().err and not list(tmp_path.iterdir())
     assert main(command) == 0
+    assert "path_example.ply" in capsys.readouterr().out.splitlines()[-2]
     path = read_path(out)
     assert len(np.unique(path.layer)) > 1 and set(path.material.tolist()) <= {1, 2, 3}
     assert (tmp_path / "path_example.ply").is_file()

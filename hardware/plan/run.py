@@ -6,7 +6,7 @@ import csv
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -71,11 +71,15 @@ class Request:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """The wound to be planned, and what was done to its scan; None where there is none."""
+    """The wound to be planned, and what was done to its scan; None where there is none.
+
+    example: a built-in scan, as vertices and triangles, to be written beside the path.
+    """
 
     name: str
     wound: Wound
     repairs: Repairs | None
+    example: tuple[Array, Index] | None = None
 
 
 def run_plan(request: Request) -> str:
@@ -115,9 +119,8 @@ def _subject(request: Request, flat: bool) -> Subject:
         raise InputError("command line", "SCAN", request.scan, "none beside --example")
     if request.example is not None:
         vertices, triangles = example_scan(request.example)
-        file = request.out.with_name(f"{request.out.stem}_example.ply")
-        write_ply(file, vertices, triangles)
-        return planned_scan(vertices, triangles, step, f"{request.example} (example)")
+        found = planned_scan(vertices, triangles, step, f"{request.example} (example)")
+        return replace(found, example=(vertices, triangles))
     if request.scan is None:
         raise InputError("command line", "SCAN", "none", "a mesh, a contour, or --example forearm, chest or foot")
     if flat:
@@ -163,7 +166,7 @@ def _whole(file: Path, write: Callable[[Path], object]) -> None:
 def _tables(
     request: Request, plan: Plan, subject: Subject, layers: Sequence[LayerFigures], total: Total, arm: str
 ) -> list[str]:  # fmt: skip
-    """Write the coverage of each layer, the summary, and the scan as it was repaired; their names."""
+    """Write the coverage of each layer, the summary, the scan as it was repaired, and an example's; their names."""
     stem = request.out.with_suffix("")
     table, summary = stem.with_name(stem.name + "_layers.csv"), stem.with_suffix(".json")
     _whole(table, lambda file: _write_layers(file, layers))
@@ -179,7 +182,11 @@ def _tables(
         return [table.name, summary.name]
     mesh = stem.with_name(stem.name + "_scan.ply")
     _whole(mesh, lambda file: write_ply(file, *_surface(plan.wound)))
-    return [table.name, summary.name, mesh.name]
+    if subject.example is None:
+        return [table.name, summary.name, mesh.name]
+    example, built_in = stem.with_name(stem.name + "_example.ply"), subject.example
+    _whole(example, lambda file: write_ply(file, *built_in))
+    return [table.name, summary.name, mesh.name, example.name]
 
 
 def _write_layers(file: Path, layers: Sequence[LayerFigures]) -> None:
