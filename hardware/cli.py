@@ -22,6 +22,7 @@ from hardware.comparing.command import add_compare
 from hardware.doctor.command import add_doctor
 from hardware.live.command import add_init, add_live
 from hardware.methods import MAP, METHODS
+from hardware.out_folder import kept, prepare_out
 from hardware.plan.command import add_plan
 from hardware.reach_command import add_reach
 from hardware.smoothing.command import add_smooth
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 
 MISSED = 1  # a simulation that ran to its end and did not reach its own limits
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
-NAMED = 20  # files of an interrupted command that are told by name; of more, the count is
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -76,22 +76,6 @@ def _end_in_order() -> None:
     """What asks this process to end, ends it as Ctrl-C does; outside the main thread that is somebody else's part."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-
-
-def kept(out: Path | None) -> str:
-    """What an interrupted command left behind, in words; None where it was to write nothing."""
-    if out is None:
-        return "nothing was to be written"
-    if out.is_dir():
-        names = sorted(file.name for file in out.iterdir())
-        if len(names) > NAMED:
-            return f"kept in {out}: {len(names)} files"
-        return f"kept in {out}: {', '.join(names)}" if names else f"nothing was written to {out}"
-    if out.suffix == ".csv" and out.exists():
-        return f"kept {out}, whole, and what stands beside it"
-    if out.exists():
-        return f"kept {out}, readable up to its last whole chunk"
-    return "nothing was written"
 
 
 def parser() -> Parser:
@@ -281,7 +265,6 @@ def _replay(arguments: argparse.Namespace) -> int | None:
     from hardware.arm_file import read_arm
     from hardware.bookmark_file import read_start
     from hardware.faults import faults_from_texts
-    from hardware.out_folder import prepare_out
     from hardware.path_file import read_path
     from hardware.replay import replay_session
     from hardware.session import damage_told, open_session

@@ -145,6 +145,25 @@ def test_wrong_words_are_named(words: list[str], named: str, capsys: pytest.Capt
     assert named in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("pictures", [False, True])
+def test_what_an_interrupted_calibration_kept_is_said_and_what_to_do(
+    pictures: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record, out = tmp_path / "moved", tmp_path / "arm.toml"
+
+    def interrupted(*_: object) -> None:
+        if pictures:
+            (record / "frames.csv").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hardware.arm_calibration.virtual.take_pictures", interrupted)
+    moves = ["--places", "4", "--swing-s", "1"]
+    assert main(["calibrate", "arm", "--virtual", "--record", str(record), "-o", str(out), *moves]) == 130
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert f"interrupted; kept in {record}: {ARM}, {NAME}" in told and "name another --record or empty this one" in told
+    assert (f"`stillbed calibrate arm {record} -o {out}`" in told) == pictures
+
+
 @pytest.mark.slow
 def test_a_simulated_arm_is_calibrated_from_pictures_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     watched, folder, out = watched_arm(1), tmp_path / "moved", tmp_path / "arm.toml"

@@ -16,9 +16,9 @@ import pytest
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
-from hardware.cli import kept, main
+from hardware.cli import main
 from hardware.clock import WallClock
-from hardware.out_folder import prepare_out
+from hardware.out_folder import kept, prepare_out
 from hardware.pose_file import PoseWriter, read_poses
 from hardware.progress import Progress, duration
 from hardware.session import open_session
@@ -145,6 +145,8 @@ def test_what_was_kept_is_said(tmp_path: Path) -> None:
     assert "whole" in kept(tmp_path / "poses.csv")
     (tmp_path / "x.mcap").write_text("x")
     assert "readable" in kept(tmp_path / "x.mcap")
+    (tmp_path / "arm.toml").write_text("x")
+    assert kept(tmp_path / "arm.toml") == f"kept {tmp_path / 'arm.toml'}"
 
 
 def frame_sets(count: int, ending: BaseException | None = None) -> Iterator[FrameSet]:

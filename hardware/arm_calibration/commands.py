@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import signal
+import sys
 from pathlib import Path
 from typing import Any
 
 from hardware.command_line import Commands, positive
+from hardware.out_folder import kept
 
+INTERRUPTED = 128 + signal.SIGINT  # exit code after Ctrl-C
 FAILED = 1  # exit code of a calibration that is not good enough
 SOURCES = ("folder", "device", "virtual", "touched")
 
@@ -77,9 +81,27 @@ def _calibrate_arm(arguments: argparse.Namespace) -> int:
     for name in needed:
         if getattr(a, name) is None:
             raise InputError("command line", f"--{name}", "missing", f"given with {given[0]}")
-    outcome = {"device": _live, "virtual": _virtual, "touched": _touched, "folder": _folder}[given[0]](a)
+    try:
+        outcome = {"device": _live, "virtual": _virtual, "touched": _touched, "folder": _folder}[given[0]](a)
+    except KeyboardInterrupt:
+        if "record" not in needed or not _holds(a.record):
+            raise
+        print(f"\nstillbed: interrupted; {kept(a.record)}; {_next(a.record, a.out)}", file=sys.stderr)
+        return INTERRUPTED
     print(outcome.text)
     return 0 if outcome.verdict.passed else FAILED
+
+
+def _holds(folder: Path) -> bool:
+    return folder.is_dir() and any(folder.iterdir())
+
+
+def _next(record: Path, out: Path) -> str:
+    """What may be done with a recording that was interrupted."""
+    anew = "to begin anew, name another --record or empty this one"
+    if not (record / "frames.csv").exists():
+        return anew
+    return f"`stillbed calibrate arm {record} -o {out}` takes what is there; {anew}"
 
 
 def _wishes(a: argparse.Namespace) -> Any:
