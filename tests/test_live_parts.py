@@ -37,12 +37,13 @@ from hardware.live.records import (
     EventEntry,
     SetEntry,
 )
-from hardware.live.settings import LiveSettings, check_settings, overridden, read_settings, settings_text
+from hardware.live.settings import LiveSettings, check_settings, cores_there, overridden, read_settings, settings_text
 from hardware.path_file import write_path
 from perception.frames import Frame, FrameSet
 from planning.progress import fingerprint
 from tests.moving import raster
 
+THERE = cores_there()
 PROFILE = ArmProfile()
 SURFACE = SurfacePose(0.0, BENCH, np.eye(6) * 1e-6, np.zeros(6), TrackState.TRACKING)
 
@@ -91,6 +92,10 @@ def test_what_a_run_used_is_read_back_as_it_was(tmp_path: Path) -> None:
         ({"patience": 0.99}, "1 to 600 s"),
         ({"jpeg_quality": 101}, "0 to 100"),
         ({"path": Path("nowhere.csv")}, "a file that exists"),
+        *(
+            ({f"cores_{name}": (THERE[0], 1000)}, rf"cores.{name} = \[{THERE[0]}, 1000\], allowed .* are: {THERE[0]}")
+            for name in ("tracking", "motion", "recorder")
+        ),
     ],
 )
 def test_settings_that_make_no_sense_are_named(change: dict[str, object], words: str, tmp_path: Path) -> None:
@@ -99,7 +104,7 @@ def test_settings_that_make_no_sense_are_named(change: dict[str, object], words:
     good = LiveSettings(
         rig=tmp_path / "rig.toml", path=tmp_path / "path.csv", arm="virtual", record=tmp_path / "x.mcap"
     )
-    check_settings(good, "here")
+    check_settings(replace(good, cores_tracking=THERE), "here")
     with pytest.raises(InputError, match=words):
         check_settings(replace(good, **change), "here")  # type: ignore[arg-type]
 

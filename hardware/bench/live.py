@@ -25,7 +25,7 @@ from hardware.live.beside import Beside
 from hardware.live.judge import TrueError, judge_run
 from hardware.live.motion_names import EXPOSURE_TO_WIRE, FRAMES_TO_WIRE, LATE
 from hardware.live.prerender import cache_folder, prerender
-from hardware.live.settings import LiveSettings, settings_text
+from hardware.live.settings import LiveSettings, cores_there, settings_text
 from hardware.path_file import read_path, write_path
 from planning.path import Path as Toolpath
 from planning.path import lengths
@@ -194,7 +194,8 @@ def _stopping(options: argparse.Namespace, folder: Path, path: Path) -> list[Fig
 def _pinned(folder: Path) -> Path:
     """A session.toml that gives each loop a core of its own."""
     file = folder / "session.toml"
-    file.write_text(settings_text(LiveSettings(cores_tracking=(0,), cores_motion=(1,), cores_recorder=(1,))))
+    one, other = cores_there()[:1], cores_there()[1:2]
+    file.write_text(settings_text(LiveSettings(cores_tracking=one, cores_motion=other, cores_recorder=other)))
     return file
 
 

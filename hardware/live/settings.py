@@ -6,7 +6,9 @@ recording. Files in it are relative to it.
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -167,11 +169,26 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
         raise InputError(where, "cameras.patience_s", s.patience, f"1 to {LONGEST:g} s")
     if not 0 <= s.jpeg_quality <= 100:
         raise InputError(where, "record.jpeg_quality", s.jpeg_quality, "0 to 100")
+    for key in (key for key in KEYS if key.table == "cores"):
+        _check_cores(where, f"cores.{key.name}", getattr(s, key.setting))
     for name in ("rig", "simulated", "path", "profile"):
         file = getattr(s, name)
         if file is not None and not file.exists():
             raise InputError(where, name, file, "a file that exists")
     return replace(s, arm=s.arm or VIRTUAL)
+
+
+def _check_cores(where: object, key: str, cores: Collection[int]) -> None:
+    there = cores_there()
+    if not set(there).issuperset(cores):
+        raise InputError(where, key, list(cores), f"cores that there are: {', '.join(map(str, there))}")
+
+
+def cores_there() -> tuple[int, ...]:
+    """The processor cores that this process may run on, by number."""
+    if hasattr(os, "sched_getaffinity"):
+        return tuple(sorted(os.sched_getaffinity(0)))
+    return tuple(range(os.cpu_count() or CORES))
 
 
 def settings_text(settings: LiveSettings | None = None) -> str:
