@@ -91,6 +91,8 @@ def test_what_a_run_used_is_read_back_as_it_was(tmp_path: Path) -> None:
         ({"lift": 100.1}, "0 to 100 mm"),
         ({"patience": 0.99}, "1 to 600 s"),
         ({"jpeg_quality": 101}, "0 to 100"),
+        ({"page_port": -4}, "page.port = -4, allowed 1 to 65535, or 0"),
+        ({"page_port": 65536}, "page.port = 65536, allowed 1 to 65535, or 0"),
         ({"path": Path("nowhere.csv")}, "a file that exists"),
         *(
             ({f"cores_{name}": (THERE[0], 1000)}, rf"cores.{name} = \[{THERE[0]}, 1000\], allowed .* are: {THERE[0]}")
@@ -118,6 +120,14 @@ def test_a_key_that_nobody_reads_or_of_a_wrong_kind_is_an_error(text: str, tmp_p
 
 def test_flags_override_and_what_was_not_given_does_not() -> None:
     assert overridden(LiveSettings(lift=3.0, arm="a"), {"lift": None, "arm": "b"}) == LiveSettings(lift=3.0, arm="b")
+
+
+@pytest.mark.parametrize("lift", [0.0, 20.0])
+def test_a_lift_is_asked_for_in_a_dry_run_alone(lift: float) -> None:
+    assert overridden(LiveSettings(), {"lift": lift, "dry_run": True}).lift == lift
+    assert overridden(LiveSettings(dry_run=True), {"lift": lift, "dry_run": None}).lift == lift
+    with pytest.raises(InputError, match=rf"--lift = {lift}, allowed with --dry-run"):
+        overridden(LiveSettings(), {"lift": lift, "dry_run": None})
 
 
 # -- between processes

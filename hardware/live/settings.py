@@ -21,6 +21,7 @@ VIRTUAL = "virtual"  # the arm that needs no device
 HIGHEST = 100.0  # mm of a dry run: above, the arm leaves the room that was looked at
 LONGEST = 600.0  # s of patience
 CORES = 1024
+PORTS = 65535  # the highest
 NAME = re.compile(r"(?!.*\.\.)[A-Za-z0-9][A-Za-z0-9.-]{0,252}")  # of a machine
 
 
@@ -171,6 +172,8 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
         raise InputError(where, "record.jpeg_quality", s.jpeg_quality, "0 to 100")
     for key in (key for key in KEYS if key.table == "cores"):
         _check_cores(where, f"cores.{key.name}", getattr(s, key.setting))
+    if not 0 <= s.page_port <= PORTS:
+        raise InputError(where, "page.port", s.page_port, f"1 to {PORTS}, or 0: any that is free")
     for name in ("rig", "simulated", "path", "profile"):
         file = getattr(s, name)
         if file is not None and not file.exists():
@@ -224,6 +227,9 @@ def _shown(value: object) -> str | None:
 
 
 def overridden(settings: LiveSettings, flags: dict[str, Any]) -> LiveSettings:
-    """The settings with what was given on the command line; None was not given."""
+    """The settings with what was given on the command line; None was not given. InputError: a lift of a real print."""
     names = {f.name for f in fields(LiveSettings)}
-    return replace(settings, **{name: value for name, value in flags.items() if name in names and value is not None})
+    made = replace(settings, **{name: value for name, value in flags.items() if name in names and value is not None})
+    if flags.get("lift") is not None and not made.dry_run:
+        raise InputError("command line", "--lift", flags["lift"], "with --dry-run")
+    return made
