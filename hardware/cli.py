@@ -26,6 +26,7 @@ from hardware.out_folder import kept, prepare_out
 from hardware.plan.command import add_plan
 from hardware.reach_command import add_reach
 from hardware.smoothing.command import add_smooth
+from hardware.standard_streams import fill_standard_streams
 from hardware.viewing.command import add_view
 from hardware.wound_commands import add_segment, add_train
 from perception.shipped import named_path
@@ -42,6 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     0, 1 where a simulation misses its limits, 2 for wrong input (one line on stderr), 130 after Ctrl-C.
     """
+    fill_standard_streams()
     arguments = parser().parse_args(argv)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads only spin over matrices this small
     code: int | None = None

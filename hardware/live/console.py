@@ -36,7 +36,7 @@ class Console:
 
     def __enter__(self) -> Console:
         with suppress(OSError, ValueError, termios.error):
-            if os.isatty(sys.stdin.fileno()):
+            if sys.stdin is not None and os.isatty(sys.stdin.fileno()):
                 self._before = termios.tcgetattr(sys.stdin.fileno())
                 tty.setcbreak(sys.stdin.fileno())
                 self.file = sys.stdin.fileno()
