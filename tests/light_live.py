@@ -44,9 +44,23 @@ def prepare_files(folder: Path, lines: int = 40, speed: float = 5.0) -> None:
 
 
 def track_nothing(
-    prepared: Any, ring: Any, words: Any, poses: Any, reports: Any, motion: Any, link: Any, sender: Any, lifeline: Any
+    prepared: Any,
+    ring: Any,
+    words: Any,
+    poses: Any,
+    reports: Any,
+    motion: Any,
+    link: Any,
+    sender: Any,
+    lifeline: Any,
+    last: str = "",
 ) -> None:
-    """The body of a tracking process that knows where the surface is."""
+    """The body of a tracking process that knows where the surface is. last: phase of the print that it sees no more of.
+
+    "" to see all of it.
+    """
+    from dataclasses import replace
+
     import numpy as np
 
     from estimation.observations import no_observations
@@ -71,7 +85,16 @@ def track_nothing(
         reports.put(TrackingReport(clock.now(), names, (0, 1), pose, *known, sets, 0, 1 / RATE, used=(50, 50)))
         outbox.put(SetEntry({0: stamp, 1: stamp}, {0: ("png", picture), 1: ("png", picture)}))
         outbox.put(PoseEntry(pose, no_observations(stamp)))
+        moved = motion.get()
+        if moved is not None and moved.progress is not None and moved.progress.phase.value == last:
+            reports.put(replace(reports.get(), ended="session is over"))
+            break
     outbox.close()
+
+
+def track_until_printed(*given: Any) -> None:
+    """The same of a recorded session that is over as soon as the last checkpoint is printed."""
+    track_nothing(*given, last="leaving")
 
 
 def png() -> bytes:
@@ -117,7 +140,7 @@ def main(folder: Path, record: Path, *flags: str) -> int:
 
         run.kept_begin = unkept
     with Console() as console:
-        outcome = LiveRun(prepared, console, track_nothing)()
+        outcome = LiveRun(prepared, console, track_until_printed if "--until-printed" in flags else track_nothing)()
         outcome.write()
         console.say(outcome.words)
     return outcome.code

@@ -196,3 +196,18 @@ def test_what_goes_wrong_on_purpose_is_said_held_through_and_in_the_end_stops_th
     assert len(went_on) > 20
     assert rests(record, struck, 1.0)
     assert kept(record, tmp_path / "path.csv") >= last_place(record) - 1e-9
+
+
+def test_a_session_that_is_over_once_all_is_printed_is_enough(start: Start, tmp_path: Path) -> None:
+    prepare_files(tmp_path, lines=2, speed=10.0)
+    run = start(tmp_path / "run.mcap", "--yes", "--until-printed")
+    assert run.end() == 0 and "done: the path is printed" in run.said and "--resume" not in run.said
+
+
+def test_a_run_that_is_ended_once_all_is_printed_is_not_to_be_resumed(start: Start, tmp_path: Path) -> None:
+    prepare_files(tmp_path, lines=2, speed=10.0)
+    run = start(tmp_path / "run.mcap", "--yes")
+    run.wait_for(r"\nprint\nhoming\n")
+    run.process.send_signal(signal.SIGINT)
+    assert run.end() == 130 and run.said.count("ended: Ctrl-C") == 2 and "ended: ended" not in run.said
+    assert "the path is printed; there is nothing to go on with" in run.said and "--resume" not in run.said

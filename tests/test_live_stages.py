@@ -13,6 +13,7 @@ from hardware.arm_profile import BENCH, ArmProfile
 from hardware.arm_status import ArmState, ArmStatus
 from hardware.live.conductor import Conductor, Seen, Task
 from hardware.live.records import LiveMotionReport, Pace, RecorderReport, TrackingReport
+from hardware.live.words import stage_line
 from hardware.motion_loop import Order, Tick
 from hardware.operator.request import Request, Wish
 from hardware.operator.view import Stage
@@ -31,6 +32,7 @@ class Staged:
         self.conductor = Conductor(Task(raster(), PROFILE, stands_home=True, **task))  # type: ignore[arg-type]
         self.now, self.arm = 0.0, ArmState.DISARMED
         self.phase: Phase | None = None
+        self.fraction = 1.0  # of 5 checkpoints
         self.seen, self.pose = Seen(recorder=RecorderReport(0.0, 0, 0.0, "")), SURFACE
         self.ended, self.asked, self.answers = "", 0, 0
         self.orders: list[object] = []
@@ -49,7 +51,7 @@ class Staged:
         nan = float("nan")
         status = ArmStatus(self.now, self.arm, "why", PROFILE.arm.home, None, 0.0, nan, nan, 0.0, 0, 0, self.answers, 0)
         tick = Tick(self.now, Hold(self.now, 0.001, "x"), b"", 0.0, status, "")
-        progress = None if self.phase is None else Progress(self.phase, 1, 6, 1.0, 9.0, 1.0)
+        progress = None if self.phase is None else Progress(self.phase, 1, 6, self.fraction, 9.0, self.fraction)
         self.seen.motion = LiveMotionReport(tick, progress, False, (), (), 0, 0, None, 0, "ordinary")
         self.orders += self.conductor(self.now, self.seen, asked)
         return self.conductor.stage
@@ -150,6 +152,32 @@ def test_what_ends_a_run_stops_the_arm_and_says_so(fault: str, words: str) -> No
     assert run.orders[-1] is Order.STOP
 
 
+@pytest.mark.parametrize("phase", [Phase.LEAVING, Phase.WAITING, Phase.FINISHED])
+@pytest.mark.parametrize("unattended", [False, True])
+def test_cameras_that_end_once_all_is_printed_end_nothing_and_the_arm_goes_home(phase: Phase, unattended: bool) -> None:
+    run = Staged(unattended=unattended, patience=1.0).to_print()
+    run.phase, run.fraction, run.ended = phase, 5.0, "session is over"
+    assert run.look() is Stage.HOMING and run.orders == [Order.HOME]
+    run.conductor(run.now + 1.1, run.seen, [])
+    assert run.look() is Stage.HOMING and not run.conductor.missed
+    run.arm = ArmState.DISARMED
+    assert run.look() is Stage.DONE and run.conductor.done and run.orders == [Order.HOME]
+
+
+def test_an_arm_that_was_stopped_when_all_was_printed_waits_for_the_operator_without_cameras() -> None:
+    run = Staged().to_print()
+    run.phase, run.fraction, run.arm = Phase.LEAVING, 5.0, ArmState.STOPPED
+    run.look(Wish.STOP)
+    run.ended = "session is over"
+    run.stays(Stage.STOPPED)
+    run.look(Wish.RESUME)
+    run.arm = ArmState.ARMED
+    assert run.look() is Stage.HOMING
+    run.look()
+    run.arm = ArmState.DISARMED
+    assert run.look() is Stage.DONE and run.conductor.done
+
+
 def test_whoever_ends_a_run_is_not_told_that_it_failed() -> None:
     run = Staged().to_print()
     assert run.look(Wish.END) is Stage.ENDED and run.orders[-1] is Order.STOP and not run.conductor.done
@@ -226,3 +254,16 @@ def test_a_process_that_says_nothing_is_missed_after_two_of_its_words_and_back_w
     assert "0.39 s" in conductor.missed and conductor.stage is Stage.PRINT
     run.look()
     assert not conductor.missed
+
+
+@pytest.mark.parametrize(
+    ("stage", "reason", "line"),
+    [
+        (Stage.PRINT, "", "print"),
+        (Stage.DONE, "the path is printed", "done: the path is printed"),
+        (Stage.ENDED, "ended: Ctrl-C", "ended: Ctrl-C"),
+        (Stage.ENDED, "ended by the operator", "ended by the operator"),
+    ],
+)
+def test_a_stage_and_why_are_said_once(stage: Stage, reason: str, line: str) -> None:
+    assert stage_line(stage, reason) == line

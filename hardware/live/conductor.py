@@ -177,13 +177,13 @@ class Conductor:
     def _missed(self, seen: Seen, now: float) -> str:
         motion, tracking = seen.motion, seen.tracking
         silent = "" if motion is None else silence("motion", motion.tick.stamp, self.task.profile.tick, now)
-        if silent or tracking is None:
+        if silent or tracking is None or tracking.ended:
             return silent
         return silence("tracking", tracking.stamp, tracking.interval, now)
 
     def _go_on(self, seen: Seen, now: float) -> Orders:
         tracking, motion = seen.tracking, seen.motion
-        if tracking is not None and tracking.ended:
+        if tracking is not None and tracking.ended and not _printed(motion):
             return self.end(f"the cameras: {tracking.ended}", now)
         if seen.recorder is not None and seen.recorder.failed:
             return self.end(seen.recorder.failed, now)
@@ -199,7 +199,7 @@ class Conductor:
                 return orders
             if self.stage is Stage.HOMING:
                 return self._homing(tracking, motion, now)
-            return self._printing(motion, now)
+            return self._printing(tracking, motion, now)
         if self.stage is Stage.STOPPED and self.task.unattended:
             return self.end(f"stopped: {self.reason}", now)
         self._came_back(motion, now)
@@ -239,7 +239,7 @@ class Conductor:
         if status.state is ArmState.UNPLUGGED:
             self._away = True
             return self._stop(f"the arm is unplugged: {status.reason}: plug it in", now)
-        if tracking.pose is not None and (age := now - tracking.pose.stamp) > self.task.patience:
+        if tracking.pose is not None and not tracking.ended and (age := now - tracking.pose.stamp) > self.task.patience:
             return self._stop(f"no pictures for {age:.1f} s", now)
         if status.state is ArmState.ARMED:
             self._armed = True
@@ -283,7 +283,7 @@ class Conductor:
         tick = tick_in_step(laid.profile.tick, interval, max(laid.profile.tick / 2, 2 * laid.profile.frame_time))
         return [Begin(path, replace(laid.profile, lag=lag, tick=tick), task.start, task.fingerprint)]
 
-    def _printing(self, motion: LiveMotionReport, now: float) -> Orders:
+    def _printing(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
         progress = motion.progress
         if self.stage is Stage.STOPPED:
             return []
@@ -291,7 +291,7 @@ class Conductor:
             return self._arm_again(motion, now)
         if progress is None or self.stage is Stage.PAUSED:
             return []
-        if progress.phase is Phase.FINISHED:
+        if progress.phase is Phase.FINISHED or tracking.ended:
             return self._home(Stage.DONE, now)
         if self.stage is Stage.APPROACH and progress.phase is Phase.PRINTING:
             self._to(Stage.PRINT, "", now)
@@ -324,3 +324,9 @@ class Conductor:
         if (stage, reason) != (self.stage, self.reason):
             self.turn += 1
         self.stage, self.reason, self._since = stage, reason, now
+
+
+def _printed(motion: LiveMotionReport | None) -> bool:
+    """Whether the last checkpoint is printed: what is left, the way home, needs no pictures."""
+    progress = None if motion is None else motion.progress
+    return progress is not None and progress.fraction >= progress.total - 1

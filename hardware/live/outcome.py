@@ -52,7 +52,9 @@ class Outcome:
             dry = self.prepared.task.lift is not None
             done = "were passed by, none printed" if dry else "are printed"
             lines.append(f"{place:.2f} of {total} checkpoints {done}; the arm is at rest")
-            lines += [] if dry else [f"go on with: stillbed live --resume {beside.record}"]
+            if not dry:
+                again = f"go on with: stillbed live --resume {beside.record}"
+                lines.append("the path is printed; there is nothing to go on with" if place >= total else again)
         return "\n".join([*lines, f"report: {beside.report}"])
 
     def write(self) -> None:

@@ -39,7 +39,7 @@ from hardware.live.records import Begin, EventEntry, UsedEntry
 from hardware.live.settings import settings_text
 from hardware.live.tally import Tally
 from hardware.live.view import Viewer
-from hardware.live.words import status_line
+from hardware.live.words import stage_line, status_line
 from hardware.motion_loop import Order
 from hardware.operator.process import OperatorPage
 from hardware.operator.request import Request, Wish
@@ -154,7 +154,7 @@ class LiveRun:
                 self._halt()
             ended = self._lines.tracking.get()
             if name == TRACKING and ended is not None and ended.ended:
-                return conductor.end(f"the cameras: {ended.ended}", now)
+                continue  # the conductor knows whether pictures are still needed
             if name in (MOTION, TRACKING, RECORDER):
                 failed = self._lines.recorder.get()
                 why = f": {failed.failed}" if name == RECORDER and failed is not None and failed.failed else ""
@@ -266,7 +266,7 @@ class LiveRun:
             self._turn = conductor.turn
             if conductor.stage is Stage.PRINT and math.isnan(self._lines.begun.instant):
                 self._lines.begun.instant = now
-            self._say(f"{conductor.stage.value}{': ' + conductor.reason if conductor.reason else ''}")
+            self._say(stage_line(conductor.stage, conductor.reason))
             if conductor.stage is Stage.FIND:
                 self._console.say(table(conductor.checks))
             elif conductor.stage in (Stage.CONFIRM, Stage.READY):

@@ -22,3 +22,10 @@ def status_line(conductor: Conductor, seen: Seen) -> str:
     if conductor.missed:
         held = f", {conductor.missed}"
     return f"{conductor.stage.value}: {progress.fraction:.1f} of {progress.total - 1} checkpoints, {state}{held}"
+
+
+def stage_line(stage: Stage, reason: str) -> str:
+    """The stage, and why; a reason that begins with the stage says both."""
+    if not reason or reason.startswith(stage.value):
+        return reason or stage.value
+    return f"{stage.value}: {reason}"
