@@ -88,6 +88,15 @@ def test_the_disk_is_judged_by_what_is_free(free: float, verdict: Verdict, monke
     assert machine.shared_check().verdict is PASS
 
 
+def test_a_cache_that_cannot_be_written_is_a_warning_and_one_that_can_is_left_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    check = machine.cache_check(tmp_path / "file" / ".cache" / "stillbed")
+    assert check.verdict is WARN and "not a directory" in check.found and "XDG_CACHE_HOME" in check.remedy
+    assert machine.cache_check(Path("/proc/stillbed")).verdict is WARN
+    assert machine.cache_check(tmp_path / "new" / "stillbed").verdict is PASS
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
+
+
 def test_little_shared_memory_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "_room", lambda folder: 0.064 if folder.name == "shm" else 99.0)
     (tmp_path / "dev/shm").mkdir(parents=True)

@@ -175,3 +175,17 @@ def test_the_same_from_a_shell(folder: Path) -> None:
     command = [sys.executable, "-m", "hardware.cli", "track", str(folder / "missing"), "-o", str(folder / "OUT")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2 and done.stdout == "" and done.stderr.startswith(f"stillbed: {folder}/missing: ")
+
+
+def test_a_cache_that_cannot_be_written_is_one_line_that_says_where_to_have_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    run = ["live", "--simulated", str(ROOT / "data/live/small.toml"), "--record", str(tmp_path / "x.mcap"), "--no-page"]
+    for cache in (tmp_path / "file", Path("/proc")):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+        assert main(run) == 2
+        told = capfd.readouterr().err
+        (line,) = [line for line in told.splitlines() if line.startswith("stillbed")]
+        assert "Traceback" not in told
+        assert line.startswith(f"stillbed: {cache}/stillbed: cache = ") and "XDG_CACHE_HOME" in line

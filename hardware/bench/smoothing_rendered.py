@@ -12,8 +12,9 @@ from estimation import smooth
 from estimation.errors import InputError
 from estimation.smoothing.smoothed import Smoothed
 from hardware.bench.figure import Figure, at_most
+from hardware.cache_folder import cache_folder
 from hardware.evaluation import spread
-from hardware.live.prerender import cache_folder, prerender
+from hardware.live.prerender import prerender
 from hardware.session import Session, open_session
 from hardware.smoothing.judged import judge
 from hardware.smoothing.relinked import Relinked, relinked

@@ -11,6 +11,7 @@ import tempfile
 from pathlib import Path
 
 from hardware.bench.machine import this_machine
+from hardware.cache_folder import REMEDY, cache_trouble
 from hardware.clock import Clock
 from hardware.evenness import evenness
 from hardware.lateness import Lateness
@@ -85,6 +86,13 @@ def disk_check(folder: Path) -> Check:
     verdict = Verdict.FAIL if free < FREE[0] else Verdict.WARN if free < FREE[1] else Verdict.PASS
     remedy = "" if verdict is Verdict.PASS else f"record where there are {FREE[1]:g} GB, or make room"
     return Check("disk", verdict, f"{free:.1f} GB {told}", remedy)
+
+
+def cache_check(cache: Path) -> Check:
+    """Whether pictures of a scenario can be kept, which `stillbed live --simulated` renders before it shows them."""
+    if trouble := cache_trouble(cache):
+        return Check("cache", Verdict.WARN, f"{cache} cannot be written: {trouble}", f"for simulated runs, {REMEDY}")
+    return Check("cache", Verdict.PASS, f"kept in {cache}")
 
 
 def shared_check(root: Path = ROOT) -> Check:

@@ -14,6 +14,7 @@ from estimation.rig import Rig
 from hardware.arm_file import read_arm
 from hardware.arm_profile import ArmProfile
 from hardware.bookmark_file import read_start
+from hardware.cache_folder import cache_folder, not_written
 from hardware.faults import Fault, Part, Runner, check_faults
 from hardware.live.beside import Beside, Found, read_found
 from hardware.live.conductor import Task
@@ -156,12 +157,15 @@ def _rendered(scenario: File) -> File:
 
 
 def _render(scenario: File, answer: Connection) -> None:
-    from hardware.live.prerender import cache_folder, prerender  # loads all of the simulator
+    from hardware.live.prerender import prerender  # loads all of the simulator
 
+    cache = cache_folder()
     try:
-        answer.send((str(prerender(scenario, cache_folder()).folder), ""))
+        answer.send((str(prerender(scenario, cache).folder), ""))
     except StillbedError as error:
         answer.send(("", str(error)))
+    except OSError as error:  # the disk is full
+        answer.send(("", str(not_written(cache, error))))
 
 
 def with_faults(prepared: Prepared, faults: tuple[Fault, ...]) -> Prepared:

@@ -22,6 +22,7 @@ from estimation.pose import SurfacePose, identity_pose
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
 from hardware.arm_file import write_arm
+from hardware.cache_folder import not_written
 from hardware.clock import WallClock
 from hardware.faults import Part
 from hardware.path_file import read_path, write_path
@@ -75,11 +76,6 @@ class Rendered:
         return Path((self.folder / "scenario").read_text(encoding="utf-8"))
 
 
-def cache_folder() -> Path:
-    """Where pre-rendered sessions are kept, as the XDG rules have it."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stillbed"
-
-
 def cached(file: Path, cache: Path, seconds: float | None = None) -> Rendered:
     """Where the session of a scenario lies or will lie; another text of scenario or path is another folder.
 
@@ -104,7 +100,8 @@ def _path_bytes(file: Path) -> bytes:
 def prerender(file: Path, cache: Path, threads: int = 2, seconds: float | None = None) -> Rendered:
     """The session of the scenario in `file`, rendered unless it is there; a run cut short leaves nothing in its place.
 
-    seconds: only so much of its beginning. InputError for a scenario that makes no sense.
+    seconds: only so much of its beginning. InputError for a scenario that makes no sense, or a cache that cannot be
+    written.
     """
     scenario = read_scenario(file)
     if seconds is not None:
@@ -112,10 +109,13 @@ def prerender(file: Path, cache: Path, threads: int = 2, seconds: float | None =
     if others := [fault for fault in scenario.faults if fault.part is not Part.ARM]:
         raise InputError(file, "faults", str(others[0]), "faults of the arm; a live run takes others as --fault")
     rendered = cached(file, cache, seconds)
-    if (rendered.folder / "scenario").exists():
-        return rendered
     beside = rendered.folder.with_name(f"{rendered.folder.name}.{os.getpid()}")
-    beside.mkdir(parents=True)
+    try:
+        if (rendered.folder / "scenario").exists():
+            return rendered
+        beside.mkdir(parents=True)
+    except OSError as error:
+        raise not_written(cache, error) from None
     try:
         _render(replace(scenario, nozzle=False, beads=False), beside, threads)
         (beside / "scenario").write_text(str(file.resolve()), encoding="utf-8")
