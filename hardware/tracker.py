@@ -13,6 +13,7 @@ from pathlib import Path
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.end_with_parent import end_with_parent
+from hardware.held_interrupt import held_interrupt
 from hardware.mesh_file import read_mesh
 from perception.frames import Roi
 from perception.prefilter import NONE, PREFILTERS
@@ -43,7 +44,9 @@ def tracker(
     if surface is not None:
         scan = read_mesh(surface).scan
     with ProcessPoolExecutor(1, get_context("spawn"), _settle) as executor:
-        executor.submit(int).result()  # started before the first frame set, not beside it
+        with held_interrupt():
+            first = executor.submit(int)
+        first.result()  # started before the first frame set, not beside it
 
         def made(found: Sequence[Roi]) -> TrackingStep:
             held = None if tool is None else Tool(tool)

@@ -31,6 +31,33 @@ if __name__ == "__main__":
     with {pool} as pool:
         list(pool.map(work, range(8)))
 """
+STARTS = """
+import os, time
+from hardware.live.children import settle
+from hardware.live.crew import Crew
+from hardware.tracker import tracker
+
+def tracked():
+    with tracker(None, [None]):
+        time.sleep(60)
+
+def begun():
+    crew = Crew()
+    crew.start("small", settle, ("small",))
+    try:
+        time.sleep(60)
+    finally:
+        crew.end("small")
+
+if __name__ == "__mp_main__":
+    os.write(1, b"loads\\n")
+    time.sleep(1)
+if __name__ == "__main__":
+    try:
+        {how}()
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
 BENCH = "workers(2)"
 TRACKER = "ProcessPoolExecutor(2, get_context('spawn'), _settle)"
 
@@ -69,6 +96,27 @@ def test_they_end_with_whoever_started_them(
         while not all(map(gone, own)) and time.monotonic() < until:
             time.sleep(0.02)
         assert all(map(gone, own))
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(started.pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("how", ["tracked", "begun"])
+def test_ctrl_c_while_a_process_loads_is_its_parents_alone(how: str, tmp_path: Path) -> None:
+    (script := tmp_path / "starts.py").write_text(STARTS.replace("{how}", how))
+    started = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    assert started.stdout is not None
+    try:
+        assert started.stdout.readline() == "loads\n"
+        os.killpg(started.pid, signal.SIGINT)
+        assert started.communicate(timeout=PATIENCE) == ("interrupted\n", "") and started.returncode == 0
     finally:
         with suppress(ProcessLookupError):
             os.killpg(started.pid, signal.SIGKILL)

@@ -12,6 +12,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
 
+from hardware.held_interrupt import held_interrupt
+
 CONTEXT = multiprocessing.get_context("spawn")  # a forked child would have loaded all that its parent has
 LAST_WORDS = 10.0  # s that a process gets to close its files, on a busy machine
 
@@ -25,7 +27,8 @@ class Crew:
     def start(self, name: str, body: Callable[..., None], arguments: tuple[Any, ...]) -> None:
         """Start a process. Ends of pipes among its arguments are its own from now on."""
         process = CONTEXT.Process(target=body, args=arguments, name=name)
-        process.start()
+        with held_interrupt():
+            process.start()
         self.members[name] = process
         for argument in arguments:
             for end in argument if isinstance(argument, list) else [argument]:
