@@ -17,7 +17,7 @@ from hardware.arm_commands import add_arm
 from hardware.bench.command import add_bench
 from hardware.calibration.commands import add_calibrate
 from hardware.cameras.command import add_cameras
-from hardware.command_line import WRONG_INPUT, Commands, Parser, add_command
+from hardware.command_line import WRONG_INPUT, Commands, Parser, add_command, told
 from hardware.comparing.command import add_compare
 from hardware.doctor.command import add_doctor
 from hardware.live.command import add_init, add_live
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # nobody reads on, as after `| head`; the files are written all the same
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (StillbedError, OSError) as error:
-        print(f"stillbed: {_told(error)}", file=sys.stderr)
+        print(f"stillbed: {told(error)}", file=sys.stderr)
         if out is not None and not was_there:
             with suppress(OSError):
                 out.rmdir()  # made for what was not done; what holds anything stays
@@ -65,13 +65,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"\nstillbed: interrupted; {kept(getattr(arguments, 'out', None))}", file=sys.stderr)
         return INTERRUPTED
     return code or 0
-
-
-def _told(error: Exception) -> str:
-    """What was wrong; of what the system refuses, the file first, as everywhere."""
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror.lower()}"
-    return str(error)
 
 
 def _end_in_order() -> None:

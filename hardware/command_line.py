@@ -33,6 +33,13 @@ def add_command(commands: Commands, name: str, summary: str, text: str, *example
     return made
 
 
+def told(error: Exception) -> str:
+    """What was wrong; of what the system refuses, the file first, as everywhere."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror.lower()}"
+    return str(error)
+
+
 def positive(text: str) -> float:
     """A finite number above 0."""
     value = _number(text)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from estimation import se3
+from estimation.errors import InputError
 from estimation.synthetic.arc_rig import arc_rig
 from estimation.trajectory import Trajectory
 from hardware.path_file import read_path, write_path
+from hardware.script import run_script
 from hardware.tum import write_tum
 from tests.moving import raster
 from tests.synthetic import write_session
@@ -75,3 +80,41 @@ def test_poses_are_judged_by_evo(tmp_path: Path, capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.name)
 def test_each_example_is_shown_in_the_documents(file: Path) -> None:
     assert f"docs/examples/{file.name}" in (EXAMPLES.parents[1] / "README.md").read_text(encoding="utf-8")
+
+
+def started(file: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parents[1])}
+    command = [sys.executable, str(file), *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.name)
+def test_each_example_says_how_it_is_started(file: Path) -> None:
+    asked, wrong = started(file, "--help"), started(file, "a", "b", "c")
+    assert (asked.returncode, asked.stderr) == (0, "") and f"python docs/examples/{file.name}" in asked.stdout
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    (line,) = wrong.stderr.splitlines()
+    assert line.startswith(f"usage: python docs/examples/{file.name}")
+
+
+def test_what_a_script_cannot_take_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+    def main(scan: str, seconds: float = 1.0) -> None:
+        if scan == "wrong":
+            raise InputError(scan, "size", seconds, "less")
+        Path(scan).read_bytes()
+        print(scan, seconds)
+
+    def code(*words: str) -> object:
+        with pytest.raises(SystemExit) as ended:
+            run_script(main, "Do it: python own.py SCAN [SECONDS]  and look.", words)
+        return ended.value.code
+
+    for words in ([], ["a", "many"], ["a", "1", "2"], ["--fast"]):
+        assert code(*words) == 2
+        assert capsys.readouterr() == ("", "usage: python own.py SCAN [SECONDS]\n")
+    assert code("wrong", "2") == 2
+    assert capsys.readouterr() == ("", "wrong: size = 2.0, allowed less\n")
+    assert code("nowhere") == 2
+    assert capsys.readouterr() == ("", "nowhere: no such file or directory\n")
+    assert code(__file__, "2") == 0
+    assert capsys.readouterr() == (f"{__file__} 2.0\n", "")

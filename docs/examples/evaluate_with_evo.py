@@ -5,12 +5,12 @@ Needs `pip install evo`. The two surface frames differ by a constant, which the 
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 from evo.core import metrics, sync
 from evo.core.trajectory import PosePath3D
 from evo.tools import file_interface
+
+from hardware.script import run_script
 
 
 def main(estimated: str, reference: str) -> None:
@@ -30,4 +30,4 @@ def main(estimated: str, reference: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run_script(main, __doc__)

@@ -6,13 +6,12 @@ program takes `pose` from a tracking step, and sends each line when its tick com
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from hardware.path_file import read_path
+from hardware.script import run_script
 from planning.command import Command, Hold
 from planning.guard import Guard
 from planning.kinematics import SimpleArm, nozzle_from_axes
@@ -50,4 +49,4 @@ def main(path: str, seconds: float = 60.0) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run_script(main, __doc__)

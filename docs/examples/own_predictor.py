@@ -5,8 +5,6 @@ This one damps the newest velocity by what would have been best until now, for e
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 
 from estimation import se3
@@ -15,6 +13,7 @@ from estimation.pose import SurfacePose
 from estimation.predictor import Predictor
 from estimation.synthetic.follow import follow
 from estimation.synthetic.world import synthetic_world
+from hardware.script import run_script
 
 AHEAD = np.array([0.1, 0.2, 0.3, 0.5])  # s
 
@@ -41,7 +40,7 @@ class Damped:
         return Forecast(AHEAD, (share * AHEAD)[:, None] * pose.twist, variance[:, None, None] * units)
 
 
-def main(seconds: str = "40") -> None:
+def main(seconds: float = 40.0) -> None:
     """RMS error, mm, of the origin in the last 40 % of a breathing world: hold, this predictor, stillbed's own."""
     world = synthetic_world("breathing", seconds=float(seconds), seed=4)
     poses, mine, ours, errors = follow(world, "told").poses, Damped(), Predictor(), []
@@ -56,4 +55,4 @@ def main(seconds: str = "40") -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run_script(main, __doc__)

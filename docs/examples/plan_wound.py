@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-
 from hardware.mesh_file import read_raw_mesh
 from hardware.path_file import write_path
+from hardware.script import run_script
 from planning.fill.pattern import Pattern
 from planning.layers.figures import figures_of, total_of
 from planning.layers.plan import Order, make_plan
@@ -32,4 +31,4 @@ def main(scan: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run_script(main, __doc__)

@@ -5,9 +5,8 @@ A session folder holds rig.toml, frames.csv and a video a camera (docs/conventio
 
 from __future__ import annotations
 
-import sys
-
 from hardware.methods import MAP, step_by
+from hardware.script import run_script
 from hardware.session import open_session
 
 
@@ -24,4 +23,4 @@ def main(folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run_script(main, __doc__)
