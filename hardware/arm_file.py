@@ -63,6 +63,18 @@ _SHAPES: dict[str, tuple[int | None, ...]] = {
     "arm_from_upright": (3, 3),
     "tool_offset_mm": (3,),
 }
+PARTS = {"arm profile": "", "arm": "", "dialect": "", "limits": "limits.", "kinematics": "kinematics."}  # with tables
+NAMED = {  # by what is wrong with them
+    "home": "home_mm_deg",
+    "tool_offset": "tool_offset_mm",
+    "tick": "tick_s",
+    "lag": "lag_s",
+    "tool": "tool_mm",
+    "kinematics.dh": "kinematics.dh_mm_deg",
+    "kinematics.low": "kinematics.low_deg",
+    "kinematics.speed": "kinematics.speed_deg_s",
+    "kinematics.acceleration": "kinematics.acceleration_deg_s2",
+}
 _TO_RAD = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])
 
 
@@ -92,7 +104,7 @@ def read_arm(path: str | Path) -> ArmProfile:
     except InputError as error:
         if error.where == str(path):
             raise
-        raise InputError(path, f"{error.where}: {error.what}", error.got, error.allowed) from None
+        raise _in_file(path, table, error) from None
 
 
 def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
@@ -118,6 +130,19 @@ def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
         *kinematics_lines(arm),
     ]
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _in_file(path: Path, table: checks.Table, error: InputError) -> InputError:
+    """What is wrong with a part of the profile, by its key and value in the file; of a default, its own value."""
+    if error.where not in PARTS:
+        return InputError(path, f"{error.where}: {error.what}", error.got, error.allowed)
+    key = PARTS[error.where] + error.what
+    key = NAMED.get(key, key)
+    found: object = table
+    for word in key.split("."):
+        found = found.get(word) if isinstance(found, dict) else None
+    whole = found is None or isinstance(error.got, str)  # one word of a list is what is wrong
+    return InputError(path, key, error.got if whole else found, error.allowed)
 
 
 def tool_from_value(where: object, key: str, value: object) -> Array:

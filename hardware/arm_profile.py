@@ -18,6 +18,7 @@ from planning.limits import Limits
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
 LONGEST_LAG = 1.0  # s: nothing moving can be followed that far ahead
+TO_DEG = np.array([1.0, 1, 1, *np.rad2deg([1.0, 1, 1])])  # of axes, mm and rad
 BENCH = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # arm_from_surface under the thesis's home, z up
 
 
@@ -49,8 +50,9 @@ class ArmProfile:
         check_profile("arm profile", "tool", self.tool)
         arm, limits = self.arm, self.limits
         if (arm.home < limits.low).any() or (arm.home > limits.high).any():
-            allowed = f"within {limits.low.tolist()} and {limits.high.tolist()}"
-            raise InputError("arm profile", "home", arm.home.tolist(), allowed)
+            low, high = (np.round(axes * TO_DEG, 9).tolist() for axes in (limits.low, limits.high))
+            allowed = f"X Y Z in mm, A B C in degrees, within {low} and {high}"
+            raise InputError("arm profile", "home", np.round(arm.home * TO_DEG, 9).tolist(), allowed)
         tip = nozzle_from_axes(arm, arm.home)[:3, 3] if limits.zones else np.zeros(3)
         for zone in limits.zones:
             if zone.depth(tip) > 0:

@@ -27,8 +27,9 @@ SPEEDS = {"speed_mm_s": 1.0, "speed_mm_min": 1 / 60}  # column: mm/s of its unit
 REST = ("material", "temperature_c")
 OPTIONAL = ("layer", "extrude")
 HEADER = (*POSE, "speed_mm_s", *REST, *OPTIONAL)
-STEMS = {name.split("_")[0]: name for name in ("temperature_c", *SPEEDS, *POSE)}  # x, alpha, speed: they need units
-SMALLEST = 0.5  # mm, corner to corner: less than any wound, and more than one of half a metre in metres
+STEMS = {name.split("_")[0]: name for name in ("temperature_c", *POSE)}  # x, alpha: they need units
+STEMS["speed"] = " or ".join(SPEEDS)
+SMALLEST = 0.1  # mm, corner to corner: less than any wound, and as much as a tenth of a metre has in metres
 Words = dict[str, list[str]]
 
 
@@ -48,7 +49,14 @@ def read_path(file: str | File) -> Path:
         extrude=_whole(file, lines, "extrude", words.get("extrude", ["1"] * len(lines)), (0, 1)) == 1,
         extra={name: np.array(words[name]) for name in words if name not in (*HEADER, *SPEEDS)},
     )
-    check_path(path, file, lines)
+    try:
+        check_path(path, file, lines)
+    except InputError as error:
+        line, _, value = error.what.rpartition(": ")
+        if (column := {"speed": speed_column, "temperature": "temperature_c"}.get(value)) is None:
+            raise
+        word = words[column][lines.index(int(line.removeprefix("line ")))]
+        raise InputError(file, f"{line}: {column}", word, error.allowed) from None
     span = float(np.linalg.norm(np.ptp(pose[:, :3], axis=0)))
     if span < SMALLEST:
         allowed = f"{SMALLEST:g} mm or more from corner to corner: are they in metres?"
@@ -84,6 +92,8 @@ def _columns(file: File) -> tuple[list[int], Words]:
 
 
 def _check_header(file: File, header: Sequence[str]) -> None:
+    if len(header) == 1 and ";" in header[0]:
+        raise InputError(file, "header", header[0], "names with commas between them, not semicolons")
     for i, name in enumerate(header):
         if not name or name in header[:i]:
             raise InputError(file, f"header, column {i + 1}", name, "a name, and each once")

@@ -61,6 +61,7 @@ class Limits:
             if name not in ("low", "high") and (value <= 0).any():
                 raise InputError("limits", name, value.tolist(), "> 0")
         if (self.low >= self.high).any():
-            raise InputError("limits", "low", self.low.tolist(), f"below high, {self.high.tolist()}")
+            raise InputError("limits", "low", self.low.tolist(), "below high, axis by axis")
         if max(abs(self.low[4]), abs(self.high[4])) >= np.pi / 2:
-            raise InputError("limits", "low, high of B", [self.low[4], self.high[4]], "within 90 degrees (gimbal lock)")
+            got = np.rad2deg([self.low[4], self.high[4]]).round(9).tolist()
+            raise InputError("limits", "low, high of B", got, "within 90 degrees (gimbal lock)")
