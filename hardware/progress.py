@@ -65,6 +65,11 @@ def line(what: str, unit: str, done: int, total: int, elapsed: float) -> str:
     return text
 
 
+def counted(count: int, noun: str) -> str:
+    """So many of what is counted: 1 layer, 2 layers."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def duration(seconds: float) -> str:
     """Seconds as a person says them: 8 s, 3 min 20 s, 1 h 5 min."""
     whole = round(seconds)

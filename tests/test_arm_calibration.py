@@ -25,8 +25,10 @@ from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.arm_calibration.moves import MoveWishes, planned
 from hardware.arm_calibration.run import run_touched
-from hardware.arm_calibration.solve import calibrated, kinematics_of
+from hardware.arm_calibration.sightings import Look
+from hardware.arm_calibration.solve import ArmCalibration, calibrated, kinematics_of
 from hardware.arm_calibration.tool_shadow import hidden_tips, needle_shown
+from hardware.arm_calibration.verdict import judge
 from hardware.arm_file import read_arm
 from hardware.arm_profile import ArmProfile, placed
 from hardware.rig_file import write_rig
@@ -255,6 +257,17 @@ def test_where_the_tool_hides_its_tip_is_told_from_where_it_is_lost() -> None:
         rig = Rig((replace(watcher, base_from_camera=se3.make(view, place)),))
         found = hidden_tips(state, SYRINGE, point, KINEMATICS, rig, rested[:1], np.zeros(1, np.int64))
         assert found.tolist() == [hides]
+
+
+def test_the_verdict_says_how_well_the_lag_is_known_and_how_well_it_must_be() -> None:
+    sightings = seen(true_state(2), noise=0.2)
+    fit = fit_arm(sightings, sent(), KINEMATICS, RIG, start_from(sightings))
+    counts, beside = np.full(len(RIG), 9), np.full(len(sightings.stamp), 0.1)
+    look = Look(sightings, counts, counts, (), np.ones(len(RIG)), (np.zeros(0), np.zeros(0, np.int64)))
+    given = look, sent(), fit, np.zeros((9, 3)), np.full(9, 0.1), beside, beside, Asked(), counts
+    lines = judge(ArmCalibration(RIG, TOLD, *given), 1.0).lines
+    (line,) = [line for line in lines if "ms late" in line]
+    assert "; both together are known to ± " in line and line.endswith(" ms, ± 5 ms is allowed")
 
 
 def touched(count: int, seek: bool, sigma: float) -> tuple[ArmState, Array, Array]:

@@ -20,7 +20,7 @@ from hardware.cli import main
 from hardware.clock import WallClock
 from hardware.out_folder import kept, prepare_out
 from hardware.pose_file import PoseWriter, read_poses
-from hardware.progress import Progress, duration
+from hardware.progress import Progress, counted, duration
 from hardware.session import open_session
 from hardware.simulator.nozzle_file import read_nozzle
 from hardware.track import follow
@@ -221,6 +221,10 @@ def test_progress_in_a_log_is_a_line_every_few_seconds() -> None:
 )
 def test_durations_are_said_as_people_do(seconds: float, words: str) -> None:
     assert duration(seconds) == words
+
+
+def test_one_is_not_told_as_many() -> None:
+    assert [counted(n, "layer") for n in (0, 1, 2)] == ["0 layers", "1 layer", "2 layers"]
 
 
 def test_help_needs_no_library() -> None:

@@ -19,6 +19,7 @@ from hardware.contour_file import read_contour
 from hardware.path_file import read_path
 from hardware.plan import run as planning_command
 from hardware.plan.order import RANGES, Wishes, order_of
+from hardware.plan.run import example_scan
 from hardware.ply_file import write_ply
 from hardware.scan_units import UNITS, in_mm
 from planning.command import Move
@@ -50,7 +51,8 @@ def test_a_contour_becomes_a_path_with_everything_beside_it(tmp_path: Path, caps
     out = tmp_path / "new" / "path.csv"
     gcode = tmp_path / "print.gcode"
     assert main(["plan", str(contour(tmp_path)), "-o", str(out), "--bead", "0.8", "--gcode", str(gcode)]) == 0
-    assert "coverage: 99" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "coverage: 99" in told and "path: 1 layer, " in told
     path = read_path(out)
     planner = Planner(path, Limits(), SimpleArm(), 0.02)
     commands = [planner(pose_at(still, 0.02 * k), 0.02 * k) for k in range(600)]
@@ -67,6 +69,14 @@ def test_a_contour_becomes_a_path_with_everything_beside_it(tmp_path: Path, caps
     (picture,) = (out.parent / "path_layers").iterdir()
     drawn = ElementTree.parse(picture).getroot()
     assert sum(e.get("class") == "start" for e in drawn.iter()) == 1
+
+
+def test_what_was_repaired_is_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    vertices, triangles = example_scan("forearm")
+    write_ply(tmp_path / "scan.ply", vertices, np.vstack([triangles, triangles[:1]]))
+    out = tmp_path / "path.csv"
+    assert main(["plan", str(tmp_path / "scan.ply"), "-o", str(out), "--bead", "0.8", "--no-pictures"]) == 0
+    assert "scan: duplicate triangles left out (1)\n" in capsys.readouterr().out
 
 
 def test_the_report_needs_no_network_and_holds_every_checkpoint(tmp_path: Path) -> None:

@@ -36,7 +36,8 @@ def judge(found: ArmCalibration, limit: float) -> Verdict:
     if found.asked.latency:
         lines.append(
             f"the arm begins {1e3 * state.dead_time:.1f} ± {1e3 * sigma[9]:.1f} ms late and follows with a lag of "
-            f"{1e3 * state.lag:.1f} ± {1e3 * sigma[10]:.1f} ms; {1e3 * LATE:g} ms for both is allowed"
+            f"{1e3 * state.lag:.1f} ± {1e3 * sigma[10]:.1f} ms; both together are known to ± {1e3 * late:.1f} ms, "
+            f"± {1e3 * LATE:g} ms is allowed"
         )
     out = 1 - found.fit.used.mean()
     if out > 0.05:

@@ -8,6 +8,7 @@ from hardware.arm_status import ArmState
 from hardware.live.laid import Laid
 from hardware.live.records import LiveMotionReport, RecorderReport, TrackingReport
 from hardware.operator.view import Check, Verdict
+from hardware.progress import counted
 from planning.path import Path
 
 FRESH = 1.0  # s: pictures older than this do not come any more
@@ -51,7 +52,7 @@ def arm_check(report: LiveMotionReport | None, stands_home: bool) -> Check:
 def path_check(path: Path, start: float) -> Check:
     """What is to be printed."""
     begun = f", from checkpoint {start:.2f} on" if start else ""
-    return Check("path", PASS, f"{len(path)} checkpoints, {len(np.unique(path.layer))} layers{begun}")
+    return Check("path", PASS, f"{len(path)} checkpoints, {counted(len(np.unique(path.layer)), 'layer')}{begun}")
 
 
 def reach_check(laid: Laid | None) -> Check:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from estimation.se3 import Array
 from hardware.page import document, figures_table, row_of_tiles, section, tile
 from hardware.plan.layer_picture import len_text
-from hardware.progress import duration
+from hardware.progress import counted, duration
 from planning.layers.figures import LayerFigures, Total, seconds_to
 from planning.layers.grid import at
 from planning.layers.plan import Plan
@@ -112,7 +112,7 @@ LAYER_WORDS = (
 def _lead(layers: Sequence[LayerFigures], total: Total) -> str:
     inks = ", ".join(f"{volume / 1000:.2f} ml of {material_text(name)}" for name, volume in total.volume)
     return (
-        f"{len(layers)} layers, {len_text(total.printed)} of bead, {duration(total.seconds)} to print: "
+        f"{counted(len(layers), 'layer')}, {len_text(total.printed)} of bead, {duration(total.seconds)} to print: "
         f"{inks}. {total.covered:.2%} of the layers' area is covered, {total.double:.2%} twice."
     )
 

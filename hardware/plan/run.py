@@ -25,7 +25,7 @@ from hardware.plan.layer_picture import bounds_of, layer_svg, len_text
 from hardware.plan.order import Wishes, check_out, order_of
 from hardware.plan.page import Story, material_text, page_text
 from hardware.ply_file import write_ply
-from hardware.progress import Progress, duration
+from hardware.progress import Progress, counted, duration
 from hardware.reach import with_feasible
 from hardware.scan_units import in_mm
 from planning.layers.figures import LayerFigures, Total, figures_of, total_of
@@ -240,14 +240,14 @@ def _told(plan: Plan, subject: Subject, total: Total, out: Path, written: Sequen
     lines = [
         f"wound: {f.area:.0f} mm^2, up to {f.depth:.2f} mm deep, {f.volume:.0f} mm^3"
         + ("" if f.given else f"; outline found where the scan is {f.level:.2f} mm deep"),
-        f"path: {sum(bool(layer.beads) for layer in plan.layers)} layers, {len(plan.path)} checkpoints, "
+        f"path: {counted(sum(bool(layer.beads) for layer in plan.layers), 'layer')}, {len(plan.path)} checkpoints, "
         f"{len_text(total.printed)} of bead, {len_text(total.travelled)} of travel, {duration(total.seconds)}",
         f"coverage: {total.covered:.2%} covered, {total.double:.2%} twice, {total.over:.2%} beside, "
         f"{total.gap:.2f} mm^2 open",
         "ink: " + ", ".join(f"{volume / 1000:.3f} ml of {material_text(name)}" for name, volume in total.volume),
     ]
     lines += [f"bumps: {bumps_text(plan)}"] if bumpy(plan) else []
-    done = [] if subject.repairs is None else [f"{n} {what}" for what, n in subject.repairs.rows()[2:] if n]
+    done = [] if subject.repairs is None else [f"{what} ({n})" for what, n in subject.repairs.rows()[2:] if n]
     if done:
         lines.append("scan: " + ", ".join(done))
     lines += [f"note: {note}" for note in notes_of(plan)]
