@@ -97,6 +97,8 @@ class PoseWriter:
             ]
         )
         self._tum_file.write("# base_from_surface: stamp_s x y z qx qy qz qw (mm)\n")
+        for file in (self._csv_file, self._tum_file):
+            file.flush()  # a run that is cut short before its first pose is read back, too
 
     def write(self, pose: SurfacePose, frames: int, report: StepReport, total: float) -> None:
         """One frame set: its pose, images given, what the step did, and the `total` s that it took."""

@@ -187,6 +187,11 @@ def test_nothing_is_lost_when_a_run_is_cut_short(tmp_path: Path, ending: BaseExc
     assert len((tmp_path / "poses.tum").read_text().splitlines()) == 1 + 6  # a comment; the first row is INITIALISING
 
 
+def test_poses_that_have_yet_to_come_are_read_back_as_none(tmp_path: Path) -> None:
+    with writer(tmp_path):
+        assert len(read_poses(tmp_path / "poses.csv")) == 0
+
+
 class Terminal(StringIO):
     def isatty(self) -> bool:
         return True
