@@ -127,7 +127,7 @@ def test_a_board_before_live_cameras_becomes_a_rig_once_somebody_says_enough(
     run = started(["calibrate", "cameras", *cameras, "--board", str(board), "-o", str(out), "--limit-mm", "1"])
     assert run.stderr is not None and run.stdout is not None
     page = browser.page(run.stderr.readline().split()[1])
-    page.until('parseInt(document.querySelector("#looked")?.textContent) >= 14', timeout=PATIENCE)
+    page.until('parseInt(document.querySelector("#looked")?.textContent) >= 30', timeout=PATIENCE)
     page.until('[...document.querySelectorAll("canvas")].every((each) => each.dataset.drawn)', timeout=PATIENCE)
     assert not page.js('document.querySelector("[data-wish=end]").disabled')
     page.click('footer [data-wish="end"]')
