@@ -264,6 +264,8 @@ class Arm(ArmDevice):
                 self._believe(now)
             for following in recall.next(echo, np.array(self._queue.target), now):
                 if isinstance(following, Pause):
+                    if recall.stood is not None:  # the step is to be given again, from where it was
+                        self._queue = ArmQueue(recall.stood.tolist(), self.profile.frame_time, now)
                     self._call_back(self._line, now)
                 elif self._line is not None:  # it was not lost over the pause
                     self._give(following, now)

@@ -43,8 +43,8 @@ class Recall:
 
     why: for a person. since: s, when it was called back. place: (6,) where it first came to rest, None until it has.
     rest: of a travel that was broken off, None where a motion was. stepped: s, when the last step was given, None where
-    none is. obeys: whether the arm is known to move again. undone: whether a motion's moves were called back, and a
-    stop came before it was told so.
+    none is, and stood: (6,) where it began. obeys: whether the arm is known to move again. undone: whether a motion's
+    moves were called back, and a stop came before it was told so.
     """
 
     def __init__(self, longest: float, speed: float, lag: float) -> None:
@@ -57,7 +57,7 @@ class Recall:
         self.rest: Iterator[G1] | None = None
         self.stepped: float | None = None
         self.obeys = self.undone = False
-        self._stood: Array | None = None  # where the last step began
+        self.stood: Array | None = None
 
     @property
     def waits(self) -> bool:
@@ -71,7 +71,7 @@ class Recall:
 
     def drop(self) -> None:
         """Nothing is called back any more."""
-        self.goal = self.place = self._stood = self.rest = self.stepped = None
+        self.goal = self.place = self.stood = self.rest = self.stepped = None
         self.why, self.obeys, self.undone = "", False, False
 
     def break_off(self) -> None:
@@ -90,20 +90,20 @@ class Recall:
         answered = echo.axes(now)
         if self.stepped is None:
             return self._rested(echo, target, now) if echo.settled(self.since) else ()
-        if near(answered, target) or underway(answered, self._stood, target):
+        if near(answered, target) or underway(answered, self.stood, target):
             self._obey(echo)
         elif echo.answered(self.stepped + self._lag + STARTED):
-            if near(answered, self._stood):  # nothing came of it: once more, after what may have come instead
+            if near(answered, self.stood):  # nothing came of it: once more, after what may have come instead
                 self.stepped = now
                 return Pause(), G1(target, self._speed)
-            self.since, self.stepped = now, None
+            self.since, self.stepped, self.stood = now, None, None
             return (Pause(),)
         return ()
 
     def _rested(self, echo: ArmEcho, stands: Array, now: float) -> tuple[G1, ...]:
         """It rests: the step, unless it has moved since it was called back, or no step could be told."""
         echo.forgive()
-        self._stood, self.place = stands, stands if self.place is None else self.place
+        self.stood, self.place = stands, stands if self.place is None else self.place
         assert self.goal is not None
         way = self.goal[:3] - stands[:3]
         length = float(np.linalg.norm(way))

@@ -50,6 +50,15 @@ def recalled_by(link: Linked, seconds: float) -> list[float]:
     return sent
 
 
+def taking_note(link: Linked, seconds: float) -> None:
+    """Let time pass as a motion does that takes note of recalls and has nothing to send."""
+
+    def each(now: float) -> None:
+        link.arm.take_up()
+
+    link.run(seconds, each)
+
+
 @settings(max_examples=12)
 @given(
     fault=st.sampled_from(["stall", "drop", "garble", "unplug", "slow 40%"]),
@@ -64,6 +73,15 @@ def test_it_goes_on_soon_after_what_struck_it_is_gone(fault: str, start: float, 
     on = gone + SOON + UNDER_WAY
     assert np.diff([on, *sent[sent > on]]).max() < 0.05
     assert link.arm.state is ArmState.ARMED and link.virtual.held <= 0.06
+
+
+def test_an_arm_that_has_begun_its_step_is_not_called_back_for_the_time_it_did_not() -> None:
+    for seconds in np.arange(0.5, 0.6, 0.007):  # answers come from all over the step
+        link = linked(ANSWERING, arm_fault(f"stall {seconds:.3f}s at 1.1s"))
+        recalled_by(link, 1.3)
+        taking_note(link, 1.2)
+        assert sum("called back" in event.text for event in link.arm.events()) == 1, seconds
+        assert link.arm.arrived(link.clock.now())
 
 
 def test_nothing_is_sent_before_somebody_has_taken_note_of_what_was_called_back() -> None:
