@@ -17,7 +17,7 @@ from hardware.arm_commands import add_arm
 from hardware.bench.command import add_bench
 from hardware.calibration.commands import add_calibrate
 from hardware.cameras.command import add_cameras
-from hardware.command_line import WRONG_INPUT, Commands, Parser, add_command, told
+from hardware.command_line import INTERRUPTED, WRONG_INPUT, Commands, Parser, add_command, told
 from hardware.comparing.command import add_compare
 from hardware.doctor.command import add_doctor
 from hardware.live.command import add_init, add_live
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from hardware.progress import Progress
 
 MISSED = 1  # a simulation that ran to its end and did not reach its own limits
-INTERRUPTED = 130  # what a shell expects after Ctrl-C
 
 
 def main(argv: Sequence[str] | None = None) -> int:

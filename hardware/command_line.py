@@ -8,7 +8,8 @@ import sys
 from typing import Any, NoReturn
 
 Commands = Any  # argparse's own type for this is private
-WRONG_INPUT = 2
+WRONG_INPUT = 2  # exit codes
+INTERRUPTED = 130  # what a shell expects after Ctrl-C
 
 
 class Parser(argparse.ArgumentParser):

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 from board_session import rendered
 
-from hardware.cli import INTERRUPTED, main
+from hardware.cli import main
+from hardware.command_line import INTERRUPTED
 from hardware.simulator.arm_settings import ArmSettings, Replies
 from tests.documents import commands
 from tests.live_runs import ROOT, Running

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from pathlib import Path
 from typing import Any
 
-from hardware.command_line import Commands, positive
+from hardware.command_line import INTERRUPTED, Commands, positive
 from hardware.out_folder import kept
 
-INTERRUPTED = 128 + signal.SIGINT  # exit code after Ctrl-C
 FAILED = 1  # exit code of a calibration that is not good enough
 SOURCES = ("folder", "device", "virtual", "touched")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from contextlib import nullcontext
 from functools import partial
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hardware.arm_calibration.commands import add_calibrate_arm
-from hardware.command_line import Commands, add_command, positive
+from hardware.command_line import INTERRUPTED, Commands, add_command, positive
 
 if TYPE_CHECKING:
     from hardware.calibration.waving_page import WavingPage
@@ -24,7 +23,6 @@ FORMATS = {
     "kalibr": "camchain.yaml",
     "anipose": "aniposelib's and caliscope's TOML, mm",
 }
-INTERRUPTED = 128 + signal.SIGINT  # exit code after Ctrl-C
 FAILED = 1  # exit code of a calibration that is not good enough
 
 
