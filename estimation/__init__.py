@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from estimation.smoothing.smooth import smooth
+    from estimation.batch.smooth import smooth
 
 __all__ = ["smooth"]
 
@@ -19,7 +19,7 @@ __all__ = ["smooth"]
 def __getattr__(name: str) -> Any:
     """`from estimation import smooth`: loaded when it is asked for, since planning needs nothing of it."""
     if name == "smooth":
-        from estimation.smoothing.smooth import smooth
+        from estimation.batch.smooth import smooth
 
         return smooth
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.averaged import Averaged
-from estimation.camera_errors import CameraErrors
 from estimation.fit import Fit
+from estimation.online.camera_errors import CameraErrors
 from estimation.se3 import Array
 from estimation.track_noise import TrackNoise
 

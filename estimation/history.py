@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimation import se3
-from estimation.compiled import NEW, compiled
+from estimation.runtime import NEW, compiled
 from estimation.se3 import Array
 
 FARTHEST = -0.9  # cosine of a turn: beyond, its axis is lost in rounding

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.compiled import compiled
+from estimation.runtime import compiled
 from estimation.se3 import Array
 
 STEP = 10**0.5  # between densities of the grid: closer ones cannot be told apart in a second

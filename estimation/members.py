@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.regression import Regression
+from estimation.forecast.experts import Regression
 from estimation.se3 import Array
 
 LEVER = 60.0  # mm, at which a turn counts like a shift: half of a surface patch

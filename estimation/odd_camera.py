@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.median import median
 from estimation.observations import Observations
+from estimation.online.pose_solver import PoseFit, Shared, own_residuals, project, solve_pose
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import PoseFit, Shared, own_residuals, project, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
 

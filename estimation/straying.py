@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.pose_solver import SharedFit
+from estimation.online.pose_solver import SharedFit
 from estimation.se3 import Array
 
 CLEARLY = 0.02  # px: shifts known better than that tell how large all of them are

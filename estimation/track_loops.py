@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.compiled import compiled
+from estimation.runtime import compiled
 from estimation.se3 import Array
 
 MEDIAN = 1.386  # of the squared length of two normal entries, in their variance

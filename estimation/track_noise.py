@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.observations import Observations
-from estimation.pose_solver import PoseFit
+from estimation.online.pose_solver import PoseFit
 from estimation.se3 import Array
 
 MEMORY = 300.0  # frame sets, ten seconds, over which the parts are learned

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.mapping.triangulation import triangulate
 from estimation.observations import Observations
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals, surface_frame
-from estimation.triangulation import triangulate
 
 ASTRAY = 4.0  # sigmas of residual, RMS over its sightings: one of them is wrong
 

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hardware.command_line import Commands, positive
-from perception.shipped import named_path
+from hardware.cli.parser import Commands, positive
+from perception.package_data import named_path
 
 
 def add_arm(commands: Commands) -> None:
@@ -44,8 +44,8 @@ def add_arm(commands: Commands) -> None:
 
 
 def _arm(arguments: argparse.Namespace) -> int | None:
-    from hardware.arm_file import read_arm
-    from hardware.arm_profile import ArmProfile
+    from hardware.arm.profile import ArmProfile
+    from hardware.files.arm_file import read_arm
 
     profile = ArmProfile() if arguments.arm is None else read_arm(arguments.arm)
     if arguments.virtual:
@@ -55,8 +55,8 @@ def _arm(arguments: argparse.Namespace) -> int | None:
 
 
 def _serve(arguments: argparse.Namespace, profile: Any) -> None:
-    from hardware.faults import Part, Runner, check_faults, faults_from_texts
-    from hardware.simulator.arm_settings import arm_settings_from_table
+    from hardware.process.faults import Part, Runner, check_faults, faults_from_texts
+    from hardware.simulator.arm.settings import arm_settings_from_table
     from hardware.simulator.port import run_virtual_arm
 
     settings = arm_settings_from_table("command line", {"replies": arguments.replies})
@@ -66,11 +66,11 @@ def _serve(arguments: argparse.Namespace, profile: Any) -> None:
 
 
 def _connect(arguments: argparse.Namespace, profile: Any) -> int:
-    from hardware.arm_console import Request, axes_from_text, jog_from_text, origin_from_text, run_arm
-    from hardware.arm_port import Device
+    from hardware.arm.console import Request, axes_from_text, jog_from_text, origin_from_text, run_arm
+    from hardware.arm.port import Device
     from hardware.arm_status import ArmState
-    from hardware.clock import WallClock
     from hardware.link_settings import LinkSettings
+    from hardware.process.clock import WallClock
 
     request = Request(
         seconds=float("inf") if arguments.watch else arguments.seconds,

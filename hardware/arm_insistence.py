@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from hardware.arm_echo import ArmEcho
+from hardware.arm.feedback import ArmEcho
 
 AGAIN = 0.09  # s: a frame on the wire, the lag, the way to rest, and the slowest answer of a public driver
 REMEMBERED = 1000  # stops

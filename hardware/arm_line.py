@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from hardware.arm_port import Port
-from hardware.protocol import LENGTH
+from hardware.arm.port import Port
+from hardware.arm.protocol import LENGTH
 from hardware.replies import Reply, reply_stream
 
 Sent = Callable[[float, float], None]  # (now, share of the frame that went just now, and not before)

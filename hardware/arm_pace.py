@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from hardware.arm.profile import ArmProfile
+from hardware.arm.protocol import G1, G4, LENGTH
+from hardware.arm.queue import ArmQueue
 from hardware.arm_line import ArmLine
-from hardware.arm_profile import ArmProfile
-from hardware.arm_queue import ArmQueue
 from hardware.link_settings import LinkSettings
-from hardware.protocol import G1, G4, LENGTH
 
 PASSED = 1e-3  # bytes: rounding
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.arm_echo import STILL, ArmEcho, near
-from hardware.protocol import G1, Pause
+from hardware.arm.feedback import STILL, ArmEcho, near
+from hardware.arm.protocol import G1, Pause
 
 TOLD = 2 * STILL[0]  # mm of a step that answers tell from none
 STARTED = 0.01  # s of a step, its lag aside, after which an answer from where it began says that it did not begin

@@ -11,7 +11,7 @@ import os
 from math import floor
 from pathlib import Path as File
 
-from hardware import checks
+from hardware.process import checks
 from planning.path import Path
 from planning.progress import Bookmark, Progress, bookmark, fingerprint, resumed
 

@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from estimation.errors import InputError
-from hardware.checks import why
+from hardware.process.checks import why
 
 REMEDY = "set XDG_CACHE_HOME to a folder that can be written"
 

@@ -12,10 +12,10 @@ from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from hardware import messages
 from hardware.heads import head_from_row
-from hardware.mcap_walk import ChunkOf, parse, walk
-from hardware.messages import Message
+from hardware.recording import messages
+from hardware.recording.mcap_file import ChunkOf, parse, walk
+from hardware.recording.messages import Message
 from perception.frames import PrintHead
 from planning.command import Command
 

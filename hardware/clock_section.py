@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.pose import TrackState
-from hardware.chart import Plot, spanning
+from hardware.files.pose_file import PoseTable
 from hardware.page import legend, line_key, section
-from hardware.pose_file import PoseTable
-from hardware.summary import clocks_learned
+from hardware.report.page import Plot, spanning
+from hardware.report.summary import clocks_learned
 
 
 def clock_section(table: PoseTable, span: tuple[float, float], width: int) -> str:

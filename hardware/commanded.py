@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from perception.frames import PrintHead
 from planning.command import Command, Move
 from planning.kinematics import nozzle_from_axes

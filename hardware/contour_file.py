@@ -9,7 +9,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware import checks
+from hardware.process import checks
 
 AXES = ("x_mm", "y_mm", "z_mm")
 

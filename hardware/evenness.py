@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.clock import Clock
+from hardware.process.clock import Clock
 
 CALLS = 20  # of each kind in a piece of work: a quarter of a millisecond, a fraction of a tick of the motion
 SLOW = 3.0  # times the usual

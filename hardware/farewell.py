@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from hardware.arm import Arm
+from hardware.arm.link import Arm
 from hardware.arm_status import ArmState
-from hardware.clock import Clock
+from hardware.process.clock import Clock
 
 LEAST, MOST = 0.05, 1.0  # s in which a last frame goes out, and in which an arm that does not stop is told so again
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.rig import Rig
-from hardware.faults import Fault, Kind, Part, struck
+from hardware.process.faults import Fault, Kind, Part, struck
 from perception.frames import Frame, FrameSet, Image
 
 

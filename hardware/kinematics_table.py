@@ -17,9 +17,9 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware import checks
-from planning.joints import JointModel
+from hardware.process import checks
 from planning.kinematics import Angles, SimpleArm
+from planning.robot.kinematics import JointModel
 
 REQUIRED = ("name", "dh_mm_deg", "low_deg", "high_deg", "speed_deg_s", "acceleration_deg_s2")
 OPTIONAL = ("nominal", "angles", "arm_from_foot", "flange_from_nozzle", "posture")

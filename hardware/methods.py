@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from estimation.rig import Rig
     from estimation.se3 import Array
-    from hardware.track import Step
+    from hardware.offline.track import Step
     from perception.frames import Roi
 
 MAP, THESIS, THESIS_FLOW = "map", "thesis", "thesis-flow"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from hardware.chart import Plot, spanning
+from hardware.files.pose_file import PoseTable
 from hardware.page import legend, line_key, section
-from hardware.pose_file import PoseTable
+from hardware.report.page import Plot, spanning
 
 
 def motion_section(table: PoseTable, span: tuple[float, float], width: int) -> str:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware import checks
+from hardware.process import checks
 from planning.no_go import NoGo, box, cylinder, half_space
 
 KINDS = ("half_space", "box", "cylinder")

@@ -9,7 +9,7 @@ from importlib.resources import files
 
 def document(kind: str, title: str, lead: str, body: Sequence[str], footer: str) -> str:
     """The whole page. kind: of report; lead: the verdict in words; body: parts as HTML; the rest is plain text."""
-    style = (files("hardware") / "report.css").read_text(encoding="utf-8")
+    style = (files("hardware") / "report" / "report.css").read_text(encoding="utf-8")
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(f"{title} · {kind}")}</title>'
         f'<meta name="viewport" content="width=device-width"><style>\n{style}</style></head><body><main>\n'

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from hardware.files.ply_file import BinaryRows, Column, Rows, TextRows
 from hardware.ply_header import WHOLE, Element, read_header
-from hardware.ply_rows import BinaryRows, Column, Rows, TextRows
 from hardware.raw_mesh import RawMesh, fans, text_rows
 
 CORNERS = ("vertex_indices", "vertex_index")  # what programs call the list of a face's vertices

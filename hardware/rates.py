@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from hardware.faults import Fault, Kind
+from hardware.process.faults import Fault, Kind
 
 Stretches = list[tuple[float, float, float]]  # of one piece of work: begin and end, s, and the share of its usual rate
 STILL = (Kind.STALL, Kind.HANG, Kind.KILL)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hardware.command_line import Commands, add_command, not_negative
-from perception.shipped import named_path
+from hardware.cli.parser import Commands, add_command, not_negative
+from perception.package_data import named_path
 
 UNREACHED = 1  # exit code where a checkpoint cannot be printed
 
@@ -57,7 +57,7 @@ def _six(text: str) -> tuple[float, ...]:
 
 
 def _reach(arguments: argparse.Namespace) -> int:
-    from hardware.reach import Question, run_reach
+    from hardware.offline.reach import Question, run_reach
 
     a = arguments
     question = Question(a.surface, a.amplitude_mm, a.turn_deg, a.rate_hz, a.spin)

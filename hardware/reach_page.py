@@ -7,10 +7,10 @@ from html import escape
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.chart import MOST_POINTS, Plot, spanning
 from hardware.page import document, dot_key, figures_table, legend, line_key, section
+from hardware.report.page import MOST_POINTS, Plot, spanning
 from planning.path import Path
-from planning.reach import REASONS, Reach
+from planning.robot.reach import REASONS, Reach
 
 WIDTH = 900  # px
 GOOD, BAD, WAY = "estimate", "off", "aside"  # classes of report.css

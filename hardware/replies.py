@@ -15,7 +15,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.protocol import FrameStream
+from hardware.arm.protocol import FrameStream
 
 REPLY_LENGTH = 9
 _REPLY = struct.Struct(">B3hBB")

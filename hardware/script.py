@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from estimation.errors import StillbedError
-from hardware.command_line import WRONG_INPUT, told
+from hardware.cli.parser import WRONG_INPUT, told
 
 USAGE = re.compile(r"python \S+\.py.*?(?=\s{2,}|$)", re.MULTILINE)  # a line of the docstring
 

@@ -10,10 +10,10 @@ from typing import TextIO
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
-from hardware.folder_tables import frame_line, head_line, write_frames, write_heads, write_roi
+from hardware.files.folder_tables import frame_line, head_line, write_frames, write_heads, write_roi
+from hardware.files.rig_file import ImageSource, write_rig
+from hardware.files.session import FrameRef
 from hardware.heads import NO_HEADS
-from hardware.rig_file import ImageSource, write_rig
-from hardware.session import FrameRef
 from hardware.tum import write_tum
 from perception.frames import Roi
 

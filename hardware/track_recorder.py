@@ -8,13 +8,13 @@ from types import TracebackType
 import numpy as np
 
 from estimation.pose import SurfacePose, TrackState
+from hardware.files.session import Session
 from hardware.heads import TOLERANCE
-from hardware.recording import Recorder
-from hardware.schemas import INFO, WARNING
-from hardware.session import Session
+from hardware.recording.recorder import Recorder
+from hardware.recording.schemas import INFO, WARNING
 from hardware.tum import rows_from_trajectory
 from perception.frames import FrameSet
-from perception.tracking import StepReport
+from perception.tracking.step import StepReport
 
 
 class TrackRecorder:

@@ -13,13 +13,13 @@ from pathlib import Path
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.end_with_parent import end_with_parent
+from hardware.files.mesh_file import read_mesh
 from hardware.held_interrupt import held_interrupt
-from hardware.mesh_file import read_mesh
 from perception.frames import Roi
 from perception.prefilter import NONE, PREFILTERS
 from perception.tool import Tool
-from perception.tracking import TrackingStep
-from perception.wound_first import WoundFirst
+from perception.tracking.step import TrackingStep
+from perception.tracking.wound_step import WoundFirst
 
 NICE = 10  # by which the process of the map stands back
 
@@ -55,8 +55,10 @@ def tracker(
         if roi:
             yield made(roi)
             return
-        from perception.segmentation import NetworkSegmenter  # loads onnxruntime, which a known region does not need
-        from perception.wound_network import WoundNetwork, shipped
+        from perception.wound.network import WoundNetwork, shipped
+        from perception.wound.segmentation import (
+            NetworkSegmenter,  # loads onnxruntime, which a known region does not need
+        )
 
         network = WoundNetwork(shipped(), threads=1)  # the other core is the tracker's
         with ThreadPoolExecutor(1) as thread:

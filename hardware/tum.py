@@ -12,7 +12,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
-from hardware.checks import why
+from hardware.process.checks import why
 
 HEADER = "# stamp_s x y z qx qy qz qw (mm, base_from_surface)\n"
 ALLOWED = "8 numbers: stamp x y z qx qy qz qw"

@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hardware.command_line import Commands
+from hardware.cli.parser import Commands
 
 if TYPE_CHECKING:
-    from perception.segmentation import Segmenter
+    from perception.wound.segmentation import Segmenter
 
 
 UNET, SHAPE = "unet", "shape"
@@ -71,7 +71,7 @@ def add_train(commands: Commands) -> None:
 
 
 def _segment(arguments: argparse.Namespace) -> None:
-    from hardware.segment import Options, run_segment
+    from hardware.offline.segment import Options, run_segment
 
     _check(arguments)
     how = arguments.scan, arguments.mm_per_px, arguments.threads
@@ -105,17 +105,17 @@ def segmenter_by(
     """A segmenter by the name of its method. model: a network's file, None: the one that comes along. scan: of the
     wound, for its outline, and for its size where mm_per_px is known."""
     if method == UNET:
-        from perception.segmentation import NetworkSegmenter
-        from perception.wound_network import WoundNetwork, shipped
+        from perception.wound.network import WoundNetwork, shipped
+        from perception.wound.segmentation import NetworkSegmenter
 
         network = WoundNetwork(shipped() if model is None else model, threads)
         return NetworkSegmenter(network, network.settings)
-    from perception.shape_matching import ShapeSegmenter, pattern_of_scan, read_shape_model
-    from perception.wound_network import shipped
+    from perception.wound.network import shipped
+    from perception.wound.shape_matching import ShapeSegmenter, pattern_of_scan, read_shape_model
 
     pattern, area = None, None
     if scan is not None:
-        from hardware.mesh_file import read_mesh
+        from hardware.files.mesh_file import read_mesh
 
         pattern, across = pattern_of_scan(read_mesh(scan).scan)
         area = None if mm_per_px is None else across / mm_per_px**2
@@ -123,6 +123,6 @@ def segmenter_by(
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    from hardware.train import run_train
+    from hardware.offline.train import run_train
 
     print(run_train(arguments))

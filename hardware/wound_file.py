@@ -13,8 +13,8 @@ import numpy as np
 from estimation.pose import SurfacePose
 from estimation.rig import Rig
 from perception.frames import FrameSet
-from perception.segmentation import Segmenter
-from perception.tracking import StepReport
+from perception.tracking.step import StepReport
+from perception.wound.segmentation import Segmenter
 from perception.wound_beside import DELAY, WoundBeside
 from perception.wound_region import area_on_plane
 from perception.wound_watch import Sight
@@ -27,7 +27,7 @@ HEAD = (
 
 
 class WoundFile:
-    """Segments beside a run, in one thread, and writes what it finds; a sink of `hardware.track.follow`."""
+    """Segments beside a run, in one thread, and writes what it finds; a sink of `hardware.offline.track.follow`."""
 
     def __init__(self, folder: Path, rig: Rig, segmenter: Segmenter) -> None:
         self._rig, self._thread = rig, ThreadPoolExecutor(1)

@@ -13,10 +13,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.compiled import NEW
+from estimation.runtime import NEW
 from estimation.se3 import Array
-from perception.descent import SIDE, descend
-from perception.patches import FLAT, Projection, Pyramid, Templates, normalise, on_level, sample
+from perception.matching.alignment_kernels import SIDE, descend
+from perception.matching.patches import FLAT, Projection, Pyramid, Templates, normalise, on_level, sample
 from perception.side_by_side import side_by_side
 
 LEAST_SIGMA = 0.05  # px

@@ -1,8 +1,8 @@
 """New landmarks that one camera alone sees: on its rays, where the surface that is known goes on.
 
 Cameras stand 36 to 84 degrees apart, so that a steep side, or anything while the others are covered, is seen by one.
-What the local fit (`estimation.local_surface`) does not know of a landmark's depth is in its covariance, and later
-looks from elsewhere reduce it.
+What the local fit (`estimation.mapping.local_surface`) does not know of a landmark's depth is in its covariance, and
+later looks from elsewhere reduce it.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.local_surface import meet
+from estimation.mapping.local_surface import meet
+from estimation.mapping.triangulation import rays
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.triangulation import rays
 from perception.features import Mask, corners
 from perception.lens import Lenses, undistort
-from perception.patches import FLAT, Pyramid, Templates, project_squares, square_axes, take_templates
+from perception.matching.patches import FLAT, Pyramid, Templates, project_squares, square_axes, take_templates
 
 SQUARELY = 0.35  # cosine of the viewing angle from which a second camera's picture can be matched: there two tell more
 BESIDE = 8  # px between landmarks

@@ -11,7 +11,7 @@ import numpy as np
 from perception.dice import dice
 from perception.frames import Image
 from perception.overlay import overlaid
-from perception.segmentation import Mask, Segmentation
+from perception.wound.segmentation import Mask, Segmentation
 
 COLUMNS = 8  # pictures a row; a row each of the best, the median and the worst
 CELL = 240  # px, side of a picture on the sheet

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.adjustment import single_fit
-from estimation.local_surface import smooth_normals
+from estimation.batch.smoothed import Smoothed
+from estimation.mapping.bundle_adjustment import single_fit
+from estimation.mapping.local_surface import smooth_normals
 from estimation.observations import Observations, no_observations
-from estimation.pose_solver import project
+from estimation.online.pose_solver import project
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.smoothing.smoothed import Smoothed
 from estimation.surface_map import SurfaceMap
 from perception.pairing import frame_period, pairing_tolerance
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from perception.frames import Image
-from perception.segmentation import Mask, Segmentation
+from perception.wound.segmentation import Mask, Segmentation
 
 FOUND, TRUTH = (60, 220, 60), (255, 160, 40)  # BGR of the outlines
 TINT = 0.25  # of the outline's colour inside it

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
-from perception.dense import match_on, middle_camera, node_size
 from perception.features import polygon_mask
-from perception.first_map import FirstMap
 from perception.frames import Image
 from perception.lens import Lenses
+from perception.mapping.dense_matching import match_on, middle_camera, node_size
+from perception.mapping.first_map import FirstMap
 
 BEGIN = 6.0  # mm over which landmarks are averaged for the first guess: about the distance between them
 MARGIN = 3.0  # mm that the lattice reaches beyond the landmarks

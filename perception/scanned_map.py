@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.adjustment import FREE, Anchors, of_frame
+from estimation.mapping.bundle_adjustment import FREE, Anchors, of_frame
 from estimation.ray_cast import cast, feet
-from estimation.registration import Registration
 from estimation.scan import Scan
+from estimation.scans.registration import Registration
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.lens import Lenses

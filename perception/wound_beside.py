@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 from estimation.deferred import Deferred
 from estimation.rig import Rig
 from perception.frames import FrameSet, Image
-from perception.segmentation import Segmentation, Segmenter
+from perception.wound.segmentation import Segmentation, Segmenter
 from perception.wound_watch import Sight, WoundWatch
 
 DELAY = 3  # frame sets until a result counts: three cameras take 60 ms of one core, a set comes every 33 ms

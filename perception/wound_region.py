@@ -10,7 +10,7 @@ from estimation import se3
 from estimation.rig import Camera
 from estimation.se3 import Array
 from perception.lens import undistort
-from perception.segmentation import Mask
+from perception.wound.segmentation import Mask
 
 Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px, the last two excluded
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.se3 import Array
-from perception.segmentation import Mask, Segmentation, centroid, largest_part
+from perception.wound.segmentation import Mask, Segmentation, centroid, largest_part
 from perception.wound_region import Box, box_of, region
 
 SAME = 0.3  # overlap of two boxes over their union, above which they show one wound: it moves little between looks

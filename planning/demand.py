@@ -9,8 +9,8 @@ from scipy.ndimage import maximum_filter1d
 
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from planning.curve import Curve
 from planning.kinematics import SimpleArm, limited_axes, most_change
+from planning.motion.curve import Curve
 from planning.stations import Stations
 
 STEP = 0.05  # mm along the path, and

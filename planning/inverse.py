@@ -12,7 +12,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.se3 import Array
-from planning.joints import JointModel, link
+from planning.robot.kinematics import JointModel, link
 
 POSTURES = np.array(list(product([1.0, -1.0], repeat=3)))  # (8, 3): shoulder, elbow, wrist; see JointModel.signs
 

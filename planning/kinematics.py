@@ -23,9 +23,9 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from planning.inverse import joints_from_nozzle, joints_from_tip
-from planning.joints import JointModel, jacobian
-from planning.joints import arm_from_nozzle as arm_from_joints
 from planning.limits import Limits
+from planning.robot.kinematics import JointModel, jacobian
+from planning.robot.kinematics import arm_from_nozzle as arm_from_joints
 
 LONGEST_OFFSET = 200.0  # mm: a tip farther from where the arm takes it to be is another tool
 FLAT = 1e-6  # so much is added to what is divided by in a singularity

@@ -8,11 +8,11 @@ import numpy as np
 
 from estimation import se3
 from estimation.se3 import Array
-from planning.curve import Curve, curve_through
-from planning.follow import LEAD
+from planning.motion.curve import Curve, curve_through
+from planning.motion.follow import LEAD
+from planning.motion.retime import Timing
 from planning.path import NEAREST, lengths
 from planning.progress import Phase
-from planning.retime import Timing
 
 CLEARANCE = 10.0  # mm above the surface, along the nozzle, on the way to and from the path
 TRAVEL = 20.0  # mm/s on that way, slow enough for a person to step in

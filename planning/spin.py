@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from estimation.se3 import Array
-from planning.joints import JointModel
 from planning.path import Path
-from planning.reach import SPINS, Motion, Reach, reach_of, spun
+from planning.robot.kinematics import JointModel
+from planning.robot.reach import SPINS, Motion, Reach, reach_of, spun
 
 UNREACHED = 1e3  # of cost: no smoothness is worth a checkpoint that cannot be printed
 STEP = 1.0  # of cost, for a spin by one candidate from one checkpoint to the next: what a turn on the spot is worth

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.se3 import Array
-from planning.curve import Curve
+from planning.motion.curve import Curve
 
 SHORTEST_BLEND = 1e-9  # mm: beside a checkpoint where nothing changes there is none
 POINTS = 30  # evenly spread grid points of one horizon: some 15 us for each

@@ -6,7 +6,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.se3 import Array
-from planning.joints import ELBOWS, SHOULDERS, WRISTS, JointModel
+from planning.robot.kinematics import ELBOWS, SHOULDERS, WRISTS, JointModel
 
 FLIP = np.diag([1.0, -1, -1])  # the nozzle's z points back into the tool, the flange's out of it
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 
-from hardware.bench.figure import Figure, Target, at_least, at_most
+from hardware.bench.figures import Figure, Target, at_least, at_most
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from boards import motion, places
 
-from estimation.camera_calibration.lens_model import matrix_of
+from estimation.calibration.lens_model import matrix_of
 from estimation.rig import Camera, Rig
-from hardware.images import encode
+from hardware.files.images import encode
 from hardware.session_folder import SessionFolder
-from hardware.simulator.board_picture import BoardView
+from hardware.simulator.scene.ground_truth_views import BoardView
 from perception.boards.board import Board
 
 BOARD = Board(squares=(4, 5), square=54.0)

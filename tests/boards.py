@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation import se3
-from estimation.camera_calibration.lens_model import image
+from estimation.calibration.lens_model import image
 from estimation.camera_calibration.views import Views
 from estimation.se3 import Array
 

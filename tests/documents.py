@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hardware.bench.command import subject_parser
 from hardware.bench.subjects import SUBJECTS
-from hardware.cli import parser
+from hardware.cli.main import parser
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

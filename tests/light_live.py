@@ -30,9 +30,9 @@ def prepare_files(folder: Path, lines: int = 40, speed: float = 5.0) -> None:
     """rig.toml, path.csv and arm.toml of a run over a surface that breathes a little, 15 mm below the arm's home."""
     from dataclasses import replace
 
-    from hardware.arm_file import write_arm
-    from hardware.arm_profile import ArmProfile
-    from hardware.path_file import write_path
+    from hardware.arm.profile import ArmProfile
+    from hardware.files.arm_file import write_arm
+    from hardware.files.path_file import write_path
     from tests.moving import raster
 
     (folder / "rig.toml").write_text("".join(RIG.format(name=name, x=x) for name, x in (("a", 0), ("b", 100))))
@@ -64,10 +64,10 @@ def track_nothing(
     import numpy as np
 
     from estimation.observations import no_observations
-    from hardware.clock import WallClock
-    from hardware.live.children import gone, settle
     from hardware.live.outbox import Outbox
     from hardware.live.records import Handed, PoseEntry, RigEntry, SetEntry, TrackingReport
+    from hardware.process.clock import WallClock
+    from hardware.process.system import gone, settle
     from tests.moving import breathing, pose_at
 
     settle("tracking")
@@ -119,11 +119,11 @@ def main(folder: Path, record: Path, *flags: str) -> int:
     """Run; the exit code is the run's."""
     from dataclasses import replace
 
-    from hardware.faults import faults_from_texts
     from hardware.live.console import Console
     from hardware.live.prepared import prepare, prepare_again
     from hardware.live.run import LiveRun
     from hardware.live.settings import LiveSettings
+    from hardware.process.faults import faults_from_texts
 
     if "--resume" in flags:
         prepared = prepare_again(record, {"unattended": "--yes" in flags})

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.arm import Arm
-from hardware.arm_profile import ArmProfile
-from hardware.clock import SimClock
-from hardware.faults import Fault
+from hardware.arm.link import Arm
+from hardware.arm.profile import ArmProfile
+from hardware.arm.protocol import G1, encode
 from hardware.link_settings import LinkSettings
-from hardware.protocol import G1, encode
-from hardware.simulator.arm_settings import ArmSettings
-from hardware.simulator.controller import VirtualArm
-from hardware.simulator.virtual_port import PortFaults, VirtualDevice
+from hardware.process.clock import SimClock
+from hardware.process.faults import Fault
+from hardware.simulator.arm.controller import VirtualArm
+from hardware.simulator.arm.ports import PortFaults, VirtualDevice
+from hardware.simulator.arm.settings import ArmSettings
 from tests.virtual_arm import HOME
 
 STEP = 0.001  # s between looks

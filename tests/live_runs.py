@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hardware.clock import WallClock
+from hardware.files.session import Session, open_session
 from hardware.live.beside import Beside
-from hardware.mcap_walk import ChunkOf, parse, walk
-from hardware.session import Session, open_session
+from hardware.process.clock import WallClock
+from hardware.recording.mcap_file import ChunkOf, parse, walk
 
 ROOT = Path(__file__).parents[1]
 CLOCK = WallClock()
@@ -64,7 +64,7 @@ class Running:
         *arguments: str,
         cache: Path,
         limits: Callable[[], None] | None = None,
-        program: Sequence[str] = ("hardware.cli", "live"),
+        program: Sequence[str] = ("hardware.cli.main", "live"),
         cwd: Path = ROOT,
     ) -> None:
         self.keys, theirs = pty.openpty()

@@ -15,9 +15,9 @@ import numpy as np
 
 from estimation.pose import TrackState
 from hardware.operator.link import OperatorLink
-from hardware.operator.request import Request, Wish
 from hardware.operator.server import serve
 from hardware.operator.settings import Limits, OperatorSettings
+from hardware.operator.shared_state import Request, Wish
 from hardware.operator.view import (
     Activity,
     CameraView,

@@ -17,9 +17,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hardware.chart import Plot, spanning
 from hardware.page import document, figures_table, legend, line_key, section
-from hardware.report import HALF
+from hardware.report.page import Plot, spanning
+from hardware.report.report import HALF
 from tests.pinned import ENVIRONMENT, ROOT, made_with, run_pinned, unlike
 from tests.reference_cases import CASES, FOLDER, TRACKS, keep, kept, replayed
 from tests.reference_signals import DECISION, NEW, STATES, Change, changes, differing

@@ -10,7 +10,7 @@ from session_files import image, rig, stamps, trajectory
 from estimation.forecast import Forecast
 from estimation.pose import SurfaceMotion, SurfacePose, TrackState
 from estimation.warp import Warp
-from hardware.recording import Recorder
+from hardware.recording.recorder import Recorder
 from perception.frames import Frame
 
 

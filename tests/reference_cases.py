@@ -18,11 +18,11 @@ from estimation.pose import SurfacePose
 from estimation.rig import Rig
 from estimation.synthetic.follow import Follower
 from estimation.triangulated import triangulated
-from hardware.arm_profile import ArmProfile
-from hardware.motion import MotionStep
-from hardware.path_file import read_path
-from hardware.replay import placed_by, replay
-from hardware.rig_file import read_rig
+from hardware.arm.profile import ArmProfile
+from hardware.files.path_file import read_path
+from hardware.files.rig_file import read_rig
+from hardware.motion.step import MotionStep
+from hardware.offline.replay import placed_by, replay
 from planning.command import Command, Move
 from planning.kinematics import axes_from_nozzle
 from planning.path import Path as Route
@@ -76,8 +76,8 @@ def _near(profile: ArmProfile, pose: SurfacePose, path: Route) -> ArmProfile:
 
 
 def _tracked(recording: Path) -> tuple[list[SurfacePose], Arrays]:
-    from hardware.session import open_session  # these load cv2
-    from perception.tracking import TrackingStep
+    from hardware.files.session import open_session  # these load cv2
+    from perception.tracking.step import TrackingStep
 
     session, poses, seen = open_session(recording), [], []
     step = TrackingStep(session.rig, session.roi)

@@ -8,7 +8,7 @@ import numpy as np
 
 from estimation.pose import TrackState
 from estimation.se3 import Array
-from hardware.report import components
+from hardware.report.report import components
 from tests.reference_cases import TRACKS, Arrays
 
 STATES = [state.value for state in TrackState]

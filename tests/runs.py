@@ -9,10 +9,10 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
-from hardware.pose_file import PoseTable
+from hardware.files.pose_file import PoseTable
 from perception.frames import FrameSet
-from perception.tracking import STAGES as STEP_STAGES
-from perception.tracking import StepReport
+from perception.tracking.step import STAGES as STEP_STAGES
+from perception.tracking.step import StepReport
 
 OFFSETS = 0.0143, -0.0091, -0.0052  # s, of the cameras, once they are known
 STAGES = ("prepare", "flow", "total")

@@ -11,7 +11,7 @@ import numpy as np
 from estimation import se3
 from estimation.rig import Camera, Rig
 from estimation.trajectory import Trajectory
-from hardware.rig_file import ImageSource, write_rig
+from hardware.files.rig_file import ImageSource, write_rig
 from hardware.tum import write_tum
 from perception.frames import Image
 

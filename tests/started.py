@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 def started(arguments: Sequence[str]) -> subprocess.Popen[str]:
     """`stillbed` with the given arguments; Ctrl-C reaches it, also where whoever runs the tests ignores it."""
     return subprocess.Popen(
-        [sys.executable, "-m", "hardware.cli", *arguments],
+        [sys.executable, "-m", "hardware.cli.main", *arguments],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -14,8 +14,8 @@ import numpy as np
 
 from hardware.cameras.controls import Control
 from hardware.cameras.identity import Identity, Kind
-from hardware.cameras.settings import CameraSource
-from hardware.clock import Clock, WallClock
+from hardware.cameras.sources import CameraSource
+from hardware.process.clock import Clock, WallClock
 from perception.frames import Image
 
 SIZE = (160, 120)

@@ -17,16 +17,16 @@ from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.trajectory import Trajectory
-from hardware.images import encode
+from hardware.files.images import encode
 from hardware.ply_file import write_ply
 from hardware.session_folder import SessionFolder
 from hardware.simulator.bodies import Wound, with_wound
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look
 from hardware.simulator.render import render
-from hardware.simulator.scene import Scene, rois
+from hardware.simulator.scene.scene import Scene, rois
+from hardware.simulator.scene.shape import cylinder, flat
 from hardware.simulator.sensor import Sensor
-from hardware.simulator.shape import cylinder, flat
 from perception.frames import Frame, FrameSet, Image
 
 Motion = Callable[[float], Array]  # stamp, s -> base_from_surface (4, 4), mm

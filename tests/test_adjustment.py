@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from estimation import se3
-from estimation.adjustment import Adjusted, KeyFrame, adjust, frame_change, without_frame
-from estimation.camera_errors import Delays
+from estimation.mapping.bundle_adjustment import Adjusted, KeyFrame, adjust, frame_change, without_frame
 from estimation.observations import Observations
-from estimation.pose_solver import solve_pose
+from estimation.online.camera_errors import Delays
+from estimation.online.pose_solver import solve_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.arc_rig import REST, arc_rig

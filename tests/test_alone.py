@@ -13,9 +13,9 @@ from estimation.state_machine import StateSettings
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.simulator.bodies import Wound
-from hardware.simulator.scene import rois
+from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet
-from perception.tracking import TrackingStep
+from perception.tracking.step import TrackingStep
 from tests.synthetic import frame_sets, patch
 
 RADIUS, COVERED = 46.0, 0.8  # mm; s, from when two cameras see nothing

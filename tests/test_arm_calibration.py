@@ -12,26 +12,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.arm_calibration.fit import Asked, fit_arm, widened
-from estimation.arm_calibration.model import ArmState, Sightings, predict
 from estimation.arm_calibration.moves import check_latency, check_places, check_turns
 from estimation.arm_calibration.set_point import SetPoint
-from estimation.arm_calibration.start import first_pose
 from estimation.arm_calibration.synthetic import set_point_of, sightings_of
 from estimation.arm_calibration.touch import fit_touched
+from estimation.calibration.arm_fit import Asked, fit_arm, widened
+from estimation.calibration.arm_model import ArmState, Sightings, predict
+from estimation.calibration.arm_start import first_pose
 from estimation.errors import InputError
 from estimation.rig import Rig, pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
+from hardware.arm.profile import ArmProfile, placed
 from hardware.arm_calibration.moves import MoveWishes, planned
-from hardware.arm_calibration.run import run_touched
-from hardware.arm_calibration.sightings import Look
-from hardware.arm_calibration.solve import ArmCalibration, calibrated, kinematics_of
 from hardware.arm_calibration.tool_shadow import hidden_tips, needle_shown
 from hardware.arm_calibration.verdict import judge
-from hardware.arm_file import read_arm
-from hardware.arm_profile import ArmProfile, placed
-from hardware.rig_file import write_rig
+from hardware.calibration.arm_run import run_touched
+from hardware.calibration.arm_sightings import Look
+from hardware.calibration.arm_solve import ArmCalibration, calibrated, kinematics_of
+from hardware.files.arm_file import read_arm
+from hardware.files.rig_file import write_rig
 from hardware.simulator.polyline import Polyline
 from hardware.simulator.servo import Servo
 from perception.tool_profile import SYRINGE

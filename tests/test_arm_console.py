@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from hardware.arm_console import Request, axes_from_text, findings, jog_from_text, origin_from_text, run_arm
-from hardware.arm_profile import ArmProfile
+from hardware.arm.console import Request, axes_from_text, findings, jog_from_text, origin_from_text, run_arm
+from hardware.arm.profile import ArmProfile
 from hardware.arm_status import ArmState, ArmStatus
-from hardware.cli import main
-from hardware.clock import SimClock
-from hardware.simulator.arm_settings import ArmSettings, Replies
-from hardware.simulator.controller import VirtualArm
-from hardware.simulator.virtual_port import PortFaults, VirtualDevice
+from hardware.cli.main import main
+from hardware.process.clock import SimClock
+from hardware.simulator.arm.controller import VirtualArm
+from hardware.simulator.arm.ports import PortFaults, VirtualDevice
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from tests.test_arm_port import serving
 from tests.virtual_arm import HOME, arm_fault
 

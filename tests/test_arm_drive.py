@@ -10,21 +10,21 @@ import pytest
 
 from estimation import se3
 from estimation.errors import InputError
-from hardware.arm import Arm
+from hardware.arm.link import Arm
+from hardware.arm.profile import ArmProfile
 from hardware.arm_calibration.commanded import HEADER, NAME, read_commanded
 from hardware.arm_calibration.moves import MoveWishes, check_moves, places, planned
 from hardware.arm_calibration.record import move_arm
-from hardware.arm_calibration.run import Wishes, check_out, check_record, run_folder
-from hardware.arm_calibration.solve import ARM
-from hardware.arm_file import read_arm
-from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmState
-from hardware.cli import main
-from hardware.clock import SimClock
-from hardware.progress import silent
-from hardware.simulator.arm_settings import ArmSettings
-from hardware.simulator.controller import VirtualArm
-from hardware.simulator.virtual_port import VirtualDevice
+from hardware.calibration.arm_run import Wishes, check_out, check_record, run_folder
+from hardware.calibration.arm_solve import ARM
+from hardware.cli.main import main
+from hardware.files.arm_file import read_arm
+from hardware.process.clock import SimClock
+from hardware.process.progress import silent
+from hardware.simulator.arm.controller import VirtualArm
+from hardware.simulator.arm.ports import VirtualDevice
+from hardware.simulator.arm.settings import ArmSettings
 from hardware.simulator.watched_arm import watched_arm
 from planning.limits import Limits
 from planning.no_go import NoGo

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.faults import Fault, Kind, Part
-from hardware.protocol import G4, Pause, encode
+from hardware.arm.protocol import G4, Pause, encode
+from hardware.process.faults import Fault, Kind, Part
 from hardware.rates import Rates
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from hardware.simulator.arm_faults import FaultyLine
-from hardware.simulator.arm_settings import ArmSettings, Replies
 from tests.virtual_arm import IDEAL, arm_fault, axes_at, motion, move, virtual_arm
 
 # -- names

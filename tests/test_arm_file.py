@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
-from hardware.arm_file import read_arm, write_arm
-from hardware.arm_profile import ArmProfile
-from hardware.protocol import Dialect
+from hardware.arm.profile import ArmProfile
+from hardware.arm.protocol import Dialect
+from hardware.files.arm_file import read_arm, write_arm
 from planning.kinematics import SimpleArm
 from planning.limits import Limits
 

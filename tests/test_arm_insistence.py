@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hardware.arm.protocol import G1, encode
 from hardware.arm_insistence import AGAIN, BLIND
 from hardware.arm_status import ArmState
 from hardware.farewell import farewell
 from hardware.link_settings import LinkSettings
-from hardware.motion_loop import Order
-from hardware.protocol import G1, encode
+from hardware.motion.loop import Order
 from hardware.replies import Reply, ReplyKind
-from hardware.simulator.arm_settings import ArmSettings, Replies
-from hardware.simulator.virtual_port import PortFaults
+from hardware.simulator.arm.ports import PortFaults
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from tests.linked import Linked, linked
 from tests.test_motion_loop import Looping
 from tests.virtual_arm import HOME, arm_fault

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
+from hardware.arm.protocol import G1, G4, Dialect, Pause, encode
 from hardware.arm_status import ArmState
 from hardware.link_settings import LinkSettings
-from hardware.protocol import G1, G4, Dialect, Pause, encode
 from hardware.replies import Reply, ReplyKind
-from hardware.simulator.arm_settings import ArmSettings, Replies
-from hardware.simulator.virtual_port import PortFaults
+from hardware.simulator.arm.ports import PortFaults
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from planning.command import feed_for
 from tests.linked import circle, linked
 from tests.virtual_arm import HOME, arm_fault

@@ -17,12 +17,12 @@ from estimation import se3
 from estimation.rig import Camera, pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import arc_rig
+from hardware.arm.profile import BITS_PER_BYTE
 from hardware.arm_calibration.commanded import NAME, read_commanded
-from hardware.arm_file import read_arm, write_arm
-from hardware.arm_profile import BITS_PER_BYTE
-from hardware.cli import main
-from hardware.rig_file import ImageSource, write_rig
-from hardware.simulator.controller import VirtualArm
+from hardware.cli.main import main
+from hardware.files.arm_file import read_arm, write_arm
+from hardware.files.rig_file import ImageSource, write_rig
+from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.port import _serve
 from hardware.simulator.pty_link import open_pty
 from hardware.simulator.watched_arm import WatchedArm, watched_arm

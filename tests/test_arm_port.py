@@ -18,11 +18,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.arm_profile import ArmProfile
-from hardware.clock import WallClock
+from hardware.arm.profile import ArmProfile
+from hardware.process.clock import WallClock
 from hardware.replies import ReplyKind, reply_stream
-from hardware.simulator.arm_settings import ArmSettings, Replies
-from hardware.simulator.controller import VirtualArm
+from hardware.simulator.arm.controller import VirtualArm
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from hardware.simulator.port import PERIOD, _spread, run_virtual_arm
 from hardware.simulator.pty_link import PtyLink
 from tests.virtual_arm import IDEAL, move

@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.arm import Arm
-from hardware.arm_port import UnpluggedError
-from hardware.arm_profile import ArmProfile, at_baud
+from hardware.arm.jog import lifted, travel
+from hardware.arm.link import Arm
+from hardware.arm.port import UnpluggedError
+from hardware.arm.profile import ArmProfile, at_baud
+from hardware.arm.protocol import G1, G4, encode
 from hardware.arm_status import ArmState
-from hardware.arm_travel import lifted, travel
 from hardware.link_settings import LinkSettings
-from hardware.protocol import G1, G4, encode
 from hardware.replies import Reply, ReplyKind, encode_reply
-from hardware.simulator.arm_settings import ArmSettings, Replies
-from hardware.simulator.virtual_port import PortFaults, VirtualPort
+from hardware.simulator.arm.ports import PortFaults, VirtualPort
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from planning.command import feed_for
 from tests.linked import circle, linked
 from tests.virtual_arm import HOME, arm_fault

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware.arm_queue import ArmQueue
-from hardware.protocol import G1, G4, Pause, decode, encode
-from hardware.simulator.arm_settings import ArmSettings
+from hardware.arm.protocol import G1, G4, Pause, decode, encode
+from hardware.arm.queue import ArmQueue
+from hardware.simulator.arm.settings import ArmSettings
 from tests.virtual_arm import HOME, virtual_arm
 
 FRAME = 1 / 240

@@ -8,20 +8,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from hardware.arm import RECALLED
-from hardware.arm_echo import ArmEcho, near
-from hardware.arm_profile import ArmProfile
-from hardware.arm_queue import ArmQueue
+from hardware.arm.feedback import ArmEcho, near
+from hardware.arm.link import RECALLED
+from hardware.arm.profile import ArmProfile
+from hardware.arm.protocol import G1, Pause
+from hardware.arm.queue import ArmQueue
 from hardware.arm_recall import TOLD, Recall, underway
 from hardware.arm_status import ArmState
 from hardware.link_settings import LinkSettings
-from hardware.motion_loop import Order, Tick
-from hardware.protocol import G1, Pause
+from hardware.motion.loop import Order, Tick
 from hardware.replies import Reply, ReplyKind
-from hardware.simulator.arm_settings import ArmSettings, Replies
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from planning.command import Move
 from planning.kinematics import nozzle_from_axes
-from planning.planner import Planner, passed
+from planning.motion.planner import Planner, passed
 from tests.linked import Linked, circle, linked
 from tests.moving import breathing, pose_at, raster
 from tests.test_motion_loop import Looping, seen

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from hardware.simulator.arm_settings import KEYS, ArmSettings, Replies, arm_settings_from_table
+from hardware.simulator.arm.settings import KEYS, ArmSettings, Replies, arm_settings_from_table
 
 FULL = {
     "fifo": 20,

@@ -9,7 +9,7 @@ import pytest
 from test_first_pose import CAMERAS, first
 
 from estimation.averaged import Averaged
-from estimation.camera_errors import CameraErrors
+from estimation.online.camera_errors import CameraErrors
 from estimation.track_noise import TrackNoise
 
 CAMERA_ERRORS = CameraErrors(CAMERAS)

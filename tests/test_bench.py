@@ -14,13 +14,13 @@ import pytest
 from estimation.errors import InputError
 from estimation.synthetic.world import synthetic_world
 from hardware.bench.command import add_bench, run_bench, subject_parser
-from hardware.bench.figure import Figure, Target, at_least, at_most
+from hardware.bench.figures import Figure, Target, at_least, at_most
 from hardware.bench.live import growth
 from hardware.bench.machine import this_machine
 from hardware.bench.solve_pnp import best_camera, pnp_pose
 from hardware.bench.subjects import SUBJECTS, Subject
 from hardware.bench.table import table_text
-from hardware.cli import main
+from hardware.cli.main import main
 from tests import bench_subject
 
 SUBJECT = {"toy": Subject("tests.bench_subject", bench_subject.add_options, "one figure of each kind")}

@@ -13,13 +13,13 @@ import pytest
 from estimation.errors import InputError
 from hardware.bench import whole
 from hardware.bench.command import subject_parser
-from hardware.bench.figure import Figure, Target, at_least, at_most
+from hardware.bench.figures import Figure, Target, at_least, at_most
 from hardware.bench.machine import this_machine
 from hardware.bench.saved import save, saved_figures, whole_table
 from hardware.bench.subjects import SUBJECTS
 from hardware.bench.whole import PARTS, Measured, Part, measure_all, read_whole, regressions, summary
 from hardware.bench.whole_page import counted, whole_markdown, whole_page
-from hardware.cli import main
+from hardware.cli.main import main
 
 FIGURES = [
     Figure("error", 0.02, "mm", at_most(0.03), "thesis", "a note"),

@@ -9,9 +9,9 @@ import pytest
 from test_estimator import LANDMARKS, RATE, RIG, begun
 
 from estimation import se3
-from estimation.bump_detector import BumpDetector, alone, picture_parts, together
+from estimation.online.bump_detector import BumpDetector, alone, picture_parts, together
+from estimation.online.pose_solver import project
 from estimation.pose import TrackState
-from estimation.pose_solver import project
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.look import observations

@@ -19,13 +19,13 @@ from estimation.rig import pixels_from_points
 from hardware.calibration.board_file import read_board, write_board
 from hardware.calibration.board_print import Print, board_of, drawing, pdf, svg, write_print
 from hardware.calibration.collect import collect
-from hardware.calibration.corner_file import content_key, read_corners, write_corners
+from hardware.calibration.corners import content_key, read_corners, write_corners
 from hardware.calibration.run import Outcome, Wishes, run_calibration
 from hardware.calibration.source import open_source
-from hardware.cli import main
-from hardware.progress import silent
-from hardware.rig_file import read_rig
-from hardware.simulator.board_picture import BoardView
+from hardware.cli.main import main
+from hardware.files.rig_file import read_rig
+from hardware.process.progress import silent
+from hardware.simulator.scene.ground_truth_views import BoardView
 from perception.boards.board import Board, black, charuco
 from perception.boards.collection import thinned, usable
 from perception.boards.corners import CornerFinder

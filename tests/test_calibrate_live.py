@@ -15,7 +15,7 @@ from board_session import BOARD, LENSES, rendered, small_rig
 from boards import motion
 
 from estimation import se3
-from estimation.camera_calibration.homography import LEAST, focal, homography, poses
+from estimation.calibration.lens_fit import LEAST, focal, homography, poses
 from estimation.rig import pixels_from_points
 from hardware.calibration.board_file import write_board
 from hardware.calibration.coverage import GRID, coverage_of, lacking
@@ -23,9 +23,9 @@ from hardware.calibration.guide import TOGETHER, Guide
 from hardware.calibration.live import Waving, devices_named, watch
 from hardware.calibration.run import Wishes, finish
 from hardware.cameras.state import CameraState, LiveHealth, Phase
-from hardware.cli import main
-from hardware.progress import Progress
-from hardware.rig_file import read_rig
+from hardware.cli.main import main
+from hardware.files.rig_file import read_rig
+from hardware.process.progress import Progress
 from perception.frames import Frame, FrameSet, Image, StampedBy
 from tests.started import started
 from tests.streams import CLOCK, HttpCamera, served

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimation.camera_calibration.calibrate import calibrate
-from estimation.camera_calibration.lens_model import KnownLenses, lens_of
+from estimation.calibration.camera_rig import calibrate
+from estimation.calibration.lens_model import KnownLenses, lens_of
 from estimation.camera_calibration.views import Views
 from estimation.rig import Rig
 from hardware.calibration.against_given import elsewhere
 from hardware.calibration.collect import collect
 from hardware.calibration.verdict import board_scatter, held_out, residual
-from hardware.progress import silent
-from hardware.session import open_session
+from hardware.files.session import open_session
+from hardware.process.progress import silent
 from perception.boards.board import Board
 from perception.boards.collection import usable
 

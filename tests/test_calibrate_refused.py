@@ -17,8 +17,8 @@ from estimation import se3
 from estimation.rig import Rig
 from hardware.calibration.against_given import check_against, check_distance, elsewhere
 from hardware.calibration.board_file import write_board
-from hardware.cli import main
-from hardware.rig_file import ImageSource, write_rig
+from hardware.cli.main import main
+from hardware.files.rig_file import ImageSource, write_rig
 from perception.boards.board import Board
 from perception.frames import Image
 

@@ -11,15 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
+from estimation.calibration.camera_rig import Calibration, calibrate, lenses, rebased
+from estimation.calibration.lens_fit import homography
+from estimation.calibration.lens_model import KnownLenses, image, lens_of
+from estimation.calibration.rig_fit import RigState, fit_rig, free_numbers
+from estimation.calibration.validation import predicted_error, volume_error, working_volume
 from estimation.camera_calibration.board_motion import carried, stencils
-from estimation.camera_calibration.calibrate import Calibration, calibrate, lenses, rebased
-from estimation.camera_calibration.homography import homography
 from estimation.camera_calibration.lens_fit import Undetermined, fit_lens
-from estimation.camera_calibration.lens_model import KnownLenses, image, lens_of
 from estimation.camera_calibration.model_choice import choose
 from estimation.camera_calibration.plausible import Implausible, check_lens, check_neighbours
-from estimation.camera_calibration.rig_error import predicted_error, volume_error, working_volume
-from estimation.camera_calibration.rig_fit import RigState, fit_rig, free_numbers
 from estimation.camera_calibration.views import Views
 from estimation.rig import Rig, pixels_from_points
 from estimation.se3 import Array
@@ -67,7 +67,7 @@ def test_pixels_are_those_of_the_rig_and_their_derivatives_are_differences(xi: A
 
 
 def camera_of(lens: Array):  # type: ignore[no-untyped-def]
-    from estimation.camera_calibration.lens_model import matrix_of
+    from estimation.calibration.lens_model import matrix_of
     from estimation.rig import Camera
 
     return Camera("a", SIZE, matrix_of(lens), np.array(lens[4:]), np.eye(4))

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from estimation.camera_errors import CameraErrors, Clocks, Variance
-from estimation.pose_solver import SharedFit
+from estimation.online.camera_errors import CameraErrors, Clocks, Variance
+from estimation.online.pose_solver import SharedFit
 from estimation.synthetic.follow import Follower, beginning
 from estimation.synthetic.world import synthetic_world
 from tests.test_estimator import begun, lively, look, stamps, step

@@ -14,11 +14,11 @@ from hardware.cameras.controls import Control
 from hardware.cameras.feed import BROKEN, LONGEST_BACK_OFF, Arrival, Feed, Place
 from hardware.cameras.identity import Identity, Kind
 from hardware.cameras.rhythm import MEMORY, SEEN, Rhythm
-from hardware.cameras.settings import CameraSource
+from hardware.cameras.sources import CameraSource
 from hardware.cameras.stamping import OLDEST, WINDOW, Stamping
 from hardware.cameras.state import STALLED, Phase
 from hardware.cameras.watch import Fault, FrameWatch, is_black
-from hardware.clock import Clock, SimClock, WallClock
+from hardware.process.clock import Clock, SimClock, WallClock
 from tests.streams import BLACK, SIZE, ListedCapture, Shot, picture
 
 PERIOD, LAG, EXPOSURE = 0.04, 0.03, 0.008

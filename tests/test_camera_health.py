@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.camera_health import CameraHealth
+from estimation.online.camera_health import CameraHealth
 
 ALLOWED = np.full(3, 0.25)
 

@@ -14,8 +14,8 @@ from estimation.rig import Camera, Rig
 from hardware.cameras.command import NOTHING_THERE, list_text
 from hardware.cameras.controls import Control, ask_picture, lock, locked_exposure, read_back, untaken
 from hardware.cameras.identity import Identity, Kind, device_node, identity_from_text, list_devices
-from hardware.cameras.settings import RANGES, CameraSource, read_live_rig, source_from_table
-from hardware.rig_file import read_rig, write_rig
+from hardware.cameras.sources import RANGES, CameraSource, read_live_rig, source_from_table
+from hardware.files.rig_file import read_rig, write_rig
 
 BY_ID = "/dev/v4l/by-id/usb-Maker_Eye_A1-video-index0"
 NAMED = Identity(Kind.DEVICE, BY_ID)

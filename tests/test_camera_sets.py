@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hardware.bench.cameras import OFFSETS, PERIOD, Shaking, paired, shown
 from hardware.cameras.feed import Arrival
-from hardware.cameras.gathering import Gathering
+from hardware.cameras.frame_sets import Gathering
 from hardware.cameras.phases import KEEP
 from perception.frames import Frame
 

@@ -12,9 +12,9 @@ import pytest
 from hardware.cameras.feed import Place
 from hardware.cameras.identity import identity_from_text, list_devices
 from hardware.cameras.live import LiveCameras
-from hardware.cameras.settings import CameraSource
 from hardware.cameras.sheet import CELL, sharpness, sheet
-from hardware.cli import main
+from hardware.cameras.sources import CameraSource
+from hardware.cli.main import main
 from tests.streams import CLOCK, HttpCamera, picture, served
 from tests.test_camera_names import rig_file
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimation.camera_errors import CameraErrors
-from estimation.claim import WARY, Claim
 from estimation.fit import Fit
 from estimation.forecast import Forecast
+from estimation.online.camera_errors import CameraErrors
+from estimation.online.pose_solver import SharedFit
+from estimation.online.reported_covariance import WARY, Claim
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import SharedFit
 from estimation.se3 import Array
 from tests.test_first_pose import CAMERAS, first, rested
 

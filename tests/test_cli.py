@@ -16,16 +16,16 @@ import pytest
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
-from hardware.cli import main
-from hardware.clock import WallClock
+from hardware.cli.main import main
+from hardware.files.pose_file import PoseWriter, read_poses
+from hardware.files.session import open_session
+from hardware.offline.track import follow
 from hardware.out_folder import kept, prepare_out
-from hardware.pose_file import PoseWriter, read_poses
-from hardware.progress import Progress, counted, duration
-from hardware.session import open_session
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress, counted, duration
 from hardware.simulator.nozzle_file import read_nozzle
-from hardware.track import follow
 from perception.frames import FrameSet
-from perception.tracking import STAGES, StepReport
+from perception.tracking.step import STAGES, StepReport
 from tests.runs import Replayed
 from tests.started import ROOT, started
 from tests.worlds import IDEAL, SMALL, write_scenario
@@ -48,7 +48,7 @@ HELP = """
 import argparse, sys
 from hardware.bench.command import subject_parser
 from hardware.bench.subjects import SUBJECTS
-from hardware.cli import parser
+from hardware.cli.main import parser
 
 def told(here):
     assert here.format_help().startswith("usage: stillbed"), here.prog
@@ -61,7 +61,7 @@ print(count, *{name.split(".")[0] for name in sys.modules})
 
 
 def stillbed(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "hardware.cli", *arguments]
+    command = [sys.executable, "-m", "hardware.cli.main", *arguments]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
 
 
@@ -74,9 +74,7 @@ def test_help_is_there_at_once_as_nothing_large_is_loaded_for_any() -> None:
 def test_a_reader_that_goes_away_is_no_error() -> None:
     read, write = os.pipe()
     os.close(read)
-    code = (
-        "import sys; from hardware import cli; cli._track = lambda a: print('x' * 99); sys.exit(cli.main(sys.argv[1:]))"
-    )
+    code = "import sys; from hardware.cli import main as cli; cli._track = lambda a: print('x' * 99); sys.exit(cli.main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "track", "x", "-o", "y"]
     done = subprocess.run(command, cwd=ROOT, stdout=write, stderr=subprocess.PIPE, text=True, timeout=60)
     os.close(write)
@@ -233,6 +231,6 @@ def test_one_is_not_told_as_many() -> None:
 
 
 def test_help_needs_no_library() -> None:
-    code = "import sys, hardware.cli; print(*sys.modules)"
+    code = "import sys, hardware.cli.main; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, env=os.environ)
     assert {"numpy", "cv2", "gtsam", "mcap"}.isdisjoint(done.stdout.split())

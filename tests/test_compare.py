@@ -14,10 +14,10 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
-from hardware.cli import WRONG_INPUT, main
+from hardware.cli.main import WRONG_INPUT, main
 from hardware.comparing.metrics import ALIGNMENTS, compare, statistics
 from hardware.comparing.posed import Posed, read_posed
-from hardware.recording import Recorder
+from hardware.recording.recorder import Recorder
 from hardware.tum import write_tum
 from perception.frames import Frame
 from tests.recorded import pose, whole_recording

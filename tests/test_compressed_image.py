@@ -14,10 +14,10 @@ from session_files import image, rig
 
 from estimation.errors import InputError
 from hardware.compressed_image import LAST_SECOND, NAME, pack, unpack
-from hardware.images import decode, encode
-from hardware.mcap_walk import ChunkOf, Stored, walk
-from hardware.recording import Recorder
-from hardware.session import open_session
+from hardware.files.images import decode, encode
+from hardware.files.session import open_session
+from hardware.recording.mcap_file import ChunkOf, Stored, walk
+from hardware.recording.recorder import Recorder
 from perception.frames import Frame
 from tests.recorded import write_frames
 

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.protocol import G1, G4, G54, THESIS, ControllerReset, Dialect, Mode, Pause, Reset, encode
+from hardware.arm.protocol import G1, G4, G54, THESIS, ControllerReset, Dialect, Mode, Pause, Reset, encode
 from hardware.replies import ReplyKind, reply_stream
-from hardware.simulator.arm_settings import ArmSettings, Replies
-from hardware.simulator.controller import VirtualArm
+from hardware.simulator.arm.controller import VirtualArm
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from planning.command import TURNING
 from tests.virtual_arm import HOME, IDEAL, axes_at, motion, move, virtual_arm
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.pose_solver import solve_pose
+from estimation.online.pose_solver import solve_pose
 from estimation.synthetic.bound import filtered_bound, pose_bound, pose_information, position_and_turn
 from estimation.synthetic.world import World, synthetic_world
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.depth import looked_at
+from estimation.online.pose_solver import project
 from estimation.own_doubt import VAGUE, OwnDoubt
-from estimation.pose_solver import project
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.arc_rig import REST, arc_rig

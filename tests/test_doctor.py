@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 
 from hardware.cameras.identity import Device
-from hardware.cli import main
-from hardware.clock import SimClock
-from hardware.doctor import devices, libraries, machine
+from hardware.cli import doctor as devices
+from hardware.cli.main import main
+from hardware.doctor import libraries, machine
 from hardware.doctor.libraries import REMEDY, Trouble, failures, library_checks
 from hardware.operator.view import Check, Verdict
+from hardware.process.clock import SimClock
 
 WORDS = "libGL.so.1", "signal 4", "hangs: not loaded after 2 s", "still loading after 2 s"
 PASS, WARN, FAIL = Verdict.PASS, Verdict.WARN, Verdict.FAIL

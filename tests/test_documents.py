@@ -12,7 +12,7 @@ import pytest
 
 from hardware.bench.command import subject_parser
 from hardware.bench.subjects import SUBJECTS
-from hardware.cli import main, parser
+from hardware.cli.main import main, parser
 from tests.documents import DOCUMENTS, ROOT, commands, leaf, shown
 from tests.shown_commands import COMPLETED, INSTEAD, MADE, NAMES, NOT_RUN, to_run
 

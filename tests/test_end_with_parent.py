@@ -33,8 +33,8 @@ if __name__ == "__main__":
 """
 STARTS = """
 import os, time
-from hardware.live.children import settle
-from hardware.live.crew import Crew
+from hardware.process.system import settle
+from hardware.live.ipc import Crew
 from hardware.tracker import tracker
 
 def tracked():

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from estimation import se3
-from estimation.estimator import Estimator, EstimatorSettings
 from estimation.observations import Observations
+from estimation.online.estimator import Estimator, EstimatorSettings
 from estimation.pose import SurfacePose, TrackState, identity_pose
 from estimation.se3 import Array
 from estimation.state_machine import StateSettings

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.pose import TrackState
 from estimation.trajectory import Trajectory
-from hardware.evaluation import associate, best_constant, compare, evaluate, latency, spread, state_shares
-from hardware.summary import as_dict, percent, summary_text, text_of, verdict, write_summary
+from hardware.report.evaluation import associate, best_constant, compare, evaluate, latency, spread, state_shares
+from hardware.report.summary import as_dict, percent, summary_text, text_of, verdict, write_summary
 from tests.runs import run
 
 SIGMA = np.array([0.002, 0.002, 0.002, 0.1, 0.1, 0.1])

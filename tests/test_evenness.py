@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hardware.clock import SimClock, WallClock
 from hardware.doctor import machine
 from hardware.evenness import SLOW, Evenness, evenness, judged
 from hardware.operator.view import Verdict
+from hardware.process.clock import SimClock, WallClock
 
 
 @given(st.integers(20, 200), st.integers(0, 9), st.floats(1e-4, 1e-2), st.floats(1.01, 20.0))

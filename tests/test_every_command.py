@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from board_session import rendered
 
-from hardware.cli import main
-from hardware.command_line import INTERRUPTED
-from hardware.simulator.arm_settings import ArmSettings, Replies
+from hardware.cli.main import main
+from hardware.cli.parser import INTERRUPTED
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from tests.documents import commands
 from tests.live_runs import ROOT, Running
 from tests.shown_commands import MADE, to_run
@@ -93,7 +93,7 @@ def run_live(words: list[str], cache: Path) -> int:
 
 def run_until_ctrl_c(words: list[str]) -> int:
     """Started, found where it says it is, and ended as a reader ends it."""
-    program = ["hardware.cli", *words[1:]] if words[0] == "stillbed" else words[2:]
+    program = ["hardware.cli.main", *words[1:]] if words[0] == "stillbed" else words[2:]
     process = subprocess.Popen(
         [sys.executable, "-u", "-m", *program],
         stdout=subprocess.PIPE,

@@ -15,7 +15,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.synthetic.arc_rig import arc_rig
 from estimation.trajectory import Trajectory
-from hardware.path_file import read_path, write_path
+from hardware.files.path_file import read_path, write_path
 from hardware.script import run_script
 from hardware.tum import write_tum
 from tests.moving import raster

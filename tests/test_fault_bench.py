@@ -16,12 +16,12 @@ import pytest
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.bench import fault_run, faults
+from hardware.bench.campaigns.faults import fault_page
 from hardware.bench.fault_draw import KINDS, PLACES, SLOT, drawn_faults
 from hardware.bench.fault_judge import LATE, SLOW, WRONG, judged
-from hardware.bench.fault_page import fault_page
 from hardware.bench.fault_run import FaultRun, Ran, Word, stage
 from hardware.bench.faults import Row, append_log, figures, one_run, read_log, run
-from hardware.faults import Fault, Kind, Part, Runner, check_faults, fault_from_text
+from hardware.process.faults import Fault, Kind, Part, Runner, check_faults, fault_from_text
 from hardware.simulator.nozzle_log import NozzleLog
 
 SCENARIOS = Path(__file__).parents[1] / "data" / "scenarios"

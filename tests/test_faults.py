@@ -21,22 +21,32 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import arc_rig
 from estimation.synthetic.motions import Motion
-from hardware.clock import SimClock, WallClock
-from hardware.faults import LONGEST, SPECS, Fault, Kind, Part, Runner, check_faults, fault_from_text, faults_from_texts
+from hardware.files.path_file import read_path
+from hardware.files.session import open_session
 from hardware.frame_faults import FrameFaults, tracked_sets
-from hardware.live.crew import Crew
-from hardware.live.feed import FeedPlan
-from hardware.live.feed import _show as show
-from hardware.live.frame_ring import FrameRing, RingSource
+from hardware.live.frame_source import FrameRing, RingSource
 from hardware.live.injected import Begun, Injector
-from hardware.path_file import read_path
-from hardware.session import open_session
-from hardware.simulator.arm_settings import ArmSettings, Replies
+from hardware.live.ipc import Crew
+from hardware.live.session_player import FeedPlan
+from hardware.live.session_player import _show as show
+from hardware.process.clock import SimClock, WallClock
+from hardware.process.faults import (
+    LONGEST,
+    SPECS,
+    Fault,
+    Kind,
+    Part,
+    Runner,
+    check_faults,
+    fault_from_text,
+    faults_from_texts,
+)
+from hardware.simulator.arm.settings import ArmSettings, Replies
+from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.camera_settings import CameraSettings
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras
 from hardware.simulator.lenses import Lenses, bump
 from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.sight import Exposures
 from hardware.simulator.simulate import true_surface
 from hardware.simulator.struck_surface import struck_motion
 from hardware.simulator.track_tracker import TrackTracker

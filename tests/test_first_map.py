@@ -10,11 +10,11 @@ from estimation import se3
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.simulator.scene import Scene, rois
+from hardware.simulator.scene.scene import Scene, rois
 from perception.features import grey, polygon_mask
-from perception.first_map import FirstMap, build_first_map, in_frame
 from perception.lens import Lenses
-from perception.patches import Pyramid, pyramid
+from perception.mapping.first_map import FirstMap, build_first_map, in_frame
+from perception.matching.patches import Pyramid, pyramid
 from tests.slowly import slowly
 from tests.synthetic import RADIUS, SCAN_FROM_SURFACE, patch, pictures
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimation.camera_errors import CameraErrors
 from estimation.first_pose import FirstPose
 from estimation.fit import Fit
-from estimation.pose_solver import PoseFit, SharedFit
+from estimation.online.camera_errors import CameraErrors
+from estimation.online.pose_solver import PoseFit, SharedFit
 from estimation.se3 import Array
 from estimation.track_noise import TrackNoise
 

@@ -22,7 +22,7 @@ OWNERS = {  # library: the files that may import it
         "hardware/cameras/capture.py",  # VideoCapture: devices, streams, files
         "hardware/cameras/controls.py",  # its numbers for exposure, gain, focus, white balance
         "hardware/cameras/sheet.py",  # draws the preview
-        "hardware/images.py",
+        "hardware/files/images.py",
         "hardware/simulator/*.py",
     ),
     "dask": ("hardware/smoothing/cluster.py",),
@@ -31,15 +31,15 @@ OWNERS = {  # library: the files that may import it
     "matplotlib": ("perception/training/*.py",),
     "mcap": (
         "hardware/mcap_index.py",
-        "hardware/mcap_walk.py",
-        "hardware/recording.py",
-        "hardware/recording_file.py",
+        "hardware/recording/mcap_file.py",
+        "hardware/recording/recorder.py",
+        "hardware/recording/session_reader.py",
         "hardware/smoothing/recording_copy.py",
     ),
-    "numba": ("estimation/compiled.py",),
+    "numba": ("estimation/runtime.py",),
     "onnx": ("perception/training/*.py",),
     "onnxruntime": ("perception/*.py",),
-    "orjson": ("hardware/recording.py",),
+    "orjson": ("hardware/recording/recorder.py",),
     "packaging": ("hardware/doctor/libraries.py",),
     "pycolmap": ("hardware/bench/bundle_adjustment.py",),
     "pytest": ("estimation/synthetic/plugin.py",),
@@ -51,7 +51,7 @@ OWNERS = {  # library: the files that may import it
         "planning/fill/*.py",
         "planning/layers/*.py",
     ),
-    "time": ("hardware/clock.py",),
+    "time": ("hardware/process/clock.py",),
     "toppra": ("planning/*.py",),
     "torch": ("perception/training/*.py",),
     "yaml": ("hardware/calibration/formats/*.py",),
@@ -137,7 +137,7 @@ def test_examples_are_short_enough_to_read_at_once() -> None:
 
 def test_the_motion_process_loads_none_of_the_heavy_libraries() -> None:
     modules = [file[:-3].replace("/", ".") for file in FILES if file.startswith("planning/")]
-    code = f"import sys, hardware.motion, hardware.clock, {', '.join(modules)}; print(*sys.modules)"
+    code = f"import sys, hardware.motion.step, hardware.process.clock, {', '.join(modules)}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert "planning.command" in loaded.stdout.split()
     assert MOTION_NEVER.isdisjoint(loaded.stdout.split())
@@ -145,5 +145,5 @@ def test_the_motion_process_loads_none_of_the_heavy_libraries() -> None:
 
 def test_the_rules_above_can_fail(tmp_path: Path) -> None:
     bad = tmp_path / "bad.py"
-    bad.write_text("def f():\n    import time\n    from hardware.cli import main\n")
-    assert set(imported(bad)) == {"time", "hardware.cli"}
+    bad.write_text("def f():\n    import time\n    from hardware.cli.main import main\n")
+    assert set(imported(bad)) == {"time", "hardware.cli.main"}

@@ -13,17 +13,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
+from hardware.arm.protocol import LENGTH, TAILS, FrameStream, decode
 from hardware.bench import fuzz, fuzz_try
+from hardware.bench.campaigns.fuzz import PATH, readers
+from hardware.bench.campaigns.fuzz_process import Task, run_tasks
 from hardware.bench.fuzz import Sum, figures
 from hardware.bench.fuzz_log import read_log
-from hardware.bench.fuzz_readers import PATH, readers
-from hardware.bench.fuzz_run import Task, run_tasks
 from hardware.bench.fuzz_try import Block, Reader, fuzzed
 from hardware.bench.mutate import mutated
-from hardware.checks import read_toml
-from hardware.faults import fault_from_text
 from hardware.operator.words import parsed
-from hardware.protocol import LENGTH, TAILS, FrameStream, decode
+from hardware.process.checks import read_toml
+from hardware.process.faults import fault_from_text
 from tests.deadly import deadly_readers
 
 READERS = readers()

@@ -12,25 +12,25 @@ import numpy as np
 import pytest
 
 from estimation import se3
-from estimation.adjustment import Adjusted
 from estimation.deferred import DELAY, Deferred
+from estimation.mapping.bundle_adjustment import Adjusted
+from estimation.mapping.refiner import Refiner
 from estimation.observations import no_observations
 from estimation.pose import SurfacePose, TrackState
-from estimation.refiner import Refiner
 from estimation.se3 import Array
 from estimation.state_machine import StateSettings
 from estimation.surface_map import SurfaceMap, joined_map
 from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.simulator.bodies import Wound
-from hardware.simulator.scene import rois
+from hardware.simulator.scene.scene import rois
 from perception.features import grey
-from perception.first_map import FirstMap, build_first_map
 from perception.frames import FrameSet
-from perception.growth import Found, Look, Probation, amid
 from perception.lens import Lenses
-from perception.patches import Pyramid, pyramid
-from perception.relocalise import CAPACITY, Relocaliser
-from perception.tracking import TrackingStep
+from perception.mapping.first_map import FirstMap, build_first_map
+from perception.mapping.growth import Found, Look, Probation, amid
+from perception.matching.features import CAPACITY, Relocaliser
+from perception.matching.patches import Pyramid, pyramid
+from perception.tracking.step import TrackingStep
 from tests.synthetic import frame_sets, patch, pictures
 
 RIG = arc_rig(size=(320, 240), focal=560.0)  # 0.7 mm a pixel, 228 mm wide

@@ -17,9 +17,9 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.warp import Warp
 from planning.command import Code, Command, Hold, Move, Refusal
-from planning.guard import Guard
 from planning.kinematics import SimpleArm
 from planning.limits import Limits
+from planning.motion.guard import Guard
 
 TICK = 1 / 64  # powers of two, so that a limit can be met to the last bit
 ARM = SimpleArm(home=np.zeros(6))

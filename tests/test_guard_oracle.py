@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from estimation.pose import SurfacePose, TrackState
-from hardware.bench.guard_oracle import Rules, judge
+from hardware.bench.campaigns.guard import Rules, judge
 from hardware.bench.link_guard import REST, jointed, random_log, simple
 from planning.command import Code, Move, Refusal
-from planning.guard import Guard
 from planning.kinematics import joints_from_axes
 from planning.limits import Limits
+from planning.motion.guard import Guard
 from tests.slowly import slowly
 
 COUNT = 500

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from hardware.channels import read_heads as recorded_heads
-from hardware.convert import export_recording, import_folder
-from hardware.folder_tables import HEAD_COLUMNS, read_heads, write_heads
+from hardware.files.folder_tables import HEAD_COLUMNS, read_heads, write_heads
+from hardware.files.session import open_session
 from hardware.heads import NO_HEADS, TOLERANCE, Heads, head_from_row, row_from_head
-from hardware.recording import CHUNK_SECONDS, Recorder
-from hardware.session import open_session
+from hardware.offline.convert import export_recording, import_folder
+from hardware.recording.recorder import CHUNK_SECONDS, Recorder
 from hardware.track_recorder import TrackRecorder
 from perception.frames import PrintHead
 from tests.recorded import write_frames

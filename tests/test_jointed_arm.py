@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm_file import read_arm, write_arm
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from hardware.bench.planner import Tally, bench_arm, follow
+from hardware.files.arm_file import read_arm, write_arm
 from planning.command import Code, Hold, Move, Refusal
-from planning.guard import Guard
 from planning.kinematics import axes_from_nozzle, joints_from_axes, nozzle_from_axes
+from planning.motion.guard import Guard
+from planning.motion.planner import Planner
 from planning.path import Path
-from planning.planner import Planner
 from planning.progress import Phase
 from tests.moving import REST, breathing, pose_at, raster
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from planning.inverse import POSTURES, joints_from_nozzle, joints_from_tip
-from planning.joints import JointModel, arm_from_nozzle, distance, jacobian
+from planning.robot.kinematics import JointModel, arm_from_nozzle, distance, jacobian
 from tests.arms import random_joints, random_model
 
 SEEDS = st.integers(0, 100_000)

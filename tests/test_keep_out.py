@@ -15,8 +15,8 @@ from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
 from perception.frames import PrintHead
 from perception.ink import FRESH, REACH, STEP, Ink, near_bead
-from perception.keep_out import MARGIN, KeepOut, highlights, trackable
 from perception.lens import Lenses
+from perception.matching.masks import MARGIN, KeepOut, highlights, trackable
 from perception.tool import Tool
 from perception.tool_profile import SYRINGE
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hardware.bench.latency import latency_figures
-from perception.tracking import STAGES
+from perception.tracking.step import STAGES
 
 
 def figures(wall_ms: float, flow_share: float = 0.25) -> dict[str, tuple[float, str]]:

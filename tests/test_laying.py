@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from hardware.simulator.laying import divided, laid
-from hardware.simulator.shape import Shape, cylinder, flat
+from hardware.simulator.scene.shape import Shape, cylinder, flat
 from planning.path import check_path, lengths
 from tests.moving import path_through, raster
 

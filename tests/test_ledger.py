@@ -13,7 +13,7 @@ from estimation import se3
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST
 from estimation.synthetic.motions import Motion
-from hardware.arm_profile import ArmProfile, placed
+from hardware.arm.profile import ArmProfile, placed
 from hardware.simulator.ledger import Ledger, executed_rows
 from hardware.simulator.truth import Truth
 from planning.command import Command, Hold, Move

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hardware.bench import link_run
+from hardware.arm.protocol import G1, encode
+from hardware.bench.campaigns import link as link_run
+from hardware.bench.campaigns.link import Counts, Run, goal_at, windows
 from hardware.bench.link import soak_figures
-from hardware.bench.link_run import Counts, Run, goal_at, windows
-from hardware.cli import main
-from hardware.protocol import G1, encode
+from hardware.cli.main import main
 from tests.slowly import slowly
 from tests.virtual_arm import HOME
 

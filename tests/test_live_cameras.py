@@ -16,7 +16,7 @@ from estimation.errors import InputError
 from estimation.rig import Camera, Rig
 from hardware.cameras.identity import Identity, Kind
 from hardware.cameras.live import LiveCameras
-from hardware.cameras.settings import CameraSource
+from hardware.cameras.sources import CameraSource
 from hardware.cameras.state import LiveHealth, Phase
 from hardware.cameras.watch import Fault
 from perception.frames import FrameSet

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hardware.arm_file import read_arm
-from hardware.faults import fault_from_text, faults_from_texts
-from hardware.live.crew import Crew
+from hardware.files.arm_file import read_arm
 from hardware.live.injected import Begun, Injector
+from hardware.live.ipc import Crew
 from hardware.live.replayed import replay_run
-from hardware.simulator.arm_settings import ArmSettings, Replies
+from hardware.process.faults import fault_from_text, faults_from_texts
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from tests.light_live import prepare_files
 from tests.live_runs import CLOCK, Running, messages
 from tests.test_arm_port import serving

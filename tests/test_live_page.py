@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from browser import Browser, Page, executable
 
-from hardware.clock import WallClock
+from hardware.process.clock import WallClock
 from tests.light_live import HOME, prepare_files
 from tests.live_runs import Running, closed, executed, messages
 

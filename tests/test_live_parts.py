@@ -19,13 +19,12 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.trajectory import Trajectory
-from hardware.arm_profile import BENCH, ArmProfile
+from hardware.arm.profile import BENCH, ArmProfile
 from hardware.bookmark_file import keep_bookmark, read_start
+from hardware.files.path_file import write_path
 from hardware.live.arrived import SourceEnded
 from hardware.live.beside import Beside, Found, read_found, write_found
-from hardware.live.conductor import Task
-from hardware.live.feed import schedule, turns
-from hardware.live.frame_ring import SLOTS, FrameRing, RingSource
+from hardware.live.frame_source import SLOTS, FrameRing, RingSource
 from hardware.live.inbox import HEAD, Inbox
 from hardware.live.kept import kept_begin
 from hardware.live.laid import laid_on, lifted
@@ -37,8 +36,9 @@ from hardware.live.records import (
     EventEntry,
     SetEntry,
 )
+from hardware.live.session_player import schedule, turns
 from hardware.live.settings import LiveSettings, check_settings, cores_there, overridden, read_settings, settings_text
-from hardware.path_file import write_path
+from hardware.live.state_machine import Task
 from perception.frames import Frame, FrameSet
 from planning.progress import fingerprint
 from tests.moving import raster

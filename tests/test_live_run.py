@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from hardware.bookmark_file import read_start
+from hardware.files.path_file import read_path
+from hardware.files.session import open_session
 from hardware.live.beside import Beside
 from hardware.live.replayed import replay_run
-from hardware.path_file import read_path
-from hardware.session import open_session
 from tests.light_live import prepare_files
 from tests.live_runs import CLOCK, Running, closed, messages, printed_once, rests, summary
 from tests.slowly import slowly

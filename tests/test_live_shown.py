@@ -10,12 +10,12 @@ import pytest
 from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.rig import Camera, Rig, pixels_from_points
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from hardware.arm_status import ArmState, ArmStatus
 from hardware.live.outline import Outline
 from hardware.live.records import LiveMotionReport, TrackingReport
 from hardware.live.true_error import TrueError
-from hardware.motion_loop import Tick
+from hardware.motion.loop import Tick
 from perception.frames import Roi
 from planning.command import Move
 from planning.kinematics import axes_from_nozzle

@@ -9,13 +9,13 @@ import pytest
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
-from hardware.arm_profile import BENCH, ArmProfile
+from hardware.arm.profile import BENCH, ArmProfile
 from hardware.arm_status import ArmState, ArmStatus
-from hardware.live.conductor import Conductor, Seen, Task
 from hardware.live.records import LiveMotionReport, Pace, RecorderReport, TrackingReport
+from hardware.live.state_machine import Conductor, Seen, Task
 from hardware.live.words import stage_line
-from hardware.motion_loop import Order, Tick
-from hardware.operator.request import Request, Wish
+from hardware.motion.loop import Order, Tick
+from hardware.operator.shared_state import Request, Wish
 from hardware.operator.view import Stage
 from planning.command import Hold
 from planning.progress import Phase, Progress

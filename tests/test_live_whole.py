@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 
 from hardware.bookmark_file import read_start
-from hardware.clock import WallClock
+from hardware.files.path_file import read_path
+from hardware.files.session import open_session
 from hardware.live.beside import Beside
 from hardware.live.prerender import prerender
 from hardware.live.remembered import recorded_poses
 from hardware.live.replayed import replay_run
-from hardware.path_file import read_path
-from hardware.session import open_session
+from hardware.process.clock import WallClock
 from hardware.tracker import tracker
 from tests.live_runs import PATH, SCENARIO, Running, closed, messages, printed_once, rests, summary
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimation.estimator import Estimator
-from estimation.local_motion import CENTRES, REACH, LocalMotion, covering
 from estimation.observations import Observations
+from estimation.online.estimator import Estimator
+from estimation.online.local_motion import CENTRES, REACH, LocalMotion, covering
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimation.local_surface import LEAST, Met, meet, smooth_normals
+from estimation.mapping.local_surface import LEAST, Met, meet, smooth_normals
 from estimation.se3 import Array
 from estimation.surface_map import local_normals
 

@@ -10,8 +10,8 @@ import pytest
 from estimation import se3
 from estimation.errors import InputError
 from estimation.scan import Scan
-from hardware import mesh_file
-from hardware.mesh_file import read_mesh
+from hardware.files import mesh_file
+from hardware.files.mesh_file import read_mesh
 from hardware.ply_file import write_ply
 from tests import scans
 from tests.synthetic import RADIUS, SCAN_FROM_SURFACE, patch, scan_of

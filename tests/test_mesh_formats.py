@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.mesh_file import read_raw_mesh
+from hardware.files.mesh_file import read_raw_mesh
 from hardware.raw_mesh import LONGEST, RawMesh, fans
 
 Corner = tuple[float, float, float]

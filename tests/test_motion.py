@@ -10,10 +10,10 @@ import pytest
 from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import TrackState
-from hardware.arm_profile import BENCH, ArmProfile, placed
-from hardware.clock import Clock, SimClock, WallClock
-from hardware.motion import MotionStep
-from hardware.protocol import G1, G4, Dialect, decode
+from hardware.arm.profile import BENCH, ArmProfile, placed
+from hardware.arm.protocol import G1, G4, Dialect, decode
+from hardware.motion.step import MotionStep
+from hardware.process.clock import Clock, SimClock, WallClock
 from planning.command import Hold, Move
 from planning.kinematics import axes_from_nozzle
 from planning.limits import Limits

@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.motion_detector import MotionDetector
+from estimation.online.surface_state import MotionDetector
 from estimation.pose import SurfaceMotion
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST

@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 HEAVY = {"gtsam", "cv2", "onnxruntime"}
 RUN = """
 import sys
-from hardware.motion import MotionStep
+from hardware.motion.step import MotionStep
 from planning.command import Move
 from tests.moving import breathing, pose_at, raster
 
@@ -38,4 +38,4 @@ def test_the_check_can_fail() -> None:
 
 
 def test_replay_loads_no_images_before_it_has_a_session() -> None:
-    assert HEAVY.isdisjoint(loaded("import hardware.replay, sys; print(*sys.modules)"))
+    assert HEAVY.isdisjoint(loaded("import hardware.offline.replay, sys; print(*sys.modules)"))

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 from estimation.pose import SurfacePose, TrackState
+from hardware.arm.profile import ArmProfile
 from hardware.arm_insistence import BLIND
-from hardware.arm_profile import ArmProfile
 from hardware.arm_status import ArmState
-from hardware.clock import SimClock, WallClock
 from hardware.lateness import Lateness
 from hardware.link_settings import LinkSettings
-from hardware.motion import MotionStep
-from hardware.motion_loop import MotionLoop, Order, Tick
-from hardware.motion_process import MotionPlan, MotionReport, motion_process
-from hardware.newest import Newest
-from hardware.simulator.arm_settings import ArmSettings, Replies
-from hardware.simulator.virtual_port import PortFaults
+from hardware.motion.loop import MotionLoop, Order, Tick
+from hardware.motion.motion_process import MotionPlan, MotionReport, motion_process
+from hardware.motion.step import MotionStep
+from hardware.process.clock import SimClock, WallClock
+from hardware.process.shared_latest import Newest
+from hardware.simulator.arm.ports import PortFaults
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from planning.command import Hold, Move
 from tests.linked import Linked, linked
 from tests.moving import breathing, pose_at, raster
@@ -190,9 +190,9 @@ def test_a_histogram_of_lateness_gives_percentiles_to_a_tenth_of_a_millisecond(s
 
 
 def test_the_motion_process_loads_nothing_that_would_stall_it() -> None:
-    code = "import sys, hardware.motion_process; print(*sys.modules)"
+    code = "import sys, hardware.motion.motion_process; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert "hardware.arm" in done.stdout.split()
+    assert "hardware.arm.link" in done.stdout.split()
     assert MOTION_NEVER.isdisjoint(done.stdout.split())
 
 

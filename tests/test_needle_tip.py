@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.se3 import Array
+from perception.boards.needle_tip import _TO_LIGHT, TipFinder, background
 from perception.frames import Image
-from perception.needle_tip import _TO_LIGHT, TipFinder, background
 
 SIZE = (240, 320)  # px
 FINE = 8  # samples across a pixel of what is drawn
@@ -64,7 +64,7 @@ def test_a_dark_side_does_not_move_the_tip(monkeypatch: pytest.MonkeyPatch) -> N
         return float(abs((np.array(after.pixel) - before.pixel) @ [-np.sin(angle), np.cos(angle)]))
 
     assert moved() < 0.05
-    monkeypatch.setattr("perception.needle_tip.COLOURED", np.inf)  # by brightness alone
+    monkeypatch.setattr("perception.boards.needle_tip.COLOURED", np.inf)  # by brightness alone
     assert moved() > 0.15
 
 

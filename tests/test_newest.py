@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from hardware.newest import Newest
+from hardware.process.shared_latest import Newest
 from tests.moving import breathing, pose_at
 
 

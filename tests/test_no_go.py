@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm_file import read_arm, write_arm
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
+from hardware.files.arm_file import read_arm, write_arm
 from planning.command import Code, Move, Refusal
-from planning.guard import Guard
 from planning.limits import Limits
+from planning.motion.guard import Guard
 from planning.no_go import NoGo, box, cylinder, half_space
 from tests.test_guard import ARM, TICK, WIDE, axes, move, pose
 

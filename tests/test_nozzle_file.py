@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from hardware.evaluation import spread
+from hardware.report.evaluation import spread
 from hardware.simulator.deposit import deposit_figures, deposit_map
 from hardware.simulator.nozzle_error import nozzle_errors, nozzle_figures
 from hardware.simulator.nozzle_file import HEADER, NozzleWriter, read_nozzle

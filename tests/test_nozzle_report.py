@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from estimation.se3 import Array
-from hardware.evaluation import evaluate
+from hardware.report.evaluation import evaluate
 from hardware.simulator.deposit import deposit_map
 from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.nozzle_report import nozzle_page, write_nozzle_report

@@ -9,9 +9,9 @@ import pytest
 from test_estimator import LANDMARKS, RIG, begun, follow, look
 
 from estimation import se3
-from estimation.estimator import Estimator
 from estimation.observations import Observations
 from estimation.odd_camera import SURER, surprise
+from estimation.online.estimator import Estimator
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.look import observations

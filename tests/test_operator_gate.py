@@ -16,9 +16,9 @@ from operator_page import Served, served
 
 from estimation.errors import InputError
 from hardware.operator.gate import Gate
-from hardware.operator.request import Wish
 from hardware.operator.server import page_files
 from hardware.operator.settings import OperatorSettings, check_settings
+from hardware.operator.shared_state import Wish
 
 TOKEN = "a-token-of-sixteen-letters"
 SETTINGS = OperatorSettings(token=TOKEN)

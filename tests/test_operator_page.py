@@ -14,11 +14,11 @@ from operator_page import OFFERED, Served, full_view
 from estimation import se3
 from estimation.pose import TrackState
 from estimation.rig import Camera, distort, pixels_from_points
-from hardware.images import encode
+from hardware.files.images import encode
 from hardware.operator.pictures import CameraPicture, Pictures
-from hardware.operator.request import Request, Wish
 from hardware.operator.scene import Scene
 from hardware.operator.settings import Limits
+from hardware.operator.shared_state import Request, Wish
 from hardware.operator.view import Activity, Answer, OperatorView, Stage, Verdict
 
 CHROMIUM = executable()

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hardware.operator.request import ALWAYS, OTHERS, SLOTS, Request, RequestLine, Wish, refusal
+from hardware.operator.shared_state import ALWAYS, OTHERS, SLOTS, Request, RequestLine, Wish, refusal
 
 QUEUED = [wish for wish in Wish if wish is not Wish.STOP]
 

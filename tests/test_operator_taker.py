@@ -8,11 +8,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hardware.images import decode
-from hardware.newest import Newest
+from hardware.files.images import decode
 from hardware.operator.pictures import CAPACITY, Pictures
-from hardware.operator.request import RequestLine
+from hardware.operator.shared_state import RequestLine
 from hardware.operator.taker import PERIOD, WIDTH, PictureTaker, Shot, crop_around
+from hardware.process.shared_latest import Newest
 
 
 def shot(width: int = 1280, height: int = 720) -> Shot:

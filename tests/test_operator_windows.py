@@ -20,17 +20,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from operator_page import Served, full_view, served
 
-from hardware.clock import WallClock
-from hardware.faults import Fault, Kind, Part
+from hardware.live.fault_injection import FloodCount
 from hardware.live.injected import Begun
 from hardware.operator import flood
-from hardware.operator.flood_count import FloodCount
 from hardware.operator.link import OperatorLink
 from hardware.operator.pictures import CameraPicture, Pictures
 from hardware.operator.process import OperatorPage
-from hardware.operator.request import OTHERS, Wish
 from hardware.operator.settings import Limits, OperatorSettings
+from hardware.operator.shared_state import OTHERS, Wish
 from hardware.operator.window import FLOOD
+from hardware.process.clock import WallClock
+from hardware.process.faults import Fault, Kind, Part
 
 CALM = Limits(stale=30.0, patience=30.0)
 

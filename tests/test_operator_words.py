@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from operator_page import full_view
 
-from hardware.operator.bundle import pictures_bytes, plain, text
+from hardware.operator.broadcast import pictures_bytes, plain, text
 from hardware.operator.pictures import CameraPicture, Pictures
-from hardware.operator.request import Wish
+from hardware.operator.shared_state import Wish
 from hardware.operator.words import LARGEST, Allowance, Ask, Shown, parsed
 
 COUNTS = st.integers(0, LARGEST)

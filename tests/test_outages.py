@@ -10,7 +10,7 @@ import pytest
 from estimation import se3
 from estimation.pose import TrackState
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.bench.outage_judge import judge
+from hardware.bench.campaigns.outages import judge
 from hardware.bench.outage_run import FPS, Stretch, Watched, make_pictures
 from hardware.bench.outages import figures, kinds_text, shares
 from hardware.simulator.outage import Kind, Outage, Spoiler, draw_outage

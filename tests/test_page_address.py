@@ -13,7 +13,7 @@ import pytest
 import trustme
 
 from estimation.errors import InputError
-from hardware.cli import main
+from hardware.cli.main import main
 from hardware.live.page_address import page_settings
 from hardware.live.settings import LiveSettings, names_given, read_settings, settings_text
 from hardware.operator.link import OperatorLink

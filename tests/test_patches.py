@@ -12,11 +12,11 @@ from estimation.rig import pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
 from perception.alignment import RELIEF, Alignment, align, align_in, coarse_score
-from perception.descent import ARRIVED
 from perception.features import grey
 from perception.frames import Image
 from perception.lens import Lenses
-from perception.patches import (
+from perception.matching.alignment_kernels import ARRIVED
+from perception.matching.patches import (
     Projection,
     Templates,
     join,

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.path_file import HEADER, read_path, write_path
-from planning.curve import curve_through
+from hardware.files.path_file import HEADER, read_path, write_path
+from planning.motion.curve import curve_through
 from planning.path import LEVER, Path, check_path, lengths
 from tests.moving import path_through, raster
 

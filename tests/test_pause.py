@@ -10,8 +10,8 @@ import pytest
 
 from estimation import se3
 from estimation.pose import TrackState
-from hardware.arm_profile import ArmProfile
-from hardware.motion import MotionStep
+from hardware.arm.profile import ArmProfile
+from hardware.motion.step import MotionStep
 from planning.command import Hold, Move, Refusal
 from planning.kinematics import nozzle_from_axes
 from planning.legs import CLEARANCE

@@ -10,15 +10,15 @@ import pytest
 
 from estimation import se3
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.images import decode
+from hardware.files.images import decode
 from hardware.simulator.cameras import Fate, Shot
 from hardware.simulator.instant import Instant
 from hardware.simulator.lenses import Lenses
 from hardware.simulator.look import Look
 from hardware.simulator.pictures import Pictures
-from hardware.simulator.scene import Scene
+from hardware.simulator.scene.scene import Scene
+from hardware.simulator.scene.shape import cylinder
 from hardware.simulator.sensor import Sensor
-from hardware.simulator.shape import cylinder
 
 RIG = arc_rig(size=(96, 64), focal=140.0)
 

@@ -10,7 +10,7 @@ import pytest
 import shapely
 
 from estimation.se3 import Array
-from hardware.cli import main
+from hardware.cli.main import main
 from hardware.ply_file import write_ply
 from planning.fill.pattern import Pattern
 from planning.layers.bumps import Passing, Step, bumps_in

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.cli import main
+from hardware.cli.main import main
 from hardware.contour_file import read_contour
-from hardware.path_file import read_path
+from hardware.files.path_file import read_path
 from hardware.plan import run as planning_command
 from hardware.plan.order import RANGES, Wishes, order_of
 from hardware.plan.run import example_scan
@@ -25,7 +25,7 @@ from hardware.scan_units import UNITS, in_mm
 from planning.command import Move
 from planning.kinematics import SimpleArm
 from planning.limits import Limits
-from planning.planner import Planner
+from planning.motion.planner import Planner
 from tests.moving import pose_at, still
 from tests.wounds import scan_of
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from estimation.errors import InputError
 from planning.layers.chart import unrolled
 from planning.layers.grid import grid_over
-from planning.layers.stack import MODES, Mode, stack_in
+from planning.layers.slicing import MODES, Mode, stack_in
 from planning.layers.tissue import Tissue, slabs
 from planning.layers.tool import ToolLimits, rotations, tilts
 from planning.layers.wound import Wound

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
+from hardware.files.path_file import read_path, write_path
 from hardware.gcode_file import gcode_text
-from hardware.path_file import read_path, write_path
 from planning.fill.bead import Bead, even
 from planning.fill.coverage import coverage
 from planning.fill.pattern import Pattern
@@ -24,7 +24,7 @@ from planning.layers.flat_wound import flat_wound
 from planning.layers.grid import at
 from planning.layers.plan import Order, Plan, make_plan
 from planning.layers.runs import runs_of, spaced, spacing_over
-from planning.layers.stack import MODES, Mode
+from planning.layers.slicing import MODES, Mode
 from planning.layers.tissue import Tissue
 from planning.path import check_path
 from tests.wounds import SKIN, wound_of

@@ -17,11 +17,11 @@ from estimation.se3 import Array
 from estimation.warp import Warp
 from hardware.bench.planner import Tally, bench_arm, follow
 from planning.command import Command, Hold, Move
-from planning.guard import Guard
 from planning.kinematics import SimpleArm, axes_from_nozzle, nozzle_from_axes
 from planning.limits import Limits
+from planning.motion.guard import Guard
+from planning.motion.planner import Planner
 from planning.path import Path
-from planning.planner import Planner
 from planning.progress import Phase
 from tests.moving import REST, Motion, breathing, pose_at, raster, still
 

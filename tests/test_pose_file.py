@@ -11,8 +11,8 @@ import pytest
 from estimation.errors import InputError
 from estimation.observations import no_observations
 from estimation.pose import SurfaceMotion, SurfacePose, TrackState
-from hardware.pose_file import PoseTable, PoseWriter, read_poses
-from perception.tracking import StepReport
+from hardware.files.pose_file import PoseTable, PoseWriter, read_poses
+from perception.tracking.step import StepReport
 from tests.runs import run
 
 STATES = {3: TrackState.DEGRADED, 4: TrackState.COASTING, 5: TrackState.LOST}

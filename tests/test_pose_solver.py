@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.pose_solver import EFFICIENCY, PoseFit, project, solve_pose
+from estimation.online.pose_solver import EFFICIENCY, PoseFit, project, solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig

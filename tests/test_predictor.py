@@ -13,9 +13,9 @@ import pytest
 
 from estimation import se3
 from estimation.forecast import Forecast, body_rate, radius
+from estimation.forecast.predictor import HORIZONS, Predictor
 from estimation.history import History
 from estimation.pose import SurfacePose, TrackState
-from estimation.predictor import HORIZONS, Predictor
 from estimation.se3 import Array
 from tests.slowly import slowly
 
@@ -129,7 +129,7 @@ def test_nothing_is_loaded_once_it_follows() -> None:
     code = """
 import sys
 import numpy as np
-from estimation.predictor import Predictor
+from estimation.forecast.predictor import Predictor
 from tests.test_predictor import breathing, seen
 stamps = np.arange(0, 12, 0.1)
 poses, predictor = seen(stamps, breathing(stamps)), Predictor()

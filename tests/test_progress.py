@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from hardware.bookmark_file import BookmarkFile, read_start, write_bookmark
-from hardware.motion import MotionStep
+from hardware.motion.step import MotionStep
 from planning.command import Move
 from planning.kinematics import SimpleArm
 from planning.limits import Limits
+from planning.motion.planner import Planner
 from planning.path import Path
-from planning.planner import Planner
 from planning.progress import Phase, bookmark, fingerprint, resumed
 from tests.moving import breathing, pose_at, raster
 

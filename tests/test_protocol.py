@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.protocol import (
+from hardware.arm.protocol import (
     G1,
     G4,
     G54,

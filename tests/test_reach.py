@@ -11,14 +11,14 @@ import pytest
 
 from estimation import se3
 from estimation.se3 import Array
-from hardware.arm_file import read_arm
-from hardware.arm_profile import BENCH
-from hardware.chart import Plot
-from hardware.cli import main
-from hardware.path_file import read_path, write_path
+from hardware.arm.profile import BENCH
+from hardware.cli.main import main
+from hardware.files.arm_file import read_arm
+from hardware.files.path_file import read_path, write_path
+from hardware.report.page import Plot
 from planning.inverse import POSTURES
-from planning.joints import JointModel, arm_from_nozzle
-from planning.reach import REASONS, Motion, best_posture, reach_of
+from planning.robot.kinematics import JointModel, arm_from_nozzle
+from planning.robot.reach import REASONS, Motion, best_posture, reach_of
 from planning.spin import at_spin, best_spin
 from tests.moving import path_through, raster
 

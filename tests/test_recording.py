@@ -17,10 +17,10 @@ from estimation.errors import InputError, StillbedError
 from estimation.observations import Observations
 from estimation.pose import TrackState
 from hardware import channels
-from hardware.recording import Recorder
-from hardware.rig_file import table_from_rig
-from hardware.schemas import WARNING
-from hardware.session import open_session
+from hardware.files.rig_file import table_from_rig
+from hardware.files.session import open_session
+from hardware.recording.recorder import Recorder
+from hardware.recording.schemas import WARNING
 from hardware.tum import rows_from_trajectory
 from perception.frames import Frame, Roi
 from planning.command import Hold, Move
@@ -191,7 +191,7 @@ def test_an_index_kept_as_bytes_gives_the_very_file_and_holds_nothing_of_its_chu
         return (tmp_path / name).read_bytes(), held
 
     packed, held = record("packed.mcap")
-    monkeypatch.setattr("hardware.recording.pack_index", lambda writer: None)
+    monkeypatch.setattr("hardware.recording.recorder.pack_index", lambda writer: None)
     plain, chunks = record("plain.mcap")
     assert packed == plain and held == 0 and chunks > 2
 

@@ -20,12 +20,12 @@ from session_files import image, rig, stamps
 
 from estimation.errors import InputError, StillbedError
 from hardware import channels
-from hardware.arm_file import write_arm
-from hardware.arm_profile import ArmProfile
-from hardware.cli import main
-from hardware.mcap_walk import ChunkOf, walk
-from hardware.recording import CHUNK_SECONDS, Recorder
-from hardware.session import open_session
+from hardware.arm.profile import ArmProfile
+from hardware.cli.main import main
+from hardware.files.arm_file import write_arm
+from hardware.files.session import open_session
+from hardware.recording.mcap_file import ChunkOf, walk
+from hardware.recording.recorder import CHUNK_SECONDS, Recorder
 from tests.recorded import whole_recording, write_frames
 from tests.started import ROOT
 
@@ -103,7 +103,7 @@ KILLED = """
 import sys, time
 sys.path.insert(0, "tests")
 from session_files import image, rig
-from hardware.recording import Recorder
+from hardware.recording.recorder import Recorder
 from perception.frames import Frame
 recorder = Recorder(sys.argv[1], rig(2))
 for k in range(10**6):

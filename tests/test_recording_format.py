@@ -20,12 +20,12 @@ from session_files import NAMES, image, rig, stamps, trajectory
 from estimation.errors import InputError
 from estimation.observations import Observations
 from hardware.compressed_image import NAME
-from hardware.images import encode
-from hardware.mcap_walk import ChunkOf, Damage, walk
-from hardware.messages import message_from_rig
-from hardware.recording import CHUNK_SECONDS, EPOCH, Recorder
-from hardware.schemas import CALIBRATION, TOPICS
-from hardware.session import open_session
+from hardware.files.images import encode
+from hardware.files.session import open_session
+from hardware.recording.mcap_file import ChunkOf, Damage, walk
+from hardware.recording.messages import message_from_rig
+from hardware.recording.recorder import CHUNK_SECONDS, EPOCH, Recorder
+from hardware.recording.schemas import CALIBRATION, TOPICS
 from hardware.tum import rows_from_trajectory
 from perception.frames import Image, Roi
 from planning.command import Hold, Move

@@ -12,9 +12,9 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.state_machine import StateSettings
-from hardware.evaluation import associate
-from hardware.session import Session, open_session
-from perception.tracking import TrackingStep
+from hardware.files.session import Session, open_session
+from hardware.report.evaluation import associate
+from perception.tracking.step import TrackingStep
 
 DATA = Path(__file__).parent.parent.parent / "shared" / "data"
 FOLLOWED = 0.95  # of the frame sets from the first pose that is given out on

@@ -7,8 +7,8 @@ import pytest
 from test_adjustment import RIG, as_map, landmarks, look, shape_error, swaying, unsure
 
 from estimation.deferred import DELAY, sets_until_ready
-from estimation.estimator import Estimator
-from estimation.refiner import Refiner
+from estimation.mapping.refiner import Refiner
+from estimation.online.estimator import Estimator
 from estimation.se3 import Array
 from estimation.surface_map import joined_map
 

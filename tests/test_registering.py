@@ -19,7 +19,7 @@ from hardware.simulator.bodies import Wound, body
 from hardware.simulator.deformation import Deformation
 from hardware.simulator.motion_table import motion_from_tables
 from hardware.simulator.registering import LEAST, surface_points, truth_from_estimate
-from hardware.simulator.shape import Shape, cylinder, flat
+from hardware.simulator.scene.shape import Shape, cylinder, flat
 from hardware.simulator.truth import Truth
 
 RIG = arc_rig()

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.closest import ScanIndex, closest_weights
-from estimation.registration import FEWEST, Registration, register
 from estimation.scan import Scan
+from estimation.scans.registration import FEWEST, Registration, register
+from estimation.scans.scan import ScanIndex, closest_weights
 from estimation.se3 import Array
 from tests import scans
 

@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 
 from estimation import se3, smooth
+from estimation.batch.smoothed import Smoothed
 from estimation.observations import Observations, no_observations
 from estimation.se3 import Array
-from estimation.smoothing.smoothed import Smoothed
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.evaluation import best_constant
-from hardware.simulator.scene import rois
-from hardware.smoothing.relinked import Relinked, with_looks
+from hardware.offline.smooth_tracks import Relinked, with_looks
+from hardware.report.evaluation import best_constant
+from hardware.simulator.scene.scene import rois
 from hardware.smoothing.tracks import Tracks
 from perception.features import grey
-from perception.first_map import FirstMap, build_first_map
 from perception.frames import FrameSet
 from perception.known_motion import KnownMotion
 from perception.lens import Lenses
-from perception.matcher import Matcher
-from perception.patches import pyramid
-from perception.relinking import References, Relinker
+from perception.mapping.first_map import FirstMap, build_first_map
+from perception.matching.matcher import Matcher
+from perception.matching.patches import pyramid
+from perception.tracking.reobservation import References, Relinker
 from tests.synthetic import WIDE, frame_sets, patch
 
 RIG = arc_rig(size=(320, 240), focal=560.0)

@@ -10,12 +10,12 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.simulator.scene import Scene
+from hardware.simulator.scene.scene import Scene
 from perception.features import grey
 from perception.frames import Image
 from perception.lens import Lenses
-from perception.patches import pyramid
-from perception.relocalise import Relocaliser
+from perception.matching.features import Relocaliser
+from perception.matching.patches import pyramid
 from tests.synthetic import AWAY, WIDE, patch, pictures
 
 RIG = arc_rig()

@@ -16,10 +16,10 @@ import pytest
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
-from hardware.arm_profile import BENCH
-from hardware.motion import MotionStep
-from hardware.protocol import G1, G4, decode
-from hardware.replay import COLUMNS, CommandWriter, placed_by, replay
+from hardware.arm.profile import BENCH
+from hardware.arm.protocol import G1, G4, decode
+from hardware.motion.step import MotionStep
+from hardware.offline.replay import COLUMNS, CommandWriter, placed_by, replay
 from planning.command import Command, Hold, Move
 from planning.kinematics import nozzle_from_axes
 from tests.moving import breathing, pose_at, poses, raster
@@ -27,8 +27,8 @@ from tests.moving import breathing, pose_at, poses, raster
 ROOT = Path(__file__).parents[1]
 DIGEST = """
 import hashlib
-from hardware.motion import MotionStep
-from hardware.replay import replay
+from hardware.motion.step import MotionStep
+from hardware.offline.replay import replay
 from tests.moving import breathing, poses, raster
 
 frames = b"".join(f for _, _, f in replay(poses(breathing, 10.0), MotionStep(raster())))

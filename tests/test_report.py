@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from estimation.pose import TrackState
-from hardware.chart import Plot, Scale, round_step, spanning, stretches, thinned
-from hardware.evaluation import Evaluation, evaluate
-from hardware.report import main, page, write_report
-from hardware.summary import as_dict, summary_text, verdict, write_summary
+from hardware.report.evaluation import Evaluation, evaluate
+from hardware.report.page import Plot, Scale, round_step, spanning, stretches, thinned
+from hardware.report.report import main, page, write_report
+from hardware.report.summary import as_dict, summary_text, verdict, write_summary
 from tests.runs import run
 
 SIGMA = np.array([0.002, 0.002, 0.002, 0.1, 0.1, 0.1])

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.pose import SurfacePose
 from hardware.bench.random_runs import Swing, random_path
-from planning.curve import Curve, curve_through
 from planning.demand import demand
 from planning.kinematics import SimpleArm, axes_from_nozzle
 from planning.legs import CORNER, SWERVE
 from planning.limits import Limits
-from planning.retime import PATH_SPEED, RISE, TOTAL, Timing, retime
+from planning.motion.curve import Curve, curve_through
+from planning.motion.retime import PATH_SPEED, RISE, TOTAL, Timing, retime
 from planning.stations import stations_on
 from tests.moving import Motion, pose_at, raster, still
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hardware.rhythm import EARLY, EASE, InStep, Rhythm, own_interval, tick_in_step
+from hardware.process.ticks import EARLY, EASE, InStep, Rhythm, own_interval, tick_in_step
 
 LOOK = 0.002  # s between looks of the loop
 

@@ -16,8 +16,8 @@ from estimation.errors import InputError
 from estimation.rig import Camera, Rig
 from hardware.calibration.formats import formats
 from hardware.calibration.formats.yaml_file import read_yaml
-from hardware.cli import main
-from hardware.rig_file import read_rig, write_rig
+from hardware.cli.main import main
+from hardware.files.rig_file import read_rig, write_rig
 
 numbers = st.floats(-0.3, 0.3, allow_subnormal=False)
 

@@ -13,11 +13,11 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST
-from hardware.arm_file import read_arm
-from hardware.images import encode
-from hardware.path_file import read_path
-from hardware.pose_file import read_poses
-from hardware.session import open_session
+from hardware.files.arm_file import read_arm
+from hardware.files.images import encode
+from hardware.files.path_file import read_path
+from hardware.files.pose_file import read_poses
+from hardware.files.session import open_session
 from hardware.session_folder import SessionFolder
 from hardware.simulator.cameras import Fate, Shot
 from hardware.simulator.nozzle_file import read_nozzle
@@ -27,7 +27,7 @@ from hardware.simulator.scenario import Scenario
 from hardware.simulator.scenario_file import read_scenario
 from hardware.tum import read_tum
 from perception.frames import Frame, FrameSet, PrintHead, Roi
-from perception.tracking import STAGES, StepReport, trusting_report
+from perception.tracking.step import STAGES, StepReport, trusting_report
 from planning.command import Command, Hold, Move
 from planning.progress import Phase, Progress
 from tests.nozzle_logs import nozzle_log, part, straight

@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 
 from estimation import se3
-from estimation.registration import Registration
 from estimation.rig import ideal_pixels
 from estimation.scan import Scan, scan_from_triangles
+from estimation.scans.registration import Registration
 from estimation.se3 import Array
 from estimation.surface_map import moved_map
 from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.simulator.bodies import Wound, body, with_wound
-from hardware.simulator.scene import Scene, rois
-from hardware.simulator.shape import Shape, cylinder, flat
-from perception.dense import Matched, match_on
+from hardware.simulator.scene.scene import Scene, rois
+from hardware.simulator.scene.shape import Shape, cylinder, flat
 from perception.features import grey
-from perception.first_map import FirstMap, build_first_map, in_frame
 from perception.frames import Image
 from perception.lens import Lenses
-from perception.patches import pyramid
-from perception.scan_place import ScanPlacing, as_at_one_instant
+from perception.mapping.dense_matching import Matched, match_on
+from perception.mapping.first_map import FirstMap, build_first_map, in_frame
+from perception.mapping.scan_map import ScanPlacing, as_at_one_instant
+from perception.matching.patches import pyramid
 from perception.scanned_map import LEAST_SIGMA, scanned
 from tests.synthetic import LOOK, SCAN_FROM_SURFACE, WIDE, pictures
 

@@ -11,9 +11,9 @@ import pytest
 from estimation import se3
 from estimation.errors import InputError
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.arm_profile import ArmProfile
-from hardware.faults import Kind
-from hardware.rig_file import ImageSource, write_rig
+from hardware.arm.profile import ArmProfile
+from hardware.files.rig_file import ImageSource, write_rig
+from hardware.process.faults import Kind
 from hardware.simulator.scenario_file import read_scenario
 from tests.worlds import write_path, write_scenario
 

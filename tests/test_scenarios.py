@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hardware.path_file import read_path
+from hardware.files.path_file import read_path
 from hardware.simulator.bodies import BODIES, Wound, body
 from hardware.simulator.laying import laid
 from hardware.simulator.scenario import Scenario
 from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.shape import Shape
+from hardware.simulator.scene.shape import Shape
 from planning.path import check_path
 
 FOLDER = Path(__file__).parents[1] / "data" / "scenarios"

@@ -21,9 +21,9 @@ from hardware.simulator.deformation import Deformation
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look, plain
 from hardware.simulator.render import render
-from hardware.simulator.scene import Scene, rois
+from hardware.simulator.scene.scene import Scene, rois
+from hardware.simulator.scene.shape import cylinder, flat, shape_from_scan
 from hardware.simulator.sensor import Sensor
-from hardware.simulator.shape import cylinder, flat, shape_from_scan
 from hardware.simulator.truth import Truth
 from perception.frames import Image
 from tests.slowly import slowly

@@ -11,8 +11,8 @@ import pytest
 from estimation.errors import InputError
 from estimation.synthetic.arc_rig import REST
 from hardware.ply_file import write_ply
+from hardware.simulator.scene.shape import flat
 from hardware.simulator.scene_table import scene_from_table, sensor_from_table
-from hardware.simulator.shape import flat
 
 COARSE = {"texel_mm": 0.8}
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from hardware.cli import main
-from hardware.segment import OVERLAYS, TABLE, Options, listed, run_segment
-from perception.segmentation import NetworkSegmenter, Segmentation
+from hardware.cli.main import main
+from hardware.offline.segment import OVERLAYS, TABLE, Options, listed, run_segment
+from perception.wound.segmentation import NetworkSegmenter, Segmentation
 from tests.test_segmentation import SETTINGS, disc, picture, red_is_wound
 
 SEGMENTER = NetworkSegmenter(red_is_wound, SETTINGS)

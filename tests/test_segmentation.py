@@ -18,9 +18,9 @@ from perception.coarse_to_fine import Looks, window, wound_logits
 from perception.dice import dice
 from perception.frames import Frame, FrameSet
 from perception.padding import picture_box
-from perception.segmentation import NetworkSegmenter, Segmentation, centroid, judged, largest_part
+from perception.wound.network import Settings
+from perception.wound.segmentation import NetworkSegmenter, Segmentation, centroid, judged, largest_part
 from perception.wound_beside import WoundBeside
-from perception.wound_network import Settings
 from perception.wound_region import area_on_plane, box_of, region
 from perception.wound_watch import PATIENCE, WoundWatch, overlap
 

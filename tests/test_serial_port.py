@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from hardware import arm_port
-from hardware.arm import Arm
-from hardware.arm_port import Device, SerialPort, UnpluggedError
-from hardware.arm_profile import ArmProfile
+from hardware.arm import port as arm_port
+from hardware.arm.link import Arm
+from hardware.arm.port import Device, SerialPort, UnpluggedError
+from hardware.arm.profile import ArmProfile
+from hardware.arm.protocol import LENGTH
 from hardware.arm_status import ArmState
-from hardware.clock import WallClock
-from hardware.protocol import LENGTH
-from hardware.simulator.arm_settings import ArmSettings, Replies
+from hardware.process.clock import WallClock
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from hardware.simulator.pty_link import open_pty
 from tests.linked import circle
 from tests.test_arm_port import serving

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from session_files import NAMES, change, make_folder, rig, trajectory
 
 from estimation.errors import InputError, StillbedError
-from hardware.convert import export_recording, import_folder
-from hardware.rig_file import table_from_rig
-from hardware.session import Session, open_session
+from hardware.files.rig_file import table_from_rig
+from hardware.files.session import Session, open_session
+from hardware.offline.convert import export_recording, import_folder
 from hardware.tum import write_tum
 
 

@@ -11,7 +11,7 @@ import pytest
 from session_files import SIZE, change, image, make_folder, rig, stamps, trajectory, write_video
 
 from estimation.errors import InputError
-from hardware.session import Session, open_session
+from hardware.files.session import Session, open_session
 from hardware.tum import write_tum
 
 
@@ -120,7 +120,7 @@ def scaled(by: float) -> Callable[[Path], None]:
     """The same rig with every length multiplied."""
 
     def act(folder: Path) -> None:
-        from hardware.rig_file import ImageSource, write_rig
+        from hardware.files.rig_file import ImageSource, write_rig
 
         other = rig(2)
         for c in other.cameras:

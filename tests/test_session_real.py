@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hardware.convert import export_recording, import_folder
-from hardware.session import open_session
+from hardware.files.session import open_session
+from hardware.offline.convert import export_recording, import_folder
 
 DATA = Path(__file__).parent.parent.parent / "shared" / "data"
 

@@ -16,8 +16,8 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
-from hardware.messages import message_from_rig, rig_from_message
-from hardware.rig_file import ImageSource, read_rig, rig_from_table, table_from_rig, write_rig
+from hardware.files.rig_file import ImageSource, read_rig, rig_from_table, table_from_rig, write_rig
+from hardware.recording.messages import message_from_rig, rig_from_message
 
 NOWHERE = ImageSource("images", "*")
 

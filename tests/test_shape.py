@@ -11,7 +11,7 @@ from estimation import se3
 from estimation.scan import face_normals, scan_from_triangles
 from hardware.simulator.bodies import BODIES, Wound, body, with_wound
 from hardware.simulator.deformation import Deformation
-from hardware.simulator.shape import cylinder, flat, shape_from_function, shape_from_scan
+from hardware.simulator.scene.shape import cylinder, flat, shape_from_function, shape_from_scan
 
 NUMBERS = st.floats(-1.0, 1.0)
 SCAN_FROM_OURS = se3.make(se3.exp_rotation([0.3, -0.2, 0.6]), [12.0, -7.0, 31.0])

@@ -11,7 +11,8 @@ import pytest
 from estimation.errors import InputError
 from estimation.scan import scan_from_triangles
 from perception.dice import dice
-from perception.shape_matching import (
+from perception.wound.network import shipped
+from perception.wound.shape_matching import (
     TERMS,
     ShapeSegmenter,
     pattern_of,
@@ -22,7 +23,6 @@ from perception.shape_matching import (
     settled,
 )
 from perception.wound_candidates import COLOUR_TERMS, FEATURES, described, outlines, scene_of
-from perception.wound_network import shipped
 from tests.test_segmentation import disc, picture
 
 

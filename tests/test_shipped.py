@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from estimation.errors import InputError
-from perception import shipped
-from perception.shipped import named_path, shipped_file
+from perception import package_data as shipped
+from perception.package_data import named_path, shipped_file
 
 ROOT = Path(__file__).parents[1]
 

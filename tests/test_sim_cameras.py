@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.images import decode, encode
+from hardware.files.images import decode, encode
 from hardware.simulator.camera_settings import CameraSettings, camera_settings_from_table
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, garble
 

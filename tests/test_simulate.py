@@ -13,15 +13,15 @@ import pytest
 from estimation.errors import InputError
 from estimation.state_machine import StateSettings
 from estimation.synthetic.arc_rig import REST
-from hardware.arm_file import read_arm
-from hardware.cli import main
-from hardware.path_file import read_path
-from hardware.pose_file import PoseTable, read_poses
-from hardware.session import open_session
+from hardware.cli.main import main
+from hardware.files.arm_file import read_arm
+from hardware.files.path_file import read_path
+from hardware.files.pose_file import PoseTable, read_poses
+from hardware.files.session import open_session
+from hardware.offline.track import run_track
 from hardware.simulator.nozzle_file import read_nozzle
 from hardware.simulator.scenario_file import read_scenario
 from hardware.simulator.simulate import Options, run_simulation
-from hardware.track import run_track
 from hardware.tum import read_tum
 from tests.worlds import IDEAL, SMALL, write_path, write_scenario
 

@@ -9,10 +9,10 @@ import pytest
 
 from estimation import se3
 from estimation.pose import SurfacePose
-from hardware.arm_profile import ArmProfile
-from hardware.motion import MotionStep
-from hardware.motion_loop import MotionLoop, Order, Tick
-from hardware.rhythm import InStep
+from hardware.arm.profile import ArmProfile
+from hardware.motion.loop import MotionLoop, Order, Tick
+from hardware.motion.step import MotionStep
+from hardware.process.ticks import InStep
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
 from tests.linked import linked

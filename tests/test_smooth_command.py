@@ -18,14 +18,14 @@ from estimation.synthetic.arc_rig import arc_rig
 from estimation.synthetic.follow import steps
 from estimation.synthetic.world import synthetic_world
 from hardware.channels import read_observations, read_poses, read_smoothed
-from hardware.cli import main
-from hardware.evaluation import best_constant
-from hardware.recording import Recorder
-from hardware.rig_file import read_rig
-from hardware.session import FrameRef, open_session
+from hardware.cli.main import main
+from hardware.files.rig_file import read_rig
+from hardware.files.session import FrameRef, open_session
+from hardware.offline.smooth_tracks import relinked
+from hardware.recording.recorder import Recorder
+from hardware.report.evaluation import best_constant
 from hardware.smoothing import run as run_module
 from hardware.smoothing.kept import made_of
-from hardware.smoothing.relinked import relinked
 from hardware.smoothing.run import session_hash
 from hardware.smoothing.tracks import tracks_of
 from hardware.tum import read_tum

@@ -14,11 +14,11 @@ import pytest
 
 from estimation.errors import InputError
 from estimation.synthetic.world import synthetic_world
-from hardware.cli import main
-from hardware.recording import Recorder
-from hardware.smoothing import many
+from hardware.cli.main import main
+from hardware.offline import smooth as many
+from hardware.offline.smooth import ALREADY, FAILED, SMOOTHED, Cluster, Job, Outcome, run_smooth, sessions_in
+from hardware.recording.recorder import Recorder
 from hardware.smoothing.cluster import local_cluster
-from hardware.smoothing.many import ALREADY, FAILED, SMOOTHED, Cluster, Job, Outcome, run_smooth, sessions_in
 from hardware.smoothing.run import Wishes
 from perception.frames import Frame
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
+from estimation.online.window import LAG, Measured, Smoother, Window
 from estimation.se3 import Array
-from estimation.smoother import LAG, Measured, Smoother, Window
 from estimation.synthetic.arc_rig import REST
 from tests.synthetic import Motion, breathing
 

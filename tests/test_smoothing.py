@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3, smooth
+from estimation.batch.priors import STATE, States, drive, links, transition
+from estimation.batch.smoothed import Smoothed
 from estimation.errors import InputError
 from estimation.observations import Observations, no_observations
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.smoothing.cameras import REFINED
 from estimation.smoothing.chain import Chain
-from estimation.smoothing.prior import STATE, States, drive, links, transition
-from estimation.smoothing.smoothed import Smoothed
 from estimation.synthetic.follow import follow
 from estimation.synthetic.world import World, synthetic_world
 from tests.slowly import slowly

@@ -16,9 +16,9 @@ from hardware.bench.smoothing_many import many_figures
 from hardware.bench.smoothing_rendered import Judgement, judged, judged_figure, rendered_figures
 from hardware.bench.subjects import SUBJECTS
 from hardware.live.prerender import cached
-from hardware.smoothing.relinked import Relinked
+from hardware.offline.smooth_tracks import Relinked
 from hardware.smoothing.tracks import Tracks
-from perception.shipped import shipped_file
+from perception.package_data import shipped_file
 from tests.synthetic import write_session
 
 

@@ -16,7 +16,7 @@ from tests.started import ROOT
 
 SEEN = """
 import os, sys
-from hardware import cli
+from hardware.cli import main as cli
 cli._track = lambda a: print(sorted(os.listdir('/proc/self/fd')), file=open('seen', 'w'))
 sys.exit(cli.main(['track', 'x', '-o', 'y']))
 """
@@ -38,7 +38,7 @@ def test_what_is_opened_takes_no_closed_streams_number(streams: tuple[int, ...],
 
 
 def test_a_wrong_command_line_is_exit_code_2_where_nobody_hears_it() -> None:
-    done = without((0, 1, 2), "-m", "hardware.cli", "track", "nowhere", "-o", "nowhere")
+    done = without((0, 1, 2), "-m", "hardware.cli.main", "track", "nowhere", "-o", "nowhere")
     assert (done.returncode, done.stdout, done.stderr) == (2, "", "")
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimation.camera_health import CameraHealth
+from estimation.online.camera_health import CameraHealth
 from estimation.pose import TrackState
 from estimation.state_machine import Measurement, StateMachine, StateSettings
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimation.pose_solver import SharedFit
+from estimation.online.pose_solver import SharedFit
 from estimation.se3 import Array
 from estimation.straying import Straying
 

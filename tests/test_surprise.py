@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.forecast import Forecast
+from estimation.forecast.innovation_gate import PATIENCE, Surprise
+from estimation.forecast.predictor import Predictor
 from estimation.pose import SurfacePose, TrackState
-from estimation.predictor import Predictor
 from estimation.se3 import Array
-from estimation.surprise import PATIENCE, Surprise
 from tests.slowly import slowly
 
 RATE = 30.0

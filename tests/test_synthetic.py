@@ -11,8 +11,8 @@ import pytest
 from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.session import open_session
-from hardware.simulator.scene import rois
+from hardware.files.session import open_session
+from hardware.simulator.scene.scene import rois
 from hardware.simulator.sensor import Sensor
 from hardware.tum import read_tum
 from perception.features import grey

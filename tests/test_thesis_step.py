@@ -18,12 +18,13 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
 from hardware.bench import options as bench_options
-from hardware.bench import thesis, thesis_scenes
-from hardware.cli import main
+from hardware.bench import recordings as thesis
+from hardware.bench import thesis_scenes
+from hardware.cli.main import main
+from hardware.files.pose_file import read_poses
 from hardware.methods import METHODS
-from hardware.pose_file import read_poses
 from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.scene import rois
+from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet, Roi
 from perception.thesis.features import KeyPoints
 from perception.thesis.flow import Corners

@@ -17,11 +17,11 @@ from estimation.rig import Rig
 from estimation.synthetic.arc_rig import arc_rig
 from hardware.channels import read_events
 from hardware.channels import read_poses as read_recorded_poses
-from hardware.cli import main
-from hardware.folder_tables import write_frames
-from hardware.pose_file import read_poses
-from hardware.rig_file import ImageSource, write_rig
-from hardware.session import FrameRef, open_session
+from hardware.cli.main import main
+from hardware.files.folder_tables import write_frames
+from hardware.files.pose_file import read_poses
+from hardware.files.rig_file import ImageSource, write_rig
+from hardware.files.session import FrameRef, open_session
 from hardware.track_recorder import TrackRecorder
 from tests.runs import Replayed
 from tests.session_files import change

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimation.fit_covariance import scatter
 from estimation.observations import Observations
-from estimation.pose_solver import PoseFit
+from estimation.online.fit import scatter
+from estimation.online.pose_solver import PoseFit
 from estimation.se3 import Array
 from estimation.track_noise import TrackNoise
 

@@ -16,10 +16,10 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.state_machine import StateSettings
 from estimation.synthetic.arc_rig import REST, TARGET, arc_rig
-from hardware.simulator.scene import Scene, rois
+from hardware.simulator.scene.scene import Scene, rois
 from perception.features import grey
 from perception.frames import Frame, FrameSet, Image, Roi
-from perception.tracking import STAGES, TrackingStep
+from perception.tracking.step import STAGES, TrackingStep
 from tests.slowly import slowly
 from tests.synthetic import AWAY, CLEAN, Motion, breathing, frame_sets, patch, pictures
 

@@ -19,7 +19,7 @@ from perception.training.export import export
 from perception.training.loop import Curve, Recipe, Schedule, Source, as_function, mean_dice, rate_at, train
 from perception.training.losses import wound_loss
 from perception.training.networks import ThesisUNet, WoundNet, made, size_of
-from perception.wound_network import Settings, WoundNetwork
+from perception.wound.network import Settings, WoundNetwork
 from tests.test_training_data import labelled
 
 RECIPE = Recipe(Augmentation(side=64, long_side=96.0))

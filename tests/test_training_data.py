@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from perception.segmentation import Segmentation
 from perception.training.augmentation import Augmentation, pyramid, sample
 from perception.training.dataset import Labelled, read_dataset
 from perception.training.groups import groups, split
@@ -19,6 +18,7 @@ from perception.training.healthy import MARGIN, SIDES, healthy_pieces
 from perception.training.judging import half_covered, half_covered_fall, scores, silent
 from perception.training.light import relit
 from perception.training.occluders import covered
+from perception.wound.segmentation import Segmentation
 from tests.test_segmentation import disc, picture
 
 

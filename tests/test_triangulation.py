@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from estimation.mapping.triangulation import epipolar_distance, rays, triangulate
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import TARGET, arc_rig
-from estimation.triangulation import epipolar_distance, rays, triangulate
 
 RIG = arc_rig()
 seeds = st.integers(0, 10_000)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from hardware.images import Video, count_by_decoding
+from hardware.files.images import Video, count_by_decoding
 
 WHOLE = 5  # frames
 

@@ -18,11 +18,11 @@ from browser import Browser, executable
 from estimation import se3
 from estimation.synthetic.follow import steps
 from estimation.synthetic.world import synthetic_world
-from hardware.cli import WRONG_INPUT, main
+from hardware.cli.main import WRONG_INPUT, main
+from hardware.files.path_file import write_path
+from hardware.offline.viewer import PictureBook, Playback, open_playback
 from hardware.operator.settings import OperatorSettings
-from hardware.path_file import write_path
-from hardware.recording import Recorder
-from hardware.viewing.playback import PictureBook, Playback, open_playback
+from hardware.recording.recorder import Recorder
 from hardware.viewing.server import instant_text, serve, session_text
 from perception.frames import Frame
 from tests.moving import raster

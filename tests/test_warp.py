@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.estimator import Estimator
+from estimation.online.deformation import WarpFilter
+from estimation.online.estimator import Estimator
+from estimation.online.pose_solver import solve_pose
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import solve_pose
 from estimation.se3 import Array
 from estimation.state_machine import StateSettings
 from estimation.surface_map import SurfaceMap
@@ -21,7 +22,6 @@ from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.synthetic.look import observations
 from estimation.synthetic.surfaces import patch
 from estimation.warp import Warp
-from estimation.warp_filter import WarpFilter
 from estimation.warp_modes import WarpModes, modes_from_map
 from hardware.simulator.deformation import Deformation
 from tests.synthetic import Motion, breathing, still

@@ -17,10 +17,10 @@ from estimation.rig import pixels_from_points
 from hardware.calibration.board_file import write_board
 from hardware.calibration.guide import TOGETHER, Guide
 from hardware.calibration.waving_page import WavingPage
-from hardware.clock import WallClock
-from hardware.operator.request import Wish
+from hardware.files.rig_file import read_rig
+from hardware.operator.shared_state import Wish
 from hardware.operator.waving import WavingStage
-from hardware.rig_file import read_rig
+from hardware.process.clock import WallClock
 from perception.frames import Frame, FrameSet
 from tests.started import started
 

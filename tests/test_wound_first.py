@@ -11,9 +11,9 @@ from estimation.pose import TrackState
 from perception.contact_sheet import CELL, COLUMNS, Shown, contact_sheet
 from perception.features import polygon_mask
 from perception.frames import FrameSet, Image, Roi
-from perception.segmentation import Segmentation
-from perception.tracking import TrackingStep
-from perception.wound_first import LOOKS, WoundFirst
+from perception.tracking.step import TrackingStep
+from perception.tracking.wound_step import LOOKS, WoundFirst
+from perception.wound.segmentation import Segmentation
 from tests.test_segmentation import disc, picture
 from tests.test_tracking import RIG, ROIS, run, same, shot
 

@@ -14,17 +14,17 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from hardware.bench import options as bench_options
-from hardware.bench.segmentation import judged_by, run
+from hardware.bench.pictures import judged_by, run
 from hardware.bench.subjects import SUBJECTS
-from hardware.cli import main
+from hardware.cli.main import main
 from hardware.simulator.wound_views import WoundView, inside, wound_view
 from hardware.wound_file import FILE, WoundFile
 from perception.dice import dice
 from perception.frames import Frame, FrameSet
-from perception.segmentation import NetworkSegmenter, centroid
-from perception.tracking import StepReport, trusting_report
+from perception.tracking.step import StepReport, trusting_report
 from perception.training.dataset import Labelled, read_dataset
-from perception.wound_network import MODEL, WoundNetwork, hash_of, read_settings, shipped
+from perception.wound.network import MODEL, WoundNetwork, hash_of, read_settings, shipped
+from perception.wound.segmentation import NetworkSegmenter, centroid
 from tests.test_segmentation import disc
 
 DATA = Path(__file__).parent.parent.parent / "shared" / "data" / "fuseg"
@@ -108,7 +108,7 @@ class Red:
     """Finds what is red."""
 
     def __call__(self, image: np.ndarray) -> object:
-        from perception.segmentation import Segmentation
+        from perception.wound.segmentation import Segmentation
 
         return Segmentation(image[..., 2].astype(int) - image[..., 1] > 60, 0.9, 0.7)
 

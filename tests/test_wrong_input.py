@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from hardware.cli import main
-from hardware.recording import Recorder
+from hardware.cli.main import main
+from hardware.recording.recorder import Recorder
 from tests.recorded import write_frames
 from tests.session_files import rig
 from tests.started import ROOT
@@ -172,7 +172,7 @@ def test_what_the_system_refuses_names_the_file_first(
 
 
 def test_the_same_from_a_shell(folder: Path) -> None:
-    command = [sys.executable, "-m", "hardware.cli", "track", str(folder / "missing"), "-o", str(folder / "OUT")]
+    command = [sys.executable, "-m", "hardware.cli.main", "track", str(folder / "missing"), "-o", str(folder / "OUT")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2 and done.stdout == "" and done.stderr.startswith(f"stillbed: {folder}/missing: ")
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.faults import Fault, Part, fault_from_text
-from hardware.protocol import G1, THESIS, encode
-from hardware.simulator.arm_settings import ArmSettings
-from hardware.simulator.controller import VirtualArm
+from hardware.arm.protocol import G1, THESIS, encode
+from hardware.process.faults import Fault, Part, fault_from_text
+from hardware.simulator.arm.controller import VirtualArm
+from hardware.simulator.arm.settings import ArmSettings
 
 HOME = np.array([202.5, 225, 113, 0, 0, 0])
 IDEAL = ArmSettings(servo_lag=0.0)

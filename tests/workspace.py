@@ -18,11 +18,11 @@ from board_session import BOARD, rendered, small_rig
 from estimation.scan import scan_from_triangles
 from hardware.bookmark_file import keep_bookmark
 from hardware.calibration.board_file import write_board
-from hardware.cli import main
-from hardware.clock import WallClock
+from hardware.cli.main import main
+from hardware.files.path_file import read_path
+from hardware.files.rig_file import ImageSource, write_rig
 from hardware.live.prerender import prerender
-from hardware.path_file import read_path
-from hardware.rig_file import ImageSource, write_rig
+from hardware.process.clock import WallClock
 from planning.progress import fingerprint
 from tests.live_runs import ROOT, SCENARIO, Running
 from tests.shown_commands import MADE

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from hardware.clock import SimClock
-from hardware.path_file import read_path
-from hardware.schemas import WARNING
+from hardware.files.path_file import read_path
+from hardware.process.clock import SimClock
+from hardware.recording.schemas import WARNING
+from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.cameras import Shot
 from hardware.simulator.deformation import Deformation
 from hardware.simulator.look import Look
@@ -25,13 +26,12 @@ from hardware.simulator.perfect import PerfectTracker
 from hardware.simulator.planned_line import planned_line
 from hardware.simulator.scenario import Scenario
 from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.scene import STILL, Scene
-from hardware.simulator.shape import flat
-from hardware.simulator.sight import Exposures
+from hardware.simulator.scene.scene import STILL, Scene
+from hardware.simulator.scene.shape import flat
 from hardware.simulator.truth import Truth
 from hardware.simulator.world import World
 from perception.frames import FrameSet, PrintHead
-from perception.tracking import StepReport
+from perception.tracking.step import StepReport
 from planning.command import Command, Hold
 from planning.progress import Progress
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
-from hardware.path_file import read_path
+from hardware.files.path_file import read_path
 from hardware.script import run_script
 from planning.command import Command, Hold
-from planning.guard import Guard
 from planning.kinematics import SimpleArm, nozzle_from_axes
 from planning.limits import Limits
-from planning.planner import Planner
+from planning.motion.guard import Guard
+from planning.motion.planner import Planner
 
 TICK, LAG = 0.02, 0.03  # s between lines, and what the arm is later than they say
 ARM = SimpleArm()

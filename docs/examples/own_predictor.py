@@ -9,8 +9,8 @@ import numpy as np
 
 from estimation import se3
 from estimation.forecast import Forecast
+from estimation.forecast.predictor import Predictor
 from estimation.pose import SurfacePose
-from estimation.predictor import Predictor
 from estimation.synthetic.follow import follow
 from estimation.synthetic.world import synthetic_world
 from hardware.script import run_script

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from hardware.mesh_file import read_raw_mesh
-from hardware.path_file import write_path
+from hardware.files.mesh_file import read_raw_mesh
+from hardware.files.path_file import write_path
 from hardware.script import run_script
 from planning.fill.pattern import Pattern
 from planning.layers.figures import figures_of, total_of

@@ -5,9 +5,9 @@ A session folder holds rig.toml, frames.csv and a video a camera (docs/conventio
 
 from __future__ import annotations
 
+from hardware.files.session import open_session
 from hardware.methods import MAP, step_by
 from hardware.script import run_script
-from hardware.session import open_session
 
 
 def main(folder: str) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from estimation import se3
-from estimation.arm_calibration.model import Kinematics
 from estimation.arm_calibration.set_point import SetPoint
-from estimation.arm_calibration.start import FEWEST
+from estimation.calibration.arm_model import Kinematics
+from estimation.calibration.arm_start import FEWEST
 from estimation.errors import InputError
 from estimation.se3 import Array
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.compiled import compiled
+from estimation.runtime import compiled
 from estimation.se3 import Array
 
 QUICKEST = 1e-9  # s: a lag below is none

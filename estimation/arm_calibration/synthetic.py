@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.arm_calibration.model import ArmState, Kinematics, Sightings, predict
 from estimation.arm_calibration.set_point import SetPoint
+from estimation.calibration.arm_model import ArmState, Kinematics, Sightings, predict
 from estimation.rig import Rig
 from estimation.se3 import Array
 

@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 
 from estimation import se3
-from estimation.arm_calibration.fit import PLACE, TIP, TOOL
 from estimation.arm_calibration.moves import check_places, check_turns
+from estimation.calibration.arm_fit import PLACE, TIP, TOOL
 from estimation.se3 import Array
 
 

@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.camera_calibration.lens_model import KnownLenses
+from estimation.calibration.lens_model import KnownLenses
+from estimation.calibration.rig_fit import RigState, fit_rig
 from estimation.camera_calibration.model_choice import folds_of
-from estimation.camera_calibration.rig_fit import RigState, fit_rig
 from estimation.camera_calibration.views import Views
 from estimation.se3 import Array
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.camera_calibration.homography import focal, homographies, poses
+from estimation.calibration.lens_fit import focal, homographies, poses
+from estimation.calibration.lens_model import MODELS, belief, image
 from estimation.camera_calibration.least_squares import DONE, damped, huber, minimise
-from estimation.camera_calibration.lens_model import MODELS, belief, image
 from estimation.camera_calibration.views import Views
 from estimation.errors import StillbedError
 from estimation.se3 import Array

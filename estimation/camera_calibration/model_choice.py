@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from estimation.calibration.lens_model import MODELS
 from estimation.camera_calibration.lens_fit import LensFit, fit_lens, fit_poses, start
-from estimation.camera_calibration.lens_model import MODELS
 from estimation.camera_calibration.plausible import Implausible, check_lens
 from estimation.camera_calibration.views import Views
 from estimation.se3 import Array

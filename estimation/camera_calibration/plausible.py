@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from estimation.camera_calibration.lens_model import PARAMETERS
+from estimation.calibration.lens_model import PARAMETERS
 from estimation.errors import StillbedError
 from estimation.se3 import Array
 

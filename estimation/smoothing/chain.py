@@ -15,8 +15,8 @@ from typing import cast
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
+from estimation.batch.priors import STATE
 from estimation.se3 import Array
-from estimation.smoothing.prior import STATE
 
 
 class Chain:

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.pose_solver import EFFICIENCY, GATE
+from estimation.batch.normal_equations import frame_sums, squares
+from estimation.batch.priors import STATE, States, right_jacobian
+from estimation.online.pose_solver import EFFICIENCY, GATE
 from estimation.se3 import Array
 from estimation.smoothing.cameras import Cameras
-from estimation.smoothing.loops import frame_sums, squares
 from estimation.smoothing.packed import Packed
-from estimation.smoothing.prior import STATE, States, right_jacobian
 
 TOGETHER = 1e-4  # s: as the sum of a frame set's delays is held at nothing
 

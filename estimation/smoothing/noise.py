@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimation.batch.solve import Equations, Estimate, Pass
 from estimation.se3 import Array
 from estimation.smoothing.measured import Noise, whitened_squares
 from estimation.smoothing.packed import Packed
-from estimation.smoothing.solve import Equations, Estimate, Pass
 from estimation.track_loops import MEDIAN
 
 LEAST_UNIT = 0.3  # of what is claimed: better than that no track is believed to be

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from estimation.observations import Observations
-from estimation.pose_solver import project
+from estimation.online.pose_solver import project
 from estimation.rig import Rig
 from estimation.se3 import Array
 

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.adjustment import Adjusted
 from estimation.errors import InputError
-from estimation.estimator import Estimator
 from estimation.fit import Fit
+from estimation.mapping.bundle_adjustment import Adjusted
+from estimation.mapping.refiner import Refiner
 from estimation.observations import Observations
+from estimation.online.estimator import Estimator
 from estimation.pose import SurfacePose, TrackState
-from estimation.refiner import Refiner
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.state_machine import StateSettings

@@ -15,8 +15,8 @@ import numpy as np
 from estimation.arm_calibration.set_point import SetPoint
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm import Arm
-from hardware.arm_queue import Stretch
+from hardware.arm.link import Arm
+from hardware.arm.queue import Stretch
 
 NAME = "commanded.csv"
 HEADER = "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg"

@@ -14,10 +14,10 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from planning.command import Move, Refusal, feed_for
-from planning.guard import Guard
 from planning.limits import MARGIN, Limits
+from planning.motion.guard import Guard
 
 PEAK = 1.875  # times its mean speed that the quickest part of a jerk-free way has (10 s^3 - 15 s^4 + 6 s^5)
 BASES = (2, 3, 5, 7, 11, 13)  # of the Halton sequence: even, however many places

@@ -8,19 +8,19 @@ from pathlib import Path
 from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware.arm import Arm
+from hardware.arm.link import Arm
+from hardware.arm.port import Opener
+from hardware.arm.profile import ArmProfile
 from hardware.arm_calibration.commanded import NAME, CommandedFile
-from hardware.arm_calibration.drive import Drive
 from hardware.arm_calibration.moves import MoveWishes, check_moves, planned
-from hardware.arm_calibration.solve import ARM
-from hardware.arm_file import write_arm
-from hardware.arm_port import Opener
-from hardware.arm_profile import ArmProfile
+from hardware.calibration.arm_record import Drive
+from hardware.calibration.arm_solve import ARM
 from hardware.cameras.live import LiveCameras
-from hardware.clock import Clock
-from hardware.images import encode
+from hardware.files.arm_file import write_arm
+from hardware.files.images import encode
 from hardware.link_settings import LinkSettings
-from hardware.progress import Report
+from hardware.process.clock import Clock
+from hardware.process.progress import Report
 from hardware.session_folder import SessionFolder
 
 FIRST = 20.0  # s that the cameras may take for their first pictures; one on a network takes five to open

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.arm_calibration.model import ArmState, Kinematics, tips
 from estimation.arm_calibration.set_point import SetPoint
+from estimation.calibration.arm_model import ArmState, Kinematics, tips
 from estimation.rig import Rig
 from estimation.se3 import Array
-from perception.needle_tip import SHORTEST
+from perception.boards.needle_tip import SHORTEST
 
 THIN = 1.5  # times its radius at the tip that a tool is a needle
 

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from estimation.errors import InputError
+from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.triangulation import triangulate
-from hardware import checks
+from hardware.process import checks
 from perception.lens import undistort
 
 TOUCH = 0.2  # mm, one sigma: what a hand on a jog button is good for

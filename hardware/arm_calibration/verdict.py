@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hardware.arm_calibration.solve import ArmCalibration
+from hardware.calibration.arm_solve import ArmCalibration
 from hardware.calibration.verdict import Verdict
 
 LIMIT = 0.1  # mm, of the tip in the working volume: a fourth of a bead

@@ -11,18 +11,18 @@ from estimation import se3
 from estimation.arm_calibration.set_point import SetPoint
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm import Arm
+from hardware.arm.link import Arm
+from hardware.arm.port import Device
 from hardware.arm_calibration.commanded import NAME, read_commanded
 from hardware.arm_calibration.moves import MoveWishes
 from hardware.arm_calibration.record import move_arm
-from hardware.arm_calibration.run import ArmTruth
-from hardware.arm_calibration.solve import ARM
-from hardware.arm_file import write_arm
-from hardware.arm_port import Device
-from hardware.clock import Clock, SimClock
-from hardware.progress import Report
-from hardware.simulator.controller import VirtualArm
-from hardware.simulator.virtual_port import VirtualDevice
+from hardware.calibration.arm_run import ArmTruth
+from hardware.calibration.arm_solve import ARM
+from hardware.files.arm_file import write_arm
+from hardware.process.clock import Clock, SimClock
+from hardware.process.progress import Report
+from hardware.simulator.arm.controller import VirtualArm
+from hardware.simulator.arm.ports import VirtualDevice
 from hardware.simulator.watched_arm import WatchedArm, served, take_pictures
 
 AROUND, STEP = 0.03, 1e-4  # s about its own dead time in which a virtual arm's is looked for, and how finely

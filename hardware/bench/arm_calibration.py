@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from estimation import se3
-from estimation.arm_calibration.fit import ArmFit, Asked, fit_arm
-from estimation.arm_calibration.model import ArmState
-from estimation.arm_calibration.start import first_pose
 from estimation.arm_calibration.synthetic import set_point_of, sightings_of
+from estimation.calibration.arm_fit import ArmFit, Asked, fit_arm
+from estimation.calibration.arm_model import ArmState
+from estimation.calibration.arm_start import first_pose
 from estimation.se3 import Array
 from hardware.arm_calibration.moves import MoveWishes, planned
-from hardware.arm_calibration.solve import ArmCalibration, kinematics_of, solve_folder
 from hardware.arm_calibration.virtual import record_in_virtual_time
-from hardware.bench.figure import Figure, Target, at_most
-from hardware.clock import WallClock
-from hardware.progress import Progress, silent
+from hardware.bench.figures import Figure, Target, at_most
+from hardware.calibration.arm_solve import ArmCalibration, kinematics_of, solve_folder
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress, silent
 from hardware.simulator.watched_arm import watched_arm
 
 PERIOD, NOISE, OUTLIERS = 0.1, 0.3, 0.05  # s, px and share, of drawn tips

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimation import se3
-from estimation.estimator import Estimator
+from estimation.online.estimator import Estimator
 from estimation.pose import TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
@@ -22,9 +22,9 @@ from estimation.synthetic.look import observations
 from estimation.synthetic.motions import Motion
 from estimation.synthetic.movements import irregular
 from estimation.synthetic.surfaces import patch
-from hardware.bench.figure import Figure, at_least, at_most
-from hardware.clock import WallClock
-from hardware.progress import Progress
+from hardware.bench.figures import Figure, at_least, at_most
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress
 
 RATE = 30.0  # Hz
 CALM, WATCHED = 6.0, 4.0  # s before a bump, and after it

@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 
 from estimation import se3
+from estimation.batch.initialisation import begin
+from estimation.batch.priors import States
+from estimation.batch.smooth import FREE
+from estimation.batch.solve import HELD, Equations, Estimate, Known, shared_step
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.smoothing.beginning import begin
 from estimation.smoothing.cameras import CalibrationPrior, cameras_of, prior_information, sigmas
 from estimation.smoothing.measured import Noise, Problem
 from estimation.smoothing.packed import Packed, packed
-from estimation.smoothing.prior import States
-from estimation.smoothing.smooth import FREE
-from estimation.smoothing.solve import HELD, Equations, Estimate, Known, shared_step
 from estimation.synthetic.world import synthetic_world
-from hardware.bench.figure import Figure, at_most
-from hardware.clock import ProcessorClock
+from hardware.bench.figures import Figure, at_most
+from hardware.process.clock import ProcessorClock
 
 PLAIN = 1e4  # times the gate: no residual is that large, and all count by their squares
 UNTIED = np.array([1e10] * 3 + [1e15] * 3)  # rad^2/s^5, mm^2/s^5: neighbouring poses know nothing of each other

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation import se3
-from estimation.camera_calibration.calibrate import Calibration, calibrate
-from estimation.camera_calibration.lens_model import image, lens_of, matrix_of
-from estimation.camera_calibration.rig_error import predicted_error, working_volume
+from estimation.calibration.camera_rig import Calibration, calibrate
+from estimation.calibration.lens_model import image, lens_of, matrix_of
+from estimation.calibration.validation import predicted_error, working_volume
 from estimation.camera_calibration.views import Views
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
-from hardware.bench.figure import Figure, Target, at_most
+from hardware.bench.figures import Figure, Target, at_most
 from hardware.calibration.verdict import held_out, residual
-from hardware.simulator.board_picture import BoardView
+from hardware.simulator.scene.ground_truth_views import BoardView
 from perception.boards.board import Board
 from perception.boards.collection import CornerTable, empty_table, usable
 from perception.boards.corners import CornerFinder

@@ -10,12 +10,12 @@ from itertools import pairwise
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.bench.figure import Figure, at_most
+from hardware.bench.figures import Figure, at_most
 from hardware.cameras.feed import Arrival
-from hardware.cameras.gathering import Gathering
+from hardware.cameras.frame_sets import Gathering
 from hardware.cameras.stamping import Stamping
 from hardware.cameras.watch import FrameWatch
-from hardware.clock import CpuClock
+from hardware.process.clock import CpuClock
 from perception.frames import Frame, FrameSet, Image
 
 PERIOD = 1 / 30  # s

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hardware.bench.subjects import SUBJECTS, Subject, Subjects
-from hardware.command_line import Commands, Parser
+from hardware.cli.parser import Commands, Parser
 
 WHOLE = Path("out/bench")
 
@@ -60,7 +60,7 @@ def subjects_text(subjects: Subjects) -> str:
 
 def _chosen(name: str, subjects: Subjects) -> Subject:
     from estimation.errors import InputError
-    from hardware.checks import meant
+    from hardware.process.checks import meant
 
     if name not in subjects:
         raise InputError("command line", "SUBJECT", name, meant(name, list(subjects)))

@@ -16,13 +16,13 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.bench.estimator import CONSISTENT, INSIDE
-from hardware.bench.figure import Figure, at_least
+from hardware.bench.figures import Figure, at_least
 from hardware.bench.outage_run import FPS, looped
 from hardware.bench.pooled import WITHIN, nees
 from hardware.simulator.picture_loop import PictureLoop
-from hardware.simulator.scene import rois
+from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet
-from perception.tracking import TrackingStep
+from perception.tracking.step import TrackingStep
 
 PERIOD = 40  # frame sets of a loop
 SETTLED = 32  # frame sets after the first TRACKING pose: until then the widest claim is given out

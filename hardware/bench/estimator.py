@@ -12,12 +12,12 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.synthetic.follow import Followed, Mapping, follow
 from estimation.synthetic.world import World, synthetic_world
-from hardware.bench.figure import Figure, Target, at_most
+from hardware.bench.figures import Figure, Target, at_most
 from hardware.bench.pooled import Pooled, pooled
 from hardware.bench.scenes import SCENES, Scene
 from hardware.bench.soak import soak_figures
 from hardware.bench.solve_pnp import best_camera
-from hardware.clock import CpuClock
+from hardware.process.clock import CpuClock
 
 CONSISTENT, INSIDE = Target(0.8, 1.25), Target(0.93, 0.97)
 MAPS: dict[Mapping, str] = {"told": "exact map", "seen": "own map"}

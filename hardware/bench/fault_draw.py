@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hardware.bench.fault_run import BEFORE
-from hardware.faults import SPECS, Fault, Kind, Part, Runner
+from hardware.process.faults import SPECS, Fault, Kind, Part, Runner
 
 SLOT, PLACES = 2.6, 7  # s from one fault to the next, and faults of a run
 SHORTEST, LONGEST = 0.15, 1.0  # s: long enough to be seen, short enough to be over before the next

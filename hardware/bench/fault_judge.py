@@ -9,7 +9,7 @@ import numpy as np
 
 from estimation.se3 import Array
 from hardware.bench.fault_run import BEFORE, Ran, Rows, speeds
-from hardware.faults import Fault, Kind, Part
+from hardware.process.faults import Fault, Kind, Part
 
 WRONG = 1.0  # mm: the largest error that a print may have while it extrudes
 USUAL = 1.5  # times the largest error of the same run before anything went wrong: what a scenario has anyway

@@ -16,36 +16,36 @@ from numpy.typing import NDArray
 
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.arm import RECALLED, Arm
-from hardware.arm_profile import ArmProfile
+from hardware.arm.link import RECALLED, Arm
+from hardware.arm.profile import ArmProfile
 from hardware.arm_status import ArmState
 from hardware.bench.axes_judge import AxesJudge
-from hardware.clock import SimClock
-from hardware.faults import Fault, Kind, Part, struck
+from hardware.files.path_file import read_path
 from hardware.link_settings import LinkSettings
 from hardware.live.silence import silence
-from hardware.motion import MotionStep
-from hardware.motion_loop import MotionLoop, Order, Tick
-from hardware.path_file import read_path
-from hardware.schemas import WARNING
+from hardware.motion.loop import MotionLoop, Order, Tick
+from hardware.motion.step import MotionStep
+from hardware.process.clock import SimClock
+from hardware.process.faults import Fault, Kind, Part, struck
+from hardware.recording.schemas import WARNING
 from hardware.simulator.agenda import Agenda
-from hardware.simulator.arm_settings import Replies
+from hardware.simulator.arm.controller import VirtualArm
+from hardware.simulator.arm.ports import PortFaults, VirtualDevice
+from hardware.simulator.arm.settings import Replies
+from hardware.simulator.camera_pipeline import Exposures, Sight
 from hardware.simulator.cameras import Shot
-from hardware.simulator.controller import VirtualArm
 from hardware.simulator.laying import laid
 from hardware.simulator.ledger import Ledger, executed_rows
 from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.scenario import Scenario, Tracking
 from hardware.simulator.scenario_file import read_scenario
+from hardware.simulator.scene.shape import Shape
 from hardware.simulator.scene_table import bare_scene
-from hardware.simulator.shape import Shape
-from hardware.simulator.sight import Exposures, Sight
 from hardware.simulator.struck_surface import folded, struck_motion
 from hardware.simulator.track_tracker import TrackTracker
 from hardware.simulator.truth import Truth
-from hardware.simulator.virtual_port import PortFaults, VirtualDevice
 from perception.frames import FrameSet, PrintHead
-from perception.tracking import StepReport
+from perception.tracking.step import StepReport
 from planning.command import Move
 from planning.kinematics import axes_from_nozzle
 from planning.path import Path

@@ -8,7 +8,7 @@ import numpy as np
 
 from estimation.se3 import Array
 from hardware.bench.fault_judge import SLOW, Verdict
-from hardware.faults import SPECS
+from hardware.process.faults import SPECS
 
 HEADER = (
     *("fault", "count", "silent", "said %", "said ms", "99 %", "known ms", "99 %", "worst mm", "restless"),

@@ -21,17 +21,17 @@ import numpy as np
 
 from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
+from hardware.bench.campaigns.faults import fault_page
 from hardware.bench.fault_draw import PLACES, drawn_faults
 from hardware.bench.fault_judge import LATE, SLOW, Verdict, judged
-from hardware.bench.fault_page import fault_page
 from hardware.bench.fault_run import FaultRun, Stage, stage
 from hardware.bench.fault_table import kinds_text
-from hardware.bench.figure import Figure, at_least, at_most
+from hardware.bench.figures import Figure, at_least, at_most
 from hardware.bench.workers import workers
-from hardware.clock import ProcessorClock, WallClock
-from hardware.faults import fault_from_text
-from hardware.progress import Progress
-from perception.shipped import shipped_file
+from hardware.process.clock import ProcessorClock, WallClock
+from hardware.process.faults import fault_from_text
+from hardware.process.progress import Progress
+from perception.package_data import shipped_file
 
 SCENARIOS = ("breathing_calm", "breathing_deep", "breathing_irregular", "hand", "shaking_table_0_1_hz", "still")
 SHOWN_BY = "of what pictures show, until the exposure of the pose that said so"

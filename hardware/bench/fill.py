@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from estimation.errors import InputError
-from hardware.bench.figure import Figure, at_least, at_most
+from hardware.bench.figures import Figure, at_least, at_most
 from hardware.bench.fill_picture import picture
 from hardware.bench.wounds import mapped, outline, random_wound
-from hardware.clock import CpuClock, WallClock
-from hardware.progress import Progress
+from hardware.process.clock import CpuClock, WallClock
+from hardware.process.progress import Progress
 from planning.fill.coverage import Coverage, coverage
 from planning.fill.fill import fill
 from planning.fill.pace import Pace, spent

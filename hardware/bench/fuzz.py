@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from estimation.errors import InputError
-from hardware.bench.figure import Figure, at_most
+from hardware.bench.campaigns.fuzz import readers
+from hardware.bench.campaigns.fuzz_process import Task, run_tasks
+from hardware.bench.figures import Figure, at_most
 from hardware.bench.fuzz_log import append_log, read_log
-from hardware.bench.fuzz_readers import readers
-from hardware.bench.fuzz_run import Task, run_tasks
 from hardware.bench.fuzz_try import Block
-from hardware.clock import WallClock
-from hardware.progress import Progress
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress
 
 KEPT = 5  # inputs of each reader that are kept; the others can be made again from their seed and number
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hardware.mesh_file import read_raw_mesh
+from hardware.files.mesh_file import read_raw_mesh
 from hardware.ply_file import write_ply
 from hardware.scan_units import in_mm
 from hardware.stl_file import TRIANGLE

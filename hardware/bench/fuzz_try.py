@@ -16,7 +16,7 @@ import numpy as np
 
 from estimation.errors import StillbedError
 from hardware.bench.mutate import mutated
-from hardware.clock import ProcessorClock
+from hardware.process.clock import ProcessorClock
 
 SECONDS, MEMORY = 3.0, 1 << 30  # of one input: s of processor time, bytes beyond what the reader's libraries take
 HANG = 20  # s of processor time of one input that is within a library and hears of no signal: the process is ended

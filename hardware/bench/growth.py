@@ -14,14 +14,14 @@ from estimation.se3 import Array
 from estimation.synthetic.arc_rig import arc_rig
 from estimation.synthetic.follow import steps
 from estimation.synthetic.world import synthetic_world
-from hardware.bench.figure import Figure
+from hardware.bench.figures import Figure
 from hardware.bench.latency import timed
 from hardware.bench.planner import carries
 from hardware.bench.thesis_scenes import made
-from hardware.chart import Plot, spanning
-from hardware.clock import CpuClock, WallClock
 from hardware.page import document, legend, line_key, section
-from hardware.progress import Progress
+from hardware.process.clock import CpuClock, WallClock
+from hardware.process.progress import Progress
+from hardware.report.page import Plot, spanning
 
 WARM = 10  # steps that fill the window and the caches
 ANGLES_DEG = (0.0, 36.0, 84.0, -36.0, 60.0, -60.0)  # the thesis's three cameras, and three more on the same arc

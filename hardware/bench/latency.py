@@ -10,13 +10,13 @@ import numpy as np
 
 from estimation.pose import TrackState
 from estimation.se3 import Array
-from hardware.bench.figure import Figure, Target, at_most
+from hardware.bench.figures import Figure, Target, at_most
 from hardware.bench.thesis_scenes import Shown, made, recorded
-from hardware.clock import ProcessorClock, WallClock
-from hardware.images import decode, encode
+from hardware.files.images import decode, encode
+from hardware.process.clock import ProcessorClock, WallClock
 from hardware.tracker import tracker
 from perception.frames import Frame, FrameSet
-from perception.tracking import STAGES
+from perception.tracking.step import STAGES
 
 REFERENCE = "thesis 70; OpenVINS stereo 26 / 41 / 98 (median / 99 % / largest)"
 TARGETS = ("median", 50, at_most(8)), ("99 %", 99, at_most(16)), ("largest", 100, at_most(33))

@@ -7,11 +7,11 @@ import os
 
 import numpy as np
 
-from hardware.arm_profile import ArmProfile
-from hardware.bench.figure import Figure, Target, at_most
-from hardware.bench.link_run import LOSSY, NOTICED, OBEYING, SECONDS, STALLING, Counts, Run
-from hardware.clock import WallClock
-from hardware.progress import Progress
+from hardware.arm.profile import ArmProfile
+from hardware.bench.campaigns.link import LOSSY, NOTICED, OBEYING, SECONDS, STALLING, Counts, Run
+from hardware.bench.figures import Figure, Target, at_most
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress
 
 NONE = at_most(0)
 FIFO = "a full queue: 4000 ms"  # 200 commands of a tick; the thesis fills it
@@ -30,7 +30,7 @@ def run(options: argparse.Namespace) -> list[Figure]:
     if options.hours > 0:
         figures += soak_figures(soaked(options.hours, options.seed, options.baud))
     if options.minutes > 0:
-        from hardware.bench.link_live import live_figures
+        from hardware.bench.campaigns.link_live import live_figures
 
         figures += live_figures(60 * options.minutes, options.seed, options.busy, not options.ordinary)
     if options.commands > 0:

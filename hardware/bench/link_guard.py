@@ -9,13 +9,13 @@ import numpy as np
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.bench.figure import Figure, at_most
-from hardware.bench.guard_oracle import Log, Rules, judge
-from perception.shipped import shipped_file
+from hardware.bench.campaigns.guard import Log, Rules, judge
+from hardware.bench.figures import Figure, at_most
+from perception.package_data import shipped_file
 from planning.command import Command, Hold, Move
-from planning.guard import Guard
 from planning.kinematics import SimpleArm
 from planning.limits import Limits
+from planning.motion.guard import Guard
 from planning.no_go import NoGo, box, cylinder, half_space
 
 CHUNK = 10_000  # commands of one run
@@ -50,7 +50,7 @@ def simple() -> Rules:
 
 def jointed() -> Rules:
     """An arm that is sent its last three joints."""
-    from hardware.arm_file import read_arm
+    from hardware.files.arm_file import read_arm
 
     profile = read_arm(shipped_file("arms", "six_axis.toml"))
     return Rules(profile.arm, boxed(profile.limits), ZONE, TICK, LAG)

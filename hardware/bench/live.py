@@ -16,18 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from hardware.bench.figure import Figure, at_least, at_most
+from hardware.bench.figures import Figure, at_least, at_most
 from hardware.bench.live_kills import kill_figures
 from hardware.bench.live_session import LiveSession
 from hardware.cache_folder import cache_folder
-from hardware.clock import WallClock
 from hardware.evenness import Evenness, evenness
+from hardware.files.path_file import read_path, write_path
 from hardware.live.beside import Beside
-from hardware.live.judge import TrueError, judge_run
 from hardware.live.motion_names import EXPOSURE_TO_WIRE, FRAMES_TO_WIRE, LATE
 from hardware.live.prerender import prerender
+from hardware.live.recorded_run import TrueError, judge_run
 from hardware.live.settings import LiveSettings, cores_there, settings_text
-from hardware.path_file import read_path, write_path
+from hardware.process.clock import WallClock
 from planning.path import Path as Toolpath
 from planning.path import lengths
 

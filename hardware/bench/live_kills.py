@@ -11,14 +11,14 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.bench.figure import Figure, at_most
+from hardware.bench.figures import Figure, at_most
 from hardware.bench.live_session import LiveSession
-from hardware.checks import read_toml
-from hardware.clock import WallClock
+from hardware.files.session import open_session
 from hardware.live.beside import Beside
-from hardware.live.judge import printed
-from hardware.progress import Progress
-from hardware.session import open_session
+from hardware.live.recorded_run import printed
+from hardware.process.checks import read_toml
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress
 
 NOTICED = ("tracking", "motion", "recorder")  # by the process that conducts; the feed's end is the cameras'
 VICTIMS = ("run", "tracking", "motion", "recorder", "feed")

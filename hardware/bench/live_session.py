@@ -10,7 +10,7 @@ import sys
 import threading
 from pathlib import Path
 
-from hardware.clock import WallClock
+from hardware.process.clock import WallClock
 
 NAME = "(sb-"  # of the processes of a run, as the system tells it
 MAP = "map"  # the processes of the tracking's own
@@ -26,7 +26,7 @@ class LiveSession:
         self.memory: list[tuple[float, dict[str, float]]] = []
         self._clock = WallClock()
         self.keys, theirs = pty.openpty()
-        command = [sys.executable, "-m", "hardware.cli", "live", *arguments]
+        command = [sys.executable, "-m", "hardware.cli.main", "live", *arguments]
         nothing = subprocess.DEVNULL
         self.process = subprocess.Popen(command, stdin=theirs, stdout=nothing, stderr=subprocess.PIPE, text=True)
         os.close(theirs)

@@ -20,14 +20,14 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.bench.fault_run import FaultRun, Stage, stage
-from hardware.bench.figure import Figure, at_least, at_most
+from hardware.bench.figures import Figure, at_least, at_most
 from hardware.bench.workers import workers
-from hardware.chart import Plot
-from hardware.clock import WallClock
 from hardware.page import document, legend, line_key, section
-from hardware.progress import Progress
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress
+from hardware.report.page import Plot
 from perception.frames import FrameSet
-from perception.shipped import shipped_file
+from perception.package_data import shipped_file
 
 WIDTH, HEIGHT = 900, 150  # px
 LEAST = 0.01  # mm, where the logarithmic axis begins

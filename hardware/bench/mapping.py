@@ -14,19 +14,19 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.bench.figure import Figure, Target, at_least, at_most
+from hardware.bench.figures import Figure, Target, at_least, at_most
 from hardware.bench.pooled import nees
 from hardware.bench.registration import shape_of
 from hardware.simulator.bodies import Wound, with_wound
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look
 from hardware.simulator.render import render
-from hardware.simulator.scene import Scene, rois
+from hardware.simulator.scene.scene import Scene, rois
+from hardware.simulator.scene.shape import Shape, cylinder, flat
 from hardware.simulator.sensor import Sensor
-from hardware.simulator.shape import Shape, cylinder, flat
 from perception.alignment import RELIEF
 from perception.frames import Frame, FrameSet
-from perception.tracking import TrackingStep
+from perception.tracking.step import TrackingStep
 
 RATE = 10.0  # frame sets a second: key frames are further apart
 LEAST = 1.0  # s: the first pose is given out after half of it

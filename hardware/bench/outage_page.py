@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hardware.bench.outage_judge import Verdict
+from hardware.bench.campaigns.outages import Verdict
 from hardware.bench.outage_run import Watched
-from hardware.chart import Plot, ribbon
 from hardware.page import area_key, document, legend, line_key, section
+from hardware.report.page import Plot, ribbon
 from hardware.simulator.outage import Kind
 
 WIDTH, LEAST = 900, 1e-3  # px; mm, where the logarithmic axis begins

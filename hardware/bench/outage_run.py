@@ -17,10 +17,10 @@ from hardware.simulator.bodies import Wound, with_wound
 from hardware.simulator.look import Look
 from hardware.simulator.outage import LONGEST, Kind, Outage, Spoiler, draw_outage
 from hardware.simulator.picture_loop import PictureLoop, closed_motion
-from hardware.simulator.scene import Scene, rois
-from hardware.simulator.shape import cylinder
+from hardware.simulator.scene.scene import Scene, rois
+from hardware.simulator.scene.shape import cylinder
 from perception.frames import Frame, FrameSet, Image
-from perception.tracking import TrackingStep
+from perception.tracking.step import TrackingStep
 
 FPS = 30.0
 PERIOD = 96  # frame sets of the motion's loop: a breath of 3.2 s

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hardware.bench.figure import Figure, at_most
-from hardware.bench.outage_judge import GOOD, Verdict, judge
+from hardware.bench.campaigns.outages import GOOD, Verdict, judge
+from hardware.bench.figures import Figure, at_most
 from hardware.bench.outage_page import outage_page
 from hardware.bench.outage_run import Watched, make_pictures, run_stretch
 from hardware.bench.workers import workers
-from hardware.clock import WallClock
-from hardware.progress import Progress
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress
 from hardware.simulator.outage import Kind
 
 SCENE = 64  # outages before one scene, whose pictures take as long to render as ten of them to track

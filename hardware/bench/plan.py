@@ -18,8 +18,8 @@ import numpy as np
 from estimation.errors import StillbedError
 from estimation.scan import Index
 from estimation.se3 import Array
-from hardware.bench.figure import Figure, at_least, at_most
-from hardware.clock import ProcessorClock
+from hardware.bench.figures import Figure, at_least, at_most
+from hardware.process.clock import ProcessorClock
 
 SIZE, DEPTH = (60.0, 40.0), 4.0  # mm; with the bed's unevenness 6 mm deep at the deepest
 SCAN_STEP = 1.0  # mm between the vertices of a scan, as handheld scanners give them

@@ -15,19 +15,19 @@ import numpy as np
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.arm_file import read_arm
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from hardware.bench.axes_judge import KINDS, AxesJudge
-from hardware.bench.figure import Figure, at_most
+from hardware.bench.figures import Figure, at_most
 from hardware.bench.random_runs import REST, TICK, random_run
-from hardware.clock import CpuClock, WallClock
-from hardware.progress import Progress as Bar
+from hardware.files.arm_file import read_arm
+from hardware.process.clock import CpuClock, WallClock
+from hardware.process.progress import Progress as Bar
 from planning.carry import CarriedPath
 from planning.command import Hold, Move
-from planning.guard import Guard
 from planning.kinematics import SimpleArm, axes_from_nozzle
+from planning.motion.guard import Guard
+from planning.motion.planner import STALL, Planner
 from planning.path import Path
-from planning.planner import STALL, Planner
 from planning.progress import bookmark, resumed
 
 STREAM = 500  # updates of one stream: 10 s

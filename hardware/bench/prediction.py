@@ -16,17 +16,17 @@ import numpy as np
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.forecast.predictor import Predictor
 from estimation.pose import SurfacePose, TrackState
-from estimation.predictor import Predictor
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
-from hardware.bench.figure import Figure, Target, at_most
+from hardware.bench.figures import Figure, Target, at_most
 from hardware.bench.options import BREATHING
 from hardware.bench.plain_ensemble import plain_forecasts
-from hardware.clock import CpuClock
+from hardware.process.clock import CpuClock
 from hardware.simulator.scenario_file import read_scenario
 from hardware.tum import read_tum
-from perception.shipped import shipped_file
+from perception.package_data import shipped_file
 
 AHEAD = (0.1, 0.2, 0.3, 0.5)  # s
 SHARES = (0.42, 0.42, 0.44, 0.47)  # of hold's error, asked for on recorded chests

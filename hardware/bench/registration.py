@@ -14,16 +14,16 @@ from estimation.scan import Scan, scan_from_triangles
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.synthetic.follow import LEAST
-from hardware.bench.figure import Figure, Target, at_most
+from hardware.bench.figures import Figure, Target, at_most
 from hardware.simulator.bodies import Wound, body, with_wound
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look
 from hardware.simulator.render import render
-from hardware.simulator.scene import Scene, rois
+from hardware.simulator.scene.scene import Scene, rois
+from hardware.simulator.scene.shape import Shape, cylinder, flat
 from hardware.simulator.sensor import Sensor
-from hardware.simulator.shape import Shape, cylinder, flat
 from perception.frames import Frame, FrameSet
-from perception.tracking import TrackingStep
+from perception.tracking.step import TrackingStep
 
 SCAN_STEP = 1.0  # mm between the vertices of a scan, as handheld scanners give them
 SCAN_FROM_SURFACE = se3.make(se3.exp_rotation([0.3, -0.2, 0.6]), [12.0, -7.0, 31.0])  # a scanner has its own frame

@@ -10,9 +10,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hardware.bench.figure import Figure, Target
+from hardware.bench.figures import Figure, Target
 from hardware.bench.machine import Machine
-from hardware.summary import finite
+from hardware.report.summary import finite
 
 COLUMNS = ("what", "value", "unit", "low", "high", "verdict", "reference", "note")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from hardware.bench.figure import Target, at_most
+from hardware.bench.figures import Target, at_most
 
 APART = 0.016  # s, half a frame period at 30 Hz: webcams are not synchronised
 

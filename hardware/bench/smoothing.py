@@ -10,17 +10,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation import se3, smooth
+from estimation.batch.smoothed import Smoothed
 from estimation.se3 import Array
 from estimation.smoothing.cameras import REFINED
-from estimation.smoothing.smoothed import Smoothed
 from estimation.synthetic.follow import follow
 from estimation.synthetic.world import World, synthetic_world
 from hardware.bench.bundle_adjustment import ceres_figures
-from hardware.bench.figure import Figure, Target, at_most
+from hardware.bench.figures import Figure, Target, at_most
 from hardware.bench.smoothing_many import many_figures
 from hardware.bench.smoothing_rendered import rendered_figures
-from hardware.clock import CpuClock
-from hardware.evaluation import best_constant
+from hardware.process.clock import CpuClock
+from hardware.report.evaluation import best_constant
 
 CONSISTENT = Target(0.8, 1.25)
 NEES_NOTE = "from the first pose on, whose one draw is in all others: many seeds make it sure"

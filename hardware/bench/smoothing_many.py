@@ -12,11 +12,11 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.synthetic.world import synthetic_world
-from hardware.bench.figure import Figure, at_least
-from hardware.clock import WallClock
-from hardware.recording import Recorder
+from hardware.bench.figures import Figure, at_least
+from hardware.offline.smooth import Cluster, run_smooth
+from hardware.process.clock import WallClock
+from hardware.recording.recorder import Recorder
 from hardware.smoothing.cluster import local_cluster
-from hardware.smoothing.many import Cluster, run_smooth
 from hardware.smoothing.run import Wishes
 from perception.frames import Frame
 

@@ -9,18 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from estimation import smooth
+from estimation.batch.smoothed import Smoothed
 from estimation.errors import InputError
-from estimation.smoothing.smoothed import Smoothed
-from hardware.bench.figure import Figure, at_most
+from hardware.bench.figures import Figure, at_most
 from hardware.cache_folder import cache_folder
-from hardware.evaluation import spread
+from hardware.files.session import Session, open_session
 from hardware.live.prerender import prerender
-from hardware.session import Session, open_session
+from hardware.offline.smooth_tracks import Relinked, relinked
+from hardware.report.evaluation import spread
 from hardware.smoothing.judged import judge
-from hardware.smoothing.relinked import Relinked, relinked
 from hardware.smoothing.run import session_hash
 from hardware.smoothing.tracks import Tracks, tracks_of
-from perception.shipped import shipped_file
+from perception.package_data import shipped_file
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,9 +10,9 @@ import numpy as np
 from estimation import se3
 from estimation.synthetic.follow import Mapping, steps
 from estimation.synthetic.world import synthetic_world
-from hardware.bench.figure import Figure, at_most
-from hardware.clock import CpuClock, WallClock
-from hardware.progress import Progress
+from hardware.bench.figures import Figure, at_most
+from hardware.process.clock import CpuClock, WallClock
+from hardware.process.progress import Progress
 
 RATE = 30.0  # Hz
 SETTLED = 60.0  # s, after which memory counts: the key frames are full and the libraries warm

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from hardware.bench import options
-from hardware.bench.figure import Figure
+from hardware.bench.figures import Figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ SUBJECTS: Subjects = {
         "hardware.bench.planner", options.planner, "random poses into planner and guard: limits kept, cost of a step"
     ),
     "segmentation": Subject(
-        "hardware.bench.segmentation",
+        "hardware.bench.pictures",
         options.segmentation,
         "finding the wound: Dice, silence, a half covered one, time",
     ),
@@ -104,7 +104,9 @@ SUBJECTS: Subjects = {
         "hardware.bench.smoothing", options.smoothing, "smoothed poses beside causal ones, clocks, time by length"
     ),
     "steps": Subject(
-        "hardware.bench.steps", options.steps, "movements of 300 um and 0.1 degree: how soon flagged, how often falsely"
+        "hardware.bench.detection",
+        options.steps,
+        "movements of 300 um and 0.1 degree: how soon flagged, how often false",
     ),
     "tracks": Subject(
         "hardware.bench.tracks", options.tracks, "scatter and creep of tracks before a surface that stands still"
@@ -113,6 +115,6 @@ SUBJECTS: Subjects = {
         "hardware.bench.views", options.views, "skin that deforms, grazing views with glare, a cube's edges"
     ),
     "thesis": Subject(
-        "hardware.bench.thesis", options.thesis, "the thesis's estimator beside ours, on the same frame sets"
+        "hardware.bench.recordings", options.thesis, "the thesis's estimator beside ours, on the same frame sets"
     ),
 }

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hardware.bench.figure import Figure
-from hardware.summary import figure as digits
+from hardware.bench.figures import Figure
+from hardware.report.summary import figure as digits
 
 HEADER = ("figure", "value", "unit", "target", "", "reference", "note")
 RIGHT = HEADER.index("value")  # numbers stand under each other

@@ -12,17 +12,17 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
 from estimation.trajectory import Trajectory
-from hardware.checks import Table
-from hardware.session import Session, open_session
+from hardware.files.session import Session, open_session
+from hardware.process.checks import Table
 from hardware.simulator.bodies import Wound, with_wound
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look
 from hardware.simulator.motion_table import motion_from_tables
 from hardware.simulator.render import render
-from hardware.simulator.scene import Scene, rois
+from hardware.simulator.scene.scene import Scene, rois
+from hardware.simulator.scene.shape import flat
 from hardware.simulator.scene_table import scene_from_table
 from hardware.simulator.sensor import Sensor
-from hardware.simulator.shape import flat
 from hardware.simulator.truth import Truth
 from perception.frames import Frame, FrameSet, Roi
 

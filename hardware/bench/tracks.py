@@ -8,18 +8,18 @@ import numpy as np
 
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.bench.figure import Figure, at_least, at_most
+from hardware.bench.figures import Figure, at_least, at_most
 from hardware.bench.registration import shape_of
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look
 from hardware.simulator.render import render
-from hardware.simulator.scene import Scene
+from hardware.simulator.scene.scene import Scene
 from hardware.simulator.sensor import Sensor
 from perception.alignment import align
 from perception.features import grey
 from perception.frames import Image
 from perception.lens import Lenses
-from perception.patches import project_squares, pyramid, take_templates
+from perception.matching.patches import project_squares, pyramid, take_templates
 
 MINUTE, DRIFT = 60.0, 0.15  # s; of the light, from the first picture to the last
 

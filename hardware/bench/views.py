@@ -17,21 +17,21 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.bench.figure import Figure, at_least, at_most
+from hardware.bench.figures import Figure, at_least, at_most
 from hardware.bench.registration import wound_points
-from hardware.checks import Table
+from hardware.process.checks import Table
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import plain
 from hardware.simulator.motion_table import motion_from_tables, waveform_from_table
-from hardware.simulator.noise import smooth
 from hardware.simulator.render import render
-from hardware.simulator.scene import Scene, rois
+from hardware.simulator.scene.fields import smooth
+from hardware.simulator.scene.scene import Scene, rois
+from hardware.simulator.scene.shape import Shape, shape_from_function
 from hardware.simulator.scene_table import scene_from_table
 from hardware.simulator.sensor import Sensor
-from hardware.simulator.shape import Shape, shape_from_function
 from hardware.simulator.truth import Truth
 from perception.frames import Frame, FrameSet
-from perception.tracking import TrackingStep
+from perception.tracking.step import TrackingStep
 
 RATE, EXPOSURE = 30.0, 0.005  # frame sets a second; s
 WHERE = "stillbed bench views"

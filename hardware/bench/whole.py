@@ -11,18 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from estimation.errors import InputError, StillbedError
-from hardware.bench.figure import Figure, Target
+from hardware.bench.figures import Figure, Target
 from hardware.bench.machine import Machine, this_machine
 from hardware.bench.saved import saved_figures, whole_table
 from hardware.bench.table import table_text
 from hardware.bench.whole_page import whole_markdown, whole_page
-from hardware.checks import why
-from hardware.clock import WallClock
-from hardware.progress import duration
+from hardware.process.checks import why
+from hardware.process.clock import WallClock
+from hardware.process.progress import duration
 
 WORSE = 1.2  # times farther from good than before: less is what these machines vary by
 FIGURES, PAGE, TABLE = "figures.json", "report.html", "table.md"  # of the whole, in its folder
-RUN = "import sys; from hardware.cli import main; sys.exit(main(sys.argv[1:]))"
+RUN = "import sys; from hardware.cli.main import main; sys.exit(main(sys.argv[1:]))"
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from hardware.bench.figure import Figure
+from hardware.bench.figures import Figure
 from hardware.bench.machine import Machine
 from hardware.page import document, row_of_tiles, section, tile
-from hardware.summary import figure as digits
+from hardware.report.summary import figure as digits
 
 Parts = Mapping[str, Sequence[Figure]]  # by the name of the part
 NAMED = 3  # figures of a part that are named where they miss their target; of more, the count is

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from estimation.errors import InputError
-from hardware import checks
+from hardware.process import checks
 from perception.boards.board import DICTIONARIES, KINDS, Board
 
 USUAL = Board()

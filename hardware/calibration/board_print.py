@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.calibration.board_file import MARKERS, read_board, write_board
-from hardware.checks import meant
 from hardware.out_folder import check_new
+from hardware.process.checks import meant
 from perception.boards.board import DICTIONARIES, Board, black, grid_of
 
 PAGES = {"A5": (148, 210), "A4": (210, 297), "A3": (297, 420), "A2": (420, 594), "letter": (215.9, 279.4)}

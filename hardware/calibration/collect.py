@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hardware.calibration.corner_file import content_key, read_corners, write_corners
-from hardware.progress import Report
-from hardware.session import FrameReader, FrameRef, Session
+from hardware.calibration.corners import content_key, read_corners, write_corners
+from hardware.files.session import FrameReader, FrameRef, Session
+from hardware.process.progress import Report
 from perception.boards.board import Board
 from perception.boards.collection import CornerTable, empty_table
 from perception.boards.corners import CornerFinder, Found

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation import se3
-from estimation.camera_calibration.calibrate import Calibration
+from estimation.calibration.camera_rig import Calibration
 from estimation.se3 import Array
 
 GRID = (4, 3)  # parts of a picture, across and down

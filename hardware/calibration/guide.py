@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.camera_calibration.homography import LEAST, focal_of, focal_terms, homography, poses
+from estimation.calibration.lens_fit import LEAST, focal_of, focal_terms, homography, poses
 from estimation.se3 import Array
 from hardware.calibration.coverage import GRID, Coverage, covered, lacking, looks_of, parts_of
 from perception.boards.board import Board

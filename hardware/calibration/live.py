@@ -15,24 +15,24 @@ from typing import Protocol
 import numpy as np
 
 from estimation import se3
+from estimation.calibration.lens_model import matrix_of
 from estimation.camera_calibration.board_motion import REACH
-from estimation.camera_calibration.lens_model import matrix_of
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from hardware.calibration.collect import KEEP, THREADS, Row, joined
-from hardware.calibration.corner_file import VERSION, read_corners, write_corners
+from hardware.calibration.corners import VERSION, read_corners, write_corners
 from hardware.calibration.guide import Guide
 from hardware.calibration.material import Material
 from hardware.calibration.waving_page import WavingPage
 from hardware.cameras.feed import Place
 from hardware.cameras.named import places_without_rig, sources_named
-from hardware.cameras.settings import CameraSource
+from hardware.cameras.sources import CameraSource
 from hardware.cameras.state import LiveHealth, Phase
-from hardware.clock import Clock
-from hardware.operator.request import Wish
-from hardware.progress import Progress
-from hardware.rig_file import NEAREST_RIG, ImageSource, read_rig
+from hardware.files.rig_file import NEAREST_RIG, ImageSource, read_rig
+from hardware.operator.shared_state import Wish
+from hardware.process.clock import Clock
+from hardware.process.progress import Progress
 from perception.boards.board import Board
 from perception.boards.collection import empty_table
 from perception.boards.corners import CornerFinder

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.camera_calibration.lens_model import KnownLenses, lens_of
+from estimation.calibration.lens_model import KnownLenses, lens_of
 from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware.calibration.suspicion import Pictures
-from hardware.rig_file import ImageSource
+from hardware.calibration.inputs import Pictures
+from hardware.files.rig_file import ImageSource
 from perception.boards.collection import CornerTable
 
 

@@ -10,9 +10,9 @@ from itertools import pairwise
 import numpy as np
 
 from estimation import se3
-from estimation.camera_calibration.calibrate import Calibration
-from estimation.camera_calibration.lens_model import PARAMETERS, lens_of
-from estimation.camera_calibration.rig_error import SIDE, VolumeError
+from estimation.calibration.camera_rig import Calibration
+from estimation.calibration.lens_model import PARAMETERS, lens_of
+from estimation.calibration.validation import SIDE, VolumeError
 from estimation.se3 import Array
 from hardware.calibration.coverage import coverage
 from hardware.calibration.verdict import Verdict, board_scatter, held_out, residual

@@ -10,27 +10,27 @@ from pathlib import Path
 
 import numpy as np
 
-from estimation.camera_calibration.calibrate import Calibration, calibrate, rebased
-from estimation.camera_calibration.lens_model import PARAMETERS
-from estimation.camera_calibration.rig_error import VolumeError, predicted_error, working_volume
+from estimation.calibration.camera_rig import Calibration, calibrate, rebased
+from estimation.calibration.lens_model import PARAMETERS
+from estimation.calibration.validation import VolumeError, predicted_error, working_volume
 from estimation.errors import InputError
 from estimation.rig import Rig
 from hardware.calibration.against_given import check_against, check_distance, elsewhere
 from hardware.calibration.board_file import read_board
 from hardware.calibration.collect import collect
 from hardware.calibration.coverage import hints
+from hardware.calibration.inputs import check_table
 from hardware.calibration.live import devices_named, watch
 from hardware.calibration.material import Material
 from hardware.calibration.report import millimetres_per_pixel, page
 from hardware.calibration.source import open_source
-from hardware.calibration.suspicion import check_table
 from hardware.calibration.verdict import LIMIT, Verdict, board_scatter, held_out, judge, residual
 from hardware.calibration.waving_page import WavingPage
 from hardware.cameras.live import LiveCameras
-from hardware.clock import Clock
+from hardware.files.rig_file import write_rig
 from hardware.operator.waving import WavingStage
-from hardware.progress import Progress, Report
-from hardware.rig_file import write_rig
+from hardware.process.clock import Clock
+from hardware.process.progress import Progress, Report
 from perception.boards.board import Board
 from perception.boards.collection import usable
 from perception.boards.undistorted import thumbnail, undistorted

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from estimation.rig import Rig
 from estimation.se3 import Array
+from hardware.calibration.inputs import pictures_of
 from hardware.calibration.material import Material
-from hardware.calibration.suspicion import pictures_of
-from hardware.folder import open_folder
-from hardware.rig_file import ImageSource, is_calibrated, read_rig, read_uncalibrated
-from hardware.session import Session, open_session
+from hardware.files.rig_file import ImageSource, is_calibrated, read_rig, read_uncalibrated
+from hardware.files.session import Session, open_session
+from hardware.files.session_folder import open_folder
 from perception.boards.collection import CornerTable
 
 

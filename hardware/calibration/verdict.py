@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation import se3
-from estimation.camera_calibration.calibrate import Calibration
-from estimation.camera_calibration.lens_model import image
-from estimation.camera_calibration.rig_error import VolumeError
+from estimation.calibration.camera_rig import Calibration
+from estimation.calibration.lens_model import image
+from estimation.calibration.validation import VolumeError
 from estimation.se3 import Array
 
 LIMIT = 0.1  # mm: what printing needs of the rig in the working volume, one sigma in 3D

@@ -11,14 +11,14 @@ import numpy as np
 from estimation.se3 import Array
 from hardware.calibration.coverage import DEEP, HELD, SHARE
 from hardware.calibration.guide import TOGETHER, Guide
-from hardware.clock import Clock
 from hardware.operator.link import OperatorLink
 from hardware.operator.process import OperatorPage
-from hardware.operator.request import Wish, refusal
 from hardware.operator.settings import OperatorSettings
+from hardware.operator.shared_state import Wish, refusal
 from hardware.operator.taker import PictureTaker, Shot
 from hardware.operator.view import Answer
 from hardware.operator.waving import WavingCamera, WavingStage, WavingView
+from hardware.process.clock import Clock
 from perception.frames import FrameSet
 
 NOBODY = WavingView(0.0, 1, WavingStage.WAVE)

@@ -17,8 +17,8 @@ import numpy as np
 
 from hardware.cameras.controls import Control, ask_picture, lock, read_back, untaken
 from hardware.cameras.identity import Identity, Kind, device_node
-from hardware.cameras.settings import CameraSource
-from hardware.clock import Clock
+from hardware.cameras.sources import CameraSource
+from hardware.process.clock import Clock
 from perception.frames import Image
 
 SILENT = 2  # s: a camera or stream that sends nothing for longer is opened anew

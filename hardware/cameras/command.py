@@ -6,12 +6,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hardware.command_line import Commands
+from hardware.cli.parser import Commands
 
 if TYPE_CHECKING:
     from hardware.cameras.identity import Device
     from hardware.cameras.live import LiveCameras
-    from hardware.clock import Clock
+    from hardware.process.clock import Clock
 
 
 NOTHING_THERE = """no camera is plugged in, or this user may not see it
@@ -45,7 +45,7 @@ def add_cameras(commands: Commands) -> None:
 
 def _cameras(arguments: argparse.Namespace) -> int:
     from hardware.cameras.identity import list_devices
-    from hardware.clock import WallClock
+    from hardware.process.clock import WallClock
 
     if not arguments.which:
         print(_list_json(list_devices()) if arguments.json else list_text(list_devices()))
@@ -97,7 +97,7 @@ def _watch(arguments: argparse.Namespace, live: LiveCameras, clock: Clock) -> in
     import json
 
     from hardware.cameras.inspection import inspect, inspection_sheet, inspection_table, inspection_text
-    from hardware.images import encode
+    from hardware.files.images import encode
 
     with live:
         inspection = inspect(live, arguments.seconds, clock)

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import cv2
 
-from hardware.cameras.settings import CameraSource
+from hardware.cameras.sources import CameraSource
 
 EXPOSURE_UNIT = 1e-4  # s: V4L2 counts an absolute exposure in 100 us
 MANUAL_EXPOSURE, OFF = 1.0, 0.0  # V4L2_EXPOSURE_MANUAL; the other automatics are switches

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 from hardware.cameras.capture import Capture, Opener, open_capture
 from hardware.cameras.controls import Control, locked_exposure
-from hardware.cameras.settings import CameraSource
+from hardware.cameras.sources import CameraSource
 from hardware.cameras.stamping import Stamped, Stamping
 from hardware.cameras.state import CameraState, Phase, rate
 from hardware.cameras.watch import Fault, FrameWatch
-from hardware.clock import Clock
+from hardware.process.clock import Clock
 from perception.frames import Frame, Image
 
 BACK_OFF, LONGEST_BACK_OFF = 0.1, 2.0  # s: doubled from try to try, so that a camera plugged in again is soon back

@@ -12,7 +12,7 @@ import numpy as np
 from hardware.cameras.live import LiveCameras
 from hardware.cameras.sheet import brightness, sharpness, sheet
 from hardware.cameras.state import CameraState, LiveHealth, Phase
-from hardware.clock import Clock
+from hardware.process.clock import Clock
 from perception.frames import FrameSet, Image
 
 STAMPED = {

@@ -13,10 +13,10 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.cameras.capture import Opener, open_capture
 from hardware.cameras.feed import Arrival, Feed, Place
-from hardware.cameras.gathering import Gathering
-from hardware.cameras.settings import CameraSource
+from hardware.cameras.frame_sets import Gathering
+from hardware.cameras.sources import CameraSource
 from hardware.cameras.state import LiveHealth
-from hardware.clock import Clock
+from hardware.process.clock import Clock
 from perception.frames import FrameSet
 from perception.pairing import DEFAULT_PERIOD
 

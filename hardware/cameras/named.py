@@ -9,7 +9,7 @@ from estimation.errors import InputError
 from estimation.rig import Rig
 from hardware.cameras.feed import Place
 from hardware.cameras.identity import identity_from_text
-from hardware.cameras.settings import CameraSource, read_live_rig
+from hardware.cameras.sources import CameraSource, read_live_rig
 
 
 def sources_named(which: Sequence[str]) -> tuple[Rig | None, tuple[CameraSource, ...]]:

@@ -15,7 +15,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.comparing.posed import Posed
-from hardware.evaluation import Errors, associate, best_constant, errors_under
+from hardware.report.evaluation import Errors, associate, best_constant, errors_under
 
 ALIGNMENTS = ("as they stand", "aligned, SE(3)", "one surface frame", "laid at one pose")
 HELD = 1e-3  # mm, one standard deviation in all: less is claimed of no pose that was measured

@@ -12,11 +12,11 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
-from hardware import checks
 from hardware.channels import read_poses, read_smoothed
-from hardware.pose_file import read_poses as read_pose_table
-from hardware.session import open_session
-from hardware.smoothing.files import COLUMNS, read_instants
+from hardware.files.pose_file import read_poses as read_pose_table
+from hardware.files.session import open_session
+from hardware.offline.trajectory_files import COLUMNS, read_instants
+from hardware.process import checks
 from hardware.tum import read_tum
 
 IN_FOLDERS = ("smoothed.mcap", "smoothed.csv", "poses.csv", "truth.tum", "reference.tum")  # the first that is there

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from estimation.errors import InputError
 from hardware.comparing.metrics import compare
-from hardware.comparing.page import as_dict, page, text
 from hardware.comparing.posed import read_posed, read_truth
+from hardware.offline.compare import as_dict, page, text
 from hardware.out_folder import prepare_out
-from hardware.summary import finite
+from hardware.report.summary import finite
 
 
 def run_compare(estimated: str, reference: str | None, delta: int, out: Path | None) -> str:

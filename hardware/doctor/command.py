@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hardware.command_line import Commands
+from hardware.cli.parser import Commands
 
 if TYPE_CHECKING:
     from hardware.operator.view import Check
@@ -35,11 +35,11 @@ def _doctor(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from estimation.errors import InputError
-    from hardware.clock import WallClock
     from hardware.doctor.libraries import library_checks
     from hardware.doctor.machine import machine_checks
     from hardware.live.checklist import table
     from hardware.operator.view import Verdict
+    from hardware.process.clock import WallClock
 
     if not arguments.folder.is_dir():
         raise InputError("command line", "--folder", arguments.folder, "a folder that exists")
@@ -58,7 +58,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
 
 def _devices() -> list[Check]:
     """Imported only where the libraries load: they are needed to look."""
-    from hardware.doctor.devices import device_checks
+    from hardware.cli.doctor import device_checks
 
     return device_checks()
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 from hardware.bench.machine import this_machine
 from hardware.cache_folder import REMEDY, cache_trouble
-from hardware.clock import Clock
 from hardware.evenness import evenness
 from hardware.lateness import Lateness
 from hardware.operator.view import Check, Verdict
+from hardware.process.clock import Clock
 
 ROOT = Path("/")
 CORES = 2  # one for tracking, one for motion, recorder and page

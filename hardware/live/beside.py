@@ -17,7 +17,7 @@ import numpy as np
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware import checks
+from hardware.process import checks
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,18 +6,18 @@ from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path as File
 
-from hardware.live.frame_ring import FrameRing
+from hardware.live.frame_source import FrameRing
 from hardware.live.injected import Begun
 from hardware.live.place import Place
 from hardware.live.prepared import Prepared
 from hardware.live.records import Handed, LiveMotionReport, RecorderReport, TrackingReport
-from hardware.newest import Newest
 from hardware.operator.link import OperatorLink
+from hardware.process.shared_latest import Newest
 
 
 def show(prepared: Prepared, ring: FrameRing, words: Connection, begun: Begun) -> None:
     """Show a recorded session, as cameras would."""
-    from hardware.live.feed import FeedPlan, feed_process
+    from hardware.live.session_player import FeedPlan, feed_process
 
     feed_process(FeedPlan(prepared.session, prepared.again, prepared.faults, begun), ring, words)
 

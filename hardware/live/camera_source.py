@@ -6,9 +6,9 @@ from pathlib import Path
 
 from estimation.se3 import Array
 from hardware.cameras.live import LiveCameras
-from hardware.cameras.settings import read_live_rig
-from hardware.clock import WallClock
+from hardware.cameras.sources import read_live_rig
 from hardware.live.arrived import Arrived, SourceEnded
+from hardware.process.clock import WallClock
 
 
 class CameraSource:

@@ -8,7 +8,7 @@ from hardware.arm_status import ArmState
 from hardware.live.laid import Laid
 from hardware.live.records import LiveMotionReport, RecorderReport, TrackingReport
 from hardware.operator.view import Check, Verdict
-from hardware.progress import counted
+from hardware.process.progress import counted
 from planning.path import Path
 
 FRESH = 1.0  # s: pictures older than this do not come any more

@@ -9,7 +9,7 @@ import tty
 from contextlib import suppress
 from typing import Any
 
-from hardware.operator.request import Wish
+from hardware.operator.shared_state import Wish
 
 KEYS = {
     " ": Wish.STOP,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from estimation.errors import InputError
-from hardware.arm_port import Device, UnpluggedError
-from hardware.arm_profile import ArmProfile
-from hardware.clock import WallClock
-from hardware.protocol import Pause, encode
+from hardware.arm.port import Device, UnpluggedError
+from hardware.arm.profile import ArmProfile
+from hardware.arm.protocol import Pause, encode
+from hardware.process.clock import WallClock
 
 PATIENCE = 0.5  # s in which the kernel takes the line from a process that was killed
 LOOK = 0.002  # s between tries

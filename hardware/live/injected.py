@@ -14,9 +14,9 @@ from multiprocessing.sharedctypes import RawArray
 from pathlib import Path
 from typing import Any
 
-from hardware.faults import Fault, Kind, Part
-from hardware.live.crew import Crew
-from hardware.operator.flood_count import FloodCount
+from hardware.live.fault_injection import FloodCount
+from hardware.live.ipc import Crew
+from hardware.process.faults import Fault, Kind, Part
 
 STRUCK = {Part.TRACKING: "tracking", Part.MOTION: "motion", Part.ARM: "arm", Part.DISK: "recorder"}  # processes
 FLOOD = "flood"  # processes that flood the page

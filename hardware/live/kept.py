@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path as File
 
 from estimation.errors import InputError
-from hardware.arm_file import read_arm, write_arm
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
+from hardware.files.arm_file import read_arm, write_arm
+from hardware.files.path_file import read_path, write_path
 from hardware.live.records import Begin
-from hardware.mcap_walk import Attached, walk
-from hardware.path_file import read_path, write_path
+from hardware.recording.mcap_file import Attached, walk
 from planning.path import Path
 
 PATH, ARM = "path.csv", "arm.toml"

@@ -9,7 +9,7 @@ import numpy as np
 from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from hardware.arm_profile import ArmProfile, placed
+from hardware.arm.profile import ArmProfile, placed
 from planning.kinematics import axes_from_nozzle, joints_from_axes
 from planning.limits import JOINT_MARGIN, MARGIN
 from planning.path import Path

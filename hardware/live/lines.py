@@ -8,18 +8,18 @@ from multiprocessing.connection import Connection
 from pathlib import Path as File
 
 from estimation.errors import StillbedError
-from hardware.clock import WallClock
 from hardware.live.bodies import move, move_virtually, record, show
-from hardware.live.crew import CONTEXT, Crew
-from hardware.live.frame_ring import FrameRing
+from hardware.live.frame_source import FrameRing
 from hardware.live.injected import Begun
+from hardware.live.ipc import CONTEXT, Crew
 from hardware.live.outbox import Outbox
 from hardware.live.place import Place
 from hardware.live.prepared import Prepared
 from hardware.live.records import Handed, LiveMotionReport, RecorderReport, TrackingReport
 from hardware.live.settings import VIRTUAL
-from hardware.newest import Newest
 from hardware.operator.link import OperatorLink
+from hardware.process.clock import WallClock
+from hardware.process.shared_latest import Newest
 
 Body = Callable[..., None]
 

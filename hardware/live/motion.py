@@ -7,10 +7,10 @@ from dataclasses import replace
 
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from hardware.live.place import Place
 from hardware.live.records import Begin
-from hardware.motion import MotionStep, bytes_from_command
+from hardware.motion.step import MotionStep, bytes_from_command
 from planning.command import Command, Hold
 from planning.progress import Progress
 

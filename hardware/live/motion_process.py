@@ -15,14 +15,12 @@ from types import FrameType
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
-from hardware.arm import Arm
-from hardware.arm_port import Device
-from hardware.arm_profile import ArmProfile
+from hardware.arm.link import Arm
+from hardware.arm.port import Device
+from hardware.arm.profile import ArmProfile
 from hardware.arm_status import ArmEvent
 from hardware.bookmark_file import keep_bookmark
-from hardware.clock import WallClock
 from hardware.link_settings import LinkSettings
-from hardware.live.children import settle
 from hardware.live.histograms import Histograms
 from hardware.live.motion import LiveMotion
 from hardware.live.motion_names import EXPOSURE_TO_WIRE, FRAMES_TO_WIRE, LATE
@@ -30,12 +28,14 @@ from hardware.live.outbox import Outbox
 from hardware.live.place import Place
 from hardware.live.records import Begin, Handed, LiveMotionReport, Pace, Span, WireEntry
 from hardware.live.tap import Tap
-from hardware.motion_loop import MotionLoop, Order, Tick
-from hardware.newest import Newest
-from hardware.operator.request import RequestLine
+from hardware.motion.loop import MotionLoop, Order, Tick
+from hardware.operator.shared_state import RequestLine
 from hardware.priority import ask_for_real_time
+from hardware.process.clock import WallClock
+from hardware.process.shared_latest import Newest
+from hardware.process.system import settle
+from hardware.process.ticks import InStep
 from hardware.recorded_tick import RecordedTick
-from hardware.rhythm import InStep
 
 EVENTS = 50  # of the last ones that a report holds
 SECOND_BYTE = 1  # of a frame: which instruction it is

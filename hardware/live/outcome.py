@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from hardware.chart import Plot, spanning, stretches
 from hardware.live.checklist import table
-from hardware.live.conductor import Conductor, Seen
 from hardware.live.course import Course
 from hardware.live.prepared import Prepared
 from hardware.live.records import Span
+from hardware.live.state_machine import Conductor, Seen
 from hardware.live.tally import Tally
 from hardware.page import area_key, document, figures_table, legend, line_key, row_of_tiles, section, tile
-from hardware.summary import figure, finite, percent
+from hardware.report.page import Plot, spanning, stretches
+from hardware.report.summary import figure, finite, percent
 
 DONE, CUT_SHORT, SIGNALLED = 0, 1, 128
 OVER = "Predicted, the largest of each moment while material left, over the seconds since the approach."

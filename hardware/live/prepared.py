@@ -11,20 +11,20 @@ from typing import Any
 
 from estimation.errors import InputError, StillbedError
 from estimation.rig import Rig
-from hardware.arm_file import read_arm
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from hardware.bookmark_file import read_start
 from hardware.cache_folder import cache_folder, not_written
-from hardware.faults import Fault, Part, Runner, check_faults
+from hardware.files.arm_file import read_arm
+from hardware.files.path_file import read_path
+from hardware.files.rig_file import read_rig
 from hardware.live.beside import Beside, Found, read_found
-from hardware.live.conductor import Task
-from hardware.live.crew import CONTEXT
+from hardware.live.ipc import CONTEXT
 from hardware.live.page_address import page_settings
 from hardware.live.settings import VIRTUAL, LiveSettings, check_settings, overridden, read_settings
-from hardware.mcap_walk import ChunkOf, parse, walk
-from hardware.messages import rig_from_message
-from hardware.path_file import read_path
-from hardware.rig_file import read_rig
+from hardware.live.state_machine import Task
+from hardware.process.faults import Fault, Part, Runner, check_faults
+from hardware.recording.mcap_file import ChunkOf, parse, walk
+from hardware.recording.messages import rig_from_message
 
 RIG_FILE = "rig.toml"
 

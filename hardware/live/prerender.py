@@ -21,14 +21,14 @@ from estimation.observations import no_observations
 from estimation.pose import SurfacePose, identity_pose
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
-from hardware.arm_file import write_arm
 from hardware.cache_folder import not_written
-from hardware.clock import WallClock
-from hardware.faults import Part
-from hardware.path_file import read_path, write_path
-from hardware.progress import Progress
-from hardware.recording import Recorder
-from hardware.schemas import WARNING
+from hardware.files.arm_file import write_arm
+from hardware.files.path_file import read_path, write_path
+from hardware.process.clock import WallClock
+from hardware.process.faults import Part
+from hardware.process.progress import Progress
+from hardware.recording.recorder import Recorder
+from hardware.recording.schemas import WARNING
 from hardware.simulator.cameras import Shot
 from hardware.simulator.laying import laid
 from hardware.simulator.nozzle_log import NozzleLog
@@ -41,7 +41,7 @@ from hardware.simulator.virtual_arm_file import write_virtual_arm
 from hardware.simulator.world import World
 from hardware.tum import rows_from_trajectory
 from perception.frames import FrameSet, PrintHead
-from perception.tracking import StepReport, trusting_report
+from perception.tracking.step import StepReport, trusting_report
 from planning.command import Command
 from planning.progress import Progress as Print
 

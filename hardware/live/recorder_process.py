@@ -14,9 +14,7 @@ from estimation.errors import StillbedError
 from estimation.heap import keep_pages
 from estimation.rig import Rig
 from estimation.trajectory import Trajectory
-from hardware.clock import ProcessorClock, WallClock
 from hardware.heads import row_from_head
-from hardware.live.children import settle
 from hardware.live.inbox import Inbox
 from hardware.live.records import (
     Entry,
@@ -31,9 +29,11 @@ from hardware.live.records import (
     UsedEntry,
     WireEntry,
 )
-from hardware.newest import Newest
+from hardware.process.clock import ProcessorClock, WallClock
+from hardware.process.shared_latest import Newest
+from hardware.process.system import settle
 from hardware.recorded_tick import RecordedTick
-from hardware.recording import Recorder
+from hardware.recording.recorder import Recorder
 from hardware.tum import rows_from_trajectory
 
 QUIET = 0.2  # s without anything new after which what is there goes to the disk

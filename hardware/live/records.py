@@ -14,10 +14,10 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from hardware.arm_status import ArmEvent
 from hardware.live.arrived import Encoded
-from hardware.motion_loop import Tick
+from hardware.motion.loop import Tick
 from hardware.recorded_tick import RecordedTick
 from perception.frames import Frame, PrintHead, Roi
 from planning.path import Path

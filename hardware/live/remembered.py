@@ -13,10 +13,10 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
-from hardware.mcap_walk import ChunkOf, parse, walk
-from hardware.messages import pose_from_message
-from hardware.session import Session
-from hardware.track import Step
+from hardware.files.session import Session
+from hardware.offline.track import Step
+from hardware.recording.mcap_file import ChunkOf, parse, walk
+from hardware.recording.messages import pose_from_message
 from perception.frames import FrameSet
 
 SETTLED = 1.0  # s of an earlier run, beyond where its path was laid, that make the map anew

@@ -10,13 +10,13 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from hardware.live.kept import PATH, used
-from hardware.mcap_walk import Attached, ChunkOf, Damage, parse, walk
-from hardware.messages import Message, bytes_from_message, pose_from_message
-from hardware.motion import MotionStep
+from hardware.motion.step import MotionStep
+from hardware.offline.replay import CommandWriter
 from hardware.out_folder import prepare_out
-from hardware.replay import CommandWriter
+from hardware.recording.mcap_file import Attached, ChunkOf, Damage, parse, walk
+from hardware.recording.messages import Message, bytes_from_message, pose_from_message
 from planning.command import Command
 from planning.path import Path
 

@@ -19,13 +19,11 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from hardware.arm_status import ArmState
-from hardware.clock import WallClock
 from hardware.live.beside import Found, write_found
 from hardware.live.bodies import track
 from hardware.live.checklist import table
-from hardware.live.conductor import Conductor, Orders, Seen
 from hardware.live.console import HELP, Console
 from hardware.live.halting import halt
 from hardware.live.injected import Injector
@@ -37,15 +35,17 @@ from hardware.live.page_address import page_settings
 from hardware.live.prepared import Prepared
 from hardware.live.records import Begin, EventEntry, UsedEntry
 from hardware.live.settings import settings_text
+from hardware.live.state_machine import Conductor, Orders, Seen
 from hardware.live.tally import Tally
 from hardware.live.view import Viewer
 from hardware.live.words import stage_line, status_line
-from hardware.motion_loop import Order
+from hardware.motion.loop import Order
 from hardware.operator.process import OperatorPage
-from hardware.operator.request import Request, Wish
 from hardware.operator.scene import scene_from
+from hardware.operator.shared_state import Request, Wish
 from hardware.operator.view import Stage
-from hardware.schemas import INFO, WARNING
+from hardware.process.clock import WallClock
+from hardware.recording.schemas import INFO, WARNING
 
 if TYPE_CHECKING:
     from hardware.live.outcome import Outcome

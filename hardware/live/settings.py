@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from estimation.errors import InputError
-from hardware import checks
+from hardware.process import checks
 
 LOOPBACK = "127.0.0.1"  # nobody but this machine
 VIRTUAL = "virtual"  # the arm that needs no device

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hardware.operator.request import Wish
+from hardware.operator.shared_state import Wish
 from hardware.operator.view import Stage
 
 RUNNING = (Stage.APPROACH, Stage.PRINT, Stage.HOMING, Stage.PAUSED)  # the arm may move, or is armed

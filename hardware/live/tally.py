@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimation import se3
-from hardware.live.conductor import Seen
 from hardware.live.course import Course
 from hardware.live.histograms import Histograms
+from hardware.live.state_machine import Seen
 from hardware.operator.view import Stage
 from planning.command import Move
 from planning.kinematics import SimpleArm, nozzle_from_axes

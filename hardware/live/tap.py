@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from hardware.arm_port import Opener, Port
+from hardware.arm.port import Opener, Port
 
 Heard = Callable[[bytes, bool], None]  # (bytes, whether they were sent rather than received)
 

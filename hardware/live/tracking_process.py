@@ -23,13 +23,12 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
-from hardware.arm_profile import ArmProfile
-from hardware.clock import WallClock
+from hardware.arm.profile import ArmProfile
 from hardware.commanded import Commanded
+from hardware.files.session import Session, open_session
 from hardware.heads import head_from_row, row_from_head
 from hardware.live.arrived import Arrived, Source
-from hardware.live.children import gone, settle
-from hardware.live.frame_ring import FrameRing, RingSource
+from hardware.live.frame_source import FrameRing, RingSource
 from hardware.live.histograms import Histograms
 from hardware.live.outbox import Outbox
 from hardware.live.outline import Outline
@@ -44,15 +43,16 @@ from hardware.live.records import (
     TrackingReport,
 )
 from hardware.live.remembered import remember, true_pose
-from hardware.newest import Newest
 from hardware.operator.link import OperatorLink
 from hardware.operator.taker import PictureTaker, Shot
 from hardware.priority import ask_to_go_first, settle_memory
-from hardware.rhythm import own_interval
-from hardware.session import Session, open_session
+from hardware.process.clock import WallClock
+from hardware.process.shared_latest import Newest
+from hardware.process.system import gone, settle
+from hardware.process.ticks import own_interval
 from hardware.tracker import tracker
 from perception.frames import FrameSet, PrintHead, Roi
-from perception.tracking import STAGES
+from perception.tracking.step import STAGES
 
 RIG = ".toml"  # of a file that names live cameras
 PATIENCE = 0.1  # s of a wait for frames, after which it looks who else is still there

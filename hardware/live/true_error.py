@@ -14,7 +14,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.se3 import Array
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from hardware.live.records import LiveMotionReport, TrackingReport
 from planning.command import Move
 from planning.kinematics import nozzle_from_axes

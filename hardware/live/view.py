@@ -8,13 +8,13 @@ from math import nan
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.arm_profile import ArmProfile
+from hardware.arm.profile import ArmProfile
 from hardware.arm_status import ArmState
-from hardware.live.conductor import Conductor, Seen
 from hardware.live.motion_names import FRAMES_TO_WIRE
 from hardware.live.prepared import Prepared
 from hardware.live.records import LiveMotionReport, TrackingReport
 from hardware.live.stages import QUESTIONS
+from hardware.live.state_machine import Conductor, Seen
 from hardware.live.tally import Tally
 from hardware.live.true_error import TrueError
 from hardware.operator.view import (

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hardware.arm_profile import ArmProfile
-from hardware.clock import RememberingClock, WallClock
-from hardware.faults import Fault
-from hardware.live.children import settle
+from hardware.arm.profile import ArmProfile
 from hardware.priority import ask_for_real_time
-from hardware.simulator.arm_settings import ArmSettings, Replies
+from hardware.process.clock import RememberingClock, WallClock
+from hardware.process.faults import Fault
+from hardware.process.system import settle
+from hardware.simulator.arm.settings import ArmSettings, Replies
 from hardware.simulator.port import run_virtual_arm
 from hardware.simulator.virtual_arm_file import read_virtual_arm
 

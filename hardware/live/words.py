@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hardware.live.conductor import Conductor, Seen
+from hardware.live.state_machine import Conductor, Seen
 from hardware.operator.view import Stage, Verdict
 
 

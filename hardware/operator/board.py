@@ -6,7 +6,7 @@ import asyncio
 from collections import deque
 from math import nan
 
-from hardware.operator.bundle import pictures_bytes, scene_text, text, text_of
+from hardware.operator.broadcast import pictures_bytes, scene_text, text, text_of
 from hardware.operator.link import OperatorLink
 from hardware.operator.pictures import Pictures
 from hardware.operator.scene import Scene

@@ -11,12 +11,11 @@ from math import nan
 import numpy as np
 
 from estimation.pose import TrackState
-from hardware.clock import Clock, WallClock
 from hardware.operator.demo_world import Painter, demo_path, demo_rig, demo_scene, nozzle_at, surface_at
 from hardware.operator.link import OperatorLink
 from hardware.operator.process import OperatorPage
-from hardware.operator.request import Request, Wish, refusal
 from hardware.operator.settings import OperatorSettings
+from hardware.operator.shared_state import Request, Wish, refusal
 from hardware.operator.taker import PictureTaker
 from hardware.operator.view import (
     Activity,
@@ -31,6 +30,7 @@ from hardware.operator.view import (
     TrackingView,
     Verdict,
 )
+from hardware.process.clock import Clock, WallClock
 
 PERIOD = 0.1  # s between two views
 SPEED = 9.0  # checkpoints/s

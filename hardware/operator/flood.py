@@ -12,12 +12,12 @@ import math
 
 import aiohttp
 
-from hardware.clock import WallClock
-from hardware.faults import Fault
-from hardware.live.children import settle
+from hardware.live.fault_injection import FloodCount
 from hardware.live.injected import Begun
-from hardware.operator.flood_count import FloodCount
 from hardware.operator.window import REFUSED
+from hardware.process.clock import WallClock
+from hardware.process.faults import Fault
+from hardware.process.system import settle
 
 WINDOWS = 12  # more than the page lets in at once
 SAID = (json.dumps({"shown": 1}), json.dumps({"ask": "resume", "turn": 0, "tag": 1}), '{"ask":')

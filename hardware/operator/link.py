@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from hardware.newest import Newest
 from hardware.operator import pictures, scene
 from hardware.operator.pictures import Pictures
-from hardware.operator.request import RequestLine
 from hardware.operator.scene import Scene
+from hardware.operator.shared_state import RequestLine
 from hardware.operator.view import OperatorView
 from hardware.operator.waving import WavingView
+from hardware.process.shared_latest import Newest
 
 
 def _pictures() -> Newest[Pictures]:

@@ -10,14 +10,14 @@ from socket import socket as Listener
 
 from aiohttp import web
 
-from hardware.clock import WallClock
 from hardware.operator.board import Board
-from hardware.operator.bundle import text
+from hardware.operator.broadcast import text
 from hardware.operator.gate import Gate, answer_headers
 from hardware.operator.link import OperatorLink
-from hardware.operator.request import Wish
 from hardware.operator.settings import Limits, OperatorSettings
+from hardware.operator.shared_state import Wish
 from hardware.operator.window import Window
+from hardware.process.clock import WallClock
 
 LOOK = 0.04  # s: how soon what the run puts out is seen
 STRANGERS = 32  # connections that are no windows: a browser keeps six

@@ -14,11 +14,11 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.clock import Clock, WallClock
-from hardware.images import small_jpeg
-from hardware.newest import Newest
+from hardware.files.images import small_jpeg
 from hardware.operator.pictures import CameraPicture, Pictures
-from hardware.operator.request import RequestLine
+from hardware.operator.shared_state import RequestLine
+from hardware.process.clock import Clock, WallClock
+from hardware.process.shared_latest import Newest
 from perception.frames import Image
 
 WIDTH = 640  # px: three side by side fill a screen

@@ -12,7 +12,7 @@ from math import nan
 
 from estimation.pose import SurfacePose, TrackState, position_sigma
 from estimation.se3 import Array
-from hardware.operator.request import Wish
+from hardware.operator.shared_state import Wish
 
 
 class Stage(StrEnum):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from hardware.operator.request import Wish
+from hardware.operator.shared_state import Wish
 from hardware.operator.view import Answer
 
 

@@ -10,12 +10,12 @@ from collections import deque
 
 from aiohttp import WSMsgType, web
 
-from hardware.clock import Clock
 from hardware.operator.board import Board
-from hardware.operator.bundle import text
-from hardware.operator.request import ALWAYS, RequestLine, Wish, refusal
+from hardware.operator.broadcast import text
 from hardware.operator.settings import Limits
+from hardware.operator.shared_state import ALWAYS, RequestLine, Wish, refusal
 from hardware.operator.words import Allowance, Ask, Shown, parsed
+from hardware.process.clock import Clock
 
 PULSE = 0.25  # s: so often a window is told how old everything is, even if nothing is new
 FLOOD = 400  # messages beyond what is allowed, after which a window is closed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 
-from hardware.operator.request import Wish
+from hardware.operator.shared_state import Wish
 
 LARGEST = 2**53 - 1  # what a browser's numbers can count to
 

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from estimation.se3 import Array
-from hardware.chart import round_step
+from hardware.report.page import round_step
 from planning.fill.bead import Bead
 from planning.layers.figures import LayerFigures
 from planning.layers.plan import PlannedLayer

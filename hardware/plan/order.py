@@ -15,7 +15,7 @@ from planning.fill.pattern import Kind, Pattern
 from planning.layers.bumps import Passing
 from planning.layers.checkpoints import Way
 from planning.layers.plan import Order
-from planning.layers.stack import Mode
+from planning.layers.slicing import Mode
 from planning.layers.tissue import Tissue
 from planning.layers.tool import ToolLimits
 from planning.path import COLDEST, FASTEST, HOTTEST

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from estimation.se3 import Array
 from hardware.page import document, figures_table, row_of_tiles, section, tile
 from hardware.plan.layer_picture import len_text
-from hardware.progress import counted, duration
+from hardware.process.progress import counted, duration
 from planning.layers.figures import LayerFigures, Total, seconds_to
 from planning.layers.grid import at
 from planning.layers.plan import Plan

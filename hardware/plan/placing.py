@@ -17,7 +17,7 @@ from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.rig import Camera
 from estimation.se3 import Array
-from hardware.session import open_session
+from hardware.files.session import open_session
 from perception.frames import FrameSet
 
 MOST_SETS = 12  # frame sets that are tried: the first map, its confirmation, the averaging, and some that fail
@@ -83,8 +83,8 @@ def _verdict(pose: SurfacePose) -> str:
 
 
 def _sights(cameras: Sequence[Camera], frames: FrameSet, pose: SurfacePose, outline: Array) -> tuple[Sight, ...]:
-    from perception.segmentation import NetworkSegmenter  # loads onnxruntime
-    from perception.wound_network import WoundNetwork, shipped
+    from perception.wound.network import WoundNetwork, shipped
+    from perception.wound.segmentation import NetworkSegmenter  # loads onnxruntime
 
     network = WoundNetwork(shipped(), threads=1)
     segmenter = NetworkSegmenter(network, network.settings)
@@ -97,7 +97,7 @@ def _sights(cameras: Sequence[Camera], frames: FrameSet, pose: SurfacePose, outl
 
 def _sight(camera: Camera, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], pose: Array, outline: Array) -> Sight:
     from perception.lens import undistort
-    from perception.segmentation import centroid
+    from perception.wound.segmentation import centroid
 
     if not mask.any():
         return Sight(camera.name, float("nan"), float("nan"))

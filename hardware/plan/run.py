@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.clock import WallClock
 from hardware.contour_file import read_contour
+from hardware.files.mesh_file import read_raw_mesh
+from hardware.files.path_file import write_path
 from hardware.gcode_file import gcode_text
-from hardware.mesh_file import read_raw_mesh
-from hardware.path_file import write_path
+from hardware.offline.reach import with_feasible
 from hardware.plan.findings import NOT_ASKED, bump_facts, bumps_text, bumpy, findings_rows, notes_of
 from hardware.plan.layer_picture import bounds_of, layer_svg, len_text
 from hardware.plan.order import Wishes, check_out, order_of
 from hardware.plan.page import Story, material_text, page_text
 from hardware.ply_file import write_ply
-from hardware.progress import Progress, counted, duration
-from hardware.reach import with_feasible
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress, counted, duration
 from hardware.scan_units import in_mm
 from planning.layers.figures import LayerFigures, Total, figures_of, total_of
 from planning.layers.flat_wound import flat_wound
@@ -255,7 +255,7 @@ def _told(plan: Plan, subject: Subject, total: Total, out: Path, written: Sequen
 
 
 def _check_session(session: Path, flat: bool) -> None:
-    from hardware.session import open_session
+    from hardware.files.session import open_session
 
     if flat:
         raise InputError("command line", "--session", session, "nothing with a contour: it has no shape to be found by")

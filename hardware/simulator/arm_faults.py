@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hardware.faults import Fault, Kind, Part, struck
-from hardware.protocol import LENGTH
+from hardware.arm.protocol import LENGTH
+from hardware.process.faults import Fault, Kind, Part, struck
 
 _BITS = 8 * LENGTH
 _LOSING = (Kind.DROP, Kind.GARBLE)

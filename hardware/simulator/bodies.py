@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.simulator.noise import smooth
-from hardware.simulator.shape import STEP, Shape, shape_from_function
+from hardware.simulator.scene.fields import smooth
+from hardware.simulator.scene.shape import STEP, Shape, shape_from_function
 
 MARGIN = 9.0  # mm of body under the drape on every side of the opening
 

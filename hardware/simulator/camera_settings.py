@@ -26,9 +26,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from estimation.errors import InputError
-from hardware import checks
-from hardware.checks import Table
-from hardware.simulator.keys import Keys
+from hardware.process import checks
+from hardware.process.checks import Table
+from hardware.simulator.scenario_tables import Keys
 
 
 @dataclass(frozen=True, slots=True)

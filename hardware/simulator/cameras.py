@@ -9,7 +9,7 @@ from enum import Enum
 
 import numpy as np
 
-from hardware.faults import Fault, Kind, Part, struck
+from hardware.process.faults import Fault, Kind, Part, struck
 from hardware.simulator.camera_settings import CameraSettings
 
 FATE_STREAM, GAIN_STREAM = 22, 23  # of the scenario's seed: no other draw of the simulator shares them

@@ -7,7 +7,7 @@ import numpy as np
 
 from hardware.simulator.field import Field, Size, ramp
 from hardware.simulator.layers import Texture, linear
-from hardware.simulator.noise import octaves, stretched, strokes, wander
+from hardware.simulator.scene.fields import octaves, stretched, strokes, wander
 
 TEAL = linear([136, 122, 44])
 HEM = linear([150, 138, 64])

@@ -9,11 +9,12 @@ import numpy as np
 
 from estimation import se3
 from estimation.se3 import Array
-from hardware.simulator import cloth, nozzle_shape, sheet
+from hardware.simulator import cloth, nozzle_shape
 from hardware.simulator.field import Field, enlarged, field, looked_up
 from hardware.simulator.hits import block
+from hardware.simulator.scene import drape as sheet
+from hardware.simulator.scene.rays import Rays, View
 from hardware.simulator.state import State, moved
-from hardware.simulator.view import Rays, View
 
 LATTICE = 8  # px between the rays that are traced
 STEPS = 20

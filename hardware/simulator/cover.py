@@ -8,7 +8,7 @@ import numpy as np
 from estimation import se3
 from estimation.rig import Camera, pixels_from_points
 from estimation.se3 import Array
-from hardware.faults import Fault, drawn
+from hardware.process.faults import Fault, drawn
 from perception.frames import Image
 
 EXTENT = np.array([[x, y, 0.0] for x in (-26.0, 26.0) for y in (-19.0, 19.0)])  # mm, round a usual wound

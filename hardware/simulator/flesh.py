@@ -6,8 +6,8 @@ import numpy as np
 
 from hardware.simulator.field import Field, Size, blurred, field, ramp
 from hardware.simulator.layers import Texture, linear
-from hardware.simulator.noise import cells, octaves, smooth, spots, strokes, wander
-from hardware.simulator.skin import Coat
+from hardware.simulator.scene.fields import cells, octaves, smooth, spots, strokes, wander
+from hardware.simulator.scene.textures import Coat
 
 RED = linear([38, 34, 158])
 DEEP = linear([28, 20, 96])

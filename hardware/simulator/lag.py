@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.se3 import Array
-from hardware.chart import stretches
+from hardware.report.page import stretches
 from hardware.simulator.nozzle_log import NozzleLog, row_step
 
 SEARCH = 0.25  # s, the largest shift tried; a loop later than this follows nothing that breathes

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.simulator.shape import Shape
+from hardware.simulator.scene.shape import Shape
 from planning.path import Path
 
 PIECE = 1.0  # mm: beds of wounds are uneven over a few

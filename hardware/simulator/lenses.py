@@ -10,7 +10,7 @@ import numpy as np
 from estimation import se3
 from estimation.rig import Camera
 from estimation.se3 import Array
-from hardware.faults import Fault, drawn
+from hardware.process.faults import Fault, drawn
 from hardware.simulator.cameras import Shot
 
 

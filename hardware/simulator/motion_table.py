@@ -29,8 +29,8 @@ from estimation.se3 import Array
 from estimation.synthetic.draws import WIDEST, BreathingSpec, draw_breathing, draw_noise, draw_pulse, draw_walk
 from estimation.synthetic.motions import FRAMES_PER_S, Driven, Motion, Part, shaking_amplitude
 from estimation.synthetic.waveforms import Corners, Levels, Sine, Steps, Waveform, Zigzag
-from hardware.checks import Table
-from hardware.simulator.keys import Keys
+from hardware.process.checks import Table
+from hardware.simulator.scenario_tables import Keys
 from hardware.simulator.trace_file import read_trace
 from hardware.simulator.traces import traced
 

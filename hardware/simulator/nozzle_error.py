@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.se3 import Array
-from hardware.evaluation import Spread, spread
+from hardware.report.evaluation import Spread, spread
 from hardware.simulator.hold_reasons import Holds, HoldSpan, hold_spans, holds_of
 from hardware.simulator.lag import Lag, lag_of
 from hardware.simulator.nozzle_log import NozzleLog, row_step

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware import checks
+from hardware.process import checks
 from hardware.simulator.nozzle_error import NozzleErrors, nozzle_errors
 from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.planned_line import PlannedLine

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.chart import Plot, stretches, thinned
 from hardware.page import area_key, document, figures_table, legend, line_key, row_of_tiles, section, tile
-from hardware.report import HALF, WIDTH, sections
+from hardware.report.page import Plot, stretches, thinned
+from hardware.report.report import HALF, WIDTH, sections
+from hardware.report.summary import figure
 from hardware.simulator.lag import Lag
 from hardware.simulator.nozzle_error import NEAR
 from hardware.simulator.nozzle_log import row_step
@@ -26,7 +27,6 @@ from hardware.simulator.nozzle_summary import (
     share,
 )
 from hardware.simulator.print_picture import KINDS, bead_picture, view_of, way_keys, way_picture
-from hardware.summary import figure
 
 KIND = "stillbed simulate"
 FOOTER = (

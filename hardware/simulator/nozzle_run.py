@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from hardware.evaluation import Evaluation, spread
+from hardware.report.evaluation import Evaluation, spread
 from hardware.simulator.deposit import DepositMap, deposit_figures, deposit_map
 from hardware.simulator.nozzle_error import NozzleErrors, nozzle_errors, nozzle_figures
 from hardware.simulator.nozzle_log import NozzleLog

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from hardware.evaluation import Spread
+from hardware.report.evaluation import Spread
+from hardware.report.summary import figure, finite, percent, spread_dict
 from hardware.simulator.nozzle_error import NEAR
 from hardware.simulator.nozzle_run import NozzleResult
 from hardware.simulator.run_limits import Verdict
-from hardware.summary import figure, finite, percent, spread_dict
 
 PARTS = ("median", "rmse", "p95", "p99", "max")
 HEADS = ("median", "RMS", "95 %", "99 %", "max")

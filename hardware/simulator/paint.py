@@ -6,12 +6,14 @@ import cv2
 import numpy as np
 
 from estimation.errors import InputError
-from hardware.simulator import cloth, flesh, sheet, skin
+from hardware.simulator import cloth, flesh
 from hardware.simulator.bodies import MARGIN
 from hardware.simulator.field import Field, Size, blurred, field, gradient, looked_up, ramp
 from hardware.simulator.layers import Layers, Texture, linear, texels
 from hardware.simulator.look import Look
-from hardware.simulator.shape import Shape
+from hardware.simulator.scene import drape as sheet
+from hardware.simulator.scene import textures as skin
+from hardware.simulator.scene.shape import Shape
 
 FADE = (5.5, 8.5)  # mm outside the opening: over this the painted drape hands over to the sheet
 

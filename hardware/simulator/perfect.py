@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from estimation.forecast.predictor import Predictor
 from estimation.observations import no_observations
 from estimation.pose import SurfacePose, TrackState
-from estimation.predictor import Predictor
 from estimation.se3 import Array
 from hardware.simulator.truth import Truth
 from perception.frames import FrameSet
-from perception.tracking import STAGES, StepReport, trusting_report
+from perception.tracking.step import STAGES, StepReport, trusting_report
 
 SURE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: exact, but no matrix without an inverse
 

@@ -13,7 +13,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.simulator.instant import Instant
 from hardware.simulator.render import render
-from hardware.simulator.scene import Scene
+from hardware.simulator.scene.scene import Scene
 from hardware.simulator.sensor import Sensor
 from perception.features import grey
 from perception.frames import Image

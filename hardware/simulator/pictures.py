@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hardware.images import encode
+from hardware.files.images import encode
 from hardware.simulator.cameras import Fate, Shot, garble
 from hardware.simulator.cover import laid_over
 from hardware.simulator.instant import Instant
 from hardware.simulator.lenses import Lenses
 from hardware.simulator.render import render
-from hardware.simulator.scene import Scene
+from hardware.simulator.scene.scene import Scene
 from hardware.simulator.sensor import Sensor
 
 NOISE, DAMAGE = 5, 6  # streams of random numbers of one picture

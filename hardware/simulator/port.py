@@ -13,12 +13,12 @@ from typing import TextIO
 import numpy as np
 
 from estimation.errors import InputError
-from hardware.arm_profile import BITS_PER_BYTE, ArmProfile
-from hardware.checks import why
-from hardware.clock import Clock, WallClock
-from hardware.faults import Fault
-from hardware.simulator.arm_settings import ArmSettings
-from hardware.simulator.controller import VirtualArm
+from hardware.arm.profile import BITS_PER_BYTE, ArmProfile
+from hardware.process.checks import why
+from hardware.process.clock import Clock, WallClock
+from hardware.process.faults import Fault
+from hardware.simulator.arm.controller import VirtualArm
+from hardware.simulator.arm.settings import ArmSettings
 from hardware.simulator.pty_link import open_pty
 
 HEADER = "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.se3 import Array
-from hardware.chart import round_step, stretches
+from hardware.report.page import round_step, stretches
 from hardware.simulator.deposit import HALF, DepositMap, gaps_and_overlaps
 from hardware.simulator.nozzle_run import NozzleResult
 

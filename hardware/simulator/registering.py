@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
+from estimation.online.pose_solver import solve_pose
 from estimation.pose import SurfacePose
-from estimation.pose_solver import solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware.simulator.shape import Shape
+from hardware.simulator.scene.shape import Shape
 from hardware.simulator.truth import Truth
 
 STEPS = 12  # Newton steps from the mean plane onto the surface; wounds are met in four

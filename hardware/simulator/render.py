@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from estimation.rig import Camera
 from hardware.simulator.cloth_picture import LATTICE, ClothPicture, cloth_picture
 from hardware.simulator.instant import Instant
-from hardware.simulator.nozzle_picture import nozzle_picture, part_boxes, whole_box
-from hardware.simulator.scene import Scene
+from hardware.simulator.scene.rays import SAMPLES, Box, View
+from hardware.simulator.scene.render import nozzle_picture, part_boxes, whole_box
+from hardware.simulator.scene.scene import Scene
+from hardware.simulator.scene.surface_picture import SkinPicture, skin_picture
 from hardware.simulator.sensor import Sensor, expose
-from hardware.simulator.skin_picture import SkinPicture, skin_picture
 from hardware.simulator.state import State, state
-from hardware.simulator.view import SAMPLES, Box, View
 from perception.frames import Image
 
 

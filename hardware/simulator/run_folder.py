@@ -22,12 +22,12 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.trajectory import Trajectory
-from hardware.arm_file import write_arm
+from hardware.files.arm_file import write_arm
+from hardware.files.pose_file import PoseWriter
 from hardware.heads import row_from_head
-from hardware.pose_file import PoseWriter
-from hardware.recording import Recorder
-from hardware.replay import CommandWriter
-from hardware.schemas import INFO, WARNING
+from hardware.offline.replay import CommandWriter
+from hardware.recording.recorder import Recorder
+from hardware.recording.schemas import INFO, WARNING
 from hardware.session_folder import SessionFolder
 from hardware.simulator.cameras import JITTER_LIMIT, Shot
 from hardware.simulator.nozzle_file import NozzleWriter
@@ -37,7 +37,7 @@ from hardware.simulator.scenario import Scenario
 from hardware.simulator.watch import Watch
 from hardware.tum import rows_from_trajectory
 from perception.frames import FrameSet, PrintHead, Roi
-from perception.tracking import STAGES, StepReport
+from perception.tracking.step import STAGES, StepReport
 from planning.command import Command, Move
 from planning.progress import Progress
 

@@ -22,8 +22,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from estimation.errors import InputError
-from hardware import checks
-from hardware.evaluation import Spread
+from hardware.process import checks
+from hardware.report.evaluation import Spread
 from hardware.simulator.deposit import DepositFigures
 from hardware.simulator.nozzle_error import NozzleFigures
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.motions import Motion
-from hardware.arm_profile import ArmProfile
-from hardware.checks import Table
-from hardware.faults import Fault
+from hardware.arm.profile import ArmProfile
 from hardware.methods import MAP
-from hardware.simulator.arm_settings import ArmSettings
+from hardware.process.checks import Table
+from hardware.process.faults import Fault
+from hardware.simulator.arm.settings import ArmSettings
 from hardware.simulator.camera_settings import CameraSettings
 from hardware.simulator.run_limits import RunLimits
 from hardware.simulator.sensor import Sensor

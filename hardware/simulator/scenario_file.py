@@ -34,15 +34,15 @@ from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware import checks
-from hardware.arm_file import read_arm, tool_from_value
-from hardware.arm_profile import BITS_PER_BYTE, LONGEST_LAG, ArmProfile, placed
-from hardware.checks import Table
-from hardware.faults import Fault, Runner, check_faults, faults_from_texts
+from hardware.arm.profile import BITS_PER_BYTE, LONGEST_LAG, ArmProfile, placed
+from hardware.arm.protocol import LENGTH
+from hardware.files.arm_file import read_arm, tool_from_value
+from hardware.files.rig_file import read_rig
 from hardware.methods import MAP, THESIS, THESIS_FLOW
-from hardware.protocol import LENGTH
-from hardware.rig_file import read_rig
-from hardware.simulator.arm_settings import ArmSettings, arm_settings_from_table
+from hardware.process import checks
+from hardware.process.checks import Table
+from hardware.process.faults import Fault, Runner, check_faults, faults_from_texts
+from hardware.simulator.arm.settings import ArmSettings, arm_settings_from_table
 from hardware.simulator.camera_settings import camera_settings_from_table
 from hardware.simulator.motion_table import motion_from_tables, waveform_from_table
 from hardware.simulator.run_limits import limits_from_table

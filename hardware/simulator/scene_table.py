@@ -32,15 +32,15 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST
-from hardware.checks import Table
-from hardware.mesh_file import read_mesh
+from hardware.files.mesh_file import read_mesh
+from hardware.process.checks import Table
 from hardware.simulator.bodies import BODIES, MARGIN, Wound, body, with_wound
 from hardware.simulator.deformation import BULGE, RADIUS, STRETCH, Deformation
-from hardware.simulator.keys import Keys
 from hardware.simulator.look import Look
-from hardware.simulator.scene import Scene
+from hardware.simulator.scenario_tables import Keys
+from hardware.simulator.scene.scene import Scene
+from hardware.simulator.scene.shape import Shape, shape_from_scan
 from hardware.simulator.sensor import BLUR, NOISE, VIGNETTING, Sensor
-from hardware.simulator.shape import Shape, shape_from_scan
 
 TEXEL = (0.05, 1.0)  # mm
 WOUND = (5.0, 80.0)  # mm across

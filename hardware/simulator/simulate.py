@@ -14,16 +14,19 @@ import numpy as np
 from estimation import se3
 from estimation.errors import InputError
 from estimation.trajectory import Trajectory
-from hardware.clock import WallClock
-from hardware.evaluation import Evaluation, evaluate
-from hardware.faults import Fault, Kind, Part, Runner, check_faults
+from hardware.files.path_file import read_path
+from hardware.files.pose_file import read_poses
 from hardware.methods import MAP, step_by
+from hardware.offline.track import Step
 from hardware.out_folder import prepare_out
-from hardware.path_file import read_path
 from hardware.ply_file import write_ply
-from hardware.pose_file import read_poses
-from hardware.progress import Progress
-from hardware.report import write_report
+from hardware.process.clock import WallClock
+from hardware.process.faults import Fault, Kind, Part, Runner, check_faults
+from hardware.process.progress import Progress
+from hardware.report.evaluation import Evaluation, evaluate
+from hardware.report.report import write_report
+from hardware.report.summary import write_summary
+from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.cameras import Fate, SimulatedCameras
 from hardware.simulator.laying import laid
 from hardware.simulator.nozzle_log import joined
@@ -36,16 +39,13 @@ from hardware.simulator.pty_link import PtyLink
 from hardware.simulator.run_folder import RunFolder, clear
 from hardware.simulator.scenario import Scenario
 from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.scene import STILL, Scene, rois
+from hardware.simulator.scene.scene import STILL, Scene, rois
+from hardware.simulator.scene.shape import Shape
 from hardware.simulator.scene_table import scene_from_table
-from hardware.simulator.shape import Shape
-from hardware.simulator.sight import Exposures
 from hardware.simulator.struck_surface import folded, struck_motion
 from hardware.simulator.track_tracker import TrackTracker
 from hardware.simulator.truth import Truth
 from hardware.simulator.world import World
-from hardware.summary import write_summary
-from hardware.track import Step
 from perception.frames import Roi
 from planning.path import Path as Checkpoints
 

@@ -13,7 +13,7 @@ from hardware.simulator.field import Field
 from hardware.simulator.hits import Relief
 from hardware.simulator.instant import Instant
 from hardware.simulator.lamps import Lamp, lamps
-from hardware.simulator.scene import Scene
+from hardware.simulator.scene.scene import Scene
 
 SHADOW_STEP = 0.5  # mm: a needle's shadow is 0.7 mm wide
 

@@ -10,7 +10,7 @@ import numpy as np
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.faults import Fault, Kind, Part, drawn, struck
+from hardware.process.faults import Fault, Kind, Part, drawn, struck
 from hardware.simulator.deformation import Deformation
 from hardware.simulator.truth import MotionOf
 

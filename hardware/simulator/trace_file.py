@@ -16,7 +16,7 @@ import numpy as np
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware import checks
+from hardware.process import checks
 from hardware.tum import read_rows
 
 MM = {"mm": 1.0, "m": 1000.0}

@@ -23,10 +23,10 @@ from estimation.synthetic.look import imaged
 from estimation.triangulated import Triangulated
 from hardware.simulator.cameras import Fate, Shot
 from hardware.simulator.lenses import Lenses
-from hardware.simulator.shape import Shape
+from hardware.simulator.scene.shape import Shape
 from hardware.simulator.truth import Truth
 from perception.frames import FrameSet
-from perception.tracking import STAGES, StepReport, trusting_report
+from perception.tracking.step import STAGES, StepReport, trusting_report
 
 COUNT, PATCH = 90, (56.0, 42.0)  # landmarks, and mm of the surface round the wound that they lie in
 FOUND, LEFT = 0.85, 0.5  # shares of landmarks that are found in a picture, and of those in a damaged one

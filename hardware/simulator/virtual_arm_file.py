@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from estimation.errors import InputError
-from hardware import checks
-from hardware.faults import Fault, Part, Runner, check_faults, faults_from_texts
-from hardware.simulator.arm_settings import ArmSettings, arm_settings_from_table, table_from_arm_settings
+from hardware.process import checks
+from hardware.process.faults import Fault, Part, Runner, check_faults, faults_from_texts
+from hardware.simulator.arm.settings import ArmSettings, arm_settings_from_table, table_from_arm_settings
 
 
 def write_virtual_arm(file: Path, settings: ArmSettings, faults: tuple[Fault, ...]) -> None:

@@ -20,23 +20,23 @@ from estimation import se3
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.arm_profile import ArmProfile, placed
-from hardware.clock import Clock, RememberingClock
-from hardware.images import encode
-from hardware.progress import Report, silent
+from hardware.arm.profile import ArmProfile, placed
+from hardware.files.images import encode
+from hardware.process.clock import Clock, RememberingClock
+from hardware.process.progress import Report, silent
 from hardware.session_folder import SessionFolder
-from hardware.simulator.arm_settings import ArmSettings
+from hardware.simulator.arm.controller import VirtualArm
+from hardware.simulator.arm.settings import ArmSettings
 from hardware.simulator.camera_settings import CameraSettings
 from hardware.simulator.cameras import Shot, SimulatedCameras
-from hardware.simulator.controller import VirtualArm
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look
 from hardware.simulator.pictures import NOISE
 from hardware.simulator.port import run_virtual_arm
 from hardware.simulator.render import StillScene
-from hardware.simulator.scene import Scene
+from hardware.simulator.scene.scene import Scene
+from hardware.simulator.scene.shape import cylinder
 from hardware.simulator.sensor import Sensor
-from hardware.simulator.shape import cylinder
 from planning.kinematics import SimpleArm, nozzle_from_axes
 
 DEAD, LAG = (0.005, 0.025), (0.012, 0.03)  # s between which the virtual arm's own are drawn

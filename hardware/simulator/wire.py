@@ -8,7 +8,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm_profile import BITS_PER_BYTE
+from hardware.arm.profile import BITS_PER_BYTE
 
 
 class Wire:

@@ -19,14 +19,16 @@ from estimation import se3
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.clock import Clock
 from hardware.commanded import Commanded
-from hardware.faults import Part, struck
-from hardware.motion import MotionStep
-from hardware.progress import Report, silent
+from hardware.motion.step import MotionStep
+from hardware.offline.track import Step
+from hardware.process.clock import Clock
+from hardware.process.faults import Part, struck
+from hardware.process.progress import Report, silent
 from hardware.simulator.agenda import ARRIVAL, TICK, Agenda
+from hardware.simulator.arm.controller import VirtualArm
+from hardware.simulator.camera_pipeline import Exposures, Sight, Watcher
 from hardware.simulator.cameras import Shot
-from hardware.simulator.controller import VirtualArm
 from hardware.simulator.instant import Instant
 from hardware.simulator.ledger import Ledger, executed_rows
 from hardware.simulator.lenses import Lenses
@@ -34,11 +36,9 @@ from hardware.simulator.nozzle_log import NozzleLog
 from hardware.simulator.pictures import Pictures
 from hardware.simulator.registering import truth_from_estimate
 from hardware.simulator.scenario import Scenario
-from hardware.simulator.scene import Scene
-from hardware.simulator.sight import Exposures, Sight, Watcher
+from hardware.simulator.scene.scene import Scene
 from hardware.simulator.truth import Truth
 from hardware.simulator.wire import Wire
-from hardware.track import Step
 from perception.frames import FrameSet, PrintHead
 from planning.command import Command
 from planning.kinematics import nozzle_from_axes

@@ -18,9 +18,9 @@ from hardware.simulator.bodies import BODIES, Wound, body
 from hardware.simulator.instant import Instant
 from hardware.simulator.look import Look
 from hardware.simulator.render import render
-from hardware.simulator.scene import Scene
+from hardware.simulator.scene.scene import Scene
+from hardware.simulator.scene.shape import Shape
 from hardware.simulator.sensor import Sensor
-from hardware.simulator.shape import Shape
 from perception.frames import Image
 
 TEXEL = 0.15  # mm: what a camera 350 mm away resolves; half the time of the simulator's own

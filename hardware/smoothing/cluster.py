@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from estimation.errors import InputError
-from hardware.smoothing.many import FAILED, Cluster, Job, Outcome, smooth_job
+from hardware.offline.smooth import FAILED, Cluster, Job, Outcome, smooth_job
 from hardware.smoothing.run import Wishes
 
 LOCAL = "local"

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.batch.smoothed import Smoothed
 from estimation.se3 import Array
-from estimation.smoothing.smoothed import Smoothed
 from estimation.trajectory import Trajectory
-from hardware.evaluation import Errors, associate, best_constant, errors_under
+from hardware.report.evaluation import Errors, associate, best_constant, errors_under
 from hardware.smoothing.rhythms import Rhythms, rhythms
 from hardware.smoothing.tracks import Tracks
 

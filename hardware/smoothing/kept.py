@@ -9,8 +9,8 @@ from pathlib import Path
 
 from estimation.errors import InputError
 from estimation.rig import Rig
-from hardware.mcap_walk import Attached, ChunkOf, walk
-from hardware.recording import Recorder
+from hardware.recording.mcap_file import Attached, ChunkOf, walk
+from hardware.recording.recorder import Recorder
 
 MADE_OF = "made_of.txt"  # attached to the recording, before all else in it
 

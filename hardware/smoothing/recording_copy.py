@@ -13,12 +13,12 @@ from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
 from mcap.writer import Writer
 
+from estimation.batch.smoothed import Smoothed
 from estimation.errors import StillbedError
 from estimation.pose import SurfacePose, TrackState
-from estimation.smoothing.smoothed import Smoothed
-from hardware.mcap_walk import Damage, pieces
-from hardware.messages import message_from_pose
-from hardware.schemas import POSE
+from hardware.recording.mcap_file import Damage, pieces
+from hardware.recording.messages import message_from_pose
+from hardware.recording.schemas import POSE
 
 TOPIC = "/smoothed"
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimation.batch.smoothed import Smoothed
 from estimation.se3 import Array
-from estimation.smoothing.smoothed import Smoothed
 
 BREATHING = (0.1, 0.7)  # Hz: 6 to 42 breaths a minute
 PULSE = (0.75, 3.0)  # Hz: 45 to 180 beats a minute

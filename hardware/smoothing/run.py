@@ -10,22 +10,22 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from estimation.batch.smooth import smooth
+from estimation.batch.smoothed import Smoothed
 from estimation.errors import InputError
 from estimation.smoothing.cameras import REFINED, CalibrationPrior
-from estimation.smoothing.smooth import smooth
-from estimation.smoothing.smoothed import Smoothed
-from hardware.clock import WallClock
-from hardware.evaluation import spread
-from hardware.progress import Progress
-from hardware.rig_file import write_rig
-from hardware.session import Session, damage_told, open_session
-from hardware.smoothing.files import write_instants, write_map
+from hardware.files.rig_file import write_rig
+from hardware.files.session import Session, damage_told, open_session
+from hardware.offline.smooth_report import lead, page
+from hardware.offline.smooth_tracks import Relinked, relinked
+from hardware.offline.trajectory_files import write_instants, write_map
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress
+from hardware.report.evaluation import spread
+from hardware.report.summary import finite
 from hardware.smoothing.judged import Judged, judge
 from hardware.smoothing.recording_copy import write_copy
-from hardware.smoothing.relinked import Relinked, relinked
-from hardware.smoothing.report import lead, page
 from hardware.smoothing.tracks import Tracks, tracks_of
-from hardware.summary import finite
 from hardware.tum import write_tum
 
 SUMMARY = "summary.json"

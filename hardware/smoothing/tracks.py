@@ -13,9 +13,9 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.trajectory import Trajectory
 from hardware.channels import read_observations, read_poses
-from hardware.clock import WallClock
-from hardware.progress import Progress
-from hardware.session import Session
+from hardware.files.session import Session
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress
 from hardware.smoothing.kept import keeping, made_of
 from hardware.tracker import tracker
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hardware.command_line import Commands
+from hardware.cli.parser import Commands
 
 
 def add_view(commands: Commands) -> None:

@@ -6,8 +6,8 @@ import asyncio
 import socket
 from pathlib import Path
 
+from hardware.offline.viewer import open_playback
 from hardware.operator.settings import OperatorSettings, check_settings
-from hardware.viewing.playback import open_playback
 from hardware.viewing.server import serve
 
 

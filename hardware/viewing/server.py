@@ -14,11 +14,11 @@ import numpy as np
 from aiohttp import web
 
 from estimation.errors import StillbedError
-from hardware.operator.bundle import pictures_bytes, scene_text, text
+from hardware.offline.viewer import PictureBook, Playback
+from hardware.operator.broadcast import pictures_bytes, scene_text, text
 from hardware.operator.gate import Gate, answer_headers
 from hardware.operator.server import KINDS, page_files
 from hardware.operator.settings import OperatorSettings
-from hardware.viewing.playback import PictureBook, Playback
 
 SHARED = ("camera.js", "lens.js", "panes.js", "scene.js", "words.js", "page.css", "icon.svg")  # of the operator's page
 UNREADABLE = 422  # an answer that says why, to a question that was understood
@@ -32,7 +32,7 @@ class ViewServer:
     def __init__(self, playback: Playback, settings: OperatorSettings, port: int) -> None:
         self._playback, self._book = playback, PictureBook(playback)
         self._gate, self._headers = Gate(settings, port), {**answer_headers(settings, port), "Server": "stillbed"}
-        own = {each.name: each.read_bytes() for each in (files("hardware") / "viewing" / "page").iterdir()}
+        own = {each.name: each.read_bytes() for each in (files("hardware") / "offline" / "viewer_page").iterdir()}
         self._files = {**{name: page_files()[name] for name in SHARED}, **own}
         self._session = session_text(playback)
 

@@ -18,7 +18,7 @@ from perception.thesis.axes import assign_axes, unmeasured
 from perception.thesis.camera import LONGEST, CameraTrack
 from perception.thesis.features import KeyPoints
 from perception.thesis.pairs import Finder
-from perception.tracking import STAGES, StepReport, trusting_report
+from perception.tracking.step import STAGES, StepReport, trusting_report
 
 LEAST_VARIANCE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: what is taken for none, with an inverse all the same
 OUTWARD = np.diag([1.0, -1.0, -1.0])  # the top camera from the surface: z out of it, to the camera

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from estimation.se3 import Array
-from perception.wound_network import Settings
+from perception.wound.network import Settings
 
 
 @dataclass(frozen=True, slots=True, eq=False)

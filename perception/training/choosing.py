@@ -12,10 +12,10 @@ from scipy.optimize import minimize
 from estimation.se3 import Array
 from perception.coarse_to_fine import Looks, Network
 from perception.dice import dice
-from perception.segmentation import NetworkSegmenter, judged
 from perception.training.dataset import Labelled
 from perception.training.judging import bgr
-from perception.wound_network import Settings
+from perception.wound.network import Settings
+from perception.wound.segmentation import NetworkSegmenter, judged
 
 EDGES = (0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6)
 SMALLEST = (0.0, 0.02, 0.05, 0.1, 0.2)

@@ -20,7 +20,7 @@ from perception.dice import dice
 from perception.training.dataset import Labelled
 from perception.training.loop import as_function
 from perception.training.quantise import Planes, quantise
-from perception.wound_network import Settings, WoundNetwork
+from perception.wound.network import Settings, WoundNetwork
 
 OPSET = 17
 SHAPE = (1, 3, 256, 192)  # of the input that is traced; any other height and width in steps of 32 px will do

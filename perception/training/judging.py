@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from estimation.se3 import Array
 from perception.dice import dice
 from perception.frames import Image
-from perception.segmentation import Mask, Segmenter
 from perception.training.dataset import Labelled
+from perception.wound.segmentation import Mask, Segmenter
 
 HOLDER = 0.6  # of the wound's larger side by which what covers it reaches beyond it
 

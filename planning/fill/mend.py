@@ -11,9 +11,9 @@ from scipy.ndimage import convolve1d
 
 from estimation.se3 import Array
 from planning.fill.bead import Bead
-from planning.fill.corners import denser, prepared
 from planning.fill.coverage import covered_by
 from planning.fill.fit import Fit
+from planning.fill.gap_fill import denser, prepared
 from planning.fill.order import Run
 from planning.fill.region import Region, minus
 from planning.fill.rings import dots

@@ -18,9 +18,9 @@ from shapely.geometry.base import BaseGeometry
 
 from planning.fill.axis import Axis, axis_of
 from planning.fill.bead import Bead, even
-from planning.fill.corners import widened
 from planning.fill.coverage import covered_by
 from planning.fill.fit import Fit
+from planning.fill.gap_fill import widened
 from planning.fill.region import Region, joined, minus, points_of
 from planning.fill.strokes import strokes
 

@@ -15,7 +15,7 @@ from planning.fill.bead import Bead
 from planning.layers.chart import Chart
 from planning.layers.grid import Grid, at, gradient, smoothed
 from planning.layers.runs import Runs, bends, runs_of, spaced, spacing_over
-from planning.layers.stack import Stack
+from planning.layers.slicing import Stack
 from planning.layers.tool import Tilts, ToolLimits, rotations
 from planning.path import NEAREST, Path
 

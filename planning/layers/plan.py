@@ -19,7 +19,7 @@ from planning.layers.bumps import Passing
 from planning.layers.chart import Chart, flat, unrolled
 from planning.layers.checkpoints import Ground, Laid, Way, ceiling, curvature, laid, path_of
 from planning.layers.contour import as_multi
-from planning.layers.stack import Layer, Mode, Stack, stack_in
+from planning.layers.slicing import Layer, Mode, Stack, stack_in
 from planning.layers.tissue import Tissue
 from planning.layers.tool import tilts
 from planning.layers.wound import Wound, nodes_within

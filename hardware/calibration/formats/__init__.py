@@ -20,7 +20,8 @@ class Format:
 
 def formats() -> dict[str, Format]:
     """All kinds by name."""
-    from hardware.calibration.formats import anipose, kalibr, per_camera
+    from hardware.calibration import rig_formats as per_camera
+    from hardware.calibration.formats import anipose, kalibr
 
     return {
         "opencv": Format(per_camera.read_opencv, per_camera.write_opencv, True),

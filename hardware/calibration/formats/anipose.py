@@ -9,8 +9,8 @@ import numpy as np
 
 from estimation import se3
 from estimation.rig import Rig
-from hardware import checks
 from hardware.calibration.formats.build import Entry, array, pinhole, rig_of
+from hardware.process import checks
 
 
 def read(path: Path) -> Rig:

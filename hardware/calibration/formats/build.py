@@ -11,9 +11,9 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware import checks
-from hardware.checks import Table
-from hardware.rig_file import rig_from_table
+from hardware.files.rig_file import rig_from_table
+from hardware.process import checks
+from hardware.process.checks import Table
 
 
 @dataclass(frozen=True, slots=True, eq=False)

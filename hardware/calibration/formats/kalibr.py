@@ -10,10 +10,10 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware import checks
 from hardware.calibration.formats.build import Entry, array, rig_of
 from hardware.calibration.formats.yaml_file import read_yaml, write_yaml
-from hardware.checks import Table
+from hardware.process import checks
+from hardware.process.checks import Table
 
 METRE = 1000.0  # mm
 

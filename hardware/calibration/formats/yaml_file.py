@@ -9,8 +9,8 @@ from typing import Any
 import yaml
 
 from estimation.errors import InputError
-from hardware import checks
-from hardware.checks import Table
+from hardware.process import checks
+from hardware.process.checks import Table
 
 SHORT = re.compile(r"^[-+]?\d+[eE][-+]?\d+$")  # 1e-10, which YAML 1.1 takes for a text
 ND_MATRIX = "tag:yaml.org,2002:opencv-nd-matrix"

@@ -1,0 +1,1 @@
+"""Smoothing of a whole recorded session: all poses, landmarks and camera parameters from all frame sets at once."""

@@ -1,0 +1,1 @@
+"""The map of landmarks: triangulation, bundle adjustment beside the frame's path, a local surface through it."""

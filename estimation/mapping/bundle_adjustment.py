@@ -1,0 +1,265 @@
+"""Refining the map from key frames: one GTSAM bundle adjustment, made away from the frame's path (it takes 20-300 ms).
+
+Unknown are the landmarks, the surface's pose at each key frame, and, because cameras are seldom exposed together, each
+camera's own pose of the surface at its own instant, tied to the key frame's by how far it may have moved meanwhile.
+The surface frame stays where it was given out: the refined poses of the key frames agree with the published ones on
+the whole, so that the path does not jump under the nozzle when a better map comes into force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import se3
+from estimation.heap import give_back
+from estimation.mapping.local_surface import smooth_normals
+from estimation.observations import Observations
+from estimation.online.camera_errors import Delays
+from estimation.online.pose_solver import PoseFit, project, solve_pose
+from estimation.rig import Rig
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap, motion_of
+
+LEAST_SIGHTINGS = 3
+LEAST_JUDGES = 6  # key frames: fewer cannot tell a stray landmark from a bent map, and a stray one is not asked again
+ASTRAY = 3.0  # px: rolling shutters and late cameras bend images that much
+FREE = 50.0  # mm: how far a landmark may lie from where it was; only there to keep a hardly seen one finite
+ROBUST = 3.0  # sigmas
+ONE_EYED = 1.0  # mm: of the depth that one camera gives
+SINGLE = np.diag([1 / 0.05**2] * 3 + [1 / 10.0**2] * 3)  # rad, mm: how far one camera's instant may be from another's
+LEAST_DRIFT = np.array([1e-5] * 3 + [1e-3] * 3)  # rad, mm: so that the tie stays well conditioned
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyFrame:
+    """One frame set worth keeping.
+
+    observations.track counts rows of the map. twist: (6,) rad/s and mm/s, the surface's own: it tells how far it may
+    have moved from one camera's instant to the next's.
+    """
+
+    base_from_surface: Array
+    observations: Observations
+    twist: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchors:
+    """What a scan, or the surface around it, says of each landmark, surface frame: the nearer to it, the likelier.
+
+    points, normals: (N, 3), the plane each lies on. sigma: (N,) mm across it; FREE for one that nothing is said of.
+    frame: (6, 6) covariance of the scan's own place, a right perturbation, rad and mm; zero without one.
+    """
+
+    points: Array
+    normals: Array
+    sigma: Array
+    frame: Array
+
+    def extended(self, new: Anchors) -> Anchors:
+        """The same with those of further rows."""
+        points, normals = np.concatenate([self.points, new.points]), np.concatenate([self.normals, new.normals])
+        return Anchors(points, normals, np.concatenate([self.sigma, new.sigma]), self.frame)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjusted:
+    """The refined map, same rows, same surface frame. agrees: (N,) which landmarks move with the rest."""
+
+    map: SurfaceMap
+    agrees: NDArray[np.bool_]
+
+
+def adjust(
+    rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], delays: Delays, anchors: Anchors | None = None
+) -> Adjusted | None:
+    """The map that fits all key frames best, or None if they do not determine one.
+
+    delays: how much later than stamped the cameras expose, as is known now. anchors: of the map's first rows, where
+    there is a scan or one camera alone sees them.
+
+    Base and surface swap roles (X = surface_from_base), so that GTSAM's stock projection factor with
+    body_P_sensor = base_from_camera is the measurement.
+    """
+    adjusted = _adjusted(rig, surface_map, keyframes, delays, anchors)
+    give_back()
+    return adjusted
+
+
+def _adjusted(
+    rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], delays: Delays, anchors: Anchors | None
+) -> Adjusted | None:
+    sightings = np.zeros(len(surface_map), int)
+    for frame in keyframes:
+        np.add.at(sightings, frame.observations.track, 1)
+    rows = np.nonzero(sightings >= LEAST_SIGHTINGS)[0]
+    if len(rows) < 12 or len(keyframes) < 2:
+        return None
+    graph, values = _graph(rig, surface_map, keyframes, set(rows.tolist()), delays, anchors)
+    try:
+        solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        covariance = _joint_covariance(graph.linearize(solved), rows)
+    except (RuntimeError, np.linalg.LinAlgError):
+        return None
+    points = surface_map.points.copy()
+    points[rows] = [solved.atPoint3(gtsam.symbol("l", int(r))) for r in rows]
+    if not np.isfinite(points).all() or not np.isfinite(covariance).all():
+        return None
+    whole = surface_map.covariance.copy()
+    covariance = without_frame(covariance, points[rows])
+    place = (3 * rows[:, None] + np.arange(3)).ravel()
+    whole[place] = whole[:, place] = 0.0
+    if anchors is not None:
+        covariance = covariance + of_frame(points[rows], anchors.frame)
+    whole[np.ix_(place, place)] = covariance
+    agrees = _agreement(rig, points, keyframes, solved)
+    if agrees.sum() < 12:
+        return None
+    refined = np.stack([_fit(rig, points, frame) for frame in keyframes])
+    points = se3.transform_points(frame_change(keyframes, refined, delays.sigma), points)
+    normals = surface_map.normals.copy()
+    normals[agrees] = smooth_normals(points[agrees], surface_map.normals[agrees])
+    return Adjusted(SurfaceMap(points, normals, whole), agrees)
+
+
+def without_frame(covariance: Array, points: Array) -> Array:
+    """Covariance (3N, 3N) of points (N, 3) without the part that moves all of them as one: the frame is theirs.
+
+    Each point holds the frame by what it is worth itself. Counted alike, one that a single camera sees, unknown by
+    centimetres along its ray, was measured to lend a tenth of a millimetre to each of two hundred others.
+    """
+    motion = motion_of(points) * [0.01, 0.01, 0.01, 1, 1, 1]  # of about one size
+    worth = 1 / np.maximum(np.repeat(np.diag(covariance).reshape(-1, 3).sum(1), 3), LEAST_DRIFT[3] ** 2)
+    held = motion.T * worth
+    of_frame = motion @ np.linalg.solve(held @ motion, held)
+    left = covariance - of_frame @ covariance
+    return np.asarray(left - left @ of_frame.T)
+
+
+def of_frame(points: Array, covariance: Array) -> Array:
+    """Covariance (3N, 3N) of points (N, 3) by that of their frame's place alone, (6, 6)."""
+    motion = motion_of(points)
+    return np.asarray(motion @ covariance @ motion.T)
+
+
+def frame_change(keyframes: list[KeyFrame], refined: Array, skew: float) -> Array:
+    """old_surface_from_new (4, 4): what makes refined poses (K, 4, 4) agree with the published ones in the mean.
+
+    Both are plain fits to the same pixels, with the old map and with the new, so what the cameras' instants do to a fit
+    cancels. A key frame counts the less the farther the surface may have moved between its cameras' instants, and
+    hardly where one camera alone saw it: its depth is the map's doubt many times over.
+    """
+    published = np.stack([f.base_from_surface for f in keyframes])
+    drift = skew * np.array([np.linalg.norm(f.twist[3:]) for f in keyframes])
+    alone = np.array([len(np.unique(f.observations.camera)) < 2 for f in keyframes])
+    weight = 1 / (0.05**2 + drift**2 + np.where(alone, ONE_EYED**2, 0.0))
+    change = np.eye(4)
+    for _ in range(3):
+        rest = se3.log(se3.inverse(published) @ refined @ se3.inverse(change))
+        change = se3.exp(weight @ rest / weight.sum()) @ change
+    return change
+
+
+def single_fit(rig: Rig, points: Array, seen: Observations, camera: int, near: Array) -> PoseFit:
+    """The fit to one camera's tracks alone, at its own instant, held to `near` (4, 4) where it sees little."""
+    mine = seen.only(seen.camera == camera)
+    return solve_pose(
+        rig, mine.camera, points[mine.track], mine.pixels, mine.sigma, near, scales=(4.0, 1.0), prior=SINGLE
+    )
+
+
+def _fit(rig: Rig, points: Array, frame: KeyFrame) -> Array:
+    seen = frame.observations
+    return solve_pose(
+        rig, seen.camera, points[seen.track], seen.pixels, seen.sigma, frame.base_from_surface, scales=(4.0, 1.0)
+    ).base_from_surface
+
+
+def _camera_key(camera: int, frame: int) -> int:
+    return int(gtsam.symbol(chr(ord("A") + camera), frame))
+
+
+def _graph(
+    rig: Rig,
+    surface_map: SurfaceMap,
+    keyframes: list[KeyFrame],
+    rows: set[int],
+    delays: Delays,
+    anchors: Anchors | None,
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    lenses = [gtsam.Cal3_S2(m[0, 0], m[1, 1], 0.0, m[0, 2], m[1, 2]) for m in rig.matrices]
+    sensors = [gtsam.Pose3(c.base_from_camera) for c in rig.cameras]
+    loss = gtsam.noiseModel.mEstimator.Cauchy.Create(ROBUST)
+    for i, frame in enumerate(keyframes):
+        body = gtsam.symbol("x", i)
+        start = gtsam.Pose3(se3.inverse(frame.base_from_surface))
+        values.insert(body, start)
+        # T exp(d) has the inverse X exp(-Ad(T) d): the same drift, seen from the base
+        carry = se3.adjoint(frame.base_from_surface)
+        drift = frame.twist * delays.sigma
+        along = np.outer(drift, drift) + np.diag((0.3 * np.abs(drift) + LEAST_DRIFT) ** 2)
+        loose = gtsam.noiseModel.Gaussian.Covariance(carry @ along @ carry.T)
+        seen = frame.observations
+        for c in np.unique(seen.camera):
+            own = single_fit(rig, surface_map.points, seen, int(c), frame.base_from_surface).base_from_surface
+            values.insert(_camera_key(int(c), i), gtsam.Pose3(se3.inverse(own)))
+            late = se3.exp(-carry @ frame.twist * delays.mean[c])
+            graph.add(gtsam.BetweenFactorPose3(body, _camera_key(int(c), i), gtsam.Pose3(late), loose))
+        for c, row, pixel, sigma in zip(seen.camera, seen.track, seen.pixels, seen.sigma, strict=True):
+            if int(row) in rows:
+                noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(2, float(sigma)))
+                graph.add(
+                    gtsam.GenericProjectionFactorCal3_S2(
+                        pixel, noise, _camera_key(int(c), i), gtsam.symbol("l", int(row)), lenses[c], sensors[c]
+                    )
+                )
+    held = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    graph.add(gtsam.PriorFactorPose3(gtsam.symbol("x", 0), values.atPose3(gtsam.symbol("x", 0)), held))
+    far = gtsam.noiseModel.Isotropic.Sigma(3, FREE)
+    for row in sorted(rows):
+        key = gtsam.symbol("l", row)
+        values.insert(key, surface_map.points[row])
+        if anchors is None or row >= len(anchors.sigma):
+            graph.add(gtsam.PriorFactorPoint3(key, surface_map.points[row], far))
+            continue
+        across = np.outer(anchors.normals[row], anchors.normals[row])
+        loose = FREE**2 * (np.eye(3) - across) + anchors.sigma[row] ** 2 * across
+        graph.add(gtsam.PriorFactorPoint3(key, anchors.points[row], gtsam.noiseModel.Gaussian.Covariance(loose)))
+    return graph, values
+
+
+def _joint_covariance(linear: gtsam.GaussianFactorGraph, rows: NDArray[np.int64]) -> Array:
+    """Joint covariance (3M, 3M) of the landmarks `rows`, from the dense information with all poses eliminated."""
+    ordering = gtsam.Ordering()
+    landmarks = [gtsam.symbol("l", int(r)) for r in rows]
+    known = set(landmarks)
+    poses = [key for key in linear.keyVector() if key not in known]
+    for key in landmarks + poses:
+        ordering.push_back(key)
+    information, _ = linear.hessian(ordering)
+    n = 3 * len(rows)
+    cross = information[:n, n:]
+    schur = information[:n, :n] - cross @ np.linalg.solve(information[n:, n:], cross.T)
+    return np.asarray(np.linalg.inv((schur + schur.T) / 2), float)
+
+
+def _agreement(rig: Rig, points: Array, keyframes: list[KeyFrame], solved: gtsam.Values) -> NDArray[np.bool_]:
+    """Which landmarks (N,) fit most of their sightings: what stands still while the surface moves does not."""
+    fits, total = np.zeros(len(points)), np.zeros(len(points))
+    if len(keyframes) < LEAST_JUDGES:
+        return np.ones(len(points), bool)
+    for i, frame in enumerate(keyframes):
+        seen = frame.observations
+        for c in np.unique(seen.camera):
+            mine = seen.camera == c
+            pose = se3.inverse(solved.atPose3(_camera_key(int(c), i)).matrix())
+            predicted = project(rig, seen.camera[mine], pose, points[seen.track[mine]])[0]
+            away = np.linalg.norm(predicted - seen.pixels[mine], axis=1)
+            np.add.at(fits, seen.track[mine], away < np.maximum(4 * ROBUST * seen.sigma[mine], ASTRAY))
+            np.add.at(total, seen.track[mine], 1)
+    return np.asarray((total < LEAST_SIGHTINGS) | (fits >= 0.5 * total))

@@ -1,0 +1,1 @@
+"""A scanned mesh: rays and nearest points on it, its registration, and what its shape leaves undetermined."""

@@ -1,0 +1,277 @@
+"""Where a scan lies: triangulated points against its surface, and an honest word on what its shape leaves open.
+
+Many starts (every part of the scan laid under the points, turned in steps about the normal) are ranked by how far the
+points stand off, the best are refined by robust point-to-plane steps (Chen and Medioni 1992), and what the shape holds
+is read from the eigenvalues of the information matrix (Gelfand et al., Geometrically Stable Sampling, 2003).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from estimation import se3
+from estimation.scan import Index, Scan
+from estimation.scans.observability import Freedom, freedom, without_free
+from estimation.scans.scan import ScanIndex
+from estimation.se3 import Array
+
+FEWEST = 12  # points: six unknowns, and as many again to see that they fit
+YAWS = 24  # starts per place: 15 degrees apart, half of it is within reach of the refinement
+PLACES = 150  # at most
+FIRST_POINTS, COARSE_POINTS = 24, 60  # spread over all, while there are many poses to be tried
+FIRST_STEPS = 3  # of all starts: ranked as they are laid down, those near the truth on a steep surface are lost
+KEPT = 80  # starts that are refined roughly
+FINE = 6  # and of these, those refined with exact nearest points
+FINAL = 3  # and of these, those refined with all points: more than one, to see whether the best is alone
+COARSE_SAMPLES = 4000  # of the scan: enough to lay a part of it under the points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """Where the scan lies.
+
+    base_from_surface: (4, 4) mm. rms: mm, of the points that fit, across the surface. covariance: (6, 6) of the right
+    perturbation, rad and mm; as wide as the scan along what is free. free: (K, 6) directions of that perturbation that
+    the shape does not hold. sure: whether the pose is fixed, unique and fits. verdict: the same in words. rival: (4, 4)
+    another pose that fits as well, or None.
+    """
+
+    base_from_surface: Array
+    rms: float
+    covariance: Array
+    free: Array
+    sure: bool
+    verdict: str
+    rival: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    pose: Array  # (4, 4) base_from_surface
+    cost: float  # mm^2, mean of capped squared distances
+    rms: float  # mm, of the points that count
+    share: float  # of points that count
+    freedom: Freedom
+
+
+def register(points_base: Array, sigma: float, scan: Scan, outward: Array) -> Registration:
+    """Find base_from_surface from points (N, 3) on the surface, mm, base frame.
+
+    sigma: mm, one standard deviation of a point across the surface. outward: (3,) rough direction out of the surface,
+    base frame, as from the points to the cameras. The points may cover a part of the scan only; a share of them may be
+    wrong. Deterministic.
+    """
+    assert sigma > 0 and np.isfinite(points_base).all()
+    index = ScanIndex(scan)
+    if len(points_base) < FEWEST:
+        return _nothing(index, len(points_base))
+    few = points_base[_spread_out(points_base, min(COARSE_POINTS, len(points_base)))]  # the first ones furthest apart
+    reach = 0.1 * _radius(points_base) + 3 * sigma  # mm: further off counts no more
+    poses = _starts(points_base, outward, index)
+    for _ in range(FIRST_STEPS):
+        poses = _rough_step(index, poses, few[:FIRST_POINTS], reach)
+    poses = poses[np.argsort(_costs(index, poses, few[:FIRST_POINTS], reach), kind="stable")[:KEPT]]
+    for step in range(8):
+        poses = _rough_step(index, poses, few, reach * 0.75**step)
+    ranked = poses[np.argsort(_costs(index, poses, few, reach), kind="stable")]
+    finer = [_refine(index, pose, few, sigma, reach, 12) for pose in _distinct(ranked, few, FINE)]
+    fits = [_measure(index, pose, gate, points_base, sigma) for pose, gate in finer]
+    best = sorted(zip(fits, finer, strict=True), key=lambda f: f[0].cost)[:FINAL]
+    finest = [_refine(index, pose, points_base, sigma, gate, 40) for _, (pose, gate) in best]
+    fits = [_measure(index, pose, gate, points_base, sigma) for pose, gate in finest]
+    return _judge(sorted(fits, key=lambda f: f.cost), points_base, sigma)
+
+
+def settle(points_base: Array, sigma: float, shared: float, index: ScanIndex, near: Array) -> Registration:
+    """Refine a pose `near` (4, 4) that is right to a millimetre or two, from points (N, 3), mm, base frame.
+
+    sigma: mm, of a point across the surface; shared: how much wider that is for what they tell together, where the
+    errors of neighbours are alike. Along what the shape leaves open the pose stays where it was.
+    """
+    if len(points_base) < FEWEST:
+        return replace(_nothing(index, len(points_base)), base_from_surface=near)
+    pose, gate = _refine(index, near, points_base, sigma, 10 * sigma, 20, held=True)
+    fit = _measure(index, pose, gate, points_base, sigma, shared)
+    return _judge([fit], points_base, max(sigma, fit.rms))
+
+
+def _judge(fits: list[_Fit], points: Array, sigma: float) -> Registration:
+    best = fits[0]
+    free = best.freedom
+    words = []
+    if best.rms > 2 * sigma:
+        words.append(f"poor fit: {best.rms:.3g} mm rms, {sigma:.3g} mm expected")
+    if best.share < 0.7:
+        words.append(f"poor fit: only {best.share:.0%} of the points lie on the scan")
+    rival = _rival(fits, points, sigma)
+    if rival is not None and not len(free.directions):
+        away = _apart(best.pose, rival.pose, points)
+        words.append(
+            f"ambiguous: a pose {away:.3g} mm away fits as well ({rival.rms:.3g} against {best.rms:.3g} mm rms)"
+        )
+    if len(free.directions):
+        words.append("free: " + "; ".join(free.names))
+    verdict = ". ".join(words) or f"found: {best.rms:.3g} mm rms, weakest direction good to {free.weakest:.2g} mm"
+    other = None if rival is None or len(free.directions) else rival.pose
+    return Registration(best.pose, best.rms, free.covariance, free.directions, not words, verdict, other)
+
+
+def _nothing(index: ScanIndex, count: int) -> Registration:
+    size = float(np.ptp(index.samples, axis=0).max())
+    covariance = np.diag([np.pi**2] * 3 + [size**2] * 3)
+    return Registration(np.eye(4), np.inf, covariance, np.eye(6), False, f"{count} points, {FEWEST} needed")
+
+
+def _rival(fits: list[_Fit], points: Array, sigma: float) -> _Fit | None:
+    """Another pose that fits as well as the best, within what chance explains."""
+    bound = max(fits[0].cost, sigma**2) * (1 + 4 * np.sqrt(2 / len(points)))
+    near = 0.1 * _radius(points)
+    others = [f for f in fits[1:] if f.cost < bound and _apart(f.pose, fits[0].pose, points) > near]
+    return others[0] if others else None
+
+
+def _refine(
+    index: ScanIndex, pose: Array, points: Array, sigma: float, gate: float, steps: int, held: bool = False
+) -> tuple[Array, float]:
+    """Robust point-to-plane steps (Geman-McClure) with exact nearest points: the pose, and the gate, mm.
+
+    The gate is narrowed to three of the residuals' own standard deviations as they settle. held: no steps along what
+    the shape does not hold.
+    """
+    for _ in range(steps):
+        pull, offset, inner = _pull(index, pose, points)
+        weight = (1 + (offset / gate) ** 2) ** -2
+        jacobian = np.concatenate([np.cross(inner, pull), pull], axis=1)  # -d offset / d xi
+        weighted = jacobian * weight[:, None]
+        information = weighted.T @ jacobian
+        step = np.linalg.solve(
+            information + 1e-6 * np.diag(np.diag(information)) + 1e-9 * np.eye(6), weighted.T @ offset
+        )
+        step = without_free(inner, pull, step) if held else step
+        pose = pose @ se3.exp(step)
+        spread = 1.4826 * float(np.median(np.abs(offset)))
+        narrowed = max(3 * max(spread, sigma), 0.5 * gate)
+        settled = narrowed >= 0.95 * gate and np.abs(jacobian @ step).max() < 1e-5
+        gate = min(gate, narrowed)
+        if settled:
+            break
+    return pose, gate
+
+
+def _measure(index: ScanIndex, pose: Array, gate: float, points: Array, sigma: float, shared: float = 1.0) -> _Fit:
+    """How well points (N, 3), base frame, fit at a pose; those within two gates count. shared: see `settle`."""
+    inner = se3.transform_points(se3.inverse(pose), points)
+    near = index.closest(inner)
+    distance = np.linalg.norm(inner - near.points, axis=1)
+    counts = (distance < 2 * gate) & ~near.rim
+    rms = float(np.sqrt(np.mean(distance[counts] ** 2))) if counts.any() else np.inf
+    held = freedom(inner[counts], near.normals[counts], shared * max(sigma, min(rms, gate)), index)
+    return _Fit(pose, float(np.mean(np.minimum(distance, 2 * gate) ** 2)), rms, float(counts.mean()), held)
+
+
+def _pull(index: ScanIndex, pose: Array, points: Array) -> tuple[Array, Array, Array]:
+    """Directions (N, 3) and offsets (N,), mm, of points from the scan, and the points (N, 3), in the surface frame.
+
+    The direction is the surface's normal; beside the scan's rim it is the way back to it.
+    """
+    inner = se3.transform_points(se3.inverse(pose), points)
+    near = index.closest(inner)
+    gap = inner - near.points
+    length = np.linalg.norm(gap, axis=1)
+    beside = near.rim & (length > 1e-6)
+    pull = np.where(beside[:, None], gap / np.maximum(length, 1e-12)[:, None], near.normals)
+    return pull, np.einsum("ni,ni->n", pull, gap), inner
+
+
+def _rough_step(index: ScanIndex, poses: Array, points: Array, gate: float) -> Array:
+    """One point-to-plane step of all poses (H, 4, 4) at once, against the nearest samples."""
+    inner = se3.transform_points(se3.inverse(poses), points)  # (H, N, 3)
+    _, near = index.tree.query(inner)
+    normal = index.normals[near]
+    gap = inner - index.samples[near]
+    offset = np.einsum("hni,hni->hn", normal, gap)
+    weight = (1 + np.einsum("hni,hni->hn", gap, gap) / gate**2) ** -2
+    jacobian = np.concatenate([np.cross(inner, normal), normal], axis=-1)
+    weighted = jacobian * weight[..., None]
+    information = np.swapaxes(weighted, 1, 2) @ jacobian
+    damped = information + 1e-3 * information * np.eye(6) + 1e-9 * np.eye(6)
+    step = np.linalg.solve(damped, np.einsum("hni,hn->hi", weighted, offset)[..., None])[..., 0]
+    length = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
+    return np.asarray(poses @ se3.exp(step * np.minimum(1, 0.3 / np.maximum(length, 1e-12))))
+
+
+def _costs(index: ScanIndex, poses: Array, points: Array, reach: float) -> Array:
+    """Mean squared distance (H,), each capped at `reach` mm; beside a sample the distance from its plane counts."""
+    inner = se3.transform_points(se3.inverse(poses), points)
+    _, near = index.tree.query(inner)
+    gap = inner - index.samples[near]
+    across = np.einsum("hni,hni->hn", index.normals[near], gap)
+    along = np.sqrt(np.maximum(np.einsum("hni,hni->hn", gap, gap) - across**2, 0))
+    squared = across**2 + np.maximum(along - 2 * index.spacing, 0) ** 2
+    return np.asarray(np.minimum(squared, reach**2).mean(axis=1))
+
+
+def _starts(points: Array, outward: Array, index: ScanIndex) -> Array:
+    """Poses (H, 4, 4) that lay each part of the scan under the points, centres and normals matched, at every yaw."""
+    radius = _radius(points)
+    base_from_cap = _cap(points, np.asarray(outward, float))
+    stride = max(1, len(index.samples) // COARSE_SAMPLES)
+    samples, normals = index.samples[::stride], index.normals[::stride]
+    places = samples[_spread_out(samples, PLACES, 0.5 * radius)]
+    yaws = se3.exp_rotation(np.arange(YAWS)[:, None] * [0.0, 0.0, 2 * np.pi / YAWS])
+    turned = base_from_cap @ se3.make(yaws, np.zeros(3))  # (Y, 4, 4)
+    poses = []
+    for near in cKDTree(samples).query_ball_point(places, 1.6 * radius):
+        poses.append(turned @ se3.inverse(_cap(samples[near], normals[near].mean(0))))
+    return np.concatenate(poses)
+
+
+def _cap(points: Array, outward: Array) -> Array:
+    """a_from_cap (4, 4): origin amid the points (N, 3), z their normal on the side of `outward` (3,)."""
+    centre = points.mean(0)
+    _, vectors = np.linalg.eigh((points - centre).T @ (points - centre))
+    z = vectors[:, 0] * (1 if vectors[:, 0] @ outward >= 0 else -1)
+    length = np.linalg.norm(outward)
+    if length > 1e-9 and z @ outward < 0.35 * length:  # deeper than wide: trust the direction that was given
+        z = outward / length
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    x /= np.linalg.norm(x)
+    return se3.make(np.column_stack([x, np.cross(z, x), z]), centre)
+
+
+def _radius(points: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, axis=1))))
+
+
+def _apart(a: Array, b: Array, points: Array) -> float:
+    """How far two poses lay the same points of the surface apart, mm rms."""
+    moved = se3.transform_points(b @ se3.inverse(a), points)
+    return float(np.sqrt(np.mean(np.sum((moved - points) ** 2, axis=1))))
+
+
+def _distinct(poses: Array, points: Array, count: int) -> list[Array]:
+    """The first `count` poses (H, 4, 4) of which no two are nearly the same."""
+    found: list[Array] = []
+    near = 0.1 * _radius(points)
+    for pose in poses:
+        if all(_apart(pose, other, points) > near for other in found):
+            found.append(pose)
+        if len(found) == count:
+            break
+    return found
+
+
+def _spread_out(points: Array, count: int, nearest: float = 0.0) -> Index:
+    """Numbers of up to `count` points (N, 3) as far apart as can be, farthest first, none nearer than `nearest` mm."""
+    first = int(np.argmin(np.linalg.norm(points - points.mean(0), axis=1)))
+    chosen, distance = [first], np.linalg.norm(points - points[first], axis=1)
+    while len(chosen) < count:
+        next_one = int(np.argmax(distance))
+        if distance[next_one] <= nearest:
+            break
+        chosen.append(next_one)
+        distance = np.minimum(distance, np.linalg.norm(points - points[next_one], axis=1))
+    return np.array(chosen)

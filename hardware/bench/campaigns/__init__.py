@@ -1,0 +1,1 @@
+"""Long campaigns for developers: faults, fuzzing, the arm's link, outages."""

@@ -1,0 +1,230 @@
+"""rig.toml: the calibrated cameras of a session and where each one's images are."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from estimation import se3
+from estimation.errors import InputError
+from estimation.rig import Camera, Rig
+from estimation.se3 import Array
+from hardware.process import checks
+from hardware.process.checks import Table
+
+CAMERA_KEYS = ("name", "size", "matrix", "distortion", "base_from_camera")
+SIGMA_KEY = "lens_sigma"  # one standard deviation of fx fy cx cy k1 k2 p1 p2 k3, where a calibration told it
+RECORDED_KEYS = ("video", "images")  # where a recorded session's images are
+LIVE_KEYS = (
+    "source",
+    "exposure_s",
+    "gain",
+    "focus_abs",
+    "white_balance_k",
+    "fps",
+    "format",
+)  # hardware/cameras reads them
+PINHOLE = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px"
+ROTATION_TOLERANCE = 1e-3  # four digits written by hand pass (and are made orthonormal); a wrong matrix does not
+EXACT_ROTATION = 1e-12  # below, the matrix is kept bit by bit, so that a rig written by us comes back the same
+NEAREST_RIG = 10.0  # mm: two lenses cannot stand closer, but a rig of up to 10 m given in metres does
+WIDEST_RIG = 1e5  # mm: 100 m
+SHORTEST_FOCAL = 0.1  # of the image's longer side: 157 degrees; a focal length in mm instead of px is far below
+
+
+@dataclass(frozen=True, slots=True)
+class ImageSource:
+    """Where one camera's images are. kind: "video" (a file), "images" (a glob) or "source" (live).
+
+    pattern: relative to the folder; a live source as its key has it.
+    """
+
+    kind: str
+    pattern: str
+
+
+@dataclass(frozen=True, slots=True)
+class RigFile:
+    """What rig.toml says. sources: one per camera, None where none is named. surface: the scan's file, if named.
+
+    lens_sigma: per camera one standard deviation (9,) of fx fy cx cy k1 k2 p1 p2 k3, None where it is not told.
+    """
+
+    rig: Rig
+    sources: tuple[ImageSource | None, ...]
+    surface: str | None
+    lens_sigma: tuple[Array | None, ...]
+
+
+def read_rig(path: str | Path) -> RigFile:
+    """Read and check a rig.toml; InputError names the key that is wrong."""
+    path = Path(path)
+    table = checks.read_toml(path)
+    checks.check_keys(path, "", table, ["camera"], ["surface"])
+    surface = table.get("surface")
+    rig = rig_from_table(path, table, (*RECORDED_KEYS, *LIVE_KEYS))
+    sources = tuple(_source(path, camera) for camera in table["camera"])
+    sigmas = tuple(_lens_sigma(path, camera) for camera in table["camera"])
+    return RigFile(rig, sources, None if surface is None else checks.text(path, "surface", surface), sigmas)
+
+
+def read_uncalibrated(path: Path) -> RigFile:
+    """A rig.toml that says of each camera only `name`, `size` and where its images are; the rest is a stand-in."""
+    table = checks.read_toml(path)
+    checks.check_keys(path, "", table, ["camera"], ["surface"])
+    entries = checks.tables(path, "camera", table.get("camera"))
+    for number, entry in enumerate(entries):
+        checks.check_keys(path, f"camera[{number}].", entry, ("name", "size"), ("video", "images"))
+        size = checks.numbers(path, f"camera[{number}].size", entry["size"], (2,), "[width, height] in px")
+        f, middle = float(size.max()), (size - 1) / 2
+        entry["matrix"] = [[f, 0.0, float(middle[0])], [0.0, f, float(middle[1])], [0.0, 0.0, 1.0]]
+        entry["distortion"] = [0.0] * 5
+        entry["base_from_camera"] = se3.make(np.eye(3), [NEAREST_RIG * number, 0.0, 0.0]).tolist()
+    rig = rig_from_table(path, table, ("video", "images"))
+    return RigFile(rig, tuple(_source(path, entry) for entry in entries), None, (None,) * len(rig))
+
+
+def is_calibrated(path: Path) -> bool:
+    """Whether every camera of a rig.toml has a lens and a place."""
+    table = checks.read_toml(path)
+    entries = checks.tables(path, "camera", table.get("camera"))
+    return any("matrix" in entry or "base_from_camera" in entry for entry in entries)
+
+
+def rig_from_table(where: object, table: Table, also: Sequence[str] = ()) -> Rig:
+    """The rig in a table with a `camera` list (rig.toml's or a recording's); `also`: further keys a camera may have."""
+    cameras: list[Camera] = []
+    for number, entry in enumerate(checks.tables(where, "camera", table.get("camera"))):
+        cameras.append(_camera(where, f"camera[{number}]", entry, also))
+        if cameras[-1].name in [c.name for c in cameras[:-1]]:
+            raise InputError(where, f"camera[{number}].name", cameras[-1].name, "a name that no other camera has")
+    _check_scale(where, cameras)
+    return Rig(tuple(cameras))
+
+
+def table_from_rig(rig: Rig) -> Table:
+    """The rig as plain lists and numbers, keys as in rig.toml; `rig_from_table` gives the same rig back, bit by bit."""
+    return {
+        "camera": [
+            {
+                "name": c.name,
+                "size": list(c.size),
+                "matrix": c.matrix.tolist(),
+                "distortion": c.distortion.tolist(),
+                "base_from_camera": c.base_from_camera.tolist(),
+                "clock_offset_s": c.clock_offset,
+            }
+            for c in rig.cameras
+        ]
+    }
+
+
+def write_rig(
+    path: str | Path,
+    rig: Rig,
+    sources: Sequence[ImageSource | None],
+    lens_sigma: Sequence[Array | None] | None = None,
+) -> None:
+    """Write a rig.toml that `read_rig` reads back to the same rig, bit by bit. lens_sigma: (9,) per camera, or None."""
+    sigmas = [None] * len(rig) if lens_sigma is None else lens_sigma
+    blocks = ["# mm, px; base_from_camera carries camera coordinates (x right, y down, z into the scene) to the base\n"]
+    for camera, source, sigma in zip(rig.cameras, sources, sigmas, strict=True):
+        lines = ["[[camera]]", f"name = {json.dumps(camera.name, ensure_ascii=False)}"]
+        if source is not None:
+            lines.append(f"{source.kind} = {json.dumps(source.pattern, ensure_ascii=False)}")
+        lines.append(f"size = {list(camera.size)}")
+        for key, array in (("matrix", camera.matrix), ("distortion", camera.distortion)):
+            lines.append(f"{key} = {checks.toml_numbers(array)}")
+        lines.append(f"base_from_camera = {checks.toml_numbers(camera.base_from_camera)}")
+        if camera.clock_offset:
+            lines.append(f"clock_offset_s = {checks.toml_number(camera.clock_offset)}")
+        if sigma is not None:
+            lines.append(f"{SIGMA_KEY} = {checks.toml_numbers(sigma)}")
+        blocks.append("\n".join(lines) + "\n")
+    Path(path).write_text("\n".join(blocks), encoding="utf-8")
+
+
+def _source(path: Path, camera: Table) -> ImageSource | None:
+    name = camera["name"]
+    named = [key for key in RECORDED_KEYS if key in camera]
+    if len(named) > 1:
+        raise InputError(path, f"camera {name!r}", "video and images", "one of the two")
+    return ImageSource(named[0], checks.text(path, f"camera {name!r}: {named[0]}", camera[named[0]])) if named else None
+
+
+def _lens_sigma(path: Path, camera: Table) -> Array | None:
+    if SIGMA_KEY not in camera:
+        return None
+    key = f"camera {camera['name']!r}: {SIGMA_KEY}"
+    allowed = "nine numbers of 0 or more, for fx fy cx cy k1 k2 p1 p2 k3"
+    sigma = checks.numbers(path, key, camera[SIGMA_KEY], (9,), allowed)
+    if (sigma < 0).any():
+        raise InputError(path, key, camera[SIGMA_KEY], allowed)
+    return sigma
+
+
+def _camera(where: object, key: str, entry: Table, also: Sequence[str]) -> Camera:
+    checks.check_keys(where, f"{key}.", entry, CAMERA_KEYS, [*also, "clock_offset_s", SIGMA_KEY])
+    name = _name(where, f"{key}.name", entry["name"])
+    key = f"camera {name!r}: "
+    size = checks.numbers(where, key + "size", entry["size"], (2,), "[width, height] in px")
+    if (size < 1).any() or (size != np.round(size)).any():
+        raise InputError(where, key + "size", entry["size"], "[width, height], whole px >= 1")
+    matrix = checks.numbers(where, key + "matrix", entry["matrix"], (3, 3), PINHOLE)
+    _check_matrix(where, key + "matrix", matrix, float(size.max()))
+    distortion = checks.numbers(where, key + "distortion", entry["distortion"], (5,), "k1 k2 p1 p2 k3")
+    base_from_camera = checks.numbers(where, key + "base_from_camera", entry["base_from_camera"], (4, 4), "mm")
+    offset = checks.number(where, key + "clock_offset_s", entry.get("clock_offset_s", 0.0))
+    extrinsics = _rigid(where, key + "base_from_camera", base_from_camera)
+    return Camera(name, (int(size[0]), int(size[1])), matrix, distortion, extrinsics, offset)
+
+
+def _name(where: object, key: str, value: object) -> str:
+    name = checks.text(where, key, value)
+    if name.startswith(".") or len(name) > 64 or any(c in '/\\,"' or not c.isprintable() for c in name):
+        raise InputError(where, key, name, 'up to 64 printable characters without / \\ , " and no dot in front')
+    return name
+
+
+def _check_matrix(where: object, key: str, matrix: Array, longer_side: float) -> None:
+    for name, focal in (("fx", matrix[0, 0]), ("fy", matrix[1, 1])):
+        if focal <= 0:
+            raise InputError(where, f"{key} {name}", focal, "a focal length > 0 px")
+        if focal < SHORTEST_FOCAL * longer_side:
+            least = SHORTEST_FOCAL * longer_side
+            allowed = f">= {least:g} px, {SHORTEST_FOCAL} of the image's longer side (px, not mm)"
+            raise InputError(where, f"{key} {name}", focal, allowed)
+    if matrix[0, 1] or matrix[1, 0] or (matrix[2] != [0, 0, 1]).any():
+        raise InputError(where, key, matrix.tolist(), PINHOLE)
+
+
+def _rigid(where: object, key: str, matrix: Array) -> Array:
+    if not se3.is_transform(matrix, ROTATION_TOLERANCE):
+        rotation = matrix[:3, :3]
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+            got = f"R R^T off by {error:.3g}, det {np.linalg.det(rotation):.3g}, last row {matrix[3].tolist()}"
+        raise InputError(where, key, got, "a rotation (orthonormal, right-handed) and a shift in mm, last row 0 0 0 1")
+    return matrix if se3.is_transform(matrix, EXACT_ROTATION) else se3.orthonormalise(matrix)
+
+
+def _check_scale(where: object, cameras: Sequence[Camera]) -> None:
+    """Refuse a rig in metres: no two lenses can stand within 10 mm of each other, and here all of them do.
+
+    One camera alone has no baseline, so its unit cannot be told; nor is one near pair among others refused.
+    """
+    centres = np.stack([c.base_from_camera[:3, 3] for c in cameras])
+    if (farthest := float(np.abs(centres).max())) > WIDEST_RIG:  # what is larger by far has no square
+        allowed = f"at most {WIDEST_RIG:g} mm along each axis (lengths are in mm)"
+        raise InputError(where, "base_from_camera of all cameras", f"up to {farthest:.4g} mm from the base", allowed)
+    spread = float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
+    if len(cameras) > 1 and spread < NEAREST_RIG:
+        allowed = f"{NEAREST_RIG:g} mm or more between the outermost cameras (lengths are in mm, not m)"
+        raise InputError(where, "base_from_camera of all cameras", f"at most {spread:.4g} mm apart", allowed)
+    if max(spread, float(np.linalg.norm(centres, axis=1).max())) > WIDEST_RIG:
+        allowed = f"at most {WIDEST_RIG:g} mm from the base and from each other (lengths are in mm)"
+        raise InputError(where, "base_from_camera of all cameras", f"{spread:.4g} mm apart", allowed)

@@ -1,0 +1,182 @@
+"""A session as a plain folder that a person can make by hand: rig.toml, frames.csv, videos or pictures, and more.
+
+Optional beside them: roi.toml, head.csv, truth.tum (exact) or reference.tum (measured; truth wins), surface.ply, .stl
+or .obj.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from estimation.errors import InputError
+from estimation.rig import Camera
+from estimation.trajectory import Trajectory
+from hardware.files.folder_tables import read_frames, read_heads, read_roi
+from hardware.files.images import Video, check_size, count_by_decoding, decode
+from hardware.files.rig_file import ImageSource, RigFile, read_rig
+from hardware.files.session import SURFACE_SUFFIXES, FrameRef, Session, common_stamps, frame_refs
+from hardware.heads import NO_HEADS
+from hardware.process import checks
+from hardware.tum import read_tum
+from perception.frames import Image
+
+TRUTH_FILES = (("truth.tum", True), ("reference.tum", False))  # the first that is there counts
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFiles:
+    """One camera's images. video: the file, or None; pictures: else one file per frame."""
+
+    camera: Camera
+    video: Path | None
+    pictures: tuple[Path, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FolderStore:
+    """The image files of a folder, one entry per camera."""
+
+    cameras: tuple[CameraFiles, ...]
+
+    def open(self) -> FolderReader:
+        """A reader of its own, at the beginning."""
+        return FolderReader(self.cameras)
+
+
+class FolderReader:
+    """Decodes the images of a folder; videos only go forward."""
+
+    def __init__(self, cameras: Sequence[CameraFiles]) -> None:
+        self._cameras = cameras
+        self._videos: dict[int, Video] = {}
+
+    def read(self, ref: FrameRef) -> Image:
+        """The image; InputError where it is missing, undecodable or not of the camera's size."""
+        files = self._cameras[ref.camera]
+        if files.video is None:
+            path = files.pictures[ref.number]
+            image = decode(checks.read_bytes(path), path, "picture")
+            check_size(image, files.camera.size, path, "size")
+            return image
+        frame = self._video(ref.camera, files.video, ref.number).read()
+        if frame is None:
+            allowed = "a video that decodes as far as frames.csv names frames"
+            raise InputError(files.video, f"frame {ref.number}", "cannot be decoded; the video ends early", allowed)
+        check_size(frame, files.camera.size, files.video, f"size of frame {ref.number}")
+        return frame
+
+    def _video(self, camera: int, path: Path, number: int) -> Video:
+        if camera not in self._videos:
+            self._videos[camera] = Video(path)
+        video = self._videos[camera]
+        assert video.next <= number
+        while video.next < number and video.skip():
+            pass
+        return video
+
+    def encoded(self, ref: FrameRef) -> tuple[str, bytes] | None:
+        """Format and bytes of a PNG or JPEG picture as stored, None for anything else."""
+        files = self._cameras[ref.camera]
+        if files.video is not None:
+            return None
+        kind = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}.get(files.pictures[ref.number].suffix.lower())
+        return None if kind is None else (kind, checks.read_bytes(files.pictures[ref.number]))
+
+    def close(self) -> None:
+        """Give the decoders back."""
+        for video in self._videos.values():
+            video.close()
+
+
+def open_folder(folder: Path, rig_file: RigFile | None = None) -> Session:
+    """Open a session folder; InputError says which file of it is wrong, and how.
+
+    rig_file: instead of what its rig.toml says, where that is not calibrated yet.
+    """
+    rig_file = read_rig(folder / "rig.toml") if rig_file is None else rig_file
+    rig = rig_file.rig
+    cameras = tuple(_files(folder, c, s) for c, s in zip(rig.cameras, rig_file.sources, strict=True))
+    stamps = read_frames(folder / "frames.csv", rig)
+    for files, times in zip(cameras, stamps, strict=True):
+        _check_count(folder / "frames.csv", files, len(times))
+        _check_first_image(files)
+    roi = folder / "roi.toml"
+    rois = read_roi(roi, rig, common_stamps(rig, stamps)) if roi.exists() else ()
+    head = folder / "head.csv"
+    heads = read_heads(head) if head.exists() else NO_HEADS
+    sets, surface = frame_refs(rig, stamps), _surface(folder, rig_file)
+    return Session(folder, rig, rois, surface, truth_of(folder), sets, FolderStore(cameras), heads=heads)
+
+
+def truth_of(folder: Path) -> Trajectory | None:
+    """The trajectory in truth.tum, else in reference.tum, else None."""
+    found = truth_file(folder)
+    return None if found is None else read_tum(*found)
+
+
+def truth_file(folder: Path) -> tuple[Path, bool] | None:
+    """The trajectory file that counts, and whether it is exact."""
+    return next(((folder / name, exact) for name, exact in TRUTH_FILES if (folder / name).exists()), None)
+
+
+def _files(folder: Path, camera: Camera, source: ImageSource | None) -> CameraFiles:
+    if source is None:
+        where, allowed = folder / "rig.toml", "`video = ` file or `images = ` glob"
+        raise InputError(where, f"camera {camera.name!r}", "neither video nor images", allowed)
+    if source.kind == "video":
+        return CameraFiles(camera, folder / source.pattern, ())
+    try:
+        found = [p for p in folder.glob(source.pattern) if p.is_file() and not p.name.startswith(".")]
+    except (ValueError, NotImplementedError):
+        where, what = folder / "rig.toml", f"camera {camera.name!r}: images"
+        raise InputError(where, what, source.pattern, "a glob relative to the folder, as cam_0/*.png") from None
+    return CameraFiles(camera, None, tuple(sorted(found, key=lambda p: _natural(p.as_posix()))))
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """A key that sorts frame10 behind frame9."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)]
+
+
+def _check_count(frames_csv: Path, files: CameraFiles, named: int) -> None:
+    """InputError unless frames.csv names every image once; a video that seems not to is counted out."""
+    if files.video is None:
+        there, what = len(files.pictures), "pictures"
+    else:
+        video = Video(files.video)
+        whole, what = video.reaches(named), f"frames that decode in {files.video.name}"
+        video.close()
+        there = named if whole else count_by_decoding(files.video)
+    if there != named:
+        key = f"number of frames of camera {files.camera.name!r}"
+        raise InputError(frames_csv, key, named, f"{there}, as many as there are {what}")
+
+
+def _check_first_image(files: CameraFiles) -> None:
+    if files.video is None and not files.pictures:
+        return  # a camera that gave nothing; frames.csv names no frame of it either
+    reader = FolderReader((files,))
+    reader.read(FrameRef(0, 0, 0.0, 0.0))
+    reader.close()
+
+
+def _surface(folder: Path, rig_file: RigFile) -> Path | None:
+    if rig_file.surface is not None:
+        path = folder / rig_file.surface
+        if path.suffix.lower() not in SURFACE_SUFFIXES:
+            raise InputError(folder / "rig.toml", "surface", rig_file.surface, f"a file {', '.join(SURFACE_SUFFIXES)}")
+        if not path.is_file():
+            raise InputError(folder / "rig.toml", "surface", rig_file.surface, "a file that is there")
+        found = [path]
+    else:
+        found = [p for s in SURFACE_SUFFIXES if (p := folder / f"surface{s}").exists()]
+    if len(found) > 1:
+        names = ", ".join(p.name for p in found)
+        raise InputError(folder, "surface", names, "one of them (or `surface = ` in rig.toml)")
+    if found and not found[0].stat().st_size:
+        raise InputError(found[0], "file", "empty", "a scan of the surface, mm")
+    return found[0] if found else None

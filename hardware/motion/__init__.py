@@ -1,0 +1,1 @@
+"""The motion of a run: MotionStep without a clock, and the 50 Hz loop that drives the arm with it."""

@@ -1,0 +1,1 @@
+"""Work on recorded sessions: track, replay, smooth, compare, segment, convert and view them."""

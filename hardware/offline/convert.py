@@ -1,0 +1,208 @@
+"""Folder to MCAP and back, losing nothing: `stillbed import` and `stillbed export`.
+
+Both write beside the place they are asked for and rename at the end, so an interrupted run leaves nothing that looks
+whole. Import stores a video's images as PNG (exact) and pictures as they are; export writes the stored pictures as
+they are, so importing an export gives the same stamps, numbers and pixels again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import heapq
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from estimation.errors import InputError, StillbedError
+from estimation.se3 import Array
+from hardware.channels import read_truth_rows
+from hardware.files.folder_tables import write_frames, write_heads, write_roi
+from hardware.files.rig_file import ImageSource, write_rig
+from hardware.files.session import FrameRef, Session, open_session
+from hardware.files.session_folder import TRUTH_FILES, truth_file
+from hardware.recording.recorder import Recorder
+from hardware.tum import read_rows, write_rows
+from perception.frames import Frame, Roi
+
+Progress = Callable[[int, int], None]  # images done, images in all
+
+_SUFFIX = {"png": ".png", "jpeg": ".jpg"}
+
+
+def _silent(done: int, total: int) -> None:
+    pass
+
+
+def import_folder(
+    folder: str | Path,
+    mcap_path: str | Path,
+    progress: Progress = _silent,
+    overwrite: bool = False,
+    jpeg_quality: int | None = None,
+) -> None:
+    """Turn a session folder into one .mcap file; `jpeg_quality` (0-100) stores images smaller and not exactly.
+
+    InputError where the folder is wrong or `mcap_path` exists and `overwrite` is not set.
+    """
+    folder, target = Path(folder), Path(mcap_path)
+    if not folder.is_dir():
+        raise InputError(folder, "session", "no such folder", "a session folder (with rig.toml)")
+    if target.is_dir() or (target.exists() and not overwrite):
+        raise InputError(target, "recording", "exists already", "a new file, or leave to overwrite")
+    if jpeg_quality is not None and not 0 <= jpeg_quality <= 100:
+        raise InputError(target, "jpeg quality", jpeg_quality, "0 .. 100")
+    session = open_session(folder)
+    part = _part_name(target)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with Recorder(part, session.rig, jpeg_quality, overwrite=True) as recorder:
+            _record(session, folder, recorder, progress, jpeg_quality is None)
+        os.replace(part, target)
+    except OSError as error:
+        raise StillbedError(f"{target}: cannot write: {error}") from error
+    finally:
+        with contextlib.suppress(OSError):  # it is renamed, or was never there
+            part.unlink()
+
+
+def export_recording(mcap_path: str | Path, folder: str | Path, progress: Progress = _silent) -> str:
+    """Turn an .mcap file into a session folder with a picture per image; returns what was lost of it, "" if nothing.
+
+    InputError unless `folder` is new or empty.
+    Poses, commands and arm bytes of a run have no place in a session folder; they stay in the recording.
+    """
+    source, target = Path(mcap_path), Path(folder)
+    if source.is_dir():
+        raise InputError(source, "recording", "a folder", "an .mcap file")
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(target, "folder", "exists and is not empty", "a new or empty folder")
+    session = open_session(source)
+    part = _part_name(target)
+    try:
+        part.mkdir(parents=True)
+        _write_folder(session, part, progress)
+        if target.exists():
+            target.rmdir()  # empty, or this fails
+        os.replace(part, target)
+    except OSError as error:
+        raise StillbedError(f"{target}: cannot write: {error}") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return session.damage
+
+
+def _part_name(target: Path) -> Path:
+    return target.parent / f".{target.name}.{os.getpid()}.part"
+
+
+def _record(session: Session, folder: Path, recorder: Recorder, progress: Progress, exact: bool) -> None:
+    """Everything in order of stamp, so that viewers need not sort."""
+    if session.surface is not None:
+        recorder.surface(session.surface)
+    reader, done, total = session.store.open(), 0, sum(map(len, session.sets))
+
+    def image(ref: FrameRef) -> None:
+        nonlocal done
+        encoded = reader.encoded(ref) if exact else None
+        if encoded is None:
+            recorder.frame(Frame(ref.camera, ref.stamp, reader.read(ref)), ref.camera_stamp)
+        else:
+            recorder.encoded_frame(ref.camera, ref.stamp, *encoded, ref.camera_stamp)
+        done += 1
+        progress(done, total)
+
+    streams = [
+        _rois(session, recorder.write),
+        _truth(folder, recorder.truth_row),
+        _heads(session, recorder.head_row),
+        _images(session, image),
+    ]
+    try:
+        for _, _, write in heapq.merge(*streams, key=lambda entry: entry[:2]):
+            write()
+    finally:
+        reader.close()
+
+
+Entry = tuple[float, int, Callable[[], None]]  # stamp, s; which goes first; writes it
+
+
+def _rois(session: Session, write: Callable[[Roi], None]) -> Iterator[Entry]:
+    return ((roi.stamp, 0, partial(write, roi)) for roi in sorted(session.roi, key=lambda r: r.stamp))
+
+
+def _truth(folder: Path, write: Callable[[Array, bool], None]) -> Iterator[Entry]:
+    found = truth_file(folder)
+    if found is None:
+        return iter(())
+    path, exact = found
+    return ((float(row[0]), 1, partial(write, row, exact)) for row in read_rows(path))
+
+
+def _heads(session: Session, write: Callable[[Array, bool], None]) -> Iterator[Entry]:
+    pairs = zip(session.heads.rows, session.heads.extruding, strict=True)
+    return ((float(row[0]), 2, partial(write, row, bool(extruding))) for row, extruding in pairs)
+
+
+def _images(session: Session, write: Callable[[FrameRef], None]) -> Iterator[Entry]:
+    refs = (ref for refs in session.sets for ref in refs)
+    return ((ref.stamp, 3, partial(write, ref)) for ref in sorted(refs, key=lambda r: (r.stamp, r.camera)))
+
+
+def _write_folder(session: Session, folder: Path, progress: Progress) -> None:
+    rig, refs = session.rig, _renumbered(session)
+    write_rig(folder / "rig.toml", rig, [ImageSource("images", f"{glob.escape(c.name)}/*") for c in rig.cameras])
+    write_frames(folder / "frames.csv", rig, [new for _, new in refs])
+    if session.roi:
+        numbers = [_frame_at(session, roi, refs) for roi in session.roi]
+        write_roi(folder / "roi.toml", rig, session.roi, numbers)
+    if session.truth is not None:
+        name = next(name for name, exact in TRUTH_FILES if exact == session.truth.exact)
+        write_rows(folder / name, read_truth_rows(session.path))
+    if len(session.heads):
+        write_heads(folder / "head.csv", session.heads)
+    if session.surface is not None:
+        shutil.copyfile(session.surface, folder / session.surface.name)
+    _write_pictures(session, folder, refs, progress)
+
+
+def _write_pictures(session: Session, folder: Path, refs: list[tuple[FrameRef, FrameRef]], progress: Progress) -> None:
+    for camera in session.rig.cameras:
+        (folder / camera.name).mkdir()
+    reader = session.store.open()
+    try:
+        for done, (ref, new) in enumerate(refs, 1):
+            encoded = reader.encoded(ref)
+            assert encoded is not None
+            kind, data = encoded
+            if kind not in _SUFFIX:
+                raise InputError(session.path, "image format", kind, f"one of {', '.join(_SUFFIX)}")
+            name = session.rig.cameras[ref.camera].name
+            (folder / name / f"{new.number:06d}{_SUFFIX[kind]}").write_bytes(data)
+            progress(done, len(refs))
+    finally:
+        reader.close()
+
+
+def _renumbered(session: Session) -> list[tuple[FrameRef, FrameRef]]:
+    """Every stored image with its number counted anew by stamp, from 0 in each camera; in order of stamp."""
+    counts = [0] * len(session.rig)
+    pairs = []
+    for ref in sorted((ref for refs in session.sets for ref in refs), key=lambda r: (r.stamp, r.camera)):
+        pairs.append((ref, FrameRef(ref.camera, counts[ref.camera], ref.camera_stamp, ref.stamp)))
+        counts[ref.camera] += 1
+    return pairs
+
+
+def _frame_at(session: Session, roi: Roi, refs: list[tuple[FrameRef, FrameRef]]) -> int:
+    """Number of the camera's image nearest to the polygon's stamp (its own, unless that image is lost)."""
+    own = [new for _, new in refs if new.camera == roi.camera]
+    if not own:
+        name = session.rig.cameras[roi.camera].name
+        raise InputError(session.path, "/roi", f"a polygon of {name!r}, which has no image", "a camera with an image")
+    return own[int(np.argmin([abs(new.stamp - roi.stamp) for new in own]))].number

@@ -1,0 +1,160 @@
+"""`stillbed segment`: pictures or a video in, one PNG mask each and a table out."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimation.errors import InputError
+from hardware.files.images import Video, decode, encode
+from hardware.out_folder import prepare_out
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress
+from perception.frames import Image
+from perception.overlay import overlaid
+from perception.wound.segmentation import Segmentation, Segmenter, centroid
+from perception.wound_region import box_of
+
+PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
+TABLE = "wounds.csv"
+OVERLAYS = "overlays"  # folder of the pictures with outlines
+OVERLAY_QUALITY = 90  # JPEG: they are for the eye
+HEAD = (
+    "name", "wound", "confidence", "threshold", "area_px", "area_mm2", "centroid_x_px", "centroid_y_px",
+    "x0_px", "y0_px", "x1_px", "y1_px", "ms",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Options:
+    """How it is written. overlay: pictures with outlines as well. mm_per_px: of the wound's plane, None: unknown.
+    force: into a folder that is not empty."""
+
+    overlay: bool = False
+    mm_per_px: float | None = None
+    force: bool = False
+
+
+def run_segment(inputs: Sequence[Path], out: Path, segmenter: Segmenter, options: Options) -> str:
+    """Segment pictures, folders of pictures and videos into the folder `out`; what it came to, in words.
+
+    A mask lies there as NAME.png (a video's as NAME_000000.png and so on), 0 or 255, of the picture's own size. A file
+    that cannot be read is told at the end, by InputError; all others have been written.
+    """
+    files = listed(inputs)
+    prepare_out(out, options.force)
+    if options.overlay:
+        (out / OVERLAYS).mkdir(exist_ok=True)
+    clock, faults = WallClock(), list[InputError]()
+    times, found = list[float](), 0
+    with (out / TABLE).open("w", newline="", encoding="utf-8") as stream:
+        table = csv.writer(stream, lineterminator="\n")
+        table.writerow(HEAD)
+        with Progress("segment", "pictures", clock.now) as progress:
+            total = sum(expected(file) for file in files)
+            for name, image in pictures(files, faults):
+                start = clock.now()
+                seen = segmenter(image)
+                times.append(1000 * (clock.now() - start))
+                found += seen.found
+                _write(out, name, image, seen, options)
+                table.writerow(row(name, seen, options.mm_per_px, times[-1]))
+                stream.flush()
+                progress(len(times), max(total, len(times)))
+    _tell(faults, len(times))
+    median, late = np.percentile(times, [50, 99])
+    took = f"{median:.1f} ms each (median), {late:.1f} ms (p99)"
+    return f"{found} of {len(times)} pictures show a wound; {took}\nmasks and {TABLE} are in {out}"
+
+
+def listed(inputs: Sequence[Path]) -> list[Path]:
+    """The files that inputs name, folders opened; InputError: none, unknown kind, two that would share a mask."""
+    files = list[Path]()
+    for path in inputs:
+        if path.is_dir():
+            inside = [f for f in sorted(path.iterdir()) if f.suffix.lower() in PICTURES]
+            if not inside:
+                raise InputError(path, "pictures", "none", f"one at least, ending in {', '.join(PICTURES)}")
+            files += inside
+        elif not path.is_file():
+            raise InputError(path, "input", "no such file or folder", "a picture, a folder of pictures or a video")
+        elif path.suffix.lower() not in PICTURES + VIDEOS:
+            raise InputError(path, "kind", path.suffix or "no suffix", ", ".join(PICTURES + VIDEOS))
+        else:
+            files.append(path)
+    first: dict[str, Path] = {}
+    for file in files:
+        if first.setdefault(file.stem, file) is not file:
+            raise InputError(
+                file, "name", file.stem, f"another than that of {first[file.stem]}: masks are named for it"
+            )
+    return files
+
+
+def expected(file: Path) -> int:
+    """How many pictures a file holds, as far as it tells."""
+    if file.suffix.lower() in PICTURES:
+        return 1
+    try:
+        video = Video(file)
+    except InputError:
+        return 0
+    count = video.told_count()
+    video.close()
+    return count
+
+
+def pictures(files: Sequence[Path], faults: list[InputError]) -> Iterator[tuple[str, Image]]:
+    """Name of the mask and picture (H, W) or (H, W, 3) BGR, one after another; what cannot be read goes to `faults`."""
+    for file in files:
+        try:
+            if file.suffix.lower() in PICTURES:
+                yield file.stem, decode(file.read_bytes(), file, "picture")
+            else:
+                yield from _frames(file)
+        except InputError as fault:
+            faults.append(fault)
+
+
+def _frames(file: Path) -> Iterator[tuple[str, Image]]:
+    video = Video(file)
+    told = video.told_count()
+    try:
+        while (image := video.read()) is not None:
+            yield f"{file.stem}_{video.next - 1:06d}", image
+        if video.next < told or not video.next:
+            raise InputError(
+                file, "frames", f"{video.next} that decode", f"{told}, as the file says (is it cut short?)"
+            )
+    finally:
+        video.close()
+
+
+def row(name: str, seen: Segmentation, mm_per_px: float | None, ms: float) -> list[Any]:
+    """One line of the table; what is not known is empty."""
+    area, box = int(seen.mask.sum()), box_of(seen.mask)
+    middle = [f"{value:.2f}" for value in centroid(seen.mask)] if seen.found else ["", ""]
+    return [
+        name, int(seen.found), f"{seen.confidence:.4f}", f"{seen.threshold:.1f}" if np.isfinite(seen.threshold) else "",
+        area, "" if mm_per_px is None else f"{area * mm_per_px**2:.2f}", *middle, *(box or ("",) * 4), f"{ms:.2f}",
+    ]  # fmt: skip
+
+
+def _write(out: Path, name: str, image: Image, seen: Segmentation, options: Options) -> None:
+    (out / f"{name}.png").write_bytes(encode(seen.mask.astype(np.uint8) * np.uint8(255))[1])
+    if options.overlay:
+        (out / OVERLAYS / f"{name}.jpg").write_bytes(encode(overlaid(image, seen), OVERLAY_QUALITY)[1])
+
+
+def _tell(faults: list[InputError], done: int) -> None:
+    if len(faults) == 1 or (faults and not done):
+        raise faults[0]
+    if faults:
+        others = ", ".join(str(fault.where) for fault in faults[1:])
+        raise InputError(faults[0].where, faults[0].what, f"{faults[0].got}; also {others}", faults[0].allowed)

@@ -1,0 +1,298 @@
+"""Records as the JSON messages of a recording, and back: what is written is read back to the same float64s.
+
+Matrices are flat, row by row. An array that is not finite becomes an empty one, which reads as NaN throughout.
+"""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+
+from estimation import se3
+from estimation.forecast import Forecast
+from estimation.observations import Observations
+from estimation.pose import SurfaceMotion, SurfacePose, TrackState
+from estimation.rig import Camera, Rig
+from estimation.se3 import Array
+from estimation.warp import Warp
+from hardware.files.rig_file import rig_from_table, table_from_rig
+from hardware.recorded_tick import RecordedTick
+from hardware.recording.schemas import camera_frame
+from perception.frames import Roi
+from planning.command import Hold, Move
+
+Message = dict[str, Any]
+
+SURFACE_FRAME = "surface"
+BASE_FRAME = "base"
+_POSE_SHAPES = {
+    "base_from_surface": (4, 4),
+    "covariance": (6, 6),
+    "twist": (6,),
+    "twist_covariance": (6, 6),
+    "acceleration_psd": (6,),
+}
+_FORECAST: dict[str, tuple[int, ...]] = {"horizons": (), "increments": (6,), "covariances": (6, 6)}  # of each horizon
+_WARP = {"control": 1, "coefficients": 1, "covariance": 2, "growth": 2}  # of 3 x as many numbers as control points
+_MM = 1e-3  # viewers count in metres
+
+
+def time_of(log_time: int) -> dict[str, int]:
+    """A log time in ns as Foxglove's time."""
+    return {"sec": log_time // 1_000_000_000, "nsec": log_time % 1_000_000_000}
+
+
+def message_from_rig(rig: Rig) -> Message:
+    """The cameras as a message."""
+    table = table_from_rig(rig)
+    for entry, camera in zip(table["camera"], rig.cameras, strict=True):
+        entry["matrix"] = camera.matrix.ravel().tolist()
+        entry["base_from_camera"] = camera.base_from_camera.ravel().tolist()
+    return table
+
+
+def rig_from_message(where: object, message: Message) -> Rig:
+    """The cameras from their message, checked like a rig.toml; InputError (where)."""
+    cameras = message["camera"]
+    for camera in cameras if isinstance(cameras, list) else ():
+        for key, rows in (("matrix", 3), ("base_from_camera", 4)):
+            if isinstance(camera, dict) and isinstance(camera.get(key), list):
+                flat = camera[key]
+                camera[key] = [flat[i : i + rows] for i in range(0, len(flat), rows)]
+    return rig_from_table(where, message)
+
+
+def message_from_roi(roi: Roi) -> Message:
+    """A polygon as a message."""
+    return {"stamp": roi.stamp, "camera": int(roi.camera), "polygon": roi.polygon.ravel().tolist()}
+
+
+def roi_from_message(message: Message) -> Roi:
+    """A polygon from its message."""
+    return Roi(message["camera"], message["stamp"], np.array(message["polygon"], float).reshape(-1, 2))
+
+
+def message_from_truth(row: Array, exact: bool) -> Message:
+    """A row (8,) of stamp x y z qx qy qz qw, s and mm, as a message."""
+    return {**_message_from_row(row), "exact": exact}
+
+
+def message_from_head(row: Array, extruding: bool) -> Message:
+    """A print head's row (8,) of stamp x y z qx qy qz qw, s and mm, base_from_nozzle, as a message."""
+    return {**_message_from_row(row), "extruding": bool(extruding)}
+
+
+def row_from_message(message: Message) -> list[float]:
+    """The row of 8 numbers, stamp x y z qx qy qz qw, in a message of truth or of a print head."""
+    return [float(value) for value in (message["stamp"], *message["position"], *message["quaternion"])]
+
+
+def _message_from_row(row: Array) -> Message:
+    values = row.tolist()
+    return {"stamp": values[0], "position": values[1:4], "quaternion": values[4:]}
+
+
+def message_from_observations(observations: Observations) -> Message:
+    """Observations as a message."""
+    return {
+        "stamp": observations.stamp,
+        "camera": observations.camera.tolist(),
+        "track": observations.track.tolist(),
+        "pixels": _flat(observations.pixels),
+        "sigma": _flat(observations.sigma),
+    }
+
+
+def observations_from_message(message: Message) -> Observations:
+    """Observations from their message."""
+    camera, track = (np.array(message[key], np.int64) for key in ("camera", "track"))
+    return Observations(
+        message["stamp"],
+        camera,
+        track,
+        _array(message["pixels"], (len(camera), 2)),
+        _array(message["sigma"], (len(camera),)),
+    )
+
+
+def message_from_pose(pose: SurfacePose) -> Message:
+    """An estimated pose as a message."""
+    return {
+        "stamp": pose.stamp,
+        "base_from_surface": _flat(pose.base_from_surface),
+        "covariance": _flat(pose.covariance),
+        "twist": _flat(pose.twist),
+        "state": pose.state.value,
+        "twist_covariance": _flat(pose.twist_covariance),
+        "acceleration_psd": _flat(pose.acceleration_psd),
+        "reason": pose.reason,
+        "motion": _message_from_motion(pose.motion),
+        "warp": _message_from_warp(pose.warp),
+        "forecast": _message_from_forecast(pose.forecast),
+    }
+
+
+def pose_from_message(message: Message) -> SurfacePose:
+    """An estimated pose from its message."""
+    arrays: dict[str, Any] = {key: _array(message[key], shape) for key, shape in _POSE_SHAPES.items()}
+    return SurfacePose(
+        stamp=message["stamp"],
+        state=TrackState(message["state"]),
+        reason=message["reason"],
+        motion=_motion_from_message(message["motion"]) if "motion" in message else SurfaceMotion(),
+        warp=_warp_from_message(message["warp"]) if "warp" in message else None,
+        forecast=_forecast_from_message(message["forecast"]) if "forecast" in message else None,
+        **arrays,
+    )
+
+
+def _message_from_motion(motion: SurfaceMotion) -> Message:
+    onset = _flat(np.array([motion.onset]))
+    return {"moving": motion.moving, "onset": onset, "moved": motion.moved, "turned": motion.turned}
+
+
+def _motion_from_message(message: Message) -> SurfaceMotion:
+    onset = float(_array(message["onset"], (1,))[0])
+    return SurfaceMotion(message["moving"], onset, message["moved"], message["turned"])
+
+
+def _message_from_forecast(forecast: Forecast | None) -> Message:
+    if forecast is None:
+        return {name: [] for name in _FORECAST}
+    return {name: _flat(getattr(forecast, name)) for name in _FORECAST}
+
+
+def _forecast_from_message(message: Message) -> Forecast | None:
+    count = len(message["horizons"])
+    arrays = (_array(message[name], (count, *shape)) for name, shape in _FORECAST.items())
+    return Forecast(*arrays) if count else None
+
+
+def _message_from_warp(warp: Warp | None) -> Message:
+    if warp is None:
+        return {**{name: [] for name in _WARP}, "reach": 0.0, "deformation": 0.0, "deformation_sigma": 0.0}
+    return {
+        **{name: _flat(getattr(warp, name)) for name in _WARP},
+        "reach": warp.reach,
+        "deformation": warp.deformation,
+        "deformation_sigma": warp.deformation_sigma,
+    }
+
+
+def _warp_from_message(message: Message) -> Warp | None:
+    size = len(message["control"])
+    if not size:
+        return None
+    control, coefficients, covariance, growth = (
+        _array(message[name], (size // 3, 3) if shape == 1 else (size, size)) for name, shape in _WARP.items()
+    )
+    return Warp(
+        control,
+        coefficients,
+        covariance,
+        growth,
+        message["reach"],
+        message["deformation"],
+        message["deformation_sigma"],
+    )
+
+
+def message_from_move(move: Move) -> Message:
+    """A move as a message."""
+    return {
+        "stamp": move.stamp,
+        "axes": move.axes.tolist(),
+        "feed": move.feed,
+        "checkpoint": int(move.checkpoint),
+        "extrude": bool(move.extrude),
+        "reason": move.reason,
+    }
+
+
+def move_from_message(message: Message) -> Move:
+    """A move from its message."""
+    axes, reason = np.array(message["axes"], float), message.get("reason", "")
+    return Move(message["stamp"], axes, message["feed"], message["checkpoint"], message["extrude"], reason)
+
+
+def message_from_hold(hold: Hold) -> Message:
+    """A hold as a message."""
+    return {"stamp": hold.stamp, "duration": hold.duration, "reason": hold.reason}
+
+
+def hold_from_message(message: Message) -> Hold:
+    """A hold from its message."""
+    return Hold(message["stamp"], message["duration"], message["reason"])
+
+
+def message_from_tick(tick: RecordedTick) -> Message:
+    """A tick of the motion as a message; its command is a message of its own."""
+    return {
+        "stamp": tick.stamp,
+        "pose_stamp": _flat(np.array([tick.pose_stamp])),
+        "asked": tick.asked,
+        "begun": _flat(np.array([tick.begun])),
+        "recalled": [] if tick.recalled is None else tick.recalled.ravel().tolist(),
+        "paused": tick.paused,
+        "fraction": tick.fraction,
+        "phase": tick.phase.value,
+        "frame": base64.b64encode(tick.frame).decode("ascii"),
+    }
+
+
+def message_from_bytes(stamp: float, data: bytes) -> Message:
+    """Bytes on the arm's link as a message."""
+    return {"stamp": stamp, "data": base64.b64encode(data).decode("ascii")}
+
+
+def bytes_from_message(message: Message) -> bytes:
+    """Bytes from a message with base64 `data`."""
+    return base64.b64decode(message["data"], validate=True)
+
+
+def message_from_calibration(camera: Camera, log_time: int) -> Message:
+    """A camera as Foxglove's CameraCalibration."""
+    matrix = camera.matrix
+    return {
+        "timestamp": time_of(log_time),
+        "frame_id": camera_frame(camera.name),
+        "width": camera.size[0],
+        "height": camera.size[1],
+        "distortion_model": "plumb_bob",
+        "D": camera.distortion.tolist(),
+        "K": matrix.ravel().tolist(),
+        "R": np.eye(3).ravel().tolist(),
+        "P": np.concatenate([matrix, np.zeros((3, 1))], axis=1).ravel().tolist(),
+    }
+
+
+def message_from_transform(base_from_child: Array, child: str, log_time: int) -> Message:
+    """Where a frame stands in the base frame (4, 4), mm, as Foxglove's FrameTransform, metres."""
+    position = base_from_child[:3, 3] * _MM
+    quaternion = se3.quaternion_from_rotation(base_from_child[:3, :3])
+    return {
+        "timestamp": time_of(log_time),
+        "parent_frame_id": BASE_FRAME,
+        "child_frame_id": child,
+        "translation": dict(zip("xyz", position.tolist(), strict=True)),
+        "rotation": dict(zip("xyzw", quaternion.tolist(), strict=True)),
+    }
+
+
+def message_from_event(stamp: float, level: int, text: str, name: str, log_time: int) -> Message:
+    """Something that happened, as Foxglove's Log."""
+    time = time_of(log_time)
+    return {"timestamp": time, "level": level, "message": text, "name": name, "file": "", "line": 0, "stamp": stamp}
+
+
+def _flat(array: Array) -> list[float]:
+    values: list[float] = array.ravel().tolist()
+    return values if np.isfinite(array).all() else []
+
+
+def _array(values: list[float], shape: tuple[int, ...]) -> Array:
+    if not values:
+        return np.full(shape, np.nan)
+    return np.array(values, np.float64).reshape(shape)

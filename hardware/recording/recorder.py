@@ -1,0 +1,293 @@
+"""Recorder: writes everything that passes a seam into one MCAP file that stays readable if the run is killed."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import TypeVar
+
+import numpy as np
+import orjson
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+
+from estimation.errors import InputError, StillbedError
+from estimation.observations import Observations
+from estimation.pose import SurfacePose
+from estimation.rig import Rig
+from estimation.se3 import Array
+from estimation.trajectory import Trajectory
+from hardware.compressed_image import ENCODING, NAME, SCHEMA, SCHEMA_ENCODING, pack
+from hardware.files.images import check_size, encode
+from hardware.files.session import SURFACE_SUFFIXES
+from hardware.mcap_index import pack_index
+from hardware.process.checks import read_bytes
+from hardware.recorded_tick import RecordedTick
+from hardware.recording import messages
+from hardware.recording.messages import SURFACE_FRAME, Message
+from hardware.recording.schemas import (
+    CALIBRATION,
+    INFO,
+    TOPICS,
+    Schema,
+    calibration_topic,
+    camera_frame,
+    image_topic,
+)
+from hardware.tum import rows_from_trajectory
+from perception.frames import Frame, Roi
+from planning.command import Command, Move
+
+CHUNK_SECONDS = 0.5  # s of stamps: what a killed run may lose; half of the second that is promised
+CHUNK_BYTES = 4 * 2**20  # a chunk is unpacked whole, so its size bounds the reader's memory
+EPOCH = 1_000_000_000  # s added to log times of a run whose stamps do not count from 1970: MCAP has none below zero
+WALL_CLOCK = 1e8  # s: a first stamp above is taken for seconds since 1970
+LAST_LOG_TIME = 2**63 - 1  # ns
+
+T = TypeVar("T")
+
+
+class Recorder:
+    """Writes a recording; a context manager. Stamps (s) may start anywhere, also below zero.
+
+    A chunk is closed and given to the system before its stamps span more than half a second, so a run killed at any
+    instant keeps all but the last half second (a power cut may take more). A disk that is full or gone is a
+    StillbedError; what was written before stays readable, and later writes are refused with the same words.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        rig: Rig,
+        jpeg_quality: int | None = None,
+        overwrite: bool = False,
+        compress: bool = True,
+    ) -> None:
+        """Create the file at `path`; images are stored as PNG, or as JPEG of `jpeg_quality` (0-100).
+
+        compress: whether chunks are; that saves a quarter of the file and costs a third of the time.
+        """
+        self.path, self.rig = Path(path), rig
+        self._jpeg_quality = jpeg_quality
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._numbers = [0] * len(rig)  # next frame number per camera
+        self._epoch: int | None = None  # s, known at the first stamp
+        self._chunk_start = math.nan  # s, stamp of the open chunk's first message
+        self._last: dict[str, float] = {}  # s, per stream of images or truth
+        self._failed = ""
+        self._closed = False
+        try:
+            self._file = open(self.path, "wb" if overwrite else "xb")  # noqa: SIM115  (closed in `close`)
+        except FileExistsError:
+            raise InputError(
+                self.path, "recording", "a file that exists", "a new file, or leave to overwrite"
+            ) from None
+        except OSError as error:
+            raise StillbedError(f"{self.path}: cannot write: {error}") from error
+        self._writer = Writer(
+            self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD if compress else CompressionType.NONE
+        )
+        pack_index(self._writer)
+        self._guarded(lambda: self._writer.start(profile="", library="stillbed"))
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.close()
+        except StillbedError:
+            if error is None:
+                raise
+
+    def write(self, record: Frame | Observations | SurfacePose | Command | Roi | RecordedTick) -> None:
+        """Write any record that carries its own stamp to its channel."""
+        if isinstance(record, Frame):
+            self.frame(record)
+        elif isinstance(record, Observations):
+            self._message("/observations", record.stamp, messages.message_from_observations(record))
+        elif isinstance(record, SurfacePose):
+            self._pose(record)
+        elif isinstance(record, Roi):
+            self._message("/roi", record.stamp, messages.message_from_roi(record))
+        elif isinstance(record, RecordedTick):
+            self._message("/tick", record.stamp, messages.message_from_tick(record))
+        elif isinstance(record, Move):
+            self._message("/move", record.stamp, messages.message_from_move(record))
+        else:
+            self._message("/hold", record.stamp, messages.message_from_hold(record))
+
+    def frame(self, frame: Frame, camera_stamp: float | None = None) -> None:
+        """Write an image; camera_stamp: s on the camera's own clock, by default the frame's less the clock offset."""
+        camera = self.rig.cameras[frame.camera]
+        check_size(frame.image, camera.size, self.path, f"image of camera {camera.name!r}")
+        self.encoded_frame(frame.camera, frame.stamp, *encode(frame.image, self._jpeg_quality), camera_stamp)
+
+    def encoded_frame(
+        self, camera: int, stamp: float, kind: str, data: bytes, camera_stamp: float | None = None
+    ) -> None:
+        """Write an image that is already PNG or JPEG (`kind` "png" or "jpeg"); stamps in s as in `frame`."""
+        own = stamp - self.rig.cameras[camera].clock_offset if camera_stamp is None else camera_stamp
+        name, number = self.rig.cameras[camera].name, self._numbers[camera]
+        self._check_rising(f"stamp of camera {name!r}", stamp)
+        image = pack(kind, data, camera_frame(name), self._log_time(stamp))
+        self._add(image_topic(name), None, stamp, image, number)
+        entry = {"stamp": stamp, "camera_stamp": own, "camera": int(camera), "number": number}
+        self._message("/frames", stamp, entry)  # after the image: where this can be read, the image can
+        self._numbers[camera] += 1
+
+    def truth(self, trajectory: Trajectory) -> None:
+        """Write known or measured poses, each at its own stamp."""
+        for row in rows_from_trajectory(trajectory):
+            self.truth_row(row, trajectory.exact)
+
+    def truth_row(self, row: Array, exact: bool) -> None:
+        """Write one pose (8,): stamp x y z qx qy qz qw, s and mm, unchanged."""
+        self._check_rising("stamp of truth", float(row[0]))
+        self._message("/truth", float(row[0]), messages.message_from_truth(row, exact))
+
+    def head_row(self, row: Array, extruding: bool) -> None:
+        """Write where the print head was at a frame set: (8,) stamp x y z qx qy qz qw, s and mm, base_from_nozzle."""
+        self._check_rising("stamp of the print head", float(row[0]))
+        self._message("/head", float(row[0]), messages.message_from_head(row, extruding))
+
+    def surface(self, path: Path) -> None:
+        """Attach the scan (ply, stl or obj, mm) as it is."""
+        if path.suffix.lower() not in SURFACE_SUFFIXES:
+            raise InputError(path, "surface", path.name, f"a file {', '.join(SURFACE_SUFFIXES)}")
+        data = read_bytes(path)
+        name = f"surface{path.suffix.lower()}"
+        self._guarded(lambda: self._writer.add_attachment(0, 0, name, "model/" + path.suffix.lower()[1:], data))
+
+    def sent(self, stamp: float, data: bytes) -> None:
+        """Write bytes that went to the arm at `stamp`, s."""
+        self._message("/arm/sent", stamp, messages.message_from_bytes(stamp, data))
+
+    def received(self, stamp: float, data: bytes) -> None:
+        """Write bytes that came from the arm at `stamp`, s."""
+        self._message("/arm/received", stamp, messages.message_from_bytes(stamp, data))
+
+    def event(self, stamp: float, text: str, level: int = INFO, name: str = "stillbed") -> None:
+        """Write something that happened at `stamp`, s, in words."""
+        log_time = self._log_time(stamp)
+        self._message("/events", stamp, messages.message_from_event(stamp, level, text, name, log_time))
+
+    def latency(self, stamp: float, stage: str, width: float, counts: NDArray[np.int64], most: float) -> None:
+        """Write how long a stage took until `stamp`, s: counts (N,) in bins of `width` s, and the largest, s."""
+        message = {"stamp": stamp, "stage": stage, "width": width, "counts": counts.tolist(), "most": most}
+        self._message("/latency", stamp, message)
+
+    def attach(self, name: str, data: bytes) -> None:
+        """Keep a file of the run in the recording, as text."""
+        self._guarded(lambda: self._writer.add_attachment(0, 0, name, "text/plain", data))
+
+    def flush(self) -> None:
+        """Close the open chunk and hand everything to the system."""
+        self._guarded(self._writer.flush)
+        self._chunk_start = math.nan
+
+    def close(self) -> None:
+        """Write the index and close the file; of a recorder that failed, keep what reached the disk. Twice is once."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            if not self._failed:
+                if self._epoch is None:
+                    self._begin(0.0)
+                self._guarded(lambda: self._writer.finish())  # type: ignore[no-untyped-call]
+                self._guarded(self._file.flush)
+        finally:
+            with contextlib.suppress(OSError):  # said already: the same bytes could not be written a moment ago
+                self._file.close()
+
+    def _pose(self, pose: SurfacePose) -> None:
+        self._message("/pose", pose.stamp, messages.message_from_pose(pose))
+        if np.isfinite(pose.base_from_surface).all():
+            log_time = self._log_time(pose.stamp)
+            self._message(
+                "/tf", pose.stamp, messages.message_from_transform(pose.base_from_surface, SURFACE_FRAME, log_time)
+            )
+
+    def _check_rising(self, stream: str, stamp: float) -> None:
+        """Refuse at the time of writing what the reader would have to refuse of the whole file."""
+        last = self._last.get(stream, -math.inf)
+        if not stamp > last:
+            raise InputError(self.path, stream, stamp, f"later than the one before, {last} s")
+        self._last[stream] = stamp
+
+    def _log_time(self, stamp: float) -> int:
+        """Whole ns for viewers; the exact stamp stands in the message."""
+        if not math.isfinite(stamp):
+            raise InputError(self.path, "stamp", stamp, "a finite number of seconds")
+        if self._epoch is None:
+            self._begin(stamp)
+        assert self._epoch is not None
+        log_time = round(stamp * 1e9) + self._epoch * 1_000_000_000
+        if not 0 <= log_time <= LAST_LOG_TIME:
+            raise InputError(self.path, "stamp", stamp, f"-{self._epoch} .. {LAST_LOG_TIME / 1e9 - self._epoch:.0f} s")
+        return log_time
+
+    def _begin(self, stamp: float) -> None:
+        """Write the rig at the first stamp, so that viewers do not see a recording that starts in 1970."""
+        self._epoch = 0 if stamp > WALL_CLOCK else EPOCH
+        epoch = {"epoch_s": str(self._epoch), "units": "mm, s, rad, px"}
+        self._guarded(lambda: self._writer.add_metadata("stillbed", epoch))
+        self._message("/rig", stamp, messages.message_from_rig(self.rig))
+        log_time = self._log_time(stamp)
+        for camera in self.rig.cameras:
+            calibration = messages.message_from_calibration(camera, log_time)
+            self._message(calibration_topic(camera.name), stamp, calibration, CALIBRATION)
+            transform = messages.message_from_transform(camera.base_from_camera, camera_frame(camera.name), log_time)
+            self._message("/tf", stamp, transform)
+
+    def _message(self, topic: str, stamp: float, message: Message, schema: Schema | None = None) -> None:
+        self._add(topic, TOPICS[topic] if schema is None else schema, stamp, self._text(topic, message))
+
+    def _add(self, topic: str, schema: Schema | None, stamp: float, data: bytes, sequence: int = 0) -> None:
+        """Write the bytes of a message; schema: None for an image."""
+        log_time = self._log_time(stamp)
+        if abs(stamp - self._chunk_start) >= CHUNK_SECONDS:
+            self.flush()
+        if math.isnan(self._chunk_start):
+            self._chunk_start = stamp
+        channel = self._channel(topic, schema)
+        self._guarded(lambda: self._writer.add_message(channel, log_time, data, log_time, sequence))
+
+    def _text(self, topic: str, message: Message) -> bytes:
+        data = orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY)
+        if b"null" in data:  # what stands there for a number that is not finite, unless it is a word
+            try:
+                json.dumps(message, allow_nan=False)
+            except ValueError:
+                raise InputError(self.path, topic, message, "finite numbers") from None
+        return data
+
+    def _channel(self, topic: str, schema: Schema | None) -> int:
+        if topic not in self._channels:
+            if schema is None:
+                name, kind, encoding, text = NAME, SCHEMA_ENCODING, ENCODING, SCHEMA.encode()
+            else:
+                name, kind, encoding, text = schema["title"], "jsonschema", "json", orjson.dumps(schema)
+            if name not in self._schemas:
+                self._schemas[name] = self._guarded(lambda: self._writer.register_schema(name, kind, text))
+            number = self._schemas[name]
+            self._channels[topic] = self._guarded(lambda: self._writer.register_channel(topic, encoding, number))
+        return self._channels[topic]
+
+    def _guarded(self, action: Callable[[], T]) -> T:
+        """Run one write of the library; a fault of the disk becomes a StillbedError, now and from then on."""
+        if self._failed:
+            raise StillbedError(self._failed)
+        try:
+            return action()
+        except OSError as error:
+            self._failed = f"{self.path}: recording stopped, {error.strerror or error}; what was written before is kept"
+            raise StillbedError(self._failed) from error

@@ -1,0 +1,227 @@
+"""How good a run was: errors against truth or reference, consistency of the covariance, states and latency.
+
+The tracker's surface frame is its own; the truth's is another. Both are rigidly attached to the surface, so
+`truth_surface_from_estimated_surface` is constant. It is taken at the first TRACKING pose, or the first measured one
+where none is ("start": nothing is fitted, and that pose's own error is in every other one), and, beside it, as the best
+constant over the run ("aligned").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import se3
+from estimation.pose import TrackState
+from estimation.se3 import Array
+from estimation.trajectory import Trajectory
+from hardware.files.pose_file import PoseTable
+
+OFF_MM = 10.0  # a pose further off than this while the state says TRACKING is a lie, not an error
+NEES_BOUND = 12.592  # chi-square of 6 degrees of freedom, 95 %
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Median, root mean square, 95th and 99th percentile and maximum of errors; NaN where there are none."""
+
+    median: float
+    rmse: float
+    p95: float
+    p99: float
+    max: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Errors:
+    """Errors of the measured poses that have a true one beside them, under one constant surface transform.
+
+    truth_surface_from_estimated_surface: (4, 4). translation: (M,) mm, of the estimated surface's origin in base.
+    rotation: (M,) rad. nees: (M,) normalised estimation error squared; its mean is 6 for an honest covariance; NaN
+    where there is no finite covariance.
+    """
+
+    truth_surface_from_estimated_surface: Array
+    translation: Array
+    rotation: Array
+    nees: Array
+
+    @property
+    def mean_nees(self) -> float:
+        """Mean NEES of the poses that have a covariance; NaN without any."""
+        known = self.nees[np.isfinite(self.nees)]
+        return float(known.mean()) if len(known) else float("nan")
+
+    @property
+    def nees_inside(self) -> float:
+        """Share of those poses whose NEES is inside the 95 % bound; NaN without any."""
+        known = self.nees[np.isfinite(self.nees)]
+        return float(np.mean(known <= NEES_BOUND)) if len(known) else float("nan")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """A run beside a truth. rows: (M,) of the run; expected: (M, 4, 4) the truth's poses there; both error kinds.
+
+    exact: whether the truth is one (NEES means something) or a measured reference. off: measured rows in state TRACKING
+    whose start error passes OFF_MM. stamp_gap: s, median distance of the associated stamps.
+    """
+
+    rows: NDArray[np.int64]
+    expected: Array
+    start: Errors
+    aligned: Errors
+    exact: bool
+    off: NDArray[np.int64]
+    stamp_gap: float
+
+
+def spread(errors: Array) -> Spread:
+    """The figures of `errors` (M,), none below 0, in their own unit."""
+    if not len(errors):
+        return Spread(*[float("nan")] * 5)
+    median, p95, p99, top = np.percentile(errors, [50, 95, 99, 100])
+    return Spread(float(median), float(np.sqrt(np.mean(errors**2))), float(p95), float(p99), float(top))
+
+
+def associate(stamps: Array, truth_stamps: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows (M,) of `stamps` (N,) and of `truth_stamps` (K,) of one instant: the nearest, at most half a period off.
+
+    The period is the smaller of the two median steps, so each row of the sparser one is matched once.
+    """
+    if not len(stamps) or not len(truth_stamps):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    steps = [np.median(np.diff(s)) for s in (stamps, truth_stamps) if len(s) > 1]
+    tolerance = 0.5 * min(steps, default=0.0) + 1e-6
+    right = np.clip(np.searchsorted(truth_stamps, stamps), 1, max(len(truth_stamps) - 1, 1))
+    right = np.minimum(right, len(truth_stamps) - 1)
+    left = np.maximum(right - 1, 0)
+    nearest = np.where(stamps - truth_stamps[left] <= truth_stamps[right] - stamps, left, right)
+    rows = np.flatnonzero(np.abs(truth_stamps[nearest] - stamps) <= tolerance)
+    return rows, nearest[rows]
+
+
+def compare(table: PoseTable, truth: Trajectory) -> Comparison | None:
+    """The run's measured poses beside the truth; None where no measured pose has a true one beside it."""
+    measured = np.flatnonzero(table.measured)
+    near, true_rows = associate(table.stamps[measured], truth.stamps)
+    if not len(near):
+        return None
+    rows = measured[near]
+    estimate, covariance = table.base_from_surface[rows], table.covariance[rows]
+    expected = truth.base_from_surface[true_rows]
+    changes = se3.inverse(expected) @ estimate  # (M, 4, 4)
+    tracking = table.is_state(TrackState.TRACKING)[rows]
+    first = int(np.argmax(tracking))  # 0 where none is
+    start = errors_under(changes[first], expected, estimate, covariance)
+    aligned = errors_under(best_constant(changes), expected, estimate, covariance)
+    return Comparison(
+        rows=rows,
+        expected=expected,
+        start=start,
+        aligned=aligned,
+        exact=truth.exact,
+        off=rows[tracking & (start.translation > OFF_MM)],
+        stamp_gap=float(np.median(np.abs(table.stamps[rows] - truth.stamps[true_rows]))),
+    )
+
+
+def best_constant(changes: Array) -> Array:
+    """The constant (4, 4) nearest to transforms (M, 4, 4): mean translation, chordal mean of the rotations.
+
+    With changes = inverse(expected) @ estimate both parts are the exact least-squares answer for poses
+    `expected @ constant`, since a rotation keeps lengths.
+    """
+    return se3.orthonormalise(changes.mean(axis=0))
+
+
+def errors_under(constant: Array, expected: Array, estimate: Array, covariance: Array) -> Errors:
+    """Errors of `estimate` (M, 4, 4) against `expected @ constant`, with covariance (M, 6, 6) of the estimate."""
+    target = expected @ constant
+    difference = se3.log(se3.inverse(estimate) @ target)  # (M, 6) right perturbation of the estimate
+    usable = np.isfinite(covariance).all(axis=(1, 2))
+    nees = np.full(len(estimate), np.nan)
+    information = np.linalg.pinv(covariance[usable], hermitian=True)
+    nees[usable] = np.einsum("ni,nij,nj->n", difference[usable], information, difference[usable])
+    return Errors(
+        truth_surface_from_estimated_surface=constant,
+        translation=np.linalg.norm(estimate[:, :3, 3] - target[:, :3, 3], axis=-1),
+        rotation=np.linalg.norm(difference[:, :3], axis=-1),
+        nees=nees,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Latency:
+    """Milliseconds per stage. stages: S + 1 names, the last "total". p50, p95, p99, max: (S + 1,) after initialisation.
+
+    initialisation: ms of all frame sets up to and including the first that left INITIALISING; initial_sets: how many.
+    total: (N,) ms of each later frame set.
+    """
+
+    stages: tuple[str, ...]
+    p50: Array
+    p95: Array
+    p99: Array
+    max: Array
+    initialisation: float
+    initial_sets: int
+    total: Array
+
+
+def latency(table: PoseTable) -> Latency:
+    """Latency percentiles of the frame sets after initialisation; NaN where there are none."""
+    started = np.flatnonzero(~table.is_state(TrackState.INITIALISING))
+    first = int(started[0]) + 1 if len(started) else len(table)
+    milliseconds = 1000 * table.seconds[first:]
+    if len(milliseconds):
+        p50, p95, p99, top = np.percentile(milliseconds, [50, 95, 99, 100], axis=0)
+    else:
+        p50 = p95 = p99 = top = np.full(len(table.stages), np.nan)
+    spent = float(1000 * table.seconds[:first, -1].sum())
+    return Latency(table.stages, p50, p95, p99, top, spent, first, milliseconds[:, -1])
+
+
+def state_shares(table: PoseTable, since: float = -np.inf) -> dict[str, float]:
+    """Share of the frame sets with stamp >= `since` (s) in each state, in TrackState's order; empty without any."""
+    rows = np.flatnonzero(table.stamps >= since - 1e-6)
+    if not len(rows):
+        return {}
+    return {state.value: float(np.mean(table.is_state(state)[rows])) for state in TrackState}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """All that the report says about one run.
+
+    title: the session's name. comparison: None without truth or reference. shares: per state, of the frame sets from
+    `since` (s) on. complete: whether the session was run to its end. damage: what was lost of its file, "" if nothing.
+    method: how it was tracked, a key of hardware.methods.METHODS or "truth", "" where that is not known.
+    """
+
+    title: str
+    table: PoseTable
+    comparison: Comparison | None
+    latency: Latency
+    shares: dict[str, float]
+    since: float
+    complete: bool
+    damage: str
+    method: str = ""
+
+
+def evaluate(
+    table: PoseTable,
+    truth: Trajectory | None,
+    title: str = "",
+    since: float = -np.inf,
+    complete: bool = True,
+    damage: str = "",
+    method: str = "",
+) -> Evaluation:
+    """Everything about one run; `since` (s) is the instant from which its states count."""
+    comparison = None if truth is None else compare(table, truth)
+    shares = state_shares(table, since)
+    return Evaluation(title, table, comparison, latency(table), shares, since, complete, damage, method)

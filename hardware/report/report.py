@@ -1,0 +1,277 @@
+"""report.html: one run on one page, in one file that needs no network."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from estimation import se3
+from estimation.errors import InputError, StillbedError
+from estimation.pose import TrackState
+from estimation.se3 import Array
+from hardware.clock_section import clock_section
+from hardware.motion_section import motion_section
+from hardware.page import area_key, document, figures_table, legend, line_key, row_of_tiles, section, tile
+from hardware.report.evaluation import NEES_BOUND, OFF_MM, Comparison, Evaluation, spread
+from hardware.report.page import Plot, ribbon, spanning
+from hardware.report.summary import figure, measured_share, percent, text_of, verdict
+
+WIDTH = 1030  # px of a chart across the page
+HALF = 480  # px of one of two
+MOST_EVENTS = 40  # rows of the table of state changes
+
+
+def write_report(path: Path, result: Evaluation) -> None:
+    """Write the page to `path`."""
+    path.write_text(page(result), encoding="utf-8")
+
+
+def page(result: Evaluation) -> str:
+    """The page as HTML text."""
+    body = [_tiles(result), *sections(result)]
+    footer = "Lengths in mm, time in s from the session's own clock; poses are base_from_surface."
+    kind = f"stillbed track, method {result.method}" if result.method else "stillbed track"
+    return document(kind, result.title or "a session", " ".join(verdict(result)), body, footer)
+
+
+def sections(result: Evaluation) -> list[str]:
+    """The parts of the page that follow its tiles, as HTML."""
+    span = _followed(result)
+    parts = [_states(result), _trajectory(result), motion_section(result.table, span, WIDTH), _errors(result)]
+    parts += [_tracks(result), clock_section(result.table, span, WIDTH), _latency(result)]
+    return [part for part in parts if part]
+
+
+def _tiles(result: Evaluation) -> str:
+    tiles = [tile(percent(measured_share(result)).removesuffix(" %"), "%", "of the frame sets followed")]
+    if result.comparison is not None:
+        start, aligned = result.comparison.start, result.comparison.aligned
+        tiles.append(tile(figure(spread(start.translation).median), "mm", "median error from the start"))
+        tiles.append(tile(figure(math.degrees(spread(start.rotation).median)), "°", "median error from the start"))
+        tiles.append(tile(figure(spread(aligned.translation).rmse), "mm", "RMSE, aligned"))
+    if len(result.latency.total):
+        late = result.latency
+        tiles.append(tile(f"{late.p50[-1]:.1f}", "ms", f"per pose; 99 % under {late.p99[-1]:.1f} ms"))
+    return row_of_tiles(tiles)
+
+
+def _span(stamps: Array) -> tuple[float, float]:
+    """First and last of the stamps (s), never equal."""
+    low, high = (float(stamps[0]), float(stamps[-1])) if len(stamps) else (0.0, 1.0)
+    return low, high if high > low else low + 1.0
+
+
+def _followed(result: Evaluation) -> tuple[float, float]:
+    """First and last instant (s) from the first map on; of the whole run where there never was one."""
+    stamps = result.table.stamps
+    later = stamps[~result.table.is_state(TrackState.INITIALISING)]
+    return _span(later if len(later) else stamps)
+
+
+def _states(result: Evaluation) -> str:
+    table = result.table
+    if not len(table):
+        return section("States", "No frame set was given.", "")
+    last = table.stamps[-1] + (np.median(np.diff(table.stamps)) if len(table) > 1 else 1.0)
+    edges = np.append(table.stamps, last)
+    names = [state.value for state in table.states]
+    titles = [f"{s:.2f} s: {n}. {why}" for s, n, why in zip(table.stamps, names, table.reasons, strict=True)]
+    strip = ribbon(edges, names, titles, _span(table.stamps), WIDTH)
+    keys = [area_key(name, f"{name} {percent(share)}") for name, share in result.shares.items() if share > 0]
+    text = "TRACKING and DEGRADED are measured, COASTING is predicted, LOST is of no use."
+    if math.isfinite(result.since):
+        text += f" Shares count from {round(result.since, 2) + 0.0:.2f} s, the instant of the roi."
+    return section("States", text, strip + legend(keys) + _events(result))
+
+
+def _events(result: Evaluation) -> str:
+    """The state changes as a table, with the reason the tracker gave."""
+    table = result.table
+    changes = [i for i in range(len(table)) if i == 0 or table.states[i] is not table.states[i - 1]]
+    rows = "".join(
+        f"<tr><td>{table.stamps[i]:.2f} s</td><td class=words>{table.states[i].value}</td>"
+        f"<td class=words>{escape(table.reasons[i])}</td></tr>"
+        for i in changes[:MOST_EVENTS]
+    )
+    more = len(changes) - MOST_EVENTS
+    rest = f"<p>and {more} more, all in poses.csv</p>" if more > 0 else ""
+    return f"<details><summary>{len(changes)} states in a row, and why</summary><table>{rows}</table>{rest}</details>"
+
+
+def _drawn(result: Evaluation) -> Array:
+    """(N,) 1 where a pose is worth drawing, NaN where it is not: before there is a map, and when lost."""
+    hidden = result.table.is_state(TrackState.INITIALISING) | result.table.is_state(TrackState.LOST)
+    return np.where(hidden, np.nan, 1.0)
+
+
+def components(poses: Array, origin: Array) -> Array:
+    """(N, 6): x y z in base, mm, and the rotation vector against `origin` (4, 4), degrees."""
+    turns = se3.log_rotation(origin[:3, :3].T @ poses[:, :3, :3])
+    return np.concatenate([poses[:, :3, 3], np.degrees(turns)], axis=-1)
+
+
+def deviations(poses: Array, covariance: Array) -> Array:
+    """(N, 6): one standard deviation of what `components` shows; rotations to first order."""
+    rotations = poses[:, :3, :3]
+    position = rotations @ covariance[:, 3:, 3:] @ np.swapaxes(rotations, -1, -2)
+    both = np.stack([position, covariance[:, :3, :3]], axis=1)  # (N, 2, 3, 3)
+    deviations = np.sqrt(np.maximum(np.diagonal(both, axis1=2, axis2=3), 0)).reshape(-1, 6)
+    return np.asarray(deviations * np.repeat([1, 180 / np.pi], 3))
+
+
+def _trajectory(result: Evaluation) -> str:
+    table = result.table
+    drawn = _drawn(result)
+    if not np.isfinite(drawn).any():
+        return ""
+    origin = table.base_from_surface[int(np.flatnonzero(np.isfinite(drawn))[0])]
+    values = components(table.base_from_surface, origin) * drawn[:, None]
+    sigma = 2 * deviations(table.base_from_surface, table.covariance) * drawn[:, None]
+    truth = None
+    if result.comparison is not None:
+        target = result.comparison.expected @ result.comparison.start.truth_surface_from_estimated_surface
+        truth = np.full((len(table), 6), np.nan)
+        truth[result.comparison.rows] = components(target, origin)
+    names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
+    plots = []
+    for i, name in enumerate(names):
+        seen = [values[:, i]] if truth is None else [values[:, i], truth[:, i]]
+        plot = Plot(HALF, 165, _followed(result), spanning(seen, 0.12, 0.5), label=name)
+        plot.band(table.stamps, values[:, i] - sigma[:, i], values[:, i] + sigma[:, i], "spread")
+        if truth is not None:
+            plot.line(table.stamps, truth[:, i], "truth")
+        plot.line(table.stamps, values[:, i], "estimate")
+        plots.append(plot.svg())
+    pairs = [plots[i] for i in (0, 3, 1, 4, 2, 5)]
+    keys = [line_key("estimate", "estimate, with two standard deviations")]
+    if result.comparison is not None:
+        keys.append(line_key("truth", "truth" if result.comparison.exact else "reference"))
+    body = f'{legend(keys)}<div class="two">{"".join(pairs)}</div>'
+    text = "Position of the surface's origin in base, and its rotation since the first pose. Time in s."
+    return section("Trajectory", text, body)
+
+
+def _errors(result: Evaluation) -> str:
+    comparison = result.comparison
+    if comparison is None:
+        return section(
+            "Errors", "The session has neither truth.tum nor reference.tum, or no measured pose beside it.", ""
+        )
+    plots = [
+        _error_plot(result, comparison, comparison.start.translation, "distance from the start on, mm", OFF_MM),
+        _error_plot(result, comparison, np.degrees(comparison.start.rotation), "angle from the start on, °"),
+    ]
+    text = (
+        f"Against the {'exact truth' if comparison.exact else 'measured reference, whose own error is part of this'}, "
+        f"at {len(comparison.rows)} measured poses. From the start: the constant transform between the two surface "
+        "frames is taken at the first TRACKING pose, nothing is fitted. Aligned: the best constant over the run."
+    )
+    return section("Errors", text, "".join(plots) + _error_table(comparison) + _consistency(comparison))
+
+
+def _error_plot(result: Evaluation, comparison: Comparison, errors: Array, label: str, limit: float = np.inf) -> str:
+    """Errors (M,) over time on a logarithmic scale; those of poses that are off get a dot, `limit` a line."""
+    positive = errors[errors > 1e-9]
+    high = max(float(positive.max()) * 1.5, 1e-2) if len(positive) else 1.0
+    low = max(float(np.percentile(positive, 2)) / 2, high / 1e5) if len(positive) else 0.1
+    plot = Plot(WIDTH, 170, _followed(result), (min(low, high / 10), high), log_y=True, label=label)
+    stamps, over_time = result.table.stamps, np.full(len(result.table), np.nan)
+    over_time[comparison.rows] = errors
+    plot.line(stamps, over_time, "estimate")
+    plot.level(float(np.median(errors)), "median", "median")
+    if math.isfinite(limit):
+        plot.level(limit, f"{limit:.0f} mm", "limit")
+        plot.dots(stamps[comparison.off], over_time[comparison.off], "off", 3)
+    return plot.svg()
+
+
+def _error_table(comparison: Comparison) -> str:
+    rows = []
+    for name, errors in (("from the start", comparison.start), ("aligned", comparison.aligned)):
+        for unit, values in (("mm", errors.translation), ("°", np.degrees(errors.rotation))):
+            s = spread(values)
+            rows.append([f"{name}, {unit}", *(figure(v) for v in (s.median, s.rmse, s.p95, s.max))])
+    return figures_table(["", "median", "RMSE", "95 %", "max"], rows)
+
+
+def _consistency(comparison: Comparison) -> str:
+    start, aligned = comparison.start, comparison.aligned
+    text = (
+        f"NEES / 6: {figure(start.mean_nees / 6)} from the start, with the first pose's own error in all poses, "
+        f"and {figure(aligned.mean_nees / 6)} aligned. "
+        f"{_percent_or_dash(aligned.nees_inside)} of the aligned poses have a NEES under {NEES_BOUND:.1f}, "
+        "where 95 % should be. "
+    )
+    if not comparison.exact:
+        text += "It says little here: it holds the reference's own error against the tracker's covariance."
+    return f'<p class="note">{escape(text)}</p>'
+
+
+def _percent_or_dash(share: float) -> str:
+    return percent(share) if math.isfinite(share) else "–"
+
+
+def _tracks(result: Evaluation) -> str:
+    table = result.table
+    if not len(table):
+        return ""
+    plot = Plot(WIDTH, 170, _followed(result), (0.0, max(float(table.used.max(initial=0)) * 1.08, 1.0)))
+    keys = []
+    counted = ~table.is_state(TrackState.INITIALISING)
+    for i, name in enumerate(table.cameras):
+        plot.line(table.stamps, np.where(counted, table.used[:, i], np.nan), f"series c{i % 5}")
+        middle = np.median(table.used[counted, i]) if counted.any() else 0
+        keys.append(line_key(f"series c{i % 5}", f"{name}, median {middle:.0f}"))
+    text = "Tracks that carry the pose, per camera."
+    return section("Tracks", text, legend(keys) + plot.svg())
+
+
+def _latency(result: Evaluation) -> str:
+    late = result.latency
+    text = (
+        "From the decoded frames to the pose, without the map refinement that no pose waits for. The first "
+        f"{late.initial_sets} frame sets, up to the first map, took {late.initialisation:.0f} ms and are not counted."
+    )
+    if not len(late.total):
+        return section("Latency", text, "")
+    rows = [
+        [name, *(f"{v:.2f}" for v in values)]
+        for name, *values in zip(late.stages, late.p50, late.p95, late.p99, late.max, strict=True)
+    ]
+    figures = figures_table(["stage, ms", "median", "95 %", "99 %", "max"], rows, last_total=True)
+    high = max(float(np.percentile(late.total, 99.5)) * 1.25, 1.0)
+    counts, edges = np.histogram(np.minimum(late.total, high * (1 - 1e-9)), bins=40, range=(0, high))
+    plot = Plot(
+        HALF,
+        210,
+        (0, high),
+        (0, max(float(counts.max()) * 1.1, 1.0)),
+    )
+    plot.bars(edges, counts.astype(float), "bar")
+    plot.mark(float(late.p50[-1]), "median", "median")
+    plot.mark(float(late.p99[-1]), "99 %", "median")
+    caption = '<div class="caption">frame sets by their total, ms</div>'
+    return section("Latency", text, f'<div class="two"><div>{figures}</div><div>{caption}{plot.svg()}</div></div>')
+
+
+def main(arguments: list[str]) -> int:
+    """`python -m hardware.report.report OUT`: say again what the run in the folder OUT came to."""
+    path = Path(arguments[0]) / "summary.json"
+    try:
+        print(text_of(json.loads(path.read_text(encoding="utf-8"))))
+        print(f"report: {path.with_name('report.html')}")
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(path, "file", str(error), "the summary.json of stillbed track") from None
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except StillbedError as error:
+        sys.exit(f"stillbed: {error}")

@@ -1,0 +1,147 @@
+"""What the virtual arm's controller and servos are like; a TOML table [arm] gives them, in mm, degrees and s.
+
+fifo = 200
+dead_time_s = 0.0
+servo_lag_s = 0.02
+acceleration_mm_s2 = 3000      # left out: no limit
+top_speed_mm_s = 250
+top_turn_deg_s = 180
+low_mm_deg = [-1000, -1000, -500, -180, -180, -180]
+high_mm_deg = [1000, 1000, 500, 180, 180, 180]
+replies = "off"                # or "stream" or "stray"
+reply_period_s = 0.05
+seed = 0
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.process import checks
+
+KEYS = (
+    "fifo",
+    "dead_time_s",
+    "servo_lag_s",
+    "acceleration_mm_s2",
+    "top_speed_mm_s",
+    "top_turn_deg_s",
+    "low_mm_deg",
+    "high_mm_deg",
+    "replies",
+    "reply_period_s",
+    "seed",
+)
+_TO_RAD = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])
+_FARTHEST = np.array([1600.0] * 3 + [np.deg2rad(320.0)] * 3)  # a reply's int16 must hold a place less an origin
+
+
+class Replies(Enum):
+    """What the arm sends."""
+
+    OFF = "off"
+    STREAM = "stream"  # place and angles every period, as a public driver reads them
+    STRAY = "stray"  # single random bytes at random instants, as thesis 6.2 has it
+
+
+def _six(x_y: float, z: float, angle_deg: float) -> Array:
+    return np.array([x_y, x_y, z, *np.deg2rad([angle_deg] * 3)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmSettings:
+    """One virtual arm. InputError names a setting that makes no sense.
+
+    fifo: commands it keeps. dead_time: s from set-point to servo. servo_lag: s, time constant. acceleration: mm/s^2
+    along X Y Z, None for no limit; A B C get the limit that takes them to their top speed in the same time.
+    top_speed: mm/s along X Y Z. top_turn: rad/s of each of A B C. low, high: (6,) mm and rad, where it can be sent.
+    reply_period: s between replies, or on average between stray bytes. seed: of the stray bytes and of faults.
+    """
+
+    fifo: int = 200  # thesis 6.2: 9600 bytes
+    dead_time: float = 0.0  # nobody has measured it
+    servo_lag: float = 0.02  # nobody has measured it; usual for small position servos
+    acceleration: float | None = None  # the maker names none
+    top_speed: float = 250.0  # 15,000 mm/min in public drivers
+    top_turn: float = float(np.pi)  # unknown; above the 120 degrees/s that the planner asks at most
+    low: Array = field(default_factory=lambda: -_six(1000, 500, 180))  # X Y Z as in a public driver
+    high: Array = field(default_factory=lambda: _six(1000, 500, 180))
+    replies: Replies = Replies.OFF  # the thesis could read none
+    reply_period: float = 0.05  # 27 bytes take 28 ms at 9600 bits/s, the slowest line of a public driver
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, low in (("fifo", 1), ("seed", 0)):
+            checks.integer("arm", name, getattr(self, name), low)
+        for name in ("dead_time", "servo_lag", "acceleration", "top_speed", "top_turn", "reply_period"):
+            self._check_positive(name, zero=name in ("dead_time", "servo_lag"))
+        for name in ("low", "high"):
+            value = getattr(self, name)
+            if np.shape(value) != (6,) or not (np.abs(value) <= _FARTHEST).all():
+                raise InputError("arm", name, np.asarray(value).tolist(), "6 numbers within 1600 mm and 320 degrees")
+        if (self.low >= self.high).any():
+            raise InputError("arm", "low", self.low.tolist(), f"below high, {self.high.tolist()}")
+
+    def _check_positive(self, name: str, zero: bool) -> None:
+        value = getattr(self, name)
+        if value is None and name == "acceleration":
+            return
+        if not (np.isfinite(value) and (value > 0 or (zero and value == 0))):
+            raise InputError("arm", name, value, "a finite number >= 0" if zero else "a finite number > 0")
+
+
+def arm_settings_from_table(where: object, table: checks.Table) -> ArmSettings:
+    """The settings in a table [arm]; what it leaves out keeps its default. InputError names the key."""
+    checks.check_keys(where, "arm.", table, (), KEYS)
+    try:
+        return ArmSettings(**{_field(key): _value(where, key, value) for key, value in table.items()})
+    except InputError as error:
+        if error.where == str(where):
+            raise
+        raise InputError(where, f"arm.{_key(str(error.what))}", error.got, error.allowed) from None
+
+
+def table_from_arm_settings(settings: ArmSettings) -> dict[str, Any]:
+    """The table [arm] that gives these settings; angles in degrees, as arrays where there are six numbers."""
+    table: dict[str, Any] = {}
+    for key in KEYS:
+        value = getattr(settings, _field(key))
+        if key.endswith("_mm_deg"):
+            value = value / _TO_RAD
+        elif key.endswith("_deg_s"):
+            value = float(np.rad2deg(value))
+        if value is not None:
+            table[key] = value.value if isinstance(value, Replies) else value
+    return table
+
+
+def _field(key: str) -> str:
+    for unit in ("_mm_s2", "_mm_s", "_deg_s", "_mm_deg", "_s"):
+        if key.endswith(unit):
+            return key.removesuffix(unit)
+    return key
+
+
+def _key(name: str) -> str:
+    return next(key for key in KEYS if _field(key) == name)
+
+
+def _value(where: object, key: str, value: object) -> Any:
+    name = f"arm.{key}"
+    if key in ("fifo", "seed"):
+        return checks.integer(where, name, value, 0)
+    if key == "replies":
+        words = [mode.value for mode in Replies]
+        if value not in words:
+            raise InputError(where, name, value, checks.meant(str(value), words))
+        return Replies(value)
+    if key.endswith("_mm_deg"):
+        return checks.numbers(where, name, value, (6,)) * _TO_RAD
+    number = checks.number(where, name, value)
+    return float(np.deg2rad(number)) if key.endswith("_deg_s") else number

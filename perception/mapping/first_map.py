@@ -1,0 +1,347 @@
+"""The first map: landmarks by triangulation across the cameras that see the region of interest.
+
+Cameras stand 36 to 84 degrees apart, so corners do not look alike from one to the next. SIFT seeds give the surface's
+rough shape; every corner is then put on that shape, its patch warped into the other view and aligned there.
+Cameras are seldom exposed together: all epipolar distances of a moving surface share an offset, found by consensus.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from estimation import se3
+from estimation.mapping.local_surface import smooth_normals
+from estimation.mapping.triangulation import epipolar_distance, rays, triangulate
+from estimation.rig import Rig, ideal_pixels
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap, local_normals, moved_map, surface_frame
+from perception.alignment import align, coarse_score
+from perception.features import Mask, corners, match, polygon_mask, sift
+from perception.lens import Lenses, undistort
+from perception.matching.masks import trackable
+from perception.matching.patches import FLAT, Pyramid, Templates, join, project_squares, take_templates
+
+EPIPOLAR_REACH = 40.0  # px: 0.3 m/s at 60 ms between exposures, f 700 px, 400 mm away
+LEAST_SEEDS, LEAST_LANDMARKS = 10, 20
+SAME = 2.0  # px: features closer than this show one spot
+LANDMARKS = 240  # in all: more cost time and gain nothing (the map's own error stays)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstMap:
+    """base_from_surface (4, 4) and the map at the first instant, with the reference pictures of its landmarks."""
+
+    base_from_surface: Array
+    map: SurfaceMap
+    templates: Templates
+
+
+def in_frame(first: FirstMap, base_from_new: Array) -> FirstMap:
+    """The same map in another surface frame, as a scan's: base_from_new (4, 4)."""
+    new_from_old = se3.inverse(base_from_new) @ first.base_from_surface
+    templates = replace(first.templates, axes=new_from_old[:3, :3] @ first.templates.axes)
+    return FirstMap(base_from_new, moved_map(first.map, new_from_old), templates)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seeds:
+    """Matches between cameras a and b: ideal pixels (N, 2) in each, points (N, 3) in the base frame."""
+
+    a: int
+    b: int
+    pixels_a: Array
+    pixels_b: Array
+    points: Array
+
+
+def consensus(
+    position: Array, value: Array, reach: float, tolerance: float, rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """Inliers (N,) of a plane value ~ [1 x y] over positions (N, 2), by RANSAC among values within `reach` of zero."""
+    scale = np.maximum(position.std(0), 1.0)
+    design = np.c_[np.ones(len(position)), (position - position.mean(0)) / scale]
+    candidates = np.nonzero(np.abs(value) < reach)[0]
+    best = np.zeros(len(value), bool)
+    if len(candidates) < 4:
+        return best
+    for trial in range(200):
+        chosen = rng.choice(candidates, 3, replace=False) if trial % 2 else rng.choice(candidates, 1)
+        model = np.array([value[chosen[0]], 0.0, 0.0])
+        if len(chosen) == 3:
+            try:
+                model = np.linalg.solve(design[chosen], value[chosen])
+            except np.linalg.LinAlgError:
+                continue
+        if abs(model[0]) > reach or np.abs(model[1:]).max() > reach / 2:
+            continue
+        inliers = np.abs(design @ model - value) < tolerance
+        if inliers.sum() > best.sum():
+            best = inliers
+    return best
+
+
+def _smooth(points: Array, neighbours: int = 8) -> NDArray[np.bool_]:
+    """Which points (N, 3) lie near the surface of their neighbours: a wrong match along its epipolar line does not."""
+    keep = np.ones(len(points), bool)
+    for _ in range(2):
+        index = np.nonzero(keep)[0]
+        if len(index) < neighbours + 2:
+            return keep
+        tree = cKDTree(points[index])
+        distance, near = tree.query(points[index], k=neighbours + 1)
+        median = np.median(points[index][near[:, 1:]], axis=1)
+        away = np.linalg.norm(points[index] - median, axis=1)
+        limit = 3.0 * np.median(distance[:, -1]) + 1e-6
+        keep[index[away > limit]] = False
+    return keep
+
+
+def find_seeds(
+    lenses: Lenses, a: int, b: int, features: dict[int, tuple[Array, NDArray[np.float32]]], rng: np.random.Generator
+) -> Seeds | None:
+    """SIFT matches between two cameras that agree on one epipolar offset and on a surface."""
+    cameras = lenses.rig.cameras
+    pairs = match(features[a][1], features[b][1], 0.85)
+    if len(pairs) < LEAST_SEEDS:
+        return None
+    both = np.concatenate([features[a][0][pairs[:, 0]], features[b][0][pairs[:, 1]]], 1)
+    _, first = np.unique(np.round(both / SAME), axis=0, return_index=True)  # one spot was found under several tilts
+    pixels_a, pixels_b = undistort(cameras[a], both[first, :2]), undistort(cameras[b], both[first, 2:])
+    distance = epipolar_distance(lenses.rig, a, b, pixels_a, pixels_b)
+    good = consensus(pixels_b, distance, EPIPOLAR_REACH, 2.0, rng)
+    points, _, _ = _pair_points(lenses.rig, a, b, pixels_a[good], pixels_b[good])
+    depth_a = ideal_pixels(cameras[a], points)[1]
+    depth_b = ideal_pixels(cameras[b], points)[1]
+    plausible = (depth_a > 20) & (depth_b > 20) & np.isfinite(points).all(1)
+    plausible[plausible] &= _smooth(points[plausible])
+    if plausible.sum() < LEAST_SEEDS:
+        return None
+    return Seeds(a, b, pixels_a[good][plausible], pixels_b[good][plausible], points[plausible])
+
+
+def _pair_points(rig: Rig, a: int, b: int, pixels_a: Array, pixels_b: Array) -> tuple[Array, Array, Array]:
+    n = len(pixels_a)
+    point = np.tile(np.arange(n), 2)
+    camera = np.repeat([a, b], n)
+    points, covariance, residual = triangulate(rig, point, camera, np.concatenate([pixels_a, pixels_b]), n)
+    return points, covariance, residual
+
+
+def _on_seeds(
+    rig: Rig, seeds: Seeds, camera: int, pixels: Array, outward: Array
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Where rays of pixels (N, 2) meet the seeds' surface: points (N, 3) and normals (N, 3), base frame.
+
+    With them the mean offset (N, 2), px, of nearby seeds in the other camera from where their own rays and depths would
+    put them, and whether seeds are near (N,).
+    """
+    own, other = (seeds.pixels_a, seeds.pixels_b) if camera == seeds.a else (seeds.pixels_b, seeds.pixels_a)
+    target = seeds.b if camera == seeds.a else seeds.a
+    tree = cKDTree(own)
+    k = min(6, len(own))
+    gap, near = tree.query(pixels, k=k)
+    spacing = np.median(tree.query(own, k=min(4, len(own)))[0][:, -1])
+    normals = local_normals(seeds.points, outward)[near].mean(1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    which = np.full(len(pixels), camera)
+    origins, directions = rays(rig, which, pixels)
+    anchor = seeds.points[near].mean(1)
+    slope = np.einsum("ni,ni->n", directions, normals)
+    safe = np.where(np.abs(slope) < 0.05, -0.05, slope)
+    reach = np.einsum("ni,ni->n", anchor - origins, normals) / safe
+    points = origins + reach[:, None] * directions
+    seed_origins, seed_directions = rays(rig, np.full(len(own), camera), own)
+    along = np.einsum("ni,ni->n", seeds.points - seed_origins, seed_directions)
+    on_ray = seed_origins + along[:, None] * seed_directions
+    offset = (other - ideal_pixels(rig.cameras[target], on_ray)[0])[near].mean(1)
+    return points, normals, offset, (gap[:, 0] < 3 * spacing + 10) & (np.abs(slope) > 0.05)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmarks:
+    """Candidates of one reference camera: its pixels (N, 2) and those in the other camera, ideal; points, normals."""
+
+    camera: int
+    other: int
+    pixels: Array
+    pixels_other: Array
+    points: Array
+    normals: Array
+
+
+def find_landmarks(
+    lenses: Lenses, pyramids: dict[int, Pyramid], mask: NDArray[np.uint8], seeds: Seeds, camera: int, count: int
+) -> Landmarks | None:
+    """Corners of one camera, found in the other: first on the seeds' surface, then by a sweep along their rays."""
+    rig = lenses.rig
+    other = seeds.b if camera == seeds.a else seeds.a
+    outward = rig.cameras[camera].base_from_camera[:3, 3] - seeds.points.mean(0)
+    pixels = undistort(rig.cameras[camera], corners(pyramids[camera][0], mask, count))
+    if len(pixels) < 4:
+        return None
+    points, normals, offset, near = _on_seeds(rig, seeds, camera, pixels, outward)
+    found, good = _place(lenses, pyramids, camera, other, points, normals, offset, least=0.8)
+    good &= near
+    if good.sum() >= 4:
+        surface = _pair_points(rig, camera, other, pixels[good], found[good])[0]
+        normals[~good] = local_normals(np.concatenate([surface, seeds.points]), outward).mean(0)
+    missing = np.nonzero(~good)[0]
+    if len(missing):
+        swept, sure = _sweep(lenses, pyramids, camera, other, pixels[missing], normals[missing], seeds, offset[missing])
+        again, back = _place(lenses, pyramids, camera, other, swept, normals[missing], offset[missing], least=0.85)
+        found[missing], good[missing] = again, back & sure
+    for _ in range(2):
+        pixels, found = pixels[good], found[good]
+        if len(pixels) < 6:
+            return None
+        points, _, residual = _pair_points(rig, camera, other, pixels, found)
+        keep = _smooth(points) & _steady(pixels, residual.reshape(2, -1, 2)[1])
+        pixels, found, points = pixels[keep], found[keep], points[keep]
+        if len(pixels) < 6:
+            return None
+        normals = smooth_normals(points, outward)
+        on_ray = on_rays(rig, camera, pixels, points)
+        offset = found - ideal_pixels(rig.cameras[other], on_ray)[0]
+        found, good = _place(lenses, pyramids, camera, other, on_ray, normals, offset, least=0.8)
+    points = _pair_points(rig, camera, other, pixels[good], found[good])[0]
+    return Landmarks(camera, other, pixels[good], found[good], points, normals[good])
+
+
+def _place(
+    lenses: Lenses,
+    pyramids: dict[int, Pyramid],
+    camera: int,
+    other: int,
+    points: Array,
+    normals: Array,
+    offset: Array,
+    least: float,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Ideal pixels (N, 2) in the other camera where the patches of points (N, 3), base frame, fit, and whether."""
+    templates = take_templates(lenses, pyramids[camera], camera, np.eye(4), points, normals)
+    where = project_squares(lenses, other, np.eye(4), points, normals, templates.axes)
+    start = where.centre + offset
+    result = align(templates, pyramids[other], where, start, least)
+    near = np.linalg.norm(result.pixels - start, axis=1) < 10
+    return undistort(lenses.rig.cameras[other], result.pixels), result.found & near & (templates.contrast > FLAT)
+
+
+def _sweep(
+    lenses: Lenses,
+    pyramids: dict[int, Pyramid],
+    camera: int,
+    other: int,
+    pixels: Array,
+    normals: Array,
+    seeds: Seeds,
+    offset: Array,
+    steps: int = 48,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Points (N, 3), base frame, on the rays of pixels (N, 2) at the depth where the patch fits best, and whether one
+    depth stands out (N,). Depths: the seeds' own range and a fifth more, even in inverse depth."""
+    rig = lenses.rig
+    origins, directions = rays(rig, np.full(len(pixels), camera), pixels)
+    reach = np.linalg.norm(seeds.points - rig.cameras[camera].base_from_camera[:3, 3], axis=1)
+    inverse = np.linspace(1 / (reach.max() * 1.2), 1 / (reach.min() * 0.8), steps)
+    scores = np.full((len(pixels), steps), -1.0)
+    for k, value in enumerate(inverse):
+        points = origins + directions / value
+        templates = take_templates(lenses, pyramids[camera], camera, np.eye(4), points, normals)
+        where = project_squares(lenses, other, np.eye(4), points, normals, templates.axes)
+        current = coarse_score(templates, pyramids[other], where, where.centre + offset)
+        scores[:, k] = np.where(where.visible, current, -1.0)
+    best = scores.argmax(1)
+    beside = np.abs(np.arange(steps) - best[:, None]) <= 3
+    rival = np.where(beside, -1.0, scores).max(1)
+    peak = scores[np.arange(len(pixels)), best]
+    return origins + directions / inverse[best][:, None], (peak > 0.7) & (rival < peak - 0.1)
+
+
+def on_rays(rig: Rig, camera: int, pixels: Array, points: Array) -> Array:
+    """The spots (N, 3) on the pixels' own rays nearest to points: a landmark stands exactly where its camera saw it."""
+    origins, directions = rays(rig, np.full(len(pixels), camera), pixels)
+    return np.asarray(origins + np.einsum("ni,ni->n", points - origins, directions)[:, None] * directions)
+
+
+def _steady(pixels: Array, residual: Array) -> NDArray[np.bool_]:
+    """Whether each residual (N, 2) agrees with an affine field over the image, as a common capture offset makes."""
+    design = np.c_[np.ones(len(pixels)), (pixels - pixels.mean(0)) / np.maximum(pixels.std(0), 1.0)]
+    keep = np.ones(len(pixels), bool)
+    for _ in range(4):
+        model = np.linalg.lstsq(design[keep], residual[keep], rcond=None)[0]
+        away = np.linalg.norm(residual - design @ model, axis=1)
+        keep = away < max(3 * 1.48 * np.median(away[keep]), 0.6)
+        if keep.sum() < 6:
+            return np.zeros(len(pixels), bool)
+    return keep
+
+
+def build_first_map(
+    lenses: Lenses, pyramids: dict[int, Pyramid], polygons: dict[int, Array], heads: dict[int, Mask] | None = None
+) -> FirstMap | str:
+    """The map of what lies inside the polygons at this instant, or the reason why there is none.
+
+    pyramids: by camera, the images. polygons: by camera, (N, 2) px as imaged; at least two cameras. heads: by camera,
+    where the print head is.
+    """
+    heads = heads or {}
+    rig = lenses.rig
+    rng = np.random.default_rng(0)
+    cameras = sorted(set(pyramids) & set(polygons))
+    if len(cameras) < 2:
+        return "the surface must be seen by two cameras to be mapped"
+    masks = {
+        c: trackable(pyramids[c][0], polygon_mask(rig.cameras[c].size, polygons[c]), heads.get(c)) for c in cameras
+    }
+    features = {c: sift(pyramids[c][0], masks[c], 1000, tilted=True) for c in cameras}
+    best: dict[int, Landmarks] = {}  # by reference camera, with the partner that sees most of its corners
+    for i, a in enumerate(cameras):
+        for b in cameras[i + 1 :]:
+            seeds = find_seeds(lenses, a, b, features, rng)
+            if seeds is None:
+                continue
+            for c in (a, b):
+                part = find_landmarks(lenses, pyramids, masks[c], seeds, c, LANDMARKS // len(cameras))
+                if part is not None and (c not in best or len(part.points) > len(best[c].points)):
+                    best[c] = part
+    parts = [best[c] for c in sorted(best)]
+    if sum(len(p.points) for p in parts) < LEAST_LANDMARKS:
+        return f"fewer than {LEAST_LANDMARKS} spots could be matched between two cameras"
+    points = np.concatenate([p.points for p in parts])
+    centre = np.mean([rig.cameras[p.camera].base_from_camera[:3, 3] for p in parts], axis=0)
+    frame = surface_frame(points, centre, rig.cameras[parts[0].camera].base_from_camera[:3, 0])
+    return assemble(lenses, pyramids, parts, frame)
+
+
+def assemble(
+    lenses: Lenses, pyramids: dict[int, Pyramid], parts: list[Landmarks], base_from_surface: Array
+) -> FirstMap:
+    """Landmarks of several cameras as one map in the frame `base_from_surface` (4, 4), and their reference pictures."""
+    rig = lenses.rig
+    points_base = np.concatenate([p.points for p in parts])
+    surface_from_base = se3.inverse(base_from_surface)
+    points = se3.transform_points(surface_from_base, points_base)
+    outward = np.mean([rig.cameras[p.camera].base_from_camera[:3, 3] for p in parts], axis=0) - points_base.mean(0)
+    normals = smooth_normals(points, surface_from_base[:3, :3] @ outward)
+    first = np.cumsum([0] + [len(p.points) for p in parts])
+    templates = join(
+        [
+            take_templates(lenses, pyramids[p.camera], p.camera, base_from_surface, points[i:j], normals[i:j])
+            for p, i, j in zip(parts, first[:-1], first[1:], strict=True)
+        ]
+    )
+    covariance = np.zeros((3 * len(points), 3 * len(points)))
+    for p, i in zip(parts, first[:-1], strict=True):
+        blocks = _pair_points(rig, p.camera, p.other, p.pixels, p.pixels_other)[1]
+        turned = surface_from_base[:3, :3] @ blocks @ surface_from_base[:3, :3].T * 0.2**2
+        for j, block in enumerate(turned):
+            at = 3 * (i + j)
+            covariance[at : at + 3, at : at + 3] = block
+    good = templates.contrast > FLAT
+    rows = np.repeat(good, 3)
+    surface_map = SurfaceMap(points[good], normals[good], covariance[np.ix_(rows, rows)])
+    return FirstMap(base_from_surface, surface_map, templates.take(good))

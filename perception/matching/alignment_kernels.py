@@ -1,0 +1,151 @@
+"""The loops of patch alignment, compiled: grey levels under a grid, and the descent that shifts it until it fits.
+
+Grey levels are interpolated in floating point: OpenCV's `remap` rounds places to 1/32 px and its answer to whole grey
+levels, which the sum over a patch does not quite average out. The interpreter is free meanwhile, so that cameras can be
+aligned side by side.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.runtime import compiled
+from estimation.se3 import Array
+from perception.frames import Image
+
+Float32 = NDArray[np.float32]
+
+RADIUS = 7  # samples: 15 x 15, of which 225 decide
+SIDE = 2 * RADIUS + 1
+GRID_SIZE = SIDE * SIDE
+ARRIVED = 0.03  # samples: a last step; what is left after it is a tenth of that
+UNSEEN = 0.3  # samples: the longest step taken without a look at where it leads
+STRIDE = 3.0  # samples: the longest step at all
+FAINT = 1e-6  # grey levels squared: no contrast at all
+
+
+@compiled("void(u1[:,::1], f8, f8, f8[:,::1], f8, f4[::1])")
+def _look(image: Image, x: float, y: float, per_sample: Array, scale: float, seen: Float32) -> None:
+    """Grey levels (S,) of the grid about x, y px, bilinear; outside the image its border's."""
+    right, low = image.shape[1] - 1, image.shape[0] - 1
+    k = 0
+    for row in range(-RADIUS, RADIUS + 1):
+        for column in range(-RADIUS, RADIUS + 1):
+            u = min(max(x + scale * (per_sample[0, 0] * column + per_sample[0, 1] * row), 0.0), float(right))
+            v = min(max(y + scale * (per_sample[1, 0] * column + per_sample[1, 1] * row), 0.0), float(low))
+            i, j = int(u), int(v)
+            i1, j1 = min(i + 1, right), min(j + 1, low)
+            above = image[j, i] + (u - i) * (float(image[j, i1]) - image[j, i])
+            below = image[j1, i] + (u - i) * (float(image[j1, i1]) - image[j1, i])
+            seen[k] = above + (v - j) * (below - above)
+            k += 1
+
+
+@compiled("b1(u1[:,::1], f8, f8, f8[:,::1], f8, f4[::1])")
+def _look_inside(image: Image, x: float, y: float, per_sample: Array, scale: float, seen: Float32) -> bool:
+    """`_look` at half the time where the whole grid is inside the image; whether it is.
+
+    Single precision from the nearest whole pixel on, and unsigned indices, which numba need not check for a sign.
+    """
+    right, low = image.shape[1] - 1, image.shape[0] - 1
+    across = RADIUS * scale * (abs(per_sample[0, 0]) + abs(per_sample[0, 1]))
+    along = RADIUS * scale * (abs(per_sample[1, 0]) + abs(per_sample[1, 1]))
+    if not (x - across >= 0 and x + across < right and y - along >= 0 and y + along < low):
+        return False
+    du, dv = np.float32(scale * per_sample[0, 0]), np.float32(scale * per_sample[1, 0])
+    left, top = int(x - across), int(y - along)
+    k = 0
+    for row in range(-RADIUS, RADIUS + 1):
+        u0 = np.float32(x - left + scale * (per_sample[0, 1] * row - RADIUS * per_sample[0, 0]))
+        v0 = np.float32(y - top + scale * (per_sample[1, 1] * row - RADIUS * per_sample[1, 0]))
+        for column in range(SIDE):
+            u, v = u0 + du * np.float32(column), v0 + dv * np.float32(column)
+            i, j = np.int32(u), np.int32(v)
+            a, b = u - np.float32(i), v - np.float32(j)
+            m, n = np.uint64(top + j), np.uint64(left + i)
+            above, below = np.float32(image[m, n]), np.float32(image[m + np.uint64(1), n])
+            above += a * (np.float32(image[m, n + np.uint64(1)]) - above)
+            below += a * (np.float32(image[m + np.uint64(1), n + np.uint64(1)]) - below)
+            seen[k] = above + b * (below - above)
+            k += 1
+    return True
+
+
+@compiled("f8[::1](f4[::1], f4[::1], f4[:,::1])", reordered=True)
+def _sums(seen: Float32, picture: Float32, steepest: Float32) -> Array:
+    """Sums over a patch of its grey levels, of their squares, and of them times picture (S,) and steepest (2, S).
+
+    Levels count from the middle of their range: so the squares' sum keeps its digits, and pictures have no mean.
+    """
+    total, squares = np.float32(0), np.float32(0)
+    alike, across, down = np.float32(0), np.float32(0), np.float32(0)
+    for k in range(GRID_SIZE):
+        level = seen[k] - np.float32(128)
+        total += level
+        squares += level * level
+        alike += level * picture[k]
+        across += level * steepest[0, k]
+        down += level * steepest[1, k]
+    return np.array([total, squares, alike, across, down], np.float64)
+
+
+@compiled("f4[:,::1](u1[:,::1], f8[:,::1], f8[:,:,::1], f8)")
+def look(image: Image, centre: Array, per_sample: Array, scale: float) -> Float32:
+    """Grey levels (N, S) of grids at centres (N, 2) px, per_sample (N, 2, 2) px a step, times `scale`."""
+    seen: Float32 = np.empty((len(centre), GRID_SIZE), np.float32)
+    for n in range(len(centre)):
+        if not _look_inside(image, centre[n, 0], centre[n, 1], per_sample[n], scale, seen[n]):
+            _look(image, centre[n, 0], centre[n, 1], per_sample[n], scale, seen[n])
+    return seen
+
+
+@compiled(
+    "f8[:,::1](u1[:,::1], f8[:,::1], f8[:,:,::1], b1[::1], f4[:,::1], f4[:,:,::1], f8[:,:,::1], f8[:,::1], f8, f8, i8)"
+)
+def descend(
+    image: Image,
+    start: Array,
+    per_sample: Array,
+    wanted: NDArray[np.bool_],
+    picture: Float32,
+    steepest: Float32,
+    inverse_hessian: Array,
+    shift: Array,
+    scale: float,
+    spacing: float,
+    rounds: int,
+) -> Array:
+    """Gauss-Newton on the shifts (N, 2), samples, in place, of those wanted (N,).
+
+    start: (N, 2) px of this image. per_sample: (N, 2, 2) px of the full image a sample; scale: of this image to it.
+    spacing: samples from one of the grid's to the next. The steepest descent pictures are free of brightness and
+    contrast, so the image need not be. Answers (N, 3): score and contrast, grey levels, at the place looked at last,
+    and what it would still have moved, samples.
+    """
+    ended = np.zeros((len(start), 3))
+    seen: Float32 = np.empty(GRID_SIZE, np.float32)
+    for n in range(len(start)):
+        if not wanted[n]:
+            continue
+        step = per_sample[n]
+        for left in range(rounds - 1, -1, -1):
+            x = start[n, 0] + scale * (step[0, 0] * shift[n, 0] + step[0, 1] * shift[n, 1])
+            y = start[n, 1] + scale * (step[1, 0] * shift[n, 0] + step[1, 1] * shift[n, 1])
+            if not _look_inside(image, x, y, step, scale * spacing, seen):
+                _look(image, x, y, step, scale * spacing, seen)
+            total, squares, alike, across, down = _sums(seen, picture[n], steepest[n])
+            mean = total / GRID_SIZE
+            contrast = np.sqrt(max(squares / GRID_SIZE - mean * mean, FAINT))
+            ended[n, 0], ended[n, 1] = alike / (GRID_SIZE * contrast), contrast
+            dx = -(inverse_hessian[n, 0, 0] * across + inverse_hessian[n, 0, 1] * down) / contrast
+            dy = -(inverse_hessian[n, 1, 0] * across + inverse_hessian[n, 1, 1] * down) / contrast
+            length = np.sqrt(dx * dx + dy * dy)
+            ended[n, 2] = 0.0 if length < ARRIVED else length
+            if left or spacing > 1 or length <= UNSEEN:
+                stride = spacing * min(1.0, STRIDE / max(length, 1e-9))
+                shift[n, 0] += stride * dx
+                shift[n, 1] += stride * dy
+            if length < ARRIVED:
+                break
+    return ended

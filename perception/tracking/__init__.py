@@ -1,0 +1,1 @@
+"""The tracking step: one frame set in, one surface pose out; and tracks found anew once a motion is known."""

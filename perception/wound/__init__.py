@@ -1,0 +1,1 @@
+"""Where the wound is in a picture: the network, shape matching, and both filtered over time."""

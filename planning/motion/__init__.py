@@ -1,0 +1,1 @@
+"""From checkpoints on a moving surface to one command a tick: re-timing, following, the guard."""
