@@ -40,7 +40,7 @@ check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest tests/test_floors.py tests/test_hazards.py
+	$(BIN)/python -m pytest tests/test_floors.py tests/test_shipped.py
 	$(BIN)/python -m tests.hazard_table --check
 	$(BIN)/python -m tests.process_replay
 

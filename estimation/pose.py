@@ -1,16 +1,122 @@
-"""The estimate: where the surface is, how fast it moves, how sure we are, and whether to trust it."""
+"""The estimate: where the surface is, how fast it moves, how sure we are, and whether to trust it.
+
+A pose has a forecast for the next half second, once enough is learned. A `Trajectory` holds poses over time.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import lru_cache
+from statistics import NormalDist
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimation import se3
-from estimation.forecast import Forecast, body_rate, point_covariance, radius
 from estimation.se3 import Array
-from estimation.warp import Warp
+from estimation.surface_map import Warp
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
+
+MIN_FORECAST_S = 0.01  # a shorter rest of a forecast says no more than the velocity there
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forecast:
+    """The motion ahead of a pose, from its stamp on."""
+
+    horizons: Array  # (H,) s after the pose, rising, above 0
+    increments: Array  # (H, 6) tangent vectors: the surface is expected at pose @ exp(increment)
+    covariances: Array  # (H, 6, 6) of the right perturbation there, scaled so that 90 % radii hold 0.9 of the errors
+
+    @property
+    def end(self) -> float:
+        """s after the pose up to which the forecast reaches."""
+        return float(self.horizons[-1])
+
+    def at(self, ahead: Array) -> tuple[Array, Array]:
+        """Increments (T, 6) and their rates (T, 6) per s, at `ahead` (T,), 0 to `end` s: a cubic through the horizons.
+
+        The curve starts at the pose itself and has continuous acceleration: an arm follows it.
+        """
+        curve, slope = _basis(tuple(self.horizons.tolist()))
+        return curve(ahead) @ self.increments, slope(ahead) @ self.increments
+
+    def covariance(self, start: Array, ahead: float) -> Array:
+        """Covariance (6, 6) at `ahead`, 0 to `end` s, with `start` (6, 6) at the pose; linear between horizons."""
+        times = np.concatenate([[0.0], self.horizons])
+        k = min(int(np.searchsorted(times, ahead, "right")), len(times) - 1)
+        u = (ahead - times[k - 1]) / (times[k] - times[k - 1])
+        before = start if k == 1 else self.covariances[k - 2]
+        return np.asarray((1 - u) * before + u * self.covariances[k - 1])
+
+    def after(self, ahead: float) -> Forecast | None:
+        """What is left of the forecast at `ahead` s, seen from the pose expected there; None from the end on."""
+        left = self.end - ahead
+        if left < MIN_FORECAST_S:
+            return None
+        steps = left * np.arange(1, len(self.horizons) + 1) / len(self.horizons)
+        here, there = self.at(np.array([ahead]))[0][0], self.at(ahead + steps)[0]
+        covariances = np.stack([self.covariance(self.covariances[0], ahead + s) for s in steps.tolist()])
+        return Forecast(steps, se3.log(se3.inverse(se3.exp(here)) @ se3.exp(there)), covariances)
+
+
+def prepare(horizons: Array) -> None:
+    """Prepare the curve of forecasts over these horizons (H,), s: 0.1 to 0.5 s that the first need not spend."""
+    _basis(tuple(horizons.tolist()))
+
+
+@lru_cache(maxsize=8)
+def _basis(horizons: tuple[float, ...]) -> tuple[CubicSpline, CubicSpline]:
+    """The curve by each horizon's increment, and its slope."""
+    from scipy.interpolate import CubicSpline  # half a second, which processes that only pass poses on need not spend
+
+    count = len(horizons)
+    curve = CubicSpline([0.0, *horizons], np.concatenate([np.zeros((1, count)), np.eye(count)]))
+    return curve, curve.derivative()
+
+
+def body_rate(increment: Array, rate: Array) -> Array:
+    """Body velocity (..., 6) where exp(increment) is passed with d increment / dt = rate, both (..., 6).
+
+    The right Jacobian's series (Barfoot 2017, 7.1.5) up to the square of the increment: turns within half a second are
+    small, and at half a radian this is within half a percent.
+    """
+    once = _bracket(increment, rate)
+    return np.asarray(rate - once / 2 + _bracket(increment, once) / 6)
+
+
+def _bracket(a: Array, b: Array) -> Array:
+    """The Lie bracket of tangent vectors (..., 6)."""
+    turn = se3.cross(a[..., :3], b[..., :3])
+    shift = se3.cross(a[..., :3], b[..., 3:]) + se3.cross(a[..., 3:], b[..., :3])
+    return np.concatenate([turn, shift], axis=-1)
+
+
+def radius(covariance: Array, share: float = 0.9) -> Array:
+    """Radius (...) of the ball that holds `share` of a normal error with covariance (..., 3, 3) about its mean.
+
+    The sum of three weighted squares is taken as one scaled chi-square (Satterthwaite 1946), whose quantile is Wilson
+    and Hilferty's (1931): within 2 % of the exact one for every shape of the covariance at 0.9.
+    """
+    trace = np.maximum(np.trace(covariance, axis1=-2, axis2=-1), 0.0)
+    squares = (covariance**2).sum((-2, -1))
+    safe = np.where(trace > 0, trace, 1.0)
+    part = 2 * np.where(trace > 0, squares, 1.0) / (9 * safe**2)
+    return np.asarray(np.sqrt(trace) * np.maximum(1 - part + _normal_quantile(share) * np.sqrt(part), 0.0) ** 1.5)
+
+
+def point_covariance(covariance: Array, points: Array) -> Array:
+    """Covariances (..., N, 3, 3), mm^2, of points (N, 3), mm, under pose covariances (..., 6, 6)."""
+    jacobian = se3.point_jacobians(points)
+    return np.asarray(jacobian @ covariance[..., None, :, :] @ np.swapaxes(jacobian, -1, -2))
+
+
+@lru_cache(maxsize=8)
+def _normal_quantile(share: float) -> float:
+    return NormalDist().inv_cdf(share)
 
 
 class TrackState(Enum):
@@ -29,43 +135,30 @@ class TrackState(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class SurfaceMotion:
-    """Whether the surface moves: a movement of 300 um or 0.1 degree away from where it was at rest (thesis 1.3).
+class MotionState:
+    """Whether the surface moves: 300 um or 0.1 degree away from where it was at rest (thesis 1.3)."""
 
-    moving: also before it has been seen at rest. onset: s, stamp of the first pose of the last movement, NaN where that
-    was before the first pose. moved: mm, of the middle of the mapped surface, and turned: rad, since it was last at
-    rest, or since the first pose before it ever was.
-    """
-
-    moving: bool = True
-    onset: float = float("nan")
-    moved: float = 0.0
-    turned: float = 0.0
+    moving: bool = True  # also before it has been seen at rest
+    onset: float = float("nan")  # s, stamp of the first pose of the last movement; nan: before the first pose
+    moved: float = 0.0  # mm, of the map's middle since it was last at rest, or since the first pose
+    turned: float = 0.0  # rad, likewise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfacePose:
-    """Pose of the surface at one instant.
+    """Pose of the surface at one instant."""
 
-    stamp: s, middle of the exposure. base_from_surface: (4, 4) mm. covariance: (6, 6) of the right perturbation
-    [rx ry rz tx ty tz], rad and mm, in the surface frame. twist: (6,) body velocity, rad/s and mm/s. twist_covariance:
-    (6, 6). acceleration_psd: (6,) spectral density of the white-noise acceleration between poses, rad^2/s^3 and
-    mm^2/s^3. reason: why the state is what it is, in words for the operator. motion: as last detected. warp: how
-    the surface departs from the rigid body that the pose describes; None while it does not.
-    forecast: where the surface is expected from the stamp on, if that is known better than by the twist.
-    """
-
-    stamp: float
-    base_from_surface: Array
-    covariance: Array
-    twist: Array
+    stamp: float  # s, middle of the exposure
+    base_from_surface: Array  # (4, 4) mm
+    covariance: Array  # (6, 6) of the right perturbation [rx ry rz tx ty tz], rad and mm, surface frame
+    twist: Array  # (6,) body velocity, rad/s and mm/s
     state: TrackState
     twist_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
-    acceleration_psd: Array = field(default_factory=lambda: np.zeros(6))
-    reason: str = ""
-    motion: SurfaceMotion = SurfaceMotion()
-    warp: Warp | None = None
-    forecast: Forecast | None = None
+    acceleration_psd: Array = field(default_factory=lambda: np.zeros(6))  # (6,) between poses, rad^2/s^3 and mm^2/s^3
+    reason: str = ""  # why the state is what it is, for the operator
+    motion: MotionState = MotionState()
+    warp: Warp | None = None  # how the surface departs from a rigid body; None while it does not
+    forecast: Forecast | None = None  # where it is known better than by the twist
 
     @property
     def deformation(self) -> float:
@@ -73,12 +166,11 @@ class SurfacePose:
         return 0.0 if self.warp is None else self.warp.deformation
 
     def predict(self, stamp: float, onwards: bool = True) -> SurfacePose:
-        """The pose at `stamp` (s): along the forecast as far as it reaches, under constant body velocity from there on.
+        """The pose at `stamp` (s): along the forecast as far as it reaches, then under constant body velocity.
 
         The covariance is the forecast's, whose 90 % radii are calibrated, or that of white noise on acceleration
         (Barfoot 2017, 11.1): P + dt^2 P_twist + q dt^3 / 3, carried along the geodesic. A stamp before the pose's own
-        runs the constant velocity backwards. onwards: whether what is left of the forecast goes along, which costs more
-        than all the rest.
+        runs the constant velocity backwards. onwards: whether to keep what is left of the forecast, which is slow.
         """
         dt = stamp - self.stamp
         if self.forecast is None or dt <= 0:
@@ -120,11 +212,8 @@ class SurfacePose:
         dt = stamp - self.stamp
         step = se3.exp(self.twist * dt)
         carry = se3.adjoint(se3.inverse(step))
-        grown = (
-            carry @ self.covariance @ carry.T
-            + dt**2 * self.twist_covariance
-            + np.diag(self.acceleration_psd) * abs(dt) ** 3 / 3
-        )
+        grown = carry @ self.covariance @ carry.T + dt**2 * self.twist_covariance
+        grown = grown + np.diag(self.acceleration_psd) * abs(dt) ** 3 / 3
         twist_grown = self.twist_covariance + np.diag(self.acceleration_psd) * abs(dt)
         return replace(
             self,
@@ -142,7 +231,7 @@ class SurfacePose:
         return np.asarray(np.sqrt(np.linalg.eigvalsh(spread)[:, -1]))
 
     def error_ahead(self, stamp: float, points_surface: Array) -> Array:
-        """What `predict(stamp).error_at(points)` is, without all else that a prediction holds."""
+        """`predict(stamp).error_at(points)`, faster: without all else that a prediction holds."""
         dt = stamp - self.stamp
         if self.forecast is None or not 0 < dt <= self.forecast.end:
             return self.predict(stamp).error_at(points_surface)
@@ -171,3 +260,19 @@ def position_sigma(covariance: Array) -> float:
     """Standard deviation, mm, of the position along its worst direction; inf where (6, 6) is not finite."""
     block = covariance[3:, 3:]
     return float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0))) if np.isfinite(block).all() else float("inf")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """A recorded motion of the surface: a session's truth or reference, or what a run wrote.
+
+    The error of a measured reference (`reference.tum`) must not be held against the tracker; a truth (`truth.tum`) is
+    a simulator's or an instrument's.
+    """
+
+    stamps: Array  # (N,) s, strictly increasing
+    base_from_surface: Array  # (N, 4, 4) mm
+    exact: bool  # a truth, not a measured reference
+
+    def __len__(self) -> int:
+        return len(self.stamps)

@@ -213,6 +213,11 @@ def transform_points(a_from_b: ArrayLike, points_b: ArrayLike) -> Array:
     return np.asarray(rotated + a_from_b[..., None, :3, 3])
 
 
+def point_jacobians(points: Array) -> Array:
+    """How points (N, 3) move with a right perturbation of their frame's pose, per rad and mm: (N, 3, 6)."""
+    return np.concatenate([-hat(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], -1)
+
+
 def angle_of(rotation: ArrayLike) -> Array:
     """Rotation angle (...), rad in [0, pi], of rotations (..., 3, 3) or transforms (..., 4, 4)."""
     return np.asarray(np.linalg.norm(log_rotation(np.asarray(rotation, float)[..., :3, :3]), axis=-1))

@@ -1,27 +1,25 @@
-"""The stored map of the surface: landmarks in the surface frame, against which every frame is matched."""
+"""The stored map of the surface, against which every frame set is matched, and the warp of soft tissue beside it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.se3 import Array
 
+INVERSE_STEPS = 4  # steps of the inverse: each leaves a share as large as the strain, a few hundredths
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceMap:
-    """Landmarks as parallel arrays; a landmark's row is the id of its track.
+    """N landmarks in the surface frame as parallel arrays; a landmark's row is the id of its track."""
 
-    points: (N, 3) mm, normals: (N, 3) unit, out of the surface, both in the surface frame. covariance: (3N, 3N) mm^2,
-    joint.
-    """
-
-    points: Array
-    normals: Array
-    covariance: Array
+    points: Array  # (N, 3) mm
+    normals: Array  # (N, 3) unit, out of the surface
+    covariance: Array  # (3N, 3N) mm^2, joint
 
     def __len__(self) -> int:
         return len(self.points)
@@ -47,16 +45,17 @@ def joined_map(first: SurfaceMap, second: SurfaceMap) -> SurfaceMap:
 
 def motion_of(points: Array) -> Array:
     """How points (N, 3) move, (3N, 6), with a right perturbation of their frame's pose, per rad and mm."""
-    each = np.concatenate([-se3.hat(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], -1)
-    return np.asarray(each.reshape(-1, 6))
+    return se3.point_jacobians(points).reshape(-1, 6)
 
 
 def local_normals(points: Array, outward: Array, neighbours: int = 12) -> Array:
     """Unit normals (N, 3) of points (N, 3) by a plane through each one's nearest neighbours, on the side of `outward`.
 
     outward: (3,) or (N, 3), a rough direction out of the surface, the same frame. Where the neighbours lie on a line or
-    scatter in depth, the normal leans towards that of all points: it is a prior for the patches, not a measurement.
+    scatter in depth, the normal leans towards that of all points.
     """
+    from scipy.spatial import cKDTree  # processes that only pass poses on need none of it
+
     k = min(neighbours, len(points))
     _, index = cKDTree(points).query(points, k=k)
     spread = points[index] - points[index].mean(1, keepdims=True)  # (N, k, 3)
@@ -66,6 +65,18 @@ def local_normals(points: Array, outward: Array, neighbours: int = 12) -> Array:
     normals = np.linalg.eigh(local + 0.02 * whole)[1][:, :, 0]
     sign = np.sign(np.einsum("ni,ni->n", normals, np.broadcast_to(outward, normals.shape)))
     return np.asarray(normals * np.where(sign == 0, 1.0, sign)[:, None])
+
+
+def farthest_points(points: Array, first: int, count: int, nearest: float = -1.0) -> NDArray[np.int64]:
+    """Rows of up to `count` points (N, 3): `first`, then each the farthest from those before, beyond `nearest`."""
+    chosen, distance = [first], np.linalg.norm(points - points[first], axis=1)
+    while len(chosen) < count:
+        farthest = int(np.argmax(distance))
+        if distance[farthest] <= nearest:
+            break
+        chosen.append(farthest)
+        distance = np.minimum(distance, np.linalg.norm(points - points[farthest], axis=1))
+    return np.array(chosen)
 
 
 def surface_frame(points_base: Array, towards: Array, right: Array) -> Array:
@@ -83,3 +94,69 @@ def surface_frame(points_base: Array, towards: Array, right: Array) -> Array:
     x = x if np.linalg.norm(x) > 1e-3 else np.cross([0.0, 1.0, 0.0], z)
     x = x / np.linalg.norm(x)
     return se3.make(np.stack([x, np.cross(z, x), z], axis=1), near.mean(0) + centroid)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Warp:
+    """How far soft tissue departs from the rigid body that the pose describes: a smooth displacement field.
+
+    A sum of Gaussian bells about K control points, so it is smooth, exact to differentiate and dies away beside the
+    mapped surface. Its rigid part over the landmarks is zero: pose and warp do not share a motion.
+    """
+
+    control: Array  # (K, 3) mm, surface frame
+    coefficients: Array  # (K, 3) mm, of the bell about each control point
+    covariance: Array  # (3K, 3K) mm^2 of the coefficients, row by row
+    growth: Array  # (3K, 3K) mm^2/s, by which that grows unseen
+    reach: float  # mm, one sigma of a bell
+    deformation: float  # mm, root mean square displacement of the landmarks
+    deformation_sigma: float  # mm
+
+    def later(self, seconds: float) -> Warp:
+        """The same shape with its covariance `seconds` s from its stamp, before or after."""
+        return replace(self, covariance=self.covariance + abs(seconds) * self.growth)
+
+    def displacement(self, points: Array) -> Array:
+        """How far (N, 3) mm points (N, 3) of the undeformed surface are moved."""
+        return np.asarray(bells(points, self.control, self.reach) @ self.coefficients)
+
+    def apply(self, points: Array) -> Array:
+        """Where points (N, 3) mm of the undeformed surface are."""
+        return np.asarray(points + self.displacement(points))
+
+    def undo(self, points: Array) -> Array:
+        """Which points (N, 3) mm of the undeformed surface are at points (N, 3)."""
+        rest = points
+        for _ in range(INVERSE_STEPS):
+            rest = points - self.displacement(rest)
+        return np.asarray(rest)
+
+    def carry(self, transforms: Array) -> Array:
+        """Poses (N, 4, 4) on the undeformed surface, moved and turned with the tissue.
+
+        The turn is that of the displacement's gradient, half its curl: the polar decomposition to first order.
+        """
+        places = transforms[:, :3, 3]
+        bell = bells(places, self.control, self.reach)
+        slope = -bell[..., None] * (places[:, None] - self.control) / self.reach**2  # (N, K, 3)
+        turn = 0.5 * se3.cross(slope, self.coefficients).sum(1)
+        return se3.make(se3.exp_rotation(turn) @ transforms[:, :3, :3], places + bell @ self.coefficients)
+
+    def uncarry(self, transforms: Array) -> Array:
+        """Poses (N, 4, 4) on the undeformed surface that are carried to `transforms` (N, 4, 4)."""
+        rest = se3.make(transforms[:, :3, :3], self.undo(transforms[:, :3, 3]))
+        turned = self.carry(rest)[:, :3, :3] @ np.swapaxes(rest[:, :3, :3], -1, -2)
+        return se3.make(np.swapaxes(turned, -1, -2) @ transforms[:, :3, :3], rest[:, :3, 3])
+
+    def spread(self, points: Array) -> Array:
+        """Covariance (N, 3, 3), mm^2, of the displacement of points (N, 3)."""
+        bell = bells(points, self.control, self.reach)
+        count = len(self.control)
+        weighted = (bell @ self.covariance.reshape(count, -1)).reshape(-1, 3, count, 3)
+        return np.asarray((bell[:, None, None] @ weighted)[:, :, 0])  # matrix products: einsum plans each call anew
+
+
+def bells(points: Array, control: Array, reach: float) -> Array:
+    """Value (N, K) at points (N, 3) of the bell about each control point (K, 3), of one sigma `reach`, mm."""
+    square = ((points[:, None] - control) ** 2).sum(-1)
+    return np.asarray(np.exp(-square / (2 * reach**2)))

@@ -1,6 +1,8 @@
-"""Between the pixels a lens images and the ideal pixels the estimator works in."""
+"""Between the pixels that a lens images and the ideal pixels that the estimator works in; filters before detection."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -8,8 +10,10 @@ from numpy.typing import NDArray
 
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
+from perception.frames import Image
 
-_EXACT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)  # the default 5 rounds leave 0.1 px at wide angles
+# 40 rounds: the default 5 leave 0.1 px at wide angles
+_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
 
 
 def undistort(camera: Camera, pixels: Array) -> Array:
@@ -17,7 +21,7 @@ def undistort(camera: Camera, pixels: Array) -> Array:
     if not len(pixels):
         return np.zeros((0, 2))
     raw = np.ascontiguousarray(pixels, np.float64).reshape(-1, 1, 2)
-    ideal = cv2.undistortPoints(raw, camera.matrix, camera.distortion, P=camera.matrix, criteria=_EXACT)
+    ideal = cv2.undistortPoints(raw, camera.matrix, camera.distortion, P=camera.matrix, criteria=_UNDISTORT_CRITERIA)
     return np.asarray(ideal, np.float64).reshape(-1, 2)
 
 
@@ -74,3 +78,22 @@ class Lenses:
             imaged[axis] *= self._focal[camera, axis]
             imaged[axis] += self._centre[camera, axis]
         return imaged, seen
+
+
+BILATERAL_DIAMETER, BILATERAL_SIGMA_GREY, BILATERAL_SIGMA_PX = 10, 75.0, 750.0  # thesis Appendix A
+
+
+def bilateral(image: Image) -> Image:
+    """The picture, its reflections filtered out and its contours kept (thesis 4.6, Fig. 4.9)."""
+    return np.asarray(
+        cv2.bilateralFilter(image, BILATERAL_DIAMETER, BILATERAL_SIGMA_GREY, BILATERAL_SIGMA_PX), np.uint8
+    )
+
+
+def unfiltered(image: Image) -> Image:
+    """The picture as it is."""
+    return image
+
+
+NO_PREFILTER, BILATERAL_PREFILTER = "none", "bilateral"
+PREFILTERS: dict[str, Callable[[Image], Image]] = {NO_PREFILTER: unfiltered, BILATERAL_PREFILTER: bilateral}

@@ -7,23 +7,23 @@ from pathlib import Path
 
 from estimation.errors import InputError
 
-CLONE = Path(__file__).parents[1] / "data"
-INSTALLED = Path(sysconfig.get_path("data")) / "share/stillbed"
+CLONE_DATA = Path(__file__).parents[1] / "data"
+INSTALLED_DATA = Path(sysconfig.get_path("data")) / "share/stillbed"
 
 
 def shipped_file(folder: str, name: str) -> Path:
     """A file by its folder (models, scenarios, ...) and name; InputError where the installation lacks it."""
-    for place in (CLONE, INSTALLED):
+    for place in (CLONE_DATA, INSTALLED_DATA):
         if (place / folder / name).is_file():
             return place / folder / name
-    raise InputError(CLONE / folder / name, "shipped", "no such file", "an installation with its data")
+    raise InputError(CLONE_DATA / folder / name, "shipped", "no such file", "an installation with its data")
 
 
 def named_path(text: str) -> Path:
     """A path as it is written on a command line. data/..., where there is none, is the file that came with stillbed."""
     path = Path(text)
     if path.parts[:1] == ("data",) and len(path.parts) > 2 and not path.exists():
-        for place in (CLONE, INSTALLED):
+        for place in (CLONE_DATA, INSTALLED_DATA):
             if (found := place.joinpath(*path.parts[1:])).is_file():
                 return found
     return path

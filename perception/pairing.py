@@ -15,31 +15,30 @@ from perception.frames import Frame, FrameSet
 
 DEFAULT_PERIOD = 1 / 30  # s: the rate of the thesis's cameras, where no camera has two frames to tell its own
 TOLERANCE_PERIODS = 0.5  # see `pairing_tolerance`
-USUAL = 5  # frames of a camera, of whose delays behind the first one of their sets the median is usual
+DELAY_SAMPLES = 5  # frames of a camera, whose median delay behind the first one of their sets is its usual delay
 SILENT_PERIODS = 5.0  # without a frame, after which no set waits for a camera: four lost in a row are rare
 
 
 class Stamped(Protocol):
-    """Anything that a camera (its number in the rig) took at a stamp (s)."""
+    """Anything that a camera took at a stamp."""
 
     @property
     def camera(self) -> int:
         """Number of the camera in the rig."""
-        ...
 
     @property
     def stamp(self) -> float:
         """Instant, s, on the clock that all cameras share."""
-        ...
 
 
-S = TypeVar("S", bound=Stamped)
+StampedItem = TypeVar("StampedItem", bound=Stamped)
 
 
 def frame_period(stamps: Sequence[Array]) -> float:
     """Frame period, s: the smallest of the cameras' median steps; stamps holds one rising (N,) array per camera.
 
-    The median forgives a camera fewer than half of its frames, the minimum one that drops more or runs slower.
+    The median tolerates the loss of fewer than half of a camera's frames, the minimum a camera that loses more or runs
+    slower.
     """
     steps = [float(np.median(np.diff(s))) for s in stamps if len(s) > 1]
     return min(steps, default=DEFAULT_PERIOD)
@@ -48,20 +47,20 @@ def frame_period(stamps: Sequence[Array]) -> float:
 def pairing_tolerance(period: float) -> float:
     """Largest spread, s, of the stamps of one set: half a frame period.
 
-    Cameras that fire together every `period` with jitter of up to j either way spread by at most 2 j within an
-    instant and leave at least period - 2 j to the next one. A limit that tells the two apart lies between, and
-    the half does so for every j below a quarter of the period: no other limit bears more.
+    Cameras that fire together every `period` with jitter of up to +-j spread by at most 2 j within an instant, and the
+    next one follows after at least period - 2 j. A limit must lie between the two. Half a period does for every j below
+    a quarter of the period; no other limit tolerates more.
     """
     return TOLERANCE_PERIODS * period
 
 
-def pair(items: Iterable[S], tolerance: float, cameras: int) -> Iterator[tuple[S, ...]]:
+def pair(items: Iterable[StampedItem], tolerance: float, cameras: int) -> Iterator[tuple[StampedItem, ...]]:
     """Sets of items, each in the rig's order, from items in order of stamp; every item comes out exactly once.
 
     A set ends when it holds all `cameras`, when a camera would come a second time, or when an item is more than
-    `tolerance` (s) younger than the set's first. So it is given out as early as can be known, and no set looks ahead.
+    `tolerance` (s) younger than the set's first. It comes out as early as possible, without looking ahead.
     """
-    current: dict[int, S] = {}
+    current: dict[int, StampedItem] = {}
     first = 0.0
     for item in items:
         if current and (item.camera in current or item.stamp - first > tolerance):
@@ -77,7 +76,7 @@ def pair(items: Iterable[S], tolerance: float, cameras: int) -> Iterator[tuple[S
         yield _in_rig_order(current)
 
 
-def _in_rig_order(by_camera: dict[int, S]) -> tuple[S, ...]:
+def _in_rig_order(by_camera: dict[int, StampedItem]) -> tuple[StampedItem, ...]:
     return tuple(by_camera[camera] for camera in sorted(by_camera))
 
 
@@ -93,25 +92,26 @@ def frame_set(frames: Sequence[Frame]) -> FrameSet:
 
 
 class Pairing:
-    """Frame sets from frames as they arrive: in any order between cameras, some late, some never.
+    """Frame sets from live frames, which arrive in any order between cameras, some late, some never.
 
-    A set is given out as soon as no frame that is still to come can belong to it: it holds every camera that is alive,
-    or each one that it lacks has since delivered a younger frame. What is never to come is waited for `patience`
-    after the set's first arrival, and a camera silent for SILENT_PERIODS no longer at all. That is half a period, and
-    where a camera's frames usually come later, its usual delay more, a period at most: stamps need not tell when a
-    camera exposed, and one that is always too late would never be seen at all. Sets come out in order of stamp; a frame
-    that is too late for that is left out and counted in `late`. The frames of one camera are taken to arrive in order.
+    A set is complete when every camera that is alive is in it, or has since delivered a younger frame. An incomplete
+    set is given out `patience` after its first arrival. That is half a period; where a camera's frames usually come
+    later, it is that delay more, but at most a period: stamps need not tell when a camera exposed, and the frames of a
+    camera that is always late would never be used. A camera that is silent for SILENT_PERIODS is not waited for.
+
+    Sets come out in order of stamp; a frame that is too late for that is dropped and counted in `late`. The frames of
+    one camera are assumed to arrive in order.
     """
 
     def __init__(self, cameras: int, period: float) -> None:
-        """cameras: in the rig. period: s, of its frames."""
+        """cameras: number of them in the rig. period: s, of their frames."""
         self.late = 0
         self.retime(period)
-        self._open: list[_Open] = []  # oldest first
-        self._newest = [-math.inf] * cameras  # stamp
-        self._heard: list[float | None] = [None] * cameras  # s, arrival
-        self._given: _Open | None = None
-        self._delays: list[deque[float]] = [deque(maxlen=USUAL) for _ in range(cameras)]  # s, behind the set's first
+        self._open: list[_OpenSet] = []  # oldest first
+        self._last_stamp = [-math.inf] * cameras
+        self._last_arrival: list[float | None] = [None] * cameras  # s
+        self._last_set: _OpenSet | None = None  # that was given out
+        self._delays: list[deque[float]] = [deque(maxlen=DELAY_SAMPLES) for _ in range(cameras)]  # s, see `_add_delay`
 
     def retime(self, period: float) -> None:
         """The cameras' frames come every `period` s from now on."""
@@ -120,34 +120,32 @@ class Pairing:
 
     def add(self, frame: Frame, now: float) -> list[FrameSet]:
         """The sets that can be given out once a frame has arrived; now: s, rising from call to call."""
-        self._newest[frame.camera], self._heard[frame.camera] = frame.stamp, now
-        if self._given is not None and self._given.should_have_held(frame, self._tolerance):
+        self._last_stamp[frame.camera], self._last_arrival[frame.camera] = frame.stamp, now
+        if self._last_set is not None and self._last_set.should_have_held(frame, self._tolerance):
             self.late += 1
-            if self._given.takes(frame, self._tolerance):
-                self._learn(frame.camera, now - self._given.arrived)
+            if self._last_set.takes(frame, self._tolerance):
+                self._add_delay(frame.camera, now - self._last_set.arrived)
         else:
             self._place(frame, now)
         return self.due(now)
 
     def due(self, now: float) -> list[FrameSet]:
-        """The sets that need not or must not be waited for any longer at `now`, s."""
-        self._heard = [now if heard is None else heard for heard in self._heard]
+        """The sets that are complete, or must not be waited for any longer, at `now`, s."""
+        self._last_arrival = [now if arrival is None else arrival for arrival in self._last_arrival]
         count = 0
         for i, group in enumerate(self._open, 1):
             if self._is_finished(group, now):
                 count = i  # and all before it, so that stamps rise
         out, self._open = self._open[:count], self._open[count:]
         if out:
-            self._given = out[-1]
+            self._last_set = out[-1]
         return [frame_set(list(group.frames.values())) for group in out]
 
-    def _learn(self, camera: int, delay: float) -> None:
-        """A frame came `delay` s after the first one of its set; what comes within half a period is waited for anyway.
-
-        A delay of most of the last frames is a camera's way to be; a single one is a hiccup.
-        """
+    def _add_delay(self, camera: int, delay: float) -> None:
+        """A frame came `delay` s after the first one of its set. A single delay is an accident, most of the last
+        DELAY_SAMPLES are the camera's nature."""
         self._delays[camera].append(delay)
-        usual = [float(np.median(d)) for d in self._delays if len(d) == USUAL]
+        usual = [float(np.median(d)) for d in self._delays if len(d) == DELAY_SAMPLES]
         longest = min(max(usual, default=0.0), self._period)
         self.patience = self._tolerance + (longest if longest > self._tolerance else 0.0)
 
@@ -156,32 +154,32 @@ class Pairing:
             rises = all(frame.stamp < later.last for later in self._open[i + 1 :])
             if rises and group.takes(frame, self._tolerance):
                 group.frames[frame.camera] = frame
-                self._learn(frame.camera, now - group.arrived)
+                self._add_delay(frame.camera, now - group.arrived)
                 return
         if any(group.first <= frame.stamp <= group.last for group in self._open):  # amid a set that it is no part of
             self.late += 1
             return
-        self._open.append(_Open(now, now + self.patience, {frame.camera: frame}))
+        self._open.append(_OpenSet(now, now + self.patience, {frame.camera: frame}))
         self._open.sort(key=lambda group: group.first)
 
-    def _is_finished(self, group: _Open, now: float) -> bool:
+    def _is_finished(self, group: _OpenSet, now: float) -> bool:
         return now >= group.until or not any(
-            self._may_come(group, camera, now) for camera in range(len(self._newest)) if camera not in group.frames
+            self._may_come(group, camera, now) for camera in range(len(self._last_stamp)) if camera not in group.frames
         )
 
-    def _may_come(self, group: _Open, camera: int, now: float) -> bool:
-        heard = self._heard[camera]
-        alive = heard is not None and now - heard <= self._silent
-        return alive and self._newest[camera] < group.first + self._tolerance
+    def _may_come(self, group: _OpenSet, camera: int, now: float) -> bool:
+        arrival = self._last_arrival[camera]
+        alive = arrival is not None and now - arrival <= self._silent
+        return alive and self._last_stamp[camera] < group.first + self._tolerance
 
 
 @dataclass(slots=True)
-class _Open:
-    """A set that is being gathered. arrived: s, when its first frame came. until: s, waited for. frames: by camera."""
+class _OpenSet:
+    """A set that is being gathered."""
 
-    arrived: float
-    until: float
-    frames: dict[int, Frame]
+    arrived: float  # s, when its first frame came
+    until: float  # s, waited for
+    frames: dict[int, Frame]  # by camera
 
     @property
     def first(self) -> float:

@@ -9,38 +9,35 @@ import numpy as np
 
 from estimation.se3 import Array
 
-SLOWEST = 1.0  # mm/s, or degrees/s: where the arm is off by rounding or a lost frame, it must not take for ever
-HASTE = 0.98  # of a tick in which a move is made: what a stall that nobody saw has queued is worked off in the rest
-TURNING = 1e-3  # mm: a shorter move only turns; the arm gets its axes as binary32, good to 6e-5 mm at 1 m
+MIN_FEED = 1.0  # mm/s, or degrees/s: where the arm is off by rounding or a lost frame, it must not take for ever
+# of a tick in which a move is made: what a stall that nobody saw has queued is worked off in the rest
+TICK_FRACTION = 0.98
+MIN_TRAVEL = 1e-3  # mm: a shorter move only turns; the arm gets its axes as binary32, good to 6e-5 mm at 1 m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
-    """Go to the machine axes [X Y Z A B C] (6,), mm and rad, at `feed` mm/s; on the way to `checkpoint`. stamp: s.
+    """Go to the machine axes."""
 
-    reason: why it brakes, "" of one that goes where the path leads. Of a move that only turns, by no more than TURNING
-    along X Y Z, `feed` is in degrees/s, as controllers of arms read it.
-    """
-
-    stamp: float
-    axes: Array
-    feed: float
-    checkpoint: int
+    stamp: float  # s
+    axes: Array  # (6,) X Y Z A B C, mm and rad
+    feed: float  # mm/s; degrees/s, as arm controllers read it, of a move by MIN_TRAVEL or less along X Y Z
+    checkpoint: int  # that the move leads to
     extrude: bool
-    reason: str = ""
+    reason: str = ""  # why it brakes; "" of a move along the path
 
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """Stay where you are for `duration` s, because of `reason`. stamp: s."""
+    """Stay in place."""
 
-    stamp: float
-    duration: float
+    stamp: float  # s
+    duration: float  # s
     reason: str
 
 
-class Code(StrEnum):
-    """Why the guard refused a command; these words do not change. docs/motion.md says what each is."""
+class RefusalCode(StrEnum):
+    """Why the guard refused a command; the values do not change. docs/motion.md explains each."""
 
     NOT_FINITE = "not_finite"
     ORDER = "order"
@@ -66,13 +63,10 @@ class Code(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Refusal(Hold):
-    """The hold that the guard puts in a command's place. got: the number that breaks `limit`, in mm, s and rad.
+    """The hold by which the guard replaces a command that it refuses."""
 
-    NaN where what is wrong is no number.
-    """
-
-    code: Code
-    got: float
+    code: RefusalCode
+    got: float  # the number that breaks `limit`, in mm, s and rad; NaN where there is none
     limit: float
 
 
@@ -80,10 +74,10 @@ Command = Move | Hold
 
 
 def feed_for(start: Array, axes: Array, tick: float) -> float:
-    """Feed, mm/s or degrees/s as `Move` has it, of a move from `start` to `axes`, (6,) each, within a tick of `tick` s.
+    """Feed, mm/s or degrees/s as in `Move`, of a move from `start` to `axes`, (6,) each, within a tick of `tick` s.
 
-    No slower than SLOWEST: a lesser way is gone in less than the tick, and the arm waits for the next one.
+    At least MIN_FEED: a shorter way then takes less than the tick, and the arm waits for the next one.
     """
     length, turn = float(np.linalg.norm(axes[:3] - start[:3])), float(np.linalg.norm(axes[3:] - start[3:]))
-    way = length if length > TURNING else float(np.rad2deg(turn))
-    return max(way / (HASTE * tick), SLOWEST)
+    way = length if length > MIN_TRAVEL else float(np.rad2deg(turn))
+    return max(way / (TICK_FRACTION * tick), MIN_FEED)

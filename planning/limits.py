@@ -1,4 +1,4 @@
-"""What arm and tissue can bear, and how much a pose must be worth before the arm follows it."""
+"""The limits of arm and tissue, of the poses that the arm may follow, and the zones that the tip must not enter."""
 
 from __future__ import annotations
 
@@ -8,10 +8,95 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from planning.no_go import NoGo
 
-MARGIN = np.array([5.0, 5, 5, *np.deg2rad([2, 2, 2])])  # that targets keep from the bounds: braking needs room
+AXIS_MARGIN = np.array([5.0, 5, 5, *np.deg2rad([2, 2, 2])])  # that targets keep from the bounds: braking needs room
 JOINT_MARGIN = float(np.deg2rad(2))  # that joints keep from the ends of their ranges
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoGo:
+    """A convex volume in the base frame: the intersection of half-spaces and a cylinder. Its surface is outside."""
+
+    name: str
+    normals: Array  # (K, 3) unit vectors, outwards
+    offsets: Array  # (K,) mm; normals @ p < offsets inside
+    axis: Array = field(default_factory=lambda: np.array([[0.0, 0, 0], [0, 0, 1]]))  # (2, 3) mm, of the cylinder
+    radius: float = np.inf  # mm; infinite without a cylinder
+
+    def __post_init__(self) -> None:
+        arrays = self.normals, self.offsets, self.axis
+        good = self.normals.ndim == 2 and self.normals.shape[1:] == (3,) and self.axis.shape == (2, 3)
+        if not good or self.offsets.shape != self.normals.shape[:1] or not all(np.isfinite(a).all() for a in arrays):
+            raise InputError("no-go zone", self.name, self.normals.tolist(), "K normals and offsets, finite")
+        if np.abs(np.linalg.norm(self.normals, axis=1) - 1).max(initial=0.0) > 1e-9 or not self.radius > 0:
+            raise InputError("no-go zone", self.name, self.radius, "unit normals, and a radius > 0")
+        if not len(self.offsets) or np.array_equal(*self.axis):
+            raise InputError("no-go zone", self.name, self.axis.tolist(), "one half-space or more, and an axis")
+
+    def depth(self, place: Array) -> float:
+        """Depth of a place (3,) inside, mm; 0 or less outside and on the surface."""
+        depth = float((self.offsets - self.normals @ place).min())
+        if np.isinf(self.radius):
+            return depth
+        start, along = self._axis()
+        return min(depth, self.radius - float(np.linalg.norm(np.cross(place - start, along))))
+
+    def depth_along(self, start: Array, end: Array) -> float:
+        """Depth of the straight way between two places (3,), mm: at its end, or in the middle of its part inside."""
+        if (depth := self.depth(end)) > 0:
+            return depth
+        low, high = 0.0, 1.0
+        for gap, more in zip(self.offsets - self.normals @ start, self.normals @ (end - start), strict=True):
+            if more == 0 and gap <= 0:
+                return 0.0
+            low, high = (max(low, gap / more), high) if more < 0 else (low, min(high, gap / more) if more else high)
+        if np.isfinite(self.radius):
+            low, high = _within(*self._flat(start, end), self.radius, low, high)
+        return max(self.depth(start + (low + high) / 2 * (end - start)), 0.0) if low < high else 0.0
+
+    def _axis(self) -> tuple[Array, Array]:
+        along = self.axis[1] - self.axis[0]
+        return self.axis[0], along / np.linalg.norm(along)
+
+    def _flat(self, start: Array, end: Array) -> tuple[Array, Array]:
+        """Two places (3,) projected along the cylinder's axis, relative to it."""
+        origin, along = self._axis()
+        return np.cross(start - origin, along), np.cross(end - origin, along)
+
+
+def half_space(name: str, normal: Array, place: Array) -> NoGo:
+    """The half-space behind a plane through `place` (3,), mm, opposite to its `normal` (3,)."""
+    if not np.linalg.norm(normal) > 0:
+        raise InputError("no-go zone", name, normal.tolist(), "a normal that is not zero")
+    unit = normal / np.linalg.norm(normal)
+    return NoGo(name, unit[None], np.array([unit @ place]))
+
+
+def box(name: str, low: Array, high: Array) -> NoGo:
+    """A box between two corners (3,), mm, along the base frame's axes."""
+    if not (low < high).all():
+        raise InputError("no-go zone", name, [low.tolist(), high.tolist()], "a low corner below a high one")
+    return NoGo(name, np.concatenate([np.eye(3), -np.eye(3)]), np.concatenate([high, -low]))
+
+
+def cylinder(name: str, start: Array, end: Array, radius: float) -> NoGo:
+    """A cylinder between the centres (3,) of its ends, mm."""
+    if not np.linalg.norm(end - start) > 0:
+        raise InputError("no-go zone", name, [start.tolist(), end.tolist()], "two ends apart")
+    along = (end - start) / np.linalg.norm(end - start)
+    offsets = np.array([-along @ start, along @ end])
+    return NoGo(name, np.stack([-along, along]), offsets, np.stack([start, end]), radius)
+
+
+def _within(start: Array, end: Array, radius: float, low: float, high: float) -> tuple[float, float]:
+    """The part, in low to high, of a straight way (3,) that is within `radius` of 0; empty: (1, 0)."""
+    way = end - start
+    a, b, c = float(way @ way), float(start @ way), float(start @ start) - radius**2
+    if a == 0:
+        return (low, high) if c < 0 else (1.0, 0.0)
+    if (root := b * b - a * c) <= 0:
+        return 1.0, 0.0
+    return max(low, (-b - root**0.5) / a), min(high, (-b + root**0.5) / a)
 
 
 def _six(length: float, angle_deg: float) -> Array:
@@ -19,15 +104,14 @@ def _six(length: float, angle_deg: float) -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Limits:
-    """Limits of one run; axes are the machine's X Y Z A B C in mm and rad. InputError names one that makes no sense.
+class MotionLimits:
+    """Limits of one run; axes are the machine's X Y Z A B C, mm and rad. InputError names one that makes no sense.
 
-    speed, acceleration, jerk: (6,) per axis and s, s^2, s^3. The planner stays within all three, the guard checks
-    the speed. jump: mm, and turn: rad, of one tick. low, high: (6,) where the axes may be. feed: mm/s.
-    pose_age: s. pose_error: mm, one standard deviation of the place under the nozzle. surface_speed: mm/s, there.
-    surface_turn: rad/s. stop_time: s, and stop_distance: mm, within which the arm comes to rest once it has no pose to
-    trust. zones: where the nozzle's tip must not be. on_path: mm that the nozzle may be off its place and still print.
-    pause: s of one hold.
+    speed, acceleration, jerk: (6,) per s, s^2, s^3. The planner keeps all three, the guard checks the speed.
+    jump, turn: mm and rad in one tick. low, high: (6,) range of the axes. feed: mm/s. pose_age: s.
+    pose_error: mm, standard deviation of the place under the nozzle. surface_speed, surface_turn: mm/s there, rad/s.
+    stop_time, stop_distance: s and mm within which the arm comes to rest without a trusted pose.
+    on_path: mm by which the nozzle may be off its place and still print. zones: no-go volumes. pause: s of one hold.
     """
 
     speed: Array = field(default_factory=lambda: _six(150.0, 120.0))  # public drivers run the arm at 167 mm/s
@@ -49,7 +133,7 @@ class Limits:
     pause: float = 0.001  # thesis 6.3: pauses of 1 ms, repeated
 
     def per_tick(self, tick: float) -> Array:
-        """Speed of each axis (6,), per s, that keeps jump and turn of one tick of `tick` s whatever the others do."""
+        """Speed (6,), per s, at which each axis keeps jump and turn of a tick of `tick` s whatever the others do."""
         return np.minimum(self.speed, np.repeat([self.jump / 3**0.5, self.turn], 3) / tick)
 
     def __post_init__(self) -> None:

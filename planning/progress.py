@@ -1,4 +1,4 @@
-"""How far a print is, and the record that lets a later run go on where it stopped (thesis 5.2)."""
+"""The progress of a print, and the record by which a later run goes on where it stopped (thesis 5.2)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from estimation.errors import InputError
 from planning.path import Path
 
 
-class Phase(Enum):
+class PrintPhase(Enum):
     """What the nozzle is doing."""
 
     WAITING = "waiting"  # at rest, nothing begun
@@ -25,18 +25,15 @@ class Phase(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
-    """How far the print is. checkpoint: the one being printed, of `total`; place: of `length` mm of path.
+class PrintProgress:
+    """How far the print is."""
 
-    fraction: the same place counted in checkpoints: 2.35 is 35 % of the way from checkpoint 2 to 3.
-    """
-
-    phase: Phase
-    checkpoint: int
-    total: int
-    place: float
-    length: float
-    fraction: float
+    phase: PrintPhase
+    checkpoint: int  # the one being printed
+    total: int  # checkpoints
+    place: float  # mm of the path
+    length: float  # mm of the whole path
+    fraction: float  # the place in checkpoints: 2.35 is 35 % of the way from checkpoint 2 to 3
 
     @property
     def printed(self) -> int:
@@ -50,19 +47,19 @@ class Progress:
 
 
 @dataclass(frozen=True, slots=True)
-class Bookmark:
-    """Where a print stopped. path: fingerprint of the path it belongs to. fraction: place, counted in checkpoints."""
+class ProgressMark:
+    """Where a print stopped."""
 
-    path: str
-    fraction: float
+    path: str  # fingerprint of its path
+    fraction: float  # place in checkpoints
 
 
-def bookmark(path: Path, progress: Progress) -> Bookmark:
+def progress_mark(path: Path, progress: PrintProgress) -> ProgressMark:
     """The record of a print of `path` that is as far as `progress` says."""
-    return Bookmark(fingerprint(path), progress.fraction)
+    return ProgressMark(fingerprint(path), progress.fraction)
 
 
-def resumed(path: Path, mark: Bookmark, where: object = "bookmark") -> float:
+def resume_fraction(path: Path, mark: ProgressMark, where: object = "bookmark") -> float:
     """The fraction at which a print of `path` goes on; InputError if the record is of another path or lies outside."""
     if mark.path != (own := fingerprint(path)):
         raise InputError(where, "path", mark.path, f"{own}, the fingerprint of the path to be printed")

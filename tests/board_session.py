@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from boards import motion, places
 
 from estimation.calibration.lens_model import matrix_of
 from estimation.rig import Camera, Rig
+from hardware.files.folder_tables import SessionFolderWriter
 from hardware.files.images import encode
-from hardware.session_folder import SessionFolder
 from hardware.simulator.scene.ground_truth_views import BoardView
 from perception.boards.board import Board
+from tests.boards import motion, places
 
 BOARD = Board(squares=(4, 5), square=54.0)
 RATE, OFFSETS = 8.0, (-0.016, 0.004, 0.012)
@@ -36,7 +36,7 @@ def rendered(folder: Path, instants: int = 14, board: Board = BOARD) -> Path:
     rig, rng = small_rig(), np.random.default_rng(5)
     views = [BoardView(camera, board) for camera in rig.cameras]
     stamps = np.arange(instants) / RATE
-    with SessionFolder(folder, rig, ()) as session:
+    with SessionFolderWriter(folder, rig, ()) as session:
         for stamp in stamps:
             for c, view in enumerate(views):
                 late = np.array([stamp + OFFSETS[c]])

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation import se3
-from estimation.calibration.lens_model import image
-from estimation.camera_calibration.views import Views
+from estimation.calibration.lens_model import BoardViews, project_lens
 from estimation.se3 import Array
 
 SIZE = (1280, 720)
@@ -64,7 +63,7 @@ def waved(
     jitter: float = 0.0,
     speed: float = 1.0,
     lenses: Array = LENSES,
-) -> tuple[Views, Truth]:
+) -> tuple[BoardViews, Truth]:
     """Views of a board waved before three cameras, and the truth."""
     points, base_from_camera = corners(), places()
     stamp = np.repeat(np.arange(instants) / rate, 3)
@@ -73,10 +72,10 @@ def waved(
     seed = int(rng.integers(1 << 30))
     boards = motion(stamp + late, np.random.default_rng(seed), points.mean(0), speed)
     inside = se3.transform_points(se3.inverse(base_from_camera)[camera] @ boards, points)
-    pixels = image(lenses[camera][:, None], inside)[0] + rng.normal(0, noise, (len(stamp), len(points), 2))
+    pixels = project_lens(lenses[camera][:, None], inside)[0] + rng.normal(0, noise, (len(stamp), len(points), 2))
     hidden = (pixels < 3).any(-1) | (pixels > np.array(SIZE) - 4).any(-1)
     pixels[hidden] = np.nan
-    views = Views(
+    views = BoardViews(
         ("top", "side", "front"),
         (SIZE,) * 3,
         points,

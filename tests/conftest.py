@@ -15,8 +15,8 @@ pytest_plugins = ["estimation.synthetic.plugin"]  # by name, so that a checkout 
 
 LONGEST = (  # files that take longest, begun first: of two workers neither then waits long for the other's last file
     *("test_tracking", "test_live_run", "test_simulate", "test_camera_calibration", "test_world", "test_estimator"),
-    *("test_calibrate_refused", "test_live_page", "test_scene_render", "test_guard_oracle", "test_registration"),
-    *("test_estimator_suite", "test_examples", "test_track", "test_operator_page", "test_wound_network"),
+    *("test_calibrate_refused", "test_scene_render", "test_guard", "test_registration"),
+    *("test_estimator_suite", "test_examples", "test_track", "test_operator_page", "test_segment_command"),
     *("test_live_faults", "test_growth", "test_fill_laws", "test_odd_camera", "test_outages", "test_fault_bench"),
 )
 

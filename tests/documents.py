@@ -6,9 +6,8 @@ import argparse
 import re
 from pathlib import Path
 
-from hardware.bench.command import subject_parser
 from hardware.bench.subjects import SUBJECTS
-from hardware.cli.main import parser
+from hardware.cli.main import parser, subject_parser
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

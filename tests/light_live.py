@@ -64,23 +64,23 @@ def track_nothing(
     import numpy as np
 
     from estimation.observations import no_observations
-    from hardware.live.outbox import Outbox
-    from hardware.live.records import Handed, PoseEntry, RigEntry, SetEntry, TrackingReport
+    from hardware.live.recorder_process import RecorderSender
+    from hardware.live.records import PoseEntry, PoseHandover, RigEntry, SetEntry, TrackingReport
     from hardware.process.clock import WallClock
-    from hardware.process.system import gone, settle
+    from hardware.process.system import pipe_closed, set_up_process
     from tests.moving import breathing, pose_at
 
-    settle("tracking")
-    clock, outbox, picture = WallClock(), Outbox(sender), png()
+    set_up_process("tracking")
+    clock, outbox, picture = WallClock(), RecorderSender(sender), png()
     outbox.put(RigEntry(prepared.rig))
     names = tuple(camera.name for camera in prepared.rig.cameras)
     begin = due = clock.now()
-    while not gone(lifeline):
+    while not pipe_closed(lifeline):
         due += 1 / RATE
         clock.wait_until(due)
         stamp, sets = due - AGE, round((due - begin) * RATE)
         pose = pose_at(lambda t: breathing(t, height=1.0, tilt=0.005), stamp)
-        poses.put(Handed(pose, due - AGE / 2, clock.now()))
+        poses.put(PoseHandover(pose, due - AGE / 2, clock.now()))
         known = np.eye(4), begin
         reports.put(TrackingReport(clock.now(), names, (0, 1), pose, *known, sets, 0, 1 / RATE, used=(50, 50)))
         outbox.put(SetEntry({0: stamp, 1: stamp}, {0: ("png", picture), 1: ("png", picture)}))
@@ -119,14 +119,14 @@ def main(folder: Path, record: Path, *flags: str) -> int:
     """Run; the exit code is the run's."""
     from dataclasses import replace
 
-    from hardware.live.console import Console
-    from hardware.live.prepared import prepare, prepare_again
+    from hardware.live.prepared import prepare, prepare_resumed
     from hardware.live.run import LiveRun
     from hardware.live.settings import LiveSettings
+    from hardware.live.view import Console
     from hardware.process.faults import faults_from_texts
 
     if "--resume" in flags:
-        prepared = prepare_again(record, {"unattended": "--yes" in flags})
+        prepared = prepare_resumed(record, {"unattended": "--yes" in flags})
     else:
         rig, path, profile = (folder / name for name in ("rig.toml", "path.csv", "arm.toml"))
         device = next((flag for flag in flags if not flag.startswith("--")), "virtual")
@@ -138,7 +138,7 @@ def main(folder: Path, record: Path, *flags: str) -> int:
     if "--unkept" in flags:
         from hardware.live import run
 
-        run.kept_begin = unkept
+        run.recorded_begin = unkept
     with Console() as console:
         outcome = LiveRun(prepared, console, track_until_printed if "--until-printed" in flags else track_nothing)()
         outcome.write()

@@ -9,17 +9,26 @@ import numpy as np
 
 from estimation.se3 import Array
 from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile
-from hardware.arm.protocol import G1, encode
-from hardware.link_settings import LinkSettings
+from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.process.clock import SimClock
 from hardware.process.faults import Fault
 from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.ports import PortFaults, VirtualDevice
 from hardware.simulator.arm.settings import ArmSettings
+from planning.command import Hold, Move
 from tests.virtual_arm import HOME
 
 STEP = 0.001  # s between looks
+
+
+def moving(axes: Array, feed: float) -> Move:
+    """The command to go there; only that counts for a link."""
+    return Move(0.0, axes, feed, 0, False)
+
+
+def waiting(duration: float) -> Hold:
+    """The command to wait for so long."""
+    return Hold(0.0, duration, "")
 
 
 @dataclass
@@ -67,7 +76,7 @@ class Linked:
         """A move that takes so long from where the arm was last sent."""
         assert self.arm.target is not None
         feed = max(float(np.linalg.norm((axes - self.arm.target)[:3])) / seconds, 1.0)
-        return self.arm.send(encode(G1(axes, feed), self.arm.profile.dialect), self.clock.now())
+        return self.arm.send(moving(axes, feed), self.clock.now())
 
 
 def linked(

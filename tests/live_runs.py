@@ -16,10 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hardware.files.session import Session, open_session
-from hardware.live.beside import Beside
+from hardware.files.session import Session
+from hardware.live.prepared import RunFiles
 from hardware.process.clock import WallClock
-from hardware.recording.mcap_file import ChunkOf, parse, walk
+from hardware.recording.mcap_file import ChunkMessages, parse, walk
+from hardware.recording.session_reader import open_session
 
 ROOT = Path(__file__).parents[1]
 CLOCK = WallClock()
@@ -157,7 +158,7 @@ class Running:
 def executed(record: Path) -> tuple[np.ndarray, np.ndarray]:
     """What the virtual arm of a run did: stamps (N,) s, axes (N, 6)."""
     until = CLOCK.now() + PATIENCE
-    file = Beside(record).executed
+    file = RunFiles(record).executed
     while not file.exists() and CLOCK.now() < until:
         CLOCK.wait_until(CLOCK.now() + 0.05)
     CLOCK.wait_until(CLOCK.now() + 0.2)
@@ -188,14 +189,14 @@ def messages(record: Path, topic: str) -> list[dict[str, object]]:
     return [
         parse(record, stored)
         for part in walk(record)
-        if isinstance(part, ChunkOf)
+        if isinstance(part, ChunkMessages)
         for stored in part.messages
         if stored.topic == topic
     ]
 
 
 def summary(record: Path) -> dict[str, object]:
-    found: dict[str, object] = json.loads(Beside(record).summary.read_text())
+    found: dict[str, object] = json.loads(RunFiles(record).summary.read_text())
     return found
 
 
@@ -208,5 +209,4 @@ def printed_once(*records: Path) -> None:
         assert places
         spans.append((min(places), max(places)))
     for before, after in pairwise(spans):
-        assert after[0] >= before[1] - 1e-9
-        assert after[0] - before[1] <= 1.0 + 1e-9
+        assert after[0] >= before[1] - 1e-9 and after[0] - before[1] <= 1.0 + 1e-9

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path as File
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.se3 import Array
-from hardware.simulator.nozzle_log import NozzleLog
-from hardware.simulator.planned_line import planned_line
+from hardware.simulator.deposit import NozzleLog, planned_line
+from hardware.simulator.run_folder import NOZZLE_HEADER
 from planning.path import Path
 from tests.moving import REST, path_through
 
@@ -133,3 +135,46 @@ def without_target(log: NozzleLog, rows: slice) -> NozzleLog:
     checkpoint = log.checkpoint.copy()
     checkpoint[rows] = -1
     return replace(log, base_from_target=target, place=place, checkpoint=checkpoint)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NozzleTable:
+    """nozzle.csv as parallel arrays of N rows; NaN, and checkpoint -1, where there was no target."""
+
+    stamps: Array
+    extrude: NDArray[np.bool_]
+    nozzle: Array
+    target: Array
+    distance: Array
+    vector: Array
+    angle: Array
+    path: Array
+    place: Array
+    checkpoint: NDArray[np.int64]
+    reason: NDArray[np.str_]
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+def read_nozzle(file: File) -> NozzleTable:
+    """The table that a NozzleWriter wrote; a last line cut short by a kill is left out."""
+    with file.open(newline="", encoding="utf-8") as stream:
+        header, *rows = csv.reader(stream)
+    assert tuple(header) == NOZZLE_HEADER
+    rows = [row for row in rows if len(row) == len(header)]
+    numbers = np.array([[float(cell or "nan") for cell in row[:-1]] for row in rows]).reshape(-1, len(header) - 1)
+    stamps, extrude, distance, angle, path, place, checkpoint = numbers[:, [0, 1, 8, 12, 13, 14, 15]].T
+    return NozzleTable(
+        stamps=stamps,
+        extrude=extrude == 1,
+        nozzle=numbers[:, 2:5],
+        target=numbers[:, 5:8],
+        distance=distance,
+        vector=numbers[:, 9:12],
+        angle=np.radians(angle),
+        path=path,
+        place=place,
+        checkpoint=checkpoint.astype(np.int64),
+        reason=np.array([row[-1] for row in rows], np.str_),
+    )

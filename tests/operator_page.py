@@ -14,27 +14,27 @@ from typing import Any
 import numpy as np
 
 from estimation.pose import TrackState
-from hardware.operator.link import OperatorLink
 from hardware.operator.server import serve
-from hardware.operator.settings import Limits, OperatorSettings
-from hardware.operator.shared_state import Request, Wish
+from hardware.operator.settings import OperatorSettings, WindowLimits
+from hardware.operator.shared_state import OperatorLink, OperatorRequest
 from hardware.operator.view import (
     Activity,
     CameraView,
     Check,
+    CheckVerdict,
     LatencyView,
     MotionView,
     OperatorView,
     ProgressView,
-    Stage,
+    RunStage,
     TrackingView,
-    Verdict,
+    Wish,
 )
 
 OFFERED = tuple(wish for wish in Wish if wish is not Wish.STOP)
 
 
-def full_view(stamp: float = 1.0, turn: int = 1, stage: Stage = Stage.PRINT, **changed: Any) -> OperatorView:
+def full_view(stamp: float = 1.0, turn: int = 1, stage: RunStage = RunStage.PRINT, **changed: Any) -> OperatorView:
     """A view with something in every place."""
     pose = np.eye(4)
     tracking = TrackingView(TrackState.TRACKING, "three cameras agree", 0.018, 0.052, pose, np.diag([1e-3] * 3), 182)
@@ -44,12 +44,15 @@ def full_view(stamp: float = 1.0, turn: int = 1, stage: Stage = Stage.PRINT, **c
         turn,
         stage,
         offers=OFFERED,
-        checks=(Check("arm", Verdict.FAIL, "does not answer", "Switch it on."), Check("path", Verdict.PASS, "fine")),
+        checks=(
+            Check("arm", CheckVerdict.FAIL, "does not answer", "Switch it on."),
+            Check("path", CheckVerdict.PASS, "fine"),
+        ),
         tracking=tracking,
         motion=motion,
         progress=ProgressView(1203.4, 3420, 0.352, 754.0, 0.87, 3, 12),
         latency=LatencyView(0.0142, 0.0271, 0.035),
-        cameras=tuple(CameraView(f"camera{k}", Verdict.PASS, 29.9, 60) for k in range(3)),
+        cameras=tuple(CameraView(f"camera{k}", CheckVerdict.PASS, 29.9, 60) for k in range(3)),
     )
     return replace(made, **changed)
 
@@ -57,9 +60,9 @@ def full_view(stamp: float = 1.0, turn: int = 1, stage: Stage = Stage.PRINT, **c
 class Served:
     """The page being served. address: to open. It can be ended and begun again on the same port, as its process is."""
 
-    def __init__(self, limits: Limits | None = None) -> None:
+    def __init__(self, limits: WindowLimits | None = None) -> None:
         self.link, self.settings = OperatorLink(), OperatorSettings()
-        self._limits = limits or Limits(stale=30.0, patience=30.0)
+        self._limits = limits or WindowLimits(stale=30.0, patience=30.0)
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.host = f"127.0.0.1:{self.listener.getsockname()[1]}"
         self.address = f"http://{self.host}/{self.settings.token}/"
@@ -82,7 +85,7 @@ class Served:
         """Show a view."""
         self.link.views.put(view)
 
-    def taken(self, count: int = 1, timeout: float = 10.0) -> list[Request]:
+    def taken(self, count: int = 1, timeout: float = 10.0) -> list[OperatorRequest]:
         """The requests that come until there are `count`."""
         found, end = [], time.monotonic() + timeout
         while len(found) < count and time.monotonic() < end:
@@ -92,7 +95,7 @@ class Served:
 
 
 @contextmanager
-def served(limits: Limits | None = None) -> Iterator[Served]:
+def served(limits: WindowLimits | None = None) -> Iterator[Served]:
     """The page, ended afterwards."""
     made = Served(limits)
     try:

@@ -17,9 +17,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hardware.page import document, figures_table, legend, line_key, section
-from hardware.report.page import Plot, spanning
-from hardware.report.report import HALF
+from hardware.report.page import Plot, document, figures_table, legend, line_key, section, spanning
+from hardware.report.report import HALF_CHART_WIDTH
 from tests.pinned import ENVIRONMENT, ROOT, made_with, run_pinned, unlike
 from tests.reference_cases import CASES, FOLDER, TRACKS, keep, kept, replayed
 from tests.reference_signals import DECISION, NEW, STATES, Change, changes, differing
@@ -112,12 +111,18 @@ def _plots(change: Change) -> str:
     unit = "" if change.unit == DECISION else f", {change.unit}"
     known = ", ".join(f"{i} {state.lower()}" for i, state in enumerate(STATES))
     names = f" ({known})" if change.name == "state" else ""
-    both = Plot(HALF, 150, span, spanning([change.before, change.after], 0.12, 1e-6), label=change.name + unit + names)
+    both = Plot(
+        HALF_CHART_WIDTH,
+        150,
+        span,
+        spanning([change.before, change.after], 0.12, 1e-6),
+        label=change.name + unit + names,
+    )
     both.line(change.stamps, change.before, "truth")
     both.line(change.stamps, change.after, "estimate")
     size = change.size
     high = max(change.most * 2, 1e-15)
-    apart = Plot(HALF, 150, span, (high / 1e4, high), log_y=True, label=f"change of {change.name}{unit}")
+    apart = Plot(HALF_CHART_WIDTH, 150, span, (high / 1e4, high), log_y=True, label=f"change of {change.name}{unit}")
     apart.line(change.stamps, np.where(size > 0, size, np.nan), "series c3")
     lost = change.stamps[size == float("inf")]
     apart.shade(lost, lost + (span[1] - span[0]) / len(size), "hold", ["one of them says nothing here"] * len(lost))

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from session_files import image, rig, stamps, trajectory
 
-from estimation.forecast import Forecast
-from estimation.pose import SurfaceMotion, SurfacePose, TrackState
-from estimation.warp import Warp
+from estimation.pose import Forecast, MotionState, SurfacePose, TrackState
+from estimation.surface_map import Warp
 from hardware.recording.recorder import Recorder
 from perception.frames import Frame
+from tests.session_files import image, rig, stamps, trajectory
 
 
 def write_frames(recorder: Recorder, count: int, cameras: int = 2, start: float = -0.1) -> None:
@@ -33,7 +32,7 @@ def pose(stamp: float, seed: int = 0) -> SurfacePose:
         np.eye(6) / 3,
         draw.random(6),
         'why "so"',
-        SurfaceMotion(True, stamp - 0.1 if seed else float("nan"), 0.31, 0.002),
+        MotionState(True, stamp - 0.1 if seed else float("nan"), 0.31, 0.002),
         Warp(draw.normal(size=(4, 3)), draw.normal(size=(4, 3)), np.eye(12) / 7, np.eye(12) / 9, 25.0, 0.3, 0.02),
         Forecast(np.array([0.1, 0.3]), draw.normal(size=(2, 6)), np.stack([np.eye(6) / 3, np.eye(6) / 7])),
     )

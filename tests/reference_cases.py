@@ -13,19 +13,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.mapping.triangulation import triangulated_map
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.rig import Rig
 from estimation.synthetic.follow import Follower
-from estimation.triangulated import triangulated
 from hardware.arm.profile import ArmProfile
+from hardware.arm.protocol import frame_from_command
 from hardware.files.path_file import read_path
 from hardware.files.rig_file import read_rig
 from hardware.motion.step import MotionStep
 from hardware.offline.replay import placed_by, replay
 from planning.command import Command, Move
-from planning.kinematics import axes_from_nozzle
 from planning.path import Path as Route
+from planning.robot.kinematics import axes_from_nozzle
 
 FOLDER = Path(__file__).parent / "reference"
 TRACKS = ("breathing", "outage")
@@ -45,7 +46,11 @@ def replayed(case: str) -> Arrays:
     given, profile = placed_by(poses)
     motion = MotionStep(path, _near(profile, next(pose for pose in poses if pose.state.measured), path))
     ticks = list(replay(given, motion))
-    return tracks | _pose_arrays(poses) | _tick_arrays([(command, frame) for _, command, frame in ticks])
+    return (
+        tracks
+        | _pose_arrays(poses)
+        | _tick_arrays([(command, frame_from_command(command, profile.dialect)) for _, command in ticks])
+    )
 
 
 def recorded_tracks(case: str) -> list[Observations]:
@@ -59,7 +64,7 @@ def recorded_tracks(case: str) -> list[Observations]:
 
 
 def _followed(rig: Rig, first: Observations, *rest: Observations) -> Iterator[SurfacePose]:
-    follower = Follower(rig, first, triangulated(rig, first), refine=True)
+    follower = Follower(rig, first, triangulated_map(rig, first), refine=True)
     assert follower.estimator.pose is not None
     yield follower.estimator.pose
     for seen in rest:
@@ -76,7 +81,7 @@ def _near(profile: ArmProfile, pose: SurfacePose, path: Route) -> ArmProfile:
 
 
 def _tracked(recording: Path) -> tuple[list[SurfacePose], Arrays]:
-    from hardware.files.session import open_session  # these load cv2
+    from hardware.recording.session_reader import open_session  # these load cv2
     from perception.tracking.step import TrackingStep
 
     session, poses, seen = open_session(recording), [], []

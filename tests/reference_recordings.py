@@ -14,9 +14,9 @@ import numpy as np
 from estimation.synthetic.world import World, synthetic_world
 from hardware.files.path_file import write_path
 from hardware.files.rig_file import ImageSource, write_rig
-from hardware.files.session import open_session
 from hardware.live.prerender import prerender
 from hardware.recording.recorder import Recorder
+from hardware.recording.session_reader import open_session
 from tests.moving import raster
 from tests.reference_cases import FOLDER
 

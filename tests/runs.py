@@ -6,9 +6,8 @@ import numpy as np
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.pose import SurfacePose, TrackState
+from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.se3 import Array
-from estimation.trajectory import Trajectory
 from hardware.files.pose_file import PoseTable
 from perception.frames import FrameSet
 from perception.tracking.step import STAGES as STEP_STAGES

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from estimation.scan import Scan, scan_from_triangles
+from estimation.scans.scan import Scan, scan_from_triangles
 from estimation.se3 import Array
 
 Shape = Callable[[Array, Array], Array]  # x, y -> z, mm

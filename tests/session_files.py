@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 
 from estimation import se3
+from estimation.pose import Trajectory
 from estimation.rig import Camera, Rig
-from estimation.trajectory import Trajectory
+from hardware.files.folder_tables import write_tum
 from hardware.files.rig_file import ImageSource, write_rig
-from hardware.tum import write_tum
 from perception.frames import Image
 
 SIZE = (64, 48)

@@ -164,7 +164,7 @@ INSTEAD = {  # (what is run in its place, why)
         for target in ("audit", "bench", "check", "demo", "fuzz", "hazards", "outages", "references", "slow", "test")
     },
 }
-MOVED = "tests/test_arm_live.py moves a virtual arm before cameras that see its needle, which takes a minute"
+MOVED = "tests/test_arm_console.py moves a virtual arm before cameras that see its needle, which takes a minute"
 MADE = (  # by these tests/workspace.py makes what the others name
     "stillbed calibrate export rig.toml --format kalibr -o camchain.yaml",
     VIRTUAL,
@@ -174,7 +174,7 @@ MADE = (  # by these tests/workspace.py makes what the others name
 TRAINED = "tests/test_training.py trains, where torch is installed"
 NOT_RUN = {  # and why not
     "pip install -c constraints.txt .": "installs what the tests run with, from a network",
-    "stillbed bench --all": "tests/test_bench_whole.py runs the whole with small parts; all of them take 20 minutes",
+    "stillbed bench --all": "tests/test_bench.py runs the whole with small parts; all of them take 20 minutes",
     "stillbed bench --quick": "the same of fewer",
     "stillbed calibrate arm --device /dev/ttyUSB0 --cameras rig.toml --record moved --yes -o arm.toml": MOVED,
     "stillbed calibrate arm --device /dev/ttyUSB0 --cameras rig.toml --record try --yes -o arm.toml": MOVED,

@@ -12,9 +12,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import cv2
 import numpy as np
 
-from hardware.cameras.controls import Control
-from hardware.cameras.identity import Identity, Kind
-from hardware.cameras.sources import CameraSource
+from hardware.cameras.capture import Control
+from hardware.cameras.sources import CameraSource, Identity, SourceKind
 from hardware.process.clock import Clock, WallClock
 from perception.frames import Image
 
@@ -43,7 +42,7 @@ class HttpCamera:
 
     @property
     def source(self) -> CameraSource:
-        return CameraSource(Identity(Kind.STREAM, self.url))
+        return CameraSource(Identity(SourceKind.STREAM, self.url))
 
     def part(self) -> bytes:
         data = cv2.imencode(".jpg", self.picture_of(len(self.sent)))[1].tobytes()

@@ -13,30 +13,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.pose import Trajectory
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST, arc_rig
-from estimation.trajectory import Trajectory
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
+from hardware.files.folder_tables import SessionFolderWriter
 from hardware.files.images import encode
-from hardware.ply_file import write_ply
-from hardware.session_folder import SessionFolder
-from hardware.simulator.bodies import Wound, with_wound
-from hardware.simulator.instant import Instant
-from hardware.simulator.look import Look
-from hardware.simulator.render import render
-from hardware.simulator.scene.scene import Scene, rois
-from hardware.simulator.scene.shape import cylinder, flat
-from hardware.simulator.sensor import Sensor
+from hardware.files.ply_file import write_ply
+from hardware.simulator.scene.appearance import Appearance, Sensor
+from hardware.simulator.scene.render import render
+from hardware.simulator.scene.scene import Scene, WorldState, rois
+from hardware.simulator.scene.shape import Wound, cylinder, flat, with_wound
 from perception.frames import Frame, FrameSet, Image
 
 Motion = Callable[[float], Array]  # stamp, s -> base_from_surface (4, 4), mm
 
 RADIUS = 70.0  # mm, of a bent patch
-LOOK = Look(texel=0.2, wetness=0.3, drape=False)  # a finer texture only costs time: a pixel is 0.36 mm or more
+LOOK = Appearance(texel=0.2, wetness=0.3, drape=False)  # a finer texture only costs time: a pixel is 0.36 mm or more
 WOUND, WIDE = Wound((26.0, 18.0)), Wound((70.0, 54.0))  # the second fills a patch: all of it has strong texture
 NOISY = Sensor()
 CLEAN = Sensor(noise=0.0, blur=0.0)
-AWAY = REST @ se3.make(np.eye(3), [5000.0, 0.0, 0.0])  # base_from_surface, out of every camera's view
+AWAY = BASE_FROM_REST @ se3.make(np.eye(3), [5000.0, 0.0, 0.0])  # base_from_surface, out of every camera's view
 SCAN_FROM_SURFACE = se3.make(se3.exp_rotation([0.3, -0.2, 0.6]), [12.0, -7.0, 31.0])  # a scanner has its own frame
 
 
@@ -45,7 +42,7 @@ def patch(
     size: tuple[float, float] = (80.0, 60.0),
     radius: float = RADIUS,
     wound: Wound = WOUND,
-    look: Look = LOOK,
+    look: Appearance = LOOK,
 ) -> Scene:
     """A patch of skin with a wound drawn on it, bent about its x axis to `radius` mm (inf: flat)."""
     shape = flat(size) if np.isinf(radius) else cylinder(size, radius)
@@ -54,7 +51,7 @@ def patch(
 
 def still(stamp: float) -> Array:
     """A motion: none."""
-    return REST
+    return BASE_FROM_REST
 
 
 def breathing(
@@ -65,7 +62,7 @@ def breathing(
     rise = 0.5 * (1 - np.cos(phase)) + 0.1 * np.sin(2 * phase)
     w = turn * np.array([rise, 0.5 * np.sin(phase), 0.2 * np.sin(0.7 * phase)])
     v = np.array([0.12 * amplitude * np.sin(phase) + drift * stamp, 0.25 * amplitude * rise, amplitude * rise])
-    return REST @ se3.make(se3.exp_rotation(w), v)
+    return BASE_FROM_REST @ se3.make(se3.exp_rotation(w), v)
 
 
 def pictures(
@@ -76,7 +73,7 @@ def pictures(
     sensor: Sensor = NOISY,
 ) -> list[Image]:
     """The cameras' sharp images of one instant, in their order."""
-    instant = Instant(0.0, 0.0, base_from_surface, np.zeros(6))
+    instant = WorldState(0.0, 0.0, base_from_surface, np.zeros(6))
     return render(scene, cameras, [instant] * len(cameras), sensor, rng.spawn(len(cameras)))
 
 
@@ -117,7 +114,7 @@ def write_session(
     polygons = rois(scene, cameras, truth.base_from_surface[0], 0.0)
     if scan:
         truth = Trajectory(truth.stamps, truth.base_from_surface @ se3.inverse(SCAN_FROM_SURFACE), exact=True)
-    with SessionFolder(folder, cameras, polygons) as session:
+    with SessionFolderWriter(folder, cameras, polygons) as session:
         session.truth(truth)
         for frames in sets:
             for frame in frames.frames:

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from estimation import se3
-from estimation.mapping.bundle_adjustment import Adjusted, KeyFrame, adjust, frame_change, without_frame
+from estimation.mapping.bundle_adjustment import AdjustedMap, KeyFrame, adjust, frame_change, without_frame
 from estimation.observations import Observations
 from estimation.online.camera_errors import Delays
-from estimation.online.pose_solver import solve_pose
+from estimation.online.pose_solver import PointTracks, solve_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.synthetic.arc_rig import REST, arc_rig
-from estimation.synthetic.look import observations
-from estimation.synthetic.surfaces import patch
+from estimation.synthetic.movements import patch
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations
 
 RIG = arc_rig()
 
@@ -24,7 +23,7 @@ RIG = arc_rig()
 def swaying(stamp: float) -> Array:
     """A livelier motion than breathing: about 20 mm/s, and 10 degrees of turn."""
     w = 0.15 * np.sin(stamp * np.array([1.1, 1.7, 0.8]) + [0, 1, 2])
-    return REST @ se3.make(se3.exp_rotation(w), 8.0 * np.sin(stamp * np.array([1.6, 1.2, 2.3]) + [2, 0, 1]))
+    return BASE_FROM_REST @ se3.make(se3.exp_rotation(w), 8.0 * np.sin(stamp * np.array([1.6, 1.2, 2.3]) + [2, 0, 1]))
 
 
 def landmarks(seed: int = 0, count: int = 40) -> Array:
@@ -52,9 +51,7 @@ def look(
 
 
 def fitted(seen: Observations, points: Array, start: Array) -> Array:
-    return solve_pose(
-        RIG, seen.camera, points[seen.track], seen.pixels, seen.sigma, start, scales=(4.0, 1.0)
-    ).base_from_surface
+    return solve_pose(RIG, PointTracks.of(seen, points[seen.track]), start, scales=(4.0, 1.0)).base_from_surface
 
 
 def key_frames(seen: list[Observations], points: Array) -> list[KeyFrame]:
@@ -88,7 +85,7 @@ def unsure(skew: float) -> Delays:
 
 def refine(
     true: Array, wrong: Array, seed: int = 1, noise: float = 0.3, delays: Sequence[float] = (0, 0, 0), skew: float = 0.0
-) -> tuple[Adjusted, list[KeyFrame]]:
+) -> tuple[AdjustedMap, list[KeyFrame]]:
     frames = key_frames([look(true, float(t), seed, noise, delays) for t in STAMPS], wrong)
     adjusted = adjust(RIG, as_map(wrong), frames, unsure(skew))
     assert adjusted is not None
@@ -101,8 +98,7 @@ def test_a_skewed_first_map_gets_its_true_shape_and_size(shrink: float) -> None:
     wrong = true * shrink + 0.1 * np.random.default_rng(5).normal(size=true.shape)
     adjusted, _ = refine(true, wrong)
     assert shape_error(wrong, true) > 0.2 and shape_error(adjusted.map.points, true) < 0.06
-    assert abs(size(adjusted.map.points) / size(true) - 1) < 0.001
-    assert adjusted.agrees.all()
+    assert abs(size(adjusted.map.points) / size(true) - 1) < 0.001 and adjusted.agrees.all()
 
 
 def test_exact_pixels_give_the_exact_shape() -> None:
@@ -116,8 +112,7 @@ def test_exact_pixels_give_the_exact_shape() -> None:
 def test_cameras_at_different_instants_do_not_distort_the_map(delays: tuple[float, ...]) -> None:
     true = landmarks(1)
     adjusted, _ = refine(true, true, delays=delays, skew=0.015)
-    assert shape_error(adjusted.map.points, true) < 0.08
-    assert abs(size(adjusted.map.points) / size(true) - 1) < 0.001
+    assert shape_error(adjusted.map.points, true) < 0.08 and abs(size(adjusted.map.points) / size(true) - 1) < 0.001
     assert adjusted.agrees.all()
 
 
@@ -137,8 +132,7 @@ def test_a_landmark_that_stays_while_the_rest_moves_is_found() -> None:
             )
         )
     adjusted = adjust(RIG, as_map(true), key_frames(seen, true), unsure(0.0))
-    assert adjusted is not None
-    assert np.flatnonzero(~adjusted.agrees).tolist() == still.tolist()
+    assert adjusted is not None and np.flatnonzero(~adjusted.agrees).tolist() == still.tolist()
     rest = np.setdiff1d(np.arange(len(true)), still)
     assert shape_error(adjusted.map.points[rest], true[rest]) < 0.06
 
@@ -203,8 +197,7 @@ def test_a_point_that_is_hardly_known_lends_nothing_to_the_others() -> None:
 
 def test_normals_stay_unit_and_on_their_side() -> None:
     adjusted, _ = refine(landmarks(7), landmarks(7))
-    assert np.allclose(np.linalg.norm(adjusted.map.normals, axis=1), 1)
-    assert (adjusted.map.normals[:, 2] > 0).all()
+    assert np.allclose(np.linalg.norm(adjusted.map.normals, axis=1), 1) and (adjusted.map.normals[:, 2] > 0).all()
 
 
 def test_a_landmark_seen_too_seldom_stays_where_it_was() -> None:
@@ -217,8 +210,7 @@ def test_a_landmark_seen_too_seldom_stays_where_it_was() -> None:
     wrong = true.copy()
     wrong[0] += [0.0, 0.0, 5.0]
     adjusted = adjust(RIG, as_map(wrong), key_frames(seen, wrong), unsure(0.0))
-    assert adjusted is not None
-    assert np.linalg.norm(adjusted.map.points[0] - wrong[0]) < 0.05 and adjusted.agrees[0]
+    assert adjusted is not None and np.linalg.norm(adjusted.map.points[0] - wrong[0]) < 0.05 and adjusted.agrees[0]
     assert np.allclose(adjusted.map.covariance[:3, :3], 0.25 * np.eye(3))
 
 

@@ -12,53 +12,50 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.arm_calibration.moves import check_latency, check_places, check_turns
-from estimation.arm_calibration.set_point import SetPoint
-from estimation.arm_calibration.synthetic import set_point_of, sightings_of
-from estimation.arm_calibration.touch import fit_touched
-from estimation.calibration.arm_fit import Asked, fit_arm, widened
-from estimation.calibration.arm_model import ArmState, Sightings, predict
-from estimation.calibration.arm_start import first_pose
+from estimation.calibration.arm_fit import ArmUnknowns, fit_arm, fit_touches, jackknife
+from estimation.calibration.arm_model import ArmParameters, SetPoint, Sightings, predict
+from estimation.calibration.arm_start import check_latency, check_places, check_turns, first_pose
 from estimation.errors import InputError
 from estimation.rig import Rig, pixels_from_points
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST, arc_rig
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.arm.profile import ArmProfile, placed
-from hardware.arm_calibration.moves import MoveWishes, planned
-from hardware.arm_calibration.tool_shadow import hidden_tips, needle_shown
-from hardware.arm_calibration.verdict import judge
-from hardware.calibration.arm_run import run_touched
-from hardware.calibration.arm_sightings import Look
-from hardware.calibration.arm_solve import ArmCalibration, calibrated, kinematics_of
+from hardware.bench.calibration import set_point_of, sightings_of
+from hardware.calibration.arm_record import MoveOptions, plan_moves
+from hardware.calibration.arm_report import judge_arm
+from hardware.calibration.arm_run import calibrate_touched
+from hardware.calibration.arm_sightings import TipObservations, hidden_tips, visible_needle
+from hardware.calibration.arm_solve import ArmCalibration, calibrated_profile, kinematics_of
 from hardware.files.arm_file import read_arm
 from hardware.files.rig_file import write_rig
-from hardware.simulator.polyline import Polyline
-from hardware.simulator.servo import Servo
-from perception.tool_profile import SYRINGE
+from hardware.simulator.arm.controller import Polyline, Servo
+from perception.frames import SYRINGE
 
-RIG, TOLD = arc_rig(), placed(ArmProfile(), REST)
+RIG, TOLD = arc_rig(), placed(ArmProfile(), BASE_FROM_REST)
 KINEMATICS = kinematics_of(TOLD.arm)
 START = TOLD.arm.home
-FEW = MoveWishes(places=9, dwell=0.4, swing=3.0)
+FEW = MoveOptions(places=9, dwell=0.4, swing=3.0)
 
 
-def true_state(seed: int) -> ArmState:
+def true_state(seed: int) -> ArmParameters:
     draw = np.random.default_rng(seed)
     pose = se3.inverse(TOLD.arm.arm_from_base) @ se3.exp(draw.normal(size=6) * [0.03, 0.03, 0.03, 5, 5, 5])
-    return ArmState(pose, draw.normal(size=3) * 2, *draw.uniform(0.005, 0.03, 2), 0.3)
+    return ArmParameters(pose, draw.normal(size=3) * 2, *draw.uniform(0.005, 0.03, 2), 0.3)
 
 
-def sent(wishes: MoveWishes = FEW) -> SetPoint:
-    return set_point_of(planned(START, TOLD.limits, TOLD.tick, wishes), TOLD.tick)
+def sent(wishes: MoveOptions = FEW) -> SetPoint:
+    return set_point_of(plan_moves(START, TOLD.limits, TOLD.tick, wishes), TOLD.tick)
 
 
-def seen(state: ArmState, noise: float = 0.0, outliers: float = 0.0, rig: Rig = RIG, period: float = 0.2) -> Sightings:
+def seen(
+    state: ArmParameters, noise: float = 0.0, outliers: float = 0.0, rig: Rig = RIG, period: float = 0.2
+) -> Sightings:
     return sightings_of(state, sent(), KINEMATICS, rig, period, noise, outliers, np.random.default_rng(7))
 
 
-def start_from(sightings: Sightings, rig: Rig = RIG) -> ArmState:
+def start_from(sightings: Sightings, rig: Rig = RIG) -> ArmParameters:
     pose = first_pose(sightings, sent(), KINEMATICS, rig)[0]
-    return ArmState(pose, np.zeros(3), 0.01, 0.01, 0.4)
+    return ArmParameters(pose, np.zeros(3), 0.01, 0.01, 0.4)
 
 
 @settings(max_examples=4)
@@ -95,8 +92,7 @@ def test_errors_are_as_large_as_is_claimed_and_blunders_are_left_out() -> None:
         late = [found.state.dead_time - true.dead_time, found.state.lag - true.lag]
         off = np.concatenate([gap, found.state.tool - true.tool, late])
         squares.append(off @ np.linalg.solve(found.covariance[:11, :11], off) / 11)
-        assert found.scatter == pytest.approx(1.0, abs=0.1)
-        assert 0.85 < found.used.mean() < 0.95
+        assert found.scatter == pytest.approx(1.0, abs=0.1) and 0.85 < found.used.mean() < 0.95
     assert 0.5 < np.mean(squares) < 1.7  # 99.8 % of chi^2 with 44
 
 
@@ -112,13 +108,13 @@ def test_what_is_off_alike_at_a_place_is_in_the_doubt() -> None:
         found = fit_arm(sightings, sent(), KINEMATICS, RIG, start_from(sightings))
         left = [sightings.take(group != g) for g in range(1, 8)]
         states = [fit_arm(some, sent(), KINEMATICS, RIG, found.state).state for some in left]
-        doubted = widened(found, states)
+        doubted = jackknife(found, states)
         assert doubted.widened_by > 2 and found.widened_by == 1
         gap = se3.log(se3.inverse(true.base_from_arm) @ found.state.base_from_arm)
         off = np.concatenate([gap, found.state.tool - true.tool])
         for out, fit in ((plain, found), (wide, doubted)):
             out.append(off @ np.linalg.solve(fit.covariance[:9, :9], off) / 9)
-        assert np.allclose(widened(found, [found.state] * 3).covariance, found.covariance)
+        assert np.allclose(jackknife(found, [found.state] * 3).covariance, found.covariance)
     assert np.mean(plain) > 2.5 and 0.3 < np.mean(wide) < 2.5
 
 
@@ -134,7 +130,7 @@ def test_what_the_rig_may_be_off_by_is_in_the_doubt() -> None:
 def test_what_is_not_asked_stays_as_it_was() -> None:
     true = true_state(9)
     start = replace(true, base_from_arm=true.base_from_arm @ se3.exp([0.01, 0, 0, 1, 1, 1]))
-    found = fit_arm(seen(true), sent(), KINEMATICS, RIG, start, Asked(False, False, False))
+    found = fit_arm(seen(true), sent(), KINEMATICS, RIG, start, ArmUnknowns(False, False, False))
     assert (found.state.dead_time, found.state.lag, found.state.blunt) == (true.dead_time, true.lag, true.blunt)
     assert found.state.tool is true.tool and not found.covariance[6:].any()
     assert np.allclose(found.state.base_from_arm, true.base_from_arm, atol=1e-4)
@@ -146,7 +142,7 @@ def test_slopes_are_those_of_differences(seed: int) -> None:
     state, draw = replace(true_state(seed), blunt=0.0), np.random.default_rng(seed)  # the end's own are left out
     stamp, camera, point = draw.uniform(1.0, 20.0, 20), draw.integers(0, 3, 20), sent()
 
-    def pixels(changed: ArmState) -> Array:
+    def pixels(changed: ArmParameters) -> Array:
         return predict(changed, point, KINEMATICS, RIG, stamp, camera).pixels
 
     found, h = predict(state, point, KINEMATICS, RIG, stamp, camera), 1e-4
@@ -214,7 +210,7 @@ def test_moves_that_cannot_tell_are_named(check: Callable[[], None], words: list
 
 
 def test_moves_that_can_tell_pass() -> None:
-    targets = planned(START, TOLD.limits, TOLD.tick, FEW)
+    targets = plan_moves(START, TOLD.limits, TOLD.tick, FEW)
     check_places(targets[:, :3])
     check_turns(KINEMATICS(targets))
     check_latency(sent(), KINEMATICS, np.arange(0.5, sent().instants[-1], 0.05))
@@ -229,10 +225,10 @@ def test_a_tip_that_no_two_cameras_agree_on_is_named() -> None:
 
 def test_the_profile_takes_over_what_was_found() -> None:
     state = true_state(2)
-    profile = calibrated(TOLD, state, Asked())
+    profile = calibrated_profile(TOLD, state, ArmUnknowns())
     assert np.allclose(profile.arm.arm_from_base @ state.base_from_arm, np.eye(4), atol=1e-12)
     assert profile.lag == pytest.approx(profile.frame_time + state.dead_time + state.lag)
-    assert calibrated(TOLD, state, Asked(latency=False)).lag == TOLD.lag
+    assert calibrated_profile(TOLD, state, ArmUnknowns(latency=False)).lag == TOLD.lag
 
 
 @given(st.floats(-1.0, 1.0))
@@ -243,7 +239,7 @@ def test_a_tool_hides_its_needle_from_who_looks_along_it(along: float) -> None:
     hit = (along > 0) & (beside < along * np.interp(upper, *SYRINGE.T)).any(1)
     free = height[: int(np.argmax(hit))] if hit.any() else height
     expected = square * float(free[-1]) if len(free) else 0.0
-    assert float(needle_shown(SYRINGE, np.array([along]))[0]) == pytest.approx(expected, abs=0.1)
+    assert float(visible_needle(SYRINGE, np.array([along]))[0]) == pytest.approx(expected, abs=0.1)
 
 
 def test_where_the_tool_hides_its_tip_is_told_from_where_it_is_lost() -> None:
@@ -263,14 +259,14 @@ def test_the_verdict_says_how_well_the_lag_is_known_and_how_well_it_must_be() ->
     sightings = seen(true_state(2), noise=0.2)
     fit = fit_arm(sightings, sent(), KINEMATICS, RIG, start_from(sightings))
     counts, beside = np.full(len(RIG), 9), np.full(len(sightings.stamp), 0.1)
-    look = Look(sightings, counts, counts, (), np.ones(len(RIG)), (np.zeros(0), np.zeros(0, np.int64)))
-    given = look, sent(), fit, np.zeros((9, 3)), np.full(9, 0.1), beside, beside, Asked(), counts
-    lines = judge(ArmCalibration(RIG, TOLD, *given), 1.0).lines
+    look = TipObservations(sightings, counts, counts, (), (np.zeros(0), np.zeros(0, np.int64)))
+    given = look, sent(), fit, np.zeros((9, 3)), np.full(9, 0.1), beside, beside, ArmUnknowns(), counts
+    lines = judge_arm(ArmCalibration(RIG, TOLD, *given), 1.0).lines
     (line,) = [line for line in lines if "ms late" in line]
     assert "; both together are known to ± " in line and line.endswith(" ms, ± 5 ms is allowed")
 
 
-def touched(count: int, seek: bool, sigma: float) -> tuple[ArmState, Array, Array]:
+def touched(count: int, seek: bool, sigma: float) -> tuple[ArmParameters, Array, Array]:
     draw, true = np.random.default_rng(count), true_state(11)
     axes = START + np.column_stack([draw.uniform(-60, 60, (count, 3)), draw.uniform(-0.4, 0.4, (count, 3)) * seek])
     tool = true.tool if seek else np.zeros(3)
@@ -281,10 +277,9 @@ def touched(count: int, seek: bool, sigma: float) -> tuple[ArmState, Array, Arra
 @pytest.mark.parametrize("seek", [True, False])
 def test_touched_points_tell_the_place(seek: bool) -> None:
     true, axes, points = touched(6, seek, 0.0)
-    found = fit_touched(KINEMATICS(axes), points, np.full(6, 0.2), np.zeros(3), seek)
+    found = fit_touches(KINEMATICS(axes), points, np.full(6, 0.2), np.zeros(3), seek)
     assert np.allclose(found.base_from_arm, true.base_from_arm, atol=1e-3)
-    assert found.tool == pytest.approx(true.tool, abs=1e-3)
-    assert np.abs(found.residuals).max() < 1e-3
+    assert found.tool == pytest.approx(true.tool, abs=1e-3) and np.abs(found.residuals).max() < 1e-3
 
 
 def touched_file(tmp_path: Path, axes: Array, points: Array, pixels: bool) -> tuple[Path, Path]:
@@ -306,7 +301,7 @@ def touched_file(tmp_path: Path, axes: Array, points: Array, pixels: bool) -> tu
 def test_a_file_of_touched_points_makes_an_arm_file(tmp_path: Path, pixels: bool) -> None:
     true, axes, points = touched(6, True, 0.0)
     file, rig = touched_file(tmp_path, axes, points, pixels)
-    outcome = run_touched(file, rig, TOLD, tmp_path / "arm.toml", keep_tool=False)
+    outcome = calibrate_touched(file, rig, TOLD, tmp_path / "arm.toml", keep_tool=False)
     assert outcome.verdict.passed
     arm = read_arm(tmp_path / "arm.toml").arm
     assert np.allclose(arm.arm_from_base @ true.base_from_arm, np.eye(4), atol=1e-2)
@@ -316,7 +311,9 @@ def test_a_file_of_touched_points_makes_an_arm_file(tmp_path: Path, pixels: bool
 def test_a_point_that_was_another_one_is_named(tmp_path: Path) -> None:
     _, axes, points = touched(8, False, 0.05)
     points[4] += [0.0, 4.0, 0.0]
-    outcome = run_touched(*touched_file(tmp_path, axes, points, False), TOLD, tmp_path / "arm.toml", keep_tool=True)
+    outcome = calibrate_touched(
+        *touched_file(tmp_path, axes, points, False), TOLD, tmp_path / "arm.toml", keep_tool=True
+    )
     assert not outcome.verdict.passed and "touch point 5 again" in outcome.verdict.hints[0]
 
 
@@ -338,5 +335,5 @@ def test_a_wrong_file_of_points_is_named(tmp_path: Path, text: str, words: list[
     write_rig(rig, RIG, [None] * 3)
     file.write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:
-        run_touched(file, rig, TOLD, tmp_path / "arm.toml", keep_tool=True)
+        calibrate_touched(file, rig, TOLD, tmp_path / "arm.toml", keep_tool=True)
     assert all(word in str(caught.value) for word in [str(file), *words]), caught.value

@@ -1,4 +1,6 @@
-"""Arm files: round trip, defaults, and faults told by key."""
+"""Arm files: round trip, defaults, and faults told by key. The table [arm]: what it may say, and what it may not. No-go
+zones: a tip on their surface passes, a hair inside is refused, and no step goes through one.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +9,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import Dialect
 from hardware.files.arm_file import read_arm, write_arm
-from planning.kinematics import SimpleArm
-from planning.limits import Limits
+from hardware.simulator.arm.settings import ARM_KEYS, ArmSettings, ReplyMode, arm_settings_from_table
+from planning.command import Move, Refusal, RefusalCode
+from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
+from planning.motion.guard import Guard
+from planning.robot.kinematics import SimpleArm
+from tests.test_guard import ARM, TICK, WIDE, axes, move, pose
 
 
 def same(a: ArmProfile, b: ArmProfile) -> bool:
@@ -42,7 +49,7 @@ def test_a_profile_comes_back(tmp_path_factory: pytest.TempPathFactory, seed: in
             *(se3.exp(draw.normal(size=6)), se3.exp_rotation(draw.normal(size=3)), draw.uniform(-0.5, 0.5, 6)),
             tool_offset=draw.uniform(-9, 9, 3),
         ),
-        Limits(speed=draw.uniform(1, 100, 6), turn=draw.uniform(0.01, 0.1), surface_turn=draw.uniform(0.1, 1)),
+        MotionLimits(speed=draw.uniform(1, 100, 6), turn=draw.uniform(0.01, 0.1), surface_turn=draw.uniform(0.1, 1)),
         Dialect(int(draw.integers(2)), ("J5", "J4", "J6"), (1, 10)[int(draw.integers(2))], (0.0, 1500.0)[seed % 2]),
         int(draw.integers(57_600, 1_000_000)),
         draw.uniform(0.01, 0.04),
@@ -58,7 +65,7 @@ def test_what_a_file_leaves_out_keeps_its_default(tmp_path: Path) -> None:
     file = tmp_path / "arm.toml"
     file.write_text("motion_byte = 0\n[limits]\nturn = 1.5\n", encoding="utf-8")
     profile = read_arm(file)
-    assert same(profile, ArmProfile(limits=Limits(turn=np.deg2rad(1.5)), dialect=Dialect(0)))
+    assert same(profile, ArmProfile(limits=MotionLimits(turn=np.deg2rad(1.5)), dialect=Dialect(0)))
 
 
 def test_on_a_slow_line_ticks_and_lag_follow_unless_they_are_given(tmp_path: Path) -> None:
@@ -116,3 +123,150 @@ def test_faults_are_told_by_file_and_key(tmp_path: Path, text: str, words: list[
         read_arm(file)
     for word in [str(file), "allowed", *words]:
         assert word in str(caught.value)
+
+
+FULL = {
+    "fifo": 20,
+    "dead_time_s": 0.01,
+    "servo_lag_s": 0.0,
+    "acceleration_mm_s2": 3000,
+    "top_speed_mm_s": 200,
+    "top_turn_deg_s": 90,
+    "low_mm_deg": [-1, -2, -3, -4, -5, -6],
+    "high_mm_deg": [1, 2, 3, 4, 5, 180],
+    "replies": "stray",
+    "reply_period_s": 0.1,
+    "seed": 7,
+}
+
+
+def test_a_table_gives_the_settings_in_mm_s_and_rad() -> None:
+    assert set(FULL) == set(ARM_KEYS)
+    arm = arm_settings_from_table("a.toml", FULL)
+    assert (arm.fifo, arm.seed, arm.replies) == (20, 7, ReplyMode.STRAY)
+    assert (arm.dead_time, arm.servo_lag, arm.acceleration, arm.reply_period) == (0.01, 0.0, 3000.0, 0.1)
+    assert (arm.top_speed, arm.top_turn) == pytest.approx((200, np.pi / 2))
+    assert arm.high == pytest.approx([1, 2, 3, *np.deg2rad([4, 5, 180])])
+
+
+def test_what_a_table_leaves_out_keeps_its_default() -> None:
+    arm, default = arm_settings_from_table("a.toml", {}), ArmSettings()
+    assert all(np.all(getattr(arm, name) == getattr(default, name)) for name in ArmSettings.__slots__)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("fifo", 0),
+        ("fifo", 1.5),
+        ("seed", -1),
+        ("dead_time_s", -0.001),
+        ("servo_lag_s", "20 ms"),
+        ("servo_lag_s", -1e-9),
+        ("acceleration_mm_s2", 0),
+        ("top_speed_mm_s", 0),
+        ("top_turn_deg_s", -1),
+        ("low_mm_deg", [0] * 5),
+        ("low_mm_deg", [1000, -1, -1, -1, -1, -1]),
+        ("high_mm_deg", [1601, 1, 1, 1, 1, 1]),
+        ("replies", "on"),
+        ("replies", 3),
+        ("reply_period_s", 0),
+    ],
+)
+def test_a_wrong_value_is_refused_by_the_name_it_has_in_the_file(key: str, value: object) -> None:
+    with pytest.raises(InputError, match=rf"a\.toml: arm\.{key.replace('high', '(low|high)')} = .*allowed"):
+        arm_settings_from_table("a.toml", {key: value})
+
+
+def test_an_unknown_key_is_refused_with_the_nearest_one() -> None:
+    with pytest.raises(InputError, match="did you mean 'servo_lag_s'"):
+        arm_settings_from_table("a.toml", {"servo_lag": 0.02})
+
+
+BED = half_space("bed", np.array([0.0, 0, 2]), np.array([7.0, 7, -2]))
+BLOCK = box("block", np.array([2.0, -1, -1]), np.array([4.0, 1, 1]))
+POST = cylinder("post", np.array([0.0, 5, -10]), np.array([0.0, 5, 10]), 2.0)
+FREE = replace(WIDE, speed=np.full(6, 1e9), zones=(BED, BLOCK, POST))
+
+
+def judged(target: Array, begin: Array | None = None) -> Move | Refusal:
+    guard = Guard(FREE, replace(ARM, home=np.zeros(6) if begin is None else begin), TICK)
+    answer = guard(move(target), pose(1.0), 1.0)
+    assert isinstance(answer, Move | Refusal)
+    return answer
+
+
+@pytest.mark.parametrize(
+    ("surface", "inwards"), [(axes(0, 0, -2), axes(0, 0, -1)), (axes(2), axes(1)), (axes(0, 3), axes(0, 1))]
+)
+def test_the_surface_of_each_kind_of_zone_is_met_and_broken_by_a_hair(surface: Array, inwards: Array) -> None:
+    assert isinstance(judged(surface), Move)
+    answer = judged(np.where(inwards != 0, np.nextafter(surface, 100 * inwards), surface))
+    assert isinstance(answer, Refusal) and answer.code is RefusalCode.NO_GO
+    assert 0 < answer.got < 1e-12 and answer.limit == 0
+
+
+def test_no_step_goes_through_a_zone_or_ends_behind_it() -> None:
+    through = judged(axes(6))
+    assert isinstance(through, Refusal) and through.code is RefusalCode.NO_GO and "'block'" in through.reason
+    assert through.got == pytest.approx(1.0) and isinstance(judged(axes(6, 3), axes(0, 1.5)), Move)
+    assert isinstance(judged(axes(0, 8)), Refusal) and isinstance(judged(axes(4, 8), axes(4, 2)), Move)
+    assert isinstance(judged(axes(2, 8), axes(2, 2)), Move)  # along the post's surface
+
+
+place = st.builds(lambda *xyz: np.array(xyz), *[st.floats(-6, 6)] * 3)
+
+
+@settings(max_examples=60)
+@given(place, place)
+def test_a_straight_way_meets_a_zone_where_one_of_its_points_is_inside(start: Array, end: Array) -> None:
+    for zone in (BED, BLOCK, POST):
+        if zone.depth(start) > 0:
+            continue
+        depths = [zone.depth(start + share * (end - start)) for share in np.linspace(0, 1, 100)]
+        if max(depths) > 1e-3:
+            assert zone.depth_along(start, end) > 0
+        if max(depths) < -0.2:
+            assert zone.depth_along(start, end) == 0
+
+
+def test_zones_come_back_from_a_file_and_home_must_be_outside(tmp_path: Path) -> None:
+    file = tmp_path / "arm.toml"
+    profile = ArmProfile(limits=MotionLimits(zones=(BED, BLOCK, POST)))
+    write_arm(file, profile)
+    for a, b in zip(read_arm(file).limits.zones, profile.limits.zones, strict=True):
+        assert a.name == b.name and a.radius == b.radius
+        assert np.allclose(a.normals, b.normals) and np.allclose(a.offsets, b.offsets) and np.allclose(a.axis, b.axis)
+    with pytest.raises(InputError, match="no-go zone 'all'"):
+        ArmProfile(limits=MotionLimits(zones=(half_space("all", np.array([0.0, 0, 1]), np.array([0.0, 0, 1000])),)))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("box = [[0, 0, 0], [1, 1, 1]]", "no_go.name"),
+        ('name = "x"', "half_space, box, or cylinder"),
+        ('name = "x"\nbox = [[0, 0, 0], [1, 1, 1]]\nradius = 3', "cylinder with radius"),
+        ('name = "x"\ncylinder = [[0, 0, 0], [1, 1, 1]]', "cylinder with radius"),
+        ('name = "x"\nbox = [[0, 0, 2], [1, 1, 1]]', "low corner"),
+        ('name = "x"\nbox = [[0, 0, nan], [1, 1, 1]]', "no_go.box"),
+        ('name = "x"\nhalf_space = [[0, 0, 0], [1, 1, 1]]', "not zero"),
+        ('name = "x"\ncylinder = [[1, 1, 1], [1, 1, 1]]\nradius = 3', "two ends apart"),
+        ('name = "x"\ncylinder = [[0, 0, 0], [1, 1, 1]]\nradius = 0', "radius > 0"),
+        ('name = "x"\nboxx = 3', "no_go.boxx"),
+    ],
+)
+def test_a_zone_that_makes_no_sense_is_refused_by_its_key(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "arm.toml"
+    file.write_text(f"[[no_go]]\n{text}\n", encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        read_arm(file)
+    assert words in str(caught.value)
+
+
+def test_a_zone_of_wrong_shapes_is_refused() -> None:
+    with pytest.raises(InputError, match="normals"):
+        NoGo("x", np.zeros((2, 3)), np.zeros(3))
+    with pytest.raises(InputError, match="unit normals"):
+        NoGo("x", np.ones((1, 3)), np.zeros(1))

@@ -1,4 +1,6 @@
-"""The arm on its line: nothing moves unasked, little is ever under way, every fault ends at rest and with a reason."""
+"""The arm on its line: nothing moves unasked, little is ever under way, every fault ends at rest and with a reason. The
+model of the arm's queue: what it says is under way is what the virtual arm has yet to do.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.arm.protocol import G1, G4, Dialect, Pause, encode
-from hardware.arm_status import ArmState
-from hardware.link_settings import LinkSettings
-from hardware.replies import Reply, ReplyKind
+from hardware.arm.device import ArmState
+from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.protocol import G1, G4, Dialect, Pause, Reply, ReplyKind, decode, encode
+from hardware.arm.queue import ArmQueue
+from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.ports import PortFaults
-from hardware.simulator.arm.settings import ArmSettings, Replies
+from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import feed_for
-from tests.linked import circle, linked
-from tests.virtual_arm import HOME, arm_fault
+from tests.linked import circle, linked, moving, waiting
+from tests.virtual_arm import HOME, arm_fault, virtual_arm
 
-ANSWERING = ArmSettings(servo_lag=0.02, replies=Replies.STREAM)
+ANSWERING = ArmSettings(servo_lag=0.02, replies=ReplyMode.STREAM)
 
 
 # -- who may move it
@@ -28,13 +31,13 @@ def test_nothing_is_sent_before_an_operator_says_so() -> None:
     link = linked(stand=False)
     assert link.arm.state is ArmState.DISARMED
     link.arm.stand(HOME, 0.0)
-    frame = encode(G1(HOME + 1, 50.0))
-    assert "disarmed" in link.arm.send(frame, 0.0)
+    command = moving(HOME + 1, 50.0)
+    assert "disarmed" in link.arm.send(command, 0.0)
     assert "disarmed" in link.arm.home(0.0)
     link.run(1.0)
     assert (link.virtual.frames, link.arm.frames) == (0, 0)
     assert link.arm.arm(1.0) == "" and link.arm.state is ArmState.ARMED
-    assert link.arm.send(frame, 1.0) == ""
+    assert link.arm.send(command, 1.0) == ""
     link.run(0.5)
     assert link.virtual.frames == 1
 
@@ -46,16 +49,14 @@ def test_an_arm_of_which_nobody_knows_where_it_stands_is_not_armed() -> None:
         link.arm.stand(np.full(6, np.nan), 0.0)
     answering = linked(ANSWERING, stand=False)
     answering.run(1.0)
-    assert answering.arm.arm(1.0) == ""
-    assert answering.arm.target == pytest.approx(HOME, abs=0.05)
+    assert answering.arm.arm(1.0) == "" and answering.arm.target == pytest.approx(HOME, abs=0.05)
 
 
 def test_an_arm_that_answers_at_rest_from_beside_where_it_is_thought_to_be_is_believed() -> None:
     link = linked(ANSWERING, stand=False, begin=HOME + [0.5, 0, 0, 0, 0, 0])
     link.arm.stand(HOME, 0.0)
     link.run(1.0)
-    assert link.arm.arm(1.0, HOME) == ""
-    assert link.arm.target == pytest.approx(HOME + [0.5, 0, 0, 0, 0, 0], abs=0.06)
+    assert link.arm.arm(1.0, HOME) == "" and link.arm.target == pytest.approx(HOME + [0.5, 0, 0, 0, 0, 0], abs=0.06)
     link.run(0.5)
     assert link.executed() == pytest.approx(HOME, abs=1e-3) and link.virtual.deepest <= 0.03
 
@@ -66,29 +67,39 @@ def test_disarmed_it_ends_what_is_under_way_and_no_more() -> None:
     frames = link.arm.frames
     link.arm.disarm(1.0)
     assert link.arm.stand(HOME, 1.0) == ""
-    link.run(1.0, lambda now: link.arm.send(encode(G1(HOME, 50.0)), now) and None)
+    link.run(1.0, lambda now: link.arm.send(moving(HOME, 50.0), now) and None)
     assert (link.arm.state, link.arm.frames) == (ArmState.DISARMED, frames)
 
 
-def test_only_moves_and_pauses_of_its_dialect_are_taken() -> None:
+def test_a_command_that_no_frame_holds_is_not_taken() -> None:
     link = linked()
-    for frame in (encode(Pause()), b"\0" * 48, encode(G1(HOME, 5.0), Dialect(motion_byte=0)), encode(G4(0.001))[:-1]):
+    for command in (moving(HOME, 0.0), moving(HOME, np.nan), moving(HOME + 1e39, 5.0), waiting(0.0), waiting(np.inf)):
         with pytest.raises(InputError):
-            link.arm.send(frame, 0.0)
+            link.arm.send(command, 0.0)
     assert link.arm.frames == 0
 
 
+def test_a_command_is_sent_in_the_dialect_and_reckoned_as_the_wire_rounds_it() -> None:
+    dialect = Dialect(motion_byte=0, slots=("J5", "J4", "J6"))
+    link = linked(profile=ArmProfile(dialect=dialect))
+    command = moving(HOME + 1 / 3, 100 / 3)
+    assert link.arm.send(command, 0.0) == ""
+    assert link.arm.command_frame == encode(G1(command.axes, command.feed), dialect)
+    told = decode(link.arm.command_frame, dialect)
+    assert isinstance(told, G1) and (told.axes != command.axes).any() and (link.arm.target == told.axes).all()
+
+
 def test_a_command_too_long_or_too_fast_stops_the_arm_and_is_not_sent() -> None:
-    for wrong in (G1(HOME + [3, 0, 0, 0, 0, 0], 60.0), G4(0.05), G1(HOME + [3, 0, 0, 0, 0, 0], 250.1)):
+    far = HOME + [3, 0, 0, 0, 0, 0]
+    for wrong in (moving(far, 60.0), waiting(0.05), moving(far, 250.1)):
         link = linked()
-        assert "limit" in link.arm.send(encode(wrong), 0.0)
-        assert link.arm.state is ArmState.STOPPED
+        assert "limit" in link.arm.send(wrong, 0.0) and link.arm.state is ArmState.STOPPED
         link.run(0.5)
         assert link.executed() == pytest.approx(HOME)
     exact = 0.05 - 1 / 240
     link = linked()
-    assert link.arm.send(encode(G4(exact * (1 - 1e-6))), 0.0) == ""
-    assert "limit" in linked().arm.send(encode(G4(exact * (1 + 1e-6))), 0.0)
+    assert link.arm.send(waiting(exact * (1 - 1e-6)), 0.0) == ""
+    assert "limit" in linked().arm.send(waiting(exact * (1 + 1e-6)), 0.0)
 
 
 # -- pacing
@@ -109,16 +120,14 @@ def test_however_it_is_called_no_more_is_under_way_than_may_be(waits: list[float
             link.send(axes + step)
         link.run(wait)
         assert link.arm.in_flight(link.clock.now()) <= 0.05 + 1e-9
-    assert link.arm.state is ArmState.ARMED
-    assert max(link.deepest, link.virtual.deepest) <= 0.05 + 1e-9
+    assert link.arm.state is ArmState.ARMED and max(link.deepest, link.virtual.deepest) <= 0.05 + 1e-9
     link.run(0.3)
     assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
 
 
 def test_a_motion_at_the_tick_flows_and_is_where_it_is_reckoned() -> None:
     link = linked()
-    assert link.follow(2.0) == []
-    assert not link.virtual.underruns
+    assert link.follow(2.0) == [] and not link.virtual.underruns
     now = link.clock.now()
     reckoned = link.arm.reckoned(now + link.arm.profile.lag - link.arm.profile.frame_time)
     assert reckoned is not None and np.allclose(reckoned, link.executed(), atol=1e-3)
@@ -128,16 +137,16 @@ def test_a_motion_at_the_tick_flows_and_is_where_it_is_reckoned() -> None:
 def test_more_frames_than_may_be_are_never_under_way() -> None:
     link, sent = linked(link=LinkSettings(frames=2)), []
     for _ in range(3):
-        sent.append(link.arm.send(encode(G4(0.018)), link.clock.now()))
+        sent.append(link.arm.send(waiting(0.018), link.clock.now()))
         link.run(0.005)
     assert sent[:2] == ["", ""] and "2 frames are under way, limit 2" in sent[2]
 
 
 def test_a_frame_waits_for_the_one_on_the_wire_so_that_a_stop_waits_for_no_more_than_one() -> None:
     link = linked()
-    assert link.arm.send(encode(G4(0.001)), 0.0) == ""
-    assert "48 bytes are on the wire" in link.arm.send(encode(G4(0.001)), 0.0)
-    assert link.arm.send(encode(G4(0.001)), 1 / 240) == ""
+    assert link.arm.send(waiting(0.001), 0.0) == ""
+    assert "48 bytes are on the wire" in link.arm.send(waiting(0.001), 0.0)
+    assert link.arm.send(waiting(0.001), 1 / 240) == ""
     link.arm.stop("asked for", 1 / 240)
     decided, on_wire = link.arm.stops[0]
     assert on_wire - decided == pytest.approx(2 / 240)
@@ -149,7 +158,7 @@ def test_a_frame_waits_for_the_one_on_the_wire_so_that_a_stop_waits_for_no_more_
 def test_a_stop_does_not_wait_for_the_queue() -> None:
     link = linked()
     for k in (1, 2):
-        assert link.arm.send(encode(G1(HOME + [2 * k, 0, 0, 0, 0, 0], 100.0)), (k - 1) / 200) == ""
+        assert link.arm.send(moving(HOME + [2 * k, 0, 0, 0, 0, 0], 100.0), (k - 1) / 200) == ""
     link.run(0.010)
     link.arm.stop("asked for", 0.010)
     link.run(1.0)
@@ -158,7 +167,7 @@ def test_a_stop_does_not_wait_for_the_queue() -> None:
     assert link.executed()[0] - HOME[0] == pytest.approx(100 * (on_wire - 1 / 240), abs=0.01)
     assert link.arm.target == pytest.approx(link.executed(), abs=0.01)
     assert (link.arm.state, link.arm.reason) == (ArmState.STOPPED, "asked for")
-    assert "stopped" in link.arm.send(encode(G1(HOME, 50.0)), 1.1)
+    assert "stopped" in link.arm.send(moving(HOME, 50.0), 1.1)
 
 
 def test_an_arm_that_knows_no_pause_frame_stops_by_an_empty_queue() -> None:
@@ -167,8 +176,7 @@ def test_an_arm_that_knows_no_pause_frame_stops_by_an_empty_queue() -> None:
     frames = link.virtual.frames
     link.arm.stop("asked for", 0.5)
     link.run(0.5)
-    assert link.virtual.frames <= frames + 1
-    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
+    assert link.virtual.frames <= frames + 1 and link.executed() == pytest.approx(link.arm.target, abs=1e-3)
 
 
 def test_armed_again_it_goes_back_slowly_to_where_the_motion_left_off() -> None:
@@ -183,8 +191,7 @@ def test_armed_again_it_goes_back_slowly_to_where_the_motion_left_off() -> None:
     assert link.arm.arm(1.5, left_off) == ""
     assert link.arm.hold(1.5) == "the arm is on its way"
     link.run(0.5)
-    assert link.arm.hold(2.0) == ""
-    assert link.executed() == pytest.approx(left_off, abs=1e-3)
+    assert link.arm.hold(2.0) == "" and link.executed() == pytest.approx(left_off, abs=1e-3)
 
 
 # -- home, origin, jog
@@ -200,15 +207,13 @@ def test_home_is_reached_slowly_by_way_of_above_and_never_much_is_under_way() ->
     path = np.array(seen)
     assert np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1).max() <= 20 * 0.0201
     across = np.abs(path[:, 0] - low[0]) > 1e-3
-    assert path[across, 2].min() > HOME[2] - 0.01
-    assert max(link.deepest, link.virtual.deepest) <= 0.05
+    assert path[across, 2].min() > HOME[2] - 0.01 and max(link.deepest, link.virtual.deepest) <= 0.05
 
 
 def test_a_place_out_of_bounds_is_not_gone_to() -> None:
     link = linked()
     assert "out of bounds" in link.arm.go(HOME + [1000, 0, 0, 0, 0, 0], 0.0)
-    assert "out of bounds" in link.arm.go(np.full(6, np.nan), 0.0)
-    assert not link.arm.travels
+    assert "out of bounds" in link.arm.go(np.full(6, np.nan), 0.0) and not link.arm.travels
 
 
 def test_a_work_origin_changes_what_is_said_and_not_where_it_goes() -> None:
@@ -235,14 +240,13 @@ def test_answers_give_lag_and_arrival_and_no_doubt_of_an_arm_that_follows() -> N
     assert link.follow(4.0) == []
     status = link.arm.status(4.0)
     assert status.lag == pytest.approx(0.02, abs=0.004) and type(status.lag) is float  # goes into an arm file
-    assert status.off < 0.2 and status.answer_rate == pytest.approx(20, rel=0.1)
-    assert not link.arm.arrived(4.0)
+    assert status.off < 0.2 and status.answer_rate == pytest.approx(20, rel=0.1) and not link.arm.arrived(4.0)
     link.run(0.5)
     assert link.arm.arrived(link.clock.now())
 
 
 def test_stray_bytes_are_kept_with_their_instants_and_harm_nothing() -> None:
-    link = linked(ArmSettings(replies=Replies.STRAY), port=PortFaults(noise=20.0))
+    link = linked(ArmSettings(replies=ReplyMode.STRAY), port=PortFaults(noise=20.0))
     assert link.follow(5.0) == []
     status = link.arm.status(5.0)
     assert status.strays > 100 and status.answers == 0
@@ -289,7 +293,7 @@ def test_an_arm_that_does_not_answer_works_off_what_a_stall_has_queued() -> None
         goal = circle(link.phase + 0.02)
         assert link.arm.target is not None
         feed = feed_for(link.arm.target, goal, 0.02)
-        if not link.arm.hold(now) and not link.arm.send(encode(G1(goal, feed)), now):
+        if not link.arm.hold(now) and not link.arm.send(moving(goal, feed), now):
             link.phase += 0.02
 
     link.run(1.65, each, tick=0.0201)
@@ -301,8 +305,7 @@ def test_an_arm_that_does_not_answer_works_off_what_a_stall_has_queued() -> None
 def test_an_arm_that_stays_behind_is_stopped() -> None:
     link = linked(ANSWERING, arm_fault("stall 5s at 1s"))
     link.follow(6.0)
-    assert link.arm.state is ArmState.STOPPED
-    assert "called back" in link.arm.reason and link.virtual.deepest < 0.15
+    assert link.arm.state is ArmState.STOPPED and "called back" in link.arm.reason and link.virtual.deepest < 0.15
 
 
 @pytest.mark.parametrize(("share", "within"), [(50, 0.25), (70, 0.29), (80, 0.37)])
@@ -326,8 +329,7 @@ def test_an_arm_that_runs_away_is_stopped_at_once() -> None:
 def test_an_arm_that_falls_silent_is_held_and_then_stopped() -> None:
     link = linked(ANSWERING, arm_fault("unplug at 2s"))
     refused = link.follow(6.0)
-    assert any("has not answered for" in reason for reason in refused)
-    assert link.arm.state is ArmState.STOPPED
+    assert any("has not answered for" in reason for reason in refused) and link.arm.state is ArmState.STOPPED
     never = linked()
     assert never.follow(2.0) == []
 
@@ -336,14 +338,14 @@ def test_one_wrong_answer_alone_is_not_believed() -> None:
     link = linked(ANSWERING)
     link.follow(1.0)
     assert link.arm._queue is not None
-    link.arm._echo.take(Reply(ReplyKind.PLACE, HOME[:3] + 100), link.arm._queue, np.zeros(3), 1.0)
+    link.arm._feedback.take(Reply(ReplyKind.PLACE, HOME[:3] + 100), link.arm._queue, np.zeros(3), 1.0)
     assert link.arm.hold(1.0) == ""
     assert link.follow(1.0) == []
 
 
 @pytest.mark.parametrize("off", [3.0, 14.0])
 def test_what_was_said_against_an_arm_before_it_was_armed_again_does_not_count(off: float) -> None:
-    link = linked(ArmSettings(servo_lag=0.02, replies=Replies.STREAM))
+    link = linked(ArmSettings(servo_lag=0.02, replies=ReplyMode.STREAM))
     link.run(1.0)
     link.virtual.receive(encode(G1(HOME + [off, 0, 0, 0, 0, 0], 200.0)), link.virtual.now)
     link.run(0.06)
@@ -354,3 +356,99 @@ def test_what_was_said_against_an_arm_before_it_was_armed_again_does_not_count(o
     link.run(3.0)
     assert link.arm.state is ArmState.ARMED and link.arm.events() == []
     assert link.arm.arrived(link.clock.now()) and link.executed() == pytest.approx(HOME, abs=0.01)
+
+
+FRAME = 1 / 240
+FREE = ArmSettings(servo_lag=0.0, top_turn=1e6)  # as fast as it is told
+step = st.floats(-3, 3)
+moves = st.tuples(st.lists(step, min_size=6, max_size=6), st.floats(1, 250)).map(
+    lambda m: G1(HOME + np.array([*m[0][:3], *np.deg2rad(m[0][3:])]), m[1])
+)
+scripts = st.lists(st.tuples(st.floats(0, 0.06), st.one_of(moves, moves, st.floats(0.001, 0.05).map(G4))), max_size=12)
+
+
+def played(script: list[tuple[float, G1 | G4]]) -> tuple[VirtualArm, ArmQueue, float, float]:
+    """A virtual arm and the model of its queue that were told the same; when, and when the last of it arrived, s."""
+    arm, queue, now, wire = virtual_arm(FREE), ArmQueue(HOME.tolist(), FRAME, 0.0), 0.0, 0.0
+    for wait, command in script:
+        now += wait
+        told = decode(encode(command))
+        assert isinstance(told, G1 | G4)
+        queue.add(told, now)
+        wire = max(wire, now) + FRAME
+        arm.receive(encode(command), wire)
+    return arm, queue, now, wire
+
+
+@settings(max_examples=80)
+@given(scripts, st.floats(0, 0.2))
+def test_what_is_under_way_is_what_the_virtual_arm_has_yet_to_do(
+    script: list[tuple[float, G1 | G4]], after: float
+) -> None:
+    arm, queue, now, wire = played(script)
+    then = max(now + after, wire)
+    arm.advance(then)
+    assert queue.in_flight(then) == pytest.approx(arm.in_flight, abs=1e-6)
+    assert abs(queue.frames(then - 1e-6) - arm.queued) <= 1  # what ends just now may count in one and not in the other
+    assert np.allclose(queue.at(then), arm.axes_at(np.array([then]))[0], atol=1e-4)
+
+
+@settings(max_examples=60)
+@given(scripts, st.floats(0, 0.1))
+def test_after_a_stop_it_knows_where_the_set_point_rests(script: list[tuple[float, G1 | G4]], after: float) -> None:
+    arm, queue, now, wire = played(script)
+    now = now + after
+    queue.occupy(now, 1.0)
+    queue.stop()
+    arm.receive(encode(Pause()), max(wire, now) + FRAME)
+    arm.advance(now + 2)
+    assert queue.in_flight(now + 1) == 0
+    assert np.allclose(queue.target, arm.axes_at(np.array([now + 1.5]))[0], atol=1e-4)
+    assert np.allclose(queue.at(now + 1), queue.target, atol=0)
+
+
+def test_it_counts_the_wire_and_frames_to_come() -> None:
+    queue = ArmQueue(HOME.tolist(), FRAME, 0.0)
+    assert (queue.in_flight(0.0), queue.frames(0.0)) == (0.0, 0)
+    queue.add(G1(HOME + [2, 0, 0, 0, 0, 0], 100.0), 0.0)
+    assert queue.in_flight(0.0) == pytest.approx(FRAME + 0.02)
+    assert queue.in_flight_with(0.02, 0.01) == pytest.approx(FRAME + 0.02 + 0.02 - 0.01)
+    queue.add(G4(0.01), 0.01)
+    assert queue.frames(0.02) == 2 and queue.frames(FRAME + 0.025) == 1
+    assert queue.in_flight(0.02) == pytest.approx(FRAME + 0.01)
+    assert queue.frames(1.0) == 0 and queue.in_flight(1.0) == 0.0
+
+
+def test_a_frame_that_goes_in_parts_arrives_when_its_last_part_does() -> None:
+    queue = ArmQueue(HOME.tolist(), FRAME, 0.0)
+    queue.occupy(0.0, 0.5)
+    queue.add(G1(HOME + [1, 0, 0, 0, 0, 0], 50.0), 0.3, left=0.5)
+    assert queue.in_flight(0.3) == pytest.approx(FRAME / 2 + 0.02)
+
+
+def test_bounds_hold_every_set_point_between() -> None:
+    queue = ArmQueue(HOME.tolist(), FRAME, 0.0)
+    for k in range(60):
+        queue.add(G1(HOME + [np.sin(k / 5), 0, 0, 0, 0, 0], 60.0), 0.02 * k)
+    low, high = queue.bounds(0.9, 1.1)
+    seen = np.array([queue.at(t) for t in np.linspace(0.9, 1.1, 200)])
+    assert (seen >= np.array(low) - 1e-9).all() and (seen <= np.array(high) + 1e-9).all()
+    assert low[0] == pytest.approx(seen[:, 0].min(), abs=1e-3) and high[0] == pytest.approx(seen[:, 0].max(), abs=1e-3)
+
+
+@given(st.lists(st.tuples(st.floats(-5, 5), st.floats(5.0, 50.0)), min_size=1, max_size=8), st.floats(0, 1))
+def test_when_it_passed_a_place_last_is_when_its_set_point_was_last_there(
+    moves: list[tuple[float, float]], share: float
+) -> None:
+    queue, now = ArmQueue(HOME.tolist(), 1 / 240, 0.0), 0.0
+    for way, feed in moves:
+        queue.add(G1(HOME + [way, 0, 0, 0, 0, 0], feed), now)
+        now += 0.05
+    until = share * queue.in_flight(0.0)
+    instants = np.linspace(0.0, until, 2000)
+    places = np.array([queue.at(t)[0] for t in instants])
+    for place in places[:: len(places) // 7]:
+        passed = queue.passed([place, *HOME[1:3]], 0.1, until)
+        near = instants[np.abs(places - place) <= 0.1]
+        assert passed == pytest.approx(near[-1], abs=2 * until / 2000 + 1e-9)
+    assert np.isnan(queue.passed([HOME[0] + 100, *HOME[1:3]], 0.1, until))

@@ -1,4 +1,6 @@
-"""The virtual arm as a device: a serial client writes to it, comes and goes, and finds it as it left it."""
+"""The virtual arm as a device: a serial client writes to it, comes and goes, and finds it as it left it. The lock on a
+port: one writer at a time, whatever became of the last one.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +20,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
+from hardware.arm.port import PortLock, lock_folder
 from hardware.arm.profile import ArmProfile
+from hardware.arm.protocol import ReplyKind, reply_stream
 from hardware.process.clock import WallClock
-from hardware.replies import ReplyKind, reply_stream
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.settings import ArmSettings, Replies
-from hardware.simulator.port import PERIOD, _spread, run_virtual_arm
-from hardware.simulator.pty_link import PtyLink
+from hardware.simulator.arm.ports import POLL_PERIOD, PtyLink, _arrivals, run_virtual_arm
+from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from tests.virtual_arm import IDEAL, move
 
 CLOCK = WallClock()
@@ -72,14 +74,13 @@ def test_a_client_moves_the_arm_and_may_come_and_go(tmp_path: Path, capsys: pyte
     assert "2 bytes in no frame" in printed[-1] and "00 01" in printed[-1]
     rows = np.loadtxt(log, delimiter=",", skiprows=1)
     assert log.read_text().splitlines()[0] == "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg"
-    assert rows[0].tolist() == [0, 202.5, 225, 113, 0, 0, 0]
-    assert rows[-1, 1:].tolist() == [212.5, 225, 113, 0, 9, 0]
+    assert rows[0].tolist() == [0, 202.5, 225, 113, 0, 0, 0] and rows[-1, 1:].tolist() == [212.5, 225, 113, 0, 9, 0]
     assert np.diff(rows[:, 0]) == pytest.approx(0.001, abs=1e-9)
     assert np.diff(rows[:, 1]).max() == pytest.approx(0.1, abs=1e-3)  # 100 mm/s
 
 
 def test_a_client_reads_replies(tmp_path: Path) -> None:
-    settings = ArmSettings(replies=Replies.STREAM, reply_period=0.01)
+    settings = ArmSettings(replies=ReplyMode.STREAM, reply_period=0.01)
     with serving(tmp_path / "arm", settings), serial.Serial(str(tmp_path / "arm"), 115_200, timeout=2) as client:
         stream = reply_stream()
         replies, _ = stream(client.read(30))
@@ -126,17 +127,15 @@ def test_a_log_never_overwrites_a_file(tmp_path: Path) -> None:
 def test_a_signal_ends_it_in_order(tmp_path: Path, number: signal.Signals) -> None:
     link, log = tmp_path / "arm", tmp_path / "motion.csv"
     code = (
-        "from pathlib import Path\nfrom hardware.simulator.port import *\n"
+        "from pathlib import Path\nfrom hardware.simulator.arm.ports import *\n"
         f"run_virtual_arm(ArmSettings(), link=Path({str(link)!r}), log=Path({str(log)!r}))"
     )
     root = Path(__file__).parents[1]
     with subprocess.Popen([sys.executable, "-c", code], cwd=root, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline().strip() == os.readlink(link)
+        assert process.stdout is not None and process.stdout.readline().strip() == os.readlink(link)
         process.send_signal(number)
         assert process.communicate()[0].startswith("0 frames")
-    assert process.returncode == 0
-    assert not os.path.lexists(link)
+    assert process.returncode == 0 and not os.path.lexists(link)
     assert log.read_text().splitlines()[1] == "0.000,202.500000,225.000000,113.000000,0.000000,0.000000,0.000000"
 
 
@@ -148,18 +147,86 @@ def test_bytes_go_through_a_pty_unchanged_and_at_once() -> None:
             data = rng.bytes(size)
             assert link.transfer(data) == data
         every = bytes(range(256)) * 2
-        assert link.transfer(every) == every
-        assert link.transfer(b"") == b""
+        assert link.transfer(every) == every and link.transfer(b"") == b""
 
 
 @given(st.binary(max_size=200), st.floats(0.0, 5.0), st.floats(0.0, 2.0))
 def test_what_came_while_the_machine_held_the_arm_up_is_taken_as_if_it_came_evenly(
     data: bytes, before: float, late: float
 ) -> None:
-    parts = list(_spread(data, before, before + late))
+    parts = list(_arrivals(data, before, before + late))
     assert b"".join(part for part, _ in parts) == data
     instants = np.array([before, *(instant for _, instant in parts)])
     assert (np.diff(instants) >= 0).all() and instants[-1] == pytest.approx(before + late)
-    assert np.diff(instants).max() <= 1.5 * PERIOD + 1e-9
+    assert np.diff(instants).max() <= 1.5 * POLL_PERIOD + 1e-9
     sizes = [len(part) for part, _ in parts]
     assert max(sizes) - min(sizes) <= 1
+
+
+ROOT = Path(__file__).parents[1]
+HOLD = """
+import sys, pathlib
+from hardware.arm.port import PortLock
+lock = PortLock("/dev/ttyX9", pathlib.Path(sys.argv[1]))
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def holder(folder: Path) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None and process.stdout.readline() == "held\n"
+    return process
+
+
+def test_a_second_owner_is_refused_until_the_first_lets_go(tmp_path: Path) -> None:
+    first = PortLock("/dev/ttyX9", tmp_path)
+    with pytest.raises(InputError, match=f"process {os.getpid()} has it"):
+        PortLock("/dev/ttyX9", tmp_path)
+    PortLock("/dev/ttyX8", tmp_path).release()
+    first.release()
+    PortLock("/dev/ttyX9", tmp_path).release()
+
+
+def test_an_owner_that_was_killed_stops_nobody(tmp_path: Path) -> None:
+    process = holder(tmp_path)
+    with pytest.raises(InputError, match=f"process {process.pid} has it"):
+        PortLock("/dev/ttyX9", tmp_path)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert (tmp_path / "LCK..ttyX9").read_text().split() == [str(process.pid), "stillbed"]
+    PortLock("/dev/ttyX9", tmp_path).release()
+
+
+def test_a_number_of_ours_that_another_process_has_by_now_stops_nobody(tmp_path: Path) -> None:
+    (tmp_path / "LCK..ttyX9").write_text(f"{os.getppid():10d}\nstillbed\n")
+    PortLock("/dev/ttyX9", tmp_path).release()
+
+
+def test_another_programs_lock_counts_while_it_lives(tmp_path: Path) -> None:
+    file = tmp_path / "LCK..ttyX9"
+    file.write_text(f"{os.getppid():10d}\n")
+    with pytest.raises(InputError, match=f"process {os.getppid()} has it by"):
+        PortLock("/dev/ttyX9", tmp_path)
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    file.write_text(f"{ended.pid:10d}\n")
+    PortLock("/dev/ttyX9", tmp_path).release()
+
+
+def test_a_link_to_a_device_is_locked_as_the_device(tmp_path: Path) -> None:
+    device, link = tmp_path / "ttyX9", tmp_path / "by-id"
+    device.touch()
+    link.symlink_to(device)
+    held = PortLock(str(link), tmp_path)
+    with pytest.raises(InputError):
+        PortLock(str(device), tmp_path)
+    held.release()
+    PortLock("socket://127.0.0.1:5000", tmp_path).release()
+    assert "LCK..socket___127.0.0.1_5000" in os.listdir(tmp_path)
+
+
+def test_locks_are_kept_where_other_programs_look() -> None:
+    assert lock_folder().is_dir() and os.access(lock_folder(), os.W_OK)

@@ -8,21 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.arm.jog import lifted, travel
+from hardware.arm.device import ArmState
+from hardware.arm.jog import lifted_travel_steps, travel_steps
 from hardware.arm.link import Arm
 from hardware.arm.port import UnpluggedError
-from hardware.arm.profile import ArmProfile, at_baud
-from hardware.arm.protocol import G1, G4, encode
-from hardware.arm_status import ArmState
-from hardware.link_settings import LinkSettings
-from hardware.replies import Reply, ReplyKind, encode_reply
+from hardware.arm.profile import ArmProfile, LinkSettings, at_baud
+from hardware.arm.protocol import Reply, ReplyKind, encode_reply
 from hardware.simulator.arm.ports import PortFaults, VirtualPort
-from hardware.simulator.arm.settings import ArmSettings, Replies
+from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import feed_for
-from tests.linked import circle, linked
+from tests.linked import circle, linked, moving, waiting
 from tests.virtual_arm import HOME, arm_fault
 
-ANSWERING = ArmSettings(servo_lag=0.02, replies=Replies.STREAM)
+ANSWERING = ArmSettings(servo_lag=0.02, replies=ReplyMode.STREAM)
 
 
 # -- the port
@@ -51,10 +49,8 @@ def test_a_port_that_takes_nothing_for_long_is_a_stop_and_a_torn_frame_is_comple
     link.follow(1.5)
     assert link.arm.state is ArmState.STOPPED and "took no bytes" in link.arm.reason
     link.run(0.5)
-    assert link.virtual.garbage == []
-    assert link.arm.frames == link.virtual.frames
-    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
-    assert link.virtual.deepest <= 0.05
+    assert link.virtual.garbage == [] and link.arm.frames == link.virtual.frames
+    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3) and link.virtual.deepest <= 0.05
 
 
 def test_a_port_that_goes_while_a_wrong_origin_is_stopped_is_an_arm_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,8 +152,8 @@ def test_settings_of_the_link_are_checked(name: str) -> None:
 
 def test_a_slower_line_leaves_room_for_less() -> None:
     slow = ArmProfile(baud=24_000)  # 20 ms a frame
-    assert linked(profile=slow).arm.send(encode(G4(0.0299)), 0.0) == ""
-    assert "limit 50 ms" in linked(profile=slow).arm.send(encode(G4(0.0301)), 0.0)
+    assert linked(profile=slow).arm.send(waiting(0.0299), 0.0) == ""
+    assert "limit 50 ms" in linked(profile=slow).arm.send(waiting(0.0301), 0.0)
 
 
 def test_at_9600_bits_a_second_one_frame_is_on_the_wire_and_one_move_in_the_arm() -> None:
@@ -170,7 +166,7 @@ def test_at_9600_bits_a_second_one_frame_is_on_the_wire_and_one_move_in_the_arm(
         goal = circle(link.phase + 0.05)
         assert link.arm.target is not None
         feed = feed_for(link.arm.target, goal, 0.05)
-        if reason := link.arm.hold(now) or link.arm.send(encode(G1(goal, feed)), now):
+        if reason := link.arm.hold(now) or link.arm.send(moving(goal, feed), now):
             refused.append(reason)
         else:
             link.phase += 0.05
@@ -181,8 +177,8 @@ def test_at_9600_bits_a_second_one_frame_is_on_the_wire_and_one_move_in_the_arm(
     link.arm.stop("asked for", link.clock.now())
     decided, on_wire = link.arm.stops[0]
     assert on_wire - decided <= 2 * slow.frame_time + 1e-9
-    assert linked(profile=slow).arm.send(encode(G4(0.05)), 0.0) == ""
-    assert "limit 100" in linked(profile=slow).arm.send(encode(G4(0.0501)), 0.0)
+    assert linked(profile=slow).arm.send(waiting(0.05), 0.0) == ""
+    assert "limit 100" in linked(profile=slow).arm.send(waiting(0.0501), 0.0)
 
 
 @pytest.mark.parametrize("off", [0.02, 0.3, 0.9])
@@ -200,12 +196,11 @@ def test_an_arm_that_stands_a_hair_beside_where_it_is_thought_to_is_not_sent_the
 
 def test_travel_ends_at_its_goal_and_no_step_is_faster_than_asked() -> None:
     rng = np.random.default_rng(0)
-    for way in (travel, lifted):
+    for way in (travel_steps, lifted_travel_steps):
         start, goal = HOME + rng.normal(size=6) * [20, 20, 20, 0.2, 0.2, 0.2], HOME
         steps = [step.axes for step in way(start, goal, 20.0, 0.3, 0.02)]
         moved = np.diff([start, *steps], axis=0)
-        assert np.array_equal(steps[-1], goal)
-        assert np.linalg.norm(moved[:, :3], axis=1).max() <= 20 * 0.02 + 1e-9
+        assert np.array_equal(steps[-1], goal) and np.linalg.norm(moved[:, :3], axis=1).max() <= 20 * 0.02 + 1e-9
         assert np.linalg.norm(moved[:, 3:], axis=1).max() <= 0.3 * 0.02 + 1e-9
 
 
@@ -246,9 +241,8 @@ def test_a_device_that_goes_while_a_frame_is_given_out_is_unplugged_and_nothing_
     link = linked()
     link.device.faults = PortFaults(away=[(0.0, 1.0)])
     frames = link.arm.frames
-    assert link.arm.send(encode(G1(HOME + [1, 0, 0, 0, 0, 0], 50.0)), 0.0) == ""
-    assert link.arm.state is ArmState.UNPLUGGED and link.arm.frames == frames
-    assert link.arm.target is None
+    assert link.arm.send(moving(HOME + [1, 0, 0, 0, 0, 0], 50.0), 0.0) == ""
+    assert link.arm.state is ArmState.UNPLUGGED and link.arm.frames == frames and link.arm.target is None
     link.arm.stop("too late", 0.01)
     assert link.arm.state is ArmState.UNPLUGGED
 
@@ -266,7 +260,7 @@ def test_an_arm_turned_off_its_way_is_held() -> None:
     assert link.arm._queue is not None
     for _ in range(2):
         tool = Reply(ReplyKind.TOOL, HOME[3:] + np.deg2rad([0, 3.0, 0]))
-        link.arm._echo.take(tool, link.arm._queue, np.zeros(3), link.clock.now())
+        link.arm._feedback.take(tool, link.arm._queue, np.zeros(3), link.clock.now())
     assert "degrees off its way, limit 2 degrees" in link.arm.hold(link.clock.now())
     link.run(0.5)
     assert link.arm.take_up() is not None and link.arm.hold(link.clock.now()) == ""

@@ -8,26 +8,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from hardware.arm.feedback import ArmEcho, near
+from hardware.arm.device import ArmState
+from hardware.arm.feedback import ArmFeedback, near
+from hardware.arm.jog import MIN_TRIAL_STEP, AbortRecovery, is_underway
 from hardware.arm.link import RECALLED
-from hardware.arm.profile import ArmProfile
-from hardware.arm.protocol import G1, Pause
+from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.protocol import G1, Pause, Reply, ReplyKind
 from hardware.arm.queue import ArmQueue
-from hardware.arm_recall import TOLD, Recall, underway
-from hardware.arm_status import ArmState
-from hardware.link_settings import LinkSettings
 from hardware.motion.loop import Order, Tick
-from hardware.replies import Reply, ReplyKind
-from hardware.simulator.arm.settings import ArmSettings, Replies
+from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Move
-from planning.kinematics import nozzle_from_axes
-from planning.motion.planner import Planner, passed
+from planning.motion.planner import Planner, place_passed
+from planning.robot.kinematics import nozzle_from_axes
 from tests.linked import Linked, circle, linked
 from tests.moving import breathing, pose_at, raster
 from tests.test_motion_loop import Looping, seen
 from tests.virtual_arm import HOME, arm_fault
 
-ANSWERING = ArmSettings(servo_lag=0.02, replies=Replies.STREAM)
+ANSWERING = ArmSettings(servo_lag=0.02, replies=ReplyMode.STREAM)
 ROUNDING = 0.15  # mm: of answers that count 0.1 mm
 STEP = 0.6  # mm, of which an arm that obeys may have some before it
 SOON = 0.2  # s
@@ -95,7 +93,7 @@ def test_nothing_is_sent_before_somebody_has_taken_note_of_what_was_called_back(
     assert recalled is not None and link.arm.hold(link.clock.now()) == ""
     assert np.abs(recalled.place - rested)[:3].max() < ROUNDING
     assert np.abs(recalled.stands - link.executed())[:3].max() < ROUNDING
-    assert TOLD - ROUNDING < np.linalg.norm((recalled.stands - rested)[:3]) < 1.0  # the step that told
+    assert MIN_TRIAL_STEP - ROUNDING < np.linalg.norm((recalled.stands - rested)[:3]) < 1.0  # the step that told
     assert link.arm.take_up() is None
 
 
@@ -207,8 +205,8 @@ def test_the_path_goes_on_where_the_arm_came_to_rest() -> None:
 def test_where_moves_passed_is_told_by_the_last_time_they_did() -> None:
     ends = [np.array([x, 0.0, 0.0]) for x in (0.0, 1.0, 2.0, 1.0, 0.0)]
     sent = list(zip(ends, (0.0, 1.0, 2.0, 3.0, 4.0), strict=True))
-    assert passed(sent, np.array([1.5, 0.3, 0.0])) == pytest.approx(2.5)
-    assert passed(sent[:2], np.array([9.0, 0.0, 0.0])) == 1.0 and passed(sent[:1], ends[4]) == 0.0
+    assert place_passed(sent, np.array([1.5, 0.3, 0.0])) == pytest.approx(2.5)
+    assert place_passed(sent[:2], np.array([9.0, 0.0, 0.0])) == 1.0 and place_passed(sent[:1], ends[4]) == 0.0
 
 
 def test_an_answer_is_near_within_its_rounding_alone() -> None:
@@ -226,7 +224,7 @@ def test_where_it_rests_is_what_was_known_as_far_as_its_answer_allows(
 ) -> None:
     true = HOME + 100 * COUNT * place
     known = true + (20 if far else 1) * COUNT * beside
-    answered, echo = np.round(true / COUNT) * COUNT, ArmEcho(LinkSettings(), 0.02)
+    answered, echo = np.round(true / COUNT) * COUNT, ArmFeedback(LinkSettings(), 0.02)
     assert echo.stands(known, 0.0) is None  # it has not answered
     queue = ArmQueue(known.tolist(), 0.004, 0.0)
     echo.take(Reply(ReplyKind.PLACE, answered[:3]), queue, np.zeros(3), 0.1)
@@ -242,11 +240,11 @@ def test_where_it_rests_is_what_was_known_as_far_as_its_answer_allows(
 
 def test_an_arm_is_under_way_between_the_ends_of_its_step_alone() -> None:
     end = HOME + [0.6, -0.3, 0, 0, 0, 0]
-    assert underway(HOME + [0.3, -0.1, 0, 0, 0, 0], HOME, end) and underway(end, HOME, end)
-    assert not underway(HOME, HOME, end)  # it has not left
-    assert not underway(HOME + [0.3, 0.4, 0, 0, 0, 0], HOME, end)  # it goes elsewhere
-    assert not underway(HOME + [0.3, -0.1, 0, 0, 0, 0.01], HOME, end)
-    assert not underway(None, HOME, end) and not underway(end, None, end)
+    assert is_underway(HOME + [0.3, -0.1, 0, 0, 0, 0], HOME, end) and is_underway(end, HOME, end)
+    assert not is_underway(HOME, HOME, end)  # it has not left
+    assert not is_underway(HOME + [0.3, 0.4, 0, 0, 0, 0], HOME, end)  # it goes elsewhere
+    assert not is_underway(HOME + [0.3, -0.1, 0, 0, 0, 0.01], HOME, end)
+    assert not is_underway(None, HOME, end) and not is_underway(end, None, end)
 
 
 @pytest.mark.parametrize(
@@ -254,7 +252,7 @@ def test_an_arm_is_under_way_between_the_ends_of_its_step_alone() -> None:
     [([0.3, 0, 0], "obeys"), ([0.6, 0, 0], "obeys"), ([0, 0, 0], "once more"), ([0, 0.3, 0], "called back")],
 )
 def test_what_an_arm_does_with_its_step_says_whether_it_obeys(away: list[float], said: str) -> None:
-    recall, echo = Recall(0.03, 20.0, 0.02), ArmEcho(LinkSettings(), 0.02)
+    recall, echo = AbortRecovery(0.03, 20.0, 0.02), ArmFeedback(LinkSettings(), 0.02)
 
     def answer(place: np.ndarray, now: float) -> None:
         for kind, values in (ReplyKind.PLACE, place[:3]), (ReplyKind.TOOL, place[3:]):

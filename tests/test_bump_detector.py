@@ -6,18 +6,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_estimator import LANDMARKS, RATE, RIG, begun
 
 from estimation import se3
-from estimation.online.bump_detector import BumpDetector, alone, picture_parts, together
+from estimation.observations import Observations
+from estimation.online.bump_detector import BumpDetector, camera_equations, reduced_alone, reduced_together
 from estimation.online.pose_solver import project
 from estimation.pose import TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.synthetic.look import observations
+from estimation.synthetic.world import observations
 from tests.synthetic import breathing
+from tests.test_estimator import LANDMARKS, RATE, RIG, begun
 
 CALM, AFTER = 3.6, 1.2  # s
+
+
+def exact(seed: int, at: Array) -> tuple[Observations, Array, Array, Array]:
+    """What all cameras see of a resting surface, exactly; its points, the pose of each camera, and slopes of pixels."""
+    seen = observations(RIG, LANDMARKS, at, 0.0, np.random.default_rng(seed), 0.0)
+    points = LANDMARKS[seen.track]
+    return seen, points, np.broadcast_to(at, (3, 4, 4)), project(RIG, seen.camera, at, points)[2]
 
 
 def knocked(camera: int, change: Array, scale: float = 1.0) -> Rig:
@@ -62,8 +70,7 @@ def test_a_lens_that_was_turned_is_told_from_a_bump(camera: int, scale: float, w
 
 def test_a_camera_that_is_put_back_is_trusted_again() -> None:
     states, reasons = watched(knocked(1, se3.exp([0, 0, 0, 0.7, 0, 0])), back=True)
-    assert "bumped" in reasons[round(AFTER * RATE) - 2]
-    assert states[-1] is TrackState.TRACKING and not reasons[-1]
+    assert "bumped" in reasons[round(AFTER * RATE) - 2] and states[-1] is TrackState.TRACKING and not reasons[-1]
 
 
 def test_a_camera_that_nobody_saw_at_first_is_not_taken_for_bumped_once_it_is_seen() -> None:
@@ -88,7 +95,7 @@ def test_a_picture_that_never_stood_still_is_not_taken_for_bumped_but_its_jump_i
         seen = replace(seen, pixels=seen.pixels + np.outer(seen.camera == 1, [off, 0]))
         points = LANDMARKS[seen.track]
         _, _, jacobians = project(RIG, seen.camera, at, points)
-        detector.watch(RIG, seen, points, exposed, jacobians, frozenset())
+        detector.update(RIG, seen, points, exposed, jacobians, frozenset())
         assert stamp > 16 or not detector.bumped
     assert list(detector.bumped) == [1]
 
@@ -101,44 +108,39 @@ def test_a_moved_surface_is_no_change_of_a_camera() -> None:
     points = LANDMARKS[seen.track]
     _, _, jacobians = project(RIG, seen.camera, moved, points)
     for pose in (moved, at):
-        parts = picture_parts(RIG, seen, points, np.broadcast_to(pose, (3, 4, 4)), jacobians)
-        for told in (*(alone(parts, c, parts) for c in parts), together(parts, 3)):
+        parts = camera_equations(RIG, seen, points, np.broadcast_to(pose, (3, 4, 4)), jacobians)
+        for told in (*(reduced_alone(parts, c, parts) for c in parts), reduced_together(parts, 3)):
             assert np.abs(told.pull / np.sqrt(np.diag(told.fixed))).max() < 2e-3
 
 
 def test_a_change_of_one_picture_comes_back_in_its_numbers() -> None:
-    draw, at = np.random.default_rng(2), breathing(0.0)
-    seen = observations(RIG, LANDMARKS, at, 0.0, draw, 0.0)
-    points, true = LANDMARKS[seen.track], np.array([0.3, -0.2, 1e-3, 2e-3])
-    exposed = np.broadcast_to(at, (3, 4, 4))
-    _, _, jacobians = project(RIG, seen.camera, at, points)
+    true = np.array([0.3, -0.2, 1e-3, 2e-3])
+    seen, points, exposed, jacobians = exact(2, breathing(0.0))
     mine = seen.camera == 1
-    slopes = picture_parts(RIG, seen, points, exposed, jacobians)[1].slopes
+    slopes = camera_equations(RIG, seen, points, exposed, jacobians)[1].slopes
     pixels = seen.pixels.copy()
     pixels[mine] += slopes @ true
-    parts = picture_parts(RIG, replace(seen, pixels=pixels), points, exposed, jacobians)
-    told = alone(parts, 1, parts)
+    parts = camera_equations(RIG, replace(seen, pixels=pixels), points, exposed, jacobians)
+    told = reduced_alone(parts, 1, parts)
     found = np.linalg.solve(told.information, told.pull)
     assert found == pytest.approx(true, rel=0.02, abs=1e-4)
-    without = alone({**parts, 1: parts[1].without(true)}, 1, parts)
+    without = reduced_alone({**parts, 1: parts[1].without(true)}, 1, parts)
     assert np.abs(without.pull).max() < 0.02 * np.abs(told.pull).max()
 
 
 @pytest.mark.parametrize("hidden", [0, 1, 2])
 def test_what_is_usual_of_three_cameras_is_usual_of_any_two(hidden: int) -> None:
     """Law: pictures that stand as they always did are off by nothing, whichever of them are seen."""
-    draw, at = np.random.default_rng(3), breathing(0.0)
-    seen = observations(RIG, LANDMARKS, at, 0.0, draw, 0.0)
-    _, _, jacobians = project(RIG, seen.camera, at, LANDMARKS[seen.track])
-    exposed, true = np.broadcast_to(at, (3, 4, 4)), draw.normal(size=(3, 4)) * [0.3, 0.3, 1e-3, 1e-3]
-    slopes = picture_parts(RIG, seen, LANDMARKS[seen.track], exposed, jacobians)
+    seen, points, exposed, jacobians = exact(3, breathing(0.0))
+    true = np.random.default_rng(4).normal(size=(3, 4)) * [0.3, 0.3, 1e-3, 1e-3]
+    slopes = camera_equations(RIG, seen, points, exposed, jacobians)
     pixels = seen.pixels.copy()
     for c in range(3):
         pixels[seen.camera == c] += slopes[c].slopes @ true[c]
-    parts = picture_parts(RIG, replace(seen, pixels=pixels), LANDMARKS[seen.track], exposed, jacobians)
-    told = together(parts, 3)
+    parts = camera_equations(RIG, replace(seen, pixels=pixels), points, exposed, jacobians)
+    told = reduced_together(parts, 3)
     usual = np.linalg.lstsq(told.information, told.pull, rcond=1e-9)[0].reshape(3, 4)
     left = {c: parts[c].without(usual[c]) for c in range(3) if c != hidden}
     for c in left:
-        before, after = alone(parts, c, left), alone(left, c, left)
+        before, after = reduced_alone(parts, c, left), reduced_alone(left, c, left)
         assert np.abs(after.pull).max() < 1e-3 * np.abs(before.pull).max() + 1e-6

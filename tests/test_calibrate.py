@@ -11,26 +11,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_session import BOARD, LENSES, OFFSETS, rendered, small_rig
 
 from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import pixels_from_points
-from hardware.calibration.board_file import read_board, write_board
-from hardware.calibration.board_print import Print, board_of, drawing, pdf, svg, write_print
-from hardware.calibration.collect import collect
-from hardware.calibration.corners import content_key, read_corners, write_corners
-from hardware.calibration.run import Outcome, Wishes, run_calibration
-from hardware.calibration.source import open_source
+from hardware.calibration.board_print import PrintOptions, board_of, drawing, pdf, svg, write_print
+from hardware.calibration.corners import collect_corners, content_key, read_corners, write_corners
+from hardware.calibration.inputs import open_source
+from hardware.calibration.run import CalibrationOptions, CalibrationResult, run_calibration
 from hardware.cli.main import main
-from hardware.files.rig_file import read_rig
-from hardware.process.progress import silent
+from hardware.files.rig_file import read_board, read_rig, write_board
+from hardware.process.progress import no_progress
 from hardware.simulator.scene.ground_truth_views import BoardView
-from perception.boards.board import Board, black, charuco
-from perception.boards.collection import thinned, usable
-from perception.boards.corners import CornerFinder
-from perception.boards.undistorted import undistorted, whole_view
+from perception.boards.board import Board, charuco_board, ink_cells, undistort, whole_view
+from perception.boards.corners import CornerFinder, thin_instants, usable_views
 from perception.frames import Image
+from tests.board_session import BOARD, LENSES, OFFSETS, rendered, small_rig
 
 POSE = se3.exp(np.array([0.3, -0.25, 0.2, 0.0, 0.0, 0.0])) @ se3.make(np.eye(3), [-108.0, -135.0, 0.0])
 POSE = se3.make(np.eye(3), [0.0, 0.0, 620.0]) @ POSE
@@ -49,8 +45,8 @@ def board_file(session: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def outcome(session: Path, board_file: Path) -> Outcome:
-    return run_calibration(session, board_file, session.parent / "rig.toml", Wishes(), silent)
+def outcome(session: Path, board_file: Path) -> CalibrationResult:
+    return run_calibration(session, board_file, session.parent / "rig.toml", CalibrationOptions(), no_progress)
 
 
 def seen(board: Board, as_board: Board | None = None, change: Callable[[Image], Image] = lambda image: image) -> int:
@@ -62,8 +58,8 @@ def seen(board: Board, as_board: Board | None = None, change: Callable[[Image], 
     "board", [BOARD, replace(BOARD, legacy=True), replace(BOARD, squares=(5, 4)), Board()], ids=str
 )
 def test_what_is_drawn_is_what_opencv_draws(board: Board) -> None:
-    ink, _ = black(board)
-    drawn = charuco(board).generateImage((ink.shape[1] * 8, ink.shape[0] * 8))
+    ink, _ = ink_cells(board)
+    drawn = charuco_board(board).generateImage((ink.shape[1] * 8, ink.shape[0] * 8))
     assert np.array_equal(np.kron(ink, np.ones((8, 8))) > 0, drawn < 128)
 
 
@@ -74,14 +70,12 @@ def test_corners_are_found_where_they_are(board: Board) -> None:
     picture = BoardView(camera, board).picture(middle, 0.6, 1.5, np.random.default_rng(0))
     found = CornerFinder(board)(picture)
     true = pixels_from_points(camera, se3.transform_points(middle, board.corners))[0]
-    assert found.count == len(board.corners)
-    assert np.sqrt(np.mean((found.pixels - true) ** 2)) < 0.15
+    assert found.count == len(board.corners) and np.sqrt(np.mean((found.pixels - true) ** 2)) < 0.15
     assert 0.4 < found.blur < 1.5
 
 
 def test_a_board_is_not_taken_for_another_nor_seen_in_a_mirror() -> None:
-    assert seen(BOARD) == 12
-    assert seen(BOARD, replace(BOARD, inverted=True)) == 0
+    assert seen(BOARD) == 12 and seen(BOARD, replace(BOARD, inverted=True)) == 0
     assert seen(BOARD, replace(BOARD, dictionary="5X5_50")) == 0
     assert seen(BOARD, change=lambda image: image[:, ::-1]) == 0
     assert seen(BOARD, change=lambda image: np.rot90(image)) == 12
@@ -116,12 +110,14 @@ def test_board_files_come_back_and_wrong_ones_are_named(tmp_path: Path) -> None:
             read_board(path)
 
 
-@pytest.mark.parametrize("wish", [Print(), Print(inverted=True), Print("chessboard", page="A3", square=30)], ids=str)
-def test_a_print_has_the_boards_true_size_and_a_ruler(wish: Print) -> None:
+@pytest.mark.parametrize(
+    "wish", [PrintOptions(), PrintOptions(inverted=True), PrintOptions("chessboard", page="A3", square=30)], ids=str
+)
+def test_a_print_has_the_boards_true_size_and_a_ruler(wish: PrintOptions) -> None:
     board = board_of(wish)
     made = drawing(board, (297.0, 420.0))
     area = float((made.ink[:, 2] * made.ink[:, 3]).sum())
-    ink, cell = black(board)
+    ink, cell = ink_cells(board)
     rim = 0.2 * board.square * 2 * (sum(board.size) + 0.4 * board.square) if board.inverted else 0.0
     assert area == pytest.approx(ink.sum() * cell**2 + rim + 30.0 + 11 * 1.2 + 10 * 0.6, rel=1e-6)
     assert 'width="297mm" height="420mm"' in svg(made)
@@ -132,7 +128,7 @@ def test_a_print_has_the_boards_true_size_and_a_ruler(wish: Print) -> None:
 
 
 def test_a_printed_svg_shows_the_board_that_its_file_describes(tmp_path: Path) -> None:
-    write_print(tmp_path / "b.svg", Print(squares=(4, 5), square=30.0))
+    write_print(tmp_path / "b.svg", PrintOptions(squares=(4, 5), square=30.0))
     board = read_board(tmp_path / "b.toml")
     picture = np.full((297 * 4, 210 * 4), 255, np.uint8)
     for x, y, w, h in drawing(board, (210.0, 297.0)).ink * 4:
@@ -154,27 +150,25 @@ def test_a_board_file_that_was_edited_is_kept_unless_told(tmp_path: Path, capsys
 
 def test_a_board_that_does_not_fit_its_page_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"3 x 3 to 7 x 10 squares on A4"):
-        write_print(tmp_path / "b.pdf", Print(squares=(9, 12)))
+        write_print(tmp_path / "b.pdf", PrintOptions(squares=(9, 12)))
 
 
-def test_a_recording_gives_its_rig_back(outcome: Outcome) -> None:
+def test_a_recording_gives_its_rig_back(outcome: CalibrationResult) -> None:
     found, rig = outcome.calibration, small_rig()
     for camera, lens, offset in zip(found.rig.cameras, LENSES, OFFSETS, strict=True):
         assert camera.matrix[0, 0] == pytest.approx(lens[0], rel=0.01)
         assert camera.clock_offset == pytest.approx(offset, abs=1e-3)
     for camera, true in zip(found.rig.cameras, rig.cameras, strict=True):
         off = se3.log(se3.inverse(true.base_from_camera) @ camera.base_from_camera)
-        assert np.degrees(np.linalg.norm(off[:3])) < 1.0
-        assert np.linalg.norm(off[3:]) < 12
+        assert np.degrees(np.linalg.norm(off[:3])) < 1.0 and np.linalg.norm(off[3:]) < 12
 
 
-def test_the_files_that_are_written_can_be_read(outcome: Outcome, session: Path) -> None:
+def test_the_files_that_are_written_can_be_read(outcome: CalibrationResult, session: Path) -> None:
     written = read_rig(session.parent / "rig.toml")
     for a, b in zip(written.rig.cameras, outcome.calibration.rig.cameras, strict=True):
         assert np.array_equal(a.matrix, b.matrix) and a.clock_offset == b.clock_offset
     figures = json.loads((session.parent / "rig.json").read_text())
-    assert np.shape(figures["covariance"]) == (48, 48)
-    assert figures["cameras"][0]["sigma"]["fx"] > 0
+    assert np.shape(figures["covariance"]) == (48, 48) and figures["cameras"][0]["sigma"]["fx"] > 0
     report = (session.parent / "rig.report.html").read_text()
     for words in ("Verdict", "Predicted error", "mm per pixel at the board", "data:image/jpeg", "Calibration passed"):
         assert words in report
@@ -192,7 +186,9 @@ def test_the_command_ends_with_the_verdict(session: Path, board_file: Path, caps
     assert said.startswith("FAIL") and "hold the board in its picture's" in said
 
 
-def test_corners_are_looked_for_once_and_a_damaged_file_again(session: Path, outcome: Outcome, tmp_path: Path) -> None:
+def test_corners_are_looked_for_once_and_a_damaged_file_again(
+    session: Path, outcome: CalibrationResult, tmp_path: Path
+) -> None:
     source, store = open_source(session), tmp_path / "x.npz"
     key = content_key(source.session, BOARD)
     table = read_corners(session.parent / "rig.corners.npz", key)
@@ -206,32 +202,36 @@ def test_corners_are_looked_for_once_and_a_damaged_file_again(session: Path, out
     assert read_corners(store, key) is None
     asked: list[int] = []
     write_corners(store, key, replace(table, done=len(source.session) - 1))
-    again = collect(source.session, BOARD, store, lambda done, total: asked.append(done))
+    again = collect_corners(source.session, BOARD, store, lambda done, total: asked.append(done))
     assert asked == [len(source.session)] and again.done == len(source.session)
 
 
 def test_long_recordings_are_thinned_in_runs() -> None:
     instant = np.repeat(np.arange(1000), 2)
-    kept = thinned(instant, np.ones(2000, bool))
+    kept = thin_instants(instant, np.ones(2000, bool))
     chosen = np.unique(instant[kept])
-    assert len(chosen) <= 250
-    assert (np.diff(chosen) == 1).mean() > 0.8
+    assert len(chosen) <= 250 and (np.diff(chosen) == 1).mean() > 0.8
 
 
 def test_undistorted_pictures_keep_every_pixel() -> None:
     camera = small_rig().cameras[0]
-    assert undistorted(camera, np.zeros((480, 640, 3), np.uint8)).shape == (480, 640, 3)
+    assert undistort(camera, np.zeros((480, 640, 3), np.uint8)).shape == (480, 640, 3)
     assert whole_view(camera)[0, 0] < camera.matrix[0, 0]
 
 
-def test_a_rig_without_lenses_is_enough_to_begin_with(session: Path, tmp_path: Path, outcome: Outcome) -> None:
+def test_a_rig_without_lenses_is_enough_to_begin_with(
+    session: Path, tmp_path: Path, outcome: CalibrationResult
+) -> None:
     shutil.copytree(session, tmp_path / "s")
     lines = [f'[[camera]]\nname = "{n}"\nimages = "{n}/*"\nsize = [640, 480]\n' for n in "abc"]
     (tmp_path / "s" / "rig.toml").write_text("\n".join(lines))
     source = open_source(tmp_path / "s")
-    assert source.given is None and [c.name for c in source.session.rig.cameras] == ["a", "b", "c"]
-    views, _ = usable(
-        collect(open_source(session).session, BOARD, None, silent), BOARD, ("a", "b", "c"), ((640, 480),) * 3
+    assert not source.given and [c.name for c in source.session.rig.cameras] == ["a", "b", "c"]
+    views, _ = usable_views(
+        collect_corners(open_source(session).session, BOARD, None, no_progress),
+        BOARD,
+        ("a", "b", "c"),
+        ((640, 480),) * 3,
     )
     assert len(views) == len(outcome.calibration.views)
 
@@ -242,8 +242,7 @@ def test_a_chessboard_calibrates_as_well(tmp_path: Path, capsys: pytest.CaptureF
     folder, out = rendered(tmp_path / "session", instants=12, board=board), tmp_path / "rig.toml"
     write_board(tmp_path / "board.toml", board)
     command = ["calibrate", "cameras", str(folder), "--board", str(tmp_path / "board.toml"), "-o", str(out)]
-    assert main(command) == 0
-    assert capsys.readouterr().out.startswith("PASS")
+    assert main(command) == 0 and capsys.readouterr().out.startswith("PASS")
     for camera, lens, true in zip(read_rig(out).rig.cameras, LENSES, small_rig().cameras, strict=True):
         assert camera.matrix[0, 0] == pytest.approx(lens[0], rel=0.005)
         off = se3.log(se3.inverse(true.base_from_camera) @ camera.base_from_camera)

@@ -11,22 +11,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from board_session import BOARD, LENSES, rendered, small_rig
-from boards import motion
 
 from estimation import se3
-from estimation.calibration.lens_fit import LEAST, focal, homography, poses
+from estimation.calibration.lens_fit import MIN_PLANE_CORNERS, focal_length, homography, poses
 from estimation.rig import pixels_from_points
-from hardware.calibration.board_file import write_board
-from hardware.calibration.coverage import GRID, coverage_of, lacking
-from hardware.calibration.guide import TOGETHER, Guide
-from hardware.calibration.live import Waving, devices_named, watch
-from hardware.calibration.run import Wishes, finish
-from hardware.cameras.state import CameraState, LiveHealth, Phase
+from hardware.calibration.corners import COVERAGE_GRID, MIN_COMMON_SETS, CoverageGuide, coverage_of, missing_coverage
+from hardware.calibration.live import WavingRecorder, devices_named, watch
+from hardware.calibration.run import CalibrationOptions, finish
+from hardware.cameras.feed import CameraPhase, CameraState, LiveHealth
 from hardware.cli.main import main
-from hardware.files.rig_file import read_rig
+from hardware.files.rig_file import read_rig, write_board
 from hardware.process.progress import Progress
 from perception.frames import Frame, FrameSet, Image, StampedBy
+from tests.board_session import BOARD, LENSES, rendered, small_rig
+from tests.boards import motion
 from tests.started import started
 from tests.streams import CLOCK, HttpCamera, served
 
@@ -71,7 +69,7 @@ class ListedCameras:
         return None if self._over else self._set(self._shown - 1)
 
     def health(self) -> LiveHealth:
-        phase = Phase.ENDED if self._over else Phase.OPEN
+        phase = CameraPhase.ENDED if self._over else CameraPhase.OPEN
         newest = [None if self._shown == 0 else way[0] for way in self._ways]
         return LiveHealth(tuple(state(name, phase, one) for name, one in zip("abc", newest, strict=True)), 0, 0, 0, 0)
 
@@ -84,7 +82,7 @@ class ListedCameras:
         return FrameSet(stamp, tuple(Frame(c, stamp, way[k]) for c, way in enumerate(self._ways)))
 
 
-def state(name: str, phase: Phase, newest: Image | None) -> CameraState:
+def state(name: str, phase: CameraPhase, newest: Image | None) -> CameraState:
     by: StampedBy = "driver"
     return CameraState(name, "a list", phase, *[0.0] * 5, by, 0, 0, 0, {}, None, 0, (), newest)
 
@@ -95,9 +93,8 @@ def test_live_cameras_are_calibrated_from_what_they_showed(pictures: list[list[I
     progress = Progress("corners", "frame sets", CLOCK.now, StringIO())
     once = [way[:INSTANTS] for way in pictures]
     material = watch(ListedCameras(once), devices, BOARD, store, None, CLOCK, progress)
-    assert material.table.done == INSTANTS
-    assert "camera" in progress.note and "the board" in progress.note
-    outcome = finish(material, BOARD, file, out, Wishes(limit=1.0))
+    assert material.table.done == INSTANTS and "camera" in progress.note and "the board" in progress.note
+    outcome = finish(material, BOARD, file, out, CalibrationOptions(limit=1.0))
     assert outcome.verdict.passed and "camera 2: focal length" in outcome.text
     written = read_rig(out)
     for camera, lens in zip(written.rig.cameras, LENSES, strict=True):
@@ -128,22 +125,21 @@ def test_what_was_found_is_kept_after_ctrl_c_and_the_next_run_goes_on(still: lis
     run.send_signal(signal.SIGINT)
     told = run.stderr.read()
     assert run.wait(SOON) == 130
-    assert f"the corners so far are in {store}; the same command goes on from there" in told
-    assert not out.exists()
+    assert f"the corners so far are in {store}; the same command goes on from there" in told and not out.exists()
     names = ("camera 1", "camera 2", "camera 3")
-    before = Waving(names, (SIZE,) * 3, BOARD, store)
+    before = WavingRecorder(names, (SIZE,) * 3, BOARD, store)
     assert before.done > 0 and max(before.guide.coverage(c).parts.sum() for c in range(3)) > 0
     assert main([*command, "--seconds", "0"]) == 2  # a board that stands still tells no lens
-    after = Waving(names, (SIZE,) * 3, BOARD, store)
+    after = WavingRecorder(names, (SIZE,) * 3, BOARD, store)
     assert after.done > before.done
     assert all(after.guide.coverage(c).parts.sum() >= before.guide.coverage(c).parts.sum() for c in range(3))
-    assert Waving(names, (SIZE,) * 3, replace(BOARD, square=50.0), store).done == 0
+    assert WavingRecorder(names, (SIZE,) * 3, replace(BOARD, square=50.0), store).done == 0
 
 
 def test_a_camera_that_shows_nothing_is_named(
     cameras: list[HttpCamera], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("hardware.calibration.live.OPENING", 1.0)
+    monkeypatch.setattr("hardware.calibration.live.OPENING_TIMEOUT", 1.0)
     cameras[1].online = False
     urls = [camera.url for camera in cameras]
     files = ["--board", str(board_file(tmp_path)), "-o", str(tmp_path / "rig.toml")]
@@ -161,8 +157,7 @@ def test_wrong_words_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ([str(tmp_path), "--seconds", "3"], "with live cameras"),
         (["http://h/1", "--keep-lenses"], "--keep-lenses"),
     ):
-        assert main(["calibrate", "cameras", *words, *end]) == 2
-        assert named in capsys.readouterr().err
+        assert main(["calibrate", "cameras", *words, *end]) == 2 and named in capsys.readouterr().err
 
 
 def test_offsets_of_a_rig_are_found_anew(tmp_path: Path) -> None:
@@ -189,7 +184,7 @@ def seen_by(camera: int, poses: np.ndarray) -> list[np.ndarray]:
 
 
 def test_the_guide_asks_for_what_is_missing_and_ends_once_it_was_seen() -> None:
-    guide = Guide(("a",), (SIZE,), BOARD)
+    guide = CoverageGuide(("a",), (SIZE,), BOARD)
     assert "a: hold the board in its picture's top left" in guide.missing()[0]
     still = motion(np.zeros(1), np.random.default_rng(0), BOARD.corners.mean(0))
     for pixels in seen_by(0, np.repeat(still, 3, 0)):
@@ -197,7 +192,7 @@ def test_the_guide_asks_for_what_is_missing_and_ends_once_it_was_seen() -> None:
     first = guide.missing()
     assert any("tilt the board by 30 degrees" in words for words in first)
     assert any("nearer to it, and farther away" in words for words in first)
-    assert any(f"{TOGETHER - 3} frame sets more" in words for words in first)
+    assert any(f"{MIN_COMMON_SETS - 3} frame sets more" in words for words in first)
     rng = np.random.default_rng(1)
     everywhere = []
     for _ in range(300):
@@ -207,18 +202,17 @@ def test_the_guide_asks_for_what_is_missing_and_ends_once_it_was_seen() -> None:
         everywhere.append(se3.make(np.eye(3), at) @ turn @ se3.make(np.eye(3), -BOARD.corners.mean(0)))
     for pixels in seen_by(0, np.stack(everywhere)):
         guide.add({0: pixels})
-    assert guide.missing() == ()
-    assert guide.coverage(0).depth == pytest.approx(1.5, abs=0.3)
+    assert guide.missing() == () and guide.coverage(0).depth == pytest.approx(1.5, abs=0.3)
 
 
 def test_cameras_that_never_see_it_together_are_asked_to() -> None:
-    guide = Guide(("a", "b"), (SIZE,) * 2, BOARD)
+    guide = CoverageGuide(("a", "b"), (SIZE,) * 2, BOARD)
     still = motion(np.zeros(1), np.random.default_rng(0), BOARD.corners.mean(0))
     for camera in (0, 1):
         guide.add({camera: seen_by(camera, still)[0]})
-    assert f"hold the board where two cameras see it, {TOGETHER} frame sets more" in guide.missing()
+    assert f"hold the board where two cameras see it, {MIN_COMMON_SETS} frame sets more" in guide.missing()
     guide.add({c: seen_by(c, still)[0] for c in (0, 1)})
-    assert f"hold the board where two cameras see it, {TOGETHER - 1} frame sets more" in guide.missing()
+    assert f"hold the board where two cameras see it, {MIN_COMMON_SETS - 1} frame sets more" in guide.missing()
 
 
 def test_what_is_added_up_is_what_all_views_tell_and_old_ones_are_seldom_looked_at_again(
@@ -230,18 +224,18 @@ def test_what_is_added_up_is_what_all_views_tell_and_old_ones_are_seldom_looked_
         looked.append(len(planes))
         return poses(planes, f)
 
-    monkeypatch.setattr("hardware.calibration.guide.poses", counted)
+    monkeypatch.setattr("hardware.calibration.corners.poses", counted)
     rng = np.random.default_rng(3)
     views = seen_by(0, motion(np.linspace(0, 20, 120), rng, BOARD.corners.mean(0)))
     views = [pixels + rng.normal(0, 0.2, pixels.shape) for pixels in views]
-    views = [pixels for pixels in views if np.isfinite(pixels[:, 0]).sum() >= LEAST]
-    guide, middle = Guide(("a",), (SIZE,), BOARD), (np.array(SIZE) - 1) / 2
+    views = [pixels for pixels in views if np.isfinite(pixels[:, 0]).sum() >= MIN_PLANE_CORNERS]
+    guide, middle = CoverageGuide(("a",), (SIZE,), BOARD), (np.array(SIZE) - 1) / 2
     for pixels in views:
         guide.add({0: pixels})
         guide.missing()
     seen = [np.isfinite(pixels[:, 0]) for pixels in views]
     planes = np.stack([homography(BOARD.corners[s, :2], p[s] - middle) for s, p in zip(seen, views, strict=True)])
-    whole = coverage_of(np.stack(views), SIZE, poses(planes, np.full(len(planes), focal(planes))))
+    whole = coverage_of(np.stack(views), SIZE, poses(planes, np.full(len(planes), focal_length(planes))))
     held = guide.coverage(0)
     assert np.array_equal(held.parts, whole.parts)
     assert held.tilts == pytest.approx(whole.tilts, abs=0.05) and held.depth == pytest.approx(whole.depth, rel=0.03)
@@ -250,4 +244,8 @@ def test_what_is_added_up_is_what_all_views_tell_and_old_ones_are_seldom_looked_
 
 def test_nothing_seen_lacks_everything() -> None:
     held = coverage_of(np.zeros((0, 12, 2)), SIZE, np.zeros((0, 4, 4)))
-    assert held.parts.shape == GRID[::-1] and [share for share, _ in lacking("a", held)] == [1.0, 1.0, 1.0]
+    assert held.parts.shape == COVERAGE_GRID[::-1] and [share for share, _ in missing_coverage("a", held)] == [
+        1.0,
+        1.0,
+        1.0,
+    ]

@@ -1,4 +1,6 @@
-"""Which camera is meant, what it is told, and what it took: names that stay, and controls read back."""
+"""Which camera is meant, what it is told, and what it took: names that stay, and controls read back. Sets of live
+cameras whose frames jitter, skip and carry offsets: found whole, never wrong, never waited for long.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +10,39 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
-from hardware.cameras.command import NOTHING_THERE, list_text
-from hardware.cameras.controls import Control, ask_picture, lock, locked_exposure, read_back, untaken
-from hardware.cameras.identity import Identity, Kind, device_node, identity_from_text, list_devices
-from hardware.cameras.sources import RANGES, CameraSource, read_live_rig, source_from_table
+from hardware.bench.detection import CAMERA_OFFSETS, FRAME_PERIOD, CameraJitter, pair_frames, sent_frames
+from hardware.cameras.capture import (
+    Control,
+    ignored_controls,
+    lock_controls,
+    locked_exposure,
+    read_controls,
+    request_picture,
+)
+from hardware.cameras.feed import Arrival
+from hardware.cameras.frame_sets import LEADER_HYSTERESIS, FrameSetBuilder
+from hardware.cameras.sources import (
+    CONTROL_RANGES,
+    CameraSource,
+    Identity,
+    SourceKind,
+    device_node,
+    identity_from_text,
+    list_devices,
+    read_live_rig,
+    source_from_table,
+)
+from hardware.cli.live import NO_CAMERA_TEXT, list_text
 from hardware.files.rig_file import read_rig, write_rig
+from perception.frames import Frame
 
 BY_ID = "/dev/v4l/by-id/usb-Maker_Eye_A1-video-index0"
-NAMED = Identity(Kind.DEVICE, BY_ID)
+NAMED = Identity(SourceKind.DEVICE, BY_ID)
 
 
 def plugged_in(root: Path, number: int, name: str, serial: str, by_id: bool = True) -> None:
@@ -52,7 +76,7 @@ def test_cameras_are_listed_by_names_that_stay(tmp_path: Path) -> None:
     assert second.identity == "/dev/v4l/by-path/pci-0-usb-0:10:1.0-video-index0"
     text = list_text((first, second))
     assert BY_ID in text and "usb:A1" in text and second.identity in text
-    assert list_text(list_devices(tmp_path / "empty")) == NOTHING_THERE
+    assert list_text(list_devices(tmp_path / "empty")) == NO_CAMERA_TEXT
 
 
 def test_a_name_leads_to_the_camera_wherever_it_is_plugged_in(tmp_path: Path) -> None:
@@ -60,9 +84,9 @@ def test_a_name_leads_to_the_camera_wherever_it_is_plugged_in(tmp_path: Path) ->
     for text in (BY_ID, "usb:A1", "/dev/v4l/by-path/pci-0-usb-0:4:1.0-video-index0"):
         node = device_node(identity_from_text("here", "source", text, tmp_path, tmp_path), tmp_path)
         assert node is not None and node.resolve() == (tmp_path / "dev/video4").resolve()
-    assert device_node(Identity(Kind.DEVICE, "usb:B2"), tmp_path) is None
+    assert device_node(Identity(SourceKind.DEVICE, "usb:B2"), tmp_path) is None
     plugged_in(tmp_path, 8, "Maker Twin", "A1")
-    assert device_node(Identity(Kind.DEVICE, "usb:A1"), tmp_path) is None  # two of them: neither is meant
+    assert device_node(Identity(SourceKind.DEVICE, "usb:A1"), tmp_path) is None  # two of them: neither is meant
 
 
 @pytest.mark.parametrize("index", ["0", "-1", "/dev/video0", "video0"])
@@ -76,10 +100,10 @@ def test_an_index_is_refused_with_what_to_write_instead(tmp_path: Path, index: s
 
 def test_urls_and_files_name_themselves_and_nothing_else_does(tmp_path: Path) -> None:
     (tmp_path / "a.avi").touch()
-    assert identity_from_text("here", "source", "rtsp://10.0.0.2/x", tmp_path).kind is Kind.STREAM
+    assert identity_from_text("here", "source", "rtsp://10.0.0.2/x", tmp_path).kind is SourceKind.STREAM
     found = identity_from_text("here", "source", "a.avi", tmp_path)
-    assert found == Identity(Kind.FILE, str((tmp_path / "a.avi").resolve()))
-    assert identity_from_text("here", "source", "/dev/wound_left", tmp_path).kind is Kind.DEVICE
+    assert found == Identity(SourceKind.FILE, str((tmp_path / "a.avi").resolve()))
+    assert identity_from_text("here", "source", "/dev/wound_left", tmp_path).kind is SourceKind.DEVICE
     for wrong in ("b.avi", "ftp://10.0.0.2/x", "usb:", "."):
         with pytest.raises(InputError, match="usb:SERIAL"):
             identity_from_text("here", "source", wrong, tmp_path)
@@ -87,9 +111,12 @@ def test_urls_and_files_name_themselves_and_nothing_else_does(tmp_path: Path) ->
 
 @pytest.mark.parametrize("secret", ["p", "p@ss:w", ""])
 def test_a_password_is_not_shown(secret: str) -> None:
-    assert Identity(Kind.STREAM, f"rtsp://me:{secret}@10.0.0.2:554/x?y=@").shown == "rtsp://me:***@10.0.0.2:554/x?y=@"
+    assert (
+        Identity(SourceKind.STREAM, f"rtsp://me:{secret}@10.0.0.2:554/x?y=@").shown
+        == "rtsp://me:***@10.0.0.2:554/x?y=@"
+    )
     for plain in ("rtsp://10.0.0.2:554/x", "http://h/a:b@c", BY_ID):
-        assert Identity(Kind.STREAM, plain).shown == plain
+        assert Identity(SourceKind.STREAM, plain).shown == plain
 
 
 def rig_file(folder: Path, *keys: str) -> Path:
@@ -110,7 +137,7 @@ def test_a_rig_names_its_live_cameras_and_is_still_a_sessions(tmp_path: Path) ->
     rig, sources = read_live_rig(path)
     assert [c.name for c in rig.cameras] == ["c0", "c1"]
     assert sources[0] == CameraSource(NAMED, 0.008, 32, 40, 4500, 30.0, "MJPG")
-    assert sources[1] == CameraSource(Identity(Kind.STREAM, "http://10.0.0.2/x"))
+    assert sources[1] == CameraSource(Identity(SourceKind.STREAM, "http://10.0.0.2/x"))
     assert read_rig(path).sources == (None, None)
 
 
@@ -129,9 +156,9 @@ def test_what_is_wrong_with_a_live_rig_is_told(tmp_path: Path, keys: str, told: 
         read_live_rig(rig_file(tmp_path, 'source = "http://h/0"', keys))
 
 
-@pytest.mark.parametrize("key", list(RANGES))
+@pytest.mark.parametrize("key", list(CONTROL_RANGES))
 def test_a_control_may_be_at_the_ends_of_its_range_and_not_beyond(tmp_path: Path, key: str) -> None:
-    low, high = RANGES[key]
+    low, high = CONTROL_RANGES[key]
     for value in (low, high):
         source_from_table("here", "c", {"source": "http://h/1", key: value}, tmp_path)
     for value in (math.nextafter(low, -math.inf), math.nextafter(high, math.inf)):
@@ -173,9 +200,9 @@ ASKED = CameraSource(NAMED, exposure=0.00812, gain=32, focus=40, white_balance=4
 
 def test_controls_are_locked_and_read_back() -> None:
     driver = Driver()
-    ask_picture(driver, ASKED, (1280, 720))
-    lock(driver, ASKED)
-    controls = {control.name: control for control in read_back(driver, ASKED)}
+    request_picture(driver, ASKED, (1280, 720))
+    lock_controls(driver, ASKED)
+    controls = {control.name: control for control in read_controls(driver, ASKED)}
     assert all(control.taken and not control.automatic for control in controls.values())
     assert controls["exposure_s"].got == pytest.approx(0.0081) and controls["format"].got == "MJPG"
     assert driver.values[cv2.CAP_PROP_FRAME_WIDTH] == 1280 and driver.values[cv2.CAP_PROP_FRAME_HEIGHT] == 720
@@ -183,17 +210,17 @@ def test_controls_are_locked_and_read_back() -> None:
 
 def test_what_a_driver_did_not_take_is_named_with_what_it_does_instead() -> None:
     driver = Driver(most_gain=16.0, focus=False)
-    lock(driver, ASKED)
-    refused = [str(control) for control in read_back(driver, ASKED) if not control.taken]
+    lock_controls(driver, ASKED)
+    refused = [str(control) for control in read_controls(driver, ASKED) if not control.taken]
     assert refused == ["format YUYV, asked for MJPG", "gain 16, asked for 32", "focus_abs not there, asked for 40"]
 
 
 def test_what_was_not_asked_for_is_left_as_it_is_and_told_to_be_automatic() -> None:
     driver, nothing = Driver(), CameraSource(NAMED)
     before = dict(driver.values)
-    ask_picture(driver, nothing, None)
-    lock(driver, nothing)
-    controls = read_back(driver, nothing)
+    request_picture(driver, nothing, None)
+    lock_controls(driver, nothing)
+    controls = read_controls(driver, nothing)
     assert driver.values == before and all(control.taken for control in controls)
     assert [c.name for c in controls if c.automatic] == ["exposure_s", "focus_abs", "white_balance_k"]
 
@@ -210,4 +237,118 @@ def test_only_an_exposure_that_is_locked_is_known() -> None:
 
 
 def test_a_stream_takes_no_controls_and_says_so() -> None:
-    assert [c.taken for c in untaken(CameraSource(Identity(Kind.STREAM, "http://h/1"), gain=3))] == [False]
+    assert [c.taken for c in ignored_controls(CameraSource(Identity(SourceKind.STREAM, "http://h/1"), gain=3))] == [
+        False
+    ]
+
+
+IMAGE = np.zeros((1, 1), np.uint8)
+
+
+@pytest.mark.parametrize("told", [FRAME_PERIOD, None])
+def test_complete_sets_are_found_and_no_pair_is_wrong_with_offsets_drops_and_jitter(told: float | None) -> None:
+    found = pair_frames(sent_frames(np.random.default_rng(8), 1000, CameraJitter()), CAMERA_OFFSETS, told)
+    assert found.complete >= 0.995 and found.wrong == 0 and found.wait <= 1.5 * FRAME_PERIOD
+
+
+def test_without_the_offsets_the_same_frames_are_torn_apart() -> None:
+    frames = sent_frames(np.random.default_rng(8), 300, CameraJitter())
+    assert pair_frames(frames, np.zeros(3)).complete < 0.5
+
+
+def test_normal_jitter_of_a_seventh_of_a_period_costs_few_sets() -> None:
+    found = pair_frames(sent_frames(np.random.default_rng(5), 700, CameraJitter(normal=True)), CAMERA_OFFSETS)
+    assert found.complete >= 0.985 and found.wrong <= 1
+
+
+def frame(camera: int, stamp: float) -> Arrival:
+    return Arrival(Frame(camera, stamp, IMAGE, "driver"), stamp, FRAME_PERIOD, stamp + 0.03)
+
+
+def test_offsets_can_be_told_while_running_and_leave_the_stamps_alone() -> None:
+    gathering, sizes, stamps = FrameSetBuilder(2, FRAME_PERIOD), [], []
+    for k in range(60):
+        if k == 30:
+            gathering.set_offsets([0.0, 0.02])
+        for arrival in (frame(0, k * FRAME_PERIOD), frame(1, k * FRAME_PERIOD - 0.02)):
+            for one in gathering.add(arrival):
+                sizes.append((k, len(one.frames)))
+                stamps += [f.stamp for f in one.frames if f.camera == 1]
+    early = [size for k, size in sizes if k < 30]
+    late = [size for k, size in sizes if k > 32]
+    assert late == [2] * len(late) and early != [2] * len(early)
+    assert set(stamps) <= {k * FRAME_PERIOD - 0.02 for k in range(60)}
+
+
+def test_a_missing_camera_holds_no_set_up_for_longer_than_a_period_and_a_half() -> None:
+    gathering, waits = FrameSetBuilder(3, FRAME_PERIOD), []
+    for k in range(60):
+        first = frame(0, k * FRAME_PERIOD)
+        for now in np.arange(first.now, first.now + FRAME_PERIOD, 0.001):
+            sets = gathering.add(first) if now == first.now else gathering.due(float(now))
+            waits += [float(now) - s.stamp - 0.03 for s in sets]
+    assert len(waits) >= 58 and max(waits) <= 1.5 * FRAME_PERIOD
+
+
+@given(
+    phases=st.lists(st.floats(0, 1), min_size=2, max_size=4), drop=st.floats(0, 0.05), seed=st.integers(0, 2**32 - 1)
+)
+@settings(max_examples=15, deadline=None)
+def test_cameras_that_run_freely_make_whole_sets_that_spread_as_little_as_they_can(
+    phases: list[float], drop: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    shots = [
+        frame(camera, 5 + (k + phase) * FRAME_PERIOD)
+        for k in range(90)
+        for camera, phase in enumerate(phases)
+        if rng.random() >= drop
+    ]
+    gathering, sets = FrameSetBuilder(len(phases), FRAME_PERIOD), []
+    for shot in sorted(shots, key=lambda shot: shot.now):
+        sets += gathering.add(shot)
+    settled = sets[len(sets) // 2 :]
+    whole = [one for one in settled if len(one.frames) == len(phases)]
+    assert len(whole) >= (1 - 3 * len(phases) * max(drop, 0.02)) * len(settled) - 3
+    widest = max(max(f.stamp for f in one.frames) - min(f.stamp for f in one.frames) for one in settled)
+    assert widest <= (1 - 1 / len(phases) / LEADER_HYSTERESIS) * FRAME_PERIOD + 1e-6
+
+
+def test_phases_that_drift_past_each_other_cost_a_set_and_no_more() -> None:
+    shots = [frame(0, k * FRAME_PERIOD) for k in range(900)] + [frame(1, k * FRAME_PERIOD * 1.001) for k in range(900)]
+    gathering, sizes = FrameSetBuilder(2, FRAME_PERIOD), []
+    for shot in sorted(shots, key=lambda shot: shot.now):
+        sizes += [len(one.frames) for one in gathering.add(shot)]
+    assert sizes[10:].count(1) <= 6
+
+
+def test_how_far_a_camera_is_out_of_step_is_told() -> None:
+    gathering = FrameSetBuilder(2, FRAME_PERIOD)
+    for k in range(80):
+        for camera, phase in enumerate((0.0, 0.3)):
+            gathering.add(frame(camera, 1 + (k + phase) * FRAME_PERIOD))
+    assert gathering.behind == pytest.approx([-0.15 * FRAME_PERIOD, 0.15 * FRAME_PERIOD], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("phases", "errors"),
+    [
+        ((0.0, 0.33, 0.66), (0.0, 0.0, 0.0)),
+        ((0.0, 0.3, 0.6), (0.0, 0.005, -0.005)),
+        ((0.0, 0.0, 0.0), tuple(CAMERA_OFFSETS)),
+    ],
+)
+def test_what_is_learned_of_sets_and_told_back_shifts_them_once_at_most(
+    phases: tuple[float, ...], errors: tuple[float, ...]
+) -> None:
+    gathering, learned = FrameSetBuilder(3, FRAME_PERIOD), np.zeros(3)
+    shots = [frame(c, 10 + (k + phase) * FRAME_PERIOD + 1e-4 * c) for k in range(900) for c, phase in enumerate(phases)]
+    spread: list[np.ndarray] = []
+    for shot in sorted(shots, key=lambda shot: shot.now):
+        for one in gathering.add(shot):
+            if len(one.frames) == 3:
+                spread.append(np.array([f.stamp for f in one.frames]) - one.stamp)
+                late = spread[-1] + errors  # when they really exposed, beside the mean of all
+                learned += (late - late.mean() - learned) / 150
+            gathering.learn(learned)
+    assert len(spread) >= 880 and (np.abs(np.diff(spread, axis=0)).max(axis=1) > 0.002).sum() <= 1

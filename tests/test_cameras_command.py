@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from hardware.cameras.feed import Place
-from hardware.cameras.identity import identity_from_text, list_devices
+from hardware.cameras.feed import CameraPlace
+from hardware.cameras.inspection import CELL_SIZE, preview_sheet, sharpness
 from hardware.cameras.live import LiveCameras
-from hardware.cameras.sheet import CELL, sharpness, sheet
-from hardware.cameras.sources import CameraSource
+from hardware.cameras.sources import CameraSource, identity_from_text, list_devices
 from hardware.cli.main import main
 from tests.streams import CLOCK, HttpCamera, picture, served
 from tests.test_camera_names import rig_file
@@ -30,7 +29,11 @@ def test_two_streams_are_watched_and_told(tmp_path: Path, capsys: pytest.Capture
             assert one["size_px"] == [160, 120] and one["frames"] > 5 and one["sharpness"] > 100
             assert 100 < one["grey_level"] < 160 and one["left_out"].get("frozen", 0) == 0
         shown = cv2.imread(str(tmp_path / "sheet.png"))
-        assert shown is not None and shown.shape[1] == 2 * CELL[0] and shown[: CELL[1], : CELL[0]].std() > 20
+        assert (
+            shown is not None
+            and shown.shape[1] == 2 * CELL_SIZE[0]
+            and shown[: CELL_SIZE[1], : CELL_SIZE[0]].std() > 20
+        )
         assert main(["cameras", urls[0], "http://127.0.0.1:9/none", "--seconds", "0.5"]) == 1
         assert "TROUBLE: camera 2 cannot be opened since" in capsys.readouterr().out
 
@@ -49,8 +52,7 @@ def test_a_rig_is_watched_by_its_names_and_a_control_that_is_not_taken_is_told(
 
 def test_nothing_there_says_what_to_do_and_wrong_input_what_is_allowed(capsys: pytest.CaptureFixture[str]) -> None:
     if not list_devices():
-        assert main(["cameras"]) == 0
-        assert "plug one in" in capsys.readouterr().out
+        assert main(["cameras"]) == 0 and "plug one in" in capsys.readouterr().out
         assert main(["cameras", "--json"]) == 0 and json.loads(capsys.readouterr().out) == []
     for wrong, allowed in (
         (["0"], "a name that stays"),
@@ -58,8 +60,7 @@ def test_nothing_there_says_what_to_do_and_wrong_input_what_is_allowed(capsys: p
         (["http://h/1", "-o", "sheet.txt"], ".jpg or .png"),
         (["a.toml", "http://h/1"], "one RIG.toml alone"),
     ):
-        assert main(["cameras", *wrong]) == 2
-        assert allowed in capsys.readouterr().err
+        assert main(["cameras", *wrong]) == 2 and allowed in capsys.readouterr().err
 
 
 def test_a_sharper_picture_has_the_higher_number() -> None:
@@ -68,8 +69,10 @@ def test_a_sharper_picture_has_the_higher_number() -> None:
 
 
 def test_a_sheet_has_a_cell_for_a_camera_without_a_picture() -> None:
-    drawn = sheet([(picture(1), ["one"], True), (None, ["two", "gone"], False), (picture(2)[..., 0], ["three"], True)])
-    assert drawn.shape[1] == 2 * CELL[0] and drawn.shape[0] > 2 * CELL[1]
+    drawn = preview_sheet(
+        [(picture(1), ["one"], True), (None, ["two", "gone"], False), (picture(2)[..., 0], ["three"], True)]
+    )
+    assert drawn.shape[1] == 2 * CELL_SIZE[0] and drawn.shape[0] > 2 * CELL_SIZE[1]
 
 
 def test_a_camera_that_is_plugged_in_delivers() -> None:
@@ -77,7 +80,7 @@ def test_a_camera_that_is_plugged_in_delivers() -> None:
     if not found:
         pytest.skip("no camera is plugged in, nor is a v4l2loopback device fed")
     source = CameraSource(identity_from_text("test", "source", found[0], Path()))
-    with LiveCameras([Place(0, "plugged in", None)], [source], CLOCK) as live:
+    with LiveCameras([CameraPlace(0, "plugged in", None)], [source], CLOCK) as live:
         end = CLOCK.now() + 10
         sets = [one for _ in range(10) if (one := live.next_set(end)) is not None]
         assert len(sets) == 10, live.health().trouble

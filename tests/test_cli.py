@@ -18,35 +18,22 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from hardware.cli.main import main
 from hardware.files.pose_file import PoseWriter, read_poses
-from hardware.files.session import open_session
 from hardware.offline.track import follow
-from hardware.out_folder import kept, prepare_out
 from hardware.process.clock import WallClock
-from hardware.process.progress import Progress, counted, duration
-from hardware.simulator.nozzle_file import read_nozzle
+from hardware.process.progress import Progress, count_text, duration_text, left_files_text, prepare_out
+from hardware.recording.session_reader import open_session
 from perception.frames import FrameSet
 from perception.tracking.step import STAGES, StepReport
+from tests.nozzle_logs import read_nozzle
 from tests.runs import Replayed
 from tests.started import ROOT, started
 from tests.worlds import IDEAL, SMALL, write_scenario
 
 CLOCK = WallClock()
-LARGE = {
-    "numpy",
-    "scipy",
-    "numba",
-    "gtsam",
-    "cv2",
-    "onnxruntime",
-    "toppra",
-    "ruckig",
-    "shapely",
-    "aiohttp",
-    "mcap",
-}
+LARGE = {"numpy", "scipy", "numba", "gtsam", "cv2", "onnxruntime", "toppra", "ruckig", "shapely", "aiohttp", "mcap"}
 HELP = """
 import argparse, sys
-from hardware.bench.command import subject_parser
+from hardware.cli.main import subject_parser
 from hardware.bench.subjects import SUBJECTS
 from hardware.cli.main import parser
 
@@ -74,7 +61,10 @@ def test_help_is_there_at_once_as_nothing_large_is_loaded_for_any() -> None:
 def test_a_reader_that_goes_away_is_no_error() -> None:
     read, write = os.pipe()
     os.close(read)
-    code = "import sys; from hardware.cli import main as cli; cli._track = lambda a: print('x' * 99); sys.exit(cli.main(sys.argv[1:]))"
+    code = (
+        "import sys; from hardware.cli import main as cli, sessions; sessions._track = lambda a: print('x' * 99);"
+        " sys.exit(cli.main(sys.argv[1:]))"
+    )
     command = [sys.executable, "-c", code, "track", "x", "-o", "y"]
     done = subprocess.run(command, cwd=ROOT, stdout=write, stderr=subprocess.PIPE, text=True, timeout=60)
     os.close(write)
@@ -110,9 +100,7 @@ def test_a_simulation_ended_by_ctrl_c_keeps_what_there_was(tmp_path: Path) -> No
         _, errors = running.communicate(timeout=60)
     finally:
         running.kill()
-    assert running.returncode == 130
-    assert "interrupted; kept in" in errors
-    assert "Traceback" not in errors
+    assert running.returncode == 130 and "interrupted; kept in" in errors and "Traceback" not in errors
     rows = read_nozzle(out / "nozzle.csv")
     assert len(rows) > 300 and np.allclose(np.diff(rows.stamps), 0.001)
     assert len(read_poses(out / "tracking" / "poses.csv")) >= 1
@@ -136,15 +124,15 @@ def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_what_was_kept_is_said(tmp_path: Path) -> None:
-    assert kept(tmp_path / "nothing") == "nothing was written"
-    assert kept(None) == "nothing was to be written"
+    assert left_files_text(tmp_path / "nothing") == "nothing was written"
+    assert left_files_text(None) == "nothing was to be written"
     (tmp_path / "poses.csv").write_text("x")
-    assert kept(tmp_path) == f"kept in {tmp_path}: poses.csv"
-    assert "whole" in kept(tmp_path / "poses.csv")
+    assert left_files_text(tmp_path) == f"kept in {tmp_path}: poses.csv"
+    assert "whole" in left_files_text(tmp_path / "poses.csv")
     (tmp_path / "x.mcap").write_text("x")
-    assert "readable" in kept(tmp_path / "x.mcap")
+    assert "readable" in left_files_text(tmp_path / "x.mcap")
     (tmp_path / "arm.toml").write_text("x")
-    assert kept(tmp_path / "arm.toml") == f"kept {tmp_path / 'arm.toml'}"
+    assert left_files_text(tmp_path / "arm.toml") == f"kept {tmp_path / 'arm.toml'}"
 
 
 def frame_sets(count: int, ending: BaseException | None = None) -> Iterator[FrameSet]:
@@ -161,16 +149,13 @@ def writer(folder: Path) -> PoseWriter:
 def test_each_pose_is_written_before_the_step_may_idle(tmp_path: Path) -> None:
     log: list[str] = []
     step, ticks = Replayed(log), iter(range(1000))
-    counts: list[tuple[int, int]] = []
+    counts: list[tuple[int, ...]] = []
 
     def sink(frames: FrameSet, pose: SurfacePose, report: StepReport) -> None:
         log.append(f"written {len(read_poses(tmp_path / 'poses.csv'))}")
 
-    def count(done: int, total: int) -> None:
-        counts.append((done, total))
-
     with writer(tmp_path) as poses:
-        done = follow(frame_sets(3), step, poses, lambda: float(next(ticks)), count, 3, [sink])
+        done = follow(frame_sets(3), step, poses, lambda: float(next(ticks)), lambda *c: counts.append(c), 3, [sink])
     assert done == 3
     assert log == ["step", "written 1", "idle", "step", "written 2", "idle", "step", "written 3", "idle"]
     assert counts == [(1, 3), (2, 3), (3, 3)]
@@ -202,8 +187,7 @@ def test_progress_on_a_terminal_is_one_line_that_changes() -> None:
             now[0] += 0.0625  # exact in binary
             progress(done, 100)
     text = stream.getvalue()
-    assert text.count("\n") == 1
-    assert text.count("\r") == 50
+    assert text.count("\n") == 1 and text.count("\r") == 50
     assert text.endswith("track: 100 of 100 frame sets, 16.0/s\n")
     assert "track: 50 of 100 frame sets, 16.0/s, 3 s left" in text
 
@@ -215,22 +199,15 @@ def test_progress_in_a_log_is_a_line_every_few_seconds() -> None:
             now[0] += 0.2
             progress(done, 100)
     lines = stream.getvalue().splitlines()
-    assert len(lines) == 4
-    assert "\r" not in stream.getvalue()
+    assert len(lines) == 4 and "\r" not in stream.getvalue()
 
 
 @pytest.mark.parametrize(
     ("seconds", "words"), [(8.4, "8 s"), (59.9, "1 min 0 s"), (200, "3 min 20 s"), (3900, "1 h 5 min")]
 )
 def test_durations_are_said_as_people_do(seconds: float, words: str) -> None:
-    assert duration(seconds) == words
+    assert duration_text(seconds) == words
 
 
 def test_one_is_not_told_as_many() -> None:
-    assert [counted(n, "layer") for n in (0, 1, 2)] == ["0 layers", "1 layer", "2 layers"]
-
-
-def test_help_needs_no_library() -> None:
-    code = "import sys, hardware.cli.main; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, env=os.environ)
-    assert {"numpy", "cv2", "gtsam", "mcap"}.isdisjoint(done.stdout.split())
+    assert [count_text(n, "layer") for n in (0, 1, 2)] == ["0 layers", "1 layer", "2 layers"]

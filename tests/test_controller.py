@@ -1,4 +1,6 @@
-"""The virtual arm: what its line is told is what its axes do, whatever way the bytes come."""
+"""The virtual arm: what its line is told is what its axes do, whatever way the bytes come. The servo: exact where it
+claims to be, and never beyond its limit.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +12,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.arm.protocol import G1, G4, G54, THESIS, ControllerReset, Dialect, Mode, Pause, Reset, encode
-from hardware.replies import ReplyKind, reply_stream
-from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.settings import ArmSettings, Replies
-from planning.command import TURNING
+from estimation.se3 import Array
+from hardware.arm.protocol import (
+    G1,
+    G4,
+    G54,
+    THESIS_DIALECT,
+    ControllerReset,
+    Dialect,
+    Mode,
+    Pause,
+    ReplyKind,
+    Reset,
+    encode,
+    reply_stream,
+)
+from hardware.simulator.arm.controller import SERVO_STEP, Polyline, Servo, VirtualArm
+from hardware.simulator.arm.settings import ArmSettings, ReplyMode
+from planning.command import MIN_TRAVEL
 from tests.virtual_arm import HOME, IDEAL, axes_at, motion, move, virtual_arm
 
 step = st.integers(-160, 160).map(lambda eighths: eighths / 8)  # exact in binary32
@@ -28,8 +43,8 @@ ARMS = st.sampled_from(
         ArmSettings(),
         ArmSettings(dead_time=0.013),
         ArmSettings(acceleration=2000.0, dead_time=0.0105),
-        ArmSettings(replies=Replies.STRAY),
-        ArmSettings(replies=Replies.STREAM),
+        ArmSettings(replies=ReplyMode.STRAY),
+        ArmSettings(replies=ReplyMode.STREAM),
     ]
 )
 
@@ -47,8 +62,8 @@ def far(before: G1 | None, after: G1) -> bool:
 @given(st.lists(moves, min_size=1, max_size=8).filter(lambda path: all(far(a, b) for a, b in pairwise([None, *path]))))
 def test_every_target_is_reached_in_a_straight_line_at_its_feed(path: list[G1]) -> None:
     arm = virtual_arm()
-    arm.receive(b"".join(map(encode, path)), 0.0)
-    start, begin = HOME, 0.0
+    arm.receive(b"".join(map(encode, path)), 1.0)
+    start, begin = HOME, 1.0
     for each in path:
         way = each.axes - start
         duration = max(np.linalg.norm(way[:3]) / min(each.feed, 250), np.abs(way[3:]).max() / np.pi)
@@ -78,16 +93,15 @@ def test_neither_the_split_of_bytes_nor_who_looks_when_changes_the_motion(
     for arm in plain, watched:
         arm.advance(now + 1)
     sent, got = plain.transmit(now + 1), got + watched.transmit(now + 1)
-    assert sent == got
-    assert motion(plain)[1].tobytes() == motion(watched)[1].tobytes()
+    assert sent == got and motion(plain)[1].tobytes() == motion(watched)[1].tobytes()
     assert (plain.frames, plain.ignored, plain.underruns) == (watched.frames, watched.ignored, watched.underruns)
 
 
-@pytest.mark.parametrize("length", [0.0, 0.5 * TURNING])
+@pytest.mark.parametrize("length", [0.0, 0.5 * MIN_TRAVEL])
 def test_a_turn_with_next_to_no_way_takes_the_time_that_its_feed_in_degrees_says(length: float) -> None:
     arm = virtual_arm()
     arm.receive(move(25.0, x=HOME[0] + length, c=0.5), 0.0)  # 0.5 degrees at 25 degrees/s
-    assert arm.in_flight == pytest.approx(0.02)
+    assert arm.in_flight == pytest.approx(0.02) and axes_at(arm, 0.01)[0, 5] == pytest.approx(0.25)
 
 
 @settings(max_examples=60)
@@ -136,21 +150,6 @@ def test_noise_between_frames_changes_no_motion(script: list[tuple[float, G1]], 
 # -- moves
 
 
-def test_a_move_goes_straight_at_its_feed() -> None:
-    arm = virtual_arm()
-    arm.receive(move(10.0, x=212.5, a=20), 1.0)
-    assert axes_at(arm, 1.0, 1.25, 2.0, 3.0)[:, [0, 3]] == pytest.approx(
-        np.array([[202.5, 0], [205, 5], [212.5, 20], [212.5, 20]])
-    )
-
-
-def test_a_move_of_angles_alone_takes_its_feed_as_degrees() -> None:
-    arm = virtual_arm()
-    arm.receive(move(10.0, a=20), 0.0)
-    assert arm.in_flight == pytest.approx(2.0)
-    assert axes_at(arm, 1.0)[0, 3] == pytest.approx(10)
-
-
 def test_no_move_is_faster_than_the_arm() -> None:
     arm = virtual_arm()
     arm.receive(move(1000.0, x=302.5), 0.0)
@@ -179,8 +178,7 @@ def test_targets_and_origins_out_of_reach_are_refused() -> None:
     arm.receive(move(10.0, x=1000.0), 0.0)
     assert arm.queued == 1 and not arm.refused
     arm.receive(move(10.0, x=1000.1) + move(10.0, c=180.1) + encode(G54(np.array([0, 0, 501.0]))), 0.5)
-    assert arm.refused == [0.5] * 3
-    assert arm.queued == 1 and not arm.origin.any()
+    assert arm.refused == [0.5] * 3 and arm.queued == 1 and not arm.origin.any()
 
 
 # -- the queue
@@ -189,13 +187,11 @@ def test_targets_and_origins_out_of_reach_are_refused() -> None:
 def test_the_fifo_holds_200_commands_and_ignores_the_rest() -> None:
     arm = virtual_arm()
     arm.receive(b"".join(move(10.0, x=202.5 + k) for k in range(1, 206)), 0.0)
-    assert (arm.queued, len(arm.ignored), arm.frames) == (200, 5, 205)
-    assert arm.in_flight == pytest.approx(20.0)
+    assert (arm.queued, len(arm.ignored), arm.frames) == (200, 5, 205) and arm.in_flight == pytest.approx(20.0)
     arm.receive(move(10.0, y=226.0), 0.05)
     assert len(arm.ignored) == 6
     arm.receive(move(10.0, x=402.5, y=226.0), 0.2)
-    assert (arm.queued, len(arm.ignored)) == (199, 6)
-    assert axes_at(arm, 30.0)[0, :2] == pytest.approx([402.5, 226])
+    assert (arm.queued, len(arm.ignored)) == (199, 6) and axes_at(arm, 30.0)[0, :2] == pytest.approx([402.5, 226])
 
 
 def test_a_queue_that_runs_dry_within_a_motion_is_an_underrun() -> None:
@@ -217,8 +213,7 @@ def test_a_stop_does_not_wait_behind_the_queue(frame: Pause | Reset | Controller
     assert (arm.queued, arm.in_flight) == (0, 0.0)
     assert axes_at(arm, 1.234, 5.0)[:, 0] == pytest.approx([214.84, 214.84])
     arm.receive(move(10.0, x=204.84), 6.0)
-    assert arm.in_flight == pytest.approx(1.0)
-    assert axes_at(arm, 6.5, 7.0)[:, 0] == pytest.approx([209.84, 204.84])
+    assert arm.in_flight == pytest.approx(1.0) and axes_at(arm, 6.5, 7.0)[:, 0] == pytest.approx([209.84, 204.84])
     assert not arm.underruns
 
 
@@ -233,28 +228,24 @@ def test_only_a_controller_reset_takes_origin_and_mode_back() -> None:
 def test_another_dialect_is_garbage_to_it() -> None:
     arm = virtual_arm()
     arm.receive(encode(G1(HOME + 1, 10.0), Dialect(motion_byte=0)) + move(10.0, x=203), 0.5)
-    assert (arm.frames, arm.queued) == (1, 1)
-    assert [(now, len(data)) for now, data in arm.garbage] == [(0.5, 48)]
+    assert (arm.frames, arm.queued) == (1, 1) and [(now, len(data)) for now, data in arm.garbage] == [(0.5, 48)]
 
 
 # -- what it sends
 
 
 def test_replies_give_place_and_angles_every_period() -> None:
-    arm = VirtualArm(ArmSettings(servo_lag=0.0, replies=Replies.STREAM), THESIS, HOME)
+    arm = VirtualArm(ArmSettings(servo_lag=0.0, replies=ReplyMode.STREAM), THESIS_DIALECT, HOME)
     arm.receive(encode(G54(np.array([200.0, 200, 100]))) + encode(G1(np.array([12.5, 25, 13, 0.1, 0, 0]), 10.0)), 0.0)
     assert arm.transmit(0.05) == b""  # on the line, which takes 2.3 ms
     replies, stray = reply_stream()(arm.transmit(0.5) + arm.transmit(0.6))
-    assert not stray
-    assert [reply.kind for reply in replies] == [ReplyKind.PLACE, ReplyKind.TOOL, ReplyKind.ARM] * 11
-    assert replies[0].values == pytest.approx([3.0, 25, 13])
-    assert replies[30].values == pytest.approx([8.0, 25, 13])
-    assert replies[31].values == pytest.approx([0.055, 0, 0], abs=1e-4)
-    assert not replies[32].values.any()
+    assert not stray and [reply.kind for reply in replies] == [ReplyKind.PLACE, ReplyKind.TOOL, ReplyKind.ARM] * 11
+    assert replies[0].values == pytest.approx([3.0, 25, 13]) and replies[30].values == pytest.approx([8.0, 25, 13])
+    assert replies[31].values == pytest.approx([0.055, 0, 0], abs=1e-4) and not replies[32].values.any()
 
 
 def test_a_line_too_slow_for_the_period_skips_replies_and_tears_none() -> None:
-    arm = VirtualArm(ArmSettings(replies=Replies.STREAM, reply_period=0.01), THESIS, HOME, baud=9600)
+    arm = VirtualArm(ArmSettings(replies=ReplyMode.STREAM, reply_period=0.01), THESIS_DIALECT, HOME, baud=9600)
     replies, stray = reply_stream()(arm.transmit(3.0))
     assert not stray
     assert len(replies) == pytest.approx(3 * 100, abs=3)  # every third period
@@ -262,7 +253,7 @@ def test_a_line_too_slow_for_the_period_skips_replies_and_tears_none() -> None:
 
 def test_stray_bytes_come_one_by_one_at_random_and_are_the_same_for_a_seed() -> None:
     def strays(seed: int) -> list[tuple[float, bytes]]:
-        arm = virtual_arm(ArmSettings(replies=Replies.STRAY, seed=seed))
+        arm = virtual_arm(ArmSettings(replies=ReplyMode.STRAY, seed=seed))
         times = np.arange(1, 20_001) / 1000
         return [(now, data) for now in times.tolist() if (data := arm.transmit(now))]
 
@@ -281,4 +272,98 @@ def test_an_arm_that_sends_nothing_sends_nothing() -> None:
 @pytest.mark.parametrize("home", [np.zeros(5), np.array([np.nan, 0, 0, 0, 0, 0])])
 def test_a_home_that_makes_no_sense_is_refused(home: np.ndarray) -> None:
     with pytest.raises(InputError, match="home"):
-        VirtualArm(IDEAL, THESIS, home)
+        VirtualArm(IDEAL, THESIS_DIALECT, home)
+
+
+GRID = np.arange(3001) * 0.001
+stretches = st.lists(
+    st.tuples(st.floats(0.001, 0.4), st.lists(st.floats(-100, 100), min_size=6, max_size=6)), min_size=1, max_size=8
+)
+
+
+def line_of(parts: list[tuple[float, list[float]]]) -> Polyline:
+    """A line from home at 0 s: for so many s at such a slope, one after the other, then rest."""
+    line, now, axes = Polyline(0.0, HOME), 0.0, HOME
+    for duration, slope in parts:
+        line.append(now, axes, np.array(slope))
+        now, axes = now + duration, axes + duration * np.array(slope)
+    line.append(now, axes, np.zeros(6))
+    return line
+
+
+def executed(line: Polyline, dead_time: float = 0.0, tau: float = 0.0, most: Array | None = None) -> Array:
+    return Servo(line, dead_time, tau, most).at(GRID, 3.0)
+
+
+@settings(max_examples=25)
+@given(stretches)
+def test_without_dead_time_lag_and_limit_it_is_the_setpoint_itself(parts: list[tuple[float, list[float]]]) -> None:
+    line = line_of(parts)
+    assert (executed(line) == line.at(GRID)).all()
+
+
+@settings(max_examples=25)
+@given(stretches, st.integers(1, 300), st.sampled_from([0.0, 0.02]), st.sampled_from([None, np.array([3000.0, 60])]))
+def test_dead_time_is_a_shift(
+    parts: list[tuple[float, list[float]]], late: int, tau: float, most: Array | None
+) -> None:
+    line = line_of(parts)
+    shifted = executed(line, late / 1000, tau, most)
+    apart = np.abs(shifted[late:] - executed(line, 0.0, tau, most)[:-late]).max()
+    assert (shifted[:late] == HOME).all()
+    if tau or most is None:
+        assert apart < (1e-9 if most is None else 2 * 0.2 * SERVO_STEP)  # the limit's step of a bend may be the next
+
+
+@settings(max_examples=20)
+@given(stretches, st.floats(0.002, 0.3))
+def test_lag_is_the_solution_of_its_equation(parts: list[tuple[float, list[float]]], tau: float) -> None:
+    line = line_of(parts)
+    fine = np.arange(30_001) * 0.0001
+    y, u = Servo(line, 0.0, tau, None).at(fine, 3.0), line.at(fine)
+    rise = np.cumsum((((u - y)[1:] + (u - y)[:-1]) / 2) * 0.0001 / tau, axis=0)
+    assert np.abs(y[1:] - (HOME + rise)).max() < 1e-3
+
+
+def test_a_steady_setpoint_is_followed_a_lag_behind() -> None:
+    line = line_of([(3.0, [50.0, 0, 0, 1, 0, 0])])
+    behind = line.at(GRID) - executed(line, dead_time=0.01, tau=0.02)
+    assert behind[1000] == pytest.approx([1.5, 0, 0, 0.03, 0, 0])
+
+
+@settings(max_examples=25)
+@given(stretches, st.floats(0, 0.05), st.floats(100, 5000))
+def test_the_limit_is_never_passed(parts: list[tuple[float, list[float]]], tau: float, most: float) -> None:
+    moved = executed(line_of(parts), tau=tau, most=np.array([most, most / 50]))
+    bend = np.diff(moved, 2, axis=0) / SERVO_STEP**2
+    assert np.linalg.norm(bend[:, :3], axis=1).max() <= most * (1 + 1e-6) + 1e-4
+    assert np.linalg.norm(bend[:, 3:], axis=1).max() <= most / 50 * (1 + 1e-6) + 1e-4
+
+
+@pytest.mark.slow
+@settings(max_examples=25)
+@given(stretches, st.floats(0.005, 0.05))
+def test_a_limit_that_is_not_reached_changes_next_to_nothing(
+    parts: list[tuple[float, list[float]]], tau: float
+) -> None:
+    line, most = line_of(parts), np.array([2 * 200 / tau, 2 * 200 / tau])
+    apart = executed(line, tau=tau, most=most) - executed(line, tau=tau)
+    assert np.abs(apart).max() <= most[0] * SERVO_STEP**2
+
+
+def test_a_limited_arm_starts_slowly_catches_up_and_comes_to_rest_without_overshoot_of_a_far_target() -> None:
+    line = Polyline(0.0, HOME)
+    line.append(0.001, HOME, np.array([20_000.0, 0, 0, 0, 0, 0]))
+    line.append(0.002, HOME + [20, 0, 0, 0, 0, 0], np.zeros(6))
+    moved = executed(line, most=np.array([1000.0, 10]))[:, 0] - HOME[0]
+    assert moved[101] == pytest.approx(1000 * 0.1**2 / 2, rel=0.05)
+    quickest = 2 * np.sqrt(20 / 1000)
+    assert np.argmax(moved > 20 - 1e-3) * 0.001 == pytest.approx(quickest, rel=0.05) and moved.max() <= 20 + 1e-3
+    assert moved[-1] == pytest.approx(20, abs=1e-9)
+
+
+def test_a_line_that_stops_is_cut_at_that_instant() -> None:
+    line = line_of([(1.0, [10.0] * 6), (1.0, [20.0] * 6)])
+    line.stop(1.5)
+    assert line.at(np.array([0.5, 1.5, 3.0])) == pytest.approx(HOME + np.array([[5.0], [20], [20]]))
+    assert len(line) == 3

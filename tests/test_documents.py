@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from hardware.bench.command import subject_parser
 from hardware.bench.subjects import SUBJECTS
-from hardware.cli.main import main, parser
+from hardware.cli.main import main, parser, subject_parser
 from tests.documents import DOCUMENTS, ROOT, commands, leaf, shown
 from tests.shown_commands import COMPLETED, INSTEAD, MADE, NAMES, NOT_RUN, to_run
 
@@ -34,11 +33,15 @@ def test_each_command_that_is_shown_is_taken_with_its_values() -> None:
     texts = [text for file in DOCUMENTS[1:] for text in shown(file) if text.startswith("stillbed")]
     assert len(texts) > 30
     for text in texts:
-        words = shlex.split(text)[1:]
-        if words[0] == "bench" and words[1] in SUBJECTS:
-            subject_parser(words[1], SUBJECTS[words[1]]).parse_args(words[2:])
-        else:
-            parser().parse_args(words)
+        take(shlex.split(text)[1:])
+
+
+def take(words: list[str]) -> None:
+    """Read a command's words; SystemExit where one of them is not taken."""
+    if words[0] == "bench" and words[1] in SUBJECTS:
+        subject_parser(words[1], SUBJECTS[words[1]]).parse_args(words[2:])
+    else:
+        parser().parse_args(words)
 
 
 @pytest.mark.parametrize(("document", "text"), [c for c in commands() if c[1].startswith("make")])
@@ -78,7 +81,7 @@ def test_every_page_can_be_found_from_the_first() -> None:
 
 
 def test_each_command_is_run_as_it_stands_or_in_another_way_that_is_told() -> None:
-    """By tests/test_every_command.py: a new one is run as it stands, with values for its placeholders."""
+    """By tests/test_examples.py: a new one is run as it stands, with values for its placeholders."""
     texts = {text for _, text in commands()}
     tables = [NAMES, COMPLETED, INSTEAD, NOT_RUN]
     told = [text for table in tables for text in table]
@@ -97,12 +100,8 @@ def test_each_command_is_run_as_it_stands_or_in_another_way_that_is_told() -> No
 def test_what_is_run_has_values_that_are_taken() -> None:
     for run in sorted({run for _, text in commands() if (run := to_run(text)) is not None}):
         words = shlex.split(run)
-        if words[0] != "stillbed" or "--help" in words:
-            continue
-        if words[1] == "bench" and words[2] in SUBJECTS:
-            subject_parser(words[2], SUBJECTS[words[2]]).parse_args(words[3:])
-        else:
-            parser().parse_args(words[1:])
+        if words[0] == "stillbed" and "--help" not in words:
+            take(words[1:])
 
 
 QUICK = {  # commands of the documents that need no device and no recording, each with a file that it leaves behind

@@ -11,13 +11,12 @@ import pytest
 from estimation import se3
 from estimation.observations import Observations
 from estimation.online.estimator import Estimator, EstimatorSettings
+from estimation.online.surface_state import StateSettings
 from estimation.pose import SurfacePose, TrackState, identity_pose
 from estimation.se3 import Array
-from estimation.state_machine import StateSettings
 from estimation.surface_map import SurfaceMap
-from estimation.synthetic.arc_rig import REST, arc_rig
-from estimation.synthetic.look import observations
-from estimation.synthetic.surfaces import patch
+from estimation.synthetic.movements import patch
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations
 from tests.slowly import slowly
 from tests.synthetic import Motion, breathing
 
@@ -29,7 +28,7 @@ RATE = 30.0
 def lively(stamp: float) -> Array:
     """About 40 mm/s: fast enough for capture instants to show."""
     w = 0.1 * np.sin(stamp * np.array([2.1, 2.7, 1.8]) + [0, 1, 2])
-    return REST @ se3.make(se3.exp_rotation(w), 12.0 * np.sin(stamp * np.array([3.1, 2.6, 3.7]) + [2, 0, 1]))
+    return BASE_FROM_REST @ se3.make(se3.exp_rotation(w), 12.0 * np.sin(stamp * np.array([3.1, 2.6, 3.7]) + [2, 0, 1]))
 
 
 def look(
@@ -98,9 +97,8 @@ def test_before_a_map_there_is_no_certainty() -> None:
 
 def test_the_first_map_is_not_a_measurement_yet() -> None:
     estimator = begun(breathing)
-    assert estimator.pose is not None
-    assert estimator.pose.state is TrackState.INITIALISING and estimator.pose.reason
-    waited = estimator.wait(0.2, "nothing seen")
+    assert estimator.pose is not None and estimator.pose.state is TrackState.INITIALISING and estimator.pose.reason
+    waited = estimator.hold(0.2, "nothing seen")
     assert (waited.state, waited.reason, waited.stamp) == (TrackState.INITIALISING, "nothing seen", 0.2)
     assert np.array_equal(waited.base_from_surface, breathing(0.0))
 
@@ -162,8 +160,7 @@ def test_one_camera_alone_is_degraded_and_says_so() -> None:
     follow(estimator, breathing, 0.5)
     for t in stamps(0.5, 0.55):
         pose = step(estimator, look(breathing, float(t), 3, cameras=(1,)))
-        assert pose.state is TrackState.DEGRADED and "one camera" in pose.reason
-        assert error(pose, breathing) < 2.0
+        assert pose.state is TrackState.DEGRADED and "one camera" in pose.reason and error(pose, breathing) < 2.0
     after = [step(estimator, look(breathing, t, 3)).state for t in (1.1, 1.1 + 1 / RATE, 1.1 + 2 / RATE)]
     assert after[-1] is TrackState.TRACKING
 
@@ -190,8 +187,7 @@ def test_few_tracks_degrade_and_the_way_back_asks_for_more_than_the_way_out() ->
 
     assert after(keep=8, start=12) is TrackState.TRACKING  # 24 tracks: enough to stay
     assert after(keep=8, start=8) is TrackState.DEGRADED  # not enough to enter
-    assert after(keep=11, start=8) is TrackState.TRACKING
-    assert after(keep=6, start=12) is TrackState.DEGRADED
+    assert after(keep=11, start=8) is TrackState.TRACKING and after(keep=6, start=12) is TrackState.DEGRADED
 
 
 def test_the_state_does_not_flicker_between_its_thresholds() -> None:
@@ -231,7 +227,7 @@ def test_a_pose_too_uncertain_is_no_measurement() -> None:
     seen = look(breathing, 0.1, 3)
     assert sure.fit(seen, breathing(0.1)).measured
     fit = unsure.fit(seen, breathing(0.1))
-    assert not fit.measured and "uncertain" in fit.reason and len(unsure.carriers(fit)) == 0
+    assert not fit.measured and "uncertain" in fit.reason and len(unsure.carrying_cameras(fit)) == 0
 
 
 def test_an_outage_coasts_then_is_lost_and_then_found() -> None:
@@ -242,8 +238,7 @@ def test_an_outage_coasts_then_is_lost_and_then_found() -> None:
         gone = p.stamp - last.stamp
         assert p.state is (TrackState.LOST if gone > estimator.settings.states.coast else TrackState.COASTING)
         assert f"{gone:.2f} s since" in p.reason
-    assert {p.state for p in dark} == {TrackState.COASTING, TrackState.LOST}
-    assert (dark[-1].twist == 0).all()
+    assert {p.state for p in dark} == {TrackState.COASTING, TrackState.LOST} and (dark[-1].twist == 0).all()
     back = follow(estimator, breathing, 0.3, 5, dark[-1].stamp + 1 / RATE)
     assert back[0].state is TrackState.DEGRADED and "seen well again" in back[0].reason
     assert {p.state for p in back[1:]} == {TrackState.TRACKING} and max(error(p, breathing) for p in back) < 0.15
@@ -288,8 +283,7 @@ def test_offsets_widen_the_claim_to_what_they_cost() -> None:
             e = (se3.inverse(pose.base_from_surface) @ lively(pose.stamp))[:3, 3]
             values.append(e @ np.linalg.solve(pose.covariance[3:, 3:], e) / 3)
             claimed.append(estimator.sigma())
-    assert np.mean(values) < 2.0
-    assert np.median(claimed) > 1.2 * run_skewed((0, 0, 0), 4.0).sigma()
+    assert np.mean(values) < 2.0 and np.median(claimed) > 1.2 * run_skewed((0, 0, 0), 4.0).sigma()
 
 
 def test_fitting_changes_nothing() -> None:

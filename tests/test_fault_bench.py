@@ -15,37 +15,56 @@ import pytest
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.bench import fault_run, faults
-from hardware.bench.campaigns.faults import fault_page
-from hardware.bench.fault_draw import KINDS, PLACES, SLOT, drawn_faults
-from hardware.bench.fault_judge import LATE, SLOW, WRONG, judged
-from hardware.bench.fault_run import FaultRun, Ran, Word, stage
-from hardware.bench.faults import Row, append_log, figures, one_run, read_log, run
-from hardware.process.faults import Fault, Kind, Part, Runner, check_faults, fault_from_text
-from hardware.simulator.nozzle_log import NozzleLog
+from hardware.bench import fault_run
+from hardware.bench.campaigns import faults
+from hardware.bench.campaigns.faults import (
+    MAX_DETECTION,
+    MAX_ERROR_MM,
+    MAX_RECOVERY,
+    FaultRow,
+    append_log,
+    fault_figures,
+    fault_page,
+    judge_fault,
+    one_run,
+    read_log,
+    run_faults,
+)
+from hardware.bench.fault_run import (
+    CAMPAIGN_KINDS,
+    FAULT_SPACING,
+    FAULTS_A_RUN,
+    FaultRun,
+    FaultRunRecord,
+    Statement,
+    draw_faults,
+    prepare_scenario,
+)
+from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults, fault_from_text
+from hardware.simulator.deposit import NozzleLog
 
 SCENARIOS = Path(__file__).parents[1] / "data" / "scenarios"
 STAMPS, ROWS = np.arange(0.0, 8.0, 0.02), np.arange(0.001, 8.0, 0.001)
-FAULT = Fault(Part.CAMERA, Kind.OFF, 4.0, 0.5)
+FAULT = Fault(FaultPart.CAMERA, FaultKind.OFF, 4.0, 0.5)
 
 
 def test_the_faults_of_a_run_are_its_own_in_order_and_all_kinds_come_in_turn() -> None:
-    assert drawn_faults(1, 5) == drawn_faults(1, 5) != drawn_faults(2, 5)
+    assert draw_faults(1, 5) == draw_faults(1, 5) != draw_faults(2, 5)
     seen = set()
     for number in range(12):
-        faults = drawn_faults(3, number)
+        faults = draw_faults(3, number)
         starts = [fault.start for fault in faults]
-        assert len(faults) == PLACES and (np.diff(starts) > SLOT - 0.5).all()
-        assert all(fault.kind is not Kind.KILL and fault.end < after.start for fault, after in pairwise(faults))
-        check_faults(faults, Runner.SIMULATE, "x", "y", 3)
+        assert len(faults) == FAULTS_A_RUN and (np.diff(starts) > FAULT_SPACING - 0.5).all()
+        assert all(fault.kind is not FaultKind.KILL and fault.end < after.start for fault, after in pairwise(faults))
+        check_faults(faults, FaultRunner.SIMULATE, "x", "y", 3)
         assert [fault_from_text("x", "y", str(fault)) for fault in faults] == faults
         seen |= {(fault.part, fault.kind) for fault in faults}
-    assert seen == set(KINDS)
+    assert seen == set(CAMPAIGN_KINDS)
 
 
 def ran(
     error: Array | None = None, said: tuple[float, float] | None = None, held: tuple[float, float] | None = None
-) -> Ran:
+) -> FaultRunRecord:
     """A run whose nozzle goes along x at 5 mm/s, off by `error` (N,) mm; said, held: from, to, s."""
     error = np.zeros(len(ROWS)) if error is None else error
     target = np.tile(np.eye(4), (len(ROWS), 1, 1))
@@ -61,47 +80,47 @@ def ran(
     for stamp in STAMPS.tolist():
         holds = held is not None and held[0] <= stamp < held[1]
         talks = said is not None and said[0] <= stamp < said[1]
-        words.append(Word(stamp, "x" if holds or talks else "", not holds, False, stamp - 0.05))
-    return Ran(words=words, log=log, ended=8.0)
+        words.append(Statement(stamp, "x" if holds or talks else "", not holds, False, stamp - 0.05))
+    return FaultRunRecord(words=words, log=log, ended=8.0)
 
 
 def test_what_is_said_in_time_and_over_with_its_cause_is_well() -> None:
-    verdict = judged(ran(said=(4.06, 4.6)), FAULT, 7.0)
+    verdict = judge_fault(ran(said=(4.06, 4.6)), FAULT, 7.0)
     assert verdict is not None and not (verdict.silent or verdict.restless or verdict.operator)
     assert verdict.detected == pytest.approx(0.06) and verdict.seen == pytest.approx(0.01)
     assert verdict.recovered == pytest.approx(0.1) and verdict.worst == 0.0
-    silent = replace(ran(), missed=[Word(4.08, "the motion process has said nothing", False, False, 4.08)])
-    hung = judged(silent, replace(FAULT, part=Part.MOTION, kind=Kind.HANG), 7.0)
+    silent = replace(ran(), missed=[Statement(4.08, "the motion process has said nothing", False, False, 4.08)])
+    hung = judge_fault(silent, replace(FAULT, part=FaultPart.MOTION, kind=FaultKind.HANG), 7.0)
     assert hung is not None and hung.seen == hung.detected == pytest.approx(0.08) and not hung.restless
-    jumped = judged(ran(said=(4.06, 4.6)), replace(FAULT, part=Part.CLOCK, kind=Kind.JUMP, amount=1.0), 7.0)
+    jumped = judge_fault(
+        ran(said=(4.06, 4.6)), replace(FAULT, part=FaultPart.CLOCK, kind=FaultKind.JUMP, amount=1.0), 7.0
+    )
     assert jumped is not None and jumped.seen == jumped.detected and np.isnan(jumped.recovered)
 
 
 def test_an_error_of_which_nobody_says_a_word_is_silent_and_one_that_is_told_is_not() -> None:
-    error = np.where((ROWS > 4.2) & (ROWS < 4.5), WRONG + 0.1, 0.0)
-    silent, told = judged(ran(error), FAULT, 7.0), judged(ran(error, said=(4.1, 4.6)), FAULT, 7.0)
+    error = np.where((ROWS > 4.2) & (ROWS < 4.5), MAX_ERROR_MM + 0.1, 0.0)
+    silent, told = judge_fault(ran(error), FAULT, 7.0), judge_fault(ran(error, said=(4.1, 4.6)), FAULT, 7.0)
     assert silent is not None and silent.silent and np.isnan(silent.detected) and silent.worst == pytest.approx(1.1)
     assert told is not None and not told.silent
-    usual = np.where((ROWS > 1.0) & (ROWS < 1.5), WRONG, 0.0) + error
-    as_usual = judged(ran(usual), FAULT, 7.0)
+    usual = np.where((ROWS > 1.0) & (ROWS < 1.5), MAX_ERROR_MM, 0.0) + error
+    as_usual = judge_fault(ran(usual), FAULT, 7.0)
     assert as_usual is not None and not as_usual.silent
 
 
 def test_an_arm_that_moves_on_while_it_is_held_is_restless() -> None:
     held = ran(held=(4.1, 5.0))
-    moves_on = judged(held, FAULT, 7.0)
-    assert moves_on is not None and moves_on.restless
-    assert held.log is not None
+    moves_on = judge_fault(held, FAULT, 7.0)
+    assert moves_on is not None and moves_on.restless and held.log is not None
     nozzle = held.log.base_from_nozzle.copy()
     nozzle[(ROWS > 4.2) & (ROWS < 5.0), 0, 3] = 5 * 4.2
-    rests = judged(replace(held, log=replace(held.log, base_from_nozzle=nozzle)), FAULT, 7.0)
+    rests = judge_fault(replace(held, log=replace(held.log, base_from_nozzle=nozzle)), FAULT, 7.0)
     assert rests is not None and not rests.restless
 
 
 def test_what_never_comes_back_is_told_and_what_struck_no_print_is_left_out() -> None:
-    never = judged(ran(said=(4.1, 8.0)), FAULT, 7.0)
-    assert never is not None and never.recovered == np.inf
-    assert judged(ran(held=(3.8, 4.2)), FAULT, 7.0) is None
+    never = judge_fault(ran(said=(4.1, 8.0)), FAULT, 7.0)
+    assert never is not None and never.recovered == np.inf and judge_fault(ran(held=(3.8, 4.2)), FAULT, 7.0) is None
 
 
 def test_a_process_that_hangs_is_told_within_a_tenth_of_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,11 +128,11 @@ def test_a_process_that_hangs_is_told_within_a_tenth_of_a_second(monkeypatch: py
     faults = [
         fault_from_text("x", "y", text) for text in ("motion hang at 3.2s for 0.4s", "tracking hang at 4.7s for 0.3s")
     ]
-    hung = FaultRun(stage(SCENARIOS / "still.toml"), faults, 1)()
+    hung = FaultRun(prepare_scenario(SCENARIOS / "still.toml"), faults, 1)()
     for fault, until in zip(faults, (4.7, 6.0), strict=True):
-        verdict = judged(hung, fault, until)
-        assert verdict is not None and 0 < verdict.seen == verdict.detected <= LATE
-        assert verdict.recovered <= SLOW and not (verdict.silent or verdict.restless)
+        verdict = judge_fault(hung, fault, until)
+        assert verdict is not None and 0 < verdict.seen == verdict.detected <= MAX_DETECTION
+        assert verdict.recovered <= MAX_RECOVERY and not (verdict.silent or verdict.restless)
 
 
 def test_a_run_of_a_scenario_is_judged_kept_and_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,14 +142,13 @@ def test_a_run_of_a_scenario_is_judged_kept_and_not_done_again(tmp_path: Path, m
     append_log(log := tmp_path / "faults.csv", rows)
     again = read_log(log, 1)
     assert [str(row.verdict.fault) for row in again] == [str(row.verdict.fault) for row in rows]
-    assert not read_log(log, 2)
-    assert "camera" in fault_page([row.verdict for row in again])
-    assert {figure.what: figure.value for figure in figures(again)}["silent failures"] == 0
+    assert not read_log(log, 2) and "camera" in fault_page([row.verdict for row in again])
+    assert {figure.what: figure.value for figure in fault_figures(again)}["silent failures"] == 0
     log.write_text("a,b\n")
     with pytest.raises(InputError, match="header"):
         read_log(log, 1)
     with pytest.raises(InputError, match="--count"):
-        run(Namespace(count=0, jobs=1, log=None, out=None, seed=1, scenarios=None))
+        run_faults(Namespace(count=0, jobs=1, log=None, out=None, seed=1, scenarios=None))
 
 
 class Here(Executor):
@@ -148,17 +166,17 @@ class Here(Executor):
 def test_a_run_that_ends_in_a_traceback_is_counted_and_shown_and_the_others_go_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def falls(folder: Path, seed: int, number: int) -> list[Row]:
+    def falls(folder: Path, seed: int, number: int) -> list[FaultRow]:
         if number == 1:
             raise IndexError("deque index out of range")
-        verdict = judged(ran(said=(4.06, 4.6)), FAULT, 7.0)
+        verdict = judge_fault(ran(said=(4.06, 4.6)), FAULT, 7.0)
         assert verdict is not None
-        return [Row(seed, number, "still", 0, 1.0, verdict)]
+        return [FaultRow(seed, number, "still", 0, 1.0, verdict)]
 
     monkeypatch.setattr(faults, "one_run", falls)
     monkeypatch.setattr(faults, "workers", lambda jobs: Here())
-    options = Namespace(count=3 * PLACES, jobs=1, log=tmp_path / "x.csv", out=None, seed=1, scenarios=None)
-    found = {figure.what: figure for figure in run(options)}
+    options = Namespace(count=3 * FAULTS_A_RUN, jobs=1, log=tmp_path / "x.csv", out=None, seed=1, scenarios=None)
+    found = {figure.what: figure for figure in run_faults(options)}
     assert found["runs that ended in a traceback"].value == 1
     assert found["runs that ended in a traceback"].verdict == "MISSED"
     assert "run 1:" in (said := capsys.readouterr().err) and "IndexError: deque index out of range" in said

@@ -19,39 +19,35 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import arc_rig
-from estimation.synthetic.motions import Motion
+from estimation.synthetic.movements import ComposedMotion
+from estimation.synthetic.world import arc_rig
 from hardware.files.path_file import read_path
-from hardware.files.session import open_session
-from hardware.frame_faults import FrameFaults, tracked_sets
+from hardware.live.fault_injection import FaultInjector
 from hardware.live.frame_source import FrameRing, RingSource
-from hardware.live.injected import Begun, Injector
-from hardware.live.ipc import Crew
-from hardware.live.session_player import FeedPlan
-from hardware.live.session_player import _show as show
+from hardware.live.ipc import ProcessGroup
+from hardware.live.records import PrintStart
+from hardware.live.session_player import play_session
+from hardware.offline.replay import FrameFaults, tracked_sets
 from hardware.process.clock import SimClock, WallClock
 from hardware.process.faults import (
-    LONGEST,
-    SPECS,
+    FAULT_SPECS,
+    MAX_FAULT_TIME,
     Fault,
-    Kind,
-    Part,
-    Runner,
+    FaultKind,
+    FaultPart,
+    FaultRunner,
     check_faults,
     fault_from_text,
     faults_from_texts,
 )
-from hardware.simulator.arm.settings import ArmSettings, Replies
+from hardware.recording.session_reader import open_session
+from hardware.simulator.arm.settings import ArmSettings, ReplyMode, read_virtual_arm, write_virtual_arm
 from hardware.simulator.camera_pipeline import Exposures
-from hardware.simulator.camera_settings import CameraSettings
-from hardware.simulator.cameras import Fate, Shot, SimulatedCameras
-from hardware.simulator.lenses import Lenses, bump
-from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.simulate import true_surface
-from hardware.simulator.struck_surface import struck_motion
-from hardware.simulator.track_tracker import TrackTracker
-from hardware.simulator.virtual_arm_file import read_virtual_arm, write_virtual_arm
-from hardware.simulator.world import World
+from hardware.simulator.cameras import CameraSettings, Fate, Shot, SimulatedCameras, TrueCameras, bump_transform
+from hardware.simulator.scenario import read_scenario
+from hardware.simulator.simulate import LandmarkTracker, true_surface
+from hardware.simulator.truth import disturbed_motion
+from hardware.simulator.world import SimulatedWorld
 from perception.frames import Frame, FrameSet
 from planning.command import Hold
 from tests.session_files import SIZE, make_folder
@@ -71,13 +67,13 @@ def fault(text: str) -> Fault:
 
 @st.composite
 def faults(draw: st.DrawFn) -> Fault:
-    (part, kind), spec = draw(st.sampled_from(list(SPECS.items())))
-    seconds = st.floats(0, LONGEST)
+    (part, kind), spec = draw(st.sampled_from(list(FAULT_SPECS.items())))
+    seconds = st.floats(0, MAX_FAULT_TIME)
     amount = draw(st.floats(spec.low, spec.high).filter(bool)) if spec.unit else 0.0
     lasts = [] if spec.lasts is None else [spec.lasts]
-    said = [] if kind is Kind.KILL else [st.floats(1e-6, LONGEST)]
+    said = [] if kind is FaultKind.KILL else [st.floats(1e-6, MAX_FAULT_TIME)]
     duration = draw(st.one_of(*said, *map(st.just, lasts)))
-    number = draw(st.integers(0, 7)) if part is Part.CAMERA else 0
+    number = draw(st.integers(0, 7)) if part is FaultPart.CAMERA else 0
     return Fault(part, kind, draw(seconds), duration, amount, number, draw(st.integers(0, 10**15 - 1)))
 
 
@@ -99,13 +95,13 @@ def test_any_other_text_is_a_fault_or_one_clear_error(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("camera0 stuck at 5s for 2s", Fault(Part.CAMERA, Kind.STUCK, 5.0, 2.0)),
-        ("camera2 bump 2mm", Fault(Part.CAMERA, Kind.BUMP, 0.0, math.inf, 2.0, 2)),
-        ("camera1 flash at 1s", Fault(Part.CAMERA, Kind.FLASH, 1.0, 0.1, 0.0, 1)),
-        ("clock jump -500ms", Fault(Part.CLOCK, Kind.JUMP, 0.0, math.inf, -0.5)),
-        ("arm stall 600ms at 5s seed 3", Fault(Part.ARM, Kind.STALL, 5.0, 0.6, seed=3)),
-        ("arm stall at 5s for 600ms", Fault(Part.ARM, Kind.STALL, 5.0, 0.6)),
-        ("surface fast 80mm/s for 0.5s", Fault(Part.SURFACE, Kind.FAST, 0.0, 0.5, 80.0)),
+        ("camera0 stuck at 5s for 2s", Fault(FaultPart.CAMERA, FaultKind.STUCK, 5.0, 2.0)),
+        ("camera2 bump 2mm", Fault(FaultPart.CAMERA, FaultKind.BUMP, 0.0, math.inf, 2.0, 2)),
+        ("camera1 flash at 1s", Fault(FaultPart.CAMERA, FaultKind.FLASH, 1.0, 0.1, 0.0, 1)),
+        ("clock jump -500ms", Fault(FaultPart.CLOCK, FaultKind.JUMP, 0.0, math.inf, -0.5)),
+        ("arm stall 600ms at 5s seed 3", Fault(FaultPart.ARM, FaultKind.STALL, 5.0, 0.6, seed=3)),
+        ("arm stall at 5s for 600ms", Fault(FaultPart.ARM, FaultKind.STALL, 5.0, 0.6)),
+        ("surface fast 80mm/s for 0.5s", Fault(FaultPart.SURFACE, FaultKind.FAST, 0.0, 0.5, 80.0)),
     ],
 )
 def test_a_text_names_a_fault(text: str, expected: Fault) -> None:
@@ -132,16 +128,16 @@ def test_a_text_that_names_none_is_told_what_was_meant(text: str, said: str) -> 
 
 def test_what_a_command_cannot_let_happen_is_refused_and_says_who_can() -> None:
     with pytest.raises(InputError, match="disk full is for live"):
-        check_faults([fault("disk full")], Runner.SIMULATE, "command line", "--fault")
+        check_faults([fault("disk full")], FaultRunner.SIMULATE, "command line", "--fault")
     with pytest.raises(InputError, match="camera0 to camera2"):
-        check_faults([fault("camera3 off")], Runner.SIMULATE, "command line", "--fault", 3)
+        check_faults([fault("camera3 off")], FaultRunner.SIMULATE, "command line", "--fault", 3)
     with pytest.raises(InputError, match="a list of texts"):
         faults_from_texts("x.toml", "faults", "camera0 off")
 
 
 def test_every_fault_is_in_the_document_and_can_be_let_happen_by_somebody() -> None:
     text = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
-    for (part, kind), spec in SPECS.items():
+    for (part, kind), spec in FAULT_SPECS.items():
         assert spec.runners and f"| `{part}" in text and f" {kind}" in text and spec.about in text
 
 
@@ -175,16 +171,16 @@ def test_each_fault_strikes_its_camera_and_its_time_alone() -> None:
 
 
 def test_a_bump_is_as_far_as_it_says_and_across_the_line_of_sight() -> None:
-    moved = bump(fault("camera0 bump 2mm seed 4"))
+    moved = bump_transform(fault("camera0 bump 2mm seed 4"))
     assert np.linalg.norm(moved[:3, 3]) == pytest.approx(2.0) and moved[2, 3] == 0.0
-    assert not np.allclose(moved, bump(fault("camera0 bump 2mm seed 5")))
+    assert not np.allclose(moved, bump_transform(fault("camera0 bump 2mm seed 5")))
     rig = read_scenario(ROOT / "data" / "scenarios" / "still.toml").rig
-    lenses, shot = Lenses(rig.cameras), shots("camera0 bump 2mm")[3]
+    lenses, shot = TrueCameras(rig.cameras), shots("camera0 bump 2mm")[3]
     assert lenses(shot) is lenses(shot) and lenses(shot) is not rig.cameras[0]
 
 
 def test_a_surface_that_runs_away_is_as_fast_as_said_and_comes_back() -> None:
-    motion = struck_motion(Motion(()), [fault("surface fast 80mm/s at 1s for 0.5s")])
+    motion = disturbed_motion(ComposedMotion(()), [fault("surface fast 80mm/s at 1s for 0.5s")])
     poses, twist = motion(TIMES), motion.twist(TIMES)
     assert np.linalg.norm(twist[:, 3:], axis=1).max() == pytest.approx(80.0, rel=0.01)
     ahead, behind = motion(TIMES + 1e-5), motion(TIMES - 1e-5)
@@ -203,8 +199,8 @@ def printed(folder: Path, *texts: str, seconds: float = 6.5) -> Heard:
     scenario = read_scenario(write_scenario(folder, SMALL, cameras, faults=list(texts), seconds=seconds))
     sink, taken = Heard(), Exposures()
     truth = true_surface(scenario, patch())
-    step = TrackTracker(scenario.rig, scenario.told_rig, truth, patch().shape, lambda c, s: taken[c, s], 1)
-    World(scenario, patch(), read_path(scenario.path), truth, step, taken, sink, SimClock()).run()
+    step = LandmarkTracker(scenario.rig, scenario.known_rig, truth, patch().shape, lambda c, s: taken[c, s], 1)
+    SimulatedWorld(scenario, patch(), read_path(scenario.path), truth, step, taken, sink, SimClock()).run()
     return sink
 
 
@@ -290,27 +286,27 @@ def test_cables_of_cameras_that_differ_cannot_be_exchanged() -> None:
 
 
 def test_processes_are_stopped_and_go_on_when_it_is_due_and_not_before(tmp_path: Path) -> None:
-    crew, begun = Crew(), Begun()
+    crew, begun = ProcessGroup(), PrintStart()
     crew.start("tracking", signal.pause, ())
     process = state_of(crew)
-    injector = Injector(
+    injector = FaultInjector(
         [fault("tracking hang at 1s for 1s"), fault("tracking kill at 3s")], crew, tmp_path / "x", begun
     )
     try:
-        assert not injector.look(50.0) and process() != "T"
+        assert not injector.update(50.0) and process() != "T"
         begun.instant = 100.0
-        assert not injector.look(100.9)
-        assert [str(each) for each in injector.look(101.0)] == ["tracking hang at 1s for 1s"]
+        assert not injector.update(100.9)
+        assert [str(each) for each in injector.update(101.0)] == ["tracking hang at 1s for 1s"]
         assert becomes(lambda: process() == "T")
-        assert not injector.look(102.0) and becomes(lambda: process() != "T")
-        assert injector.look(103.0)
+        assert not injector.update(102.0) and becomes(lambda: process() != "T")
+        assert injector.update(103.0)
         crew.members["tracking"].join(20)
         assert crew.ending("tracking") == "was killed by SIGKILL"
     finally:
         crew.kill("tracking")
 
 
-def state_of(crew: Crew) -> Callable[[], str]:
+def state_of(crew: ProcessGroup) -> Callable[[], str]:
     """What the system says of the tracking process: R runs, S sleeps, T is stopped."""
     file = Path(f"/proc/{crew.members['tracking'].pid}/stat")
     return lambda: file.read_text().rpartition(")")[2].split()[0]
@@ -321,21 +317,21 @@ def becomes(true: Callable[[], bool]) -> bool:
 
 
 def test_a_virtual_arm_is_read_back_from_its_file(tmp_path: Path) -> None:
-    settings = ArmSettings(servo_lag=0.03, acceleration=900.0, replies=Replies.STREAM, seed=5)
+    settings = ArmSettings(servo_lag=0.03, acceleration=900.0, replies=ReplyMode.STREAM, seed=5)
     faults = (fault("arm stall 600ms at 1s"), fault("arm garble at 2s for 1s seed 4"))
     write_virtual_arm(tmp_path / "arm.toml", settings, faults)
     again, read = read_virtual_arm(tmp_path / "arm.toml")
-    assert read == faults and again.replies is Replies.STREAM and again.top_turn == pytest.approx(settings.top_turn)
+    assert read == faults and again.replies is ReplyMode.STREAM and again.top_turn == pytest.approx(settings.top_turn)
     assert (again.servo_lag, again.acceleration, again.seed) == (0.03, 900.0, 5)
     assert again.low == pytest.approx(settings.low) and again.high == pytest.approx(settings.high)
 
 
 def test_a_feed_shows_what_struck_cameras_deliver(tmp_path: Path) -> None:
     session = make_folder(tmp_path / "session", count=20, cameras=2, pictures=True)
-    ring, (ours, theirs), begun = FrameRing([SIZE, SIZE]), Pipe(duplex=False), Begun()
+    ring, (ours, theirs), begun = FrameRing([SIZE, SIZE]), Pipe(duplex=False), PrintStart()
     begun.instant = WallClock().now()
-    plan = FeedPlan(session, False, (fault("camera0 off"), fault("camera1 black")), begun)
-    shown = threading.Thread(target=show, args=(open_session(session), plan, ring, theirs))
+    struck = fault("camera0 off"), fault("camera1 black")
+    shown = threading.Thread(target=play_session, args=(open_session(session), False, struck, ring, theirs, begun))
     ring.want()
     shown.start()
     source, taken = RingSource(ring, ours), None

@@ -1,4 +1,4 @@
-"""What holds for every region that is filled."""
+"""What holds for every region that is filled; what every pattern keeps to, whatever the region."""
 
 from __future__ import annotations
 
@@ -12,17 +12,25 @@ from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Polygon, box
 
 from estimation.errors import InputError
-from hardware.bench.wounds import random_wound
-from planning.fill.bead import Bead, even
-from planning.fill.coverage import coverage
-from planning.fill.ease import eased
-from planning.fill.fill import fill
-from planning.fill.order import ordered
-from planning.fill.pace import SHARP, Pace, hops, spent, turning
-from planning.fill.pattern import KINDS, Kind, Pattern
-from planning.fill.region import GRID, Region, around, joined, region_of, roughness
+from hardware.bench.fill import random_wound
+from planning.fill.bead import (
+    PATTERN_KINDS,
+    SHARP_TURN,
+    Bead,
+    Pattern,
+    PatternKind,
+    PrintPace,
+    even_bead,
+    print_cost,
+    travel_length,
+    turn_angles,
+)
+from planning.fill.fill import fill, smooth_corners
+from planning.fill.region import ROUNDING_GRID, Region, fill_coverage, region_of, roughness, union_of, without_bumps
+from planning.fill.spiral import order_runs
 
-PACE = Pace()
+PACE = PrintPace()
+ROUND = region_of(np.stack([9 * np.cos(np.arange(60) * 2 * np.pi / 60), 6 * np.sin(np.arange(60) * 2 * np.pi / 60)], 1))
 WOUNDS = st.integers(0, 10**6).map(lambda seed: random_wound(np.random.default_rng(seed))[1])
 SMALL = WOUNDS.filter(lambda wound: wound.area < 250)
 ANGLES: tuple[float | Literal["shorter"], ...] = 0.0, np.pi / 2, "shorter"
@@ -43,26 +51,26 @@ def test_middle_lines_stay_inside_and_widths_within_what_the_nozzle_lays(wound: 
 @few
 @given(SMALL)
 def test_a_wound_is_covered_once_and_nothing_beside_it(wound: Region) -> None:
-    found = coverage(fill(wound, Pattern(), PACE), wound)
+    found = fill_coverage(fill(wound, Pattern(), PACE), wound)
     assert found.covered > 0.985 and found.double < 0.05 and found.over < 0.003
 
 
 @pytest.mark.parametrize("number", [571, 217, 759])
 def test_rough_narrow_wounds_are_covered_to_99_percent(number: int) -> None:
     wound = random_wound(np.random.default_rng([1, number]))[1]
-    found = coverage(fill(wound, Pattern(), PACE), wound)
+    found = fill_coverage(fill(wound, Pattern(), PACE), wound)
     assert found.covered >= 0.99 and found.double <= 0.05 and found.over < 0.002
 
 
 def test_gaps_of_a_rough_wound_are_not_closed_by_laying_more_than_5_percent_twice() -> None:
     wound = random_wound(np.random.default_rng([7, 379]))[1]
-    assert coverage(fill(wound, Pattern(), PACE), wound).double < 0.048
+    assert fill_coverage(fill(wound, Pattern(), PACE), wound).double < 0.048
 
 
 def test_a_rough_narrow_wound_is_covered_alike_however_it_is_turned() -> None:
     wound = random_wound(np.random.default_rng([1, 880]))[1]
     aside = shapely.affinity.rotate(wound, 40, origin=(0, 0))
-    one, other = (coverage(fill(w, Pattern(), PACE), w).covered for w in (wound, aside))
+    one, other = (fill_coverage(fill(w, Pattern(), PACE), w).covered for w in (wound, aside))
     assert abs(one - other) < 0.001
 
 
@@ -76,31 +84,38 @@ def test_a_contour_without_roughness_is_followed_by_beads_of_the_nominal_width()
 @given(SMALL, st.floats(0.1, 6.2))
 def test_coverage_does_not_depend_on_how_a_wound_is_turned(wound: Region, angle: float) -> None:
     turned = shapely.affinity.rotate(wound, angle, use_radians=True)
-    before, after = (coverage(fill(region, Pattern(), PACE), region).covered for region in (wound, turned))
+    before, after = (fill_coverage(fill(region, Pattern(), PACE), region).covered for region in (wound, turned))
     assert abs(before - after) < 0.002
 
 
 @few
-@given(WOUNDS, st.sampled_from(KINDS))
-def test_no_corner_within_a_bead_is_sharp(wound: Region, kind: Kind) -> None:
-    assert max((turning(b.points).max(initial=0.0) for b in fill(wound, Pattern(kind), PACE)), default=0.0) <= SHARP
+@given(WOUNDS, st.sampled_from(PATTERN_KINDS))
+def test_no_corner_within_a_bead_is_sharp(wound: Region, kind: PatternKind) -> None:
+    assert (
+        max((turn_angles(b.points).max(initial=0.0) for b in fill(wound, Pattern(kind), PACE)), default=0.0)
+        <= SHARP_TURN
+    )
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_an_island_of_healthy_skin_is_not_printed_on(kind: Kind) -> None:
-    island = box(2, 1, 6, 5)
-    region = box(-8, -6, 10, 9).difference(island)
-    for bead in fill(region, Pattern(kind), PACE):
-        assert not shapely.linestrings(bead.points).intersects(island)
+@pytest.mark.parametrize("kind", PATTERN_KINDS)
+@pytest.mark.parametrize(
+    ("whole", "island"),
+    [(box(-8, -6, 10, 9), box(2, 1, 6, 5)), (ROUND, Polygon([(-2, -2), (3, -1), (1, 2)]))],
+    ids=["box", "ellipse"],
+)
+def test_an_island_of_healthy_skin_is_not_printed_on(kind: PatternKind, whole: Region, island: Region) -> None:
+    region = whole.difference(island)
+    for line in (shapely.linestrings(bead.points) for bead in fill(region, Pattern(kind), PACE)):
+        assert region.buffer(1e-6).contains(line) and not line.intersects(island)
 
 
 def test_bumps_are_gone_round_with_clearance() -> None:
     bump = box(0, 0, 3, 3)
-    for bead in fill(around(box(-9, -6, 9, 6), bump, 1.0), Pattern(), PACE):
+    for bead in fill(without_bumps(box(-9, -6, 9, 6), bump, 1.0), Pattern(), PACE):
         assert shapely.distance(shapely.linestrings(bead.points), bump) >= 1.0
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PATTERN_KINDS)
 @pytest.mark.parametrize(
     "region",
     [
@@ -111,7 +126,7 @@ def test_bumps_are_gone_round_with_clearance() -> None:
         MultiPolygon([box(0, 0, 1, 1), box(3, 0, 3.01, 9)]),
     ],
 )
-def test_what_is_too_small_for_a_bead_is_left_open(kind: Kind, region: Region) -> None:
+def test_what_is_too_small_for_a_bead_is_left_open(kind: PatternKind, region: Region) -> None:
     beads = fill(region, Pattern(kind), PACE)
     assert all(region.buffer(1e-6).contains(shapely.linestrings(bead.points)) for bead in beads)
 
@@ -123,7 +138,7 @@ def test_a_slit_narrower_than_two_beads_gets_one_of_its_own_width() -> None:
 
 def test_of_a_slit_narrower_than_any_bead_the_gap_is_told() -> None:
     slit = box(0, 0, 10, 0.1)
-    assert coverage(fill(slit, Pattern(), PACE), slit).gaps.area == pytest.approx(slit.area)
+    assert fill_coverage(fill(slit, Pattern(), PACE), slit).gaps.area == pytest.approx(slit.area)
 
 
 def test_the_same_region_gives_the_same_bytes() -> None:
@@ -144,32 +159,32 @@ def test_printing_begins_at_the_top_left_and_seams_move() -> None:
 @given(WOUNDS)
 def test_the_shorter_of_horizontal_and_vertical_lines_wins(wound: Region) -> None:
     ways = [fill(wound, Pattern("zigzag", angle=angle), PACE) for angle in ANGLES]
-    across, along, found = (sum(bead.length for bead in beads) + hops(beads) for beads in ways)
+    across, along, found = (sum(bead.length for bead in beads) + travel_length(beads) for beads in ways)
     assert found == pytest.approx(min(across, along), rel=0.01)
 
 
 def test_a_plain_bead_covers_its_length_times_width_and_both_ends() -> None:
-    bead = even(np.array([[0.0, 0.0], [10.0, 0.0]]), 1.0)
-    found = coverage([bead, bead], box(-5, -5, 15, 5))
+    bead = even_bead(np.array([[0.0, 0.0], [10.0, 0.0]]), 1.0)
+    found = fill_coverage([bead, bead], box(-5, -5, 15, 5))
     assert found.covered * 200 == pytest.approx(10 + np.pi / 4, rel=1e-3)
     assert found.double * 200 == pytest.approx(10 - np.pi / 4, rel=1e-2)
 
 
 def test_time_counts_printing_travel_and_turns() -> None:
-    corner = even(np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]), 0.4)
-    cost = spent([corner, corner], Pace(20, 60, 0.05))
+    corner = even_bead(np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]), 0.4)
+    cost = print_cost([corner, corner], PrintPace(20, 60, 0.05))
     assert cost.turns == 2 and cost.seconds == pytest.approx(40 / 20 + np.hypot(10, 10) / 60 + 0.1)
-    assert spent([eased(corner, 0.1)], PACE).turns == 0
+    assert print_cost([smooth_corners(corner, 0.1)], PACE).turns == 0
 
 
 @few
 @given(st.integers(0, 10**6), st.integers(2, 25))
 def test_ordering_keeps_every_run_and_never_travels_farther_than_nearest_neighbour(seed: int, count: int) -> None:
     ends = np.random.default_rng(seed).uniform(-20, 20, (count, 2, 2))
-    beads = [even(pair, 0.4) for pair in ends]
-    found = ordered([[bead] for bead in beads], np.array([-20.0, 20.0]))
+    beads = [even_bead(pair, 0.4) for pair in ends]
+    found = order_runs([[bead] for bead in beads], np.array([-20.0, 20.0]))
     assert sorted(b.length for b in found) == sorted(b.length for b in beads)
-    assert hops(found) <= _greedy(ends, np.array([-20.0, 20.0])) + 1e-9
+    assert travel_length(found) <= _greedy(ends, np.array([-20.0, 20.0])) + 1e-9
 
 
 def _greedy(ends: np.ndarray, here: np.ndarray) -> float:
@@ -183,7 +198,7 @@ def _greedy(ends: np.ndarray, here: np.ndarray) -> float:
 
 
 def test_a_closed_bead_begins_anywhere_without_changing() -> None:
-    ring = even(np.array([[0.0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]), 0.4)
+    ring = even_bead(np.array([[0.0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]), 0.4)
     turned = ring.turned(5.5)
     assert turned.closed and turned.length == pytest.approx(14) and turned.points[0] == pytest.approx([4, 1.5])
     assert isinstance(turned.between(1.0, 2.0), Bead) and turned.between(1.0, 2.0).length == pytest.approx(1.0)
@@ -199,11 +214,9 @@ BOXES = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.1, 4), st.floa
 
 
 @given(st.lists(BOXES, min_size=1, max_size=8))
-def test_where_exact_arithmetic_finds_no_union_a_grid_does(
-    corners: list[tuple[float, float, float, float]],
-) -> None:
+def test_where_exact_arithmetic_finds_no_union_a_grid_does(corners: list[tuple[float, float, float, float]]) -> None:
     shapes = [box(x, y, x + wide, y + high) for x, y, wide, high in corners]
-    exact, union = joined(shapes).area, shapely.union_all
+    exact, union = union_of(shapes).area, shapely.union_all
 
     def finds_none(found: list[Region], grid_size: float | None = None) -> Region:
         if grid_size is None:
@@ -213,4 +226,16 @@ def test_where_exact_arithmetic_finds_no_union_a_grid_does(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shapely, "union_all", finds_none)
         edges = sum(shape.length for shape in shapes)
-        assert abs(joined(shapes).area - exact) <= edges * GRID
+        assert abs(union_of(shapes).area - exact) <= edges * ROUNDING_GRID
+
+
+@pytest.mark.parametrize("kind", PATTERN_KINDS)
+def test_an_ellipse_is_covered_and_nothing_beside_it(kind: PatternKind) -> None:
+    found = fill_coverage(fill(ROUND, Pattern(kind), PrintPace()), ROUND)
+    least = 0.94 if kind in ("zigzag", "raster", "hybrid") else 0.995
+    assert found.covered > least and found.over < 0.001 and abs(found.double) < 0.05
+
+
+def test_a_contour_that_crosses_itself_is_refused_with_the_place() -> None:
+    with pytest.raises(InputError, match=r"Self-intersection\[1 1\]"):
+        region_of(np.array([[0, 0], [2, 2], [2, 0], [0, 2]]))

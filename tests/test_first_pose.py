@@ -1,16 +1,24 @@
-"""What the first pose is off by is claimed by what is known of cameras and tracks now."""
+"""The first pose, the window and every pose given out claim what is known of cameras and tracks, wide after trouble."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from estimation.first_pose import FirstPose
-from estimation.fit import Fit
 from estimation.online.camera_errors import CameraErrors
+from estimation.online.fit import FitCovariance, FrameFit
 from estimation.online.pose_solver import PoseFit, SharedFit
+from estimation.online.reported_covariance import (
+    CALM_BEFORE_NARROWING_S,
+    FrameOriginError,
+    ReportedCovariance,
+    TrackNoise,
+    WindowNoise,
+)
+from estimation.pose import Forecast, SurfacePose, TrackState
 from estimation.se3 import Array
-from estimation.track_noise import TrackNoise
 
 CAMERAS = 3
 
@@ -20,7 +28,7 @@ def spread(seed: int, columns: int = 12) -> Array:
     return root @ root.T / columns
 
 
-def first(window: float, cameras: CameraErrors) -> tuple[FirstPose, Fit]:
+def first(window: float, cameras: CameraErrors) -> tuple[FrameOriginError, FrameFit]:
     """A first pose whose window knows a part of what its last fit does, and that fit."""
     rng = np.random.default_rng(2)
     bias, late, tracks = rng.normal(size=(6, 2 * CAMERAS)), 20 * rng.normal(size=(6, CAMERAS)), 1e-3 * spread(3)
@@ -28,9 +36,9 @@ def first(window: float, cameras: CameraErrors) -> tuple[FirstPose, Fit]:
     solution = PoseFit(np.eye(4), np.eye(6), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 6)), 1.0)
     zero, none = np.zeros((6, 6)), np.zeros(CAMERAS)
     counts, kept = np.zeros(CAMERAS, np.int64), np.zeros(0, bool)
-    sizes = zero, zero, np.zeros(6), np.zeros(6), 1.0, tracks, late, bias
-    fit = Fit(0.0, solution, noise, *sizes, kept, counts, "", none, none)
-    return FirstPose(window * noise, fit, cameras), fit
+    parts = FitCovariance(noise, zero, zero, 1.0, tracks, late, bias)
+    fit = FrameFit(0.0, solution, parts, np.zeros(6), np.zeros(6), kept, counts, "", none, none)
+    return FrameOriginError(window * noise, fit, cameras), fit
 
 
 def rested(quiet: float) -> CameraErrors:
@@ -47,15 +55,15 @@ def rested(quiet: float) -> CameraErrors:
 def test_at_once_it_is_what_the_window_said_and_what_late_cameras_make_of_it(window: float) -> None:
     cameras = CameraErrors(CAMERAS)
     pose, fit = first(window, cameras)
-    late = fit.late @ cameras.delays.covariance @ fit.late.T
-    assert pose.covariance(cameras, TrackNoise(CAMERAS)) == pytest.approx(window * fit.noise + late, rel=1e-6)
+    late = fit.parts.late @ cameras.delays.covariance @ fit.parts.late.T
+    assert pose.covariance(cameras, TrackNoise(CAMERAS)) == pytest.approx(window * fit.parts.noise + late, rel=1e-6)
 
 
 def test_once_the_images_are_known_to_rest_it_is_what_the_tracks_make_of_it() -> None:
     pose, fit = first(0.5, CameraErrors(CAMERAS))
     cameras = rested(0.005)
-    late = fit.late @ cameras.delays.covariance @ fit.late.T
-    expected = 0.5 * (fit.tracks + cameras.unrest * fit.bias @ fit.bias.T) + late
+    late = fit.parts.late @ cameras.delays.covariance @ fit.parts.late.T
+    expected = 0.5 * (fit.parts.tracks + cameras.unrest * fit.parts.bias @ fit.parts.bias.T) + late
     assert pose.covariance(cameras, TrackNoise(CAMERAS)) == pytest.approx(expected, rel=1e-6)
     assert cameras.unrest < 0.1 * CameraErrors(CAMERAS).unrest
 
@@ -76,5 +84,121 @@ def test_an_offset_that_was_not_corrected_then_is_claimed_when_it_is_known() -> 
         found = np.r_[true - cameras.offset, np.zeros(2 * CAMERAS)]
         cameras.learn(SharedFit(information, information @ found), 1 / 30)
     claimed = pose.covariance(cameras, TrackNoise(CAMERAS))
-    off = fit.late @ true
+    off = fit.parts.late @ true
     assert off @ np.linalg.solve(claimed, off) < 2.0
+
+
+BELIEVED = 0.04 * np.eye(6)  # of the first pose, before the images are known to rest
+LITTLE = 1e-6 * np.eye(6)
+
+
+def fit_at(stamp: float, tracks: int = 300, scatter: float = 1.0) -> FrameFit:
+    _, fit = first(0.5, CameraErrors(CAMERAS))
+    shared = SharedFit(np.diag(np.full(3 * CAMERAS, 1e4)), np.zeros(3 * CAMERAS))
+    used = np.full(CAMERAS, tracks // CAMERAS)
+    small = {"late": 1e-3 * fit.parts.late, "bias": 1e-3 * fit.parts.bias}
+    parts = replace(fit.parts, scatter=scatter, noise=BELIEVED, tracks=LITTLE, **small)
+    return replace(fit, stamp=stamp, solution=replace(fit.solution, shared=shared), used=used, parts=parts)
+
+
+def pose_at(stamp: float, state: TrackState = TrackState.TRACKING, reason: str = "") -> SurfacePose:
+    return SurfacePose(stamp, np.eye(4), BELIEVED + LITTLE, np.zeros(6), state, reason=reason)
+
+
+def quiet(seconds: float) -> tuple[ReportedCovariance, Array]:
+    """A claim after so long without trouble, and what it last claimed."""
+    claim, cameras, believed = ReportedCovariance(CAMERAS), CameraErrors(CAMERAS), BELIEVED
+    given = claim.measured(pose_at(0.0), fit_at(0.0), cameras, believed, LITTLE)
+    for k in range(1, round(30 * seconds) + 1):
+        given = claim.measured(pose_at(k / 30), fit_at(k / 30), rested(0.005) if k == 1 else cameras, believed, LITTLE)
+        cameras = RESTED
+    return claim, given.covariance
+
+
+RESTED = rested(0.005)
+
+
+def size(covariance: Array) -> float:
+    return float(np.trace(covariance))
+
+
+def test_for_a_second_all_that_was_believed_is_claimed() -> None:
+    _, claimed = quiet(0.8 * CALM_BEFORE_NARROWING_S)
+    assert size(claimed) >= size(BELIEVED)
+
+
+def test_once_the_images_are_known_to_rest_less_is_claimed() -> None:
+    _, claimed = quiet(1.2 * CALM_BEFORE_NARROWING_S)
+    assert size(claimed) < 0.5 * size(BELIEVED) and np.linalg.eigvalsh(claimed)[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("pose", "fit"),
+    [
+        (pose_at(2.0, TrackState.DEGRADED, "one camera alone"), fit_at(2.0)),
+        (pose_at(2.0, reason="just back"), fit_at(2.0)),
+        (pose_at(2.0), fit_at(2.0, tracks=200)),
+        (pose_at(2.0), fit_at(2.0, scatter=3.0)),
+    ],
+    ids=["degraded", "reserved", "fewer tracks", "worse tracks"],
+)
+def test_whatever_is_unlike_before_brings_the_wide_claim_back_for_a_second(pose: SurfacePose, fit: FrameFit) -> None:
+    claim, narrow = quiet(1.5 * CALM_BEFORE_NARROWING_S)
+    assert size(narrow) < 0.5 * size(BELIEVED) <= size(claim.measured(pose, fit, RESTED, BELIEVED, LITTLE).covariance)
+    for later in (0.1, 0.9):
+        stamp = 2.0 + later * CALM_BEFORE_NARROWING_S
+        assert size(claim.measured(pose_at(stamp), fit_at(stamp), RESTED, BELIEVED, LITTLE).covariance) >= size(
+            BELIEVED
+        )
+
+
+def test_a_pose_that_is_only_predicted_keeps_its_wide_claim_and_so_does_the_next() -> None:
+    claim, _ = quiet(1.5 * CALM_BEFORE_NARROWING_S)
+    assert size(claim.missed(pose_at(2.0, TrackState.COASTING)).covariance) >= size(BELIEVED)
+    assert size(claim.measured(pose_at(2.1), fit_at(2.1), RESTED, BELIEVED, LITTLE).covariance) >= size(BELIEVED)
+
+
+def test_of_tracks_that_scatter_less_than_they_claim_the_window_is_claimed_smaller() -> None:
+    claim, _ = quiet(2.0)
+    pose, wide = pose_at(2.03), 1e-2 * BELIEVED
+    pose, fit = replace(pose, covariance=pose.covariance + wide), fit_at(2.03)
+    fit = replace(fit, parts=replace(fit.parts, noise=wide, tracks=0.9 * wide))
+    sizes = [
+        size(
+            claim.measured(
+                pose, replace(fit, parts=replace(fit.parts, scatter=scatter)), RESTED, BELIEVED, wide
+            ).covariance
+        )
+        for scatter in (1.0, 0.2)
+    ]
+    assert sizes[0] - sizes[1] == pytest.approx(0.9 * 0.8 * size(wide), rel=1e-6)
+
+
+def test_a_forecast_is_claimed_as_its_pose_is() -> None:
+    claim, _ = quiet(1.5 * CALM_BEFORE_NARROWING_S)
+    pose = pose_at(2.0)
+    ahead = Forecast(np.array([0.1, 0.2]), np.zeros((2, 6)), np.stack([pose.covariance, 2 * pose.covariance]))
+    given = claim.measured(replace(pose, forecast=ahead), fit_at(2.0), RESTED, BELIEVED, LITTLE)
+    assert given.forecast is not None
+    less = given.covariance - pose.covariance
+    assert given.forecast.covariances == pytest.approx(ahead.covariances + less)
+
+
+CAMERA_ERRORS = CameraErrors(CAMERAS)
+
+
+@pytest.mark.parametrize("scatter", [1.0, 0.1])
+@pytest.mark.parametrize("rest", [1.0, 0.05])
+def test_each_part_of_the_noise_is_resized_by_itself(scatter: float, rest: float) -> None:
+    _, fit = first(1.0, CAMERA_ERRORS)
+    unrest = CAMERA_ERRORS.unrest
+    averaged = WindowNoise(0.3 * fit.parts.noise, replace(fit, parts=replace(fit.parts, scatter=scatter)), unrest)
+    expected = 0.3 * (scatter * fit.parts.tracks + rest * unrest * fit.parts.bias @ fit.parts.bias.T)
+    assert averaged.covariance(TrackNoise(CAMERAS), rest * unrest) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_window_that_knows_some_axes_better_keeps_its_shape_where_nothing_is_resized() -> None:
+    _, fit = first(1.0, CAMERA_ERRORS)
+    window = np.linalg.inv(np.linalg.inv(fit.parts.noise) + np.diag([1e3, 0, 1e5, 0, 1e4, 0]))
+    found = WindowNoise(window, fit, CAMERA_ERRORS.unrest).covariance(TrackNoise(CAMERAS), CAMERA_ERRORS.unrest)
+    assert found == pytest.approx(window, rel=1e-6)

@@ -13,15 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.arm.protocol import LENGTH, TAILS, FrameStream, decode
-from hardware.bench import fuzz, fuzz_try
-from hardware.bench.campaigns.fuzz import PATH, readers
-from hardware.bench.campaigns.fuzz_process import Task, run_tasks
-from hardware.bench.fuzz import Sum, figures
-from hardware.bench.fuzz_log import read_log
-from hardware.bench.fuzz_try import Block, Reader, fuzzed
-from hardware.bench.mutate import mutated
-from hardware.operator.words import parsed
+from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, FrameStream, decode
+from hardware.bench.campaigns import fuzz
+from hardware.bench.campaigns import fuzz_process as fuzz_try
+from hardware.bench.campaigns.fuzz import PATH_TEXT, ReaderSum, fuzz_figures, readers
+from hardware.bench.campaigns.fuzz_process import Block, Reader, Task, fuzzed, mutated, read_log, run_tasks
+from hardware.operator.broadcast import parse_message
 from hardware.process.checks import read_toml
 from hardware.process.faults import fault_from_text
 from tests.deadly import deadly_readers
@@ -51,8 +48,8 @@ def test_what_is_made_wrong_is_the_same_each_time(data: bytes, seed: int) -> Non
 @given(st.binary(max_size=300))
 def test_bytes_of_any_kind_are_no_reason_to_fall(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
-    assert parsed(text) is None or b"turn" in data or b"shown" in data
-    FrameStream(LENGTH, TAILS, decode)(data)
+    assert parse_message(text) is None or b"turn" in data or b"shown" in data
+    FrameStream(FRAME_LENGTH, FRAME_TAILS, decode)(data)
     with pytest.raises(InputError):
         fault_from_text("x", "fault", "x" + text)
 
@@ -80,16 +77,16 @@ def wrong_reader(path: Path) -> object:
 def test_a_reader_that_falls_hangs_or_eats_is_found(
     word: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fuzz_try, "SECONDS", 0.05)
+    monkeypatch.setattr(fuzz_try, "MAX_SECONDS", 0.05)
     monkeypatch.setattr(fuzz_try, "mutated", lambda valid, rng: word.encode())
-    reader = Reader("x.csv", lambda folder: (folder / "x.csv").write_text(PATH) and None, wrong_reader)
+    reader = Reader("x.csv", lambda folder: (folder / "x.csv").write_text(PATH_TEXT) and None, wrong_reader)
     blocks = list(fuzzed("x", reader, range(2), 1, tmp_path))
     assert [(block.count, block.number, block.case) for block in blocks] == [(1, k, word.encode()) for k in range(2)]
     assert all(said in block.wrong for block in blocks)
 
 
 def test_the_figures_count_what_went_wrong() -> None:
-    values = {figure.what: figure.value for figure in figures([Sum(10, 4, 0.1, 1), Sum(5, 5, 0.1, 0)])}
+    values = {figure.what: figure.value for figure in fuzz_figures([ReaderSum(10, 4, 0.1, 1), ReaderSum(5, 5, 0.1, 0)])}
     assert values["inputs"] == 15 and values["inputs that went wrong"] == 1
 
 
@@ -118,13 +115,13 @@ def test_a_run_goes_on_where_it_was_stopped(
     log = tmp_path / "x.csv"
     options = argparse.Namespace(count=20, seed=1, only=None, jobs=1, log=log, out=tmp_path)
     with pytest.raises(KeyboardInterrupt):
-        fuzz.run(options)
+        fuzz.run_fuzz(options)
     assert (tmp_path / "a_3.bin").read_bytes() == b"case" and "fell; kept as" in capsys.readouterr().out
     monkeypatch.setattr(fuzz, "run_tasks", lambda tasks, *rest: iter([Block(t.name, len(t.numbers)) for t in tasks]))
-    values = {figure.what: figure.value for figure in fuzz.run(options)}
+    values = {figure.what: figure.value for figure in fuzz.run_fuzz(options)}
     assert asked == [Task("a", range(10)), Task("b", range(10))]
     assert values["inputs"] == 20 and values["inputs that went wrong"] == 1 and "fell" in capsys.readouterr().out
     assert sum(block.count for block in read_log(log, 1)) == 20 and not read_log(log, 2)
     log.write_text(log.read_text() + "1,a,x,0,0,0,\n")
     with pytest.raises(InputError, match="line 6"):
-        fuzz.run(options)
+        fuzz.run_fuzz(options)

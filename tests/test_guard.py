@@ -1,10 +1,13 @@
-"""The guard: every limit met exactly passes, broken by one epsilon is refused; and it never changes a command."""
+"""The guard: every limit met exactly passes, broken by one epsilon is refused. And it never changes a command. The
+guard before an oracle written from the limits alone: nothing that breaks one passes, nothing else is refused.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,15 +18,24 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from estimation.warp import Warp
-from planning.command import Code, Command, Hold, Move, Refusal
-from planning.kinematics import SimpleArm
-from planning.limits import Limits
+from estimation.surface_map import Warp
+from hardware.bench.campaigns.guard import (
+    SURFACE_REST,
+    GuardRules,
+    jointed_rules,
+    judge_guard,
+    random_log,
+    simple_rules,
+)
+from planning.command import Command, Hold, Move, Refusal, RefusalCode
+from planning.limits import MotionLimits
 from planning.motion.guard import Guard
+from planning.robot.kinematics import SimpleArm, joints_from_axes
+from tests.slowly import slowly
 
 TICK = 1 / 64  # powers of two, so that a limit can be met to the last bit
 ARM = SimpleArm(home=np.zeros(6))
-WIDE = Limits(
+WIDE = MotionLimits(
     speed=np.full(6, 128.0),
     jump=64.0,
     turn=64.0,
@@ -58,7 +70,7 @@ def move(target: Array, stamp: float = 1.0, feed: float = 5.0, extrude: bool = F
 
 
 def judged(
-    command: Command, seen: SurfacePose | None = None, limits: Limits = WIDE, begin: Array | None = None
+    command: Command, seen: SurfacePose | None = None, limits: MotionLimits = WIDE, begin: Array | None = None
 ) -> Command:
     """What a guard that stands at `begin` (6,) makes of a command."""
     guard = Guard(limits, replace(ARM, home=np.zeros(6) if begin is None else begin), TICK)
@@ -73,42 +85,29 @@ def refused(answer: Command, *words: str) -> bool:
 @pytest.mark.parametrize("side", [-1, 1])
 def test_the_bounds_of_each_axis(axis: int, side: int) -> None:
     bound = (WIDE.low, WIDE.high)[side > 0][axis]
-    limits = replace(WIDE, speed=np.full(6, 1e9))
-    begin = np.zeros(6)
-    begin[axis] = bound - side * 0.25
-    target = begin.copy()
-    target[axis] = bound
-    exact = move(target)
+    limits, only = replace(WIDE, speed=np.full(6, 1e9)), np.eye(6)[axis]
+    begin, exact = (bound - side * 0.25) * only, move(bound * only)
     assert judged(exact, limits=limits, begin=begin) is exact
-    target = target.copy()
-    target[axis] = np.nextafter(bound, side * np.inf)
-    assert refused(judged(move(target), limits=limits, begin=begin), "XYZABC"[axis], "allowed")
+    beyond = move(np.nextafter(bound, side * np.inf) * only)
+    assert refused(judged(beyond, limits=limits, begin=begin), "XYZABC"[axis], "allowed")
 
 
-@pytest.mark.parametrize("axis", range(6))
-def test_the_implied_speed_of_each_axis(axis: int) -> None:
-    limits = replace(WIDE, speed=np.full(6, 64.0))
-    target = np.zeros(6)
-    target[axis] = 1.0  # in a 64th of a second
-    exact = move(target)
-    assert judged(exact, limits=limits) is exact
-    target = target.copy()
-    target[axis] = up(1.0)
-    assert refused(judged(move(target), limits=limits), "XYZABC"[axis], "/s, limit")
+FAST = np.full(6, 1e9)
+ONE, MORE = np.eye(6), up(1.0) * np.eye(6)  # of an axis in a 64th of a second
 
 
-def test_the_jump_is_the_way_in_space() -> None:
-    limits = replace(WIDE, jump=5.0, speed=np.full(6, 1e9))
-    exact = move(axes(3, 4))
-    assert judged(exact, limits=limits) is exact
-    assert refused(judged(move(axes(3, up(up(4)))), limits=limits), "jump")
-
-
-def test_the_turn_of_one_tick() -> None:
-    limits = replace(WIDE, turn=0.25, speed=np.full(6, 1e9))
-    exact = move(axes(0, 0, 0, 0.25, -0.25, 0.25))
-    assert judged(exact, limits=limits) is exact
-    assert refused(judged(move(axes(0, 0, 0, 0.25, -up(0.25), 0)), limits=limits), "turn")
+@pytest.mark.parametrize(
+    ("change", "exact", "beyond", "words"),
+    [
+        *(({"speed": np.full(6, 64.0)}, ONE[k], MORE[k], ("XYZABC"[k], "/s, limit")) for k in range(6)),
+        ({"jump": 5.0, "speed": FAST}, axes(3, 4), axes(3, up(up(4))), ("jump",)),  # the way in space
+        ({"turn": 0.25, "speed": FAST}, axes(0, 0, 0, 0.25, -0.25, 0.25), axes(0, 0, 0, 0.25, -up(0.25), 0), ("turn",)),
+    ],
+    ids=[*"XYZABC", "jump", "turn"],
+)
+def test_the_step_of_one_tick(change: dict[str, Any], exact: Array, beyond: Array, words: tuple[str, ...]) -> None:
+    limits, wanted = replace(WIDE, **change), move(exact)
+    assert judged(wanted, limits=limits) is wanted and refused(judged(move(beyond), limits=limits), *words)
 
 
 @pytest.mark.parametrize(("feed", "passes"), [(250.0, True), (up(250.0), False), (5e-324, True), (0.0, False)])
@@ -218,23 +217,21 @@ def test_without_a_pose_only_a_stop_follows(since: float, way: float, extrude: b
 def test_a_refused_move_leaves_the_arm_where_it_was() -> None:
     guard = Guard(WIDE, ARM, TICK)
     guard(move(axes(1.0), 1.0), pose(1.0), 1.0)
-    assert refused(guard(move(axes(1000.0), 2.0), pose(2.0), 2.0))
-    assert np.array_equal(guard.axes, axes(1.0))
+    assert refused(guard(move(axes(1000.0), 2.0), pose(2.0), 2.0)) and np.array_equal(guard.axes, axes(1.0))
     assert isinstance(guard(move(axes(2.0), 3.0), pose(3.0), 3.0), Move)
 
 
 def test_a_hold_passes_and_moves_nothing() -> None:
     guard = Guard(WIDE, ARM, TICK)
     hold = Hold(1.0, 0.001, "lost")
-    assert guard(hold, None, 1.0) is hold
-    assert np.array_equal(guard.axes, np.zeros(6))
+    assert guard(hold, None, 1.0) is hold and np.array_equal(guard.axes, np.zeros(6))
 
 
 @given(st.integers(0, 100_000))
 def test_nothing_that_breaks_a_limit_passes(seed: int) -> None:
     """Random commands against an oracle that was written from the limits alone."""
     draw = np.random.default_rng(seed)
-    guard, limits = Guard(Limits(), SimpleArm(), 0.02), Limits()
+    guard, limits = Guard(MotionLimits(), SimpleArm(), 0.02), MotionLimits()
     before, stamp = SimpleArm().home, 0.0
     for _ in range(40):
         stamp += draw.choice([0.02, 0.02, 0.02, 0.0, -0.02])
@@ -246,8 +243,7 @@ def test_nothing_that_breaks_a_limit_passes(seed: int) -> None:
             step = np.abs(target - before)
             assert (target >= limits.low).all() and (target <= limits.high).all()
             assert (step <= limits.speed * 0.02 * (1 + 1e-12)).all()
-            assert np.linalg.norm(step[:3]) <= limits.jump * (1 + 1e-12)
-            assert wanted.feed <= limits.feed
+            assert np.linalg.norm(step[:3]) <= limits.jump * (1 + 1e-12) and wanted.feed <= limits.feed
             assert seen.state is TrackState.TRACKING and stamp - seen.stamp <= limits.pose_age
             before = target
 
@@ -266,7 +262,7 @@ def test_nothing_that_breaks_a_limit_passes(seed: int) -> None:
 )
 def test_limits_are_checked(name: str, value: object) -> None:
     with pytest.raises(InputError, match="limits"):
-        replace(Limits(), **{name: value})  # type: ignore[arg-type]
+        replace(MotionLimits(), **{name: value})  # type: ignore[arg-type]
 
 
 def test_the_arm_is_checked() -> None:
@@ -289,31 +285,37 @@ def test_a_warp_adds_its_own_doubt_and_what_grows_of_it() -> None:
     assert refused(judged(move(axes(0.5)), warped(np.nan, 0.0)), "not finite")
 
 
-REFUSED: list[tuple[Code, Move, SurfacePose | None, float, float]] = [
-    (Code.ORDER, move(axes(0.5), 0.5), pose(1.0), 0.5, 1.0),
-    (Code.NOT_FINITE, move(axes(np.nan)), pose(1.0), np.nan, np.nan),
-    (Code.FEED, move(axes(0.5), feed=250.5), pose(1.0), 250.5, 250.0),
-    (Code.WORKSPACE, move(axes(257)), pose(1.0), 257.0, 256.0),
-    (Code.JUMP, move(axes(65)), pose(1.0), 65.0, 64.0),
-    (Code.TURN, move(axes(0, 0, 0, 1.25)), pose(1.0), 1.25, 1.0),
-    (Code.AXIS_SPEED, move(axes(3)), pose(1.0), 192.0, 128.0),
-    (Code.NO_POSE, move(axes(0.5), extrude=True), None, np.nan, np.nan),
-    (Code.POSE_NOT_FINITE, move(axes(0.5), extrude=True), pose(1.0, twist=np.full(6, np.inf)), np.nan, np.nan),
-    (Code.TRACK_STATE, move(axes(0.5), extrude=True), pose(1.0, state=TrackState.LOST), np.nan, np.nan),
-    (Code.POSE_AGE, move(axes(0.5), extrude=True), pose(0.5), 0.5, 0.25),
-    (Code.SURFACE_SPEED, move(axes(0.5), extrude=True), pose(1.0, twist=axes(0, 0, 0, 51)), 51.0, 50.0),
-    (Code.SURFACE_TURN, move(axes(0.5), extrude=True), pose(1.0, twist=axes(1.5)), 1.5, 0.75),
-    (Code.POSE_ERROR, move(axes(0.5), extrude=True), pose(1.0, covariance=np.diag([0.0, 0, 0, 1, 0, 0])), 1.0, 0.5),
-    (Code.STOP_DISTANCE, move(axes(5), 1.25), None, 5.0, 4.0),
-    (Code.WATCHDOG, move(axes(0.5), 1.75), None, 0.75, 0.5),
+REFUSED: list[tuple[RefusalCode, Move, SurfacePose | None, float, float]] = [
+    (RefusalCode.ORDER, move(axes(0.5), 0.5), pose(1.0), 0.5, 1.0),
+    (RefusalCode.NOT_FINITE, move(axes(np.nan)), pose(1.0), np.nan, np.nan),
+    (RefusalCode.FEED, move(axes(0.5), feed=250.5), pose(1.0), 250.5, 250.0),
+    (RefusalCode.WORKSPACE, move(axes(257)), pose(1.0), 257.0, 256.0),
+    (RefusalCode.JUMP, move(axes(65)), pose(1.0), 65.0, 64.0),
+    (RefusalCode.TURN, move(axes(0, 0, 0, 1.25)), pose(1.0), 1.25, 1.0),
+    (RefusalCode.AXIS_SPEED, move(axes(3)), pose(1.0), 192.0, 128.0),
+    (RefusalCode.NO_POSE, move(axes(0.5), extrude=True), None, np.nan, np.nan),
+    (RefusalCode.POSE_NOT_FINITE, move(axes(0.5), extrude=True), pose(1.0, twist=np.full(6, np.inf)), np.nan, np.nan),
+    (RefusalCode.TRACK_STATE, move(axes(0.5), extrude=True), pose(1.0, state=TrackState.LOST), np.nan, np.nan),
+    (RefusalCode.POSE_AGE, move(axes(0.5), extrude=True), pose(0.5), 0.5, 0.25),
+    (RefusalCode.SURFACE_SPEED, move(axes(0.5), extrude=True), pose(1.0, twist=axes(0, 0, 0, 51)), 51.0, 50.0),
+    (RefusalCode.SURFACE_TURN, move(axes(0.5), extrude=True), pose(1.0, twist=axes(1.5)), 1.5, 0.75),
+    (
+        RefusalCode.POSE_ERROR,
+        move(axes(0.5), extrude=True),
+        pose(1.0, covariance=np.diag([0.0, 0, 0, 1, 0, 0])),
+        1.0,
+        0.5,
+    ),
+    (RefusalCode.STOP_DISTANCE, move(axes(5), 1.25), None, 5.0, 4.0),
+    (RefusalCode.WATCHDOG, move(axes(0.5), 1.75), None, 0.75, 0.5),
 ]
 
 
 @pytest.mark.parametrize(("code", "command", "seen", "got", "limit"), REFUSED, ids=[r[0] for r in REFUSED])
 def test_a_refusal_has_its_code_the_number_and_the_limit(
-    code: Code, command: Move, seen: SurfacePose | None, got: float, limit: float
+    code: RefusalCode, command: Move, seen: SurfacePose | None, got: float, limit: float
 ) -> None:
-    fast = code in (Code.WORKSPACE, Code.JUMP, Code.TURN, Code.STOP_DISTANCE)
+    fast = code in (RefusalCode.WORKSPACE, RefusalCode.JUMP, RefusalCode.TURN, RefusalCode.STOP_DISTANCE)
     limits = replace(WIDE, speed=np.full(6, 1e9 if fast else 128.0), turn=1.0)
     guard = Guard(limits, ARM, TICK)
     first = 1.0 if command.stamp != 1.0 else 0.9
@@ -326,4 +328,108 @@ def test_a_refusal_has_its_code_the_number_and_the_limit(
 
 def test_every_code_is_documented() -> None:
     text = (Path(__file__).parents[1] / "docs" / "motion.md").read_text(encoding="utf-8")
-    assert [code for code in Code if f"`{code}`" not in text] == []
+    assert [code for code in RefusalCode if f"`{code}`" not in text] == []
+
+
+COUNT = 500
+HAIR = 1e-12  # rad, rad/s: the joints are solved anew under each limit, which moves their last bits
+
+
+@pytest.mark.parametrize("seed", [0, *slowly(1, 2, 3)])
+@pytest.mark.parametrize("rules", [simple_rules, jointed_rules])
+def test_no_random_command_that_breaks_a_limit_passes_and_none_that_keeps_all_is_refused(
+    rules: Callable[[], GuardRules], seed: int
+) -> None:
+    asked, passed, broken, refused = judge_guard(random_log(seed, COUNT, rules()), rules())
+    assert (asked, broken, refused) == (COUNT, 0, 0)
+    assert 0.3 * COUNT < passed < 0.9 * COUNT  # both sides are tried
+
+
+def loosened(limits: MotionLimits, name: str) -> MotionLimits:
+    if name == "zones":
+        return replace(limits, zones=limits.zones[:-1])
+    value = getattr(limits, name)
+    wide = value + {"low": -100, "high": 100}[name] if name in ("low", "high") else value * 1.6
+    if name in ("low", "high"):
+        wide[3:] = value[3:]
+    return replace(limits, **{name: wide})
+
+
+def forgetful(rules: GuardRules, name: str) -> Guard:
+    """A guard with one limit looser than it was told."""
+    return Guard(loosened(rules.limits, name), rules.arm, rules.tick, rules.zone, rules.lag)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("low", "high", "jump", "turn", "speed", "feed"),
+        "zones",
+        *("pose_age", "pose_error", "surface_speed", "surface_turn", "stop_time", "stop_distance"),
+    ],
+)
+def test_the_oracle_finds_a_guard_that_is_loose_in_any_limit(name: str) -> None:
+    rules = simple_rules()
+    if name == "turn":  # the speed alone would stop it
+        rules = replace(rules, limits=replace(rules.limits, speed=np.append(rules.limits.speed[:3], [9.0] * 3)))
+    if name == "speed":  # jump and turn alone would
+        rules = replace(rules, limits=replace(rules.limits, jump=9.0, turn=1.0))
+    if name == "stop_distance":  # none is tried for so long
+        rules = replace(rules, limits=replace(rules.limits, stop_distance=2.0))
+    far = name in ("low", "high")  # a wander from home takes long to get there
+    count = COUNT if far else COUNT // 5
+    logs = (random_log(seed, count, rules, forgetful(rules, name)) for seed in range(4 if far else 20))
+    assert any(judge_guard(log, rules)[2] for log in logs)
+
+
+def test_the_oracle_finds_a_guard_that_refuses_too_much() -> None:
+    rules = simple_rules()
+    strict = Guard(replace(rules.limits, jump=2.9), rules.arm, rules.tick, rules.zone, rules.lag)
+    assert judge_guard(random_log(0, COUNT, rules, strict), rules)[3] > 0
+
+
+def standing(rules: GuardRules, **changes: np.ndarray) -> tuple[Guard, Move, np.ndarray, np.ndarray]:
+    """A guard whose arm has these joints, a small move, and the joints before and after it (6,)."""
+    model = rules.arm.jointed
+    assert model is not None
+    home = rules.arm.home
+    axes = home + np.array([1.0, -0.5, 0.7, 0.01, -0.02, 0.015])
+    before, after = joints_from_axes(model, np.stack([home, axes]))
+    guard = Guard(rules.limits, replace(rules.arm, joints=replace(model, **changes)), rules.tick)
+    return guard, Move(1.0, axes, 50.0, 0, False), before, after
+
+
+def code_of(guard: Guard, move: Move) -> RefusalCode | None:
+    """Why the guard refuses a move, None where it lets it pass."""
+    answer = guard(move, SurfacePose(1.0, SURFACE_REST, np.zeros((6, 6)), np.zeros(6), TrackState.TRACKING), 1.0)
+    return answer.code if isinstance(answer, Refusal) else None
+
+
+@pytest.mark.parametrize("joint", range(6))
+def test_the_range_and_speed_of_each_joint_are_met_and_broken_by_next_to_nothing(joint: int) -> None:
+    rules = jointed_rules()
+    model = rules.arm.jointed
+    assert model is not None
+    _, _, before, after = standing(rules)
+    for name, exact, beyond in (
+        ("low", after[joint], HAIR),
+        ("high", after[joint], -HAIR),
+        ("speed", abs(after[joint] - before[joint]) / rules.tick, -HAIR),
+    ):
+        limit = getattr(model, name).copy()
+        limit[joint] = exact - beyond
+        guard, move, _, _ = standing(rules, **{name: limit})
+        assert code_of(guard, move) is None, name
+        limit = limit.copy()
+        limit[joint] = exact + beyond
+        guard, move, _, _ = standing(rules, **{name: limit})
+        assert code_of(guard, move) is (RefusalCode.JOINT_SPEED if name == "speed" else RefusalCode.JOINT_RANGE)
+
+
+def test_the_oracle_finds_a_guard_that_does_not_look_at_the_joints() -> None:
+    rules = jointed_rules()
+    assert rules.arm.jointed is not None
+    slow = replace(rules.arm.jointed, speed=rules.arm.jointed.speed / 10)
+    tight = replace(rules, arm=replace(rules.arm, joints=slow))
+    guard = Guard(rules.limits, rules.arm, rules.tick, rules.zone, rules.lag)
+    assert judge_guard(random_log(0, COUNT, tight, guard), tight)[2] > 0

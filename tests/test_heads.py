@@ -11,13 +11,12 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
-from hardware.channels import read_heads as recorded_heads
 from hardware.files.folder_tables import HEAD_COLUMNS, read_heads, write_heads
-from hardware.files.session import open_session
-from hardware.heads import NO_HEADS, TOLERANCE, Heads, head_from_row, row_from_head
-from hardware.offline.convert import export_recording, import_folder
-from hardware.recording.recorder import CHUNK_SECONDS, Recorder
-from hardware.track_recorder import TrackRecorder
+from hardware.files.session import HEAD_STAMP_TOLERANCE, NO_PRINT_HEADS, PrintHeadLog, head_from_row, row_from_head
+from hardware.offline.convert import TrackRecorder, export_recording, import_folder
+from hardware.recording.recorder import MAX_CHUNK_SECONDS, Recorder
+from hardware.recording.session_reader import open_session
+from hardware.recording.session_reader import read_heads as recorded_heads
 from perception.frames import PrintHead
 from tests.recorded import write_frames
 from tests.runs import Replayed
@@ -26,15 +25,15 @@ from tests.session_files import make_folder, rig, stamps
 HEADER = ",".join(HEAD_COLUMNS)
 
 
-def made_up(times: list[float], seed: int = 0) -> Heads:
+def made_up(times: list[float], seed: int = 0) -> PrintHeadLog:
     """Heads anywhere at these stamps, s."""
     draw = np.random.default_rng(seed)
     nozzle = se3.exp(draw.normal(size=(len(times), 6)) * [1, 1, 1, 100, 100, 1e3])
     rows = [row_from_head(stamp, PrintHead(place, False)) for stamp, place in zip(times, nozzle, strict=True)]
-    return Heads(np.array(rows).reshape(-1, 8), draw.integers(0, 2, len(times)).astype(bool))
+    return PrintHeadLog(np.array(rows).reshape(-1, 8), draw.integers(0, 2, len(times)).astype(bool))
 
 
-def same(a: Heads, b: Heads) -> bool:
+def same(a: PrintHeadLog, b: PrintHeadLog) -> bool:
     return a.rows.tobytes() == b.rows.tobytes() and np.array_equal(a.extruding, b.extruding)
 
 
@@ -63,15 +62,15 @@ def test_a_frame_set_gets_the_nearest_head_or_none(steps: list[float], start: fl
     heads = made_up(times.tolist(), seed)
     found, away = heads.at(stamp), np.abs(times - stamp)
     if found is None:
-        assert away.min() > TOLERANCE
+        assert away.min() > HEAD_STAMP_TOLERANCE
     else:
-        assert away.min() <= TOLERANCE
+        assert away.min() <= HEAD_STAMP_TOLERANCE
         places = heads.rows[away == away.min(), 1:4]
         assert (found.base_from_nozzle[:3, 3] == places).all(1).any()
 
 
 def test_without_rows_there_is_no_head() -> None:
-    assert len(NO_HEADS) == 0 and NO_HEADS.at(0.0) is None
+    assert len(NO_PRINT_HEADS) == 0 and NO_PRINT_HEADS.at(0.0) is None
 
 
 # -- in files
@@ -146,7 +145,7 @@ def test_the_recording_of_a_run_has_the_rows_of_its_session(session: Path, tmp_p
     except KeyboardInterrupt:
         pass
     count = tracked - 4
-    first = Heads(original.heads.rows[:count], original.heads.extruding[:count])
+    first = PrintHeadLog(original.heads.rows[:count], original.heads.extruding[:count])
     assert same(open_session(tmp_path / "run.mcap").heads, first)
 
 
@@ -161,8 +160,8 @@ def test_a_damaged_recording_has_its_heads_up_to_the_damage(tmp_path: Path) -> N
     (tmp_path / "x.mcap").write_bytes(data[: len(data) // 2])
     session = open_session(tmp_path / "x.mcap")
     count = len(session.heads)
-    assert session.damage and 90 * 0.5 - 30 * CHUNK_SECONDS - 1 <= count < 60
-    assert same(session.heads, Heads(heads.rows[:count], heads.extruding[:count]))
+    assert session.damage and 90 * 0.5 - 30 * MAX_CHUNK_SECONDS - 1 <= count < 60
+    assert same(session.heads, PrintHeadLog(heads.rows[:count], heads.extruding[:count]))
     assert all(frames.head is not None for frames in session.frame_sets())
 
 
@@ -205,8 +204,7 @@ def test_a_wrong_row_is_named(session: Path, text: str, what: str, words: str) -
     (session / "head.csv").write_text(text)
     with pytest.raises(InputError) as caught:
         open_session(session)
-    assert (Path(caught.value.where).name, caught.value.what) == ("head.csv", what)
-    assert words in str(caught.value)
+    assert (Path(caught.value.where).name, caught.value.what) == ("head.csv", what) and words in str(caught.value)
 
 
 def test_a_file_that_cannot_be_read_is_named(session: Path) -> None:

@@ -1,4 +1,6 @@
-"""The heap: what is free goes back to the system, even below what is still in use; or stays, where that was asked."""
+"""The heap: what is free goes back to the system, even below what is still in use. Or stays, where that was asked. The
+quick median is the slow one.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +9,19 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from estimation.heap import give_back
-from hardware.bench.soak import resident
+from estimation.runtime import median, trim_heap
+from hardware.bench.estimator import resident
+
+
+def printed(code: str) -> int:
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    return int(done.stdout)
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="this C library does not give back on demand")
@@ -19,7 +30,7 @@ def test_what_is_free_below_what_is_in_use_is_given_back() -> None:
     last = blocks[-1]
     full = resident()
     blocks.clear()
-    give_back()
+    trim_heap()
     assert full - resident() > 40.0 and last == bytes(5000)
 
 
@@ -27,8 +38,8 @@ def test_what_is_free_below_what_is_in_use_is_given_back() -> None:
 def test_pages_that_are_kept_are_not_asked_for_again() -> None:
     code = """
 from resource import RUSAGE_SELF, getrusage
-from estimation.heap import keep_pages
-keep_pages(2**25)
+from estimation.runtime import retain_freed_pages
+retain_freed_pages(2**25)
 def fill():
     return [bytearray(b"x") * 2**22 for _ in range(4)]
 for _ in range(3):
@@ -38,9 +49,7 @@ for _ in range(10):
     fill()
 print(getrusage(RUSAGE_SELF).ru_minflt - before)
 """
-    root = Path(__file__).parents[1]
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
-    assert int(done.stdout) < 1000  # of 40,000 pages that were filled
+    assert printed(code) < 1000  # of 40,000 pages that were filled
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="this C library cannot be told of its heaps")
@@ -48,8 +57,8 @@ def test_threads_that_share_pages_have_no_heap_of_their_own() -> None:
     code = """
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
-from estimation.heap import share_pages
-share_pages()
+from estimation.runtime import use_one_arena
+use_one_arena()
 before, together = open("/proc/self/maps").read().count("---p"), Barrier(4)
 def fill(_):
     together.wait()
@@ -58,6 +67,19 @@ with ThreadPoolExecutor(4) as threads:
     list(threads.map(fill, range(4)))
     print(open("/proc/self/maps").read().count("---p") - before)
 """
-    root = Path(__file__).parents[1]
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
-    assert int(done.stdout) == 4  # a guard page of each stack; a heap of its own would reserve more
+    assert printed(code) == 4  # a guard page of each stack; a heap of its own would reserve more
+
+
+NUMBERS = st.floats(-1e6, 1e6)
+
+
+@given(st.lists(NUMBERS, min_size=1, max_size=41))
+def test_it_is_the_middle_one_and_of_an_even_count_the_upper_of_the_two(values: list[float]) -> None:
+    assert median(np.array(values)) == sorted(values)[len(values) // 2]
+
+
+@pytest.mark.parametrize("place", range(3))
+def test_what_is_not_a_number_is_not_hidden(place: int) -> None:
+    values = np.arange(3.0)
+    values[place] = np.nan
+    assert np.isnan(median(values))

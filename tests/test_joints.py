@@ -1,19 +1,40 @@
-"""Joints: forward and back again in every posture, the Jacobian by differences, singularities where they must be."""
+"""Joints: forward and back again in every posture, the Jacobian by differences, singularities where they must be. An
+arm whose A B C are its joints: planned, guarded and read from a file as any other.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path as Folder
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
-from planning.inverse import POSTURES, joints_from_nozzle, joints_from_tip
-from planning.robot.kinematics import JointModel, arm_from_nozzle, distance, jacobian
+from hardware.arm.profile import ArmProfile
+from hardware.bench.planner import StreamTally, bench_arm, follow_stream
+from hardware.files.arm_file import read_arm, write_arm
+from planning.command import Hold, Move, Refusal, RefusalCode
+from planning.motion.guard import Guard
+from planning.motion.planner import Planner
+from planning.progress import PrintPhase
+from planning.robot.kinematics import (
+    POSTURES,
+    JointModel,
+    axes_from_nozzle,
+    jacobian,
+    joint_distance,
+    joints_from_axes,
+    joints_from_nozzle,
+    joints_from_tip,
+    nozzle_from_axes,
+    nozzle_from_joints,
+)
 from tests.arms import random_joints, random_model
+from tests.moving import REST, breathing, pose_at, raster
 
 SEEDS = st.integers(0, 100_000)
 
@@ -27,10 +48,10 @@ def all_postures(model: JointModel, wanted: np.ndarray) -> np.ndarray:
 def test_every_posture_that_is_found_brings_the_nozzle_there(seed: int) -> None:
     draw = np.random.default_rng(seed)
     model = random_model(draw)
-    wanted = arm_from_nozzle(model, random_joints(draw, 10))
+    wanted = nozzle_from_joints(model, random_joints(draw, 10))
     found = all_postures(model, wanted)
     reached = np.asarray(np.isfinite(found).all(axis=-1))
-    got = arm_from_nozzle(model, np.where(reached[..., None], found, 0.0))
+    got = nozzle_from_joints(model, np.where(reached[..., None], found, 0.0))
     off = np.abs(got - wanted).max((-1, -2))[reached]
     assert off.max() < 1e-6
     assert (reached.sum(axis=0) >= 2).all()  # a wrist has two solutions wherever it is reached
@@ -41,7 +62,7 @@ def test_the_joints_one_started_from_are_among_the_postures(seed: int) -> None:
     draw = np.random.default_rng(seed)
     model = random_model(draw)
     joints = random_joints(draw, 5)
-    found = all_postures(model, arm_from_nozzle(model, joints))
+    found = all_postures(model, nozzle_from_joints(model, joints))
     off = np.abs(np.exp(1j * found) - np.exp(1j * joints)).max(-1)
     assert (np.nanmin(off, axis=0) < 1e-5).all()
 
@@ -50,12 +71,12 @@ def test_the_joints_one_started_from_are_among_the_postures(seed: int) -> None:
 def test_tip_and_wrist_joints_give_the_whole_arm_back(seed: int) -> None:
     draw = np.random.default_rng(seed)
     model = random_model(draw)
-    wanted = arm_from_nozzle(model, random_joints(draw, 20))
+    wanted = nozzle_from_joints(model, random_joints(draw, 20))
     joints = joints_from_nozzle(model, wanted)
     reached = np.isfinite(joints).all(axis=-1)
     back = joints_from_tip(model, wanted[:, :3, 3], joints[:, 3:])
     assert np.isfinite(back[reached]).all()
-    got = arm_from_nozzle(model, back[reached])
+    got = nozzle_from_joints(model, back[reached])
     assert np.allclose(got[:, :3, 3], wanted[reached, :3, 3], atol=1e-6)
     assert np.allclose(back[reached, 3:], joints[reached, 3:], atol=1e-9)
 
@@ -66,7 +87,7 @@ def test_the_jacobian_is_the_derivative(seed: int) -> None:
     model, joints, step = random_model(draw), random_joints(draw, 1)[0], 1e-6
     matrix = jacobian(model, joints)
     for i in range(6):
-        before, after = (arm_from_nozzle(model, joints + h * np.eye(6)[i]) for h in (-step, step))
+        before, after = (nozzle_from_joints(model, joints + h * np.eye(6)[i]) for h in (-step, step))
         turn = se3.log_rotation(after[:3, :3] @ before[:3, :3].T) / (2 * step)
         assert np.allclose(matrix[:3, i], turn, atol=1e-6)
         assert np.allclose(matrix[3:, i], (after - before)[:3, 3] / (2 * step), atol=1e-4)
@@ -78,14 +99,12 @@ def test_manipulability_vanishes_in_each_singularity_and_only_there(seed: int) -
     model, joints = random_model(draw, lateral=0.0), random_joints(draw, 1)[0]
     straight = joints.copy()
     straight[4] = -model.dh[4, 3]
-    assert distance(model, straight).wrist < 1e-9
-    assert distance(model, straight).manipulability < 1e-9
+    assert joint_distance(model, straight).wrist < 1e-9 and joint_distance(model, straight).manipulability < 1e-9
     stretched = joints.copy()
     a, alpha, d, theta = model.dh.T
     stretched[2] = -theta[2] - np.arctan2(-np.sign(alpha[2]) * d[3], a[2])
-    assert distance(model, stretched).elbow < 1e-9
-    assert distance(model, stretched).manipulability < 1e-9
-    free = distance(model, joints)
+    assert joint_distance(model, stretched).elbow < 1e-9 and joint_distance(model, stretched).manipulability < 1e-9
+    free = joint_distance(model, joints)
     if min(free.wrist, free.elbow) > 0.2 and free.shoulder > 50:
         assert free.manipulability > 1e-4
 
@@ -94,7 +113,7 @@ def test_continuous_poses_have_continuous_joints_in_one_posture() -> None:
     draw = np.random.default_rng(3)
     model = random_model(draw, lateral=0.0)
     start = np.array([0.2, 0.3, 0.4, 0.5, 0.6, 0.7]) - model.dh[:, 3]
-    line = arm_from_nozzle(model, start) @ se3.exp(np.linspace(0, 1, 200)[:, None] * np.array([0.1, 0, 0, 5, 5, 5]))
+    line = nozzle_from_joints(model, start) @ se3.exp(np.linspace(0, 1, 200)[:, None] * np.array([0.1, 0, 0, 5, 5, 5]))
     for signs in POSTURES:
         joints = joints_from_nozzle(model, line, signs)
         if np.isfinite(joints).all():
@@ -121,3 +140,111 @@ def test_what_is_too_far_is_nan_in_every_posture() -> None:
 def test_an_arm_that_makes_no_sense_is_refused(change: dict[str, object], words: str) -> None:
     with pytest.raises(InputError, match=words):
         replace(random_model(np.random.default_rng(0)), **change)  # type: ignore[arg-type]
+
+
+FILE = Folder(__file__).parents[1] / "data" / "arms" / "six_axis.toml"
+TICK = 0.02
+
+
+def profile() -> ArmProfile:
+    return bench_arm(read_arm(FILE))
+
+
+@given(st.integers(0, 10_000))
+def test_axes_and_nozzle_are_one(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    arm = profile().arm
+    nozzle = REST @ se3.exp(draw.normal(size=(5, 6)) * [0.1, 0.1, 0.3, 20, 20, 20])
+    axes = axes_from_nozzle(arm, nozzle)
+    assert np.allclose(axes[:, :3], nozzle[:, :3, 3])
+    assert np.allclose(nozzle_from_axes(arm, axes), nozzle, atol=1e-8)
+
+
+def test_a_whole_print_keeps_the_joints_within_ranges_and_speeds() -> None:
+    settings_ = profile()
+    arm, model = settings_.arm, settings_.arm.joints
+    assert model is not None
+    path = raster(size=5, lines=2)
+    planner, guard = Planner(path, settings_.limits, arm, TICK), Guard(settings_.limits, arm, TICK, path.zone)
+    axes = [arm.home]
+    for k in range(350):
+        now, pose = 10 + k * TICK, pose_at(breathing, 10 + k * TICK)
+        wanted = planner(pose, now)
+        assert guard(wanted, pose, now) is wanted
+        axes.append(wanted.axes if isinstance(wanted, Move) else axes[-1])
+    assert planner.progress.phase is PrintPhase.FINISHED
+    joints = joints_from_axes(model, np.array(axes))
+    assert (joints > model.low).all() and (joints < model.high).all()
+    assert (np.abs(np.diff(joints, axis=0)) / TICK <= model.speed).all()
+
+
+@settings(max_examples=2)
+@given(st.integers(0, 10_000))
+def test_no_stream_of_poses_breaks_a_limit(seed: int) -> None:
+    tally = StreamTally()
+    follow_stream((seed, 1), tally, profile(), 100)
+    assert tally.worst.max() <= 1 + 1e-6 and tally.errors == []
+
+
+def test_beyond_a_joint_it_holds_and_says_which() -> None:
+    settings_, turned = profile(), REST @ se3.exp([0, 0, -2.3, 0, 0, 0])
+    planner = Planner(raster(), settings_.limits, settings_.arm, TICK)
+    commands = (planner(pose_at(lambda t: turned, now), now) for now in 10 + TICK * np.arange(250))
+    reasons = {command.reason for command in commands if isinstance(command, Hold)}
+    assert any("out of reach: J6" in r or "C = " in r for r in reasons), reasons
+
+
+def test_the_guard_refuses_a_place_that_the_posture_does_not_reach() -> None:
+    settings_ = profile()
+    limits = replace(settings_.limits, jump=1e4, speed=np.full(6, 1e6))
+    low, high = np.append([-2000.0] * 3, limits.low[3:]), np.append([2000.0] * 3, limits.high[3:])
+    guard = Guard(replace(limits, low=low, high=high), settings_.arm, TICK)
+    move = Move(10.0, settings_.arm.home + [900.0, 0, 0, 0, 0, 0], 10.0, 0, False)
+    refused = guard(move, pose_at(breathing, 10.0), 10.0)
+    assert isinstance(refused, Refusal) and "no posture" in refused.reason and refused.code is RefusalCode.POSTURE
+
+
+def test_the_guard_knows_each_joints_own_speed() -> None:
+    settings_ = profile()
+    model = settings_.arm.joints
+    assert model is not None
+    slow = replace(settings_.arm, joints=replace(model, speed=np.append([0.05] * 3, model.speed[3:])))
+    guard = Guard(settings_.limits, slow, TICK)
+    refused = guard(Move(10.0, slow.home + [1.0, 0, 0, 0, 0, 0], 50.0, 0, False), pose_at(breathing, 10.0), 10.0)
+    assert isinstance(refused, Refusal) and refused.reason.startswith("refused: J")
+    assert refused.code is RefusalCode.JOINT_SPEED and refused.got > refused.limit == 0.05
+
+
+def test_both_arm_files_come_back_as_written(tmp_path: Folder) -> None:
+    for file in sorted(FILE.parent.glob("*.toml")):
+        first = read_arm(file)
+        write_arm(tmp_path / "a.toml", first)
+        again = read_arm(tmp_path / "a.toml")
+        assert first.arm.angles is again.arm.angles
+        a, b = first.arm.joints, again.arm.joints
+        assert a is not None and b is not None and (a.name, a.posture, a.nominal) == (b.name, b.posture, b.nominal)
+        for name in ("dh", "low", "high", "speed", "acceleration", "arm_from_foot", "flange_from_nozzle"):
+            assert np.allclose(getattr(a, name), getattr(b, name), rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('angles = "joints"', 'angles = "joint"', "did you mean 'joints'"),
+        ("posture = [", "posture = [1, ", "three words"),
+        ("[20, 90, 0, 0]", "[20, 80, 0, 0]", "alpha"),
+        ("low_deg = [-170", "low_deg = [400", r"kinematics\.low_deg = \[400, .* below high"),
+        ("speed_deg_s = [120", "speed_deg_s = [-120", r": kinematics\.speed_deg_s = \[-120, 120, .* allowed > 0"),
+        ('posture = ["front"', 'posture = ["left"', r": kinematics\.posture = 'left', allowed front or"),
+        ("nominal = true", "nominal = 1", "true or false"),
+        ("175]\n\n[kin", "176]\n\n[kin", "limits.high of A B C"),
+        ("[202.5, 225, 113", "[602.5, 225, 113", "posture reaches"),
+        ("speed_deg_s", "speed_deg", "did you mean"),
+    ],
+)
+def test_faults_are_told_by_file_and_key(tmp_path: Folder, old: str, new: str, words: str) -> None:
+    text = FILE.read_text()
+    assert old in text
+    (tmp_path / "arm.toml").write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=words):
+        read_arm(tmp_path / "arm.toml")

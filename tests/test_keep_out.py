@@ -12,16 +12,24 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST, arc_rig
-from perception.frames import PrintHead
-from perception.ink import FRESH, REACH, STEP, Ink, near_bead
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
+from perception.frames import SYRINGE, PrintHead
 from perception.lens import Lenses
-from perception.matching.masks import MARGIN, KeepOut, highlights, trackable
-from perception.tool import Tool
-from perception.tool_profile import SYRINGE
+from perception.matching.masks import (
+    BEAD_REACH_MM,
+    BEAD_STEP_MM,
+    GEL_TIME_S,
+    PRINT_HEAD_MARGIN_MM,
+    Ink,
+    Tool,
+    TrackingMasks,
+    highlights,
+    near_bead,
+    trackable,
+)
 
 LENSES = Lenses(arc_rig(size=(640, 480), focal=700.0))
-ABOVE = REST @ se3.make(np.eye(3), [4.0, -3.0, 1.0])  # a tip a millimetre above the surface, upright
+ABOVE = BASE_FROM_REST @ se3.make(np.eye(3), [4.0, -3.0, 1.0])  # a tip a millimetre above the surface, upright
 
 
 def on_tool(rng: np.random.Generator, base_from_nozzle: Array, count: int = 300) -> Array:
@@ -50,23 +58,23 @@ def test_every_spot_of_the_head_is_hidden_and_what_is_far_from_it_is_not(
     shift: tuple[float, ...], turn: tuple[float, ...], camera: int, seed: int
 ) -> None:
     nozzle = ABOVE @ se3.exp(np.array([*turn, *shift]))
-    keep_out = KeepOut(LENSES)
-    keep_out.look(PrintHead(nozzle, False), range(3))
+    masks = TrackingMasks(LENSES)
+    masks.set_print_head(PrintHead(nozzle, False), range(3))
     spots = imaged(camera, on_tool(np.random.default_rng(seed), nozzle))
-    assert keep_out.hides(camera, spots).all()
+    assert masks.hides(camera, spots).all()
     everywhere = np.random.default_rng(seed).uniform(0, 1, (400, 2)) * LENSES.sizes[camera]
     head = imaged(camera, on_tool(np.random.default_rng(seed + 1), nozzle, 4000))
     if len(head) > 1000:
         away = np.array([np.linalg.norm(head - spot, axis=1).min() for spot in everywhere])
-        assert not keep_out.hides(camera, everywhere[away > 40]).any()
+        assert not masks.hides(camera, everywhere[away > 40]).any()
 
 
 def test_without_a_head_nothing_is_hidden() -> None:
-    keep_out = KeepOut(LENSES)
-    keep_out.look(PrintHead(ABOVE, False), range(3))
-    assert keep_out.masks
-    keep_out.look(None, range(3))
-    assert not keep_out.masks and not keep_out.hides(0, np.full((5, 2), 200.0)).any()
+    masks = TrackingMasks(LENSES)
+    masks.set_print_head(PrintHead(ABOVE, False), range(3))
+    assert masks.print_head
+    masks.set_print_head(None, range(3))
+    assert not masks.print_head and not masks.hides(0, np.full((5, 2), 200.0)).any()
 
 
 @pytest.mark.parametrize(
@@ -89,7 +97,7 @@ def test_the_tool_is_drawn_a_little_too_large() -> None:
         spots = np.concatenate(Tool(SYRINGE).silhouette(LENSES, 1, ABOVE, margin))
         return float(np.prod(np.ptp(spots, axis=0)))
 
-    assert area(0.0) < area(MARGIN) < area(5.0)
+    assert area(0.0) < area(PRINT_HEAD_MARGIN_MM) < area(5.0)
 
 
 # -- ink
@@ -107,12 +115,15 @@ def test_a_bead_has_no_gaps(corners: list[tuple[float, float]]) -> None:
 
 
 def test_only_what_the_bead_reaches_is_covered_and_only_while_it_is_fresh() -> None:
-    ink, points = Ink(), np.array([[5.0, 0.0, 0.0], [5.0, REACH + 0.5, 0.0], [5.0, REACH + STEP + 2.0, 0.0]])
+    ink, points = (
+        Ink(),
+        np.array([[5.0, 0.0, 0.0], [5.0, BEAD_REACH_MM + 0.5, 0.0], [5.0, BEAD_REACH_MM + BEAD_STEP_MM + 2.0, 0.0]]),
+    )
     ink.lay(0.0, np.zeros(3))
     bead = ink.lay(1.0, np.array([10.0, 0.0, 0.0]))
     assert ink.covers(points, np.full(3, 1.0), 2.0).tolist() == [True, True, False]
     assert near_bead(points, bead, np.full(3, 1.0)).tolist() == [True, True, False]
-    assert not ink.covers(points, np.full(3, 1.0), 1.5 + FRESH).any()
+    assert not ink.covers(points, np.full(3, 1.0), 1.5 + GEL_TIME_S).any()
 
 
 def test_a_lifted_nozzle_draws_no_line_to_where_it_is_set_down() -> None:
@@ -124,14 +135,14 @@ def test_a_lifted_nozzle_draws_no_line_to_where_it_is_set_down() -> None:
 
 
 def test_ink_lies_on_the_surface_not_where_the_surface_was() -> None:
-    keep_out = KeepOut(LENSES)
-    moved = REST @ se3.exp(np.array([0.0, 0, 0.2, 8.0, 0, 3.0]))
+    masks = TrackingMasks(LENSES)
+    moved = BASE_FROM_REST @ se3.exp(np.array([0.0, 0, 0.2, 8.0, 0, 3.0]))
     tip = se3.make(np.eye(3), [1.0, 2.0, 0.0])
-    first = keep_out.lay(PrintHead(REST @ tip, True), 0.0, REST)
-    second = keep_out.lay(PrintHead(moved @ tip, True), 0.1, moved)
+    first = masks.lay_ink(PrintHead(BASE_FROM_REST @ tip, True), 0.0, BASE_FROM_REST)
+    second = masks.lay_ink(PrintHead(moved @ tip, True), 0.1, moved)
     assert first is not None and second is not None
     np.testing.assert_allclose(second[-1], first[-1], atol=1e-9)
-    assert keep_out.lay(PrintHead(moved @ tip, False), 0.2, moved) is None
+    assert masks.lay_ink(PrintHead(moved @ tip, False), 0.2, moved) is None
 
 
 # -- highlights
@@ -150,9 +161,9 @@ def test_small_bright_spots_are_highlights_and_an_overexposed_picture_has_none()
 def test_tracks_begin_neither_outside_the_region_nor_behind_the_head() -> None:
     image, region = np.full((480, 640), 90, np.uint8), np.zeros((480, 640), np.uint8)
     region[:, 200:] = 255
-    keep_out = KeepOut(LENSES)
-    keep_out.look(PrintHead(ABOVE, False), [0])
-    free = trackable(image, region, keep_out.masks[0])
+    masks = TrackingMasks(LENSES)
+    masks.set_print_head(PrintHead(ABOVE, False), [0])
+    free = trackable(image, region, masks.print_head[0])
     assert not free[:, :199].any() and free.any()
     y, x = np.nonzero(free)
-    assert not keep_out.hides(0, np.stack([x, y], -1).astype(float)).any()
+    assert not masks.hides(0, np.stack([x, y], -1).astype(float)).any()

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from hardware.files.arm_file import read_arm
-from hardware.live.injected import Begun, Injector
-from hardware.live.ipc import Crew
-from hardware.live.replayed import replay_run
+from hardware.live.fault_injection import FaultInjector
+from hardware.live.ipc import ProcessGroup
+from hardware.live.recorded_run import replay_run
+from hardware.live.records import PrintStart
 from hardware.process.faults import fault_from_text, faults_from_texts
-from hardware.simulator.arm.settings import ArmSettings, Replies
+from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from tests.light_live import prepare_files
 from tests.live_runs import CLOCK, Running, messages
 from tests.test_arm_port import serving
@@ -71,22 +72,22 @@ def stands_still(pid: int, expected: bool) -> bool:
 
 
 def test_what_is_slow_runs_for_its_share_of_every_period_and_freely_afterwards(tmp_path: Path) -> None:
-    crew, begun = Crew(), Begun()
+    crew, begun = ProcessGroup(), PrintStart()
     slow = fault_from_text("here", "fault", "tracking slow 25% at 1s for 1s")
     try:
         crew.start("tracking", time.sleep, (600.0,))
         pid = crew.members["tracking"].pid
         assert pid is not None
-        injector = Injector([slow], crew, tmp_path / "run.mcap", begun)
-        assert injector.look(99.0) == []  # nothing has begun
+        injector = FaultInjector([slow], crew, tmp_path / "run.mcap", begun)
+        assert injector.update(99.0) == []  # nothing has begun
         begun.instant = 100.0
-        assert injector.look(100.99) == [] and stands_still(pid, False)
-        assert injector.look(101.01) == [str(slow)] and stands_still(pid, False)
+        assert injector.update(100.99) == [] and stands_still(pid, False)
+        assert injector.update(101.01) == [str(slow)] and stands_still(pid, False)
         for k in range(1, 8):
-            assert injector.look(101.01 + 0.05 * k) == [] and stands_still(pid, k % 4 != 0)
-        injector.look(102.01)
+            assert injector.update(101.01 + 0.05 * k) == [] and stands_still(pid, k % 4 != 0)
+        injector.update(102.01)
         assert stands_still(pid, False)
-        injector.look(102.1)
+        injector.update(102.1)
         assert stands_still(pid, False)
     finally:
         crew.kill("tracking")
@@ -131,7 +132,7 @@ def test_a_run_whose_stalled_arm_was_called_back_is_replayed_to_the_byte(start: 
     texts = [f"arm stall 300ms at {instant}s" for instant in range(4, 90, 2)]  # whenever it comes to print
     stalls = faults_from_texts("here", "fault", texts)
     profile = read_arm(tmp_path / "arm.toml")
-    with serving(link, ArmSettings(replies=Replies.STREAM), profile=profile, faults=stalls):
+    with serving(link, ArmSettings(replies=ReplyMode.STREAM), profile=profile, faults=stalls):
         run = start(record, str(link))
         run.wait_for("the path is printed")
         assert run.end() == 0

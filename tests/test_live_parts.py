@@ -1,4 +1,6 @@
-"""Parts of a live run: settings, what goes between processes, what is shown when, what is kept beside."""
+"""Parts of a live run: settings, what goes between processes, what is shown when, what is kept beside. The course of a
+run: bounded, whatever its length, and nothing of what matters is lost in its bins.
+"""
 
 from __future__ import annotations
 
@@ -17,50 +19,50 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
-from estimation.pose import SurfacePose, TrackState
-from estimation.trajectory import Trajectory
-from hardware.arm.profile import BENCH, ArmProfile
-from hardware.bookmark_file import keep_bookmark, read_start
-from hardware.files.path_file import write_path
-from hardware.live.arrived import SourceEnded
-from hardware.live.beside import Beside, Found, read_found, write_found
-from hardware.live.frame_source import SLOTS, FrameRing, RingSource
-from hardware.live.inbox import HEAD, Inbox
-from hardware.live.kept import kept_begin
-from hardware.live.laid import laid_on, lifted
-from hardware.live.outbox import Outbox
-from hardware.live.prepared import prepare, prepare_again
-from hardware.live.records import (
-    Begin,
-    Entry,
-    EventEntry,
-    SetEntry,
+from estimation.pose import SurfacePose, TrackState, Trajectory
+from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
+from hardware.files.path_file import read_progress, write_path, write_progress_durably
+from hardware.live.checklist import place_path, raised_path
+from hardware.live.frame_source import RING_SLOTS, FrameRing, RingSource, SourceEnded
+from hardware.live.outcome import FIRST_BIN_WIDTH, TIMELINE_BINS, ErrorTimeline
+from hardware.live.prepared import RunFiles, SurfacePlacement, prepare, prepare_resumed, read_placement, write_placement
+from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender
+from hardware.live.records import BeginPrint, Entry, EventEntry, SetEntry
+from hardware.live.run import recorded_begin
+from hardware.live.session_player import schedule, turning_sets
+from hardware.live.settings import (
+    LiveSettings,
+    available_cores,
+    check_settings,
+    override_settings,
+    read_settings,
+    settings_text,
 )
-from hardware.live.session_player import schedule, turns
-from hardware.live.settings import LiveSettings, check_settings, cores_there, overridden, read_settings, settings_text
-from hardware.live.state_machine import Task
+from hardware.live.state_machine import PrintTask
 from perception.frames import Frame, FrameSet
 from planning.progress import fingerprint
 from tests.moving import raster
 
-THERE = cores_there()
+THERE = available_cores()
 PROFILE = ArmProfile()
-SURFACE = SurfacePose(0.0, BENCH, np.eye(6) * 1e-6, np.zeros(6), TrackState.TRACKING)
+SURFACE = SurfacePose(0.0, ARM_FROM_BENCH, np.eye(6) * 1e-6, np.zeros(6), TrackState.TRACKING)
 
 
 def test_a_dry_run_extrudes_nothing_and_stays_above_along_the_tool() -> None:
     path = raster()
-    dry = lifted(path, 7.0)
+    dry = raised_path(path, 7.0)
     assert not dry.extrude.any()
-    assert Task(path, PROFILE).fingerprint == fingerprint(path) and not Task(path, PROFILE, lift=7.0).fingerprint
+    assert (
+        PrintTask(path, PROFILE).fingerprint == fingerprint(path) and not PrintTask(path, PROFILE, lift=7.0).fingerprint
+    )
     up = np.einsum("nij,nj->ni", path.surface_from_nozzle[:, :3, :3], np.tile([0, 0, 7.0], (len(path), 1)))
     assert dry.surface_from_nozzle[:, :3, 3] == pytest.approx(path.surface_from_nozzle[:, :3, 3] + up)
 
 
 def test_an_arm_that_has_no_place_is_put_where_the_surface_lies_below_its_home() -> None:
     pose = replace(SURFACE, base_from_surface=se3.make(se3.exp_rotation([0.3, 0.2, 0.1]), np.array([9.0, 8, 700])))
-    assert laid_on(raster(), np.eye(4), pose, PROFILE, place=False).unreachable
-    assert not laid_on(raster(), np.eye(4), pose, PROFILE, place=True).unreachable
+    assert place_path(raster(), np.eye(4), pose, PROFILE, place=False).unreachable
+    assert not place_path(raster(), np.eye(4), pose, PROFILE, place=True).unreachable
 
 
 # -- settings
@@ -119,15 +121,17 @@ def test_a_key_that_nobody_reads_or_of_a_wrong_kind_is_an_error(text: str, tmp_p
 
 
 def test_flags_override_and_what_was_not_given_does_not() -> None:
-    assert overridden(LiveSettings(lift=3.0, arm="a"), {"lift": None, "arm": "b"}) == LiveSettings(lift=3.0, arm="b")
+    assert override_settings(LiveSettings(lift=3.0, arm="a"), {"lift": None, "arm": "b"}) == LiveSettings(
+        lift=3.0, arm="b"
+    )
 
 
 @pytest.mark.parametrize("lift", [0.0, 20.0])
 def test_a_lift_is_asked_for_in_a_dry_run_alone(lift: float) -> None:
-    assert overridden(LiveSettings(), {"lift": lift, "dry_run": True}).lift == lift
-    assert overridden(LiveSettings(dry_run=True), {"lift": lift, "dry_run": None}).lift == lift
+    assert override_settings(LiveSettings(), {"lift": lift, "dry_run": True}).lift == lift
+    assert override_settings(LiveSettings(dry_run=True), {"lift": lift, "dry_run": None}).lift == lift
     with pytest.raises(InputError, match=rf"--lift = {lift}, allowed with --dry-run"):
-        overridden(LiveSettings(), {"lift": lift, "dry_run": None})
+        override_settings(LiveSettings(), {"lift": lift, "dry_run": None})
 
 
 # -- between processes
@@ -162,14 +166,14 @@ def test_frames_that_were_written_over_meanwhile_are_not_taken() -> None:
     ring = FrameRing([(8, 6), (8, 6)])
     word = ring.put(frames(1), {}, lambda: 0.0, 0.0)
     assert ring.take(word) is not None
-    for count in range(SLOTS):
+    for count in range(RING_SLOTS):
         ring.put(frames(count + 2), {}, lambda: 0.0, 0.0)
     assert ring.take(word) is None
 
 
 def test_a_recorder_that_takes_nothing_holds_up_nobody_and_what_finds_no_room_is_counted() -> None:
     ours, theirs = Pipe(duplex=False)
-    box = Outbox(theirs)
+    box = RecorderSender(theirs)
     picture = SetEntry({0: 0.0}, {0: ("jpeg", bytes(4_000_000))})
     for _ in range(20):
         box.put(picture)
@@ -178,7 +182,7 @@ def test_a_recorder_that_takes_nothing_holds_up_nobody_and_what_finds_no_room_is
     box.put(EventEntry(1.0, "small", 2, "x"))
     assert box.dropped == before  # pictures leave room for what is small
     found = list[Entry]()
-    reader = threading.Thread(target=lambda: found.extend(_taken(Inbox(ours))))
+    reader = threading.Thread(target=lambda: found.extend(_taken(RecorderReceiver(ours))))
     reader.start()
     box.close()
     reader.join(10)
@@ -186,7 +190,7 @@ def test_a_recorder_that_takes_nothing_holds_up_nobody_and_what_finds_no_room_is
     box.put(picture)
 
 
-def _taken(inbox: Inbox) -> list[Entry]:
+def _taken(inbox: RecorderReceiver) -> list[Entry]:
     taken = list[Entry]()
     while not inbox.ended:
         taken += inbox.take()
@@ -197,7 +201,7 @@ def _taken(inbox: Inbox) -> list[Entry]:
 @given(st.lists(st.integers(0, 5_000) | st.integers(900_000, 3_000_000), max_size=5))
 def test_what_is_put_is_taken_in_order_however_large(sizes: list[int]) -> None:
     ours, theirs = Pipe(duplex=False)
-    inbox, box = Inbox(ours), Outbox(theirs)
+    inbox, box = RecorderReceiver(ours), RecorderSender(theirs)
     found = list[Entry]()
     reader = threading.Thread(target=lambda: found.extend(_taken(inbox)))
     reader.start()
@@ -212,10 +216,10 @@ def test_what_is_put_is_taken_in_order_however_large(sizes: list[int]) -> None:
 @given(st.lists(st.integers(0, 300), max_size=5), st.lists(st.integers(1, 200), min_size=1), st.integers(0, 2000))
 def test_what_a_killed_sender_cut_short_is_left_out(sizes: list[int], pieces: list[int], cut: int) -> None:
     entries = [pickle.dumps(EventEntry(float(k), "x" * size, 2, "test")) for k, size in enumerate(sizes)]
-    data = b"".join(HEAD.pack(len(entry)) + entry for entry in entries)[:cut]
-    whole = int(np.searchsorted(np.cumsum([HEAD.size + len(entry) for entry in entries]), len(data), "right"))
+    data = b"".join(ENTRY_HEAD.pack(len(entry)) + entry for entry in entries)[:cut]
+    whole = int(np.searchsorted(np.cumsum([ENTRY_HEAD.size + len(entry) for entry in entries]), len(data), "right"))
     ours, theirs = Pipe(duplex=False)
-    inbox, found, begin = Inbox(ours), list[Entry](), 0
+    inbox, found, begin = RecorderReceiver(ours), list[Entry](), 0
     for size in itertools.cycle(pieces):
         if begin >= len(data):
             break
@@ -235,7 +239,7 @@ def test_a_session_shown_to_and_fro_is_smooth_where_it_turns(count: int, seed: i
     stamps = np.cumsum(rng.uniform(0.02, 0.05, count))
     places = np.sin(2 * np.pi * stamps / stamps[-1] * 4 + rng.uniform(0, 6))
     truth = Trajectory(stamps, se3.make(np.eye(3), np.outer(places, [0, 0, 3.0])), True)
-    first, last = turns(truth, stamps)
+    first, last = turning_sets(truth, stamps)
     assert 0 <= first < last < count
     shown = schedule(stamps, 100.0, (first, last))
     showings = [next(shown) for _ in range(4 * count)]
@@ -256,25 +260,25 @@ def test_a_session_without_truth_is_shown_once() -> None:
 
 def test_the_place_of_a_path_is_kept_and_read_back(tmp_path: Path) -> None:
     path = raster()
-    keep_bookmark(tmp_path / "x.toml", fingerprint(path), 3.0625)
-    assert read_start(tmp_path / "x.toml", path) == 3.0625
+    write_progress_durably(tmp_path / "x.toml", fingerprint(path), 3.0625)
+    assert read_progress(tmp_path / "x.toml", path) == 3.0625
     with pytest.raises(InputError):
-        read_start(tmp_path / "x.toml", lifted(path, 1.0))
+        read_progress(tmp_path / "x.toml", raised_path(path, 1.0))
 
 
 def test_where_the_path_lies_is_kept_to_the_last_digit(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").touch()
     pose = se3.make(se3.exp_rotation([0.1, 0.2, 0.3]), np.array([1 / 3, 2 / 3, 1e-9]))
-    write_found(tmp_path / "x.toml", Found(tmp_path / "run.mcap", 1 / 7, pose, se3.inverse(pose)))
-    found = read_found(tmp_path / "x.toml")
+    write_placement(tmp_path / "x.toml", SurfacePlacement(tmp_path / "run.mcap", 1 / 7, pose, se3.inverse(pose)))
+    found = read_placement(tmp_path / "x.toml")
     assert (found.surface_from_path == pose).all() and (found.arm_from_base == se3.inverse(pose)).all()
     assert found.until == 1 / 7
     for name in ("gone.mcap", 800 * "x"):
-        write_found(tmp_path / "y.toml", Found(tmp_path / name, 0.0, pose, pose))
+        write_placement(tmp_path / "y.toml", SurfacePlacement(tmp_path / name, 0.0, pose, pose))
         with pytest.raises(InputError, match="map"):
-            read_found(tmp_path / "y.toml")
-    assert Beside(tmp_path / "run.mcap").next().record == tmp_path / "run-2.mcap"
-    assert Beside(tmp_path / "run-2.mcap").next().record == tmp_path / "run-3.mcap"
+            read_placement(tmp_path / "y.toml")
+    assert RunFiles(tmp_path / "run.mcap").next().record == tmp_path / "run-2.mcap"
+    assert RunFiles(tmp_path / "run-2.mcap").next().record == tmp_path / "run-3.mcap"
 
 
 def test_a_run_that_resumes_one_that_resumed_knows_what_the_first_one_found(tmp_path: Path) -> None:
@@ -286,25 +290,50 @@ def test_a_run_that_resumes_one_that_resumed_knows_what_the_first_one_found(tmp_
     record, names = tmp_path / "run.mcap", ("rig.toml", "path.csv")
     rig, path = (tmp_path / name for name in names)
     first = prepare(LiveSettings(rig=rig, path=path, arm="virtual", record=record), "here", False)
-    first.beside.session.write_text(settings_text(first.settings))
+    first.files.session.write_text(settings_text(first.settings))
     place = se3.make(np.eye(3), np.array([1.0, 2, 3]))
-    write_found(first.beside.surface, Found(rig, 5.0, place, se3.inverse(place)))
-    keep_bookmark(first.beside.progress, fingerprint(first.task.path), 2.5)
+    write_placement(first.files.surface, SurfacePlacement(rig, 5.0, place, se3.inverse(place)))
+    write_progress_durably(first.files.progress, fingerprint(first.task.path), 2.5)
     for _ in range(3):
         record.touch()
-        again = prepare_again(record, {})
-        assert again.task.start == 2.5 and again.found is not None and again.found.map == rig
+        again = prepare_resumed(record, {})
+        assert again.task.start == 2.5 and again.placement is not None and again.placement.map == rig
         assert (again.task.profile.arm.arm_from_base == se3.inverse(place)).all() and not again.task.place
-        record = again.beside.record
-        again.beside.session.write_text(settings_text(again.settings))
+        record = again.files.record
+        again.files.session.write_text(settings_text(again.settings))
     assert record.name == "run-4.mcap"
 
 
 def test_what_is_begun_is_what_the_recording_holds() -> None:
-    begin = Begin(raster(), replace(PROFILE, lag=0.1 / 3), 0.0, "x")
-    texts, used = kept_begin(begin)
-    again, same = kept_begin(used)
+    begin = BeginPrint(raster(), replace(PROFILE, lag=0.1 / 3), 0.0, "x")
+    texts, used = recorded_begin(begin)
+    again, same = recorded_begin(used)
     assert used.profile.lag == begin.profile.lag
     assert (same.path.surface_from_nozzle == used.path.surface_from_nozzle).all()
     assert used.path.surface_from_nozzle == pytest.approx(begin.path.surface_from_nozzle, abs=1e-12)
     assert set(texts) == set(again)
+
+
+TICK = 0.05  # s
+
+
+@given(seconds=st.floats(0.1, 400.0), seed=st.integers(0, 1000))
+def test_the_largest_error_and_the_time_of_holds_stay_where_they_were(seconds: float, seed: int) -> None:
+    draw, course = np.random.default_rng(seed), ErrorTimeline()
+    stamps = 1000.0 + np.arange(0.0, seconds, TICK)
+    error = np.where(draw.random(len(stamps)) < 0.3, np.nan, draw.exponential(0.1, len(stamps)))
+    held = np.where(np.isnan(error), TICK, 0.0)
+    for tick in zip(stamps.tolist(), error.tolist(), held.tolist(), strict=True):
+        course.add(*tick)
+    known = len(course.stamps)
+    assert known <= TIMELINE_BINS == len(course.error) == len(course.held)
+    assert course.stamps[-1] == pytest.approx(stamps[-1] - stamps[0], abs=course.width)
+    assert course.width == FIRST_BIN_WIDTH or seconds > TIMELINE_BINS / 2 * course.width
+    assert course.held.sum() == pytest.approx(held.sum()) and not course.held[known:].any()
+    if np.isfinite(error).any():
+        largest = np.nanargmax(error)
+        assert np.nanmax(course.error) == error[largest]
+        where = course.stamps[np.nanargmax(course.error[:known])]
+        assert where == pytest.approx(stamps[largest] - stamps[0], abs=course.width)
+    else:
+        assert np.isnan(course.error).all()

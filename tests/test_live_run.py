@@ -1,4 +1,6 @@
-"""A live run whose tracker needs no pictures: it prints, is stopped by whatever may stop it, loses nothing, goes on."""
+"""A live run whose tracker needs no pictures: it prints, is stopped by whatever may stop it, loses nothing, goes on. A
+live run operated from its page alone: what the buttons say is so, and the bytes that the arm was sent prove it.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hardware.bookmark_file import read_start
-from hardware.files.path_file import read_path
-from hardware.files.session import open_session
-from hardware.live.beside import Beside
-from hardware.live.replayed import replay_run
-from tests.light_live import prepare_files
-from tests.live_runs import CLOCK, Running, closed, messages, printed_once, rests, summary
+from hardware.files.path_file import read_path, read_progress
+from hardware.live.prepared import RunFiles
+from hardware.live.recorded_run import replay_run
+from hardware.recording.session_reader import open_session
+from tests.browser import Browser, Page, executable
+from tests.light_live import HOME, prepare_files
+from tests.live_runs import CLOCK, Running, closed, executed, messages, printed_once, rests, summary
 from tests.slowly import slowly
 from tests.test_arm_port import serving
 
@@ -59,7 +61,7 @@ def confirmed(run: Running) -> int:
 
 def kept(record: Path, path: Path) -> float:
     """The place on the path that is kept for the next run."""
-    return read_start(Beside(record).progress, read_path(path))
+    return read_progress(RunFiles(record).progress, read_path(path))
 
 
 def last_place(record: Path) -> float:
@@ -96,8 +98,7 @@ def test_stopped_paused_home_and_without_its_page_it_goes_on_until_ctrl_c_and_an
     os.kill(resumed.process.pid, signal.SIGHUP)  # what the kernel sends when a terminal goes
     os.close(resumed.keys)
     resumed.keys = -1
-    assert resumed.end() == 128 + signal.SIGHUP
-    assert rests(second, now, 0.5) and not open_session(second).damage
+    assert resumed.end() == 128 + signal.SIGHUP and rests(second, now, 0.5) and not open_session(second).damage
     printed_once(record, second)
     for file in (record, second):  # with a stop, a pause and a way home in the first
         ticks = list(replay_run(file))
@@ -115,9 +116,7 @@ def test_a_process_that_is_killed_is_noticed_the_arm_rests_and_the_place_is_kept
     run = begun(start, record)
     killed = run.kill(name)
     run.wait_for(f"the {name} process was killed by SIGKILL")
-    assert run.end() == 1
-    assert rests(record, killed, 0.5)
-    assert killed - open_session(record).sets[-1][0].stamp < 1.0
+    assert run.end() == 1 and rests(record, killed, 0.5) and killed - open_session(record).sets[-1][0].stamp < 1.0
     place = kept(record, tmp_path / "path.csv")
     assert place >= last_place(record) - 1e-9
     if name != "recorder":  # what is recorded ends with the recorder
@@ -131,8 +130,7 @@ def test_the_conducting_process_killed_leaves_an_arm_at_rest_and_a_whole_recordi
     run = begun(start, record)
     killed = CLOCK.now()
     run.process.kill()
-    assert rests(record, killed, 0.5)
-    assert killed - closed(record).sets[-1][0].stamp < 0.5
+    assert rests(record, killed, 0.5) and killed - closed(record).sets[-1][0].stamp < 0.5
     assert kept(record, tmp_path / "path.csv") == pytest.approx(last_place(record), abs=0.2)
 
 
@@ -186,15 +184,13 @@ def test_what_goes_wrong_on_purpose_is_said_held_through_and_in_the_end_stops_th
     hung = CLOCK.now()
     run.wait_for("on purpose: disk full")
     struck = CLOCK.now()
-    assert run.end() == 1
-    assert "recording stopped" in run.said and "go on with: stillbed live --resume" in run.said
+    assert run.end() == 1 and "recording stopped" in run.said and "go on with: stillbed live --resume" in run.said
     holds = [m for m in messages(record, "/hold") if hung < float(str(m["stamp"])) < hung + 1.2]
     assert any("pose is" in str(m["reason"]) for m in holds)
     missed = [m for m in messages(record, "/events") if "the tracking process has said nothing" in str(m["message"])]
     assert any(hung < float(str(m["stamp"])) < hung + 1.2 for m in missed)
     went_on = [m for m in messages(record, "/move") if hung + 1.0 < float(str(m["stamp"])) < struck]
-    assert len(went_on) > 20
-    assert rests(record, struck, 1.0)
+    assert len(went_on) > 20 and rests(record, struck, 1.0)
     assert kept(record, tmp_path / "path.csv") >= last_place(record) - 1e-9
 
 
@@ -211,3 +207,108 @@ def test_a_run_that_is_ended_once_all_is_printed_is_not_to_be_resumed(start: Sta
     run.process.send_signal(signal.SIGINT)
     assert run.end() == 130 and run.said.count("ended: Ctrl-C") == 2 and "ended: ended" not in run.said
     assert "the path is printed; there is nothing to go on with" in run.said and "--resume" not in run.said
+
+
+CHROMIUM = executable()
+SETTLED = 0.3  # s after which what was sent before has been carried out
+RETREATED = 2.0  # s after which the nozzle stands above the surface in a pause
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[Running]:
+    prepare_files(tmp_path)
+    made = Running("--page", cache=tmp_path, program=("tests.light_live", str(tmp_path), str(tmp_path / "run.mcap")))
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def browser() -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium: apt-get install chromium")
+    made = Browser(CHROMIUM)
+    yield made
+    made.close()
+
+
+def press(page: Page, wish: str, leads_to: str, sure: bool = False) -> float:
+    """Press a button, and again if a busy machine let the page look old at that moment; when it was followed, s."""
+    button = f'footer [data-wish="{wish}"]'
+    for attempt in range(6):
+        if attempt and page.js(f'{leads_to}.includes(document.body.dataset.stage + "")'):
+            return CLOCK.now()
+        page.until(f"document.querySelector('{button}') && !document.querySelector('{button}').disabled", timeout=60)
+        page.js("new Promise((done) => setTimeout(done, 750))")
+        page.click(button)
+        if sure and page.js('!document.getElementById("sure").hidden'):
+            page.click("#sure-yes")
+        try:
+            page.until(f'{leads_to}.includes(document.body.dataset.stage + "")', timeout=4)
+            return CLOCK.now()
+        except AssertionError:
+            continue
+    raise AssertionError(f"{wish} led to nothing: {page.js('document.body.innerText')}")
+
+
+def moves_sent(record: Path) -> np.ndarray:
+    """Stamps (N,), s, of the moves that went to the arm."""
+    sent = messages(record, "/arm/sent")
+    return np.array([float(str(m["stamp"])) for m in sent if base64.b64decode(str(m["data"]))[1:2] == b"1"])
+
+
+def test_every_button_does_what_it_says_and_the_end_is_told(run: Running, browser: Browser, tmp_path: Path) -> None:
+    end = run.wait_for(r"open http://\S+")
+    page = browser.page(run.said[:end].rsplit(" ", 1)[1])
+    confirmed = press(page, "confirm", '["ready"]')
+    started = press(page, "start", '["homing", "approach", "print"]', sure=True)
+    prints(page)
+    paused = press(page, "pause", '["paused"]')
+    pause_ends = later(RETREATED + 1.0)
+    press(page, "resume", '["approach", "print"]')
+    prints(page)
+    homing = press(page, "home", '["homing", "stopped"]', sure=True)
+    page.until('document.body.dataset.stage === "stopped"', timeout=60)
+    home = CLOCK.now()
+    home_ends = later(0.5)
+    press(page, "resume", '["approach", "print"]', sure=True)
+    prints(page)
+    stopped = press(page, "stop", '["stopped"]')
+    stop_ends = later(1.0)
+    press(page, "resume", '["approach", "print"]', sure=True)
+    prints(page)
+    ended = press(page, "end", '["ended"]', sure=True)
+    page.until('document.body.dataset.news === "gone"', timeout=60)
+    assert page.text("#chip") == "Finished" and "by the operator" in page.text("#reason")
+    assert run.end() == 1 and "\nended by the operator\n" in run.said
+    record = tmp_path / "run.mcap"
+    closed(record)
+    moves = moves_sent(record)
+
+    def between(begin: float, end: float) -> int:
+        return int(((moves > begin) & (moves < end)).sum())
+
+    assert between(0.0, confirmed) == 0 and between(started, paused) > 20
+    assert between(paused + RETREATED, pause_ends) == 0 and between(pause_ends, homing) > 20
+    assert between(homing, home) > 5 and between(home + SETTLED, home_ends) == 0
+    assert between(home_ends, stopped) > 20 and between(stopped + SETTLED, stop_ends) == 0
+    assert between(stop_ends, ended) > 20 and between(ended + SETTLED, np.inf) == 0
+    stamps, axes = executed(record)
+    for begin, end in ((stopped, stop_ends), (home, home_ends), (ended, np.inf)):
+        still = axes[(stamps > begin + SETTLED) & (stamps < end)]
+        assert not len(still) or np.ptp(still, axis=0).max() < 0.05
+    waits = axes[(stamps > paused + RETREATED) & (stamps < pause_ends)]
+    printing = axes[(stamps > paused - 0.3) & (stamps < paused)]
+    assert waits[:, 2].min() > printing[:, 2].max() + 5.0
+    at_home = axes[(stamps > home + SETTLED) & (stamps < home_ends)]
+    assert np.abs(at_home[:, 2] - HOME).max() < 0.1
+
+
+def prints(page: Page) -> None:
+    page.until('document.body.dataset.stage === "print"', timeout=60)
+    later(0.8)
+
+
+def later(seconds: float) -> float:
+    """Wait; the instant, s."""
+    CLOCK.wait_until(CLOCK.now() + seconds)
+    return CLOCK.now()

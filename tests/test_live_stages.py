@@ -9,49 +9,49 @@ import pytest
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
-from hardware.arm.profile import BENCH, ArmProfile
-from hardware.arm_status import ArmState, ArmStatus
-from hardware.live.records import LiveMotionReport, Pace, RecorderReport, TrackingReport
-from hardware.live.state_machine import Conductor, Seen, Task
-from hardware.live.words import stage_line
+from hardware.arm.device import ArmState, ArmStatus, Reason
+from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
+from hardware.live.records import LiveMotionReport, PauseOrder, RecorderReport, TrackingReport
+from hardware.live.state_machine import PrintTask, RunReports, RunStateMachine
+from hardware.live.view import stage_line
 from hardware.motion.loop import Order, Tick
-from hardware.operator.shared_state import Request, Wish
-from hardware.operator.view import Stage
+from hardware.operator.shared_state import OperatorRequest
+from hardware.operator.view import RunStage, Wish
 from planning.command import Hold
-from planning.progress import Phase, Progress
+from planning.progress import PrintPhase, PrintProgress
 from tests.moving import raster
 
 PROFILE = ArmProfile()
-SURFACE = SurfacePose(0.0, BENCH, np.eye(6) * 1e-6, np.zeros(6), TrackState.TRACKING)
+SURFACE = SurfacePose(0.0, ARM_FROM_BENCH, np.eye(6) * 1e-6, np.zeros(6), TrackState.TRACKING)
 
 
 class Staged:
     """A conductor with the reports that it is given; time goes on by `look`."""
 
     def __init__(self, **task: object) -> None:
-        self.conductor = Conductor(Task(raster(), PROFILE, stands_home=True, **task))  # type: ignore[arg-type]
+        self.conductor = RunStateMachine(PrintTask(raster(), PROFILE, stands_home=True, **task))  # type: ignore[arg-type]
         self.now, self.arm = 0.0, ArmState.DISARMED
-        self.phase: Phase | None = None
+        self.phase: PrintPhase | None = None
         self.fraction = 1.0  # of 5 checkpoints
-        self.seen, self.pose = Seen(recorder=RecorderReport(0.0, 0, 0.0, "")), SURFACE
+        self.seen, self.pose = RunReports(recorder=RecorderReport(0.0, 0, 0.0, "")), SURFACE
         self.ended, self.asked, self.answers = "", 0, 0
         self.orders: list[object] = []
         self.led: list[object] = []  # orders on the way to where it prints, begun paths by a word
 
-    def look(self, *wishes: Wish, seconds: float = 0.1) -> Stage:
+    def look(self, *wishes: Wish, seconds: float = 0.1) -> RunStage:
         self.now += seconds
         asked = []
         for wish in wishes:
             self.asked += 1
-            asked.append(Request(self.asked, wish, self.conductor.turn))
+            asked.append(OperatorRequest(self.asked, wish, self.conductor.turn))
         pose = replace(self.pose, stamp=self.now)
         self.seen.tracking = TrackingReport(
             self.now, ("a", "b"), (0, 1), pose, np.eye(4), 0.0, 5, ended=self.ended, used=(50, 50)
         )
         nan = float("nan")
         status = ArmStatus(self.now, self.arm, "why", PROFILE.arm.home, None, 0.0, nan, nan, 0.0, 0, 0, self.answers, 0)
-        tick = Tick(self.now, Hold(self.now, 0.001, "x"), b"", 0.0, status, "")
-        progress = None if self.phase is None else Progress(self.phase, 1, 6, self.fraction, 9.0, self.fraction)
+        tick = Tick(self.now, Hold(self.now, 0.001, "x"), b"", 0.0, status, Reason())
+        progress = None if self.phase is None else PrintProgress(self.phase, 1, 6, self.fraction, 9.0, self.fraction)
         self.seen.motion = LiveMotionReport(tick, progress, False, (), (), 0, 0, None, 0, "ordinary")
         self.orders += self.conductor(self.now, self.seen, asked)
         return self.conductor.stage
@@ -72,43 +72,43 @@ class Staged:
         self.to_homing()
         self.arm = ArmState.DISARMED
         self.look()
-        self.arm, self.phase = ArmState.ARMED, Phase.PRINTING
+        self.arm, self.phase = ArmState.ARMED, PrintPhase.PRINTING
         self.look()
-        assert self.look() is Stage.PRINT
-        self.led = [order if isinstance(order, Order | Pace) else "begin" for order in self.orders]
+        assert self.look() is RunStage.PRINT
+        self.led = [order if isinstance(order, Order | PauseOrder) else "begin" for order in self.orders]
         self.orders.clear()
         return self
 
-    def stays(self, stage: Stage, looks: int = 100) -> None:
+    def stays(self, stage: RunStage, looks: int = 100) -> None:
         """Look again and again: it stays where it is."""
         assert {self.look() for _ in range(looks)} == {stage}
 
 
 def test_stages_follow_each_other_and_the_arm_is_armed_only_after_it_went_home() -> None:
     run = Staged().to_print()
-    assert run.led == [Order.AT_HOME, Order.HOME, "begin", Pace.RESUME, Order.ARM]
-    run.phase = Phase.FINISHED
-    assert run.look() is Stage.HOMING
+    assert run.led == [Order.AT_HOME, Order.HOME, "begin", PauseOrder.RESUME, Order.ARM]
+    run.phase = PrintPhase.FINISHED
+    assert run.look() is RunStage.HOMING
     run.look()
     run.arm = ArmState.DISARMED
-    assert run.look() is Stage.DONE and run.conductor.done
+    assert run.look() is RunStage.DONE and run.conductor.done
 
 
 def test_nothing_moves_before_it_was_confirmed_and_started() -> None:
     run = Staged()
     for _ in range(50):
-        assert run.look() in (Stage.CHECK, Stage.FIND, Stage.CONFIRM)
+        assert run.look() in (RunStage.CHECK, RunStage.FIND, RunStage.CONFIRM)
     run.look(Wish.START, Wish.RESUME, Wish.HOME)
     assert not run.orders
     run.look(Wish.CONFIRM)
-    assert not run.orders and run.conductor.stage is Stage.READY
+    assert not run.orders and run.conductor.stage is RunStage.READY
 
 
-@pytest.mark.parametrize("stage", [Stage.CHECK, Stage.CONFIRM, Stage.PRINT, Stage.PAUSED, Stage.HOMING])
-def test_a_stop_is_always_ordered_whatever_the_window_showed(stage: Stage) -> None:
+@pytest.mark.parametrize("stage", [RunStage.CHECK, RunStage.CONFIRM, RunStage.PRINT, RunStage.PAUSED, RunStage.HOMING])
+def test_a_stop_is_always_ordered_whatever_the_window_showed(stage: RunStage) -> None:
     run = Staged().to_print()
     run.conductor.stage = stage
-    orders = run.conductor(run.now, run.seen, [Request(1, Wish.STOP, -7)])
+    orders = run.conductor(run.now, run.seen, [OperatorRequest(1, Wish.STOP, -7)])
     assert orders[0] is Order.STOP
 
 
@@ -118,18 +118,18 @@ def test_a_wish_from_before_a_stop_lets_nothing_go_on() -> None:
     run.arm = ArmState.STOPPED
     run.look(Wish.STOP)
     run.orders.clear()
-    run.conductor(run.now, run.seen, [Request(9, Wish.RESUME, turn)])
-    assert run.conductor.stage is Stage.STOPPED and not run.orders
+    run.conductor(run.now, run.seen, [OperatorRequest(9, Wish.RESUME, turn)])
+    assert run.conductor.stage is RunStage.STOPPED and not run.orders
     assert run.conductor.answer is not None and not run.conductor.answer.followed
 
 
 def test_an_arm_that_stops_by_itself_is_not_armed_again_unasked() -> None:
     run = Staged().to_print()
     run.arm = ArmState.STOPPED
-    run.stays(Stage.STOPPED)
+    run.stays(RunStage.STOPPED)
     assert not run.orders and run.conductor.reason == "why"
     run.look(Wish.RESUME)
-    assert run.orders == [Pace.RESUME, Order.ARM]
+    assert run.orders == [PauseOrder.RESUME, Order.ARM]
 
 
 def test_what_goes_on_by_itself_ends_where_nobody_is_there_to_resume() -> None:
@@ -148,52 +148,53 @@ def test_what_ends_a_run_stops_the_arm_and_says_so(fault: str, words: str) -> No
     else:
         run.seen.recorder = RecorderReport(0.0, 0, 0.0, "the disk is full")
     run.look()
-    assert words in run.conductor.ended and run.conductor.stage is Stage.FAILED
-    assert run.orders[-1] is Order.STOP
+    assert words in run.conductor.ended and run.conductor.stage is RunStage.FAILED and run.orders[-1] is Order.STOP
 
 
-@pytest.mark.parametrize("phase", [Phase.LEAVING, Phase.WAITING, Phase.FINISHED])
+@pytest.mark.parametrize("phase", [PrintPhase.LEAVING, PrintPhase.WAITING, PrintPhase.FINISHED])
 @pytest.mark.parametrize("unattended", [False, True])
-def test_cameras_that_end_once_all_is_printed_end_nothing_and_the_arm_goes_home(phase: Phase, unattended: bool) -> None:
+def test_cameras_that_end_once_all_is_printed_end_nothing_and_the_arm_goes_home(
+    phase: PrintPhase, unattended: bool
+) -> None:
     run = Staged(unattended=unattended, patience=1.0).to_print()
     run.phase, run.fraction, run.ended = phase, 5.0, "session is over"
-    assert run.look() is Stage.HOMING and run.orders == [Order.HOME]
+    assert run.look() is RunStage.HOMING and run.orders == [Order.HOME]
     run.conductor(run.now + 1.1, run.seen, [])
-    assert run.look() is Stage.HOMING and not run.conductor.missed
+    assert run.look() is RunStage.HOMING and not run.conductor.silence
     run.arm = ArmState.DISARMED
-    assert run.look() is Stage.DONE and run.conductor.done and run.orders == [Order.HOME]
+    assert run.look() is RunStage.DONE and run.conductor.done and run.orders == [Order.HOME]
 
 
 def test_an_arm_that_was_stopped_when_all_was_printed_waits_for_the_operator_without_cameras() -> None:
     run = Staged().to_print()
-    run.phase, run.fraction, run.arm = Phase.LEAVING, 5.0, ArmState.STOPPED
+    run.phase, run.fraction, run.arm = PrintPhase.LEAVING, 5.0, ArmState.STOPPED
     run.look(Wish.STOP)
     run.ended = "session is over"
-    run.stays(Stage.STOPPED)
+    run.stays(RunStage.STOPPED)
     run.look(Wish.RESUME)
     run.arm = ArmState.ARMED
-    assert run.look() is Stage.HOMING
+    assert run.look() is RunStage.HOMING
     run.look()
     run.arm = ArmState.DISARMED
-    assert run.look() is Stage.DONE and run.conductor.done
+    assert run.look() is RunStage.DONE and run.conductor.done
 
 
 def test_whoever_ends_a_run_is_not_told_that_it_failed() -> None:
     run = Staged().to_print()
-    assert run.look(Wish.END) is Stage.ENDED and run.orders[-1] is Order.STOP and not run.conductor.done
+    assert run.look(Wish.END) is RunStage.ENDED and run.orders[-1] is Order.STOP and not run.conductor.done
 
 
 def test_pictures_that_do_not_come_stop_the_arm_until_somebody_resumes() -> None:
     run = Staged(patience=2.0).to_print()
     assert run.conductor(run.now + 2.1, run.seen, []) == [Order.STOP]
-    assert run.conductor.stage is Stage.STOPPED and "no pictures for 2.1 s" in run.conductor.reason
+    assert run.conductor.stage is RunStage.STOPPED and "no pictures for 2.1 s" in run.conductor.reason
     run.now += 2.1
     run.arm = ArmState.STOPPED
-    run.stays(Stage.STOPPED)
+    run.stays(RunStage.STOPPED)
     run.look(Wish.RESUME)
     run.arm = ArmState.ARMED
     run.look()
-    assert run.look() is Stage.PRINT and not run.conductor.ended
+    assert run.look() is RunStage.PRINT and not run.conductor.ended
 
 
 @pytest.mark.parametrize("answers", [0, 5])
@@ -203,14 +204,14 @@ def test_an_arm_that_is_unplugged_is_waited_for_and_says_where_it_stands_or_is_t
     run.to_print()
     run.arm = ArmState.UNPLUGGED
     for _ in range(200):
-        assert run.look() is Stage.STOPPED and "plug it in" in run.conductor.reason
+        assert run.look() is RunStage.STOPPED and "plug it in" in run.conductor.reason
     run.arm = ArmState.DISARMED
     run.look()
     assert set(run.orders) == {Order.STOP} and not run.conductor.ended
     assert ("by hand" in run.conductor.reason) == (not answers)
     run.orders.clear()
     run.look(Wish.HOME)
-    assert run.orders == [Pace.PAUSE, *([] if answers else [Order.AT_HOME]), Order.HOME]
+    assert run.orders == [PauseOrder.PAUSE, *([] if answers else [Order.AT_HOME]), Order.HOME]
 
 
 def test_an_arm_that_is_unplugged_ends_a_run_that_nobody_attends() -> None:
@@ -225,7 +226,7 @@ def test_an_arm_that_stops_on_its_way_home_is_not_taken_to_be_there() -> None:
     run = Staged().to_homing()
     run.orders.clear()
     run.arm = ArmState.STOPPED
-    run.stays(Stage.STOPPED)
+    run.stays(RunStage.STOPPED)
     assert run.conductor.reason == "why" and set(run.orders) <= {Order.STOP}
 
 
@@ -234,36 +235,35 @@ def test_a_path_out_of_reach_is_told_and_not_begun() -> None:
     run.pose = replace(SURFACE, base_from_surface=se3.make(np.eye(3), np.array([900.0, 0, 0])))
     for _ in range(4):
         run.look()
-    assert "out of reach: checkpoint 0: X" in run.conductor.ended
-    assert run.orders == [Order.STOP]
+    assert "out of reach: checkpoint 0: X" in run.conductor.ended and run.orders == [Order.STOP]
 
 
 @pytest.mark.parametrize("name", ["motion", "tracking"])
 def test_a_process_that_says_nothing_is_missed_after_two_of_its_words_and_back_with_the_next(name: str) -> None:
     run = Staged().to_print()
     conductor, seen = run.conductor, run.seen
-    assert seen.tracking is not None and seen.motion is not None and not conductor.missed
+    assert seen.tracking is not None and seen.motion is not None and not conductor.silence
     interval = PROFILE.tick if name == "motion" else 0.033
     said = run.now
     for look in range(1, 40):
         now = said + look * 0.01
         tracking = replace(seen.tracking, interval=0.033, stamp=said if name == "tracking" else now)
         tick = replace(seen.motion.tick, stamp=said if name == "motion" else now)
-        conductor(now, Seen(tracking, replace(seen.motion, tick=tick), seen.recorder), [])
-        assert bool(conductor.missed) == (now - said > 2 * interval + 0.01) and name in (conductor.missed or name)
-    assert "0.39 s" in conductor.missed and conductor.stage is Stage.PRINT
+        conductor(now, RunReports(tracking, replace(seen.motion, tick=tick), seen.recorder), [])
+        assert bool(conductor.silence) == (now - said > 2 * interval + 0.01) and name in (conductor.silence or name)
+    assert "0.39 s" in conductor.silence and conductor.stage is RunStage.PRINT
     run.look()
-    assert not conductor.missed
+    assert not conductor.silence
 
 
 @pytest.mark.parametrize(
     ("stage", "reason", "line"),
     [
-        (Stage.PRINT, "", "print"),
-        (Stage.DONE, "the path is printed", "done: the path is printed"),
-        (Stage.ENDED, "ended: Ctrl-C", "ended: Ctrl-C"),
-        (Stage.ENDED, "ended by the operator", "ended by the operator"),
+        (RunStage.PRINT, "", "print"),
+        (RunStage.DONE, "the path is printed", "done: the path is printed"),
+        (RunStage.ENDED, "ended: Ctrl-C", "ended: Ctrl-C"),
+        (RunStage.ENDED, "ended by the operator", "ended by the operator"),
     ],
 )
-def test_a_stage_and_why_are_said_once(stage: Stage, reason: str, line: str) -> None:
+def test_a_stage_and_why_are_said_once(stage: RunStage, reason: str, line: str) -> None:
     assert stage_line(stage, reason) == line

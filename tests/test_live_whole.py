@@ -1,4 +1,6 @@
-"""`stillbed live` before rendered pictures: what test_live_run.py shows of a light run holds of a whole one."""
+"""`stillbed live` before rendered pictures: what test_live_run.py shows of a light run holds of a whole one. When an
+arm came to rest after a kill, as the bench tells it from what a virtual arm has executed.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +15,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from hardware.bookmark_file import read_start
-from hardware.files.path_file import read_path
-from hardware.files.session import open_session
-from hardware.live.beside import Beside
+from hardware.bench.live import MAX_REST_DELAY, MIN_REST, REST_RADIUS, Kills, rest_delay
+from hardware.files.path_file import read_path, read_progress
+from hardware.live.prepared import RunFiles
 from hardware.live.prerender import prerender
-from hardware.live.remembered import recorded_poses
-from hardware.live.replayed import replay_run
+from hardware.live.recorded_run import replay_run
+from hardware.offline.track import tracker
 from hardware.process.clock import WallClock
-from hardware.tracker import tracker
+from hardware.recording.session_reader import open_session, read_poses
 from tests.live_runs import PATH, SCENARIO, Running, closed, messages, printed_once, rests, summary
 
 pytestmark = pytest.mark.slow
@@ -64,7 +67,7 @@ def begun(start: Start, cache: Path, record: Path, **more: Callable[[], None]) -
 
 def retracked_alike(record: Path, count: int) -> None:
     """That the first sets of a recording, tracked anew, give the very poses that it holds."""
-    session, poses = open_session(record), {pose.stamp: pose for pose in recorded_poses(record)}
+    session, poses = open_session(record), {pose.stamp: pose for pose in read_poses(record)}
     rois = [replace(roi, stamp=-np.inf) for roi in session.roi]
     with tracker(session.rig, rois) as step:
         for frames in islice(session.frame_sets(), count):
@@ -97,8 +100,7 @@ def test_stopped_in_the_terminal_it_rests_goes_on_and_a_signal_ends_it_for_anoth
     at = run.wait_for(r"\nprint\n", at)
     CLOCK.wait_until(CLOCK.now() + 1.0)
     os.kill(run.process.pid, signal.SIGTERM)
-    assert run.end() == 128 + signal.SIGTERM
-    assert "go on with: stillbed live --resume" in run.said
+    assert run.end() == 128 + signal.SIGTERM and "go on with: stillbed live --resume" in run.said
     found = summary(record)
     stops = found["latency_ms"]["stop decided to on the wire"]  # type: ignore[index,call-overload]
     assert stops["count"] >= 2
@@ -124,15 +126,13 @@ def test_a_process_that_is_killed_is_noticed_the_arm_rests_and_the_place_is_kept
     run = begun(start, cache, record)
     killed = run.kill(name)
     run.wait_for(f"the {name} process was killed by SIGKILL")
-    assert run.end() == 1
-    assert rests(record, killed, 0.5)
+    assert run.end() == 1 and rests(record, killed, 0.5)
     session = open_session(record)
     assert killed - session.sets[-1][0].stamp < 1.0
     path = read_path(next((cache / "stillbed").glob("small-*")) / "path.csv")
     ticks = messages(record, "/tick")
-    kept = read_start(Beside(record).progress, path)
-    assert kept >= float(str(ticks[-1]["fraction"])) - 1e-9
-    assert kept - float(str(ticks[-1]["fraction"])) < 1.0
+    kept = read_progress(RunFiles(record).progress, path)
+    assert kept >= float(str(ticks[-1]["fraction"])) - 1e-9 and kept - float(str(ticks[-1]["fraction"])) < 1.0
 
 
 def test_the_conducting_process_killed_leaves_an_arm_at_rest_and_a_whole_recording(
@@ -147,7 +147,7 @@ def test_the_conducting_process_killed_leaves_an_arm_at_rest_and_a_whole_recordi
     assert killed - session.sets[-1][0].stamp < 0.5
     ticks = messages(record, "/tick")
     path = read_path(next((cache / "stillbed").glob("small-*")) / "path.csv")
-    assert read_start(Beside(record).progress, path) == pytest.approx(float(str(ticks[-1]["fraction"])), abs=0.2)
+    assert read_progress(RunFiles(record).progress, path) == pytest.approx(float(str(ticks[-1]["fraction"])), abs=0.2)
 
 
 def test_cameras_that_end_end_the_run_with_the_arm_at_rest(start: Start, cache: Path, tmp_path: Path) -> None:
@@ -155,8 +155,7 @@ def test_cameras_that_end_end_the_run_with_the_arm_at_rest(start: Start, cache: 
     run = begun(start, cache, record)
     now = run.kill("feed")
     run.wait_for("the cameras have ended")
-    assert run.end() == 1
-    assert rests(record, now, 0.6)
+    assert run.end() == 1 and rests(record, now, 0.6)
 
 
 def test_a_full_disk_ends_the_run_and_what_was_written_stays(start: Start, cache: Path, tmp_path: Path) -> None:
@@ -167,8 +166,7 @@ def test_a_full_disk_ends_the_run_and_what_was_written_stays(start: Start, cache
         limits=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most)),
     )
     run.wait_for("recording stopped")
-    assert run.end() == 1
-    assert len(open_session(record)) > 20
+    assert run.end() == 1 and len(open_session(record)) > 20
     assert np.isfinite([ref.stamp for refs in open_session(record).sets for ref in refs]).all()
 
 
@@ -179,10 +177,44 @@ def test_a_camera_that_is_stuck_is_said_and_left_out_and_the_print_goes_on(
     run = start("--simulated", cache / "small.toml", "--record", record, "--yes", f"--fault={stuck}")
     run.wait_for("the path is printed")
     assert run.end() == 0
-    poses = list(recorded_poses(record))
+    poses = list(read_poses(record))
     same = [[f"cam_{c} shows the same picture again" in pose.reason for c in range(3)] for pose in poses]
     said = [pose.stamp for pose, (first, *others) in zip(poses, same, strict=True) if first and not any(others)]
     assert len(said) > 10 and said[-1] - said[0] == pytest.approx(1.5, abs=0.2)
     assert poses[0].stamp < said[0] - 1.0 and said[-1] + 1.0 < poses[-1].stamp
     assert all(pose.state.measured for pose in poses if said[0] <= pose.stamp <= said[-1])  # two see enough
     printed_once(record)
+
+
+STEP, END = 0.002, 3.0
+STAMPS = np.arange(0.0, END, STEP)
+
+
+@given(st.floats(1.0, END + 0.5), st.floats(1.0, 60.0))
+def test_it_rests_from_when_it_stays_where_it_ended(stop: float, speed: float) -> None:
+    axes = np.zeros((len(STAMPS), 6))
+    axes[:, 1] = speed * np.minimum(STAMPS, stop)
+    found, arrived = rest_delay(STAMPS, axes, 1.0), max(stop - 1.0 - REST_RADIUS / speed, 0.0)
+    if found == np.inf:
+        assert stop > END - MIN_REST - 2 * STEP
+    else:
+        assert abs(found - arrived) <= 2 * STEP
+
+
+def test_an_arm_that_stood_all_the_time_rests_at_once_and_a_turning_tool_moves_no_arm() -> None:
+    axes = np.zeros((len(STAMPS), 6))
+    axes[:, 5] = STAMPS
+    assert rest_delay(STAMPS, axes, 1.0) == 0.0
+
+
+def test_what_an_arm_that_moved_on_has_left_is_kept(tmp_path: Path) -> None:
+    left, kept = tmp_path / "left", tmp_path / "kept"
+    left.mkdir()
+    kept.mkdir()
+    kills = Kills(kept)
+    for name, rested in (("a", MAX_REST_DELAY / 2), ("b", MAX_REST_DELAY * 1.1)):
+        (left / f"{name}.mcap").write_bytes(b"x")
+        kills.rests.append(rested)
+        kills.keep(left / f"{name}.mcap", "feed", 3.0)
+    assert sorted(file.name for file in kept.iterdir()) == ["b.mcap", "kills.csv"]
+    assert (kept / "kills.csv").read_text().splitlines()[1:] == ["a.mcap,feed,0.250,3.000", "b.mcap,feed,0.550,3.000"]

@@ -11,22 +11,27 @@ from hypothesis import strategies as st
 
 from estimation.observations import Observations
 from estimation.online.estimator import Estimator
-from estimation.online.local_motion import CENTRES, REACH, LocalMotion, covering
+from estimation.online.local_motion import (
+    BELL_SIGMA_MM,
+    MAX_BELLS,
+    LocalMotion,
+    bell_centres,
+    displacement_sums,
+    solve_symmetric3,
+)
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.synthetic.arc_rig import arc_rig
-from estimation.synthetic.look import observations
-from estimation.synthetic.surfaces import patch
-from estimation.track_loops import displacement_sums, solutions
-from hardware.simulator.deformation import Deformation
-from hardware.simulator.struck_surface import RIDGE
+from estimation.synthetic.movements import patch
+from estimation.synthetic.world import arc_rig, observations
+from hardware.simulator.scene.shape import Deformation
+from hardware.simulator.truth import FOLD_SIGMA
 from tests.slowly import slowly
 from tests.synthetic import breathing
 
 RIG, RATE = arc_rig(), 30.0
 LANDMARKS = patch(120, np.random.default_rng(3)).points
-FOLD = Deformation(bulge=1.0, radius=RIDGE)
+FOLD = Deformation(bulge=1.0, radius=FOLD_SIGMA)
 MIDDLE = np.zeros((1, 3))
 BEGINS = 30  # frame sets before anything happens
 SOON, BACK = 3, 6  # frame sets: of a visible fold until it is said; of a flat surface until all is as before
@@ -87,8 +92,7 @@ def test_a_fold_is_said_soon_widens_the_claim_and_is_forgotten_soon(
     assert all(pose.state is TrackState.DEGRADED for pose in np.array(poses)[said])
     assert claims[said].min() > 0.5 > 5 * claims[BEGINS - 1]  # of mm that the guard allows
     over = int(np.ceil(BEGINS + late + RATE * seconds)) + BACK
-    assert all(pose.state is TrackState.TRACKING for pose in poses[over:])
-    assert claims[over:].max() < 0.1
+    assert all(pose.state is TrackState.TRACKING for pose in poses[over:]) and claims[over:].max() < 0.1
 
 
 @pytest.mark.parametrize("count", [300, *slowly(10_000)])
@@ -130,11 +134,11 @@ def test_what_the_map_takes_in_is_displaced_no_more() -> None:
 @settings(max_examples=20, deadline=None)
 def test_every_point_has_a_bell_and_those_of_before_stay(seed: int, count: int, further: int) -> None:
     points = np.random.default_rng(seed).uniform(-30, 30, (count + further, 3))
-    before = covering(points[:count], np.zeros((0, 3)))
-    after = covering(points, before)
-    assert (after[: len(before)] == before).all() and len(after) <= CENTRES
+    before = bell_centres(points[:count], np.zeros((0, 3)))
+    after = bell_centres(points, before)
+    assert (after[: len(before)] == before).all() and len(after) <= MAX_BELLS
     away = np.linalg.norm(points[:, None] - after, axis=2).min(1)
-    assert len(after) == CENTRES or away.max() <= REACH
+    assert len(after) == MAX_BELLS or away.max() <= BELL_SIGMA_MM
 
 
 @given(seed=st.integers(0, 999), count=st.integers(1, 12))
@@ -150,4 +154,4 @@ def test_each_landmark_s_normal_equations_are_those_of_its_own_tracks(seed: int,
         assert normal[i] == pytest.approx(a.T @ a) and right[i] == pytest.approx(a.T @ b)
         assert square[i] == pytest.approx(b @ b) and views[i] == (precision[row == i] > 0).sum()
     definite = normal + np.eye(3)
-    assert solutions(definite, right) == pytest.approx(np.linalg.solve(definite, right[..., None])[..., 0])
+    assert solve_symmetric3(definite, right) == pytest.approx(np.linalg.solve(definite, right[..., None])[..., 0])

@@ -1,12 +1,30 @@
-"""The closed loop's bench: what the motion is told, how a print is judged, and its page."""
+"""Benches of the closed loop, of consistency, latency and growth: what is measured, how it is judged, what is shown."""
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
-from hardware.bench.loop import OURS, WAYS, Print, StillBed, as_it_is, last_seen, loop_page, steady
+from estimation.se3 import Array
+from hardware.bench import recordings as growth
+from hardware.bench.estimator import CLAIM_SETTLED_SETS, consistency_figures, scene_errors
+from hardware.bench.prediction import (
+    FORECAST_INPUT,
+    MOTION_INPUTS,
+    Print,
+    StillBed,
+    as_it_is,
+    last_seen,
+    loop_page,
+    steady,
+)
+from hardware.bench.recordings import CostAxis, axes_for, growth_figures, growth_page, latency_figures, slope
+from perception.tracking.step import STAGES
 
 TWIST = np.array([0.0, 0.0, 0.1, 5.0, 0.0, -2.0])
 
@@ -46,5 +64,99 @@ def test_a_print_counts_what_leaves_the_nozzle() -> None:
 def test_the_page_shows_every_way_of_every_scenario() -> None:
     one = Print(np.arange(0, 1, 0.001), np.abs(np.sin(np.arange(0, 1, 0.001))))
     never = Print(one.stamps, np.full(1000, np.nan))
-    page = loop_page({(name, way): one if way == OURS else never for name in ("a", "b") for way in WAYS})
-    assert all(page.count(f">{way}: 95 %") == 2 for way in WAYS) and page.count("<h2>") == 2
+    page = loop_page(
+        {(name, way): one if way == FORECAST_INPUT else never for name in ("a", "b") for way in MOTION_INPUTS}
+    )
+    assert all(page.count(f">{way}: 95 %") == 2 for way in MOTION_INPUTS) and page.count("<h2>") == 2
+
+
+COUNT = 600
+SIGMA = np.array([1e-4, 2e-4, 1e-4, 0.01, 0.01, 0.02])  # rad, mm
+OTHER = se3.exp(np.array([0.3, -0.2, 0.5, 12.0, -7.0, 3.0]))  # true_from_own, of the surface frames
+
+
+def poses(claimed: float, truth: Array, waiting: int = 5) -> list[SurfacePose]:
+    """Poses with noise of SIGMA in their own surface frame, claimed `claimed` times as wide, TRACKING after a while."""
+    draw, covariance = np.random.default_rng(3), np.diag((claimed * SIGMA) ** 2)
+    made = []
+    for k, pose in enumerate(truth):
+        noise = np.zeros(6) if k <= waiting else SIGMA * draw.normal(size=6)
+        state = TrackState.TRACKING if k >= waiting else TrackState.INITIALISING
+        made.append(SurfacePose(k / 30, pose @ OTHER @ se3.exp(noise), covariance, np.zeros(6), state))
+    return made
+
+
+def figures(claimed: float, count: int = COUNT, waiting: int = 5) -> dict[str, float]:
+    phase = np.arange(count)[:, None] / 20
+    truth = se3.exp(np.sin(phase) * np.array([0.02, 0.01, 0.0, 1.0, 2.0, 3.0]))
+    run = scene_errors(poses(claimed, truth, waiting), truth)
+    return {f.what: f.value for f in consistency_figures("x", [run])}
+
+
+@pytest.mark.parametrize(("claimed", "inside"), [(0.5, 0.67), (1.0, 0.95), (3.0, 1.0)])
+def test_the_claim_is_held_against_the_error(claimed: float, inside: float) -> None:
+    found = figures(claimed)
+    assert found["x: NEES/6"] == pytest.approx(1 / claimed**2, rel=0.1)
+    assert found["x: inside 95 %"] == pytest.approx(inside, abs=0.02)
+    assert found["x: claim of an axis"] / found["x: error of an axis"] == pytest.approx(claimed, rel=0.1)
+    assert found["x: measured"] == 100.0
+
+
+def test_a_surface_that_is_hardly_followed_has_no_consistency() -> None:
+    for count, waiting in ((CLAIM_SETTLED_SETS, 5), (20, 20)):
+        assert np.isnan(figures(1.0, count, waiting)["x: NEES/6"])
+
+
+def latency_bench_figures(wall_ms: float, flow_share: float = 0.25) -> dict[str, tuple[float, str]]:
+    wall = np.full((40, 1 + len(STAGES)), wall_ms / 1000)
+    wall[round(40 * flow_share) :, 1 + STAGES.index("flow")] = 0.0
+    found = latency_figures("x", wall, np.full(40, 0.002))
+    return {f.what: (f.value, f.verdict) for f in found}
+
+
+@pytest.mark.parametrize(
+    ("ms", "verdicts"), [(7.9, ("met", "met", "met")), (12.0, ("MISSED", "met", "met")), (40.0, ("MISSED",) * 3)]
+)
+def test_latencies_are_judged_by_median_percentile_and_largest(ms: float, verdicts: tuple[str, ...]) -> None:
+    found = latency_bench_figures(ms)
+    for word, verdict in zip(("median", "99 %", "largest"), verdicts, strict=True):
+        value, judged = found[f"x: pose after, {word}"]
+        assert value == pytest.approx(ms) and judged == verdict
+
+
+def test_processor_time_and_the_share_of_flow_are_told() -> None:
+    found = latency_bench_figures(5.0)
+    assert found["x: processor, median"][0] == pytest.approx(2.0)
+    assert found["x: frame sets that asked for flow"][0] == pytest.approx(25.0)
+    assert found["x: estimation alone, 99 %"] == (pytest.approx(5.0), "MISSED")
+
+
+def test_a_surface_that_is_never_followed_has_no_latency() -> None:
+    (only,) = latency_figures("x", np.zeros((0, 1 + len(STAGES))), np.zeros(0))
+    assert np.isnan(only.value) and only.note
+
+
+@pytest.mark.parametrize("power", [0.0, 0.5, 1.0, 2.0])
+def test_the_slope_is_the_power_of_the_law(power: float) -> None:
+    values = (1.0, 3.0, 10.0, 40.0)
+    assert slope(values, 7 * np.array(values) ** power) == pytest.approx(power, abs=1e-9)
+    assert slope(values, np.array([7.0, np.nan, 7 * 10.0**power, np.nan])) == pytest.approx(power, abs=1e-9)
+    assert np.isnan(slope(values, np.full(4, np.nan)))
+
+
+def test_each_point_is_told_and_drawn() -> None:
+    axis = CostAxis("tracks", "landmarks", "a pose", (10, 20, 40), lambda n: (n, 2 * n))
+    costs = np.array([axis.cost(n) for n in axis.values])
+    told = growth_figures(axis, costs)
+    assert [f.value for f in told[:3]] == [10, 20, 40] and told[3].value == pytest.approx(1.0)
+    assert growth_page([(axis, costs)]).count("<circle") >= 6
+
+
+def test_a_short_run_measures_every_axis_but_the_rendered_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(growth, "WORLD_MINUTES", (0.02, 0.03))
+    short = tuple(CostAxis(a.name, a.unit, a.what, a.values[:2], a.cost) for a in axes_for(0.8))
+    monkeypatch.setattr(growth, "axes_for", lambda seconds: short)
+    found = growth.run_growth(argparse.Namespace(seconds=0.8, no_pictures=True, out=tmp_path))
+    assert len(found) == 4 * 3 and all(f.value > 0 for f in found if "median" in f.what)
+    assert not any(f.what.startswith("pixels") for f in found)
+    assert "Minutes" in (tmp_path / "growth.html").read_text()

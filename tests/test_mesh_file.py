@@ -1,18 +1,23 @@
-"""Scans are read from PLY, STL and OBJ, and whatever is wrong with one is said in one line that names the file."""
+"""Scans are read from PLY, STL and OBJ, and whatever is wrong with one is said in one line that names the file. What is
+written as a PLY, STL or OBJ file is read back, triangle for triangle. Of a damaged one nothing is read.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
-from estimation.scan import Scan
+from estimation.scans.scan import Scan
 from hardware.files import mesh_file
-from hardware.files.mesh_file import read_mesh
-from hardware.ply_file import write_ply
+from hardware.files.mesh_file import read_mesh, read_raw_mesh
+from hardware.files.ply_file import MAX_LINE_BYTES, RawMesh, fans, write_ply
 from tests import scans
 from tests.synthetic import RADIUS, SCAN_FROM_SURFACE, patch, scan_of
 
@@ -134,7 +139,224 @@ def test_the_size_that_is_allowed_ends_where_it_says(tmp_path: Path, side: float
 
 def test_a_file_that_is_too_large_is_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "surface.stl", BALL)
-    monkeypatch.setattr(mesh_file, "LARGEST_FILE", path.stat().st_size - 1)
+    monkeypatch.setattr(mesh_file, "MAX_MESH_FILE_BYTES", path.stat().st_size - 1)
     assert "size of the file" in refusal(path)
-    monkeypatch.setattr(mesh_file, "LARGEST_FILE", path.stat().st_size)
+    monkeypatch.setattr(mesh_file, "MAX_MESH_FILE_BYTES", path.stat().st_size)
     assert read_mesh(path).open_edges == 0
+
+
+Corner = tuple[float, float, float]
+NUMBER = st.floats(-1e6, 1e6, width=32)
+VERTICES = st.lists(st.tuples(NUMBER, NUMBER, NUMBER), min_size=5, max_size=9)
+FACES = st.lists(st.lists(st.integers(0, 4), min_size=3, max_size=6), min_size=1, max_size=6)
+PLANE: list[Corner] = [(0, 0, 0), (20, 0, 1), (20, 20, 0), (0, 20, 2), (10, 30, 3.5)]
+MIXED = [[0, 1, 2, 3], [3, 2, 4], [0, 1, 2, 4, 3]]
+
+
+def ply(order: str, vertices: list[Corner], faces: list[list[int]]) -> bytes:
+    """A PLY file with more in it than the mesh. order: of the bytes, "" for text."""
+    name = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    head = f"""ply
+format {name} 1.0
+comment nothing
+element material 2
+property list uchar short shades
+property uchar shine
+element vertex {len(vertices)}
+property uchar red
+property float z
+property float x
+property double y
+element face {len(faces)}
+property float quality
+property list ushort uint vertex_index
+property list uchar float texcoord
+end_header
+""".encode()
+    if not order:
+        rows = ["2 -7 8 1", "0 255"] + [f"9 {z!r} {x!r} {y!r}" for x, y, z in vertices]
+        rows += [f"0.5 {len(face)} {' '.join(map(str, face))} 2 0.25 0.75" for face in faces]
+        return head + "\n".join(rows).encode() + b"\n"
+    parts = [packed(order, "u1", 2), packed(order, "i2", -7, 8), packed(order, "u1", 1, 0, 255)]
+    for x, y, z in vertices:
+        parts += [packed(order, "u1", 9), packed(order, "f4", z, x), packed(order, "f8", y)]
+    for face in faces:
+        parts += [packed(order, "f4", 0.5), packed(order, "u2", len(face)), packed(order, "u4", *face)]
+        parts += [packed(order, "u1", 2), packed(order, "f4", 0.25, 0.75)]
+    return head + b"".join(parts)
+
+
+def packed(order: str, kind: str, *values: float) -> bytes:
+    return np.array(values, order + kind).tobytes()
+
+
+def obj(vertices: list[Corner], faces: list[list[int]]) -> bytes:
+    """An OBJ file of all four ways to name a corner, some of them counted from behind."""
+    lines = ["# nothing", "mtllib x.mtl", "o thing_1"]
+    lines += [f"v {x!r} {y!r} {z!r} 0.5 0.5 0.5\nvt 0 1\nvn 0 0 1" for x, y, z in vertices]
+    ways = ["{0}", "{0}/1", "{0}//1", "{0}/1/1"]
+    for k, face in enumerate(faces):
+        numbers = [one - len(vertices) if k % 2 else one + 1 for one in face]
+        lines.append("f " + " ".join(ways[k % 4].format(one) for one in numbers) + " # a face")
+    return "\n".join(lines).encode()
+
+
+def binary_stl(vertices: list[Corner], faces: list[list[int]]) -> bytes:
+    """The triangles among the faces."""
+    rows = [np.r_[[0, 0, 0], np.array(vertices)[face].ravel()].astype("<f4").tobytes() + b"\0\0" for face in faces]
+    return b"solid by its first word".ljust(80) + np.uint32(len(faces)).tobytes() + b"".join(rows)
+
+
+def text_stl(vertices: list[Corner], faces: list[list[int]]) -> bytes:
+    """The same as text, each triangle a solid."""
+    found = []
+    for face in faces:
+        corners = "\n".join("  vertex " + " ".join(map(repr, vertices[one])) for one in face)
+        found.append(f"solid a b\nFACET normal 0 0 1\nouter loop\n{corners}\nendloop\nendfacet\nendsolid a b\n")
+    return "\r\n".join(found).encode()
+
+
+FORMS: dict[str, Callable[[list[Corner], list[list[int]]], bytes]] = {
+    "text.ply": lambda v, f: ply("", v, f),
+    "little.ply": lambda v, f: ply("<", v, f),
+    "big.ply": lambda v, f: ply(">", v, f),
+    "windows.ply": lambda v, f: ply("", v, f).replace(b"\n", b"\r\n"),
+    "x.obj": obj,
+}
+SOUPS = {"binary.stl": binary_stl, "text.stl": text_stl}
+
+
+def read(folder: Path, name: str, data: bytes) -> RawMesh:
+    (folder / name).write_bytes(data)
+    return read_raw_mesh(folder / name)
+
+
+def refused(folder: Path, name: str, data: bytes) -> str:
+    with pytest.raises(InputError) as caught:
+        read(folder, name, data)
+    assert caught.value.where == str(folder / name) and "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("meshes")
+
+
+@given(VERTICES, FACES)
+def test_what_is_written_is_read_triangle_for_triangle(
+    folder: Path, vertices: list[Corner], faces: list[list[int]]
+) -> None:
+    expected = [[face[0], face[k], face[k + 1]] for face in faces for k in range(1, len(face) - 1)]
+    for name, form in FORMS.items():
+        mesh = read(folder, name, form(vertices, faces))
+        np.testing.assert_array_equal(mesh.vertices, vertices)
+        np.testing.assert_array_equal(mesh.triangles, expected)
+
+
+@given(VERTICES, FACES)
+def test_a_soup_of_triangles_is_read_corner_for_corner(
+    folder: Path, vertices: list[Corner], faces: list[list[int]]
+) -> None:
+    triangles = [face[:3] for face in faces]
+    for name, form in SOUPS.items():
+        mesh = read(folder, name, form(vertices, triangles))
+        np.testing.assert_array_equal(mesh.vertices[mesh.triangles], np.array(vertices)[triangles])
+
+
+@given(st.lists(st.integers(3, 9), max_size=20))
+def test_polygons_become_fans_that_hold_their_edges(counts: list[int]) -> None:
+    corners = np.arange(sum(counts))
+    triangles = fans(np.array(counts, np.int64), corners)
+    assert len(triangles) == sum(counts) - 2 * len(counts)
+    edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    single = {(a, b) for a, b in edges.tolist()} - {(b, a) for a, b in edges.tolist()}
+    first = np.repeat(np.cumsum(counts, dtype=np.int64) - counts, counts)
+    after = first + (corners - first + 1) % np.repeat(counts, counts)
+    assert single == set(zip(corners.tolist(), after.tolist(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "end"),  # of the last word text may lose all but a letter, and nobody can know
+    [("text.ply", b"0.75\n"), ("windows.ply", b"0.75\r\n"), ("little.ply", b"?"), ("big.ply", b"?")]
+    + [("binary.stl", b"?"), ("text.stl", b"d a b\n")],
+)
+def test_whatever_is_cut_off_a_file_is_missed_and_so_is_more(name: str, end: bytes, tmp_path: Path) -> None:
+    data = {**FORMS, **SOUPS}[name](PLANE, [[0, 1, 2]])
+    for length in range(len(data) - len(end) + 1):
+        refused(tmp_path, name, data[:length])
+    refused(tmp_path, name, data + b"1")
+
+
+HEAD = b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+FACE = b"element face 1\nproperty list uchar int vertex_indices\n"
+ROWS = b"0 0 0\n20 0 0\n0 20 0\n3 0 1 2\n"
+BIG = HEAD.replace(b"ascii", b"binary_big_endian")
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (HEAD.replace(b" x", b" " + b"x" * 5000) + FACE + b"end_header\n" + ROWS, "properties of vertex"),
+        (HEAD.replace(b"float x", b"9" * 5000 + b" x") + FACE + b"end_header\n" + ROWS, "line 4"),
+        (HEAD.replace(b"vertex 3", b"vertex " + b"9" * 5000) + FACE + b"end_header\n" + ROWS, "line 3"),
+        (HEAD.replace(b"vertex 3", b"vertex") + FACE + b"end_header\n" + ROWS, "line 3"),
+        (HEAD.replace(b"vertex 3", b"vertex -1") + FACE + b"end_header\n" + ROWS, "line 3"),
+        (HEAD.replace(b"vertex 3", b"vertex 99999999999999") + FACE + b"end_header\n" + ROWS, "line 13"),
+        (HEAD.replace(b"ascii", b""), "line 2"),
+        (HEAD + FACE.replace(b"uchar", b"[" * 400) + b"end_header\n" + ROWS, "line 8"),
+        (HEAD + FACE.replace(b"uchar", b"float") + b"end_header\n" + ROWS, "line 8"),
+        (HEAD + FACE.replace(b"list uchar ", b"") + b"end_header\n" + ROWS, "properties of face"),
+        (HEAD + HEAD[20:] + b"end_header\n" + ROWS, "no name twice"),
+        (HEAD + b"element face 1\nend_header\n" + ROWS, "elements with properties"),
+        (HEAD + FACE + b"x" * (2 * MAX_LINE_BYTES), f"line 9 = '{MAX_LINE_BYTES} bytes or more'"),
+        (HEAD + FACE + b"end_header\n" + ROWS.replace(b"20 0 0", b"20 0"), "line 11"),
+        (HEAD + FACE + b"end_header\n" + ROWS.replace(b"20 0 0", b"20 x 0"), "line 11"),
+        (HEAD + FACE + b"end_header\n" + ROWS.replace(b"3 0 1", b"2 0 1"), "line 13"),
+        (HEAD + FACE + b"end_header\n" + ROWS.replace(b"3 0 1", b"-3 0 1"), "line 13"),
+        (HEAD + FACE + b"end_header\n" + ROWS.replace(b"3 0 1 2", b"2 0 1"), "face 0 = '2 vertices'"),
+        (HEAD + FACE + b"end_header\n" + ROWS.replace(b"3 0 1 2", b"3 0 1 " + b"9" * 5000), "line 13"),
+        (HEAD + FACE + b"end_header\n" + ROWS.replace(b"3 0 1 2", b"3 0 1 " + b"9" * 30), "line 13"),
+        (HEAD + FACE + b"end_header\n" + ROWS + b"1 2 3", "nothing behind"),
+        (BIG.replace(b"vertex 3", b"vertex 1" + b"0" * 17) + b"end_header\n" + bytes(36), "rows of vertex = 3"),
+        (BIG + FACE.replace(b"uchar", b"uint") + b"end_header\n" + bytes(36) + b"\xff" * 8, "rows of face = 0"),
+        (BIG + FACE.replace(b"uchar", b"char") + b"end_header\n" + bytes(36) + b"\xff" * 8, "length of vertex_indices"),
+        (
+            BIG + FACE.replace(b"face 1", b"face 2") + b"end_header\n" + bytes(36) + b"\3" + bytes(12) + b"\3",
+            "rows of face = 1",
+        ),
+    ],
+)
+def test_what_is_wrong_in_a_ply_file_is_said(data: bytes, said: str, tmp_path: Path) -> None:
+    assert said in refused(tmp_path, "x.ply", data)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        *((f"f {one}", "f and three") for one in ("1 2", "1 2 0", "1 2 -4", "1 2 x", "1 2 1.5", "1 2 " + "9" * 30)),
+        *((f"v {one}", "v and the three") for one in ("1 2", "1 2 x", "", "# 1 2 3")),
+        ("curv 0 1 1 2", "v and the three"),
+    ],
+)
+def test_what_is_wrong_in_an_obj_file_is_said(line: str, said: str, tmp_path: Path) -> None:
+    data = f"v 0 0 0\nv 20 0 0\nv 0 20 0\n{line}\nf 1 2 3\n".encode()
+    assert "line 4 = " in (text := refused(tmp_path, "x.obj", data)) and said in text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("vertex 20.0 0.0 0.0\n", "", "allowed vertex and three numbers"),
+        ("vertex 20.0 0.0 0.0", "vertex 20.0 0.0", "allowed vertex and three numbers"),
+        ("vertex 20.0 0.0 0.0", "vertex 20.0 x 0.0", "allowed vertex and three numbers"),
+        ("vertex 20.0 0.0 0.0", "vertex 20.0 0.0 0.0\nvertex 1 2 3", "allowed endloop"),
+        ("outer loop\n", "", "allowed outer"),
+        ("endsolid a b", "endsolit", "allowed facet"),
+        ("endsolid a b\n", "endsolid\nendsolid", "allowed solid"),
+        ("endsolid a b\n", "", "ends within a solid"),
+    ],
+)
+def test_what_is_wrong_in_an_stl_file_is_said(old: str, new: str, said: str, tmp_path: Path) -> None:
+    text = text_stl([(0.0, 0.0, 0.0), (20.0, 0.0, 0.0), (0.0, 20.0, 0.0)], [[0, 1, 2]]).decode()
+    assert said in refused(tmp_path, "x.stl", text.replace("  vertex", "vertex").replace(old, new).encode())

@@ -1,7 +1,10 @@
-"""MotionStep: one frame a tick, the guard's word is the last, and nothing heavy is loaded."""
+"""MotionStep: one frame a tick, the guard's word is the last, and nothing heavy is loaded. A pause: the nozzle leaves
+the surface, waits above it, and goes on at the very place where it left off.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,38 +13,42 @@ import pytest
 from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import TrackState
-from hardware.arm.profile import BENCH, ArmProfile, placed
-from hardware.arm.protocol import G1, G4, Dialect, decode
+from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile, placed
+from hardware.arm.protocol import G1, G4, Dialect, decode, encode, frame_from_command, motion_from_frame
 from hardware.motion.step import MotionStep
 from hardware.process.clock import Clock, SimClock, WallClock
-from planning.command import Hold, Move
-from planning.kinematics import axes_from_nozzle
-from planning.limits import Limits
-from planning.progress import Phase
-from tests.moving import REST, breathing, pose_at, raster
+from planning.command import Hold, Move, Refusal
+from planning.limits import MotionLimits
+from planning.motion.curve import APPROACH_HEIGHT
+from planning.progress import PrintPhase
+from planning.robot.kinematics import axes_from_nozzle, nozzle_from_axes
+from tests.moving import REST, Motion, breathing, pose_at, raster, still
+from tests.slowly import slowly
 
 
 def test_a_move_is_a_g1_frame_and_a_hold_a_g4_frame() -> None:
     motion = MotionStep(raster())
     hold = motion(None, 1.0)
-    assert isinstance(motion.last, Hold)
-    assert motion.last.reason == "no pose yet"
-    pause = decode(hold)
+    assert isinstance(hold, Hold)
+    assert hold.reason == "no pose yet"
+    pause = decode(held := frame_from_command(hold))
     assert isinstance(pause, G4)
     assert pause.duration == pytest.approx(0.001)
-    frame = motion(pose_at(breathing, 1.02), 1.02)
-    assert isinstance(motion.last, Move)
-    move = decode(frame)
+    wanted = motion(pose_at(breathing, 1.02), 1.02)
+    assert isinstance(wanted, Move)
+    move = decode(frame := frame_from_command(wanted))
     assert isinstance(move, G1)
-    assert np.allclose(move.axes, motion.last.axes, atol=1e-4)
-    assert move.feed == pytest.approx(motion.last.feed, rel=1e-6)
-    assert len(hold) == len(frame) == 48
+    assert np.allclose(move.axes, wanted.axes, atol=1e-4)
+    assert move.feed == pytest.approx(wanted.feed, rel=1e-6)
+    assert len(held) == len(frame) == 48
+    for one in (held, frame):
+        assert encode(motion_from_frame(one)) == one
 
 
 def test_the_dialect_of_the_arm_is_spoken() -> None:
     dialect = Dialect(motion_byte=0, slots=("J5", "J4", "J6"))
     motion = MotionStep(raster(), ArmProfile(dialect=dialect))
-    frame = motion(pose_at(breathing, 1.0), 1.0)
+    frame = frame_from_command(motion(pose_at(breathing, 1.0), 1.0), dialect)
     assert frame[2] == 0
     assert isinstance(decode(frame, dialect), G1)
 
@@ -50,13 +57,13 @@ def test_progress_counts_up_to_the_end() -> None:
     motion = MotionStep(raster(speed=10.0))
     seen = []
     for k in range(800):
-        motion(pose_at(breathing, 1 + k * 0.02), 1 + k * 0.02)
+        last = motion(pose_at(breathing, 1 + k * 0.02), 1 + k * 0.02)
         seen.append(motion.progress)
-    assert [p.phase for p in (seen[0], seen[-1])] == [Phase.ENTERING, Phase.FINISHED]
+    assert [p.phase for p in (seen[0], seen[-1])] == [PrintPhase.ENTERING, PrintPhase.FINISHED]
     assert (np.diff([p.checkpoint for p in seen]) >= 0).all()
     assert (seen[0].checkpoint, seen[-1].checkpoint, seen[-1].total) == (0, 5, 6)
     assert seen[-1].place == seen[-1].length
-    assert motion.last == Hold(motion.last.stamp, 0.001, "path finished")
+    assert last == Hold(last.stamp, 0.001, "path finished")
 
 
 def test_after_a_refusal_the_planner_knows_where_the_arm_stands() -> None:
@@ -68,10 +75,10 @@ def test_after_a_refusal_the_planner_knows_where_the_arm_stands() -> None:
     for k in range(500):
         if k == 300:
             motion._guard._limits = wide
-        motion(pose_at(breathing, 1 + k * 0.02), 1 + k * 0.02)
-        axes.append(motion.last.axes if isinstance(motion.last, Move) else axes[-1])
-        if isinstance(motion.last, Hold):
-            assert motion.last.reason.startswith("refused: Z = ")
+        last = motion(pose_at(breathing, 1 + k * 0.02), 1 + k * 0.02)
+        axes.append(last.axes if isinstance(last, Move) else axes[-1])
+        if isinstance(last, Hold):
+            assert last.reason.startswith("refused: Z = ")
     heights = np.array(axes)[:, 2]
     assert 100 <= heights[:301].min() < 101
     assert heights[-1] < 95
@@ -84,7 +91,8 @@ def test_the_bytes_depend_on_the_input_only() -> None:
         for k in range(400):
             pose = pose_at(breathing, 1 + k * 0.02)
             lost = 250 < k < 280
-            out += motion(replace(pose, state=TrackState.LOST) if lost else pose, 1 + k * 0.02)
+            command = motion(replace(pose, state=TrackState.LOST) if lost else pose, 1 + k * 0.02)
+            out += frame_from_command(command)
         return out
 
     assert frames() == frames()
@@ -112,13 +120,13 @@ def test_the_wire_carries_the_ticks() -> None:
     with pytest.raises(InputError, match="tool"):
         ArmProfile(tool=np.array([[0.0, 1.0]]))
     with pytest.raises(InputError, match="home"):
-        ArmProfile(limits=Limits(low=np.array([210.0, -650, -200, -1, -1, -1])))
+        ArmProfile(limits=MotionLimits(low=np.array([210.0, -650, -200, -1, -1, -1])))
 
 
 def test_a_placed_arm_has_the_surface_on_its_bench() -> None:
     somewhere = se3.exp([2.0, -1.0, 0.5, 100, -300, 900])
     profile = placed(ArmProfile(), somewhere)
-    assert np.allclose(axes_from_nozzle(profile.arm, somewhere), [*BENCH[:3, 3], 0, 0, 0], atol=1e-9)
+    assert np.allclose(axes_from_nozzle(profile.arm, somewhere), [*ARM_FROM_BENCH[:3, 3], 0, 0, 0], atol=1e-9)
     assert np.allclose(placed(ArmProfile(), REST, REST).arm.arm_from_base, np.eye(4))
 
 
@@ -129,3 +137,57 @@ def test_clocks_wait_and_never_go_back(clock: Clock) -> None:
     assert start <= clock.now() < start + 1.0
     clock.wait_until(start + 0.03)
     assert start + 0.03 <= clock.now() < start + 3.0
+
+
+PROFILE = ArmProfile()
+AGE = 0.03  # s of a pose
+
+
+class Paused:
+    """A motion that is paused for a while; each tick with the nozzle's height over the surface, mm, and the place."""
+
+    def __init__(
+        self, motion: Motion, between: tuple[float, float], seconds: float, lost: Callable[[float], bool]
+    ) -> None:
+        step = MotionStep(raster(speed=4.0), PROFILE)
+        self.stamps, self.commands, self.heights, self.places = [], [], [], []
+        self.phases: list[PrintPhase] = []
+        axes = PROFILE.arm.home
+        for now in np.arange(0.0, seconds, PROFILE.tick).tolist():
+            step.paused = between[0] <= now < between[1]
+            pose = pose_at(motion, now - AGE)
+            command = step(replace(pose, state=TrackState.LOST) if lost(now) else pose, now)
+            if isinstance(command, Move):
+                axes = command.axes
+            surface = motion(now + PROFILE.tick + PROFILE.lag)
+            self.heights.append(float((se3.inverse(surface) @ nozzle_from_axes(PROFILE.arm, axes))[2, 3]))
+            self.stamps.append(now)
+            self.commands.append(command)
+            self.places.append(step.progress.place)
+            self.phases.append(step.progress.phase)
+
+
+@pytest.mark.parametrize("motion", [breathing, *slowly(still)])
+@pytest.mark.parametrize("gone", [(9.0, 9.0), (6.1, 6.3)])  # s: the surface is lost on the way up
+def test_it_waits_above_the_surface_and_goes_on_where_it_left_off(motion: Motion, gone: tuple[float, float]) -> None:
+    run = Paused(motion, (6.0, 9.0), 13.0, lambda now: gone[0] <= now < gone[1])
+    stamps, heights, places = (np.array(x) for x in (run.stamps, run.heights, run.places))
+    extrudes = np.array([isinstance(c, Move) and c.extrude for c in run.commands])
+    assert not any(isinstance(c, Refusal) for c in run.commands if not gone[0] <= c.stamp < gone[1] + 0.3)
+    waits = (stamps > 8.0) & (stamps < 9.0)
+    sway = 5.0 if motion is breathing else 0.5  # mm: it stands, and the surface breathes below it
+    assert heights[waits].min() > APPROACH_HEIGHT - 2 * sway and heights[waits].max() < APPROACH_HEIGHT + 2 * sway
+    assert all(isinstance(c, Hold) for c, w in zip(run.commands, waits, strict=True) if w)
+    pause = (stamps > 6.0) & (stamps < 9.0)
+    assert not extrudes[pause].any() and np.ptp(places[pause]) == 0
+    assert PrintPhase.RETREATING in run.phases
+    assert extrudes[stamps < 6.0].any() and extrudes[stamps > 9.0].any()
+    again = np.flatnonzero(extrudes & (stamps > 9.0))[0]
+    assert abs(heights[again]) < 0.1 and places[again] - places[pause][0] < 0.2
+    assert (np.diff(places) >= 0).all()
+
+
+def test_a_pause_that_ends_on_the_way_up_leads_back_to_the_path() -> None:
+    run = Paused(breathing, (6.0, 6.2), 10.0, lambda now: False)
+    assert max(run.heights[round(6.0 / PROFILE.tick) :]) < APPROACH_HEIGHT + 1
+    assert run.places[-1] > run.places[round(6.2 / PROFILE.tick)] + 2

@@ -13,18 +13,15 @@ import numpy as np
 import pytest
 
 from estimation.pose import SurfacePose, TrackState
-from hardware.arm.profile import ArmProfile
-from hardware.arm_insistence import BLIND
-from hardware.arm_status import ArmState
-from hardware.lateness import Lateness
-from hardware.link_settings import LinkSettings
+from hardware.arm.device import BLIND_RESENDS, ArmState
+from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.motion.loop import MotionLoop, Order, Tick
-from hardware.motion.motion_process import MotionPlan, MotionReport, motion_process
-from hardware.motion.step import MotionStep
+from hardware.motion.step import MotionPlan, MotionReport, MotionStep, motion_process
 from hardware.process.clock import SimClock, WallClock
-from hardware.process.shared_latest import Newest
+from hardware.process.shared_latest import SharedLatest
+from hardware.process.ticks import LatenessHistogram
 from hardware.simulator.arm.ports import PortFaults
-from hardware.simulator.arm.settings import ArmSettings, Replies
+from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Hold, Move
 from tests.linked import Linked, linked
 from tests.moving import breathing, pose_at, raster
@@ -111,7 +108,7 @@ def test_after_a_stop_and_a_new_arming_the_print_goes_on_where_it_was() -> None:
 
 def test_an_arm_far_from_home_is_not_armed_before_it_went_there() -> None:
     away = HOME + np.array([30.0, 0, 20, 0, 0, 0])
-    link = linked(ArmSettings(servo_lag=0.01, replies=Replies.STREAM), stand=False, begin=away)
+    link = linked(ArmSettings(servo_lag=0.01, replies=ReplyMode.STREAM), stand=False, begin=away)
     looping = Looping({0.5: Order.ARM, 1.0: Order.HOME, 5.0: Order.ARM}, link, seen)
     ticks = looping.run(6.0)
     assert any("from where the motion left off" in t.answer for t in ticks)
@@ -136,7 +133,10 @@ def test_a_lost_surface_is_a_pause_on_the_wire_and_the_arm_at_rest() -> None:
     looping = Looping(START, linked(stand=False), lost)
     ticks = looping.run(3.0)
     assert isinstance(ticks[-1].command, Hold) and len(ticks[-1].frame) == 48
-    first, stop = 1, 1 + BLIND  # the step to where it stands; and the end, said again to an arm that does not answer
+    first, stop = (
+        1,
+        1 + BLIND_RESENDS,
+    )  # the step to where it stands; and the end, said again to an arm that does not answer
     assert looping.link.arm.frames == first + sum(bool(t.frame) for t in ticks) + stop
 
 
@@ -180,7 +180,7 @@ def test_the_same_input_gives_the_same_bytes() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_histogram_of_lateness_gives_percentiles_to_a_tenth_of_a_millisecond(seed: int) -> None:
     late = np.random.default_rng(seed).exponential(0.002, 5000)
-    histogram = Lateness()
+    histogram = LatenessHistogram()
     assert np.isnan(histogram.percentile(50))
     for each in late:
         histogram.add(each)
@@ -190,14 +190,14 @@ def test_a_histogram_of_lateness_gives_percentiles_to_a_tenth_of_a_millisecond(s
 
 
 def test_the_motion_process_loads_nothing_that_would_stall_it() -> None:
-    code = "import sys, hardware.motion.motion_process; print(*sys.modules)"
+    code = "import sys, hardware.motion.step; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert "hardware.arm.link" in done.stdout.split()
     assert MOTION_NEVER.isdisjoint(done.stdout.split())
 
 
 def test_what_priority_was_granted_is_said() -> None:
-    code = "from hardware.priority import ask_for_real_time; print(ask_for_real_time())"
+    code = "from hardware.process.system import ask_for_real_time; print(ask_for_real_time())"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.split(",")[0].split(":")[0].strip() in {"real time", "nice -10", "nothing"}
 
@@ -205,10 +205,10 @@ def test_what_priority_was_granted_is_said() -> None:
 def test_in_a_process_of_its_own_it_prints_over_a_pty_and_ends_when_nobody_is_left(tmp_path: Path) -> None:
     clock = WallClock()
     context = multiprocessing.get_context("spawn")
-    poses: Newest[SurfacePose] = Newest()
-    reports: Newest[MotionReport] = Newest()
+    poses: SharedLatest[SurfacePose] = SharedLatest()
+    reports: SharedLatest[MotionReport] = SharedLatest()
     orders, theirs = context.Pipe()
-    with serving(tmp_path / "arm", ArmSettings(replies=Replies.STREAM)) as ended:
+    with serving(tmp_path / "arm", ArmSettings(replies=ReplyMode.STREAM)) as ended:
         plan = MotionPlan(raster(speed=10.0), ArmProfile(), str(tmp_path / "arm"), LinkSettings())
         process = context.Process(target=motion_process, args=(plan, poses, reports, theirs))
         process.start()

@@ -1,7 +1,10 @@
-"""Motions of the surface: twist and pose agree, parts compose, the thesis's experiments move as it says."""
+"""Motions of the surface: twist and pose agree, parts compose, the thesis's experiments move as it says. The scenarios
+of data/scenarios: each can be read, says what it proves, and asks for what can be printed.
+"""
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +15,13 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
-from estimation.synthetic.draws import WIDEST
-from estimation.synthetic.motions import Motion, shaking_amplitude
+from estimation.synthetic.movements import MAX_DRAW_SIGMAS, ComposedMotion, shaking_amplitude
+from hardware.files.path_file import read_path
 from hardware.simulator.motion_table import motion_from_tables, waveform_from_table
+from hardware.simulator.scenario import Scenario, read_scenario
+from hardware.simulator.scene.shape import BODIES, Shape, Wound, body
+from hardware.simulator.truth import drape_path
+from planning.path import check_path
 
 H = 1e-4  # s, half the step of a difference quotient
 Spec = dict[str, Any]
@@ -34,7 +41,7 @@ KINDS = sorted(SPECS)
 seeds = st.integers(0, 2**32 - 1)
 
 
-def make(*specs: Spec, seed: int = 0) -> Motion:
+def make(*specs: Spec, seed: int = 0) -> ComposedMotion:
     return motion_from_tables("scenario.toml", list(specs), Path(), seed)
 
 
@@ -67,8 +74,10 @@ def test_the_twist_integrates_to_the_pose(seed: int, start: float) -> None:
 def test_parts_compose_in_order(first: str, second: str, start: float) -> None:
     times = start + np.linspace(0, 3, 7)
     both = make(SPECS[first], SPECS[second])
-    assert np.allclose(both(times), Motion(both.parts[:1])(times) @ Motion(both.parts[1:])(times), atol=1e-12)
-    assert np.array_equal(Motion(both.parts[:1])(times), make(SPECS[first])(times))  # a part draws by itself
+    assert np.allclose(
+        both(times), ComposedMotion(both.parts[:1])(times) @ ComposedMotion(both.parts[1:])(times), atol=1e-12
+    )
+    assert np.array_equal(ComposedMotion(both.parts[:1])(times), make(SPECS[first])(times))  # a part draws by itself
 
 
 def test_no_parts_are_a_surface_at_rest() -> None:
@@ -111,11 +120,11 @@ def test_breathing_stays_within_its_amplitude_and_speed(seed: int, amplitude: fl
     spec = {"kind": "breathing", "amplitude_mm": amplitude, "sigh_factor": sigh, "sighs_per_min": 2.0}
     motion, times = make(spec, seed=seed), np.linspace(0, 300, 6001)
     z = motion(times)[:, 2, 3]
-    most = amplitude * sigh * (1 + WIDEST * 0.15)
+    most = amplitude * sigh * (1 + MAX_DRAW_SIGMAS * 0.15)
     assert z.min() >= -1e-9
     assert z.max() <= most + 1e-9
     steepest = 4 * (3 / 4) ** 1.5 / 2 * np.pi / 2 / 0.4  # of sin^4, in shares of its depth and length
-    assert np.abs(motion.twist(times)[:, 5]).max() <= most * steepest / (4 * (1 - WIDEST * 0.1)) + 1e-9
+    assert np.abs(motion.twist(times)[:, 5]).max() <= most * steepest / (4 * (1 - MAX_DRAW_SIGMAS * 0.1)) + 1e-9
 
 
 def test_holding_irregular_breathing_of_ten_millimetres_for_180_ms_costs_one() -> None:
@@ -226,3 +235,68 @@ def test_what_is_no_list_of_tables_is_refused() -> None:
     with pytest.raises(InputError, match=r"scene\.breathing\.amplitude_mm"):
         spec = {"kind": "breathing", "amplitude_mm": 1.0}
         waveform_from_table("s.toml", "scene.breathing", spec, np.random.default_rng(0))
+
+
+FOLDER = Path(__file__).parents[1] / "data" / "scenarios"
+FILES = sorted(FOLDER.glob("*.toml"))
+SCENARIOS_KINDS = {  # what must be proved
+    *("still", "shaking_table_0_1_hz", "shaking_table_0_5_hz", "thesis_cube", "turns", "hand", "steps_300um"),
+    *("breathing_calm", "breathing_deep", "breathing_irregular", "nozzle_occlusion", "camera_lost", "clock_offsets"),
+    *("printed_material", "wet_glare", "deformation"),
+}
+
+
+@cache
+def scenario(file: Path) -> Scenario:
+    return read_scenario(file)
+
+
+@cache
+def shape(kind: str, seed: int) -> Shape:
+    return body(kind, Wound(), seed)
+
+
+def test_there_is_one_for_each_thing_that_must_be_proved() -> None:
+    assert {file.stem for file in FILES} >= SCENARIOS_KINDS
+    assert len({scenario(file).title for file in FILES}) == len(FILES)
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_a_scenario_says_above_its_title_what_it_proves(file: Path) -> None:
+    lines = file.read_text(encoding="utf-8").splitlines()
+    comment = " ".join(
+        line.removeprefix("# ") for line in lines[: next(i for i, x in enumerate(lines) if x[:1] != "#")]
+    )
+    assert "Proves" in comment
+    assert comment.endswith(".")
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_a_scenario_bounds_error_and_duty(file: Path) -> None:
+    assert {"p95_mm", "duty"} <= set(scenario(file).limits.names)
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_a_path_lies_in_the_wound_and_can_be_printed_in_time(file: Path) -> None:
+    asked = scenario(file)
+    kind = asked.scene["body"]
+    surface = shape(kind, asked.seed)
+    path = read_path(asked.path)
+    places = path.surface_from_nozzle[:, :3, 3]
+    assert surface.inside is not None
+    x, y = np.rint(surface._nodes(places)).astype(int).T
+    assert surface.inside[y, x].min() > asked.bead / 2  # not even the bead's edge is on the rim
+    assert (np.abs(places[:, :2]) < np.array(BODIES[kind][1]) / 2).all()
+    assert asked.clearance is not None
+    fine = check_path(drape_path(path, surface, asked.clearance))
+    length = np.linalg.norm(np.diff(fine.surface_from_nozzle[:, :3, 3], axis=0), axis=1)
+    assert 5.0 + float(np.sum(length / fine.speed[1:])) < asked.seconds  # 5 s to see the surface and to get there
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_a_motion_stays_where_cameras_and_arm_reach(file: Path) -> None:
+    asked = scenario(file)
+    motion = asked.motion(np.linspace(0, asked.seconds, 400))
+    assert np.linalg.norm(motion[:, :3, 3], axis=1).max() < 60.0
+    moves = np.ptp(motion[:, :3, 3], axis=0).max() + np.ptp(motion[:, :3, :3], axis=0).max() * 50
+    assert (moves > 0.1) == (file.stem != "still")

@@ -6,17 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_estimator import LANDMARKS, RIG, begun, follow, look
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.odd_camera import SURER, surprise
+from estimation.online.camera_health import MAX_MOTION_SIGMAS, motion_sigmas
 from estimation.online.estimator import Estimator
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.synthetic.look import observations
+from estimation.synthetic.world import observations
 from tests.slowly import slowly
 from tests.synthetic import breathing
+from tests.test_estimator import LANDMARKS, RIG, begun, follow, look
 
 SECONDS, NEXT = 2.0, 2.0 + 1 / 30
 
@@ -87,7 +87,7 @@ def by_chance(share: float, reach: float) -> Observations:
 def test_few_tracks_that_stand_off_are_no_measurement_though_nothing_surprises(reach: float, measured: bool) -> None:
     estimator = followed()
     fit = estimator.fit(by_chance(0.2, reach), estimator.predict(NEXT))
-    assert surprise(fit.solution, estimator.expected(NEXT)) < SURER
+    assert motion_sigmas(fit.solution, estimator.expected(NEXT)) < MAX_MOTION_SIGMAS
     assert fit.measured is measured
 
 
@@ -96,4 +96,4 @@ def test_shape_and_clocks_learn_nothing_of_half_the_tracks_where_all_stand_off(
     share: float, reach: float, sound: bool
 ) -> None:
     estimator = followed()
-    assert estimator.sound(estimator.fit(by_chance(share, reach), estimator.predict(NEXT))) is sound
+    assert estimator.may_learn(estimator.fit(by_chance(share, reach), estimator.predict(NEXT))) is sound

@@ -8,18 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browser import Browser, Page, executable
-from operator_page import OFFERED, Served, full_view
 
 from estimation import se3
 from estimation.pose import TrackState
 from estimation.rig import Camera, distort, pixels_from_points
 from hardware.files.images import encode
-from hardware.operator.pictures import CameraPicture, Pictures
-from hardware.operator.scene import Scene
-from hardware.operator.settings import Limits
-from hardware.operator.shared_state import Request, Wish
-from hardware.operator.view import Activity, Answer, OperatorView, Stage, Verdict
+from hardware.operator.settings import WindowLimits
+from hardware.operator.shared_state import CameraPicture, OperatorRequest, PagePictures, PageScene
+from hardware.operator.view import Activity, CheckVerdict, OperatorView, RequestAnswer, RunStage, Wish
+from tests.browser import Browser, Page, executable
+from tests.operator_page import OFFERED, Served, full_view
 
 CHROMIUM = executable()
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
@@ -40,7 +38,7 @@ def browser() -> Iterator[Browser]:
 class Run:
     """A run whose views are put by hand, each newer than the last; `page` is a window of it."""
 
-    def __init__(self, browser: Browser, limits: Limits | None = None) -> None:
+    def __init__(self, browser: Browser, limits: WindowLimits | None = None) -> None:
         self.served, self._browser, self._stamp = Served(limits), browser, 0.0
         self.view = full_view()
         self.pages: list[Page] = []
@@ -85,7 +83,7 @@ def settle(page: Page) -> None:
 def test_every_button_asks_for_what_it_says_once_and_those_that_move_the_arm_ask_twice(run: Run) -> None:
     page = run.open()
     for wish in Wish:
-        view = run.show(offers=(wish,) if wish is not Wish.STOP else (), stage=Stage.PAUSED)
+        view = run.show(offers=(wish,) if wish is not Wish.STOP else (), stage=RunStage.PAUSED)
         if wish in (Wish.CONFIRM, Wish.START, Wish.RESUME):
             settle(page)
         page.click(f'footer [data-wish="{wish}"]')
@@ -101,7 +99,7 @@ def test_every_button_asks_for_what_it_says_once_and_those_that_move_the_arm_ask
 
 def test_what_is_not_offered_cannot_be_pressed_and_stop_always_can(run: Run) -> None:
     page = run.open()
-    for stage in Stage:
+    for stage in RunStage:
         run.show(stage=stage, offers=())
         enabled = page.js('[...document.querySelectorAll("footer button:not(:disabled)")].map((b) => b.dataset.wish)')
         assert enabled == ["stop"]
@@ -128,7 +126,7 @@ def test_a_question_whether_one_is_sure_is_dropped_in_words_when_the_run_has_cha
     page = run.open()
     page.click('[data-wish="home"]')
     page.until('!document.getElementById("sure").hidden')
-    run.show(stage=Stage.STOPPED)
+    run.show(stage=RunStage.STOPPED)
     page.until('document.getElementById("sure").hidden')
     assert page.text("#toast") == "Home was not asked: the run has changed meanwhile."
     page.click('[data-wish="end"]')
@@ -141,23 +139,23 @@ def test_the_end_of_a_run_that_changes_meanwhile_is_still_asked_for(run: Run) ->
     page = run.open()
     page.click('[data-wish="end"]')
     page.until('!document.getElementById("sure").hidden')
-    view = run.show(stage=Stage.APPROACH)
+    view = run.show(stage=RunStage.APPROACH)
     page.click("#sure-yes")
     (request,) = run.served.taken()
     assert request.wish is Wish.END and request.turn < view.turn
     page.click('[data-wish="end"]')
     page.until('!document.getElementById("sure").hidden')
-    run.show(stage=Stage.DONE, offers=())
+    run.show(stage=RunStage.DONE, offers=())
     page.until('document.getElementById("sure").hidden')
 
 
 def test_a_button_that_has_just_come_to_mean_something_else_is_not_pressed_by_a_second_tap(run: Run) -> None:
     page = run.open()
-    run.show(stage=Stage.CONFIRM, offers=(Wish.CONFIRM,))
+    run.show(stage=RunStage.CONFIRM, offers=(Wish.CONFIRM,))
     settle(page)
     page.click("#go")
     assert [request.wish for request in run.served.taken()] == [Wish.CONFIRM]
-    run.show(stage=Stage.PAUSED, offers=(Wish.RESUME,))
+    run.show(stage=RunStage.PAUSED, offers=(Wish.RESUME,))
     page.click("#go")
     settle(page)
     assert run.served.link.requests.take() == []
@@ -167,12 +165,12 @@ def test_a_button_that_has_just_come_to_mean_something_else_is_not_pressed_by_a_
 
 def test_a_finger_that_was_down_when_another_window_stopped_the_run_does_not_resume_it(run: Run) -> None:
     page, other = run.open(), run.open()
-    run.show(stage=Stage.PAUSED, offers=(Wish.RESUME,))
+    run.show(stage=RunStage.PAUSED, offers=(Wish.RESUME,))
     settle(page)
     press = "document.getElementById('go').dispatchEvent(new PointerEvent('pointerdown'))"
     page.js(press)
     other.click('[data-wish="stop"]')
-    run.show(stage=Stage.PAUSED, offers=(Wish.RESUME,))
+    run.show(stage=RunStage.PAUSED, offers=(Wish.RESUME,))
     page.js("document.getElementById('go').click()")
     page.until('document.getElementById("toast").textContent.includes("changed")')
     assert [request.wish for request in run.served.taken()] == [Wish.STOP]
@@ -185,7 +183,7 @@ def test_both_windows_show_what_became_of_a_request(run: Run) -> None:
     first.click('[data-wish="pause"]')
     (request,) = run.served.taken()
     first.until('document.querySelector("[data-wish=pause]").classList.contains("asked")')
-    run.show(stage=Stage.PAUSED, answer=Answer(request.number, Wish.PAUSE, True), offers=(Wish.RESUME,))
+    run.show(stage=RunStage.PAUSED, answer=RequestAnswer(request.number, Wish.PAUSE, True), offers=(Wish.RESUME,))
     for page in (first, second):
         page.until('document.getElementById("toast").textContent === "Pause was followed."')
         assert page.text("#chip") == "Paused"
@@ -208,7 +206,7 @@ def test_a_reloaded_window_shows_the_same_and_knows_the_last_minute(run: Run) ->
     assert texts == {name: page.text(name) for name in texts}
     page.until("document.querySelector('#course').dataset.rows === '6'")  # drawn in the next frame
     page.click('[data-wish="pause"]')
-    assert run.served.taken() == [Request(1, Wish.PAUSE, run.view.turn)]
+    assert run.served.taken() == [OperatorRequest(1, Wish.PAUSE, run.view.turn)]
 
 
 def test_state_and_why_and_all_figures_are_there_in_words(run: Run) -> None:
@@ -226,7 +224,13 @@ def test_state_and_why_and_all_figures_are_there_in_words(run: Run) -> None:
 
 def test_the_page_has_words_for_all_that_a_view_can_say(run: Run) -> None:
     page = run.open()
-    kinds = {"STAGES": Stage, "TRACKING": TrackState, "ACTIVITIES": Activity, "WISHES": Wish, "VERDICTS": Verdict}
+    kinds = {
+        "STAGES": RunStage,
+        "TRACKING": TrackState,
+        "ACTIVITIES": Activity,
+        "WISHES": Wish,
+        "VERDICTS": CheckVerdict,
+    }
     for name, kind in kinds.items():
         known = page.js(f'import("./words.js").then((words) => Object.keys(words.{name}))')
         assert set(known) == {each.value for each in kind}
@@ -234,7 +238,7 @@ def test_the_page_has_words_for_all_that_a_view_can_say(run: Run) -> None:
 
 def test_a_failed_check_says_what_to_do(run: Run) -> None:
     page = run.open()
-    run.show(stage=Stage.CHECK, offers=(Wish.AGAIN,))
+    run.show(stage=RunStage.CHECK, offers=(Wish.AGAIN,))
     assert "✗ mend" in page.text("#checks tr.fail") and "Switch it on." in page.text("#checks tr.fail")
     assert len(page.js('[...document.querySelectorAll("#checks tr")].map((r) => r.className)')) == 2
 
@@ -246,14 +250,14 @@ def test_markup_in_what_is_shown_stays_text(run: Run) -> None:
     cameras = tuple(replace(camera, words=evil) for camera in run.view.cameras)
     tracking = replace(run.view.tracking, reason=evil)
     run.show(question=evil, reason=evil, notes=(evil,), checks=checks, cameras=cameras, tracking=tracking)
-    run.show(stage=Stage.CHECK)
+    run.show(stage=RunStage.CHECK)
     assert page.text("#question") == evil
     assert page.js("document.querySelectorAll('img').length") == 0
     assert page.js("document.body.dataset.owned") is None
 
 
 def test_old_news_are_greyed_and_said_to_be_old_and_stop_still_stops(browser: Browser) -> None:
-    run = Run(browser, Limits(stale=0.6, patience=30.0))
+    run = Run(browser, WindowLimits(stale=0.6, patience=30.0))
     run.show()
     page = browser.page(run.served.address)
     run.pages.append(page)
@@ -272,7 +276,7 @@ def test_old_news_are_greyed_and_said_to_be_old_and_stop_still_stops(browser: Br
 
 def test_a_window_says_when_the_run_is_gone_and_comes_back_by_itself(run: Run) -> None:
     page = run.open()
-    run.served.put(replace(run.view, stamp=99.0, stage=Stage.DONE))
+    run.served.put(replace(run.view, stamp=99.0, stage=RunStage.DONE))
     run.served.end()
     page.until('document.body.dataset.news === "gone" && document.body.dataset.stage === "done"')
     assert "has ended" in page.text("#alarm")
@@ -323,10 +327,10 @@ def test_the_browser_images_points_as_the_estimator_does(run: Run) -> None:
 def test_a_picture_that_stands_still_says_how_old_it_is_while_the_others_go_on(run: Run) -> None:
     page = run.open()
     jpeg = encode(np.full((36, 64, 3), 128, np.uint8), 90)[1]
-    run.served.link.pictures.put(Pictures(1.0, tuple(CameraPicture(f"camera{k}", jpeg) for k in range(2))))
+    run.served.link.pictures.put(PagePictures(1.0, tuple(CameraPicture(f"camera{k}", jpeg) for k in range(2))))
     page.until('document.querySelector("[data-camera=camera0] canvas").dataset.drawn')
     for stamp in range(2, 30):
-        run.served.link.pictures.put(Pictures(float(stamp), (CameraPicture("camera1", jpeg),)))
+        run.served.link.pictures.put(PagePictures(float(stamp), (CameraPicture("camera1", jpeg),)))
         if page.js('document.querySelector("[data-camera=camera0]").classList.contains("still")'):
             break
         page.js("new Promise((done) => setTimeout(done, 100))")
@@ -343,10 +347,10 @@ def test_printed_path_and_path_to_come_are_drawn_where_they_lie_in_the_picture(
     above[2, 3] = 300.0
     straight = replace(CAMERA, base_from_camera=above)
     path = np.column_stack([np.linspace(-50, 50, 11), np.zeros(11), np.zeros(11)])
-    run.served.link.scene.put(Scene((straight,), path, np.arange(11), np.ones(11, bool)))
+    run.served.link.scene.put(PageScene((straight,), path, np.arange(11), np.ones(11, bool)))
     jpeg = encode(np.full((360, 640, 3), 128, np.uint8), 90)[1]
     picture = CameraPicture("camera0", jpeg, near=b"" if crop is None else jpeg, crop=crop)
-    run.served.link.pictures.put(Pictures(1.0, (picture,), np.eye(4)))
+    run.served.link.pictures.put(PagePictures(1.0, (picture,), np.eye(4)))
     run.show(motion=replace(run.view.motion, base_from_nozzle=None), progress=replace(run.view.progress, fraction=5.0))
     page.until('document.querySelector("[data-camera=camera0] canvas").dataset.drawn === "path"')
     left, top, width, height = crop or (0, 0, 640, 360)
@@ -368,7 +372,7 @@ def test_printed_path_and_path_to_come_are_drawn_where_they_lie_in_the_picture(
 def test_everything_fits_and_stop_is_on_top_in_every_stage(run: Run, size: tuple[int, int]) -> None:
     page = run.open(size)
     long = "The predicted error at the nozzle is above its limit, as the surface moves faster than before. "
-    for stage in Stage:
+    for stage in RunStage:
         run.show(stage=stage, reason=long * 3, question=long)
         facts = page.js(
             """(() => { const b = document.querySelector("[data-wish=stop]").getBoundingClientRect();

@@ -18,21 +18,20 @@ import pytest
 from aiohttp import WSMsgType
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from operator_page import Served, full_view, served
 
+from hardware.live import fault_injection as flood
 from hardware.live.fault_injection import FloodCount
-from hardware.live.injected import Begun
-from hardware.operator import flood
-from hardware.operator.link import OperatorLink
-from hardware.operator.pictures import CameraPicture, Pictures
+from hardware.live.records import PrintStart
 from hardware.operator.process import OperatorPage
-from hardware.operator.settings import Limits, OperatorSettings
-from hardware.operator.shared_state import OTHERS, Wish
-from hardware.operator.window import FLOOD
+from hardware.operator.server import MAX_DROPPED_MESSAGES
+from hardware.operator.settings import OperatorSettings, WindowLimits
+from hardware.operator.shared_state import OTHER_REQUEST_SLOTS, CameraPicture, OperatorLink, PagePictures
+from hardware.operator.view import Wish
 from hardware.process.clock import WallClock
-from hardware.process.faults import Fault, Kind, Part
+from hardware.process.faults import Fault, FaultKind, FaultPart
+from tests.operator_page import Served, full_view, served
 
-CALM = Limits(stale=30.0, patience=30.0)
+CALM = WindowLimits(stale=30.0, patience=30.0)
 
 
 class Socket:
@@ -131,7 +130,7 @@ def test_pictures_and_scene_come_once_and_not_again_until_they_change() -> None:
             return sizes
 
     with served(CALM) as page:
-        pictures = Pictures(1.0, (CameraPicture("camera0", bytes(3000)),), np.eye(4))
+        pictures = PagePictures(1.0, (CameraPicture("camera0", bytes(3000)),), np.eye(4))
         page.put(full_view())
         page.link.pictures.put(pictures)
         small, large = asyncio.run(look(page))
@@ -231,7 +230,7 @@ def test_a_window_that_floods_is_closed_and_another_one_is_served_all_the_while(
         code = asyncio.run(flood(page))
         assert code in ((1009, 1006) if what == "too long" else (1008,))
         wishes = [request.wish for request in page.taken()]
-        assert wishes.count(Wish.PAUSE) == 1 and wishes.count(Wish.RESUME) <= OTHERS
+        assert wishes.count(Wish.PAUSE) == 1 and wishes.count(Wish.RESUME) <= OTHER_REQUEST_SLOTS
 
 
 def test_a_flood_of_stops_is_one_stop_after_another_and_nothing_else() -> None:
@@ -251,10 +250,10 @@ def test_a_flood_of_stops_is_one_stop_after_another_and_nothing_else() -> None:
 def test_a_flood_of_windows_is_turned_away_and_another_one_is_served_all_the_while(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    count, begun = FloodCount(), Begun()
+    count, begun = FloodCount(), PrintStart()
     begun.instant = WallClock().now()
-    poured = Fault(Part.PAGE, Kind.FLOOD, 0.0, 60.0)
-    monkeypatch.setattr(flood, "AGAIN", 0.01)
+    poured = Fault(FaultPart.PAGE, FaultKind.FLOOD, 0.0, 60.0)
+    monkeypatch.setattr(flood, "RECONNECT_AFTER", 0.01)
 
     async def both(page: Served) -> None:
         async with window(page.address) as one:
@@ -269,7 +268,7 @@ def test_a_flood_of_windows_is_turned_away_and_another_one_is_served_all_the_whi
     with served(CALM) as page:
         page.put(full_view(turn=7))
         asyncio.run(both(page))
-        assert count.messages > FLOOD
+        assert count.messages > MAX_DROPPED_MESSAGES
         assert [request.wish for request in page.taken()] == [Wish.PAUSE]  # what was asked under no turn is not asked
 
 

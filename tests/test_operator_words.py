@@ -1,28 +1,57 @@
-"""What windows say is parsed with suspicion, and what they are sent can always be parsed."""
+"""What windows say is parsed with suspicion, and what they are sent can always be parsed. Requests cross from the page
+to the run: bounded, in order, and a stop always. What is handed to the page: small enough for a browser, and true.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import multiprocessing
+import os
+import pickle
+import signal
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from operator_page import full_view
 
-from hardware.operator.broadcast import pictures_bytes, plain, text
-from hardware.operator.pictures import CameraPicture, Pictures
-from hardware.operator.shared_state import Wish
-from hardware.operator.words import LARGEST, Allowance, Ask, Shown, parsed
+from estimation.rig import Camera, Rig
+from hardware.operator import shared_state as limits
+from hardware.operator.broadcast import (
+    MAX_BROWSER_INTEGER,
+    RateLimiter,
+    RequestMessage,
+    ShownMessage,
+    parse_message,
+    pictures_bytes,
+    plain,
+    text,
+)
+from hardware.operator.shared_state import (
+    MAX_PATH_POINTS,
+    MAX_TRIANGLES,
+    OTHER_REQUEST_SLOTS,
+    REQUEST_SLOTS,
+    CameraPicture,
+    OperatorLink,
+    OperatorRequest,
+    PagePictures,
+    PageScene,
+    RequestLine,
+    scene_from,
+)
+from hardware.operator.view import CALMING_WISHES, Wish, refusal
+from planning.path import Path
+from tests.operator_page import full_view
 
-COUNTS = st.integers(0, LARGEST)
+COUNTS = st.integers(0, MAX_BROWSER_INTEGER)
 
 
 @given(st.sampled_from(list(Wish)), COUNTS, COUNTS)
 def test_what_the_page_says_is_understood(wish: Wish, turn: int, tag: int) -> None:
-    assert parsed(json.dumps({"ask": wish.value, "turn": turn, "tag": tag})) == Ask(wish, turn, tag)
-    assert parsed(json.dumps({"shown": turn})) == Shown(turn)
+    assert parse_message(json.dumps({"ask": wish.value, "turn": turn, "tag": tag})) == RequestMessage(wish, turn, tag)
+    assert parse_message(json.dumps({"shown": turn})) == ShownMessage(turn)
 
 
 ANYTHING = st.recursive(
@@ -38,8 +67,8 @@ NEARLY = st.fixed_dictionaries(
 
 @given(st.text(max_size=512) | (ANYTHING | NEARLY).map(json.dumps))
 def test_anything_else_is_no_message_and_no_error(said: str) -> None:
-    message = parsed(said)
-    if isinstance(message, Ask):
+    message = parse_message(said)
+    if isinstance(message, RequestMessage):
         assert json.loads(said) == {"ask": message.wish.value, "turn": message.turn, "tag": message.tag}
     elif message is not None:
         assert json.loads(said) == {"shown": message.bundle}
@@ -55,12 +84,12 @@ def test_anything_else_is_no_message_and_no_error(said: str) -> None:
     ],
 )  # fmt: skip
 def test_these_are_no_messages(said: str) -> None:
-    assert parsed(said) is None
+    assert parse_message(said) is None
 
 
 @given(st.lists(st.floats(0.0, 0.2), min_size=1, max_size=300))
 def test_no_course_of_messages_goes_beyond_the_allowance(gaps: list[float]) -> None:
-    allowance, now, passed = Allowance(5.0, 0.0), 0.0, 0
+    allowance, now, passed = RateLimiter(5.0, 0.0), 0.0, 0
     for gap in gaps:
         now += gap
         passed += allowance.take(now)
@@ -87,7 +116,7 @@ def test_arrays_and_their_holes_become_lists_and_nulls() -> None:
 
 def test_pictures_stand_behind_a_head_that_tells_their_lengths() -> None:
     polygon = np.array([[1.25, 2.0], [3.0, 4.0]])
-    pictures = Pictures(
+    pictures = PagePictures(
         1.5,
         (CameraPicture("a", b"first", (polygon,)), CameraPicture("b", b"second!", near=b"it", crop=(1, 2, 3, 4))),
         np.eye(4),
@@ -99,3 +128,152 @@ def test_pictures_stand_behind_a_head_that_tells_their_lengths() -> None:
     assert [each["near"] for each in head["pictures"]] == [0, 2]
     assert [each["crop"] for each in head["pictures"]] == [None, [1, 2, 3, 4]]
     assert head["pictures"][0]["outline"] == [[1.2, 2.0, 3.0, 4.0]] and head["base_from_surface"] == np.eye(4).tolist()
+
+
+QUEUED = [wish for wish in Wish if wish is not Wish.STOP]
+
+
+@given(st.lists(st.one_of(st.sampled_from(QUEUED), st.none()), max_size=80))
+def test_requests_come_in_order_and_those_that_found_no_room_were_refused(steps: list[Wish | None]) -> None:
+    line, asked, taken, waiting = RequestLine(), [], [], 0
+    for turn, step in enumerate(steps):
+        if step is None:
+            taken += line.take()
+            waiting = 0
+            continue
+        number = line.ask(step, turn)
+        assert (number is None) == (waiting >= (REQUEST_SLOTS if step in CALMING_WISHES else OTHER_REQUEST_SLOTS))
+        if number is not None:
+            asked.append(OperatorRequest(number, step, turn))
+            waiting += 1
+    assert taken + line.take() == asked
+    assert [r.number for r in asked] == list(range(1, len(asked) + 1))
+
+
+@given(st.lists(st.sampled_from([wish for wish in QUEUED if wish not in CALMING_WISHES]), max_size=3 * REQUEST_SLOTS))
+def test_a_flood_of_what_leads_elsewhere_leaves_room_for_what_leads_to_rest(flood: list[Wish]) -> None:
+    line = RequestLine()
+    for wish in flood:
+        line.ask(wish, 1)
+    assert line.ask(Wish.PAUSE, 1) is not None and line.ask(Wish.END, 1) is not None
+    assert [r.wish for r in line.take()][-2:] == [Wish.PAUSE, Wish.END]
+
+
+@given(st.integers(0, 3 * REQUEST_SLOTS), st.integers(1, 3), st.integers(0, 3 * REQUEST_SLOTS))
+def test_a_stop_finds_room_in_any_line_and_voids_what_came_with_it(before: int, stops: int, after: int) -> None:
+    line = RequestLine()
+    for _ in range(before):
+        line.ask(Wish.RESUME, 1)
+    assert all(line.ask(Wish.STOP, 0) is not None for _ in range(stops))
+    last = line.last_stop
+    for _ in range(after):
+        line.ask(Wish.START, 1)
+    assert line.take() == [OperatorRequest(last, Wish.STOP, 0)]
+    assert line.take() == []
+    line.ask(Wish.PAUSE, 2)
+    assert [r.wish for r in line.take()] == [Wish.PAUSE]
+
+
+def test_another_process_that_holds_the_line_sees_the_last_stop() -> None:
+    line = RequestLine()
+    context = multiprocessing.get_context("spawn")
+    child = context.Process(target=_stop, args=(line,))
+    child.start()
+    child.join(20)
+    assert line.last_stop == 1 and line.take() == [OperatorRequest(1, Wish.STOP, 0)]
+
+
+def test_a_page_that_is_killed_while_it_asks_leaves_a_line_that_still_works() -> None:
+    line = RequestLine()
+    context = multiprocessing.get_context("fork")
+    for _ in range(10):
+        child = context.Process(target=_ask_for_ever, args=(line,))
+        child.start()
+        before = line.last_stop
+        while line.last_stop < before + 50:
+            line.take()
+        assert child.pid is not None
+        os.kill(child.pid, signal.SIGKILL)
+        child.join(5)
+        line.take()
+        number = line.ask(Wish.HOME, 7)
+        assert [(r.number, r.wish, r.turn) for r in line.take()] == [(number, Wish.HOME, 7)]
+
+
+@pytest.mark.parametrize("wish", list(Wish))
+def test_a_window_that_shows_what_is_no_longer_so_may_only_stop_pause_and_end(wish: Wish) -> None:
+    assert (refusal(wish, 3, list(Wish), 4) == "") == (wish in (Wish.STOP, Wish.PAUSE, Wish.END))
+    assert refusal(wish, 4, list(Wish), 4) == ""
+
+
+@pytest.mark.parametrize("wish", list(Wish))
+def test_what_is_not_offered_is_refused_but_for_a_stop(wish: Wish) -> None:
+    assert (refusal(wish, 4, [], 4) == "") == (wish is Wish.STOP)
+
+
+def _stop(line: RequestLine) -> None:
+    line.ask(Wish.STOP, 0)
+
+
+def _ask_for_ever(line: RequestLine) -> None:
+    while True:
+        line.ask(Wish.STOP, 0)
+        line.ask(Wish.PAUSE, 0)
+
+
+RIG = Rig((Camera("camera0", (640, 360), np.diag([500.0, 500.0, 1.0]), np.zeros(5), np.eye(4)),))
+
+
+def printed_path(count: int) -> Path:
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = np.arange(count) * 0.01
+    extrude = np.arange(count) % 997 != 0
+    plain = np.zeros(count)
+    return Path(poses, plain + 5, plain.astype(int), plain + 20, plain.astype(int), extrude)
+
+
+def dome(side: int) -> tuple[np.ndarray, np.ndarray]:
+    x, y = np.meshgrid(np.linspace(-40, 40, side), np.linspace(-30, 30, side))
+    points = np.column_stack([x.ravel(), y.ravel(), 15 - (x**2 + y**2).ravel() / 150])
+    a = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    return points, np.concatenate([np.stack([a, a + 1, a + side], 1), np.stack([a + 1, a + side + 1, a + side], 1)])
+
+
+@pytest.mark.parametrize("count", [2, 300, MAX_PATH_POINTS, 50_000])
+def test_a_path_is_thinned_to_what_can_be_drawn_and_keeps_its_ends_and_its_gaps(count: int) -> None:
+    path = printed_path(count)
+    scene = scene_from(RIG, path)
+    assert len(scene.path) <= 1.5 * MAX_PATH_POINTS
+    assert scene.checkpoint[0] == 0 and scene.checkpoint[-1] == count - 1
+    assert (np.diff(scene.checkpoint) > 0).all()
+    assert np.array_equal(scene.path, path.surface_from_nozzle[scene.checkpoint, :3, 3])
+    assert np.count_nonzero(~scene.extrude) == np.count_nonzero(~path.extrude)
+
+
+def test_a_fine_surface_is_drawn_with_few_triangles_that_lie_on_it() -> None:
+    points, triangles = dome(150)
+    scene = scene_from(RIG, None, points, triangles)
+    assert MAX_TRIANGLES / 4 < len(scene.triangles) <= MAX_TRIANGLES
+    x, y, z = scene.surface.T
+    assert np.abs(z - (15 - (x**2 + y**2) / 150)).max() < 0.3
+    assert np.ptp(x) > 75 and np.ptp(y) > 55
+
+
+def test_a_small_surface_stays_as_it_is() -> None:
+    points, triangles = dome(10)
+    scene = scene_from(RIG, None, points, triangles)
+    assert np.array_equal(scene.surface, points) and np.array_equal(scene.triangles, triangles)
+
+
+def test_points_without_triangles_are_thinned_too() -> None:
+    assert len(scene_from(RIG, None, np.random.default_rng(1).normal(size=(90_000, 3))).surface) == MAX_TRIANGLES
+
+
+def test_the_largest_scene_and_pictures_fit_their_places() -> None:
+    link = OperatorLink()
+    scene = scene_from(RIG, printed_path(50_000), *dome(150))
+    assert len(pickle.dumps(scene)) < limits.SCENE_CAPACITY
+    link.scene.put(scene)
+    link.pictures.put(PagePictures(1.0, tuple(CameraPicture(f"camera{k}", bytes(200_000)) for k in range(3))))
+    got = link.scene.get()
+    assert isinstance(got, PageScene) and np.array_equal(got.path, scene.path)

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from perception.frames import Frame, FrameSet
 from perception.pairing import (
     DEFAULT_PERIOD,
+    DELAY_SAMPLES,
     SILENT_PERIODS,
-    USUAL,
     Pairing,
     frame_period,
     frame_set,
@@ -222,7 +222,7 @@ def late_by(delays: list[float], count: int = 40) -> list[tuple[float, Frame]]:
 def test_a_camera_that_is_always_late_is_soon_waited_for(delay: float, other: float) -> None:
     """Where stamps do not tell that a camera exposes later than the others, only its frames' arrival does."""
     out, _ = live(late_by([0.0, delay * PERIOD, other * PERIOD]), 3)
-    assert all(len(s.frames) == 3 for _, s in out[USUAL + 1 :])
+    assert all(len(s.frames) == 3 for _, s in out[DELAY_SAMPLES + 1 :])
 
 
 def test_one_frame_that_is_late_makes_nobody_wait_for_the_next() -> None:

@@ -1,30 +1,40 @@
-"""Patches are found to a fraction of a pixel however they turned, never creep, and hidden ones are not found."""
+"""Patches are found to a fraction of a pixel however they turned, never creep, and hidden ones are not found. Flow
+finds where pixels went, and says which it lost. Matching gives the same pairs whichever way it takes.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST, arc_rig
-from perception.alignment import RELIEF, Alignment, align, align_in, coarse_score
-from perception.features import grey
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from perception.frames import Image
-from perception.lens import Lenses
-from perception.matching.alignment_kernels import ARRIVED
+from perception.lens import BILATERAL_PREFILTER, NO_PREFILTER, PREFILTERS, Lenses
+from perception.matching import features
+from perception.matching.alignment_kernels import CONVERGED_STEP
+from perception.matching.features import grey, match
+from perception.matching.matcher import optical_flow
 from perception.matching.patches import (
+    RELIEF_PX,
+    Alignment,
     Projection,
     Templates,
+    align,
+    align_in,
+    coarse_score,
+    cut_templates,
     join,
     normalise,
     project_into,
     project_squares,
     pyramid,
-    take_templates,
 )
 from tests.synthetic import LOOK, WIDE, patch, pictures
 
@@ -46,7 +56,7 @@ def true_pixels(pose: Array, camera: int = 0) -> Array:
 
 @pytest.fixture(scope="module")
 def templates() -> Templates:
-    return take_templates(LENSES, pyramid(picture(REST)), 0, REST, POINTS, NORMALS)
+    return cut_templates(LENSES, pyramid(picture(BASE_FROM_REST)), 0, BASE_FROM_REST, POINTS, NORMALS)
 
 
 def find(
@@ -80,7 +90,7 @@ MOTIONS = {
 @pytest.mark.parametrize("name", MOTIONS)
 def test_patches_are_found_to_a_fraction_of_a_pixel(templates: Templates, name: str) -> None:
     """The prediction is 0.6 mm and 0.6 degrees off, about 1.5 px."""
-    pose = REST @ se3.exp(MOTIONS[name])
+    pose = BASE_FROM_REST @ se3.exp(MOTIONS[name])
     found, where = find(
         templates, picture(pose, seed=1), pose @ se3.exp(np.array([0.006, -0.006, 0.006, 0.4, -0.4, 0.2]))
     )
@@ -91,7 +101,7 @@ def test_patches_are_found_to_a_fraction_of_a_pixel(templates: Templates, name: 
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.5, 0.0), (0.7, 40.0), (1.0, -25.0), (1.1, 10.0)])
 def test_brightness_and_contrast_do_not_matter(templates: Templates, gain: float, offset: float) -> None:
-    pose = REST @ se3.exp(MOTIONS["shifted"])
+    pose = BASE_FROM_REST @ se3.exp(MOTIONS["shifted"])
     image = np.clip(np.rint(gain * picture(pose, seed=1).astype(float) + offset), 0, 255).astype(np.uint8)
     found, where = find(templates, image, pose)
     assert found.found.sum() > 0.85 * where.visible.sum()
@@ -99,15 +109,15 @@ def test_brightness_and_contrast_do_not_matter(templates: Templates, gain: float
 
 
 def test_another_camera_finds_the_same_spots(templates: Templates) -> None:
-    found, where = find(templates, picture(REST, camera=1), REST, camera=1)
+    found, where = find(templates, picture(BASE_FROM_REST, camera=1), BASE_FROM_REST, camera=1)
     assert found.found.sum() > 0.7 * where.visible.sum() > 15
-    assert np.sqrt(np.mean(errors(found, REST, 1) ** 2)) < 0.25
+    assert np.sqrt(np.mean(errors(found, BASE_FROM_REST, 1) ** 2)) < 0.25
 
 
 def test_the_claimed_error_is_of_the_true_ones_size(templates: Templates) -> None:
     ratios = []
     for seed in range(4):
-        pose = REST @ se3.exp(np.array([0, 0, 0.02, 0.37 * seed, 0.21 * seed, 0]))
+        pose = BASE_FROM_REST @ se3.exp(np.array([0, 0, 0.02, 0.37 * seed, 0.21 * seed, 0]))
         found, _ = find(templates, picture(pose, seed=seed + 3), pose)
         ratios.append(errors(found, pose) / (np.sqrt(2) * found.sigma[found.found]))
     assert 0.3 < np.sqrt(np.mean(np.concatenate(ratios) ** 2)) < 1.5
@@ -115,8 +125,8 @@ def test_the_claimed_error_is_of_the_true_ones_size(templates: Templates) -> Non
 
 @pytest.mark.parametrize("coarse", [True, False])
 def test_cameras_aligned_together_stand_where_each_does_alone(templates: Templates, coarse: bool) -> None:
-    pose = REST @ se3.exp(np.array([0.004, 0, 0.004, 0.3, -0.2, 0]))
-    images = [pyramid(picture(REST, camera=c)) for c in range(3)]
+    pose = BASE_FROM_REST @ se3.exp(np.array([0.004, 0, 0.004, 0.3, -0.2, 0]))
+    images = [pyramid(picture(BASE_FROM_REST, camera=c)) for c in range(3)]
     whole = project_into(LENSES, range(3), np.stack([pose] * 3), POINTS, NORMALS, templates.axes)
     count = [len(POINTS)] * 3
     together = align_in(join([templates] * 3), images, count, whole, whole.centre, coarse=coarse)
@@ -128,56 +138,56 @@ def test_cameras_aligned_together_stand_where_each_does_alone(templates: Templat
         both = together.found[part] & alone.found
         assert both.sum() >= max(15, 0.95 * alone.found.sum())
         change = np.linalg.norm(together.pixels[part] - alone.pixels, axis=1)[both]
-        assert change.max() < ARRIVED
+        assert change.max() < CONVERGED_STEP
 
 
 def test_what_is_seen_from_the_side_claims_less(templates: Templates) -> None:
     claims = []
     for tilt in (0.3, 0.0, -0.5):  # ever further from facing the camera
-        pose = REST @ se3.exp(np.array([tilt, 0, 0, 0, 0, 0]))
+        pose = BASE_FROM_REST @ se3.exp(np.array([tilt, 0, 0, 0, 0, 0]))
         found, where = find(templates, picture(pose, seed=6), pose)
         slope = np.sqrt(1 / where.facing[found.found] ** 2 - 1)
-        assert (found.sigma[found.found] >= 0.999 * RELIEF * slope).all() and found.found.sum() > 40
+        assert (found.sigma[found.found] >= 0.999 * RELIEF_PX * slope).all() and found.found.sum() > 40
         claims.append(float(np.median(found.sigma[found.found])))
     assert claims[0] < claims[1] < claims[2]
 
 
 def test_a_patch_that_had_not_arrived_says_how_far_it_had_to_go(templates: Templates) -> None:
-    begin = true_pixels(REST) + [2.6, 2.3]
-    found, _ = find(templates, picture(REST, seed=4), REST, begin=begin, coarse=False)
-    away = np.linalg.norm(found.pixels - true_pixels(REST), axis=1)
+    begin = true_pixels(BASE_FROM_REST) + [2.6, 2.3]
+    found, _ = find(templates, picture(BASE_FROM_REST, seed=4), BASE_FROM_REST, begin=begin, coarse=False)
+    away = np.linalg.norm(found.pixels - true_pixels(BASE_FROM_REST), axis=1)
     short = found.found & (away > 0.3)
     assert found.found.sum() > 30 and short.sum() > 5
     assert 0.5 < np.median(away[short] / found.sigma[short]) < 2
 
 
 def test_the_coarse_image_reaches_five_pixels_from_any_side(templates: Templates) -> None:
-    image = picture(REST, seed=4)
+    image = picture(BASE_FROM_REST, seed=4)
     for angle in range(6):
-        begin = true_pixels(REST) + 5.0 * np.array([np.cos(angle), np.sin(angle)])
-        far, near = (find(templates, image, REST, begin=begin, coarse=coarse)[0] for coarse in (True, False))
-        assert (errors(far, REST) < 0.5).sum() > 0.85 * len(POINTS)
-        assert (errors(near, REST) < 0.5).sum() < 0.6 * len(POINTS)
+        begin = true_pixels(BASE_FROM_REST) + 5.0 * np.array([np.cos(angle), np.sin(angle)])
+        far, near = (find(templates, image, BASE_FROM_REST, begin=begin, coarse=coarse)[0] for coarse in (True, False))
+        assert (errors(far, BASE_FROM_REST) < 0.5).sum() > 0.85 * len(POINTS)
+        assert (errors(near, BASE_FROM_REST) < 0.5).sum() < 0.6 * len(POINTS)
 
 
 def test_tracks_of_a_still_scene_never_creep(templates: Templates) -> None:
     """Each frame begins where the last one ended; after 60 the tracks stand where they stood after the first."""
-    begin, mean = true_pixels(REST), []
+    begin, mean = true_pixels(BASE_FROM_REST), []
     for seed in range(60):
-        found, _ = find(templates, picture(REST, seed=10 + seed), REST, begin=begin, coarse=False)
-        begin = np.where(found.found[:, None], found.pixels, true_pixels(REST))
-        mean.append(begin - true_pixels(REST))
+        found, _ = find(templates, picture(BASE_FROM_REST, seed=10 + seed), BASE_FROM_REST, begin=begin, coarse=False)
+        begin = np.where(found.found[:, None], found.pixels, true_pixels(BASE_FROM_REST))
+        mean.append(begin - true_pixels(BASE_FROM_REST))
     early, late = np.mean(mean[:10], axis=0), np.mean(mean[-10:], axis=0)
     assert np.linalg.norm(late - early, axis=1).max() < 0.05
     assert np.linalg.norm(late.mean(0)) < 0.02
 
 
 def test_hidden_patches_are_not_found(templates: Templates) -> None:
-    image, pixels = picture(REST, seed=5), true_pixels(REST)
+    image, pixels = picture(BASE_FROM_REST, seed=5), true_pixels(BASE_FROM_REST)
     edge = round(float(np.median(pixels[:, 0])))
     cloth = np.random.default_rng(6).integers(60, 200, image.shape, np.uint8)
     image[:, edge:] = cloth[:, edge:]
-    found, where = find(templates, image, REST)
+    found, where = find(templates, image, BASE_FROM_REST)
     hidden, clear = pixels[:, 0] > edge + 12, pixels[:, 0] < edge - 12
     assert not found.found[hidden].any() and hidden.sum() > 15
     assert found.found[clear & where.visible].mean() > 0.9
@@ -185,32 +195,32 @@ def test_hidden_patches_are_not_found(templates: Templates) -> None:
 
 @pytest.mark.parametrize("level", [0, 128, 255])
 def test_nothing_is_found_in_an_even_image(templates: Templates, level: int) -> None:
-    found, _ = find(templates, np.full((480, 640), level, np.uint8), REST)
+    found, _ = find(templates, np.full((480, 640), level, np.uint8), BASE_FROM_REST)
     assert not found.found.any() and np.isfinite(found.score).all()
 
 
 def test_what_turned_its_back_is_not_visible(templates: Templates) -> None:
-    over = REST @ se3.exp(np.array([np.pi, 0, 0, 0, 0, 0]))
-    found, where = find(templates, picture(REST), over)
+    over = BASE_FROM_REST @ se3.exp(np.array([np.pi, 0, 0, 0, 0, 0]))
+    found, where = find(templates, picture(BASE_FROM_REST), over)
     assert not where.visible.any() and not found.found.any() and (where.facing < 0).all()
 
 
 def test_what_left_the_image_is_not_visible(templates: Templates) -> None:
-    aside = REST @ se3.exp(np.array([0, 0, 0, 300.0, 0, 0]))
-    found, where = find(templates, picture(REST), aside)
+    aside = BASE_FROM_REST @ se3.exp(np.array([0, 0, 0, 300.0, 0, 0]))
+    found, where = find(templates, picture(BASE_FROM_REST), aside)
     assert not where.visible.any() and not found.found.any()
 
 
 def test_a_square_is_about_a_pixel_a_sample_in_its_own_camera(templates: Templates) -> None:
-    where = project_squares(LENSES, 0, REST, POINTS, NORMALS, templates.axes)
-    assert np.allclose(where.centre, true_pixels(REST), atol=1e-6)
+    where = project_squares(LENSES, 0, BASE_FROM_REST, POINTS, NORMALS, templates.axes)
+    assert np.allclose(where.centre, true_pixels(BASE_FROM_REST), atol=1e-6)
     lengths = np.linalg.norm(where.per_sample, axis=1)
     assert (lengths < 1.1).all() and (lengths > 0.5).all()
 
 
 def test_a_template_is_its_own_best_match(templates: Templates) -> None:
-    where = project_squares(LENSES, 0, REST, POINTS, NORMALS, templates.axes)
-    images = pyramid(picture(REST))
+    where = project_squares(LENSES, 0, BASE_FROM_REST, POINTS, NORMALS, templates.axes)
+    images = pyramid(picture(BASE_FROM_REST))
     itself = align(templates, images, where, where.centre, coarse=False)
     assert np.abs(itself.pixels - where.centre)[itself.found].max() < 0.05 and itself.score[itself.found].min() > 0.999
     here = coarse_score(templates, images, where, where.centre)
@@ -232,3 +242,77 @@ def test_templates_can_be_taken_apart_and_joined(templates: Templates) -> None:
     order = np.argsort(np.r_[np.flatnonzero(odd), np.flatnonzero(~odd)])
     for name in Templates.__slots__:
         assert np.array_equal(getattr(again.take(order), name), getattr(templates, name))
+
+
+SIZE = (320, 240)
+
+
+def texture(seed: int) -> Image:
+    noise = np.random.default_rng(seed).normal(0, 1, SIZE[::-1]).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return np.asarray(np.clip(120 + 50 * smooth / smooth.std(), 0, 255), np.uint8)
+
+
+def shifted(image: Image, by: tuple[float, float]) -> Image:
+    return np.asarray(cv2.warpAffine(image, np.array([[1, 0, by[0]], [0, 1, by[1]]], float), SIZE), np.uint8)
+
+
+def grid() -> Array:
+    x, y = np.meshgrid(np.arange(60.0, 261.0, 20.0), np.arange(60.0, 181.0, 20.0))
+    return np.stack([x.ravel(), y.ravel()], -1)
+
+
+@pytest.mark.parametrize("by", [(0.0, 0.0), (3.3, -2.1), (14.0, 9.0)])
+def test_pixels_are_found_where_they_went(by: tuple[float, float]) -> None:
+    before, pixels = texture(0), grid()
+    found, ok = optical_flow(before, shifted(before, by), pixels, pixels)
+    assert ok.all()
+    assert np.abs(found - pixels - by).max() < 0.2
+
+
+def test_what_something_else_has_covered_does_not_come_back_and_is_not_found() -> None:
+    before, pixels = texture(0), grid()
+    after = shifted(before, (3.0, 2.0))
+    after[:, 160:] = texture(1)[:, 160:]
+    found, ok = optical_flow(before, after, pixels, pixels)
+    covered = pixels[:, 0] > 180
+    assert ok[pixels[:, 0] < 130].all() and ok[covered].mean() < 0.3
+    assert np.abs((found - pixels - (3.0, 2.0))[ok & (pixels[:, 0] < 130)]).max() < 0.3
+
+
+def test_a_guess_that_is_far_off_is_mended_where_the_pyramid_reaches() -> None:
+    before, pixels = texture(0), grid()
+    found, ok = optical_flow(before, shifted(before, (20.0, 0.0)), pixels, pixels + [8.0, 6.0])
+    assert ok.mean() > 0.9 and np.abs(found - pixels - (20.0, 0.0))[ok].max() < 0.3
+
+
+def descriptors(count: int, seed: int) -> NDArray[np.float32]:
+    raw = np.random.default_rng(seed).normal(0, 1, (count, 128)) ** 2
+    return np.round(512 * raw / np.linalg.norm(raw, axis=1, keepdims=True)).astype(np.float32)
+
+
+def test_trees_give_nearly_the_pairs_of_all_distances_and_the_same_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    a = descriptors(800, 0)
+    b = np.concatenate([a[:400] + np.random.default_rng(1).normal(0, 12, (400, 128)), descriptors(400, 2)])
+    b = b.astype(np.float32)
+    exact = match(a, b)
+    monkeypatch.setattr(features, "MAX_BRUTE_FORCE_DISTANCES", 0)
+    trees, again = match(a, b), match(a, b)
+    assert len(exact) > 350 and (exact[:, 0] == exact[:, 1]).mean() > 0.99
+    assert len(set(map(tuple, exact)) & set(map(tuple, trees))) > 0.97 * len(exact)
+    assert np.array_equal(trees, again)
+
+
+def test_two_of_a_kind_are_nobodys_match() -> None:
+    a = descriptors(50, 0)
+    assert not len(match(a, np.concatenate([a, a])))
+    assert not len(match(a[:1], a)) and not len(match(a, a[:0]))
+
+
+def test_the_bilateral_filter_keeps_an_edge_and_takes_the_noise() -> None:
+    image = np.where(np.arange(320) < 160, 60, 190) + np.random.default_rng(0).normal(0, 6, (240, 320))
+    filtered = PREFILTERS[BILATERAL_PREFILTER](np.asarray(np.clip(image, 0, 255), np.uint8)).astype(float)
+    assert filtered[:, 20:140].std() < 0.5 * image[:, 20:140].std()
+    assert filtered[:, 164:].mean() - filtered[:, :156].mean() > 120
+    same = texture(0)
+    assert PREFILTERS[NO_PREFILTER](same) is same

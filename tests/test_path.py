@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.files.path_file import HEADER, read_path, write_path
+from hardware.files.path_file import PATH_HEADER, read_path, write_path
 from planning.motion.curve import curve_through
-from planning.path import LEVER, Path, check_path, lengths
+from planning.path import LEVER_ARM, Path, check_path, way_lengths
 from tests.moving import path_through, raster
 
-HEAD = ",".join(HEADER)
+HEAD = ",".join(PATH_HEADER)
 GOOD = [f"{x},0,0,0,0,0,5,1,20,0,1" for x in range(3)]
 SAMPLE = File(__file__).parents[1] / "data/paths/square_10mm.csv"
 
@@ -168,7 +168,7 @@ def test_a_turn_on_the_spot_has_a_length() -> None:
     path = path_through(np.zeros((2, 3)))
     rotations = se3.exp_rotation([[0, 0, 0], [0, 0, 0.5]])
     turned = replace(path, surface_from_nozzle=se3.make(rotations, np.zeros(3)))
-    assert lengths(check_path(turned).surface_from_nozzle) == pytest.approx([0.5 * LEVER])
+    assert way_lengths(check_path(turned).surface_from_nozzle) == pytest.approx([0.5 * LEVER_ARM])
 
 
 def steps(curve_length: float) -> Array:
@@ -183,7 +183,7 @@ def test_the_curve_passes_near_each_checkpoint_and_never_outruns_its_length(seed
     off = np.linalg.norm(at_knots[:, :3, 3] - path.surface_from_nozzle[:, :3, 3], axis=1)
     assert off.max() <= 0.05 + 1e-9
     turned = np.swapaxes(path.surface_from_nozzle[:, :3, :3], -1, -2) @ at_knots[:, :3, :3]
-    assert LEVER * se3.angle_of(turned).max() <= 0.05 + 1e-9
+    assert LEVER_ARM * se3.angle_of(turned).max() <= 0.05 + 1e-9
     s = steps(curve.length)
     assert np.linalg.norm(curve.derivatives(s)[0], axis=1).max() <= 1 + 1e-12
     places = curve.poses(s)[:, :3, 3]

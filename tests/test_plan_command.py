@@ -1,4 +1,6 @@
-"""`stillbed plan`: one line for a new user, everything beside the path, one line for what is wrong."""
+"""`stillbed plan`: one line for a new user, everything beside the path, one line for what is wrong. A plan that lies
+where the wound is seen is said to. One that lies beside it is off by as much as it is.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +10,28 @@ import re
 from pathlib import Path
 from xml.etree import ElementTree
 
+import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from estimation import se3
 from estimation.errors import InputError
+from estimation.se3 import Array
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.cli.main import main
-from hardware.contour_file import read_contour
-from hardware.files.path_file import read_path
+from hardware.files.mesh_file import SCAN_UNITS, in_mm
+from hardware.files.path_file import read_contour, read_path
+from hardware.files.ply_file import write_ply
 from hardware.plan import run as planning_command
-from hardware.plan.order import RANGES, Wishes, order_of
-from hardware.plan.run import example_scan
-from hardware.ply_file import write_ply
-from hardware.scan_units import UNITS, in_mm
+from hardware.plan.order import SETTING_RANGES, PlanSettings, example_scan, order_of
+from hardware.plan.run import MAX_MIDDLE_DISTANCE, ScanPlacement, WoundSighting, _sight
+from perception.lens import Lenses
 from planning.command import Move
-from planning.kinematics import SimpleArm
-from planning.limits import Limits
+from planning.limits import MotionLimits
 from planning.motion.planner import Planner
+from planning.robot.kinematics import SimpleArm
 from tests.moving import pose_at, still
 from tests.wounds import scan_of
 
@@ -54,7 +60,7 @@ def test_a_contour_becomes_a_path_with_everything_beside_it(tmp_path: Path, caps
     told = capsys.readouterr().out
     assert "coverage: 99" in told and "path: 1 layer, " in told
     path = read_path(out)
-    planner = Planner(path, Limits(), SimpleArm(), 0.02)
+    planner = Planner(path, MotionLimits(), SimpleArm(), 0.02)
     commands = [planner(pose_at(still, 0.02 * k), 0.02 * k) for k in range(600)]
     assert sum(isinstance(command, Move) for command in commands) > 500 and planner.progress.place > 0
     assert sorted(file.name for file in out.parent.iterdir()) == [
@@ -190,32 +196,68 @@ def test_ctrl_c_leaves_a_whole_path_or_none(
         assert main(command) == 130
     assert "whole" in capsys.readouterr().err and len(read_path(out)) > 2
     with monkeypatch.context() as patched:
-        patched.setattr("planning.layers.plan.path_of", interrupted)
+        patched.setattr("planning.layers.plan.path_from", interrupted)
         assert main([*command, "--force"]) == 130
     assert len(read_path(out)) > 2 and not list(tmp_path.glob("*.part"))
 
 
-@given(st.sampled_from(sorted(UNITS)), st.floats(25, 900))
+@given(st.sampled_from(sorted(SCAN_UNITS)), st.floats(25, 900))
 def test_the_right_unit_is_taken_and_a_wrong_one_is_answered_with_it(unit: str, size: float) -> None:
-    vertices = np.random.default_rng(0).uniform(0, 1.05 * size / UNITS[unit], (2000, 3))
+    vertices = np.random.default_rng(0).uniform(0, 1.05 * size / SCAN_UNITS[unit], (2000, 3))
     triangles = np.arange(1998).reshape(-1, 3)
-    assert np.allclose(in_mm(vertices, triangles, unit, "scan"), vertices * UNITS[unit])
-    for other in UNITS:
+    assert np.allclose(in_mm(vertices, triangles, unit, "scan"), vertices * SCAN_UNITS[unit])
+    for other in SCAN_UNITS:
         try:
             in_mm(vertices, triangles, other, "scan")
         except InputError as error:
             assert f"--unit {unit}" in str(error)
 
 
-@given(st.sampled_from([name for name, _, _ in RANGES]), st.booleans())
+@given(st.sampled_from([name for name, _, _ in SETTING_RANGES]), st.booleans())
 def test_every_setting_is_refused_just_beyond_its_range(name: str, above: bool) -> None:
-    low, high = next((low, high) for n, low, high in RANGES if n == name)
+    low, high = next((low, high) for n, low, high in SETTING_RANGES if n == name)
     inside, outside = (high, np.nextafter(high, np.inf)) if above else (low, np.nextafter(low, -np.inf))
-    order_of(Wishes(**{name: inside}), flat=False)
+    order_of(PlanSettings(**{name: inside}), flat=False)
     with pytest.raises(InputError, match="--" + name.replace("_", "-")):
-        order_of(Wishes(**{name: float(outside)}), flat=False)
+        order_of(PlanSettings(**{name: float(outside)}), flat=False)
 
 
 def test_a_contour_may_be_closed_and_repeat_points(tmp_path: Path) -> None:
     file = contour(tmp_path, "x_mm,y_mm\n0,0\n0,0\n5,0\n5,5\n0,0\n")
     assert np.array_equal(read_contour(file), [[0, 0], [5, 0], [5, 5]])
+
+
+AROUND = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+OUTLINE = np.column_stack([20 * np.cos(AROUND), 14 * np.sin(AROUND) + 2 * np.cos(2 * AROUND), 0 * AROUND])
+
+
+def seen(camera: int, outline: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """The mask of an outline (N, 3), surface frame, as a camera images it."""
+    rig = arc_rig()
+    inner = se3.transform_points(se3.inverse(rig.cameras[camera].base_from_camera) @ BASE_FROM_REST, outline)
+    ideal = inner[:, :2] / inner[:, 2:] * rig.cameras[camera].matrix[[0, 1], [0, 1]] + rig.cameras[camera].matrix[:2, 2]
+    pixels, _ = Lenses(rig).image(camera, ideal, inner[:, 2])
+    mask = np.zeros(rig.cameras[camera].size[::-1], np.uint8)
+    return cv2.fillPoly(mask, [np.rint(pixels).astype(np.int32)], 1).astype(bool)
+
+
+@pytest.mark.parametrize("camera", range(3))
+def test_a_plan_on_the_wound_is_near_its_middle(camera: int) -> None:
+    found = _sight(arc_rig().cameras[camera], seen(camera, OUTLINE), BASE_FROM_REST, OUTLINE)
+    assert found.off < 0.5 and found.share > 0.9
+
+
+@given(st.floats(4, 15), st.floats(0, 2 * np.pi))
+@settings(max_examples=10, deadline=None)
+def test_a_plan_beside_the_wound_is_off_by_as_much(away: float, angle: float) -> None:
+    moved = OUTLINE + away * np.array([np.cos(angle), np.sin(angle), 0.0])
+    offs = [_sight(arc_rig().cameras[c], seen(c, OUTLINE), BASE_FROM_REST, moved).off for c in range(3)]
+    assert 0.85 * away < max(offs) < 1.15 * away + 0.5
+    lines = ScanPlacement(np.eye(4), "TRACKING", (WoundSighting("top", max(offs), 1.0),)).lines()
+    assert (f"more than {MAX_MIDDLE_DISTANCE:g} mm" in lines[1]) == (max(offs) > MAX_MIDDLE_DISTANCE)
+
+
+def test_a_camera_that_shows_no_wound_says_so() -> None:
+    nothing = np.zeros(arc_rig().cameras[0].size[::-1], bool)
+    found = _sight(arc_rig().cameras[0], nothing, BASE_FROM_REST, OUTLINE)
+    assert "no wound" in ScanPlacement(np.eye(4), "TRACKING", (found,)).lines()[1]

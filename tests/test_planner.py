@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from estimation.warp import Warp
-from hardware.bench.planner import Tally, bench_arm, follow
+from estimation.surface_map import Warp
+from hardware.bench.planner import StreamTally, bench_arm, follow_stream
 from planning.command import Command, Hold, Move
-from planning.kinematics import SimpleArm, axes_from_nozzle, nozzle_from_axes
-from planning.limits import Limits
+from planning.limits import MotionLimits
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
 from planning.path import Path
-from planning.progress import Phase
+from planning.progress import PrintPhase
+from planning.robot.kinematics import SimpleArm, axes_from_nozzle, nozzle_from_axes
 from tests.moving import REST, Motion, breathing, pose_at, raster, still
 
-TICK, LIMITS, ARM = 0.02, Limits(), SimpleArm()
+TICK, LIMITS, ARM = 0.02, MotionLimits(), SimpleArm()
 CLOSE = SimpleArm(home=ARM.home - [0, 0, 62, 0, 0, 0])  # 1 mm above the surface, so that prints begin at once
 
 
@@ -36,7 +36,7 @@ class Run:
     commands: Sequence[Command]
     axes: Array
     places: Array
-    phases: Sequence[Phase]
+    phases: Sequence[PrintPhase]
 
     @property
     def reasons(self) -> set[str]:
@@ -44,7 +44,7 @@ class Run:
 
 
 def run(
-    path: Path, seen: Iterable[tuple[float, SurfacePose | None]], limits: Limits = LIMITS, arm: SimpleArm = ARM
+    path: Path, seen: Iterable[tuple[float, SurfacePose | None]], limits: MotionLimits = LIMITS, arm: SimpleArm = ARM
 ) -> Run:
     planner, guard = Planner(path, limits, arm, TICK), Guard(limits, arm, TICK, path.zone)
     commands: list[Command] = []
@@ -66,7 +66,7 @@ def exact(motion: Motion, seconds: float, start: float = 10.0) -> Iterable[tuple
         yield start + k * TICK, pose_at(motion, start + k * TICK)
 
 
-def over_limit(axes: Array, limits: Limits) -> float:
+def over_limit(axes: Array, limits: MotionLimits) -> float:
     """The largest ratio of a difference quotient of axes (T, 6) to its limit."""
     quotients = [np.abs(np.diff(axes, n, axis=0)) / TICK**n for n in (1, 2, 3)]
     ratios = [q / limit for q, limit in zip(quotients, (limits.speed, limits.acceleration, limits.jerk), strict=True)]
@@ -95,7 +95,7 @@ def extruding(result: Run) -> NDArray[np.bool_]:
     return np.array([isinstance(c, Move) and c.extrude for c in result.commands])
 
 
-def moves_while(result: Run, phase: Phase) -> list[Move]:
+def moves_while(result: Run, phase: PrintPhase) -> list[Move]:
     return [c for c, p in zip(result.commands, result.phases, strict=True) if p is phase and isinstance(c, Move)]
 
 
@@ -104,7 +104,7 @@ def test_a_whole_print(motion: Motion) -> None:
     path = raster(speed=5.0)
     result = run(path, exact(motion, 16))
     order = list(dict.fromkeys(result.phases))
-    assert order == [Phase.ENTERING, Phase.PRINTING, Phase.LEAVING, Phase.FINISHED]
+    assert order == [PrintPhase.ENTERING, PrintPhase.PRINTING, PrintPhase.LEAVING, PrintPhase.FINISHED]
     assert result.reasons == {"path finished"}
     assert over_limit(result.axes, LIMITS) <= 1
     printing, where = extruding(result), tips(result, motion)
@@ -119,14 +119,14 @@ def test_a_whole_print(motion: Motion) -> None:
     steps = np.linalg.norm(np.diff(where, axis=0), axis=1)[printing[1:] & printing[:-1]] / TICK
     assert np.median(steps) == pytest.approx(5.0, rel=0.001)
     assert steps.max() < 5.0 * 1.08  # where the start is made good; measured 5.31
-    assert not any(move.extrude for move in moves_while(result, Phase.LEAVING))
+    assert not any(move.extrude for move in moves_while(result, PrintPhase.LEAVING))
 
 
 def test_checkpoints_are_counted_and_their_extrusion_obeyed() -> None:
     path = raster(lines=3)
     quiet = replace(path, extrude=np.array([False, True, False, True, False, True]))
     result = run(quiet, exact(still, 16))
-    moves = moves_while(result, Phase.PRINTING)
+    moves = moves_while(result, PrintPhase.PRINTING)
     assert list(dict.fromkeys(m.checkpoint for m in moves if m.extrude)) == [1, 3, 5]
     on_lines = {m.checkpoint for m in moves if not m.extrude}
     assert {2, 4} <= on_lines
@@ -167,7 +167,7 @@ def test_progress_counts_in_checkpoints_too() -> None:
 def test_the_speed_of_each_checkpoint_is_its_way_there() -> None:
     path = raster(size=8, lines=2)
     result = run(replace(path, speed=np.array([1.0, 4, 8, 2])), exact(still, 11), arm=CLOSE)
-    moves = moves_while(result, Phase.PRINTING)
+    moves = moves_while(result, PrintPhase.PRINTING)
     for checkpoint, speed in ((1, 4.0), (2, 8.0), (3, 2.0)):
         feeds = [m.feed for m in moves if m.checkpoint == checkpoint]
         assert np.median(feeds) == pytest.approx(speed, rel=0.05)
@@ -233,8 +233,8 @@ def test_a_surface_that_jumps_is_found_again_before_printing_goes_on() -> None:
 @settings(max_examples=5)
 @given(st.integers(0, 2**32 - 1))
 def test_no_stream_of_poses_breaks_a_limit(seed: int) -> None:
-    tally = Tally()
-    follow((seed, 0), tally, bench_arm(), 200)
+    tally = StreamTally()
+    follow_stream((seed, 0), tally, bench_arm(), 200)
     assert tally.samples == 200
     assert tally.worst.max() <= 1 + 1e-6
     assert (tally.refused, tally.errors) == (0, [])

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.forecast import Forecast
-from estimation.pose import SurfacePose, TrackState
+from estimation.pose import Forecast, SurfacePose, TrackState
 
 
 def pose(seed: int) -> SurfacePose:

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.pose_solver import EFFICIENCY, PoseFit, project, solve_pose
+from estimation.online.pose_solver import EFFICIENCY, PointTracks, PoseFit, project, solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST, arc_rig
-from estimation.synthetic.look import observations
-from estimation.synthetic.surfaces import patch
+from estimation.synthetic.movements import patch
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations
 
 RIG = arc_rig()
 LANDMARKS = patch(60, np.random.default_rng(3)).points
@@ -29,7 +28,7 @@ def seen(pose: Array, seed: int, noise: float = 0.3, outliers: float = 0.0) -> O
 
 
 def fit(o: Observations, start: Array, scales: tuple[float, ...] = (4.0, 1.0), prior: Array | None = None) -> PoseFit:
-    return solve_pose(RIG, o.camera, LANDMARKS[o.track], o.pixels, o.sigma, start, scales=scales, prior=prior)
+    return solve_pose(RIG, PointTracks.of(o, LANDMARKS[o.track]), start, scales=scales, prior=prior)
 
 
 def away(fitted: PoseFit, truth: Array) -> Array:
@@ -47,7 +46,7 @@ def anywhere(seed: int, degrees: float, mm: float) -> Array:
 def mean_error(outliers: float, noise: float = 0.3, count: int = 20) -> float:
     """Mean position error, mm, over `count` draws, begun 5 mm and 2 degrees away."""
     errors = [
-        away(fit(seen(REST, k, noise, outliers), REST @ anywhere(k, 2.0, 5.0)), REST)[3:]
+        away(fit(seen(BASE_FROM_REST, k, noise, outliers), BASE_FROM_REST @ anywhere(k, 2.0, 5.0)), BASE_FROM_REST)[3:]
         for k in range(100, 100 + count)
     ]
     return float(np.mean(np.linalg.norm(errors, axis=1)))
@@ -56,7 +55,7 @@ def mean_error(outliers: float, noise: float = 0.3, count: int = 20) -> float:
 @given(seeds)
 @settings(max_examples=40)
 def test_exact_data_give_the_exact_pose_from_20_mm_and_10_degrees_away(seed: int) -> None:
-    truth = REST @ anywhere(seed + 1, 8.0, 6.0)
+    truth = BASE_FROM_REST @ anywhere(seed + 1, 8.0, 6.0)
     fitted = fit(seen(truth, seed, noise=0.0), truth @ anywhere(seed, 10.0, 20.0))
     assert np.abs(away(fitted, truth)).max() < 1e-6
     assert np.abs(fitted.residuals).max() < 1e-4 and fitted.weights.min() > 0.999 and fitted.scale == 1.0
@@ -64,7 +63,7 @@ def test_exact_data_give_the_exact_pose_from_20_mm_and_10_degrees_away(seed: int
 
 @given(seeds)
 def test_pixels_and_depths_are_those_of_the_rig(seed: int) -> None:
-    pose = REST @ anywhere(seed, 20.0, 30.0)
+    pose = BASE_FROM_REST @ anywhere(seed, 20.0, 30.0)
     for number, camera in enumerate(RIG.cameras):
         pixels, depth, _ = project(RIG, np.full(len(LANDMARKS), number), pose, LANDMARKS)
         expected, expected_depth = ideal_pixels(camera, se3.transform_points(pose, LANDMARKS))
@@ -74,7 +73,7 @@ def test_pixels_and_depths_are_those_of_the_rig(seed: int) -> None:
 @given(seeds)
 @settings(max_examples=30)
 def test_jacobians_are_the_slopes_of_the_projection(seed: int) -> None:
-    pose, camera = REST @ anywhere(seed, 20.0, 30.0), np.arange(len(LANDMARKS)) % 3
+    pose, camera = BASE_FROM_REST @ anywhere(seed, 20.0, 30.0), np.arange(len(LANDMARKS)) % 3
     jacobian = project(RIG, camera, pose, LANDMARKS)[2]
     for axis, h in enumerate([1e-5] * 3 + [1e-3] * 3):
         step = se3.exp(h * np.eye(6)[axis])
@@ -84,17 +83,17 @@ def test_jacobians_are_the_slopes_of_the_projection(seed: int) -> None:
 
 
 def test_the_information_of_perfect_tracks_is_the_sum_over_them() -> None:
-    o = seen(REST, 1, noise=0.0)
+    o = seen(BASE_FROM_REST, 1, noise=0.0)
     o = Observations(o.stamp, o.camera, o.track, o.pixels, np.random.default_rng(4).uniform(0.1, 1.0, len(o)))
-    j = project(RIG, o.camera, REST, LANDMARKS[o.track])[2]
+    j = project(RIG, o.camera, BASE_FROM_REST, LANDMARKS[o.track])[2]
     expected = np.einsum("nki,n,nkj->ij", j, 1 / o.sigma**2, j)
-    assert np.allclose(fit(o, REST).information, EFFICIENCY * expected, rtol=1e-9)
+    assert np.allclose(fit(o, BASE_FROM_REST).information, EFFICIENCY * expected, rtol=1e-9)
 
 
 def test_a_track_twice_as_sure_counts_four_times() -> None:
-    sure, unsure = seen(REST, 1, noise=0.0), seen(REST, 1, noise=0.0)
+    sure, unsure = seen(BASE_FROM_REST, 1, noise=0.0), seen(BASE_FROM_REST, 1, noise=0.0)
     sure = Observations(0.0, sure.camera, sure.track, sure.pixels, sure.sigma / 2)
-    assert np.allclose(fit(sure, REST).information, 4 * fit(unsure, REST).information)
+    assert np.allclose(fit(sure, BASE_FROM_REST).information, 4 * fit(unsure, BASE_FROM_REST).information)
 
 
 @pytest.mark.parametrize(("outliers", "worse"), [(0.05, 1.3), (0.3, 1.7), (0.4, 2.0)])
@@ -103,10 +102,10 @@ def test_scattered_outliers_barely_move_the_pose(outliers: float, worse: float) 
 
 
 def test_outliers_are_told_from_the_rest() -> None:
-    o = seen(REST, 8, outliers=0.3)
-    exact = project(RIG, o.camera, REST, LANDMARKS[o.track])[0]
+    o = seen(BASE_FROM_REST, 8, outliers=0.3)
+    exact = project(RIG, o.camera, BASE_FROM_REST, LANDMARKS[o.track])[0]
     distance = np.linalg.norm(o.pixels - exact, axis=1)
-    weights = fit(o, REST @ anywhere(8, 2.0, 5.0)).weights
+    weights = fit(o, BASE_FROM_REST @ anywhere(8, 2.0, 5.0)).weights
     assert weights[distance > 6].max() < 0.2 < weights[distance < 0.9].min()
 
 
@@ -115,9 +114,9 @@ def stuck_error(share: float, mm: float, seed: int) -> float:
 
     Begun where a prediction would: half a millimetre and a third of a degree off.
     """
-    now = REST @ anywhere(seed, 1.0, mm)
+    now = BASE_FROM_REST @ anywhere(seed, 1.0, mm)
     o, still = seen(now, seed), np.random.default_rng([seed, 1]).permutation(len(LANDMARKS)) < share * len(LANDMARKS)
-    drape = project(RIG, o.camera, REST, LANDMARKS[o.track])[0]
+    drape = project(RIG, o.camera, BASE_FROM_REST, LANDMARKS[o.track])[0]
     pixels = np.where(still[o.track][:, None], drape, o.pixels)
     start = now @ anywhere(seed + 1, 0.3, 0.5)
     return float(np.linalg.norm(away(fit(Observations(0.0, o.camera, o.track, pixels, o.sigma), start), now)[3:]))
@@ -133,8 +132,8 @@ def test_tracks_that_stick_to_a_drape_barely_move_the_pose(mm: float) -> None:
 def test_the_covariance_is_as_wide_as_the_errors(outliers: float) -> None:
     nees = []
     for k in range(150):
-        fitted = fit(seen(REST, k, outliers=outliers), REST @ anywhere(k, 2.0, 5.0))
-        e = away(fitted, REST)
+        fitted = fit(seen(BASE_FROM_REST, k, outliers=outliers), BASE_FROM_REST @ anywhere(k, 2.0, 5.0))
+        e = away(fitted, BASE_FROM_REST)
         nees.append(e @ fitted.information @ e / 6)
     assert 0.6 < np.mean(nees) < 1.15  # the robust weights make the information a quarter small
 
@@ -143,7 +142,7 @@ def apart(mm: float, seed: int) -> tuple[Observations, Observations]:
     """Exact tracks of three cameras, each of which sees the surface `mm` further on, and of cameras in step."""
     along = np.random.default_rng(seed).normal(size=3)
     shift = np.r_[np.zeros(3), mm * along / np.linalg.norm(along)]
-    parts = [seen(REST @ se3.exp(k * shift), seed, noise=0.0) for k in (-1, 0, 1)]
+    parts = [seen(BASE_FROM_REST @ se3.exp(k * shift), seed, noise=0.0) for k in (-1, 0, 1)]
     own = [np.flatnonzero(part.camera == c) for c, part in enumerate(parts)]
     camera, track, pixels, sigma = (
         np.concatenate([getattr(part, name)[mine] for part, mine in zip(parts, own, strict=True)])
@@ -157,8 +156,8 @@ def test_cameras_at_different_instants_are_averaged_and_none_is_thrown_out(mm: f
     off, least = [], []
     for seed in range(20):
         late, together = apart(mm, seed)
-        fitted, ideal = fit(late, REST), fit(together, REST)
-        off.append(np.linalg.norm(away(fitted, REST)[3:]) / mm)
+        fitted, ideal = fit(late, BASE_FROM_REST), fit(together, BASE_FROM_REST)
+        off.append(np.linalg.norm(away(fitted, BASE_FROM_REST)[3:]) / mm)
         least.append(min(fitted.weights[late.camera == c].mean() for c in range(3)))
         expected = np.einsum("nki,n,nkj->ij", fitted.jacobians, fitted.weights / late.sigma**2, fitted.jacobians)
         assert np.allclose(np.diag(fitted.information), EFFICIENCY * np.diag(expected) / fitted.scale**2, rtol=0.1)
@@ -168,22 +167,22 @@ def test_cameras_at_different_instants_are_averaged_and_none_is_thrown_out(mm: f
 
 
 def test_points_behind_the_camera_have_no_say() -> None:
-    o = seen(REST, 2)
+    o = seen(BASE_FROM_REST, 2)
     points = LANDMARKS[o.track].copy()
     back: NDArray[np.bool_] = np.arange(len(o)) % 10 == 0
-    beyond = se3.transform_points(se3.inverse(REST), [c.base_from_camera[:3, 3] * 3 for c in RIG.cameras])
+    beyond = se3.transform_points(se3.inverse(BASE_FROM_REST), [c.base_from_camera[:3, 3] * 3 for c in RIG.cameras])
     points[back] = beyond[o.camera[back]]
-    depth = project(RIG, o.camera, REST, points)[1]
+    depth = project(RIG, o.camera, BASE_FROM_REST, points)[1]
     assert (depth[back] < 0).any()
-    fitted = solve_pose(RIG, o.camera, points, o.pixels, o.sigma, REST, scales=(4.0, 1.0))
-    assert (fitted.weights[depth < 0] == 0).all() and np.linalg.norm(away(fitted, REST)[3:]) < 0.1
+    fitted = solve_pose(RIG, PointTracks.of(o, points), BASE_FROM_REST, scales=(4.0, 1.0))
+    assert (fitted.weights[depth < 0] == 0).all() and np.linalg.norm(away(fitted, BASE_FROM_REST)[3:]) < 0.1
 
 
 def test_a_prior_holds_what_the_tracks_leave_open() -> None:
-    o = seen(REST, 3, noise=0.0)
+    o = seen(BASE_FROM_REST, 3, noise=0.0)
     few = np.flatnonzero(o.camera == 0)[:2]
     two = Observations(0.0, o.camera[few], o.track[few], o.pixels[few], o.sigma[few])
-    start = REST @ anywhere(3, 1.0, 2.0)
+    start = BASE_FROM_REST @ anywhere(3, 1.0, 2.0)
     fitted = fit(two, start, prior=np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3))
     assert np.abs(fitted.residuals).max() < 0.1
     assert np.linalg.norm(away(fitted, start)[3:]) < 10

@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from hardware.arm.profile import ArmProfile
-from hardware.bookmark_file import BookmarkFile, read_start, write_bookmark
+from hardware.files.path_file import ProgressFile, read_progress, write_progress
 from hardware.motion.step import MotionStep
 from planning.command import Move
-from planning.kinematics import SimpleArm
-from planning.limits import Limits
+from planning.limits import MotionLimits
 from planning.motion.planner import Planner
 from planning.path import Path
-from planning.progress import Phase, bookmark, fingerprint, resumed
+from planning.progress import PrintPhase, fingerprint, progress_mark, resume_fraction
+from planning.robot.kinematics import SimpleArm
 from tests.moving import breathing, pose_at, raster
 
 TICK = 0.02
@@ -59,25 +59,25 @@ def assert_once(intervals: Sequence[Interval], path: Path) -> None:
 def test_outages_and_a_second_run_deposit_every_place_once(outages: list[Interval], cut: float) -> None:
     path = raster(size=4, lines=2, speed=4.0)
     lost = [(a, a + b) for a, b in outages]
-    first = Planner(path, Limits(), CLOSE, TICK)
+    first = Planner(path, MotionLimits(), CLOSE, TICK)
     intervals = printed_by(first, 10.0, cut, lost)
-    start = resumed(path, bookmark(path, first.progress))
-    second = Planner(path, Limits(), CLOSE, TICK, start=start)
+    start = resume_fraction(path, progress_mark(path, first.progress))
+    second = Planner(path, MotionLimits(), CLOSE, TICK, start=start)
     intervals += printed_by(second, 100.0, 12.0, [(1.0, 1.3)])
-    assert second.progress.phase is Phase.FINISHED
+    assert second.progress.phase is PrintPhase.FINISHED
     assert_once(intervals, path)
 
 
 @pytest.mark.parametrize("checkpoint", range(6))
 def test_any_checkpoint_can_be_the_first(checkpoint: int) -> None:
     path = raster(size=2, lines=3)
-    planner = Planner(path, Limits(), CLOSE, TICK, start=checkpoint)
+    planner = Planner(path, MotionLimits(), CLOSE, TICK, start=checkpoint)
     assert (planner.progress.printed, planner.progress.fraction) == (checkpoint, checkpoint)
     intervals = printed_by(planner, 10.0, 6.0)
     lengths = np.concatenate(
         [[0.0], np.cumsum(np.linalg.norm(np.diff(path.surface_from_nozzle[:, :3, 3], axis=0), axis=1))]
     )
-    assert planner.progress.phase is Phase.FINISHED
+    assert planner.progress.phase is PrintPhase.FINISHED
     if checkpoint == 5:
         assert intervals == []
     else:
@@ -88,18 +88,18 @@ def test_any_checkpoint_can_be_the_first(checkpoint: int) -> None:
 @pytest.mark.parametrize("left", [1e-3, 1e-6, 1e-7, 1e-9])
 def test_a_last_bit_too_short_to_go_along_ends_the_print(left: float) -> None:
     path = raster(size=2, lines=3)
-    planner = Planner(path, Limits(), CLOSE, TICK, start=5 - left)
+    planner = Planner(path, MotionLimits(), CLOSE, TICK, start=5 - left)
     printed_by(planner, 10.0, 6.0)
-    assert planner.progress.phase is Phase.FINISHED
+    assert planner.progress.phase is PrintPhase.FINISHED
 
 
 def test_printed_printing_and_next_are_told() -> None:
-    planner = Planner(raster(size=2, lines=2), Limits(), CLOSE, TICK)
+    planner = Planner(raster(size=2, lines=2), MotionLimits(), CLOSE, TICK)
     seen = set()
     for k in range(250):
         planner(pose_at(breathing, 10 + k * TICK), 10 + k * TICK)
         p = planner.progress
-        if p.phase is Phase.PRINTING and p.fraction % 1 > 0:
+        if p.phase is PrintPhase.PRINTING and p.fraction % 1 > 0:
             assert p.printed == p.checkpoint - 1
             seen.add((p.printed, p.checkpoint, p.next))
     assert seen == {(0, 1, 2), (1, 2, 3), (2, 3, None)}
@@ -108,18 +108,18 @@ def test_printed_printing_and_next_are_told() -> None:
 def test_a_record_serves_a_later_run_of_the_same_path_and_no_other(tmp_path: File) -> None:
     path, file = raster(), tmp_path / "progress.toml"
     motion = MotionStep(path, ArmProfile(arm=CLOSE))
-    keeper = BookmarkFile(file, path)
+    keeper = ProgressFile(file, path)
     for k in range(150):
         motion(pose_at(breathing, 10 + k * TICK), 10 + k * TICK)
         keeper.write(motion.progress)
     assert [f.name for f in tmp_path.iterdir()] == ["progress.toml"]
-    start = read_start(file, path)
+    start = read_progress(file, path)
     assert start == motion.progress.fraction > 0
     assert MotionStep(path, start=start).progress.place == pytest.approx(motion.progress.place)
-    write_bookmark(tmp_path / "again.toml", path, motion.progress)
+    write_progress(tmp_path / "again.toml", path, motion.progress)
     assert (tmp_path / "again.toml").read_bytes() == file.read_bytes()
     with pytest.raises(InputError, match="fingerprint of the path"):
-        read_start(file, replace(path, speed=path.speed * 2))
+        read_progress(file, replace(path, speed=path.speed * 2))
 
 
 @pytest.mark.parametrize(
@@ -136,13 +136,13 @@ def test_a_damaged_record_is_refused(tmp_path: File, text: str, words: str) -> N
     file = tmp_path / "progress.toml"
     file.write_text(text.replace("PATH", fingerprint(raster())))
     with pytest.raises(InputError, match=words):
-        read_start(file, raster())
+        read_progress(file, raster())
 
 
 def test_a_start_beyond_the_path_is_refused() -> None:
     for start in (-0.1, 5.1, float("nan")):
         with pytest.raises(InputError, match="fraction"):
-            Planner(raster(), Limits(), CLOSE, TICK, start=start)
+            Planner(raster(), MotionLimits(), CLOSE, TICK, start=start)
 
 
 def test_every_column_counts_in_the_fingerprint() -> None:

@@ -11,19 +11,17 @@ import pytest
 
 from estimation import se3
 from estimation.se3 import Array
-from hardware.arm.profile import BENCH
+from hardware.arm.profile import ARM_FROM_BENCH
 from hardware.cli.main import main
 from hardware.files.arm_file import read_arm
 from hardware.files.path_file import read_path, write_path
 from hardware.report.page import Plot
-from planning.inverse import POSTURES
-from planning.robot.kinematics import JointModel, arm_from_nozzle
-from planning.robot.reach import REASONS, Motion, best_posture, reach_of
-from planning.spin import at_spin, best_spin
+from planning.robot.kinematics import POSTURES, JointModel, nozzle_from_joints
+from planning.robot.reach import REASONS, SurfaceMotion, best_posture, best_spin, reach_at_spin, reach_of
 from tests.moving import path_through, raster
 
 ARMS = Path(__file__).parents[1] / "data" / "arms"
-STILL = Motion()
+STILL = SurfaceMotion()
 
 
 def nominal() -> JointModel:
@@ -32,29 +30,32 @@ def nominal() -> JointModel:
     return model
 
 
-def reasons(model: JointModel, place: Array, motion: Motion = STILL, speed: float = 5.0) -> set[str]:
+def reasons(model: JointModel, place: Array, motion: SurfaceMotion = STILL, speed: float = 5.0) -> set[str]:
     return {REASONS[i] for i in reach_of(model, place, raster(speed=speed), motion).reason}
 
 
 def test_a_path_under_home_is_printable_and_its_joints_bring_the_nozzle_there() -> None:
     model, path = nominal(), raster()
-    found = reach_of(model, BENCH, path, Motion(10.0, 0.05, 0.25))
+    found = reach_of(model, ARM_FROM_BENCH, path, SurfaceMotion(10.0, 0.05, 0.25))
     assert found.feasible.all()
-    assert np.allclose(arm_from_nozzle(model, found.joints), BENCH @ path.surface_from_nozzle, atol=1e-9)
-    assert best_posture(model, BENCH, path, STILL) == (int(np.argmax((model.signs == POSTURES).all(1))), len(path))
+    assert np.allclose(nozzle_from_joints(model, found.joints), ARM_FROM_BENCH @ path.surface_from_nozzle, atol=1e-9)
+    assert best_posture(model, ARM_FROM_BENCH, path, STILL) == (
+        int(np.argmax((model.signs == POSTURES).all(1))),
+        len(path),
+    )
 
 
 @pytest.mark.parametrize(
     ("place", "motion", "speed", "reason"),
     [
-        (BENCH @ se3.exp([0, 0, 0, 500, 0, 0]), STILL, 5.0, "too far"),
+        (ARM_FROM_BENCH @ se3.exp([0, 0, 0, 500, 0, 0]), STILL, 5.0, "too far"),
         (se3.make(np.eye(3), [5.0, 0, 100]), STILL, 5.0, "too far"),
         (se3.make(se3.exp_rotation([0, 0, np.pi]), [-300.0, 5, 50]), STILL, 5.0, "joint range"),
-        (BENCH, STILL, 199.0, "joint speed"),
-        (BENCH, Motion(40.0, 0.3, 3.0), 5.0, "joint speed"),
+        (ARM_FROM_BENCH, STILL, 199.0, "joint speed"),
+        (ARM_FROM_BENCH, SurfaceMotion(40.0, 0.3, 3.0), 5.0, "joint speed"),
     ],
 )
-def test_each_reason_is_told(place: Array, motion: Motion, speed: float, reason: str) -> None:
+def test_each_reason_is_told(place: Array, motion: SurfaceMotion, speed: float, reason: str) -> None:
     model = nominal()
     if speed > 100:
         model = replace(model, speed=np.full(6, 0.3))
@@ -65,7 +66,7 @@ def test_a_wrist_within_five_degrees_of_singular_is_told_though_its_range_allows
     model = nominal()
     point = path_through(np.array([[0.0, 0, 0], [0.1, 0, 0]]))
     for degrees, reason in ((80.0, "ok"), (86.5, "singular"), (89.0, "joint range")):
-        place = arm_from_nozzle(model, np.array([0.1, -0.4, -0.3, 0.2, np.deg2rad(degrees), 0.1]))
+        place = nozzle_from_joints(model, np.array([0.1, -0.4, -0.3, 0.2, np.deg2rad(degrees), 0.1]))
         assert {REASONS[i] for i in reach_of(model, place, point, STILL).reason} == {reason}
 
 
@@ -78,12 +79,12 @@ def test_a_motion_of_the_surface_takes_reach_away() -> None:
     )
     near = edge @ se3.exp([0, 0, 0, -4.0, 0, 0])
     assert reach_of(model, near, path, STILL).feasible.all()
-    assert not reach_of(model, near, path, Motion(30.0)).feasible.all()
+    assert not reach_of(model, near, path, SurfaceMotion(30.0)).feasible.all()
 
 
 def test_speed_of_joints_is_that_of_differences() -> None:
     model, path = nominal(), path_through(np.linspace([0, 0, 0], [4, 3, 0], 101), speed=20.0)
-    found = reach_of(model, BENCH, path, STILL)
+    found = reach_of(model, ARM_FROM_BENCH, path, STILL)
     rates = np.abs(np.diff(found.joints, axis=0)) / (0.05 / 20.0) / model.speed
     assert np.allclose(found.speed[1:], rates.max(axis=1), rtol=0.01)
 
@@ -91,11 +92,11 @@ def test_speed_of_joints_is_that_of_differences() -> None:
 def test_the_tool_spins_to_stay_within_the_last_joint_and_no_more_than_it_must() -> None:
     model, path = nominal(), raster()
     narrow = replace(model, low=np.append(model.low[:5], -0.5), high=np.append(model.high[:5], 0.5))
-    assert {REASONS[i] for i in reach_of(narrow, BENCH, path, STILL).reason} == {"joint range"}
-    spin = best_spin(narrow, BENCH, path, STILL)
-    assert at_spin(narrow, BENCH, path, STILL, spin).feasible.all()
+    assert {REASONS[i] for i in reach_of(narrow, ARM_FROM_BENCH, path, STILL).reason} == {"joint range"}
+    spin = best_spin(narrow, ARM_FROM_BENCH, path, STILL)
+    assert reach_at_spin(narrow, ARM_FROM_BENCH, path, STILL, spin).feasible.all()
     assert np.ptp(spin) < 1e-9  # one angle serves the whole path
-    assert np.allclose(best_spin(model, BENCH, path, STILL), best_spin(model, BENCH, path, STILL)[0])
+    assert np.allclose(best_spin(model, ARM_FROM_BENCH, path, STILL), best_spin(model, ARM_FROM_BENCH, path, STILL)[0])
 
 
 def test_the_command_marks_the_path_and_says_whether_all_can_be_printed(

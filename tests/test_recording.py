@@ -1,30 +1,38 @@
-"""Recordings: every record comes back, and what could not come back is refused when it is written."""
+"""Recordings: every record comes back, and what could not come back is refused when it is written. An image in a
+recording is what ROS reads as one, and bytes that are none are refused.
+"""
 
 from __future__ import annotations
 
 import gc
 from dataclasses import fields
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import SeekingReader
 from mcap.records import ChunkIndex
-from session_files import image, rig, stamps, trajectory
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from estimation.errors import InputError, StillbedError
 from estimation.observations import Observations
 from estimation.pose import TrackState
-from hardware import channels
+from hardware.files.folder_tables import rows_from_trajectory
+from hardware.files.images import IMAGE_SCHEMA_NAME, MAX_TIME_SECOND, decode, encode, pack_image, unpack_image
 from hardware.files.rig_file import table_from_rig
-from hardware.files.session import open_session
+from hardware.recording import session_reader as channels
+from hardware.recording.mcap_file import ChunkMessages, StoredMessage, walk
 from hardware.recording.recorder import Recorder
 from hardware.recording.schemas import WARNING
-from hardware.tum import rows_from_trajectory
+from hardware.recording.session_reader import open_session
 from perception.frames import Frame, Roi
 from planning.command import Hold, Move
 from tests.recorded import LOST, pose, write_frames
+from tests.session_files import image, rig, stamps, trajectory
 
 EXACT_STAMPS = st.floats(-1e8, 1e8) | st.floats(1e9, 4e9)
 
@@ -181,22 +189,97 @@ def test_what_the_reader_would_refuse_is_refused_when_written(tmp_path: Path) ->
     assert len(open_session(tmp_path / "x.mcap")) == 3
 
 
+class LibraryWriter:
+    """The library's own writer, called as ours."""
+
+    def __init__(self, file: BinaryIO, chunk_size: int, compress: bool) -> None:
+        kind = CompressionType.ZSTD if compress else CompressionType.NONE
+        self.writer = writer = Writer(file, chunk_size=chunk_size, compression=kind)
+        self.register_schema, self.register_channel = writer.register_schema, writer.register_channel
+        self.add_metadata, self.flush, self.finish = writer.add_metadata, writer.flush, writer.finish
+
+    def start(self, library: str) -> None:
+        self.writer.start("", library)
+
+    def add_message(self, channel: int, log_time: int, data: bytes, sequence: int) -> None:
+        self.writer.add_message(channel, log_time, data, log_time, sequence)
+
+    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
+        self.writer.add_attachment(0, 0, name, media_type, data)
+
+
+@pytest.mark.parametrize("compress", [True, False])
 def test_an_index_kept_as_bytes_gives_the_very_file_and_holds_nothing_of_its_chunks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compress: bool
 ) -> None:
     def record(name: str) -> tuple[bytes, int]:
-        with Recorder(tmp_path / name, rig()) as recorder:
+        with Recorder(tmp_path / name, rig(), compress=compress) as recorder:
+            recorder.attach("notes.txt", b"before all")
+            recorder.event(-1.0, "earlier than all else")
             write_frames(recorder, 60, 3, 0.0)
+            recorder.attach("more.txt", b"amid it")
             held = sum(isinstance(each, ChunkIndex) for each in gc.get_objects())
         return (tmp_path / name).read_bytes(), held
 
     packed, held = record("packed.mcap")
-    monkeypatch.setattr("hardware.recording.recorder.pack_index", lambda writer: None)
+    monkeypatch.setattr("hardware.recording.recorder.McapWriter", LibraryWriter)
     plain, chunks = record("plain.mcap")
     assert packed == plain and held == 0 and chunks > 2
 
 
-def test_a_library_that_keeps_its_index_elsewhere_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("hardware.mcap_index.CHUNKS", "_kept_elsewhere")
-    with pytest.raises(StillbedError, match="constraints"):
-        Recorder(tmp_path / "x.mcap", rig())
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+WORDS = st.text(st.characters(exclude_categories=["Cs", "Cc"]), max_size=12)
+
+
+@given(kind=WORDS, frame=WORDS, data=st.binary(max_size=70), log_time=st.integers(0, MAX_TIME_SECOND * 10**9))
+def test_ros_reads_what_is_packed_and_so_do_we(kind: str, frame: str, data: bytes, log_time: int) -> None:
+    packed = pack_image(kind, data, frame, log_time)
+    assert unpack_image(packed) == (kind, data)
+    told = STORE.deserialize_cdr(packed, IMAGE_SCHEMA_NAME)
+    stamp = told.header.stamp
+    assert (told.format, told.header.frame_id, bytes(told.data)) == (kind, frame, data)
+    assert stamp.sec * 10**9 + stamp.nanosec == log_time
+    assert bytes(STORE.serialize_cdr(told, IMAGE_SCHEMA_NAME)) == packed
+
+
+@given(data=st.binary(max_size=30), cut=st.integers(0, 200))
+def test_bytes_that_are_cut_are_refused(data: bytes, cut: int) -> None:
+    packed = pack_image("png", data, "camera/left", 5)
+    if cut < len(packed):
+        with pytest.raises(ValueError, match=r"ends at byte|begins with"):
+            unpack_image(packed[:cut])
+
+
+def test_a_time_that_ros_cannot_tell_is_its_last() -> None:
+    stamp = STORE.deserialize_cdr(
+        pack_image("png", b"", "", (MAX_TIME_SECOND + 9) * 10**9 + 7), IMAGE_SCHEMA_NAME
+    ).header.stamp
+    assert (stamp.sec, stamp.nanosec) == (MAX_TIME_SECOND, 7)
+
+
+def test_the_schema_in_the_file_is_the_one_that_ros_knows(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
+        write_frames(recorder, 3)
+    with open(tmp_path / "x.mcap", "rb") as file:
+        found = list(SeekingReader(file, validate_crcs=True).iter_messages(topics=["/camera/left/image"]))
+    for number, (schema, channel, message) in enumerate(found):
+        assert schema is not None
+        assert (schema.name, schema.encoding, channel.message_encoding) == (IMAGE_SCHEMA_NAME, "ros2msg", "cdr")
+        defined = get_types_from_msg(schema.data.decode(), schema.name)
+        assert all(STORE.fielddefs[name] == fields for name, fields in defined.items())
+        picture = decode(bytes(STORE.deserialize_cdr(message.data, IMAGE_SCHEMA_NAME).data), "x", "image")
+        assert np.array_equal(picture, image(0, number))
+
+
+def test_an_image_that_is_broken_inside_a_sound_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    with Recorder(path, rig(2)) as recorder:
+        recorder.write(Frame(0, 0.0, image(0, 0)))
+    stored = next(
+        m for part in walk(path) if isinstance(part, ChunkMessages) for m in part.messages if "image" in m.topic
+    )
+    assert isinstance(stored, StoredMessage) and unpack_image(stored.data) == encode(image(0, 0))
+    with Recorder(path, rig(2), overwrite=True) as recorder:
+        recorder.encoded_frame(0, 0.0, "png", b"no picture")
+    with pytest.raises(InputError, match="undecodable"):
+        open_session(path)

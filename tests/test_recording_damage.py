@@ -16,17 +16,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import SeekingReader
-from session_files import image, rig, stamps
 
 from estimation.errors import InputError, StillbedError
-from hardware import channels
 from hardware.arm.profile import ArmProfile
 from hardware.cli.main import main
 from hardware.files.arm_file import write_arm
-from hardware.files.session import open_session
-from hardware.recording.mcap_file import ChunkOf, walk
-from hardware.recording.recorder import CHUNK_SECONDS, Recorder
+from hardware.recording import session_reader as channels
+from hardware.recording.mcap_file import ChunkMessages, walk
+from hardware.recording.recorder import MAX_CHUNK_SECONDS, Recorder
+from hardware.recording.session_reader import open_session
 from tests.recorded import whole_recording, write_frames
+from tests.session_files import image, rig, stamps
 from tests.started import ROOT
 
 SQUARE = ROOT / "data" / "paths" / "square_10mm.csv"
@@ -45,7 +45,7 @@ def chunk_ends(path: Path) -> list[tuple[int, int]]:
     assert summary is not None
     ends = []
     frames = 0
-    chunks = {p.offset: p for p in walk(path) if isinstance(p, ChunkOf)}
+    chunks = {p.offset: p for p in walk(path) if isinstance(p, ChunkMessages)}
     for index in sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
         frames += sum(m.topic == "/frames" for m in chunks[index.chunk_start_offset].messages)
         ends.append((index.chunk_start_offset + index.chunk_length, frames))
@@ -75,7 +75,7 @@ def test_a_file_cut_at_any_byte_is_readable_up_to_its_last_whole_chunk(
 
 def test_a_chunk_that_an_interrupted_run_wrote_twice_counts_once(whole: Path) -> None:
     data, ends = whole.read_bytes(), [end for end, _ in chunk_ends(whole)]
-    starts = [p.offset for p in walk(whole) if isinstance(p, ChunkOf)]
+    starts = [p.offset for p in walk(whole) if isinstance(p, ChunkMessages)]
     again = whole.parent / "again.mcap"
     again.write_bytes(data[: ends[1]] + data[starts[1] : ends[1]] + data[ends[1] :])
     session = open_session(again)
@@ -102,7 +102,7 @@ def test_a_flipped_bit_never_gives_a_wrong_image(whole: Path, where: float, bit:
 KILLED = """
 import sys, time
 sys.path.insert(0, "tests")
-from session_files import image, rig
+from tests.session_files import image, rig
 from hardware.recording.recorder import Recorder
 from perception.frames import Frame
 recorder = Recorder(sys.argv[1], rig(2))
@@ -126,7 +126,7 @@ def test_a_killed_run_is_readable_to_the_last_second(tmp_path: Path) -> None:
     session = open_session(tmp_path / "x.mcap")
     assert "not closed" in session.damage or "cut" in session.damage
     frames = list(session.frame_sets())
-    assert last / 30 - frames[-1].stamp <= CHUNK_SECONDS + 2 / 30
+    assert last / 30 - frames[-1].stamp <= MAX_CHUNK_SECONDS + 2 / 30
 
 
 @contextmanager

@@ -15,21 +15,20 @@ from mcap.records import ChunkIndex
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
-from session_files import NAMES, image, rig, stamps, trajectory
 
 from estimation.errors import InputError
 from estimation.observations import Observations
-from hardware.compressed_image import NAME
-from hardware.files.images import encode
-from hardware.files.session import open_session
-from hardware.recording.mcap_file import ChunkOf, Damage, walk
+from hardware.files.folder_tables import rows_from_trajectory
+from hardware.files.images import IMAGE_SCHEMA_NAME, encode
+from hardware.recording.mcap_file import ChunkMessages, Damage, walk
 from hardware.recording.messages import message_from_rig
-from hardware.recording.recorder import CHUNK_SECONDS, EPOCH, Recorder
+from hardware.recording.recorder import LOG_EPOCH, MAX_CHUNK_SECONDS, Recorder
 from hardware.recording.schemas import CALIBRATION, TOPICS
-from hardware.tum import rows_from_trajectory
+from hardware.recording.session_reader import open_session
 from perception.frames import Image, Roi
 from planning.command import Hold, Move
 from tests.recorded import LOST, pose, whole_recording, write_frames
+from tests.session_files import NAMES, image, rig, stamps, trajectory
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 
@@ -75,12 +74,12 @@ def test_the_summary_points_at_what_is_there(whole: Path) -> None:
         (metadata,) = reader.iter_metadata()
     assert counted == summary.statistics.message_count
     assert attachment.name == "surface.ply" and attachment.data == b"ply\n" * 500
-    assert metadata.metadata["epoch_s"] == str(EPOCH)
+    assert metadata.metadata["epoch_s"] == str(LOG_EPOCH)
     for index in summary.chunk_indexes:
         assert isinstance(index, ChunkIndex)
         opcode, length = struct.unpack_from("<BQ", data, index.chunk_start_offset)
         assert (opcode, length + 9) == (0x06, index.chunk_length)
-        assert index.message_end_time - index.message_start_time <= CHUNK_SECONDS * 1e9
+        assert index.message_end_time - index.message_start_time <= MAX_CHUNK_SECONDS * 1e9
         for offset in index.message_index_offsets.values():
             assert data[offset] == 0x07
     assert len(summary.chunk_indexes) == summary.statistics.chunk_count >= 4
@@ -141,8 +140,8 @@ def test_images_are_given_to_viewers_at_their_stamp(whole: Path) -> None:
     with open(whole, "rb") as file:
         found = list(SeekingReader(file).iter_messages(topics=[f"/camera/{NAMES[0]}/image"]))
     for (_, _, message), stamp in zip(found, stamps(24, 0.0), strict=True):
-        assert message.log_time == round(3 * stamp * 1e9) + EPOCH * 10**9
-        told = STORE.deserialize_cdr(message.data, NAME).header.stamp
+        assert message.log_time == round(3 * stamp * 1e9) + LOG_EPOCH * 10**9
+        told = STORE.deserialize_cdr(message.data, IMAGE_SCHEMA_NAME).header.stamp
         assert told.sec * 10**9 + told.nanosec == message.log_time
 
 
@@ -154,7 +153,7 @@ def test_an_attachment_cannot_choose_where_it_is_unpacked(tmp_path: Path) -> Non
         writer.start()
         writer.add_attachment(0, 0, "../surface.ply", "model/ply", b"ply")
         for part in walk(tmp_path / "x.mcap"):
-            for stored in part.messages if isinstance(part, ChunkOf) else ():
+            for stored in part.messages if isinstance(part, ChunkMessages) else ():
                 channel = writer.register_channel(stored.topic, stored.encoding, 0)
                 writer.add_message(channel, 0, stored.data, 0, stored.sequence)
         writer.finish()  # type: ignore[no-untyped-call]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_adjustment import RIG, as_map, landmarks, look, shape_error, swaying, unsure
 
-from estimation.deferred import DELAY, sets_until_ready
-from estimation.mapping.refiner import Refiner
+from estimation.mapping.refiner import MIN_DELAY_SETS, Refiner, sets_until_ready
 from estimation.online.estimator import Estimator
 from estimation.se3 import Array
 from estimation.surface_map import joined_map
+from tests.test_adjustment import RIG, as_map, landmarks, look, shape_error, swaying, unsure
 
 STAMPS = (0.0, 0.15, 0.3, 0.45)
 DELAYS = (0.02, -0.008, -0.012)  # s
@@ -52,7 +51,7 @@ def test_a_surface_that_deforms_has_the_map_again_as_it_was_confirmed_and_it_sta
     assert confirmed is not None
     refined = []
     for seen in later[1:]:
-        for _ in range(DELAY + 1):
+        for _ in range(MIN_DELAY_SETS + 1):
             refiner.offer(estimator.fit(seen, swaying(seen.stamp)), seen, np.zeros(6), delays)
             refined.append(refiner.poll())
     assert any(r is not None for r in refined)
@@ -64,6 +63,9 @@ def test_a_surface_that_deforms_has_the_map_again_as_it_was_confirmed_and_it_sta
     assert refiner.freeze() is None
 
 
-@pytest.mark.parametrize(("interval", "sets"), [(0.0, DELAY), (1 / 10, DELAY), (1 / 30, 9), (1 / 60, 18), (1.0, DELAY)])
+@pytest.mark.parametrize(
+    ("interval", "sets"),
+    [(0.0, MIN_DELAY_SETS), (1 / 10, MIN_DELAY_SETS), (1 / 30, 9), (1 / 60, 18), (1.0, MIN_DELAY_SETS)],
+)
 def test_a_map_is_given_the_time_that_it_takes_however_fast_the_cameras_are(interval: float, sets: int) -> None:
     assert sets_until_ready(interval) == sets

@@ -1,4 +1,6 @@
-"""Registering by the skin's texture: tracks are carried onto the true surface, and the tracker's frame comes out."""
+"""Registering by the skin's texture: tracks are carried onto the true surface, and the tracker's frame comes out.
+Laying a path onto a surface: at its height, in short pieces, and nothing else changed.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +10,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from estimation import se3
+from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.simulator.bodies import Wound, body
-from hardware.simulator.deformation import Deformation
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.simulator.motion_table import motion_from_tables
-from hardware.simulator.registering import LEAST, surface_points, truth_from_estimate
-from hardware.simulator.scene.shape import Shape, cylinder, flat
-from hardware.simulator.truth import Truth
+from hardware.simulator.scene.shape import Deformation, Shape, Wound, body, cylinder, flat
+from hardware.simulator.truth import Truth, divide_path, drape_path
+from hardware.simulator.world import MIN_REGISTRATION_TRACKS, surface_points, truth_from_estimate
+from planning.path import check_path, way_lengths
+from tests.moving import path_through, raster
 
 RIG = arc_rig()
 MOTION = motion_from_tables(
@@ -43,7 +48,7 @@ def shapes() -> dict[str, Shape]:
 
 def truth(shape: Shape, strained: bool = False) -> Truth:
     strain = (lambda times: 0.5 + 0.5 * np.asarray(times)) if strained else None
-    return Truth(REST, MOTION, STRAINED if strained else Deformation(), strain, shape.surface_from_grid)
+    return Truth(BASE_FROM_REST, MOTION, STRAINED if strained else Deformation(), strain, shape.surface_from_grid)
 
 
 def seen(shape: Shape, true: Truth, exposed: Array = EXPOSED, count: int = 90) -> tuple[Observations, Array]:
@@ -143,7 +148,7 @@ def test_noise_of_the_tracks_does_not_matter() -> None:
     assert found == pytest.approx(CHANGE, abs=1e-5)  # it is in both poses
 
 
-@pytest.mark.parametrize("count", [0, LEAST - 1, LEAST])
+@pytest.mark.parametrize("count", [0, MIN_REGISTRATION_TRACKS - 1, MIN_REGISTRATION_TRACKS])
 def test_too_few_tracks_on_the_surface_register_nothing(count: int) -> None:
     shape = shapes()["wound"]
     true = truth(shape)
@@ -153,4 +158,87 @@ def test_too_few_tracks_on_the_surface_register_nothing(count: int) -> None:
     there = replace(observations, pixels=away)
     pose = at(true.base_from_surface(TOGETHER)[0] @ CHANGE)
     found = truth_from_estimate(pose, there, (RIG, RIG), true, shape, TOGETHER)
-    assert (found is None) is (count < LEAST)
+    assert (found is None) is (count < MIN_REGISTRATION_TRACKS)
+
+
+@given(st.lists(st.tuples(st.floats(-20, 20), st.floats(-20, 20)), min_size=2, max_size=6, unique=True))
+def test_a_divided_path_is_the_same_line_in_pieces_of_a_millimetre(xy: list[tuple[float, float]]) -> None:
+    points = np.column_stack([xy, np.linspace(0, 1, len(xy))])
+    path = path_through(points)
+    fine = divide_path(path, 1.0)
+    step = way_lengths(fine.surface_from_nozzle)
+    assert step.max() <= 1.0 + 1e-9
+    assert step.sum() == pytest.approx(way_lengths(path.surface_from_nozzle).sum())
+    distance = np.linalg.norm(fine.surface_from_nozzle[:, None, :3, 3] - points, axis=-1)
+    assert distance.min(axis=0).max() < 1e-9  # every checkpoint is still there
+
+
+def test_a_new_checkpoint_takes_after_the_next_of_the_old_ones() -> None:
+    path = replace(
+        path_through(np.array([[0.0, 0, 0], [3, 0, 0], [3, 2.5, 0]])),
+        speed=np.array([1.0, 2, 3]),
+        extrude=np.array([False, True, False]),
+        layer=np.array([0, 1, 2]),
+        extra={"note": np.array(["a", "b", "c"])},
+    )
+    fine = divide_path(path, 1.0)
+    assert fine.speed.tolist() == [1, 2, 2, 2, 3, 3, 3]
+    assert fine.extrude.tolist() == [False, True, True, True, False, False, False]
+    assert fine.layer.tolist() == [0, 1, 1, 1, 2, 2, 2]
+    assert fine.extra["note"].tolist() == list("abbbccc")
+    assert fine.surface_from_nozzle[:, 0, 3] == pytest.approx([0, 1, 2, 3, 3, 3, 3])
+    check_path(fine)
+
+
+def test_a_stretch_on_which_the_tool_turns_is_left_whole() -> None:
+    path = path_through(np.array([[0.0, 0, 0], [5, 0, 0], [9, 0, 0]]))
+    path.surface_from_nozzle[1:, :3, :3] = se3.exp_rotation([0.0, 0.2, 0.0])
+    assert len(divide_path(path, 1.0)) == 1 + 1 + 4
+
+
+@pytest.mark.parametrize("shape", [flat((40, 40)), cylinder((40, 40), 45.0)], ids=["flat", "cylinder"])
+def test_a_laid_path_stands_at_its_clearance_above_the_surface(shape: Shape) -> None:
+    path = drape_path(raster(20.0), shape, 0.4)
+    places = path.surface_from_nozzle[:, :3, 3]
+    assert places[:, 2] - shape.heights_at(places[:, :2]) == pytest.approx(0.4)
+    assert np.array_equal(path.surface_from_nozzle[:, :3, :3], np.broadcast_to(np.eye(3), (len(path), 3, 3)))
+
+
+def test_on_a_scan_whose_frame_is_tilted_the_clearance_is_along_the_frames_own_z() -> None:
+    bent = cylinder((60, 60), 45.0)
+    tilted = replace(bent, surface_from_grid=se3.make(se3.exp_rotation([0.3, -0.4, 0.2]), [3.0, -2.0, 40.0]))
+    path = raster(10.0)
+    places = drape_path(path, tilted, 0.4).surface_from_nozzle[:, :3, 3]
+    below = places - [0, 0, 0.4]
+    assert tilted.points(tilted.material(below)) == pytest.approx(below, abs=1e-4)
+    assert np.array_equal(places[:, :2], divide_path(path, 1.0).surface_from_nozzle[:, :2, 3])
+
+
+@pytest.mark.parametrize("side", [10.1, -10.1])
+def test_a_path_that_leaves_the_surface_is_refused(side: float) -> None:
+    shape = flat((40, 20))
+    path = path_through(np.array([[0.0, 0, 0], [0, np.sign(side) * 10, 0]]))
+    drape_path(path, shape, 0.4)
+    with pytest.raises(InputError, match=r"x\.csv: a place on the path.*40 x 20 mm"):
+        drape_path(path_through(np.array([[0.0, 0, 0], [0, side, 0]])), shape, 0.4, "x.csv")
+
+
+def test_a_path_over_a_hole_of_a_scan_is_refused() -> None:
+    shape = flat((40, 20))
+    valid = np.ones(shape.heights.shape, bool)
+    valid[10, 20] = False  # the node in the middle
+    holed = replace(shape, valid=valid)
+    drape_path(path_through(np.array([[-5.0, 1, 0], [5, 1, 0]])), holed, 0.4)
+    with pytest.raises(InputError, match=r"x = 0\.00, y = 0\.00 mm"):
+        drape_path(path_through(np.array([[-5.0, 0, 0], [5, 0, 0]])), holed, 0.4)
+
+
+def test_the_layers_of_a_path_stay_above_each_other() -> None:
+    low = raster(20.0).surface_from_nozzle[:, :3, 3]
+    both = path_through(np.concatenate([low, low[::-1] + [0, 0, 0.7]]))
+    shape = cylinder((40, 40), 45.0)
+    places = drape_path(both, shape, 0.4).surface_from_nozzle[:, :3, 3]
+    above = places[:, 2] - shape.heights_at(places[:, :2])
+    half = len(above) // 2
+    assert above[: half - 1] == pytest.approx(0.4)
+    assert above[half + 1 :] == pytest.approx(1.1)

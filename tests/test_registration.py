@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.scan import Scan
-from estimation.scans.registration import FEWEST, Registration, register
-from estimation.scans.scan import ScanIndex, closest_weights
+from estimation.scans.registration import MIN_REGISTRATION_POINTS, Registration, register
+from estimation.scans.scan import Scan, ScanIndex, closest_weights
 from estimation.se3 import Array
 from tests import scans
 
@@ -135,8 +134,8 @@ def test_points_of_another_surface_are_called_a_poor_fit() -> None:
 
 
 def test_too_few_points_hold_nothing() -> None:
-    result = register(np.zeros((FEWEST - 1, 3)), 0.1, BODY, np.array([0.0, 0, 1]))
-    assert not result.sure and len(result.free) == 6 and f"{FEWEST} needed" in result.verdict
+    result = register(np.zeros((MIN_REGISTRATION_POINTS - 1, 3)), 0.1, BODY, np.array([0.0, 0, 1]))
+    assert not result.sure and len(result.free) == 6 and f"{MIN_REGISTRATION_POINTS} needed" in result.verdict
 
 
 @pytest.mark.slow

@@ -1,9 +1,12 @@
-"""Replay: poses and ticks merged by stamp, files that can be read, and the same bytes every time."""
+"""Replay: poses and ticks merged by stamp, files that can be read, and the same bytes every time. The reference
+recordings: what is kept of them comes again, and a change is found, told, and taken by one command.
+"""
 
 from __future__ import annotations
 
 import csv
 import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -16,22 +19,27 @@ import pytest
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
-from hardware.arm.profile import BENCH
-from hardware.arm.protocol import G1, G4, decode
+from hardware.arm.profile import ARM_FROM_BENCH
+from hardware.arm.protocol import G1, G4, decode, frame_from_command
 from hardware.motion.step import MotionStep
-from hardware.offline.replay import COLUMNS, CommandWriter, placed_by, replay
+from hardware.offline.replay import COMMAND_COLUMNS, CommandWriter, placed_by, replay
 from planning.command import Command, Hold, Move
-from planning.kinematics import nozzle_from_axes
+from planning.robot.kinematics import nozzle_from_axes
+from tests import process_replay, reference_cases
 from tests.moving import breathing, pose_at, poses, raster
+from tests.pinned import ENVIRONMENT, PACKAGES, made_with, run_pinned, unlike
+from tests.reference_cases import CASES, FOLDER, Arrays, kept, recorded_tracks, replayed
+from tests.reference_signals import changes, differing
 
 ROOT = Path(__file__).parents[1]
 DIGEST = """
 import hashlib
 from hardware.motion.step import MotionStep
+from hardware.arm.protocol import frame_from_command
 from hardware.offline.replay import replay
 from tests.moving import breathing, poses, raster
 
-frames = b"".join(f for _, _, f in replay(poses(breathing, 10.0), MotionStep(raster())))
+frames = b"".join(frame_from_command(c) for _, c in replay(poses(breathing, 10.0), MotionStep(raster())))
 print(hashlib.sha256(frames).hexdigest())
 """
 
@@ -71,7 +79,7 @@ def test_poses_are_asked_for_only_when_they_are_due() -> None:
             asked.append(pose.stamp)
             yield pose
 
-    for now, _, _ in replay(stream(), MotionStep(raster()), 0.05):
+    for now, _ in replay(stream(), MotionStep(raster()), 0.05):
         assert asked[-1] <= now + 1 / 30 + 1e-9
 
 
@@ -90,13 +98,13 @@ def test_poses_out_of_order_are_refused() -> None:
 def test_a_delayed_loop_prints_the_path_on_a_breathing_surface() -> None:
     motion = MotionStep(raster())
     errors = []
-    for now, command, _ in replay(poses(breathing, 20.0), motion):
+    for now, command in replay(poses(breathing, 20.0), motion):
         if isinstance(command, Move) and command.extrude:
             there = now + motion.profile.tick + motion.profile.lag
             tip = np.linalg.inv(breathing(there)) @ nozzle_from_axes(motion.profile.arm, command.axes)
             errors.append(abs(tip[2, 3]))
     assert motion.progress.place == pytest.approx(40.0)
-    assert isinstance(motion.last, Hold)
+    assert isinstance(command, Hold)
     assert np.sqrt(np.mean(np.square(errors))) < 0.15  # mm along the normal; measured 0.100
     assert max(errors) < 0.2  # measured 0.153
 
@@ -112,19 +120,19 @@ def read(folder: Path) -> tuple[list[dict[str, str]], list[bytes]]:
 def test_the_two_files_say_the_same(tmp_path: Path) -> None:
     commands: list[Command] = []
     with CommandWriter(tmp_path) as writer:
-        for _, command, frame in replay(poses(breathing, 10.0), MotionStep(raster())):
-            writer.write(command, frame)
+        for _, command in replay(poses(breathing, 10.0), MotionStep(raster())):
+            writer.write(command, frame_from_command(command))
             commands.append(command)
             assert (tmp_path / "frames.bin").stat().st_size == 48 * len(commands)  # nothing is kept back
     rows, frames = read(tmp_path)
     assert len(rows) == len(frames) == len(commands)
-    assert tuple(rows[0]) == COLUMNS
+    assert tuple(rows[0]) == COMMAND_COLUMNS
     assert {row["kind"] for row in rows} == {"move", "hold"}
     for row, frame, command in zip(rows, frames, commands, strict=True):
         sent = decode(frame)
         assert float(row["stamp_s"]) == pytest.approx(command.stamp, abs=1e-6)
         if isinstance(sent, G1):
-            shown = [float(row[name]) for name in COLUMNS[2:9]]
+            shown = [float(row[name]) for name in COMMAND_COLUMNS[2:9]]
             assert np.allclose(
                 shown, [*sent.axes[:3], *np.rad2deg(sent.axes[3:]), sent.feed * 60], rtol=1e-6, atol=2e-5
             )
@@ -144,7 +152,7 @@ def test_the_same_bytes_in_every_process() -> None:
             [sys.executable, "-c", DIGEST], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
         )
         digests.add(done.stdout.strip())
-    frames = b"".join(f for _, _, f in replay(poses(breathing, 10.0), MotionStep(raster())))
+    frames = b"".join(frame_from_command(c) for _, c in replay(poses(breathing, 10.0), MotionStep(raster())))
     assert digests == {hashlib.sha256(frames).hexdigest()}
 
 
@@ -155,10 +163,110 @@ def test_the_arm_is_placed_by_the_first_measured_pose_and_moves_only_then() -> N
     stream = [pose_at(away, 10 + k / 30) for k in range(60)]
     unseen = [replace(p, state=TrackState.INITIALISING, base_from_surface=np.eye(4)) for p in stream[:20]]
     given, profile = placed_by([*unseen, *stream[20:]])
-    assert np.allclose(profile.arm.arm_from_base @ stream[20].base_from_surface, BENCH, atol=1e-9)
-    held = [isinstance(c, Hold) for _, c, _ in replay(given, MotionStep(raster(), profile), 0.05)]
+    assert np.allclose(profile.arm.arm_from_base @ stream[20].base_from_surface, ARM_FROM_BENCH, atol=1e-9)
+    held = [isinstance(c, Hold) for _, c in replay(given, MotionStep(raster(), profile), 0.05)]
     first_move = held.index(False)
     assert 10 + first_move * 0.02 >= stream[20].stamp + 0.05
     nothing, default = placed_by(unseen)
     assert len(list(nothing)) == 20
     assert np.array_equal(default.arm.arm_from_base, np.eye(4))
+
+
+@pytest.fixture(scope="module")
+def now() -> Arrays:
+    """What comes of a recording in whatever arithmetic this machine has."""
+    return replayed("outage")
+
+
+def test_references_are_small() -> None:
+    assert sum(file.stat().st_size for file in FOLDER.rglob("*") if file.is_file()) < 700_000
+
+
+def test_another_arithmetic_changes_nothing_but_the_last_digits(now: Arrays) -> None:
+    before = kept("outage")
+    other = differing(before, now)
+    assert process_replay.passes("outage", other, changes(before, now), ["another kind of processor"])
+
+
+def test_the_recording_shows_what_it_is_there_for(now: Arrays) -> None:
+    assert {"TRACKING", "DEGRADED", "COASTING"} <= set(now["pose state"].tolist())
+    assert now["tick extrude"].any() and (now["tick checkpoint"] < 0).any()
+    assert len(recorded_tracks("outage")) == len(now["pose stamp"])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_one_bit_of_what_is_kept_is_found(case: str) -> None:
+    before = kept(case)
+    for name in before:
+        after = {key: array.copy() for key, array in before.items()}
+        row = len(after[name]) // 2
+        if after[name].dtype.kind == "U":
+            after[name][row] = "LOST" if name == "pose state" else "?"
+        else:
+            after[name].view(np.uint8).reshape(len(after[name]), -1)[row, 0] ^= 1
+        assert set(differing(before, after)) == {name}
+        if case != "pictures":
+            found = changes(before, after) if "stamp" not in name else []
+            assert not process_replay.passes(case, differing(before, after), found, [])
+
+
+def test_what_rounding_cannot_do_is_no_rounding() -> None:
+    before = kept("outage")
+    for name, by in (("pose base_from_surface", 1e-3), ("pose twist", 0.1), ("tick axes", 1e-3), ("tick feed", 0.1)):
+        after = before | {name: before[name] + by}
+        assert not process_replay.passes("outage", differing(before, after), changes(before, after), ["another kind"])
+    fewer = {name: array[:-1] if name.startswith("tick") else array for name, array in before.items()}
+    assert not process_replay.passes("outage", differing(before, fewer), changes(before, fewer), ["another kind"])
+    never = before | {"tick extrude": np.zeros_like(before["tick extrude"])}
+    assert not process_replay.passes("outage", differing(before, never), changes(before, never), ["another kind"])
+
+
+def test_a_change_is_told_with_a_picture_and_taken_by_one_command(
+    tmp_path: Path, now: Arrays, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "outage").mkdir()
+    for module in (process_replay, reference_cases):
+        monkeypatch.setattr(module, "FOLDER", tmp_path)
+    monkeypatch.setattr(process_replay, "ROOT", tmp_path)
+    monkeypatch.setattr(process_replay, "MADE_WITH", tmp_path / "made_with.json")
+    monkeypatch.setattr(process_replay, "PAGE", tmp_path / "out" / "references.html")
+    monkeypatch.setattr(process_replay, "replayed", lambda case: now)
+    assert process_replay.main(["--case", "outage"]) == 1 and "nothing is kept of it yet" in capsys.readouterr().out
+    assert process_replay.main(["--case", "outage", "--update"]) == 0
+    assert process_replay.main(["--case", "outage"]) == 0 and not process_replay.PAGE.exists()
+    lower = now["tick axes"].copy()
+    lower[100:, 2] -= 0.25
+    monkeypatch.setattr(process_replay, "replayed", lambda case: now | {"tick axes": lower})
+    capsys.readouterr()
+    assert process_replay.main(["--case", "outage"]) == 1
+    said, page = capsys.readouterr().out, process_replay.PAGE.read_text(encoding="utf-8")
+    assert "axis Z by up to 0.25 mm from 2.000 s on" in said and "make references" in said
+    assert "change of axis Z, mm" in page and "change of axis X" not in page
+    assert process_replay.main(["--case", "outage", "--update"]) == 0
+    assert process_replay.main(["--case", "outage"]) == 0
+
+
+def test_bits_are_asked_for_only_where_the_same_libraries_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = json.loads((FOLDER / "made_with.json").read_text(encoding="utf-8"))
+    assert set(made) == set(made_with()) >= set(PACKAGES)
+    assert unlike(made_with() | {"numpy": "1.0"})[-1].endswith("not 1.0")
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    assert unlike(made_with())[0] == "the processor is aarch64, not x86_64"
+
+
+def test_the_environment_reaches_the_libraries() -> None:
+    asked = "import numpy; from numpy._core._multiarray_umath import __cpu_features__ as f; print(f['X86_V4'])"
+    asked += "; import numba; print(numba.config.CPU_NAME)"
+    environment = {**os.environ, **ENVIRONMENT}
+    done = subprocess.run([sys.executable, "-c", asked], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "haswell"]
+
+
+@pytest.mark.slow
+def test_a_constant_that_is_another_one_by_a_billionth_is_found(capfd: pytest.CaptureFixture[str]) -> None:
+    if reasons := unlike(json.loads((FOLDER / "made_with.json").read_text(encoding="utf-8"))):
+        pytest.skip("; ".join(reasons))
+    changed = "import estimation.online.estimator as e\ne.PERSISTS *= 1 + 1e-9"
+    assert run_pinned("tests.process_replay", ["--case", "outage"]) == 0
+    assert run_pinned("tests.process_replay", ["--case", "outage"], changed) == 1
+    assert "CHANGED" in capfd.readouterr().out

@@ -11,30 +11,27 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.pose import SurfacePose
-from hardware.bench.random_runs import Swing, random_path
-from planning.demand import demand
-from planning.kinematics import SimpleArm, axes_from_nozzle
-from planning.legs import CORNER, SWERVE
-from planning.limits import Limits
-from planning.motion.curve import Curve, curve_through
-from planning.motion.retime import PATH_SPEED, RISE, TOTAL, Timing, retime
-from planning.stations import stations_on
+from hardware.bench.planner import SwingingSurface, random_path
+from planning.limits import MotionLimits
+from planning.motion.curve import CORNER_SPEED_CHANGE, CORNER_TOLERANCE, PathCurve, curve_through, gridpoints_on
+from planning.motion.retime import LIMIT_SHARE, PATH_SPEED_SHARE, RISE_TIME, Timing, axis_derivatives, retime
+from planning.robot.kinematics import SimpleArm, axes_from_nozzle
 from tests.moving import Motion, pose_at, raster, still
 
-ARM, LIMITS = SimpleArm(), Limits()
+ARM, LIMITS = SimpleArm(), MotionLimits()
 BOUNDS = LIMITS.speed, LIMITS.acceleration
 STEP = 0.02  # s, a tick
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def curve_of(seed: int) -> Curve:
+def curve_of(seed: int) -> PathCurve:
     path = random_path(np.random.default_rng(seed))
-    return curve_through(path.surface_from_nozzle, path.speed[1:], CORNER, SWERVE)
+    return curve_through(path.surface_from_nozzle, path.speed[1:], CORNER_TOLERANCE, CORNER_SPEED_CHANGE)
 
 
-def timed(curve: Curve, start: float, end: float, speed: float = 0.0, motion: Motion = still) -> Timing:
-    grid = stations_on(curve, start, end)
-    timing = retime(grid, demand(ARM, pose_at(motion, 10.0), curve, grid, 10.0), speed, 10.0, BOUNDS)
+def timed(curve: PathCurve, start: float, end: float, speed: float = 0.0, motion: Motion = still) -> Timing:
+    grid = gridpoints_on(curve, start, end)
+    timing = retime(grid, axis_derivatives(ARM, pose_at(motion, 10.0), curve, grid, 10.0), speed, 10.0, BOUNDS)
     assert isinstance(timing, Timing), timing
     return timing
 
@@ -56,7 +53,7 @@ def test_no_stretch_and_no_corner_is_passed_faster_than_it_may_be(seed: int) -> 
     assert timing.at(np.array([-1.0, 10.0, timing.end, 1e9])) == pytest.approx(places[[0, 0, -1, -1]])
 
 
-def most_of_the_limits(curve: Curve, timing: Timing, pose: SurfacePose, end: float) -> tuple[float, float]:
+def most_of_the_limits(curve: PathCurve, timing: Timing, pose: SurfacePose, end: float) -> tuple[float, float]:
     """The largest shares of speed and acceleration limits up to `end`, s, by differences of the axes asked for."""
     t = np.arange(timing.times[0], min(timing.end, end), STEP)
     axes = axes_from_nozzle(ARM, pose.base_at(t) @ curve.poses(timing.at(t)))
@@ -71,10 +68,10 @@ def test_path_and_surface_together_keep_the_axes_limits(
     seed: int, swing: tuple[float, float, float], share: float
 ) -> None:
     """As long as a surface is foreseen at all, and with the surface moving so."""
-    curve, pose = curve_of(seed), pose_at(Swing(*swing).at, 10.4)
+    curve, pose = curve_of(seed), pose_at(SwingingSurface(*swing).at, 10.4)
     start = share * curve.length
-    grid = stations_on(curve, start, curve.after(start, 2.0))
-    timing = retime(grid, demand(ARM, pose, curve, grid, 10.4), 0.0, 10.4, BOUNDS)
+    grid = gridpoints_on(curve, start, curve.after(start, 2.0))
+    timing = retime(grid, axis_derivatives(ARM, pose, curve, grid, 10.4), 0.0, 10.4, BOUNDS)
     assert isinstance(timing, Timing)
     speed, acceleration = most_of_the_limits(curve, timing, pose, 12.4)
     assert speed <= 1
@@ -89,17 +86,19 @@ def test_the_path_alone_keeps_well_within_the_axes_limits_at_all_its_corners(see
     curve = curve_of(seed)
     timing = timed(curve, 0.0, curve.after(0.0, 2.0))
     speed, acceleration = most_of_the_limits(curve, timing, pose_at(still, 10.0), np.inf)
-    assert speed <= PATH_SPEED * 1.01
-    assert acceleration <= TOTAL
+    assert speed <= PATH_SPEED_SHARE * 1.01
+    assert acceleration <= LIMIT_SHARE
 
 
 def test_a_surface_that_takes_most_of_an_axis_leaves_the_path_little() -> None:
     """X may do 150 mm/s; a surface that asks 115 of TOTAL * 150 leaves 5 to a path that would go at 40."""
-    curve = curve_through(raster(size=40, lines=2).surface_from_nozzle, np.full(3, 40.0), CORNER, SWERVE)
-    grid = stations_on(curve, 0.0, 35.0)
-    asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
+    curve = curve_through(
+        raster(size=40, lines=2).surface_from_nozzle, np.full(3, 40.0), CORNER_TOLERANCE, CORNER_SPEED_CHANGE
+    )
+    grid = gridpoints_on(curve, 0.0, 35.0)
+    asked = axis_derivatives(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     taken = np.zeros_like(asked.speed)
-    taken[:, 0] = TOTAL * LIMITS.speed[0] - 5.0
+    taken[:, 0] = LIMIT_SHARE * LIMITS.speed[0] - 5.0
     slow = retime(grid, replace(asked, speed=taken), 0.0, 10.0, BOUNDS)
     free = retime(grid, asked, 0.0, 10.0, BOUNDS)
     assert isinstance(slow, Timing) and isinstance(free, Timing)
@@ -108,9 +107,9 @@ def test_a_surface_that_takes_most_of_an_axis_leaves_the_path_little() -> None:
 
 
 def test_a_surface_faster_than_an_axis_slows_the_path_and_does_not_stop_it() -> None:
-    curve = curve_through(raster().surface_from_nozzle, np.full(5, 40.0), CORNER, SWERVE)
-    grid = stations_on(curve, 0.0, 8.0)
-    asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
+    curve = curve_through(raster().surface_from_nozzle, np.full(5, 40.0), CORNER_TOLERANCE, CORNER_SPEED_CHANGE)
+    grid = gridpoints_on(curve, 0.0, 8.0)
+    asked = axis_derivatives(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     much = np.full_like(asked.speed, 1e4)
     timing = retime(grid, replace(asked, speed=much, acceleration=much), 0.0, 10.0, BOUNDS)
     assert isinstance(timing, Timing)
@@ -121,15 +120,17 @@ def test_a_surface_faster_than_an_axis_slows_the_path_and_does_not_stop_it() -> 
 @given(SEEDS)
 def test_a_speed_carried_into_narrower_limits_is_brought_down_and_not_refused(seed: int) -> None:
     draw = np.random.default_rng(seed)
-    curve = curve_through(raster(size=60, lines=2).surface_from_nozzle, np.full(3, 30.0), CORNER, SWERVE)
-    grid = stations_on(curve, 10.0, 55.0)
-    asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
+    curve = curve_through(
+        raster(size=60, lines=2).surface_from_nozzle, np.full(3, 30.0), CORNER_TOLERANCE, CORNER_SPEED_CHANGE
+    )
+    grid = gridpoints_on(curve, 10.0, 55.0)
+    asked = axis_derivatives(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     taken = np.broadcast_to(draw.uniform(0, 2) * LIMITS.speed, asked.speed.shape)
     timing = retime(grid, replace(asked, speed=taken), 30.0, 10.0, BOUNDS)
     assert isinstance(timing, Timing)
     assert timing.speeds[0] == pytest.approx(30.0, rel=0.002)
     slowing = -np.diff(timing.speeds**2) / (2 * np.diff(timing.places))
-    assert slowing.max() <= 30.0 / RISE * 1.001
+    assert slowing.max() <= 30.0 / RISE_TIME * 1.001
 
 
 @settings(max_examples=15)
@@ -138,15 +139,15 @@ def test_speed_changes_by_no_more_than_the_cruising_speed_in_a_rise(seed: int) -
     curve = curve_of(seed)
     timing = timed(curve, 0.0, curve.length)
     change = np.abs(np.diff(timing.speeds)) / np.diff(timing.times)
-    assert (change <= curve.speed.max() / RISE * 1.001).all()
+    assert (change <= curve.speed.max() / RISE_TIME * 1.001).all()
 
 
 def test_the_demand_of_a_surface_is_its_axes_own_speed_and_acceleration() -> None:
-    swing = Swing(10.0, 0.1, 0.25)
+    swing = SwingingSurface(10.0, 0.1, 0.25)
     pose = pose_at(swing.at, 10.0)
-    curve = curve_through(raster().surface_from_nozzle, np.full(5, 5.0), CORNER, SWERVE)
-    grid = stations_on(curve, 0.0, 4.0)
-    asked = demand(ARM, pose, curve, grid, 10.0)
+    curve = curve_through(raster().surface_from_nozzle, np.full(5, 5.0), CORNER_TOLERANCE, CORNER_SPEED_CHANGE)
+    grid = gridpoints_on(curve, 0.0, 4.0)
+    asked = axis_derivatives(ARM, pose, curve, grid, 10.0)
     fixed = curve.poses(grid.places[:1])
     before, after = (axes_from_nozzle(ARM, pose.base_at(np.array([10.0 + h])) @ fixed)[0] for h in (-1e-3, 1e-3))
     own = np.abs(after - before) / 2e-3
@@ -156,8 +157,10 @@ def test_the_demand_of_a_surface_is_its_axes_own_speed_and_acceleration() -> Non
 
 
 def test_two_places_that_are_one_have_no_timing_and_say_so() -> None:
-    curve = curve_through(se3.make(np.eye(3), np.array([[0.0, 0, 0], [1, 0, 0]])), np.array([5.0]), CORNER, SWERVE)
-    grid = stations_on(curve, 0.0, 1.0)
-    asked = demand(ARM, pose_at(still, 10.0), curve, grid, 10.0)
+    curve = curve_through(
+        se3.make(np.eye(3), np.array([[0.0, 0, 0], [1, 0, 0]])), np.array([5.0]), CORNER_TOLERANCE, CORNER_SPEED_CHANGE
+    )
+    grid = gridpoints_on(curve, 0.0, 1.0)
+    asked = axis_derivatives(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     reason = retime(grid, replace(asked, first=asked.first * np.nan), 0.0, 1.0, BOUNDS)
     assert isinstance(reason, str) and "no timing from 0.00 to 1.00 mm" in reason

@@ -1,7 +1,12 @@
-"""Rigs in other programs' files: what is written comes back, and what cannot be told is named."""
+"""Rigs in other programs' files: what is written comes back, and what cannot be told is named. `stillbed doctor`: each
+thing that can be wrong with a machine is seen and comes with what to do.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -14,10 +19,15 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
-from hardware.calibration.formats import formats
-from hardware.calibration.formats.yaml_file import read_yaml
+from hardware.calibration.rig_formats import FORMATS, read_yaml
+from hardware.cameras.sources import CameraDevice
+from hardware.cli import doctor
+from hardware.cli.doctor import REINSTALL, LoadFailure, library_checks, load_failures
 from hardware.cli.main import main
 from hardware.files.rig_file import read_rig, write_rig
+from hardware.operator.view import Check, CheckVerdict
+from hardware.process.clock import SimClock
+from perception.wound import network
 
 numbers = st.floats(-0.3, 0.3, allow_subnormal=False)
 
@@ -39,7 +49,7 @@ def rigs(draw: st.DrawFn) -> Rig:
 @given(rig=rigs())
 @settings(max_examples=15, deadline=None)
 def test_what_is_written_comes_back(name: str, rig: Rig) -> None:
-    kind = formats()[name]
+    kind = FORMATS[name]
     with TemporaryDirectory() as folder:
         out = Path(folder) / ("rig" if kind.folder else "rig.toml" if name == "anipose" else "rig.yaml")
         kind.write(out, rig)
@@ -59,7 +69,7 @@ def one(k3: float = 0.0) -> Rig:
 
 
 def test_opencv_itself_reads_what_is_written_for_it(tmp_path: Path) -> None:
-    formats()["opencv"].write(tmp_path, one(0.02))
+    FORMATS["opencv"].write(tmp_path, one(0.02))
     stored = cv2.FileStorage(str(tmp_path / "left.yaml"), cv2.FILE_STORAGE_READ)
     assert np.array_equal(stored.getNode("camera_matrix").mat(), one().cameras[0].matrix)
     assert np.allclose(stored.getNode("distortion_coefficients").mat(), one(0.02).cameras[0].distortion)
@@ -72,18 +82,18 @@ def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
     stored.write("camera_matrix", one().cameras[0].matrix)
     stored.write("distortion_coefficients", one(0.02).cameras[0].distortion)
     stored.release()
-    back = formats()["opencv"].read(tmp_path).cameras[0]
+    back = FORMATS["opencv"].read(tmp_path).cameras[0]
     assert np.allclose(back.matrix, one().cameras[0].matrix) and back.distortion[4] == 0.02
 
 
 def test_a_k3_does_not_fit_kalibr_and_is_not_dropped_in_silence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"camera left: k3 = 0.02, allowed 0"):
-        formats()["kalibr"].write(tmp_path / "chain.yaml", one(0.02))
+        FORMATS["kalibr"].write(tmp_path / "chain.yaml", one(0.02))
 
 
 def test_kalibr_is_in_metres(tmp_path: Path) -> None:
     right = Camera("right", (1280, 720), one().cameras[0].matrix, np.zeros(5), se3.make(np.eye(3), [300.0, 0, 0]))
-    formats()["kalibr"].write(tmp_path / "chain.yaml", Rig((*one().cameras, right)))
+    FORMATS["kalibr"].write(tmp_path / "chain.yaml", Rig((*one().cameras, right)))
     assert "-0.3" in (tmp_path / "chain.yaml").read_text()
 
 
@@ -103,16 +113,16 @@ def test_what_is_wrong_with_a_file_is_named(name: str, text: str, named: str, tm
     path = tmp_path / ("x.toml" if name == "anipose" else "x.yaml")
     path.write_text(text)
     with pytest.raises(InputError, match=named):
-        formats()[name].read(path)
+        FORMATS[name].read(path)
 
 
 def test_lenses_without_places_are_no_rig(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        formats()["opencv"].write(tmp_path, Rig((Camera(name, *one_lens()),)))
+        FORMATS["opencv"].write(tmp_path, Rig((Camera(name, *one_lens()),)))
         text = (tmp_path / f"{name}.yaml").read_text()
         (tmp_path / f"{name}.yaml").write_text(text[: text.index("base_from_camera")])
     with pytest.raises(InputError, match="places of the cameras"):
-        formats()["opencv"].read(tmp_path)
+        FORMATS["opencv"].read(tmp_path)
 
 
 def one_lens() -> tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]:  # type: ignore[type-arg]
@@ -150,3 +160,134 @@ def test_brackets_in_brackets_are_refused(tmp_path: Path) -> None:
     (tmp_path / "x.yaml").write_text("a: " + 2000 * "[", encoding="utf-8")
     with pytest.raises(InputError, match="a YAML file"):
         read_yaml(tmp_path / "x.yaml")
+
+
+WORDS = "libGL.so.1", "signal 4", "hangs: not loaded after 2 s", "still loading after 2 s"
+PASS, WARN, FAIL = CheckVerdict.PASS, CheckVerdict.WARN, CheckVerdict.FAIL
+
+
+def test_here_everything_needed_works_and_is_told_in_words_and_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    names = {check["name"] for check in told["libraries"]}
+    assert {"gtsam", "toppra", "ruckig", "opencv-python-headless", "onnxruntime"} <= names and "pytest" not in names
+    assert {check["verdict"] for check in told["libraries"]} == {"pass"}
+    network = next(check for check in told["devices"] if check["name"] == "wound network")
+    assert network["verdict"] == "pass"
+    assert all(check["remedy"] for part in told.values() for check in part if check["verdict"] != "pass")
+
+
+def test_a_folder_that_is_not_there_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--folder", str(tmp_path / "none")]) == 2
+    assert "--folder" in capsys.readouterr().err
+
+
+def test_each_library_that_fails_is_named_however_it_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "lacks_file.py").write_text("raise ImportError('libGL.so.1: cannot open shared object file')\n")
+    (tmp_path / "dies.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGILL)\n")
+    (tmp_path / "hangs.py").write_text("import threading\nthreading.Event().wait()\n")
+    (tmp_path / "works.py").write_text("while True:\n    pass\n")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    found = load_failures(["json", "lacks_file", "dies", "csv", "hangs", "re", "works"], patience=2)
+    assert list(found) == ["lacks_file", "dies", "hangs", "works"]
+    reasons = [trouble.reason for trouble in found.values()]
+    assert all(word in reason for word, reason in zip(WORDS, reasons, strict=True))
+    assert [trouble.slow for trouble in found.values()] == [False, False, False, True]
+
+
+def test_a_library_that_is_only_slow_is_no_failure() -> None:
+    busy = doctor._library_check("numpy", "numpy", {"numpy": LoadFailure("still loading after 60 s", slow=True)})
+    assert busy.verdict is WARN and busy.remedy
+
+
+def test_a_library_that_is_not_installed_fails_with_a_remedy() -> None:
+    (check,) = library_checks(["no-such-library"])
+    assert check == Check("no-such-library", FAIL, "not installed", REINSTALL)
+
+
+def system(root: Path, flags: str, free_kb: int) -> Path:
+    (root / "proc").mkdir()
+    (root / "proc/cpuinfo").write_text(f"processor : 0\nflags\t\t: {flags}\n")
+    (root / "proc/meminfo").write_text(f"MemTotal: 9 kB\nMemAvailable:   {free_kb} kB\n")
+    return root
+
+
+def test_a_processor_without_its_instructions_and_little_memory_are_warnings(tmp_path: Path) -> None:
+    root = system(tmp_path, "fpu sse2 avx2", 3_900_000)
+    check = doctor.processor_check(root)
+    assert check.verdict is WARN and "without fma" in check.found
+    assert doctor.memory_check(root).verdict is WARN and "3.9 GB" in doctor.memory_check(root).found
+    (root / "proc/meminfo").write_text("MemAvailable: 4100000 kB\n")
+    assert doctor.memory_check(root).verdict is PASS
+    assert doctor.memory_check(root / "nothing").verdict is WARN
+
+
+def test_an_old_python_fails() -> None:
+    assert doctor.python_check((3, 10, 4)).verdict is FAIL
+    assert doctor.python_check((3, 11, 0)).verdict is not FAIL
+
+
+@pytest.mark.parametrize(("free", "verdict"), [(0.9, FAIL), (9.0, WARN), (11.0, PASS)])
+def test_the_disk_is_judged_by_what_is_free(
+    free: float, verdict: CheckVerdict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "_free_gb", lambda folder: free)
+    assert doctor.disk_check(Path()).verdict is verdict
+    assert doctor.shared_check().verdict is PASS
+
+
+def test_little_shared_memory_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_free_gb", lambda folder: 0.064 if folder.name == "shm" else 99.0)
+    (tmp_path / "dev/shm").mkdir(parents=True)
+    check = doctor.shared_check(tmp_path)
+    assert check.verdict is FAIL and "64 MB" in check.found and "shm-size" in check.remedy
+
+
+class Late(SimClock):
+    """A clock whose sleep takes as much longer as is said."""
+
+    def __init__(self, late: float) -> None:
+        super().__init__()
+        self.late = late
+
+    def wait_until(self, instant: float) -> None:
+        super().wait_until(instant + self.late)
+
+
+@pytest.mark.parametrize(("late", "verdict"), [(0.0005, PASS), (0.0025, WARN)])
+def test_a_machine_that_wakes_late_is_a_warning(late: float, verdict: CheckVerdict) -> None:
+    assert doctor.punctuality_check(Late(late)).verdict is verdict
+
+
+def test_an_address_that_nobody_may_listen_on_fails() -> None:
+    assert doctor.loopback_check("192.0.2.1").verdict is FAIL  # RFC 5737: never anybody's
+    assert doctor.loopback_check().verdict is PASS
+
+
+def test_what_is_plugged_in_but_closed_to_this_user_says_which_group_to_join(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = tmp_path / "video0"
+    node.touch()
+    seen = (CameraDevice(node, "a webcam", "", "", ""),)
+    assert doctor.camera_check(seen) == Check("cameras", PASS, "a webcam")
+    ports = [(str(node), "an adapter")]
+    assert doctor.arm_check(ports).verdict is PASS
+    monkeypatch.setattr(doctor.os, "access", lambda *_: False)
+    for check, group in ((doctor.camera_check(seen), "video"), (doctor.arm_check(ports), "dialout")):
+        assert check.verdict is FAIL and str(node) in check.found and group in check.remedy
+    assert doctor.lock_check(tmp_path).verdict is FAIL
+
+
+def test_nothing_plugged_in_is_a_warning_with_what_to_do() -> None:
+    for check in (doctor.camera_check(()), doctor.arm_check([])):
+        assert check.verdict is WARN and "plug" in check.remedy
+
+
+def test_a_network_that_is_damaged_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    damaged = tmp_path / "wound.onnx"
+    damaged.write_bytes(b"\x00" * 100)
+    damaged.with_suffix(".toml").write_text('sha256 = "00"\n')
+    monkeypatch.setattr(network, "shipped_model", lambda: damaged)
+    check = doctor.network_check()
+    assert check.verdict is FAIL and "sha256" in check.found

@@ -1,36 +1,36 @@
-"""The folder of a run: all that passes is in it as it comes, readable however the run ends."""
+"""The folder of a run: all that passes is in it as it comes, readable however the run ends. The page that is watched
+while a run goes on.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from estimation import se3
 from estimation.observations import no_observations
 from estimation.pose import SurfacePose, TrackState
-from estimation.rig import Rig
+from estimation.rig import Rig, pixels_from_points
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.files.arm_file import read_arm
+from hardware.files.folder_tables import SessionFolderWriter, read_tum
 from hardware.files.images import encode
 from hardware.files.path_file import read_path
 from hardware.files.pose_file import read_poses
-from hardware.files.session import open_session
-from hardware.session_folder import SessionFolder
+from hardware.recording.session_reader import open_session
 from hardware.simulator.cameras import Fate, Shot
-from hardware.simulator.nozzle_file import read_nozzle
-from hardware.simulator.planned_line import planned_line
-from hardware.simulator.run_folder import RunFolder
-from hardware.simulator.scenario import Scenario
-from hardware.simulator.scenario_file import read_scenario
-from hardware.tum import read_tum
-from perception.frames import Frame, FrameSet, PrintHead, Roi
-from perception.tracking.step import STAGES, StepReport, trusting_report
+from hardware.simulator.deposit import planned_line
+from hardware.simulator.run_folder import MAIN_TILE, SIDE_TILE, WATCH_INTERVAL, RunFolder, WatchPage
+from hardware.simulator.scenario import Scenario, read_scenario
+from perception.frames import Frame, FrameSet, Image, PrintHead, Roi
+from perception.tracking.step import STAGES, StepReport, report_without_offsets
 from planning.command import Command, Hold, Move
-from planning.progress import Phase, Progress
-from tests.nozzle_logs import nozzle_log, part, straight
+from planning.progress import PrintPhase, PrintProgress
+from tests.nozzle_logs import nozzle_log, part, read_nozzle, straight
 from tests.worlds import IDEAL, SMALL, write_scenario
 
 ROIS = tuple(Roi(c, 0.1, np.array([[10.0, 5], [80, 5], [50, 60]])) for c in range(3))
@@ -42,7 +42,7 @@ def scenario(folder: Path, *tables: dict[str, object]) -> Scenario:
 
 def moving(times: Array) -> Array:
     """base_from_surface (N, 4, 4): 3 mm/s upwards."""
-    poses = np.broadcast_to(REST, (len(times), 4, 4)).copy()
+    poses = np.broadcast_to(BASE_FROM_REST, (len(times), 4, 4)).copy()
     poses[:, 2, 3] += 3.0 * times
     return poses
 
@@ -83,15 +83,15 @@ def pose(stamp: float, state: TrackState = TrackState.TRACKING) -> SurfacePose:
 
 
 def report(stamp: float) -> StepReport:
-    return trusting_report(no_observations(stamp), np.zeros(3, np.int64), np.zeros(len(STAGES)))
+    return report_without_offsets(no_observations(stamp), np.zeros(3, np.int64), np.zeros(len(STAGES)))
 
 
 def move(stamp: float, extrude: bool) -> Move:
     return Move(stamp, np.zeros(6), 5.0, 1, extrude)
 
 
-def progress() -> Progress:
-    return Progress(Phase.PRINTING, 1, 2, 3.0, 8.0, 0.4)
+def progress() -> PrintProgress:
+    return PrintProgress(PrintPhase.PRINTING, 1, 2, 3.0, 8.0, 0.4)
 
 
 @pytest.mark.parametrize("ending", [None, KeyboardInterrupt(), OSError("disk")], ids=["whole", "Ctrl-C", "failed"])
@@ -137,7 +137,7 @@ def test_the_truth_holds_every_row_and_every_exposure_once_in_order(tmp_path: Pa
 
 
 def test_the_print_head_is_kept_in_both_sessions_and_an_instant_told_again_is_one(tmp_path: Path) -> None:
-    heads = [PrintHead(REST @ se3.exp(np.array([0.1, 0, 0.2 * n, n, 0, 3.0])), n > 2) for n in range(4)]
+    heads = [PrintHead(BASE_FROM_REST @ se3.exp(np.array([0.1, 0, 0.2 * n, n, 0, 3.0])), n > 2) for n in range(4)]
     folder = opened(tmp_path, scenario(tmp_path))
     with folder:
         feed(folder, 1)  # before the first move nobody knows where the arm is
@@ -219,10 +219,92 @@ def test_what_the_arm_was_taken_for_and_what_was_simulated_are_kept(tmp_path: Pa
 
 def test_a_session_folder_numbers_its_frames_and_names_them_by_kind(tmp_path: Path) -> None:
     rig: Rig = scenario(tmp_path).rig
-    with SessionFolder(tmp_path / "session", rig, ()) as session:
+    with SessionFolderWriter(tmp_path / "session", rig, ()) as session:
         session.picture(1, 0.1, *picture(1, 0))
         session.picture(1, 0.2, "png", encode(np.zeros((64, 96, 3), np.uint8), None)[1])
     assert sorted(f.name for f in (tmp_path / "session" / "cam_1").iterdir()) == ["000000.jpg", "000001.png"]
     assert (tmp_path / "session" / "frames.csv").read_text().splitlines()[1:] == ["cam_1,0,0.1", "cam_1,1,0.2"]
     assert not (tmp_path / "session" / "roi.toml").exists()
     assert not (tmp_path / "session" / "truth.tum").exists()
+
+
+RIG = arc_rig()
+DOTTED = np.array([[x, y, 0.0] for x in (-8.0, 8.0) for y in (-5.0, 5.0)])
+POSE = SurfacePose(1.0, BASE_FROM_REST, np.eye(6), np.zeros(6), TrackState.TRACKING)
+
+
+def watch_frames(stamp: float = 1.0, cameras: tuple[int, ...] = (0, 1, 2), gray: bool = False) -> FrameSet:
+    shape = (720, 1280) if gray else (720, 1280, 3)
+    return FrameSet(stamp, tuple(Frame(camera, stamp, np.full(shape, 60, np.uint8)) for camera in cameras))
+
+
+def shown(folder: Path, pose: SurfacePose = POSE, line: np.ndarray | None = DOTTED, **more: object) -> Image:
+    WatchPage(folder, RIG, "A <title>").show(watch_frames(**more), pose, line, [("arm", "prints & waits")])  # type: ignore[arg-type]
+    picture = cv2.imread(str(folder / "watch.jpg"))
+    assert picture is not None
+    return np.asarray(picture, np.uint8)
+
+
+def drawn(picture: Image) -> np.ndarray:
+    """Where (540, 960) something bright stands in the first camera's tile, its label and the frame left out."""
+    bright = picture[: MAIN_TILE[1], : MAIN_TILE[0]].max(axis=2) > 130
+    bright[:50] = bright[:, :20] = bright[-20:] = bright[:, -20:] = False
+    return np.asarray(bright)
+
+
+def test_the_page_says_what_is_told_and_renews_itself_until_the_run_is_over(tmp_path: Path) -> None:
+    watch = WatchPage(tmp_path, RIG, "A <title>")
+    watch.show(watch_frames(), POSE, None, [("arm", "prints & waits")])
+    text = watch.page.read_text()
+    assert 'http-equiv="refresh"' in text
+    assert "A &lt;title&gt;" in text and "prints &amp; waits" in text and POSE.state.value in text
+    watch.finish("It was <good>.")
+    text = watch.page.read_text()
+    assert "refresh" not in text
+    assert "It was &lt;good&gt;." in text and 'href="report.html"' in text
+
+
+def test_there_is_one_picture_for_each_half_second_of_the_run(tmp_path: Path) -> None:
+    watch = WatchPage(tmp_path, RIG, "x")
+    written = set()
+    for i in range(31):
+        stamp = i * WATCH_INTERVAL / 10
+        watch.show(watch_frames(stamp, cameras=()), SurfacePose(stamp, *_rest()), None, [])
+        written.add(watch.page.read_text().split("watch.jpg?")[1].split('"')[0])
+    assert written == {"1", "2", "3", "4"}
+
+
+def _rest() -> tuple[np.ndarray, np.ndarray, np.ndarray, TrackState]:
+    return BASE_FROM_REST, np.eye(6), np.zeros(6), TrackState.TRACKING
+
+
+def test_the_line_is_drawn_where_the_pose_says_and_only_while_it_is_measured(tmp_path: Path) -> None:
+    rows, columns = np.nonzero(drawn(shown(tmp_path)))
+    assert len(rows) > 300
+    assert abs(rows.mean() - MAIN_TILE[1] / 2) < 15 and abs(columns.mean() - MAIN_TILE[0] / 2) < 15  # close to the line
+    lost = SurfacePose(1.0, BASE_FROM_REST, np.eye(6), np.zeros(6), TrackState.LOST, reason="blind")
+    assert not drawn(shown(tmp_path, lost)).any()
+    assert not drawn(shown(tmp_path, line=None)).any()
+
+
+def test_a_line_behind_a_camera_is_not_drawn(tmp_path: Path) -> None:
+    camera = RIG.cameras[0]
+    behind = SurfacePose(1.0, camera.base_from_camera @ se3.make(np.eye(3), [0, 0, -300]), *_rest()[1:])
+    assert (pixels_from_points(camera, se3.transform_points(behind.base_from_surface, DOTTED))[1] < 0).all()
+    assert not drawn(shown(tmp_path, behind)).any()
+
+
+def test_a_missing_camera_is_a_dark_tile_and_gray_pictures_are_shown(tmp_path: Path) -> None:
+    both = shown(tmp_path, line=None, cameras=(0, 2), gray=True)
+    assert both.shape == (max(MAIN_TILE[1], 2 * SIDE_TILE[1]), MAIN_TILE[0] + SIDE_TILE[0], 3)
+    first, missing, third = both[300, 300], both[150, MAIN_TILE[0] + 200], both[SIDE_TILE[1] + 150, MAIN_TILE[0] + 200]
+    assert abs(int(first[0]) - 60) < 8 and abs(int(third[0]) - 60) < 8
+    assert missing.max() < 40
+
+
+def test_rigs_of_one_camera_and_of_five_have_a_page(tmp_path: Path) -> None:
+    for count in (1, 5):
+        rig = arc_rig(tuple(20.0 * i for i in range(count)))
+        watch = WatchPage(tmp_path, rig, "x")
+        watch.show(watch_frames(cameras=tuple(range(count))), POSE, DOTTED, [])
+        assert (tmp_path / "watch.jpg").stat().st_size > 1000

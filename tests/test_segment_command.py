@@ -1,18 +1,32 @@
-"""`stillbed segment`: masks of the inputs' own names and sizes, a table, and what it says of bad input."""
+"""`stillbed segment`: masks of the inputs' own names and sizes, a table, and what it says of bad input. The network
+that comes along: it is the one its settings belong to, finds wounds, and keeps silent about skin.
+"""
 
 from __future__ import annotations
 
 import csv
+import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from estimation import se3
 from estimation.errors import InputError
+from estimation.pose import SurfacePose, TrackState
+from estimation.rig import Rig
+from hardware.bench.pictures import judged_by, run_segmentation
+from hardware.bench.subjects import SUBJECTS
 from hardware.cli.main import main
-from hardware.offline.segment import OVERLAYS, TABLE, Options, listed, run_segment
-from perception.wound.segmentation import NetworkSegmenter, Segmentation
+from hardware.files.pose_file import WOUND_FILE_NAME, WoundFile
+from hardware.offline.segment import OVERLAY_FOLDER, WOUND_TABLE, SegmentOptions, input_files, run_segment
+from hardware.simulator.scene.ground_truth_views import WoundView, mask_from_outlines, wound_view
+from perception.frames import Frame, FrameSet
+from perception.tracking.step import StepReport, report_without_offsets
+from perception.training.dataset import Labelled, read_dataset
+from perception.wound.network import SHIPPED_MODEL, WoundNetwork, hash_of, read_settings, shipped_model
+from perception.wound.segmentation import NetworkSegmenter, Segmentation, centroid, dice
 from tests.test_segmentation import SETTINGS, disc, picture, red_is_wound
 
 SEGMENTER = NetworkSegmenter(red_is_wound, SETTINGS)
@@ -26,7 +40,7 @@ def write_video(file: Path, frames: int) -> None:
 
 
 def rows(out: Path) -> list[dict[str, str]]:
-    with (out / TABLE).open(newline="", encoding="utf-8") as stream:
+    with (out / WOUND_TABLE).open(newline="", encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
 
 
@@ -36,13 +50,13 @@ def test_masks_have_the_pictures_names_and_sizes_and_are_black_and_white(tmp_pat
     for name, size in (("one.jpg", (120, 160)), ("two.PNG", (90, 70)), ("none.png", (64, 64))):
         image = np.full((*size, 3), 150, np.uint8) if name == "none.png" else picture((30, 40), 15, size)[0]
         cv2.imwrite(str(photos / name), image)
-    said = run_segment([photos], tmp_path / "masks", SEGMENTER, Options(overlay=True, mm_per_px=0.5))
+    said = run_segment([photos], tmp_path / "masks", SEGMENTER, SegmentOptions(overlay=True, mm_per_px=0.5))
     assert said.startswith("2 of 3 pictures show a wound")
     for name, size in (("one", (120, 160)), ("two", (90, 70)), ("none", (64, 64))):
         mask = cv2.imread(str(tmp_path / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
         assert mask.shape == size
         assert set(np.unique(mask)) <= {0, 255}
-        assert (tmp_path / "masks" / OVERLAYS / f"{name}.jpg").is_file()
+        assert (tmp_path / "masks" / OVERLAY_FOLDER / f"{name}.jpg").is_file()
     table = {row["name"]: row for row in rows(tmp_path / "masks")}
     area = int(table["one"]["area_px"])
     assert area == pytest.approx(disc((120, 160), (30, 40), 15).sum(), rel=0.1)
@@ -54,7 +68,7 @@ def test_masks_have_the_pictures_names_and_sizes_and_are_black_and_white(tmp_pat
 
 def test_a_video_gives_a_mask_a_frame(tmp_path: Path) -> None:
     write_video(tmp_path / "ward.avi", 5)
-    run_segment([tmp_path / "ward.avi"], tmp_path / "masks", SEGMENTER, Options())
+    run_segment([tmp_path / "ward.avi"], tmp_path / "masks", SEGMENTER, SegmentOptions())
     assert [row["name"] for row in rows(tmp_path / "masks")] == [f"ward_{k:06d}" for k in range(5)]
     middles = [float(row["centroid_x_px"]) for row in rows(tmp_path / "masks")]
     assert np.allclose(np.diff(middles), 1, atol=0.5)
@@ -65,7 +79,7 @@ def test_a_video_cut_short_keeps_what_decodes_and_says_so(tmp_path: Path) -> Non
     write_video(file, 20)
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     with pytest.raises(InputError, match=r"cut\.avi"):
-        run_segment([file], tmp_path / "masks", SEGMENTER, Options())
+        run_segment([file], tmp_path / "masks", SEGMENTER, SegmentOptions())
     assert len(rows(tmp_path / "masks")) == len(list((tmp_path / "masks").glob("*.png"))) < 20
 
 
@@ -73,7 +87,7 @@ def test_an_unreadable_picture_is_told_after_the_others_are_done(tmp_path: Path)
     (tmp_path / "a.jpg").write_bytes(b"no picture")
     cv2.imwrite(str(tmp_path / "b.png"), picture((30, 30), 9, (60, 60))[0])
     with pytest.raises(InputError, match=r"a\.jpg: picture"):
-        run_segment([tmp_path / "a.jpg", tmp_path / "b.png"], tmp_path / "masks", SEGMENTER, Options())
+        run_segment([tmp_path / "a.jpg", tmp_path / "b.png"], tmp_path / "masks", SEGMENTER, SegmentOptions())
     assert [row["name"] for row in rows(tmp_path / "masks")] == ["b"]
 
 
@@ -89,7 +103,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path) -> None:
         return SEGMENTER(image)
 
     with pytest.raises(KeyboardInterrupt):
-        run_segment([tmp_path], tmp_path / "masks", segmenter, Options())
+        run_segment([tmp_path], tmp_path / "masks", segmenter, SegmentOptions())
     assert [row["name"] for row in rows(tmp_path / "masks")] == ["0", "1"]
 
 
@@ -105,7 +119,7 @@ def test_inputs_that_make_no_sense_are_refused_before_anything_is_written(tmp_pa
         ([tmp_path / "x.jpg", tmp_path / "x.png"], "masks are named for it"),
     ):
         with pytest.raises(InputError, match=match):
-            listed(inputs)
+            input_files(inputs)
 
 
 def test_the_command_line_refuses_options_that_do_not_go_together(
@@ -122,3 +136,171 @@ def test_the_command_line_refuses_options_that_do_not_go_together(
         assert main(["segment", str(tmp_path / "b.png"), "-o", str(tmp_path / "out"), *extra]) == 2
         assert capsys.readouterr().err.startswith("stillbed: ")
     assert not (tmp_path / "out").exists()
+
+
+DATA = Path(__file__).parent.parent.parent / "shared" / "data" / "fuseg"
+
+
+@pytest.fixture(scope="module")
+def segmenter() -> NetworkSegmenter:
+    network = WoundNetwork(shipped_model(), 1)
+    return NetworkSegmenter(network, network.settings)
+
+
+@pytest.fixture(scope="module")
+def views() -> list[WoundView]:
+    return [wound_view(seed) for seed in range(2)]
+
+
+def test_rendered_wounds_are_found_and_their_masks_are_exact(
+    segmenter: NetworkSegmenter, views: list[WoundView]
+) -> None:
+    for view in views:
+        found = segmenter(view.image)
+        assert dice(found.mask, view.wound) > 0.7
+        assert np.linalg.norm(centroid(found.mask) - centroid(view.wound)) < 8
+    redness = [float(v.image[v.wound][:, 2].mean() - v.image[v.wound][:, 1].mean()) for v in views]
+    assert min(redness) > 20
+
+
+def test_rendered_healthy_skin_shows_no_wound(segmenter: NetworkSegmenter) -> None:
+    for seed in range(2):
+        view = wound_view(seed, wounded=False)
+        assert not view.wound.any() and view.area == 0
+        assert not segmenter(view.image).found
+
+
+def test_the_network_answers_the_same_on_one_thread_and_on_two(views: list[WoundView]) -> None:
+    one, two = (WoundNetwork(shipped_model(), threads) for threads in (1, 2))
+    first, second = (NetworkSegmenter(each, each.settings)(views[0].image) for each in (one, two))
+    assert np.array_equal(first.mask, second.mask)
+
+
+def test_a_network_of_other_bytes_than_its_settings_say_is_refused(tmp_path: Path) -> None:
+    for suffix in (".onnx", ".toml"):
+        shutil.copy(shipped_model(suffix=suffix), tmp_path / f"x{suffix}")
+    WoundNetwork(tmp_path / "x.onnx", 1)
+    with (tmp_path / "x.onnx").open("ab") as stream:
+        stream.write(b"\0")
+    with pytest.raises(InputError, match="sha256"):
+        WoundNetwork(tmp_path / "x.onnx", 1)
+
+
+def test_what_is_wrong_with_a_network_is_told_by_its_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        WoundNetwork(tmp_path / "gone.onnx")
+    bad = tmp_path / "bad.onnx"
+    bad.write_bytes(b"no network")
+    with pytest.raises(InputError, match="settings"):
+        WoundNetwork(bad)
+    wrong = [("", "network"), ("edge = true", "edge"), ("colour = 3", "colour"), ("[looks]\nx = 1", "x")]
+    wrong += [(f"edge = {value}", "finite") for value in ("nan", "-inf", "9" * 400)]
+    wrong += [(f"[looks]\nwindow = {'9' * 400}", "finite")]
+    for extra, match in wrong:
+        bad.with_suffix(".toml").write_text(f'sha256 = "{hash_of(bad)}"\n{extra}\n', encoding="utf-8")
+        with pytest.raises(InputError, match=match):
+            WoundNetwork(bad)
+
+
+def test_settings_without_a_word_are_the_usual_ones(tmp_path: Path) -> None:
+    (tmp_path / "x.toml").write_text('sha256 = "abc"\n[looks]\nwindow = 0\n', encoding="utf-8")
+    settings = read_settings(tmp_path / "x.toml", "abc")
+    assert settings.looks.window == 0 and settings.edge == 0.5
+
+
+def test_the_true_mask_of_a_disc_has_the_discs_area() -> None:
+    angle = np.linspace(0, 2 * np.pi, 300, endpoint=False)
+    rim = np.column_stack([50 + 20.3 * np.cos(angle), 40 + 20.3 * np.sin(angle)])
+    assert mask_from_outlines([rim], (100, 80)).sum() == pytest.approx(np.pi * 20.3**2, rel=0.02)
+    assert not mask_from_outlines([], (100, 80)).any()
+
+
+class Red:
+    """Finds what is red."""
+
+    def __call__(self, image: np.ndarray) -> object:
+        from perception.wound.segmentation import Segmentation
+
+        return Segmentation(image[..., 2].astype(int) - image[..., 1] > 60, 0.9, 0.7)
+
+
+def test_the_file_of_a_run_holds_each_cameras_wound_and_its_area_once_the_surface_is_tracked(tmp_path: Path) -> None:
+    view = wound_view(0)
+    rig = Rig((view.camera,))
+    image = np.zeros_like(view.image)
+    image[view.wound] = (20, 20, 200)
+    pose = SurfacePose(0.0, view.base_from_surface, np.eye(6), np.zeros(6), TrackState.TRACKING)
+    with WoundFile(tmp_path, rig, Red()) as file:
+        for number in range(8):
+            stamp = number / 30
+            now = SurfacePose(stamp, pose.base_from_surface, pose.covariance, pose.twist, pose.state)
+            file.write(FrameSet(stamp, (Frame(0, stamp, image),)), now, report())
+    with (tmp_path / WOUND_FILE_NAME).open(newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [float(row["stamp_s"]) for row in rows] == pytest.approx([0, 0.1], abs=1e-5)
+    # A plane stands for a bed some mm deep, and for a body that is curved
+    assert float(rows[0]["area_mm2"]) == pytest.approx(view.area, rel=0.12)
+    assert rows[0]["camera"] == view.camera.name and rows[0]["wound"] == "1"
+
+
+def report() -> StepReport:
+    from estimation.observations import no_observations
+
+    return report_without_offsets(no_observations(0.0), np.zeros(1, np.int64), np.zeros(5))
+
+
+def test_the_bench_judges_by_what_was_held_out_of_the_networks_own_data_and_by_all_of_another(tmp_path: Path) -> None:
+    names = shipped_model(f"{SHIPPED_MODEL}_held_out", ".txt").read_text(encoding="utf-8").split()
+    empty = np.zeros((4, 4), bool)
+    own = [Labelled(name, np.zeros((4, 4, 3), np.uint8), empty) for name in (*names, "fuseg/trained.jpg")]
+    assert [each.name for each in judged_by(own, tmp_path)] == names
+    other = [Labelled("x/1.jpg", np.zeros((4, 4, 3), np.uint8), empty)]
+    assert judged_by(other, tmp_path) == other
+    with pytest.raises(InputError, match="held out"):
+        judged_by(own[:5], tmp_path)
+    assert len(names) >= 150
+
+
+@pytest.mark.slow
+def test_the_bench_runs_without_data_and_says_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
+    import argparse
+
+    parser = argparse.ArgumentParser()
+    SUBJECTS["segmentation"].add_options(parser)
+    figures = {figure.what: figure for figure in run_segmentation(parser.parse_args(["--rendered", "2"]))}
+    assert "segmentation" in SUBJECTS
+    assert "Dice of each picture, mean" not in figures and "no DATASET is named" in capsys.readouterr().err
+    assert figures["Dice on rendered wounds, mean"].value > 0.7
+    assert figures["network, a picture: median"].value > 0
+
+
+def test_training_refuses_what_cannot_be_before_it_reads_a_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "there.toml").touch()
+    for arguments in (
+        ["-o", str(tmp_path / "x.txt")],
+        ["-o", str(tmp_path / "gone" / "x.toml"), "--network", "shape"],
+        ["-o", str(tmp_path / "there.toml"), "--network", "shape"],
+        ["-o", str(tmp_path / "x.toml"), "--network", "shape", "--hold-out", "0"],
+        ["-o", str(tmp_path / "x.toml"), "--network", "shape"],
+    ):
+        assert main(["train", str(tmp_path / "data"), *arguments]) == 2
+        assert capsys.readouterr().err.startswith("stillbed: ")
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="labelled pictures of wounds are not beside the project")
+def test_real_wounds_held_out_are_found(segmenter: NetworkSegmenter) -> None:
+    names = shipped_model(f"{SHIPPED_MODEL}_held_out", ".txt").read_text(encoding="utf-8").split()
+    pictures = {each.name: each for each in read_dataset(DATA)}
+    some = [pictures[name] for name in names[::8]]
+    reached = [dice(segmenter(np.ascontiguousarray(p.picture[..., ::-1])).mask, p.wound) for p in some]
+    assert float(np.mean(reached)) > 0.7
+
+
+def test_a_pose_behind_the_camera_gives_no_area() -> None:
+    from perception.wound.segmentation import area_on_plane
+
+    view = wound_view(1)
+    far = view.camera.base_from_camera @ se3.make(np.eye(3), [0, 0, -50])
+    assert np.isnan(area_on_plane(disc(view.wound.shape, (300, 200), 20), view.camera, far))

@@ -12,17 +12,23 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.rig import pixels_from_points
-from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.simulator.wound_views import inside
-from perception.coarse_to_fine import Looks, window, wound_logits
-from perception.dice import dice
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
+from hardware.simulator.scene.ground_truth_views import mask_from_outlines
 from perception.frames import Frame, FrameSet
-from perception.padding import picture_box
-from perception.wound.network import Settings
-from perception.wound.segmentation import NetworkSegmenter, Segmentation, centroid, judged, largest_part
-from perception.wound_beside import WoundBeside
-from perception.wound_region import area_on_plane, box_of, region
-from perception.wound_watch import PATIENCE, WoundWatch, overlap
+from perception.tracking.wound_step import MAX_MISSED_LOOKS, AsyncSegmentation, WoundFilter, overlap
+from perception.wound.network import Looks, Settings, window, wound_logits
+from perception.wound.segmentation import (
+    NetworkSegmenter,
+    Segmentation,
+    area_on_plane,
+    box_of,
+    centroid,
+    dice,
+    largest_part,
+    picture_box,
+    region,
+    segmentation_from_logits,
+)
 
 SETTINGS = Settings(trust=0.3)
 SIDES = st.integers(8, 900)
@@ -104,32 +110,32 @@ def test_a_picture_nearly_all_dark_is_kept_whole() -> None:
 def test_the_threshold_falls_from_seven_tenths_until_something_is_found(probability: float, threshold: float) -> None:
     logits = np.full((60, 60), -8.0, np.float32)
     logits[disc((60, 60), (30, 30), 12)] = np.log(probability / (1 - probability))
-    found = judged(logits, Settings(trust=0.0))
+    found = segmentation_from_logits(logits, Settings(trust=0.0))
     assert found.threshold == pytest.approx(threshold)
     assert found.mask.sum() == disc((60, 60), (30, 30), 12).sum()
 
 
 def test_below_a_tenth_there_is_no_wound() -> None:
-    assert not judged(np.full((60, 60), np.log(0.09 / 0.91), np.float32), Settings(trust=0.0)).found
+    assert not segmentation_from_logits(np.full((60, 60), np.log(0.09 / 0.91), np.float32), Settings(trust=0.0)).found
 
 
 def test_an_unsure_wound_is_kept_silent_about_but_its_confidence_told() -> None:
     logits = np.full((60, 60), -8.0, np.float32)
     logits[20:30, 20:30] = 0.5
-    unsure = judged(logits, Settings(trust=0.9))
+    unsure = segmentation_from_logits(logits, Settings(trust=0.9))
     assert not unsure.found and 0.5 < unsure.confidence < 0.9 and np.isnan(unsure.threshold)
-    assert judged(logits, Settings(trust=0.5)).found
+    assert segmentation_from_logits(logits, Settings(trust=0.5)).found
 
 
 def test_what_fills_the_whole_picture_is_no_wound() -> None:
-    assert not judged(np.full((60, 60), 5.0, np.float32), SETTINGS).found
+    assert not segmentation_from_logits(np.full((60, 60), 5.0, np.float32), SETTINGS).found
 
 
 def test_specks_are_dropped_and_a_second_wound_is_kept() -> None:
     logits = np.full((100, 100), -8.0, np.float32)
     large, second, speck = disc((100, 100), (30, 30), 15), disc((100, 100), (75, 75), 8), disc((100, 100), (90, 10), 2)
     logits[large | second | speck] = 4.0
-    found = judged(logits, Settings(trust=0.0, smallest=0.05)).mask
+    found = segmentation_from_logits(logits, Settings(trust=0.0, smallest=0.05)).mask
     assert np.array_equal(found, large | second)
     assert np.array_equal(largest_part(found), large)
 
@@ -172,9 +178,9 @@ def test_the_area_on_the_surface_is_the_ellipse_that_was_put_there(camera: int) 
     seen = arc_rig().cameras[camera]
     angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     rim = np.column_stack([20 * np.cos(angle), 14 * np.sin(angle), np.zeros(400)])
-    pixels, _ = pixels_from_points(seen, se3.transform_points(REST, rim))
-    mask = inside([pixels], seen.size)
-    assert area_on_plane(mask, seen, REST) == pytest.approx(np.pi * 20 * 14, rel=0.01)
+    pixels, _ = pixels_from_points(seen, se3.transform_points(BASE_FROM_REST, rim))
+    mask = mask_from_outlines([pixels], seen.size)
+    assert area_on_plane(mask, seen, BASE_FROM_REST) == pytest.approx(np.pi * 20 * 14, rel=0.01)
 
 
 def test_an_area_on_a_plane_behind_the_camera_is_not_known() -> None:
@@ -190,7 +196,7 @@ def seen_at(centre: tuple[int, int] | None, size: tuple[int, int] = (640, 480)) 
 
 
 def test_a_wound_that_jumps_is_believed_at_the_second_look() -> None:
-    watch = WoundWatch((640, 480))
+    watch = WoundFilter((640, 480))
     watch.take(seen_at((100, 100)))
     once = watch.take(seen_at((400, 300)))
     assert once.box == box_of(disc((480, 640), (100, 100), 30)) and once.missed == 1 and once.roi == (0, 0, 640, 480)
@@ -199,16 +205,16 @@ def test_a_wound_that_jumps_is_believed_at_the_second_look() -> None:
 
 
 def test_a_wound_that_is_not_seen_stays_for_a_few_looks_only() -> None:
-    watch = WoundWatch((640, 480))
+    watch = WoundFilter((640, 480))
     first = watch.take(seen_at((100, 100)))
-    for _ in range(PATIENCE):
+    for _ in range(MAX_MISSED_LOOKS):
         assert watch.take(seen_at(None)).box == first.box
     assert watch.take(seen_at(None)).box is None
     assert watch.take(seen_at((400, 300))).box is not None
 
 
 def test_the_region_of_a_moving_wound_holds_where_it_was() -> None:
-    watch = WoundWatch((640, 480))
+    watch = WoundFilter((640, 480))
     watch.take(seen_at((100, 100)))
     x0, _, x1, _ = watch.take(seen_at((110, 100))).roi
     assert x0 == 100 - 30 - 5 and x1 == 110 + 30 + 1 + 5
@@ -223,7 +229,7 @@ def test_a_box_overlaps_itself_wholly(corner: tuple[int, int, int, int]) -> None
 
 def run_beside(executor: ThreadPoolExecutor | None, segmenter: Callable[[np.ndarray], Segmentation]) -> list[object]:
     rig = arc_rig(size=(64, 48), focal=55.0)
-    beside = WoundBeside(rig, segmenter, executor)
+    beside = AsyncSegmentation(rig, segmenter, executor)
     out: list[object] = []
     for number in range(12):
         images = [Frame(c, number / 30, np.full((48, 64, 3), number, np.uint8)) for c in range(3)]

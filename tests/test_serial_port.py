@@ -12,17 +12,17 @@ import pytest
 
 from estimation.errors import InputError
 from hardware.arm import port as arm_port
+from hardware.arm.device import ArmState
 from hardware.arm.link import Arm
-from hardware.arm.port import Device, SerialPort, UnpluggedError
+from hardware.arm.port import PortOpener, SerialPort, UnpluggedError
 from hardware.arm.profile import ArmProfile
-from hardware.arm.protocol import LENGTH
-from hardware.arm_status import ArmState
+from hardware.arm.protocol import FRAME_LENGTH
 from hardware.process.clock import WallClock
-from hardware.simulator.arm.settings import ArmSettings, Replies
-from hardware.simulator.pty_link import open_pty
-from tests.linked import circle
+from hardware.simulator.arm.ports import open_pty
+from hardware.simulator.arm.settings import ArmSettings, ReplyMode
+from tests.linked import circle, moving
 from tests.test_arm_port import serving
-from tests.virtual_arm import HOME, move
+from tests.virtual_arm import HOME
 
 CLOCK = WallClock()
 
@@ -61,7 +61,7 @@ def test_bytes_go_both_ways_and_nothing_waits(pair: tuple[int, str]) -> None:
 def test_a_full_buffer_takes_a_part_and_then_nothing_and_then_again(pair: tuple[int, str]) -> None:
     ours, name = pair
     port = SerialPort(name, 115_200)
-    data, sent = bytes(range(LENGTH)) * 2000, 0
+    data, sent = bytes(range(FRAME_LENGTH)) * 2000, 0
     while taken := port.write(data[sent:]):
         sent += taken
     assert 0 < sent < len(data)
@@ -123,18 +123,18 @@ def test_two_writers_on_one_port_are_impossible(pair: tuple[int, str], tmp_path:
     _, name = pair
     link = tmp_path / "arm"
     link.symlink_to(name)
-    first = Device(name, 115_200)
+    first = PortOpener(name, 115_200)
     port = first()
     for second in (name, str(link)):
         with pytest.raises(InputError, match="a port that is free"):
-            Device(second, 115_200)()
+            PortOpener(second, 115_200)()
     first.release()
-    other = Device(name, 115_200)
+    other = PortOpener(name, 115_200)
     with pytest.raises(InputError, match="no other program"):  # its lock is gone, but it is still open
         other()
     other.release()
     port.close()
-    again = Device(name, 115_200)
+    again = PortOpener(name, 115_200)
     again().close()
     again.release()
 
@@ -145,7 +145,7 @@ def test_an_adapter_that_comes_back_under_another_name_is_the_same(
     _, name = pair
     there = [("/dev/ttyUSB0", (0x1A86, 0x7523, "at 1-1")), ("/dev/ttyUSB7", (0x0403, 0x6001, "A50285BI"))]
     monkeypatch.setattr(arm_port, "_adapters", lambda: list(there))
-    device = Device("/dev/ttyUSB7", 115_200)
+    device = PortOpener("/dev/ttyUSB7", 115_200)
     there[:] = [("/dev/ttyUSB7", (0x1A86, 0x7523, "at 1-1"))]  # another one has taken its name
     with pytest.raises(UnpluggedError, match="0403:6001 A50285BI"):
         device()
@@ -155,9 +155,9 @@ def test_an_adapter_that_comes_back_under_another_name_is_the_same(
 
 
 def test_over_a_pty_in_real_time_the_arm_moves_answers_and_stops(tmp_path: Path) -> None:
-    settings = ArmSettings(servo_lag=0.0, replies=Replies.STREAM)
+    settings = ArmSettings(servo_lag=0.0, replies=ReplyMode.STREAM)
     with serving(tmp_path / "arm", settings) as ended:
-        device = Device(str(tmp_path / "arm"), 115_200)
+        device = PortOpener(str(tmp_path / "arm"), 115_200)
         arm = Arm(device, ArmProfile(), CLOCK.now())
         assert arm.stand(HOME, CLOCK.now()) == "" and arm.arm(CLOCK.now()) == ""
         phase, start, most = 0.0, CLOCK.now(), 0.0
@@ -170,8 +170,7 @@ def test_over_a_pty_in_real_time_the_arm_moves_answers_and_stops(tmp_path: Path)
                     phase += 0.02
                     goal = circle(phase)
                     feed = float(np.linalg.norm((goal - arm.target)[:3])) / 0.02
-                    frame = move(feed, x=goal[0], y=goal[1], c=np.rad2deg(goal[5]))
-                    assert arm.send(frame, now) == ""
+                    assert arm.send(moving(goal, feed), now) == ""
             most = max(most, arm.in_flight(now))
             CLOCK.wait_until(now + 0.002)
         arm.stop("asked for", CLOCK.now())
@@ -190,7 +189,7 @@ def test_over_a_pty_in_real_time_the_arm_moves_answers_and_stops(tmp_path: Path)
 
 def test_a_pty_that_goes_and_comes_back_is_disarmed(tmp_path: Path) -> None:
     link = tmp_path / "arm"
-    device = Device(str(link), 115_200)
+    device = PortOpener(str(link), 115_200)
     with serving(link):
         arm = Arm(device, ArmProfile(), CLOCK.now())
         arm.stand(HOME, CLOCK.now())

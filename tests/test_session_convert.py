@@ -1,21 +1,32 @@
-"""Folder to MCAP and back: nothing is lost, nothing half done is left, nothing is overwritten."""
+"""Folder to MCAP and back: nothing is lost, nothing half done is left, nothing is overwritten. The real recordings that
+lie beside the project: opened, imported, exported. Skipped where they are absent. Rig.toml: any rig comes back bit
+by bit, and matrices that are no rigid motion or no millimetres are refused.
+"""
 
 from __future__ import annotations
 
 import filecmp
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from session_files import NAMES, change, make_folder, rig, trajectory
 
+from estimation import se3
 from estimation.errors import InputError, StillbedError
-from hardware.files.rig_file import table_from_rig
-from hardware.files.session import Session, open_session
+from estimation.rig import Camera, Rig
+from estimation.se3 import Array
+from hardware.files.folder_tables import write_tum
+from hardware.files.rig_file import ImageSource, read_rig, rig_from_table, table_from_rig, write_rig
+from hardware.files.session import Session
 from hardware.offline.convert import export_recording, import_folder
-from hardware.tum import write_tum
+from hardware.recording.messages import message_from_rig, rig_from_message
+from hardware.recording.session_reader import open_session
+from tests.session_files import NAMES, camera, change, make_folder, rig, trajectory
 
 
 def assert_same(a: Session, b: Session) -> None:
@@ -207,3 +218,148 @@ def test_a_rig_written_is_the_rig_read(tmp_path: Path) -> None:
     assert table_from_rig(open_session(make_folder(tmp_path / "s", cameras=3, offset=1 / 3)).rig) == table_from_rig(
         rig(3, 1 / 3)
     )
+
+
+DATA = Path(__file__).parent.parent.parent / "shared" / "data"
+
+needs_data = pytest.mark.skipif(not (DATA / "webcams_a").is_dir(), reason=f"no recordings in {DATA}")
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("name", "cameras", "sets", "roi_frame"),
+    [("webcams_a", 3, 48, 0), ("webcams_b", 3, 111, 66), ("teabox", 2, 121, 0)],
+)
+def test_a_real_folder_gives_every_frame_set_whole(name: str, cameras: int, sets: int, roi_frame: int) -> None:
+    session = open_session(DATA / name)
+    assert len(session) == sets and {len(s) for s in session.sets} == {cameras}
+    assert session.truth is not None and not session.truth.exact and session.surface is None
+    assert {roi.stamp for roi in session.roi} <= {ref.stamp for ref in session.sets[roi_frame]}
+    first = next(iter(session.frame_sets()))
+    for seen_by, frame in zip(session.rig.cameras, first.frames, strict=True):
+        assert frame.image.shape == (seen_by.size[1], seen_by.size[0], 3)
+
+
+@needs_data
+def test_a_real_folder_survives_the_way_there_and_back(tmp_path: Path) -> None:
+    folder = open_session(DATA / "teabox")
+    import_folder(DATA / "teabox", tmp_path / "a.mcap")
+    export_recording(tmp_path / "a.mcap", tmp_path / "out")
+    for path in (tmp_path / "a.mcap", tmp_path / "out"):
+        back = open_session(path)
+        assert back.sets == folder.sets
+        for a, b in islice(zip(folder.frame_sets(), back.frame_sets(), strict=True), 20):
+            assert a.stamp == b.stamp
+            assert all(np.array_equal(f.image, g.image) for f, g in zip(a.frames, b.frames, strict=True))
+        assert folder.truth is not None and back.truth is not None
+        assert folder.truth.base_from_surface.tobytes() == back.truth.base_from_surface.tobytes()
+
+
+NOWHERE = ImageSource("images", "*")
+
+
+def written(path: Path, cameras: list[Camera]) -> Path:
+    write_rig(path, Rig(tuple(cameras)), [NOWHERE] * len(cameras))
+    return path
+
+
+finite = st.floats(-1e4, 1e4)
+
+
+@given(
+    xi=st.lists(st.floats(-3, 3), min_size=3, max_size=3),
+    t=st.lists(finite, min_size=3, max_size=3),
+    focal=st.floats(1e3, 1e5),
+    lens=st.lists(st.floats(-1, 1), min_size=5, max_size=5),
+    offset=finite,
+    name=st.text(st.characters(categories=["L", "N", "P", "S", "Zs"], exclude_characters='/\\,"'), min_size=1).filter(
+        lambda n: not n.startswith(".") and len(n) < 60
+    ),
+)
+def test_a_rig_comes_back_bit_by_bit(
+    tmp_path_factory: pytest.TempPathFactory,
+    xi: list[float],
+    t: list[float],
+    focal: float,
+    lens: list[float],
+    offset: float,
+    name: str,
+) -> None:
+    matrix = np.array([[focal, 0, 1 / 3], [0, focal * 1.1, 17.0], [0, 0, 1]])
+    base_from_camera = se3.make(se3.exp_rotation(xi), t)
+    one = Camera(name if name.isprintable() else "a", (1280, 720), matrix, np.array(lens), base_from_camera, offset)
+    first = read_rig(written(tmp_path_factory.mktemp("rig") / "rig.toml", [one])).rig
+    assert table_from_rig(first) == table_from_rig(Rig((one,)))
+    assert table_from_rig(rig_from_message("file", message_from_rig(first))) == table_from_rig(first)
+
+
+def test_four_digits_become_an_exact_rotation_and_stay_it(tmp_path: Path) -> None:
+    rough = replace(camera("a", 1), base_from_camera=np.round(camera("a", 1).base_from_camera, 4))
+    first = read_rig(written(tmp_path / "rig.toml", [rough])).rig
+    exact = first.cameras[0].base_from_camera
+    assert se3.is_transform(exact, 1e-14) and not se3.is_transform(rough.base_from_camera, 1e-6)
+    assert np.abs(exact - rough.base_from_camera).max() < 2e-4
+    second = read_rig(written(tmp_path / "again.toml", list(first.cameras))).rig
+    assert second.cameras[0].base_from_camera.tobytes() == exact.tobytes()
+
+
+def mirrored(m: Array) -> Array:
+    return m @ np.diag([1.0, 1.0, -1.0, 1.0])
+
+
+def scaled(m: Array) -> Array:
+    return np.block([[1.002 * m[:3, :3], m[:3, 3:]], [m[3:]]])
+
+
+def sheared(m: Array) -> Array:
+    out = m.copy()
+    out[0, 1] += 0.01
+    return out
+
+
+@pytest.mark.parametrize("spoil", [mirrored, scaled, sheared, np.transpose])
+def test_a_matrix_that_is_no_rotation_is_refused(tmp_path: Path, spoil: Callable[[Array], Array]) -> None:
+    wrong = replace(camera("a", 1), base_from_camera=spoil(camera("a", 1).base_from_camera))
+    with pytest.raises(InputError, match=r"camera 'a': base_from_camera = .*allowed a rotation"):
+        read_rig(written(tmp_path / "rig.toml", [camera("b", 0), wrong]))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("place", [(0, 0), (1, 3)])
+def test_a_matrix_with_a_hole_is_refused(tmp_path: Path, value: float, place: tuple[int, int]) -> None:
+    table = table_from_rig(rig(2))
+    table["camera"][1]["base_from_camera"][place[0]][place[1]] = value
+    with pytest.raises(InputError, match=r"camera 'top': base_from_camera .* 4 x 4 finite numbers"):
+        rig_from_table("here", table)
+
+
+def baseline(distance: float) -> Rig:
+    shifted = camera("b", 0).base_from_camera.copy()
+    shifted[0, 3] += distance
+    return Rig((camera("a", 0), replace(camera("b", 0), base_from_camera=shifted)))
+
+
+def test_the_shortest_baseline_is_ten_millimetres(tmp_path: Path) -> None:
+    assert len(rig_from_table("here", table_from_rig(baseline(10.001)))) == 2
+    with pytest.raises(InputError, match="not m"):
+        rig_from_table("here", table_from_rig(baseline(9.999)))
+
+
+def test_a_rig_in_micrometres_is_refused() -> None:
+    table = table_from_rig(rig(3))
+    for entry in table["camera"]:
+        for i in range(3):
+            entry["base_from_camera"][i][3] *= 1e3
+    with pytest.raises(InputError, match="mm"):
+        rig_from_table("here", table)
+
+
+def test_one_near_pair_in_a_wide_rig_and_a_single_camera_are_taken() -> None:
+    near = baseline(0.0).cameras
+    assert len(rig_from_table("here", table_from_rig(Rig((*near, camera("c", 5)))))) == 3
+    assert len(rig_from_table("here", table_from_rig(Rig((camera("a", 0),))))) == 1
+
+
+def test_a_calibration_without_images_can_be_read(tmp_path: Path) -> None:
+    write_rig(tmp_path / "rig.toml", rig(2), [None, None])
+    assert read_rig(tmp_path / "rig.toml").sources == (None, None)

@@ -1,15 +1,22 @@
-"""What comes with stillbed is found from a clone and from an installation, under the names that the documents use."""
+"""What comes with stillbed is found from a clone and from an installation, under the names that the documents use. What
+is said of the pins: known vulnerabilities and what mends them, never "none" where nobody was asked. The table of
+hazards: it is what its file says, and every control has tests that are there.
+"""
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 
 import pytest
 
 from estimation.errors import InputError
+from hardware.bench.subjects import SUBJECTS
 from perception import package_data as shipped
 from perception.package_data import named_path, shipped_file
+from tests.audit import NOBODY, NONE, SOME, main, told
+from tests.hazard_table import DOCUMENT, document, failed, hazards, missing
 
 ROOT = Path(__file__).parents[1]
 
@@ -35,11 +42,76 @@ def test_a_path_of_the_documents_leads_to_the_shipped_file_from_anywhere(
 
 
 def test_an_installation_is_searched_where_there_is_no_clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shipped, "CLONE", tmp_path / "none")
-    monkeypatch.setattr(shipped, "INSTALLED", ROOT / "data")
+    monkeypatch.setattr(shipped, "CLONE_DATA", tmp_path / "none")
+    monkeypatch.setattr(shipped, "INSTALLED_DATA", ROOT / "data")
     monkeypatch.chdir(tmp_path)
     assert shipped_file("paths", "square_10mm.csv").is_file()
     assert named_path("data/paths/square_10mm.csv").is_file()
-    monkeypatch.setattr(shipped, "INSTALLED", tmp_path)
+    monkeypatch.setattr(shipped, "INSTALLED_DATA", tmp_path)
     with pytest.raises(InputError, match="an installation with its data"):
         shipped_file("paths", "square_10mm.csv")
+
+
+GOOD = {"name": "numpy", "version": "2.4.6", "vulns": []}
+BAD = {"name": "aiohttp", "version": "3.0", "vulns": [{"id": "PYSEC-1", "fix_versions": ["3.1"], "aliases": []}]}
+LEFT = {"name": "gtsam", "skip_reason": "not found on PyPI"}
+
+
+def answer(*dependencies: object) -> str:
+    return json.dumps({"dependencies": dependencies, "fixes": []})
+
+
+def test_each_known_vulnerability_is_listed_with_what_mends_it() -> None:
+    code, words = told(answer(GOOD, BAD, LEFT), "")
+    assert code == SOME
+    assert words.splitlines() == [
+        "aiohttp 3.0: PYSEC-1, mended in 3.1",
+        "gtsam: not checked: not found on PyPI",
+        "1 known vulnerabilities in 2 pins of constraints.txt",
+    ]
+    assert told(answer(GOOD), "")[0] == NONE
+
+
+@pytest.mark.parametrize(
+    ("said", "trouble"),
+    [("", "ERROR: Connection refused"), ("{}", ""), ("[]", ""), (answer(), ""), (answer(LEFT), "")],
+)
+def test_where_nobody_could_be_asked_nothing_is_said_to_be_well(said: str, trouble: str) -> None:
+    code, words = told(said, trouble)
+    assert code == NOBODY and "nothing was checked" in words and trouble in words
+
+
+def test_a_program_that_is_not_there_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main("/nowhere/pip-audit") == NOBODY
+    assert "nothing was checked" in capsys.readouterr().out
+
+
+def test_the_page_is_what_the_file_says() -> None:
+    assert DOCUMENT.read_text(encoding="utf-8") == document(), "make hazards writes it"
+
+
+def test_every_hazard_has_a_control_and_tests_that_are_there() -> None:
+    found = hazards()
+    assert len({each.id for each in found}) == len(found)
+    for each in found:
+        assert all((each.hazard, each.cause, each.control, each.tests)), each.id
+        assert not missing(each.tests), each.id
+
+
+def test_every_figure_is_measured_by_a_subject_of_the_bench() -> None:
+    for each in hazards():
+        assert bool(each.figure) == bool(each.command), each.id
+        if each.command:
+            program, verb, subject = each.command.split()[:3]
+            assert (program, verb) == ("stillbed", "bench") and subject in SUBJECTS, each.id
+
+
+def test_a_test_that_is_not_there_or_skipped_or_failed_is_found(tmp_path: Path) -> None:
+    (tmp_path / "tests").mkdir()
+    skipped = "@pytest.mark.skip(reason='x')\ndef test_two() -> None: ...\n"
+    (tmp_path / "tests" / "test_x.py").write_text(f"import pytest\n\n\ndef test_one() -> None: ...\n\n\n{skipped}")
+    names = [f"tests/test_x.py::test_{name}" for name in ("one", "two", "no")]
+    assert missing([*names, "tests/y.py::test_one"], tmp_path) == [*names[1:], "tests/y.py::test_one"]
+    (tmp_path / "lastfailed").write_text(json.dumps({"tests/test_x.py::test_one[3]": True}))
+    assert failed(names, tmp_path / "lastfailed") == names[:1]
+    assert not failed(names, tmp_path / "none")

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from hardware.files.images import decode, encode
-from hardware.simulator.camera_settings import CameraSettings, camera_settings_from_table
-from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, garble
+from hardware.simulator.cameras import CameraSettings, Fate, Shot, SimulatedCameras, camera_settings_from_table, garble
 
 NAMES = ("top", "middle", "side")
 EVIL = {

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from estimation.state_machine import StateSettings
-from estimation.synthetic.arc_rig import REST
+from estimation.online.surface_state import StateSettings
+from estimation.synthetic.world import BASE_FROM_REST
 from hardware.cli.main import main
 from hardware.files.arm_file import read_arm
+from hardware.files.folder_tables import read_tum
 from hardware.files.path_file import read_path
 from hardware.files.pose_file import PoseTable, read_poses
-from hardware.files.session import open_session
 from hardware.offline.track import run_track
-from hardware.simulator.nozzle_file import read_nozzle
-from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.simulate import Options, run_simulation
-from hardware.tum import read_tum
+from hardware.recording.session_reader import open_session
+from hardware.simulator.scenario import read_scenario
+from hardware.simulator.simulate import SimulationOptions, run_simulation
+from tests.nozzle_logs import read_nozzle
 from tests.worlds import IDEAL, SMALL, write_path, write_scenario
 
 BREATHING = {"kind": "breathing", "amplitude_mm": 2.0, "rate_hz": 0.4}
@@ -37,7 +37,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with pictures and faults, rendered by one thread."""
     folder = tmp_path_factory.mktemp("recorded")
     file = write_scenario(folder, SMALL, FAULTY, motion=[BREATHING], seconds=1.0, seed=8, clearance_mm=0.4)
-    run_simulation(file, folder / "one", Options(threads=1))
+    run_simulation(file, folder / "one", SimulationOptions(threads=1))
     return folder
 
 
@@ -62,7 +62,7 @@ def same_columns(one: Path, other: Path) -> bool:
 
 
 def test_two_runs_and_any_number_of_threads_give_the_same_bytes(recorded: Path) -> None:
-    run_simulation(recorded / "scenario.toml", recorded / "two", Options(threads=2))
+    run_simulation(recorded / "scenario.toml", recorded / "two", SimulationOptions(threads=2))
     one, two = recorded / "one", recorded / "two"
     names = sorted(str(file.relative_to(one)) for file in one.rglob("*") if file.is_file())
     assert names == sorted(str(file.relative_to(two)) for file in two.rglob("*") if file.is_file())
@@ -77,7 +77,7 @@ def test_two_runs_and_any_number_of_threads_give_the_same_bytes(recorded: Path) 
 def test_another_seed_gives_other_pictures_and_other_errors(recorded: Path) -> None:
     tremor = [BREATHING, {"kind": "tremor", "rms_mm": [0.1, 0.1, 0.1]}]
     file = write_scenario(recorded, SMALL, motion=tremor, seconds=0.3, seed=6, clearance_mm=0.4, name="other.toml")
-    run_simulation(file, recorded / "other", Options(threads=1))
+    run_simulation(file, recorded / "other", SimulationOptions(threads=1))
     for name in ("session/cam_0/000001.jpg", "nozzle.csv", "session/truth.tum"):
         assert (recorded / "one" / name).read_bytes() != (recorded / "other" / name).read_bytes()
 
@@ -165,7 +165,7 @@ def test_the_frames_that_were_sent_are_those_of_the_commands(recorded: Path) -> 
 def test_what_arrives_damaged_beyond_decoding_is_told_and_left_out(tmp_path: Path) -> None:
     change = {"cameras": {"fps": 15.0, "garble": 1.0}, "scene": {"wound": False, "texel_mm": 1.0}}
     file = write_scenario(tmp_path, SMALL, change, seconds=0.8, rig={"size": [160, 90], "focal_px": 150})
-    run_simulation(file, tmp_path / "out", Options(threads=1))
+    run_simulation(file, tmp_path / "out", SimulationOptions(threads=1))
     session = open_session(tmp_path / "out" / "session")
     assert 0 < sum(len(refs) for refs in session.sets) < 3 * 11
     assert all(frame.image.shape == (90, 160, 3) for frames in session.frame_sets() for frame in frames.frames)
@@ -194,7 +194,7 @@ def test_a_limit_that_is_missed_is_told(quick: Path) -> None:
 
 
 def test_the_pty_carries_the_same_bytes(quick: Path) -> None:
-    run_simulation(quick / "scenario.toml", quick / "pty", Options(pty=True))
+    run_simulation(quick / "scenario.toml", quick / "pty", SimulationOptions(pty=True))
     for name in ("frames.bin", "nozzle.csv", "commands.csv"):
         assert (quick / "pty" / name).read_bytes() == (quick / "out" / name).read_bytes()
 
@@ -202,16 +202,16 @@ def test_the_pty_carries_the_same_bytes(quick: Path) -> None:
 def test_a_trace_is_simulated_instead_of_the_scenarios_own_motion(quick: Path) -> None:
     trace = quick / "moved.tum"
     trace.write_text("".join(f"{t / 10} 0 {2 * np.sin(t / 10)} 0 0 0 0 1\n" for t in range(60)))
-    run_simulation(quick / "scenario.toml", quick / "traced", Options(trace=trace))
+    run_simulation(quick / "scenario.toml", quick / "traced", SimulationOptions(trace=trace))
     moved, still = (read_nozzle(quick / name / "nozzle.csv") for name in ("traced", "out"))
-    along = REST[:3, 1]
+    along = BASE_FROM_REST[:3, 1]
     assert np.nanmax(moved.target @ along) > np.nanmax(still.target @ along) + 1.0
 
 
 # -- what is refused
 
 
-def refused(file: Path, out: Path, words: str, options: Options | None = None) -> None:
+def refused(file: Path, out: Path, words: str, options: SimulationOptions | None = None) -> None:
     with pytest.raises(InputError, match=words):
         run_simulation(file, out, options)
     assert not out.exists()  # nothing is made for what makes no sense
@@ -220,8 +220,8 @@ def refused(file: Path, out: Path, words: str, options: Options | None = None) -
 def test_what_makes_no_sense_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     file, out = write_scenario(tmp_path, IDEAL), tmp_path / "out"
     refused(tmp_path / "none.toml", out, r"none\.toml")
-    refused(file, out, "--threads = 0", Options(threads=0))
-    refused(file, out, r"gone\.tum", Options(trace=tmp_path / "gone.tum"))
+    refused(file, out, "--threads = 0", SimulationOptions(threads=0))
+    refused(file, out, r"gone\.tum", SimulationOptions(trace=tmp_path / "gone.tum"))
     refused(write_scenario(tmp_path, IDEAL, path="gone.csv"), out, r"gone\.csv")
     refused(write_scenario(tmp_path, IDEAL, scene={"body": "whale"}), out, r"scenario\.toml: scene\.body = 'whale'")
     refused(write_scenario(tmp_path, IDEAL, scene={"tone": 2}), out, r"scenario\.toml: scene\.tone")
@@ -240,7 +240,7 @@ def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--force"):
         run_simulation(file, tmp_path / "out")
     assert [f.name for f in (tmp_path / "out").iterdir()] == ["mine.txt"]
-    run_simulation(file, tmp_path / "out", Options(force=True))
+    run_simulation(file, tmp_path / "out", SimulationOptions(force=True))
     assert (tmp_path / "out" / "mine.txt").exists()
 
 
@@ -267,7 +267,7 @@ def test_what_would_have_no_effect_is_refused(tmp_path: Path, tables: dict[str, 
 def test_a_scenario_is_not_run_over_itself(tmp_path: Path) -> None:
     file = write_scenario(tmp_path, IDEAL)
     with pytest.raises(InputError, match="the folder that holds the scenario"):
-        run_simulation(file, tmp_path, Options(force=True))
+        run_simulation(file, tmp_path, SimulationOptions(force=True))
     assert file.exists()
 
 
@@ -276,7 +276,7 @@ def test_nothing_of_an_earlier_run_is_left_to_be_mistaken_for_this_one(tmp_path:
     out = tmp_path / "out"
     for seconds, quality in ((0.9, 90), (0.5, 0)):
         tables = {"sensor": {"jpeg_quality": quality}}
-        run_simulation(write_scenario(tmp_path, SMALL, tables, seconds=seconds), out, Options(force=True))
+        run_simulation(write_scenario(tmp_path, SMALL, tables, seconds=seconds), out, SimulationOptions(force=True))
     (out / "mine.txt").write_text("kept")
     session = open_session(out / "session")
     pictures = sum(len(list(folder.iterdir())) for folder in (out / "session").iterdir() if folder.is_dir())

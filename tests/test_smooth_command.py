@@ -14,21 +14,18 @@ import pytest
 
 from estimation import se3, smooth
 from estimation.errors import InputError
-from estimation.synthetic.arc_rig import arc_rig
-from estimation.synthetic.follow import steps
-from estimation.synthetic.world import synthetic_world
-from hardware.channels import read_observations, read_poses, read_smoothed
+from estimation.synthetic.follow import follow_steps
+from estimation.synthetic.world import arc_rig, synthetic_world
 from hardware.cli.main import main
+from hardware.files.folder_tables import read_tum
 from hardware.files.rig_file import read_rig
-from hardware.files.session import FrameRef, open_session
-from hardware.offline.smooth_tracks import relinked
+from hardware.files.session import FrameRef
+from hardware.offline import smooth as run_module
+from hardware.offline.smooth import session_hash
+from hardware.offline.smooth_tracks import reobserve, source_hash, tracks_of
 from hardware.recording.recorder import Recorder
+from hardware.recording.session_reader import open_session, read_observations, read_poses, read_smoothed
 from hardware.report.evaluation import best_constant
-from hardware.smoothing import run as run_module
-from hardware.smoothing.kept import made_of
-from hardware.smoothing.run import session_hash
-from hardware.smoothing.tracks import tracks_of
-from hardware.tum import read_tum
 from perception.frames import Frame, Image
 from tests.synthetic import write_session
 
@@ -42,7 +39,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     world = synthetic_world("breathing", seconds=3.0, rate=20.0, count=40, offsets=(0.004, 0.0, -0.004))
     with Recorder(path, world.rig) as recorder:
         recorder.truth(world.truth)
-        for k, step in enumerate(steps(world, "seen")):
+        for k, step in enumerate(follow_steps(world, "seen")):
             for camera in range(3 if k % 20 == 0 else 1):
                 recorder.frame(Frame(camera, step.pose.stamp, BLANK))
             recorder.write(step.seen)
@@ -106,7 +103,7 @@ def test_what_is_done_is_not_done_again(
     assert main(["smooth", str(recording), "-o", str(out), "--rate", "100"]) == 0
     assert "done already" in capsys.readouterr().out
     assert (out / "summary.json").stat().st_mtime_ns == before
-    asked = [run_module.content_hash("a session's", run_module.Wishes(rate)) for rate in (100.0, 50.0)]
+    asked = [run_module.content_hash("a session's", run_module.SmoothOptions(rate)) for rate in (100.0, 50.0)]
     assert asked[0] != asked[1]
 
 
@@ -167,12 +164,12 @@ def test_pictures_are_tracked_and_searched_once_and_anew_when_they_change(
     assert main(["smooth", str(pictures), "-o", str(out), "--no-relink"]) == 0
     assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["looks_found"] == 0 and times() == first
 
-    changed, kept = tmp_path / "breathing", made_of(out / "tracks.mcap")
+    changed, kept = tmp_path / "breathing", source_hash(out / "tracks.mcap")
     shutil.copytree(pictures, changed)
     picture, other = sorted((changed / "cam_0").iterdir())[3:5]
     shutil.copyfile(other, picture)
     tracks_of(open_session(changed), out, session_hash(changed))
-    assert times()[0] > first[0] and made_of(out / "tracks.mcap") not in ("", kept)
+    assert times()[0] > first[0] and source_hash(out / "tracks.mcap") not in ("", kept)
 
 
 def test_a_picture_that_cannot_be_read_leaves_the_tracks_to_be_smoothed(recording: Path, tmp_path: Path) -> None:
@@ -180,9 +177,9 @@ def test_a_picture_that_cannot_be_read_leaves_the_tracks_to_be_smoothed(recordin
     tracks = tracks_of(session, tmp_path, "")
     result = smooth(session.rig, tracks.observations, start=tracks.start)
     broken = replace(session, store=Unreadable())
-    found = relinked(broken, tracks, result, tmp_path, "of these", StringIO())
+    found = reobserve(broken, tracks, result, tmp_path, "of these", StringIO())
     assert found.looks == 0 and "no picture" in found.text
-    assert made_of(tmp_path / "relinked.mcap") == ""
+    assert source_hash(tmp_path / "relinked.mcap") == ""
 
 
 class Unreadable:

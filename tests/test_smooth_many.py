@@ -16,10 +16,19 @@ from estimation.errors import InputError
 from estimation.synthetic.world import synthetic_world
 from hardware.cli.main import main
 from hardware.offline import smooth as many
-from hardware.offline.smooth import ALREADY, FAILED, SMOOTHED, Cluster, Job, Outcome, run_smooth, sessions_in
+from hardware.offline.smooth import (
+    ALREADY_DONE,
+    FAILED,
+    SMOOTHED,
+    Cluster,
+    SmoothJob,
+    SmoothOptions,
+    SmoothOutcome,
+    local_cluster,
+    run_smooth,
+    sessions_in,
+)
 from hardware.recording.recorder import Recorder
-from hardware.smoothing.cluster import local_cluster
-from hardware.smoothing.run import Wishes
 from perception.frames import Frame
 
 distributed = pytest.importorskip("distributed")
@@ -95,12 +104,12 @@ def test_failures_are_listed_and_what_is_done_is_not_done_again(
     record(sessions / "c.mcap", 1)
     assert main(words) == 1
     again = table(tmp_path)
-    assert [row["state"] for row in again.values()] == [ALREADY, ALREADY, FAILED, SMOOTHED]
+    assert [row["state"] for row in again.values()] == [ALREADY_DONE, ALREADY_DONE, FAILED, SMOOTHED]
     assert (tmp_path / "a" / "summary.json").stat().st_mtime_ns == before
     assert again["a.mcap"]["error_mm"] == rows["a.mcap"]["error_mm"] != again["c.mcap"]["error_mm"]
 
 
-def killed_once(job: Job, wishes: Wishes) -> Outcome:
+def killed_once(job: SmoothJob, wishes: SmoothOptions) -> SmoothOutcome:
     """Half-way through the first session its worker is killed, as if its machine had gone."""
     mark = job.out.parent / "killed"
     if job.session.name == "a.mcap" and not mark.exists():
@@ -114,10 +123,10 @@ def killed_once(job: Job, wishes: Wishes) -> Outcome:
 def test_a_worker_that_is_killed_loses_no_session(
     sessions: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hardware.smoothing import cluster
+    from hardware.offline import smooth as cluster
 
     monkeypatch.setattr(cluster, "smooth_job", killed_once)
-    found = list(run_smooth([sessions], tmp_path, Wishes(), Cluster(address)))
+    found = list(run_smooth([sessions], tmp_path, SmoothOptions(), Cluster(address)))
     assert (tmp_path / "killed").exists()
     assert {o.job.session.name: o.state for o in found if not o.failed} == dict.fromkeys(
         ("a.mcap", "b.mcap", "c.mcap"), SMOOTHED
@@ -129,7 +138,7 @@ def test_a_worker_that_is_killed_loses_no_session(
 def test_forty_sessions_are_smoothed_though_a_local_worker_is_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hardware.smoothing import cluster
+    from hardware.offline import smooth as cluster
 
     folder = tmp_path / "sessions"
     folder.mkdir()
@@ -137,13 +146,13 @@ def test_forty_sessions_are_smoothed_though_a_local_worker_is_killed(
     for k in range(39):
         shutil.copy(folder / "a.mcap", folder / f"s{k:02}.mcap")
     monkeypatch.setattr(cluster, "smooth_job", killed_once)
-    found = list(run_smooth([folder], tmp_path / "out", Wishes(), Cluster("local", 2)))
+    found = list(run_smooth([folder], tmp_path / "out", SmoothOptions(), Cluster("local", 2)))
     assert (tmp_path / "out" / "killed").exists()
     assert [outcome.state for outcome in found] == [SMOOTHED] * 40
 
 
 def test_what_was_interrupted_is_in_the_table(sessions: Path, tmp_path: Path) -> None:
-    some = run_smooth([sessions], tmp_path, Wishes())
+    some = run_smooth([sessions], tmp_path, SmoothOptions())
     next(some)
     some.close()
     rows = list(table(tmp_path).values())
@@ -158,7 +167,7 @@ def test_a_folder_names_its_sessions(sessions: Path, tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "rig.toml").write_text("")
     (tmp_path / "a.mcap").touch()
-    found = list(run_smooth([tmp_path], tmp_path / "out", Wishes()))
+    found = list(run_smooth([tmp_path], tmp_path / "out", SmoothOptions()))
     assert [outcome.job.out.name for outcome in found] == ["a", "a.mcap"]
     assert all(outcome.failed for outcome in found)
 

@@ -1,4 +1,6 @@
-"""The sliding window: finds the motion, knows its error, outlives what breaks GTSAM's smoother."""
+"""The sliding window: finds the motion, knows its error, outlives what breaks GTSAM's smoother. The density of the
+acceleration is found from the poses alone, and follows when the motion changes.
+"""
 
 from __future__ import annotations
 
@@ -8,30 +10,30 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.online.window import LAG, Measured, Smoother, Window
+from estimation.online.window import WINDOW_LAG_S, AccelerationPsd, MeasuredPose, Smoother, WindowEstimate
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST
+from estimation.synthetic.world import BASE_FROM_REST
 from tests.synthetic import Motion, breathing
 
 NOISE = np.array([2e-3] * 3 + [0.03] * 3)  # rad, mm: what one frame set is worth
 COVARIANCE = np.diag(NOISE**2)
 
 
-def measure(motion: Motion, stamps: Array, seed: int, noise: Array = NOISE) -> list[Measured]:
+def measure(motion: Motion, stamps: Array, seed: int, noise: Array = NOISE) -> list[MeasuredPose]:
     draw = np.random.default_rng(seed)
-    return [Measured(float(t), motion(float(t)) @ se3.exp(noise * draw.normal(size=6)), COVARIANCE) for t in stamps]
+    return [MeasuredPose(float(t), motion(float(t)) @ se3.exp(noise * draw.normal(size=6)), COVARIANCE) for t in stamps]
 
 
-def run(measured: list[Measured], smoother: Smoother | None = None) -> list[Window]:
+def run(measured: list[MeasuredPose], smoother: Smoother | None = None) -> list[WindowEstimate]:
     smoother = smoother or Smoother()
     return [smoother.add(m) for m in measured]
 
 
 def turning(twist: Array) -> Motion:
-    return lambda stamp: REST @ se3.exp(twist * stamp)
+    return lambda stamp: BASE_FROM_REST @ se3.exp(twist * stamp)
 
 
-def nees(windows: list[Window], motion: Motion, skip: int = 15) -> float:
+def nees(windows: list[WindowEstimate], motion: Motion, skip: int = 15) -> float:
     """Mean normalised squared pose error, 1 for an honest covariance."""
     values = []
     for w in windows[skip:]:
@@ -80,7 +82,7 @@ def test_a_waving_hand_is_not_dragged() -> None:
     """Half a metre a second, turned round within one frame: the window may not lag by more than the frame's noise."""
 
     def waving(stamp: float) -> Array:
-        return REST @ se3.exp(np.array([0, 0.3 * np.sin(8 * stamp), 0, 60 * np.sin(8 * stamp), 0, 0]))
+        return BASE_FROM_REST @ se3.exp(np.array([0, 0.3 * np.sin(8 * stamp), 0, 60 * np.sin(8 * stamp), 0, 0]))
 
     windows = run(measure(waving, np.arange(60) / 6, 3))
     off = [se3.log(se3.inverse(w.pose) @ waving(w.stamp)) / NOISE for w in windows]
@@ -94,9 +96,9 @@ def test_a_waving_hand_is_not_dragged() -> None:
 def test_what_is_not_finite_never_reaches_the_window(wrong: float) -> None:
     smoother = Smoother()
     first = run(measure(breathing, np.arange(5) / 30, 1), smoother)[-1]
-    for pose, covariance in [(REST + wrong, COVARIANCE), (REST, COVARIANCE + wrong)]:
+    for pose, covariance in [(BASE_FROM_REST + wrong, COVARIANCE), (BASE_FROM_REST, COVARIANCE + wrong)]:
         with pytest.raises(AssertionError):
-            smoother.add(Measured(1.0, pose, covariance))
+            smoother.add(MeasuredPose(1.0, pose, covariance))
     assert smoother.newest is first and smoother.restarts == 0
     assert smoother.add(measure(breathing, np.array([6 / 30]), 1)[0]).stamp == 6 / 30
 
@@ -105,7 +107,7 @@ def test_what_is_not_finite_never_reaches_the_window(wrong: float) -> None:
 def test_a_covariance_that_is_none_does_not_break_what_comes_after(value: float) -> None:
     smoother, measured = Smoother(), measure(breathing, np.arange(30) / 30, 1)
     run(measured[:10], smoother)
-    smoother.add(Measured(measured[10].stamp, measured[10].pose, value * COVARIANCE))
+    smoother.add(MeasuredPose(measured[10].stamp, measured[10].pose, value * COVARIANCE))
     windows = run(measured[11:], smoother)
     assert np.abs(windows[-1].pose - run(measured)[-1].pose).max() < 0.02
     assert 0.5 < nees(windows, breathing, skip=0) < 2.0
@@ -114,7 +116,7 @@ def test_a_covariance_that_is_none_does_not_break_what_comes_after(value: float)
 def test_a_gap_longer_than_the_window_begins_a_new_one() -> None:
     smoother = Smoother()
     run(measure(breathing, np.arange(20) / 30, 1), smoother)
-    after = measure(breathing, 19 / 30 + LAG + 0.5 + np.arange(20) / 30, 2)
+    after = measure(breathing, 19 / 30 + WINDOW_LAG_S + 0.5 + np.arange(20) / 30, 2)
     windows = run(after, smoother)
     alone = run(after)
     assert smoother.restarts == 0
@@ -153,5 +155,53 @@ def test_the_window_holds_as_much_after_a_minute_as_after_a_second() -> None:
         sizes.append((smoother._window.getFactors().size(), len(smoother._window.timestamps())))
     factors, keys = np.array(sizes).T
     assert factors[60:].max() <= factors[30:60].max() and keys[60:].max() <= keys[30:60].max()
-    assert keys.max() <= 2 * (LAG * 30 + 2)
+    assert keys.max() <= 2 * (WINDOW_LAG_S * 30 + 2)
     assert smoother.restarts == 0
+
+
+DT = 1 / 30
+LIVELINESS_NOISE = np.array([1e-3] * 3 + [0.02] * 3)  # rad, mm
+
+
+def wander(psd: Array, count: int, seed: int) -> Array:
+    """Positions (count, 6) of a body under white-noise acceleration of density `psd` (6,)."""
+    rng = np.random.default_rng(seed)
+    root = np.linalg.cholesky(np.array([[DT**3 / 3, DT**2 / 2], [DT**2 / 2, DT]]))
+    state, out = np.zeros((2, 6)), np.zeros((count, 6))
+    for k in range(count):
+        state = np.stack([state[0] + DT * state[1], state[1]]) + (root @ rng.normal(size=(2, 6))) * np.sqrt(psd)
+        out[k] = state[0] + LIVELINESS_NOISE * rng.normal(size=6)
+    return out
+
+
+def follow(lively: AccelerationPsd, positions: Array) -> AccelerationPsd:
+    for moved in np.diff(positions, axis=0):
+        lively.add(moved, DT, LIVELINESS_NOISE**2)
+    return lively
+
+
+@pytest.mark.parametrize("rotation", [1e-4, 1e-2, 1.0])
+@pytest.mark.parametrize("translation", [1.0, 100.0, 1e4])
+def test_the_density_of_a_motion_is_found_to_a_factor_of_four(rotation: float, translation: float) -> None:
+    true = np.array([rotation] * 3 + [translation] * 3)
+    found = follow(AccelerationPsd(), wander(true, 300, 1)).psd
+    assert (np.abs(np.log(found / true)) < np.log(4)).all()
+
+
+def test_a_surface_at_rest_is_found_to_be() -> None:
+    found = follow(AccelerationPsd(), wander(np.zeros(6), 300, 2)).psd
+    assert (found[:3] < 1e-5).all() and (found[3:] < 0.3).all()
+
+
+def test_it_follows_within_a_second_when_the_motion_becomes_lively() -> None:
+    lively = follow(AccelerationPsd(), wander(np.array([1e-4] * 3 + [1.0] * 3), 200, 3))
+    before = lively.psd
+    after = follow(lively, wander(np.array([1.0] * 3 + [1e4] * 3), 30, 4)).psd
+    assert (after > 100 * before).all()
+
+
+def test_a_single_jerk_does_not_make_a_motion_lively() -> None:
+    lively = follow(AccelerationPsd(), wander(np.array([1e-4] * 3 + [1.0] * 3), 200, 5))
+    before = lively.psd
+    lively.add(np.array([0.0, 0.0, 0.0, 5.0, 0.0, 0.0]), DT, LIVELINESS_NOISE**2)
+    assert (lively.psd < 1e3 * before).all()

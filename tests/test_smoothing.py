@@ -12,14 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3, smooth
-from estimation.batch.priors import STATE, States, drive, links, transition
+from estimation.batch.priors import REFINED_PRIOR, STATE_DOF, States, jerk_covariance, prior_factors, transition
 from estimation.batch.smoothed import Smoothed
+from estimation.batch.solve import BlockTridiagonal
 from estimation.errors import InputError
 from estimation.observations import Observations, no_observations
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.smoothing.cameras import REFINED
-from estimation.smoothing.chain import Chain
 from estimation.synthetic.follow import follow
 from estimation.synthetic.world import World, synthetic_world
 from tests.slowly import slowly
@@ -45,20 +44,20 @@ def aligned(poses: Array, truth: Array) -> float:
 @settings(max_examples=12)
 def test_a_chain_with_a_border_is_inverted_as_a_whole(seed: int, count: int, size: int) -> None:
     draw = np.random.default_rng(seed)
-    n = STATE * count
+    n = STATE_DOF * count
     whole = np.zeros((n + size, n + size))
     for k in range(count):  # each factor touches two neighbours and the border
-        rows = draw.normal(size=(3 * STATE, n + size))
-        rows[:, : STATE * k] = rows[:, STATE * (k + 2) : n] = 0
+        rows = draw.normal(size=(3 * STATE_DOF, n + size))
+        rows[:, : STATE_DOF * k] = rows[:, STATE_DOF * (k + 2) : n] = 0
         whole += rows.T @ rows
     right = draw.normal(size=n)
-    blocks = whole[:n, :n].reshape(count, STATE, count, STATE)
+    blocks = whole[:n, :n].reshape(count, STATE_DOF, count, STATE_DOF)
     own = np.stack([blocks[k, :, k] for k in range(count)])
     ties = np.zeros_like(own)
     for k in range(count - 1):
         ties[k] = blocks[k, :, k + 1]
-    border = whole[:n, n:].reshape(count, STATE, size)
-    chain, gradient = Chain(count), right.reshape(count, STATE)
+    border = whole[:n, n:].reshape(count, STATE_DOF, size)
+    chain, gradient = BlockTridiagonal(count), right.reshape(count, STATE_DOF)
     cut = count // 2
     entry = np.zeros((0, 0))
     roots = [chain.take(own[:cut], ties[:cut], border[:cut], gradient[:cut])] if cut else []
@@ -66,7 +65,7 @@ def test_a_chain_with_a_border_is_inverted_as_a_whole(seed: int, count: int, siz
     roots.append(chain.take(own[cut:], ties[cut:], border[cut:], gradient[cut:]))
     inverse = np.linalg.inv(whole[:n, :n])
     covariance, after = chain.covariances()
-    expected = inverse.reshape(count, STATE, count, STATE)
+    expected = inverse.reshape(count, STATE_DOF, count, STATE_DOF)
     for k in range(count):
         assert np.allclose(covariance[k], expected[k, :, k], rtol=1e-6, atol=1e-9)
     for k in range(count - 1):
@@ -77,9 +76,9 @@ def test_a_chain_with_a_border_is_inverted_as_a_whole(seed: int, count: int, siz
     assert np.allclose(border_left.T @ border_left, schur, rtol=1e-6, atol=1e-9)
     again = chain.again((cut, count), border[cut:], entry)
     assert np.allclose(again, roots[-1])
-    response = dict(chain.responses((cut, count), again, np.zeros((STATE, size))))
+    response = dict(chain.responses((cut, count), again, np.zeros((STATE_DOF, size))))
     for k, found in response.items():
-        assert np.allclose(found, -(inverse @ border.reshape(n, size)).reshape(count, STATE, size)[k], atol=1e-7)
+        assert np.allclose(found, -(inverse @ border.reshape(n, size)).reshape(count, STATE_DOF, size)[k], atol=1e-7)
 
 
 @given(st.integers(0, 1000))
@@ -89,11 +88,11 @@ def test_the_prior_is_differentiated_exactly(seed: int) -> None:
     poses = se3.exp(draw.normal(size=(3, 6)) * [0.1, 0.1, 0.1, 5, 5, 5])
     states = States(poses, draw.normal(size=(3, 6)), draw.normal(size=(3, 6)))
     stamps = np.array([0.0, 0.04, 0.1])
-    at = links(states, stamps)
-    for k in range(STATE):
-        step = np.zeros((3, STATE))
+    at = prior_factors(states, stamps)
+    for k in range(STATE_DOF):
+        step = np.zeros((3, STATE_DOF))
         step[1, k] = 1e-6
-        change = (links(states.moved(step), stamps).off - links(states.moved(-step), stamps).off) / 2e-6
+        change = (prior_factors(states.moved(step), stamps).off - prior_factors(states.moved(-step), stamps).off) / 2e-6
         assert np.allclose(change[0], at.after[0, :, k], atol=2e-5)
         assert np.allclose(change[1], at.before[1, :, k], atol=2e-5)
 
@@ -102,9 +101,11 @@ def test_a_constant_twist_costs_nothing_and_time_may_be_cut_anywhere() -> None:
     twist = np.array([0.3, -0.2, 0.5, 20.0, -10.0, 5.0])
     stamps = np.array([0.0, 0.05, 0.2])
     states = States(se3.exp(twist * stamps[:, None]), np.tile(twist, (3, 1)), np.zeros((3, 6)))
-    assert np.abs(links(states, stamps).off).max() < 1e-9
-    both = transition(np.array(0.3)) @ drive(np.array(0.2)) @ transition(np.array(0.3)).T + drive(np.array(0.3))
-    assert np.allclose(both, drive(np.array(0.5)))
+    assert np.abs(prior_factors(states, stamps).off).max() < 1e-9
+    both = transition(np.array(0.3)) @ jerk_covariance(np.array(0.2)) @ transition(np.array(0.3)).T + jerk_covariance(
+        np.array(0.3)
+    )
+    assert np.allclose(both, jerk_covariance(np.array(0.5)))
 
 
 def test_errors_are_as_large_as_is_claimed() -> None:
@@ -144,7 +145,7 @@ def test_clocks_are_found_with_their_doubt() -> None:
 
 def test_late_cameras_and_an_imperfect_calibration_cost_less_than_50_micrometres() -> None:
     world = synthetic_world("lively", seconds=3.0, offsets=(0.016, 0.0, -0.016), calibration=0.3, seed=4)
-    result = smooth(world.rig, list(world), prior=REFINED)
+    result = smooth(world.rig, list(world), prior=REFINED_PRIOR)
     assert aligned(result.states.poses, world.truth.base_from_surface) < 0.05
 
 

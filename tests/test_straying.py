@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from estimation.online.pose_solver import SharedFit
+from estimation.online.reported_covariance import ImageShiftDrift
 from estimation.se3 import Array
-from estimation.straying import Straying
 
 CAMERAS = 3
 
@@ -25,7 +25,7 @@ def strayed(sigmas: Array, draws: int, size: float) -> float:
     rng, found, fit = np.random.default_rng(9), [], told(sigmas)
     errors = np.linalg.cholesky(np.linalg.inv(fit.information[3:, 3:]))
     for _ in range(draws):
-        straying = Straying()
+        straying = ImageShiftDrift()
         straying.start(fit, (errors @ rng.normal(size=6)).reshape(2, -1).T)
         now = size * rng.normal(size=6) + errors @ rng.normal(size=6)
         straying.learn(fit, now.reshape(2, -1).T, 1.0)
@@ -34,7 +34,7 @@ def strayed(sigmas: Array, draws: int, size: float) -> float:
 
 
 def test_before_there_is_a_first_pose_nothing_has_strayed() -> None:
-    straying = Straying()
+    straying = ImageShiftDrift()
     straying.learn(told(np.full(6, 0.01)), np.ones((CAMERAS, 2)), 1.0)
     assert straying.variance == 0.0
 

@@ -20,11 +20,8 @@ from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST, arc_rig
-from estimation.synthetic.look import observations
-from estimation.synthetic.movements import MOVEMENTS
-from estimation.synthetic.surfaces import SURFACES
-from estimation.synthetic.world import World
+from estimation.synthetic.movements import MOVEMENTS, SURFACES
+from estimation.synthetic.world import BASE_FROM_REST, World, arc_rig, observations
 from estimation.synthetic.world import synthetic_world as made
 
 ROOT = Path(__file__).parents[1]
@@ -39,7 +36,7 @@ def off(world: World, late: Array | None = None) -> list[tuple[Observations, Arr
     instants = np.zeros(len(world.rig)) if late is None else late
     found = []
     for seen in world:
-        right, _ = world.imaged(seen.stamp + instants)
+        right, _ = world.pixels_at(seen.stamp + instants)
         found.append((seen, seen.pixels - right[seen.camera, seen.track]))
     return found
 
@@ -99,12 +96,12 @@ def test_a_movement_is_smooth_and_its_twist_carries_it_on(movement: str) -> None
 def test_a_movement_moves_and_another_seed_moves_otherwise(movement: str) -> None:
     one, other = (made(movement, seconds=8.0, seed=seed).truth.base_from_surface for seed in (1, 2))
     assert np.abs(one - one[0]).max() > 0.05 and np.abs(one - other).max() > 0.01
-    assert np.linalg.norm(one[:, :3, 3] - REST[:3, 3], axis=1).max() < 40.0
+    assert np.linalg.norm(one[:, :3, 3] - BASE_FROM_REST[:3, 3], axis=1).max() < 40.0
 
 
 def test_breathing_is_as_deep_and_as_fast_as_it_is_said_to_be() -> None:
     world = made("breathing", seconds=60.0, seed=2)
-    lift = se3.transform_points(se3.inverse(REST), world.truth.base_from_surface[:, :3, 3])[:, 2]
+    lift = se3.transform_points(se3.inverse(BASE_FROM_REST), world.truth.base_from_surface[:, :3, 3])[:, 2]
     speed = np.linalg.norm(world.twists(world.stamps)[:, 3:], axis=1)
     assert 9.0 < np.ptp(lift) < 12.5 and 8.0 < speed.max() < 16.0
 
@@ -165,7 +162,7 @@ def test_so_many_observations_are_outliers(share: float) -> None:
 
 def test_coherent_tracks_stay_where_they_were_in_the_image() -> None:
     world = made("lively", seconds=2.0, coherent=0.3, noise=0.0)
-    first, _ = world.imaged(np.zeros(3))
+    first, _ = world.pixels_at(np.zeros(3))
     moved = [(np.abs(away).max(1) > 1e-9, seen) for seen, away in off(world)][30]
     stuck, seen = moved
     assert stuck.mean() == pytest.approx(0.3, abs=0.06)
@@ -211,8 +208,8 @@ def test_jitter_moves_each_camera_anew() -> None:
 @pytest.mark.parametrize("rms", [0.1, 0.3, 1.0])
 def test_the_rig_that_is_told_misses_by_as_much_as_asked(rms: float) -> None:
     world = made("still", calibration=rms, noise=0.0, seconds=0.1)
-    for camera, told in enumerate(made("still", noise=0.0, seconds=0.1).imaged(np.zeros(3))[0]):
-        away = world.imaged(np.zeros(3))[0][camera] - told
+    for camera, told in enumerate(made("still", noise=0.0, seconds=0.1).pixels_at(np.zeros(3))[0]):
+        away = world.pixels_at(np.zeros(3))[0][camera] - told
         assert np.sqrt((away**2).mean()) == pytest.approx(rms, rel=0.01)
     assert [c.name for c in world.rig.cameras] == [c.name for c in world.true_rig.cameras]
 
@@ -282,12 +279,12 @@ def test_one_look_has_the_noise_the_outliers_and_the_gaps_that_are_asked_for() -
     rig, points, draw = arc_rig(), SURFACES["patch"](400, np.random.default_rng(1)).points, np.random.default_rng(2)
     visible = np.ones((3, 400), bool)
     visible[1, 5:] = False
-    clean = observations(rig, points, REST, 0.5, draw, sigma=0.0, visible=visible)
-    seen = observations(rig, points, REST, 0.5, draw, sigma=0.3, outliers=0.1, visible=visible)
+    clean = observations(rig, points, BASE_FROM_REST, 0.5, draw, sigma=0.0, visible=visible)
+    seen = observations(rig, points, BASE_FROM_REST, 0.5, draw, sigma=0.3, outliers=0.1, visible=visible)
     assert seen.stamp == 0.5 and (seen.sigma == 0.3).all()
     assert np.bincount(seen.camera).tolist() == [400, 5, 400] and set(seen.track[seen.camera == 1]) == set(range(5))
     for number, camera in enumerate(rig.cameras):
-        ideal, _ = ideal_pixels(camera, se3.transform_points(REST, points))
+        ideal, _ = ideal_pixels(camera, se3.transform_points(BASE_FROM_REST, points))
         mine = clean.camera == number
         np.testing.assert_allclose(clean.pixels[mine], ideal[clean.track[mine]], atol=1e-9)
     error = seen.pixels - clean.pixels

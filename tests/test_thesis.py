@@ -12,16 +12,20 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import Camera, ideal_pixels, pixels_from_points
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import TARGET, arc_rig
+from estimation.synthetic.world import WOUND_CENTRE, arc_rig
 from perception.frames import Image
-from perception.thesis.axes import assign_axes, unmeasured
-from perception.thesis.displacement import displacement, turn
-from perception.thesis.features import KeyPoints
-from perception.thesis.flow import Corners
-from perception.thesis.kalman import Belief, predict, update, velocity_at_rest, velocity_seen
-from perception.thesis.pairs import Finder, Pairs
-from perception.thesis.region import BORDER, corners_of, united
-from perception.thesis.view import FlatView
+from perception.thesis.camera import (
+    FlatView,
+    GaussianState,
+    displacement,
+    initial_velocity,
+    predict,
+    turn,
+    update,
+    update_velocity,
+)
+from perception.thesis.features import REGION_BORDER_PX, Corners, Finder, KeyPoints, Pairs, corners_of, united
+from perception.thesis.step import assign_axes, unmeasured
 
 seeds = st.integers(0, 10_000)
 
@@ -33,7 +37,7 @@ def spd(rng: np.random.Generator, n: int) -> Array:
 
 @given(st.lists(st.floats(-100, 100), min_size=1, max_size=20), st.floats(0.1, 10))
 def test_the_filter_of_a_constant_is_the_mean_and_its_variance_falls_by_the_count(seen: list[float], r: float) -> None:
-    one, belief = np.eye(1), Belief(np.zeros(1), np.array([[1e9]]))
+    one, belief = np.eye(1), GaussianState(np.zeros(1), np.array([[1e9]]))
     for value in seen:
         belief = update(predict(belief, one, 0 * one), np.array([value]), one, r * one)
     assert belief.mean[0] == pytest.approx(np.mean(seen), abs=1e-4)
@@ -43,7 +47,7 @@ def test_the_filter_of_a_constant_is_the_mean_and_its_variance_falls_by_the_coun
 @given(seeds)
 def test_an_update_adds_the_measurements_information(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    before, h, r = Belief(rng.normal(size=4), spd(rng, 4)), rng.normal(size=(2, 4)), spd(rng, 2)
+    before, h, r = GaussianState(rng.normal(size=4), spd(rng, 4)), rng.normal(size=(2, 4)), spd(rng, 2)
     measured = rng.normal(size=2)
     after = update(before, measured, h, r)
     information = np.linalg.inv(before.covariance) + h.T @ np.linalg.inv(r) @ h
@@ -54,15 +58,15 @@ def test_an_update_adds_the_measurements_information(seed: int) -> None:
 
 def test_a_prediction_moves_the_mean_and_widens_by_the_noise() -> None:
     a, q = np.array([[1.0, 0.5], [0.0, 1.0]]), np.diag([0.1, 0.2])
-    later = predict(Belief(np.array([1.0, 2.0]), np.eye(2)), a, q)
+    later = predict(GaussianState(np.array([1.0, 2.0]), np.eye(2)), a, q)
     assert np.allclose(later.mean, [2.0, 2.0])
     assert np.allclose(later.covariance, a @ a.T + q)
 
 
 def test_a_steady_velocity_is_learned() -> None:
-    belief, move = velocity_at_rest(), np.array([2.0, -1.0, 0.01])
+    belief, move = initial_velocity(), np.array([2.0, -1.0, 0.01])
     for _ in range(5):
-        belief = velocity_seen(belief, move, 0.05)
+        belief = update_velocity(belief, move, 0.05)
     assert np.allclose(belief.mean, move / 0.05, rtol=0.01)
 
 
@@ -137,7 +141,7 @@ def test_the_united_box_holds_both_regions_and_stays_in_the_image(seed: int) -> 
     assert 0 <= x0 < x1 <= size[0] and 0 <= y0 < y1 <= size[1]
     both = np.concatenate(regions)
     assert (both >= [x0, y0]).all() and (both <= [x1, y1]).all()
-    assert x0 <= max(both[:, 0].min() - BORDER, 0)
+    assert x0 <= max(both[:, 0].min() - REGION_BORDER_PX, 0)
 
 
 def camera() -> Camera:
@@ -147,7 +151,7 @@ def camera() -> Camera:
 @given(seeds)
 @settings(max_examples=30)
 def test_the_flat_view_is_a_pinhole_of_its_own_matrix(seed: int) -> None:
-    points = TARGET + np.random.default_rng(seed).uniform(-40, 40, (20, 3))
+    points = WOUND_CENTRE + np.random.default_rng(seed).uniform(-40, 40, (20, 3))
     view = FlatView(camera())
     imaged, _ = pixels_from_points(camera(), points)
     ideal, _ = ideal_pixels(camera(), points)
@@ -168,10 +172,10 @@ def test_the_flat_view_shows_a_spot_where_its_pixels_say() -> None:
 
 def test_a_millimetre_at_the_surface_is_one_over_the_scale_in_pixels() -> None:
     view, rotation = FlatView(camera()), camera().base_from_camera[:3, :3]
-    points = TARGET + np.stack([np.zeros(3), rotation[:, 0], rotation[:, 1]])
+    points = WOUND_CENTRE + np.stack([np.zeros(3), rotation[:, 0], rotation[:, 1]])
     flat = view.pixels(pixels_from_points(camera(), points)[0])
     moved = np.array([flat[1, 0] - flat[0, 0], flat[2, 1] - flat[0, 1]])
-    assert np.allclose(moved * view.scale(TARGET), 1.0, rtol=1e-3)
+    assert np.allclose(moved * view.scale(WOUND_CENTRE), 1.0, rtol=1e-3)
 
 
 def test_a_picture_of_another_size_is_refused() -> None:

@@ -16,18 +16,17 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.bench import options as bench_options
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.bench import recordings as thesis
-from hardware.bench import thesis_scenes
+from hardware.bench import recordings as thesis_scenes
+from hardware.bench.subjects import MADE
 from hardware.cli.main import main
 from hardware.files.pose_file import read_poses
-from hardware.methods import METHODS
-from hardware.simulator.scenario_file import read_scenario
+from hardware.offline.track import TRACKING_METHODS
+from hardware.simulator.scenario import read_scenario
 from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet, Roi
-from perception.thesis.features import KeyPoints
-from perception.thesis.flow import Corners
+from perception.thesis.features import Corners, KeyPoints
 from perception.thesis.step import ThesisStep
 from tests.slowly import slowly
 from tests.synthetic import WIDE, Motion, frame_sets, patch, write_session
@@ -35,7 +34,7 @@ from tests.worlds import SMALL, write_scenario
 
 RIG = arc_rig(focal=550.0, size=(640, 360))
 PATCH = patch(radius=np.inf, wound=WIDE)
-ROIS = rois(PATCH, RIG, REST, 0.0)
+ROIS = rois(PATCH, RIG, BASE_FROM_REST, 0.0)
 RATE = 20.0
 
 
@@ -44,7 +43,7 @@ def moving(xi: Sequence[float]) -> Motion:
 
     def motion(stamp: float) -> Array:
         w, v = stamp * np.array(xi[:3]), stamp * np.array(xi[3:])
-        return se3.make(se3.exp_rotation(w) @ REST[:3, :3], REST[:3, 3] + v)
+        return se3.make(se3.exp_rotation(w) @ BASE_FROM_REST[:3, :3], BASE_FROM_REST[:3, 3] + v)
 
     return motion
 
@@ -181,7 +180,7 @@ def test_help_names_every_method(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["track", "--help"])
     words = " ".join(capsys.readouterr().out.split()).replace("- ", "-")  # argparse breaks lines at hyphens
-    for name, what in METHODS.items():
+    for name, what in TRACKING_METHODS.items():
         assert f"{name}: {what}" in words
 
 
@@ -190,7 +189,7 @@ def test_a_method_that_there_is_not_is_refused_with_those_there_are(capsys: pyte
         main(["track", "x", "-o", "y", "--method", "theses"])
     assert ended.value.code == 2
     said = capsys.readouterr().err
-    assert "theses" in said and all(name in said for name in METHODS)
+    assert "theses" in said and all(name in said for name in TRACKING_METHODS)
 
 
 @pytest.mark.parametrize("method", ["thesis", *slowly("thesis-flow")])
@@ -240,7 +239,7 @@ def test_the_loop_closes_with_the_thesis(tmp_path: Path) -> None:
 def test_the_bench_shows_both_on_the_same_frame_sets(tmp_path: Path) -> None:
     write_session(tmp_path / "session", seconds=0.6, rate=10.0, cameras=RIG)
     options = Namespace(sessions=[tmp_path / "session"], seconds=1.0, method="thesis")
-    figures = {f.what.removeprefix("session: "): f for f in thesis.run(options)}
+    figures = {f.what.removeprefix("session: "): f for f in thesis.run_thesis(options)}
     ours, theirs = figures["error, ours"], figures["error, thesis"]
     assert 0 < ours.value < theirs.value < 2.0
     ratio = figures["error, thesis / ours"]
@@ -250,12 +249,12 @@ def test_the_bench_shows_both_on_the_same_frame_sets(tmp_path: Path) -> None:
 
 
 def test_the_recordings_that_can_be_asked_for_are_those_that_can_be_made() -> None:
-    assert tuple(thesis_scenes.MADE) == bench_options.MADE
+    assert tuple(thesis_scenes.MADE_RECORDINGS) == MADE
 
 
-@pytest.mark.parametrize("name", [name for name, (body, _) in thesis_scenes.MADE.items() if body is None])
+@pytest.mark.parametrize("name", [name for name, (body, _) in thesis_scenes.MADE_RECORDINGS.items() if body is None])
 def test_a_made_recording_is_the_same_each_time_and_moves(name: str) -> None:
-    shown = thesis_scenes.made(name, 2.0)
+    shown = thesis_scenes.made_recording(name, 2.0)
     first = [next(iter(shown.frame_sets())) for _ in range(2)]
     for a, b in zip(first[0].frames, first[1].frames, strict=True):
         assert np.array_equal(a.image, b.image)

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from estimation.rig import Rig
-from estimation.synthetic.arc_rig import arc_rig
-from hardware.channels import read_events
-from hardware.channels import read_poses as read_recorded_poses
+from estimation.synthetic.world import arc_rig
 from hardware.cli.main import main
 from hardware.files.folder_tables import write_frames
 from hardware.files.pose_file import read_poses
 from hardware.files.rig_file import ImageSource, write_rig
-from hardware.files.session import FrameRef, open_session
-from hardware.track_recorder import TrackRecorder
+from hardware.files.session import FrameRef
+from hardware.offline.convert import TrackRecorder
+from hardware.recording.session_reader import open_session, read_events
+from hardware.recording.session_reader import read_poses as read_recorded_poses
 from tests.runs import Replayed
 from tests.session_files import change
 from tests.started import started

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from estimation.observations import Observations
-from estimation.online.fit import scatter
+from estimation.online.fit import residual_scatter
 from estimation.online.pose_solver import PoseFit
+from estimation.online.reported_covariance import TrackNoise
 from estimation.se3 import Array
-from estimation.track_noise import TrackNoise
 
 COUNT, CAMERAS = 120, 3
 SIGMA = np.full(COUNT, 0.25)
@@ -58,11 +58,13 @@ def test_before_anything_is_seen_all_is_new() -> None:
 @pytest.mark.parametrize("size", [0.1, 0.3, 1.0])
 def test_the_scatter_is_that_of_the_residuals(size: float) -> None:
     rng = np.random.default_rng(3)
-    found = [scatter(seen(0.0), fitted(size * SIGMA[:, None] * rng.normal(size=(COUNT, 2)))) for _ in range(40)]
+    found = [
+        residual_scatter(seen(0.0), fitted(size * SIGMA[:, None] * rng.normal(size=(COUNT, 2)))) for _ in range(40)
+    ]
     assert np.mean(found) == pytest.approx(size**2, rel=0.1, abs=0.12)
 
 
 def test_wrong_tracks_hardly_count_in_the_scatter() -> None:
     residuals = 0.3 * SIGMA[:, None] * np.random.default_rng(4).normal(size=(COUNT, 2))
     residuals[: COUNT // 10] = 20.0
-    assert scatter(seen(0.0), fitted(residuals)) < 0.3
+    assert residual_scatter(seen(0.0), fitted(residuals)) < 0.3

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from estimation import se3
+from estimation.online.surface_state import StateSettings
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from estimation.state_machine import StateSettings
-from estimation.synthetic.arc_rig import REST, TARGET, arc_rig
+from estimation.synthetic.world import BASE_FROM_REST, WOUND_CENTRE, arc_rig
 from hardware.simulator.scene.scene import Scene, rois
-from perception.features import grey
 from perception.frames import Frame, FrameSet, Image, Roi
+from perception.matching.features import grey
 from perception.tracking.step import STAGES, TrackingStep
 from tests.slowly import slowly
 from tests.synthetic import AWAY, CLEAN, Motion, breathing, frame_sets, patch, pictures
@@ -209,11 +209,11 @@ def test_a_hidden_surface_is_never_called_tracked(sets: list[FrameSet], hidden: 
     assert states(poses[18:]) == {TrackState.TRACKING} and errors(poses)[18:].max() < 0.15
 
 
-AWAY_AT_ONCE = REST @ se3.exp(np.array([0.02, 0.02, 0.02, 4.0, 3.0, 1.0]))
+AWAY_AT_ONCE = BASE_FROM_REST @ se3.exp(np.array([0.02, 0.02, 0.02, 4.0, 3.0, 1.0]))
 
 
 def jolted(stamp: float) -> Array:
-    return AWAY_AT_ONCE if stamp > 1.35 else REST
+    return AWAY_AT_ONCE if stamp > 1.35 else BASE_FROM_REST
 
 
 @pytest.fixture(scope="module")
@@ -309,8 +309,11 @@ def test_without_a_region_whatever_two_cameras_see_is_the_surface(sets: list[Fra
 
 @pytest.mark.slow
 def test_a_surface_at_rest_stays_at_rest() -> None:
-    poses = run(shot(lambda stamp: REST, STAMPS[:20], 5))
-    assert states(poses[FIRST:]) == {TrackState.TRACKING} and errors(poses, lambda stamp: REST)[FIRST:].max() < 0.03
+    poses = run(shot(lambda stamp: BASE_FROM_REST, STAMPS[:20], 5))
+    assert (
+        states(poses[FIRST:]) == {TrackState.TRACKING}
+        and errors(poses, lambda stamp: BASE_FROM_REST)[FIRST:].max() < 0.03
+    )
     assert max(np.linalg.norm(p.twist[3:]) for p in poses[5:]) < 0.3
 
 
@@ -343,7 +346,7 @@ def test_a_camera_that_runs_late_makes_the_claim_wider_not_wrong() -> None:
     """Camera 2 is exposed 20 ms late: at 25 mm/s that is half a millimetre of disagreement."""
 
     def swinging(stamp: float) -> Array:
-        return REST @ se3.exp(np.array([0, 0, 0, 8.0 * np.sin(3 * stamp), 0, 4.0 * np.sin(2 * stamp)]))
+        return BASE_FROM_REST @ se3.exp(np.array([0, 0, 0, 8.0 * np.sin(3 * stamp), 0, 4.0 * np.sin(2 * stamp)]))
 
     on_time, late = shot(swinging, STAMPS, 2), shot(lambda t: swinging(t + 0.02), STAMPS, 2)
     mixed = [FrameSet(a.stamp, (*a.frames[:2], b.frames[2])) for a, b in zip(on_time, late, strict=True)]
@@ -369,7 +372,7 @@ def test_a_hand_over_half_the_surface_does_not_pull_at_it(sets: list[FrameSet]) 
     """A still thing covers what lies on one side of the patch's middle, in every camera."""
 
     def covered(camera: int, image: Image) -> Image:
-        middle = round(float(cv2.projectPoints(TARGET[None], *_view(camera))[0][0, 0, 0]))
+        middle = round(float(cv2.projectPoints(WOUND_CENTRE[None], *_view(camera))[0][0, 0, 0]))
         cover = np.random.default_rng(camera).integers(40, 200, (60, 80, 3), np.uint8)
         big = cv2.resize(cover, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_CUBIC)
         return np.where((np.arange(image.shape[1]) > middle)[None, :, None], big, image)

@@ -12,20 +12,31 @@ torch = pytest.importorskip("torch", reason="torch is in the extra [train]")
 pytest.importorskip("onnx", reason="onnx is in the extra [train]")
 
 from estimation.errors import StillbedError
-from perception.coarse_to_fine import Looks
-from perception.training.augmentation import Augmentation, pyramid
-from perception.training.choosing import chosen_settings
+from perception.training.augmentation import Augmentation, sample_pyramid
 from perception.training.export import export
-from perception.training.loop import Curve, Recipe, Schedule, Source, as_function, mean_dice, rate_at, train
-from perception.training.losses import wound_loss
-from perception.training.networks import ThesisUNet, WoundNet, made, size_of
-from perception.wound.network import Settings, WoundNetwork
+from perception.training.loop import (
+    Curve,
+    Recipe,
+    Schedule,
+    Source,
+    ThesisUNet,
+    WoundNet,
+    as_function,
+    build_network,
+    mean_dice,
+    parameter_count,
+    rate_at,
+    train,
+    wound_loss,
+)
+from perception.training.metrics import chosen_settings
+from perception.wound.network import Looks, Settings, WoundNetwork
 from tests.test_training_data import labelled
 
 RECIPE = Recipe(Augmentation(side=64, long_side=96.0))
 SCHEDULE = Schedule(rounds=2, steps=3, batch=4, small=0.0, seed=7)
 PICTURES = [labelled(seed) for seed in range(4)]
-SOURCE = Source([pyramid(each) for each in PICTURES], np.ones(4))
+SOURCE = Source([sample_pyramid(each) for each in PICTURES], np.ones(4))
 
 
 def small() -> WoundNet:
@@ -101,9 +112,9 @@ def test_a_network_that_cannot_be_rounded_is_refused(tmp_path: Path) -> None:
 def test_both_networks_keep_the_size_and_ours_is_below_three_million() -> None:
     planes = torch.zeros(1, 3, 64, 96)
     for name in ("wound", "thesis"):
-        network = made(name, 1).eval()
+        network = build_network(name, 1).eval()
         assert network(planes).shape == (1, 1, 64, 96)
-    assert size_of(WoundNet()) < 3e6 < size_of(ThesisUNet())
+    assert parameter_count(WoundNet()) < 3e6 < parameter_count(ThesisUNet())
 
 
 def test_the_mean_dice_of_a_network_that_says_no_is_nothing() -> None:

@@ -1,7 +1,11 @@
-"""What the wound network learns from: labelled pictures, groups that show one wound, samples and covers."""
+"""What the wound network learns from: labelled pictures, groups that show one wound, samples and covers. Segmentation
+by shape: the thesis's own method, and the one that ranks outlines by colour and shape. Tracking that looks for the
+wound first, where nobody has said where the surface is.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -11,15 +15,42 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from perception.training.augmentation import Augmentation, pyramid, sample
-from perception.training.dataset import Labelled, read_dataset
-from perception.training.groups import groups, split
-from perception.training.healthy import MARGIN, SIDES, healthy_pieces
-from perception.training.judging import half_covered, half_covered_fall, scores, silent
-from perception.training.light import relit
-from perception.training.occluders import covered
-from perception.wound.segmentation import Segmentation
+from estimation.pose import TrackState
+from estimation.scans.scan import scan_from_triangles
+from perception.frames import FrameSet, Image, Roi
+from perception.matching.features import polygon_mask
+from perception.tracking.step import TrackingStep
+from perception.tracking.wound_step import MAX_EMPTY_LOOKS, WoundTrackingStep
+from perception.training.augmentation import Augmentation, cover_sample, draw_sample, relight, sample_pyramid
+from perception.training.dataset import (
+    PIECE_SIDES_PX,
+    WOUND_MARGIN_PX,
+    Labelled,
+    healthy_pieces,
+    hold_out_groups,
+    picture_groups,
+    read_dataset,
+)
+from perception.training.metrics import dice_before_and_after_cover, half_covered, scores, silent_share
+from perception.wound.network import shipped_model
+from perception.wound.segmentation import SHEET_CELL_PX, SHEET_COLUMNS, JudgedPicture, Segmentation, contact_sheet, dice
+from perception.wound.shape_matching import (
+    COLOUR_TERMS,
+    OUTLINE_FEATURES,
+    RANK_TERMS,
+    ShapeSegmenter,
+    find_outlines,
+    largest_outline,
+    outline_features,
+    products,
+    read_shape_model,
+    refine_outline,
+    scan_outline,
+    small_picture,
+    thesis_mask,
+)
 from tests.test_segmentation import disc, picture
+from tests.test_tracking import RIG, ROIS, run, same, shot
 
 
 def labelled(seed: int, wounded: bool = True, size: tuple[int, int] = (240, 320)) -> Labelled:
@@ -78,7 +109,7 @@ def test_copies_mirror_images_and_shifted_views_are_one_group_and_strangers_are_
     mirrored = Labelled("m", np.ascontiguousarray(first.picture[:, ::-1]), first.wound[:, ::-1])
     turned = Labelled("t", np.ascontiguousarray(np.rot90(first.picture)), np.rot90(first.wound))
     shifted = Labelled("s", np.roll(first.picture, 6, 1), np.roll(first.wound, 6, 1))
-    number = groups([first, stranger, mirrored, turned, shifted])
+    number = picture_groups([first, stranger, mirrored, turned, shifted])
     assert len({number[k] for k in (0, 2, 3, 4)}) == 1
     assert number[1] != number[0]
 
@@ -87,7 +118,7 @@ def test_copies_mirror_images_and_shifted_views_are_one_group_and_strangers_are_
 @given(st.lists(st.integers(0, 12), min_size=1, max_size=60), st.integers(0, 40), st.integers(0, 99))
 def test_a_split_never_parts_a_group_and_holds_out_enough(numbers: list[int], wanted: int, seed: int) -> None:
     group = np.array(numbers)
-    held = split(group, wanted, np.random.default_rng(seed))
+    held = hold_out_groups(group, wanted, np.random.default_rng(seed))
     assert held.sum() >= min(wanted, len(group))
     assert not set(group[held]) & set(group[~held])
 
@@ -95,10 +126,10 @@ def test_a_split_never_parts_a_group_and_holds_out_enough(numbers: list[int], wa
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6), st.booleans())
 def test_a_sample_has_its_size_and_its_wound_stays_on_the_wound(seed: int, wounded: bool) -> None:
-    source = pyramid(labelled(seed, wounded))
+    source = sample_pyramid(labelled(seed, wounded))
     how = Augmentation(cover=0.0)
     rng = np.random.default_rng(seed)
-    seen, wound = sample(source, source, how, rng)
+    seen, wound = draw_sample(source, source, how, rng)
     assert seen.shape == (192, 192, 3) and wound.shape == (192, 192)
     if not wounded:
         assert not wound.any()
@@ -111,8 +142,8 @@ def test_a_sample_has_its_size_and_its_wound_stays_on_the_wound(seed: int, wound
 
 
 def test_samples_are_the_same_for_the_same_seed() -> None:
-    source = pyramid(labelled(5))
-    first, second = (sample(source, source, Augmentation(), np.random.default_rng(9)) for _ in range(2))
+    source = sample_pyramid(labelled(5))
+    first, second = (draw_sample(source, source, Augmentation(), np.random.default_rng(9)) for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
 
 
@@ -121,7 +152,7 @@ def test_what_is_covered_is_no_wound_and_the_rest_is_left_alone() -> None:
     mask = each.wound.astype(np.uint8) * np.uint8(255)
     changed = 0
     for seed in range(20):
-        seen, wound = covered(each.picture, mask, each.picture, np.random.default_rng(seed))
+        seen, wound = cover_sample(each.picture, mask, each.picture, np.random.default_rng(seed))
         assert not (wound > mask).any()
         gone = (mask > 0) & (wound == 0)
         changed += gone.any()
@@ -132,7 +163,7 @@ def test_what_is_covered_is_no_wound_and_the_rest_is_left_alone() -> None:
 
 def test_light_changes_colours_and_not_places() -> None:
     each = labelled(4)
-    means = [relit(each.picture, np.random.default_rng(seed)).mean() for seed in range(12)]
+    means = [relight(each.picture, np.random.default_rng(seed)).mean() for seed in range(12)]
     assert np.std(means) > 5
 
 
@@ -141,9 +172,9 @@ def test_healthy_pieces_keep_away_from_the_wound() -> None:
     pieces = healthy_pieces(pictures, np.random.default_rng(0), 4)
     assert 0 < len(pieces) <= 4
     for piece in pieces:
-        assert SIDES[0] <= piece.shape[0] <= SIDES[1]
+        assert PIECE_SIDES_PX[0] <= piece.shape[0] <= PIECE_SIDES_PX[1]
         redness = piece[..., 0].astype(int) - piece[..., 1]
-        assert (redness > 120).mean() < 0.001, f"wound within {MARGIN} px"
+        assert (redness > 120).mean() < 0.001, f"wound within {WOUND_MARGIN_PX} px"
 
 
 @given(st.integers(0, 10**6))
@@ -165,6 +196,178 @@ def test_a_segmenter_that_knows_the_truth_scores_one_and_one_that_sees_wounds_ev
 
     assert scores(red, pictures, lambda done, of: None) == pytest.approx([1, 1], abs=0.01)
     assert scores(everything, pictures, lambda done, of: None)[1] == 0
-    assert silent(red, [pictures[1].picture]) == 1 and silent(everything, [pictures[1].picture]) == 0
-    before, after = half_covered_fall(red, pictures, np.random.default_rng(0))
+    assert silent_share(red, [pictures[1].picture]) == 1 and silent_share(everything, [pictures[1].picture]) == 0
+    before, after = dice_before_and_after_cover(red, pictures, np.random.default_rng(0))
     assert before == pytest.approx(1, abs=0.01) and after == pytest.approx(1, abs=0.02)
+
+
+def ellipse(size: tuple[int, int], centre: tuple[int, int], axes: tuple[int, int], angle: float = 0) -> np.ndarray:
+    mask = np.zeros(size, np.uint8)
+    cv2.ellipse(mask, centre, axes, angle, 0, 360, 1, -1)
+    return mask > 0
+
+
+def test_the_thesis_method_finds_the_drawn_shape_among_others() -> None:
+    image = np.full((300, 400), 200, np.uint8)
+    wanted, other = ellipse((300, 400), (100, 150), (60, 20)), ellipse((300, 400), (280, 150), (45, 40))
+    image[wanted | other] = 90
+    found = thesis_mask(image, largest_outline(ellipse((200, 200), (100, 100), (90, 30), 40)))
+    assert dice(found, wanted) > 0.85
+    assert dice(thesis_mask(image, largest_outline(ellipse((200, 200), (100, 100), (90, 80)))), other) > 0.85
+
+
+def test_the_outlines_of_a_coloured_disc_hold_the_disc_itself() -> None:
+    model = read_shape_model(shipped_model("shape", ".toml"))
+    image, truth = picture((120, 90), 30, (200, 256))
+    scene = small_picture(np.ascontiguousarray(image[..., ::-1]), model.colour)
+    best = 0.0
+    for outline in find_outlines(scene):
+        mask = np.zeros(truth.shape, np.uint8)
+        cv2.drawContours(mask, [outline], -1, 1, -1)
+        best = max(best, dice(mask > 0, truth))
+        assert outline_features(scene, outline, list(model.patterns), None).shape == (OUTLINE_FEATURES,)
+    assert best > 0.95
+
+
+def test_a_description_does_not_depend_on_the_patterns_scale_or_turn() -> None:
+    image, _ = picture((120, 90), 30, (200, 256))
+    scene = small_picture(
+        np.ascontiguousarray(image[..., ::-1]), read_shape_model(shipped_model("shape", ".toml")).colour
+    )
+    outline = find_outlines(scene)[0]
+    small, large = (largest_outline(ellipse((400, 400), (200, 200), (20 * k, 8 * k), 30 * k)) for k in (2, 5))
+    assert np.allclose(
+        outline_features(scene, outline, [small], None), outline_features(scene, outline, [large], None), atol=0.1
+    )
+
+
+def test_an_edge_that_was_drawn_too_wide_settles_where_the_colours_part() -> None:
+    image, truth = picture((120, 90), 30, (200, 256))
+    lab = cv2.cvtColor(image, cv2.COLOR_BGR2LAB).astype(np.float32)
+    wide = largest_outline(disc((200, 256), (120, 90), 33))
+    assert dice(refine_outline(lab, wide), truth) > dice(disc((200, 256), (120, 90), 33), truth)
+
+
+def test_the_segmenter_answers_with_a_mask_of_the_pictures_size_and_the_same_twice() -> None:
+    segmenter = ShapeSegmenter(read_shape_model(shipped_model("shape", ".toml")))
+    image, _ = picture((300, 200), 60)
+    first, second = segmenter(image), segmenter(image)
+    assert first.mask.shape == (480, 640)
+    assert np.array_equal(first.mask, second.mask) and first.confidence == second.confidence
+
+
+def test_a_picture_of_one_colour_shows_no_wound() -> None:
+    found = ShapeSegmenter(read_shape_model(shipped_model("shape", ".toml")))(np.full((90, 120, 3), 128, np.uint8))
+    assert not found.found
+
+
+def test_the_outline_of_a_scan_is_its_topmost_layers() -> None:
+    """The thesis's own simulated scan: elliptic, radii (0.25, 0.8) on top and (0.1, 0.15) below, 0.3 deep."""
+    angle, depth = np.meshgrid(np.linspace(0, 2 * np.pi, 60, endpoint=False), np.linspace(0, 1, 40))
+    wide, long = 0.25 - 0.15 * depth, 0.8 - 0.65 * depth
+    points = np.stack([wide * np.cos(angle), long * np.sin(angle), -0.3 * depth], -1).reshape(-1, 3) * 40
+    triangles = [(i, i + 1, i + 60) for i in range(len(points) - 61)]
+    pattern, area = scan_outline(scan_from_triangles(points, np.array(triangles)))
+    _, _, width, height = cv2.boundingRect(pattern)
+    assert width / height == pytest.approx(0.25 / 0.8, rel=0.1)
+    assert area == pytest.approx(np.pi * 10 * 32, rel=0.05)
+
+
+def test_a_model_that_is_none_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "shape.toml"
+    for text in ("", "colour = 3", "colour = [1.0]\nrank = [1.0]\nrank_usual = [1.0]\ntrust = 0.4\npatterns = []"):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match="shape model"):
+            read_shape_model(file)
+
+
+def model_text(trust: str = "0.4", colour: str = "1.0", corner: str = "1") -> str:
+    rank = ", ".join(["1.0"] * RANK_TERMS)
+    lists = f"colour = [{', '.join([colour] * COLOUR_TERMS)}]\nrank = [{rank}]\nrank_usual = [{rank}]\n"
+    return f"trust = {trust}\n{lists}patterns = [[[{corner}, 1], [2, 2], [3, 1]]]\n"
+
+
+def test_a_model_with_a_number_that_is_not_finite_or_too_large_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "shape.toml"
+    file.write_text(model_text(), encoding="utf-8")
+    assert len(read_shape_model(file).patterns) == 1
+    wrong = [{key: word} for key in ("trust", "colour", "corner") for word in ("inf", "nan", "9" * 400)]
+    for each in [*wrong, {"corner": "9" * 30}]:
+        file.write_text(model_text(**each), encoding="utf-8")
+        with pytest.raises(InputError, match="shape model"):
+            read_shape_model(file)
+
+
+def test_products_are_all_pairs_and_begin_with_one() -> None:
+    assert np.array_equal(products(np.array([[2.0, 3.0]])), [[1, 2, 3, 4, 6, 9]])
+
+
+class Sees:
+    """A segmenter that knows where the surface is; `cameras` are those in which it finds it."""
+
+    def __init__(self, sets: Sequence[FrameSet], cameras: Sequence[int]) -> None:
+        self._camera = {id(f.image): f.camera for frames in sets for f in frames.frames}
+        self._cameras = cameras
+
+    def __call__(self, image: Image) -> Segmentation:
+        camera = self._camera[id(image)]
+        mask = polygon_mask(RIG.cameras[camera].size, ROIS[camera].polygon) > 0
+        found = camera in self._cameras
+        return Segmentation(mask & found, float(found), 0.7 if found else np.nan)
+
+
+def first_step(sets: Sequence[FrameSet], cameras: Sequence[int]) -> tuple[WoundTrackingStep, list[tuple[Roi, ...]]]:
+    asked: list[tuple[Roi, ...]] = []
+
+    def made(rois: Sequence[Roi]) -> TrackingStep:
+        asked.append(tuple(rois))
+        return TrackingStep(RIG, rois)
+
+    return WoundTrackingStep(RIG, made, Sees(sets, cameras)), asked
+
+
+def test_the_surface_is_tracked_where_the_wound_was_seen() -> None:
+    sets = shot(stamps=np.arange(9) / 10)
+    step, asked = first_step(sets, (0, 1, 2))
+    poses = []
+    for frames in sets:
+        poses.append(step(frames))
+        step.idle()
+    assert [p.state for p in poses[:3]] == [TrackState.INITIALISING] * 3
+    assert "looked for" in poses[0].reason
+    assert poses[-1].state is TrackState.TRACKING
+    (rois,) = asked
+    for roi, told in zip(rois, ROIS, strict=True):
+        size = np.array(RIG.cameras[roi.camera].size)
+        inside = np.clip(told.polygon, 0, size - 1)
+        assert (roi.polygon.min(0) <= inside.min(0)).all() and (roi.polygon.max(0) >= inside.max(0)).all()
+    assert all(same(a, b) for a, b in zip(poses[3:], run(sets[3:], rois), strict=True))
+
+
+@pytest.mark.slow
+def test_without_a_wound_in_two_cameras_the_whole_pictures_are_taken() -> None:
+    sets = shot(stamps=np.arange(3 * MAX_EMPTY_LOOKS + 1) / 10)
+    step, asked = first_step(sets, (1,))
+    for frames in sets:
+        step(frames)
+    assert asked == [()]
+
+
+@pytest.mark.slow
+def test_a_camera_that_does_not_see_the_wound_is_searched_whole() -> None:
+    sets = shot(stamps=np.arange(4) / 10)
+    step, asked = first_step(sets, (0, 2))
+    for frames in sets:
+        step(frames)
+    ((first, second, third),) = asked
+    assert np.array_equal(second.polygon.max(0), RIG.cameras[1].size)
+    assert (third.polygon.max(0) < RIG.cameras[2].size).any() and first.stamp == sets[0].stamp
+
+
+def test_a_contact_sheet_has_three_rows_however_few_pictures_there_are() -> None:
+    image, truth = picture((60, 50), 20, (100, 120))
+    shown = [JudgedPicture(image, Segmentation(disc((100, 120), (60, 50), r), 0.9, 0.7), truth) for r in (20, 10, 4)]
+    assert contact_sheet(shown).shape == (3 * SHEET_CELL_PX, SHEET_COLUMNS * SHEET_CELL_PX, 3)
+    assert (
+        contact_sheet([JudgedPicture(image, Segmentation(truth & False, 0.0, np.nan), truth & False)]).dtype == np.uint8
+    )

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST
-from hardware.simulator.deformation import Deformation
+from estimation.synthetic.world import BASE_FROM_REST
 from hardware.simulator.motion_table import motion_from_tables
+from hardware.simulator.scene.shape import Deformation
 from hardware.simulator.truth import Truth
 
 MOTION = motion_from_tables(
@@ -41,14 +41,14 @@ def nozzles(points: Array) -> Array:
 
 @given(places, instants, st.sampled_from([np.eye(4), GRID]))
 def test_material_is_the_inverse_of_checkpoints(place: Array, instant: float, grid: Array) -> None:
-    truth, times = Truth(REST, surface_from_grid=grid, **SMOOTH), np.array([instant])  # type: ignore[arg-type]
+    truth, times = Truth(BASE_FROM_REST, surface_from_grid=grid, **SMOOTH), np.array([instant])  # type: ignore[arg-type]
     base_from_target = truth.checkpoints(times, nozzles(place[None]))
     assert truth.material(times, base_from_target[:, :3, 3]) == pytest.approx(place[None], abs=1e-8)
 
 
 @given(places, instants, st.sampled_from([np.eye(4), GRID]))
 def test_a_checkpoint_is_a_rigid_pose_where_the_displacement_says(place: Array, instant: float, grid: Array) -> None:
-    truth, times = Truth(REST, surface_from_grid=grid, **SMOOTH), np.array([instant])  # type: ignore[arg-type]
+    truth, times = Truth(BASE_FROM_REST, surface_from_grid=grid, **SMOOTH), np.array([instant])  # type: ignore[arg-type]
     (target,) = truth.checkpoints(times, nozzles(place[None]))
     assert se3.is_transform(target)
     amount = float(np.sin(2 * instant))
@@ -60,7 +60,7 @@ def test_a_checkpoint_is_a_rigid_pose_where_the_displacement_says(place: Array, 
 @given(places, instants)
 def test_the_tool_turns_with_the_skin_under_it(place: Array, instant: float) -> None:
     """A polar rotation is the one nearest to the gradient: what is left of the gradient is symmetric."""
-    truth = Truth(REST, **SMOOTH)  # type: ignore[arg-type]
+    truth = Truth(BASE_FROM_REST, **SMOOTH)  # type: ignore[arg-type]
     times, amount = np.array([instant]), np.sin(2 * np.array([instant]))
     nozzle = nozzles(place[None])
     turn = (se3.inverse(truth.base_from_surface(times)) @ truth.checkpoints(times, nozzle))[0, :3, :3] @ nozzle[
@@ -77,14 +77,18 @@ def test_the_tool_turns_with_the_skin_under_it(place: Array, instant: float) -> 
 
 def test_without_strain_a_checkpoint_is_carried_rigidly() -> None:
     times, nozzle = np.linspace(0, 5, 7), nozzles(np.arange(21.0).reshape(7, 3))
-    for truth in (Truth(REST, MOTION), Truth(REST, MOTION, SKIN), Truth(REST, MOTION, SKIN, np.zeros_like)):
+    for truth in (
+        Truth(BASE_FROM_REST, MOTION),
+        Truth(BASE_FROM_REST, MOTION, SKIN),
+        Truth(BASE_FROM_REST, MOTION, SKIN, np.zeros_like),
+    ):
         assert np.array_equal(truth.checkpoints(times, nozzle), truth.base_from_surface(times) @ nozzle)
 
 
 def test_checkpoints_are_not_changed_by_asking() -> None:
     nozzle = nozzles(np.ones((3, 3)))
     before = nozzle.copy()
-    Truth(REST, **SMOOTH).checkpoints(np.array([0.3, 0.6, 0.9]), nozzle)  # type: ignore[arg-type]
+    Truth(BASE_FROM_REST, **SMOOTH).checkpoints(np.array([0.3, 0.6, 0.9]), nozzle)  # type: ignore[arg-type]
     assert np.array_equal(nozzle, before)
 
 
@@ -100,7 +104,7 @@ def test_a_pure_stretch_turns_no_tool_and_a_bulge_leans_it_outwards() -> None:
 
 
 def test_the_twist_is_the_derivative_of_the_pose() -> None:
-    truth, times, h = Truth(REST, MOTION), np.linspace(0.5, 9.0, 20), 1e-5
+    truth, times, h = Truth(BASE_FROM_REST, MOTION), np.linspace(0.5, 9.0, 20), 1e-5
     there, ahead, behind = (truth.base_from_surface(times + dt) for dt in (0, h, -h))
     assert truth.twist(times) == pytest.approx(se3.log(se3.inverse(behind) @ ahead) / (2 * h), abs=1e-4)
     assert there.shape == (20, 4, 4)

@@ -1,4 +1,6 @@
-"""`stillbed view`: each instant shows what was recorded, in a real browser too; strangers are refused."""
+"""`stillbed view`: each instant shows what was recorded, in a real browser too. Strangers are refused. `stillbed
+compare`: evo's own numbers, from every kind of file, and one clear error for what cannot be compared.
+"""
 
 from __future__ import annotations
 
@@ -13,21 +15,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import Browser, executable
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.synthetic.follow import steps
+from estimation.errors import InputError
+from estimation.pose import Trajectory
+from estimation.se3 import Array
+from estimation.synthetic.follow import follow_steps
 from estimation.synthetic.world import synthetic_world
 from hardware.cli.main import WRONG_INPUT, main
+from hardware.files.folder_tables import write_tum
 from hardware.files.path_file import write_path
-from hardware.offline.viewer import PictureBook, Playback, open_playback
+from hardware.offline.compare import ALIGNMENTS, compare, error_statistics
+from hardware.offline.trajectory_files import PoseSeries, read_pose_series
+from hardware.offline.viewer import PictureReader, Playback, instant_text, open_playback, serve, session_text
 from hardware.operator.settings import OperatorSettings
 from hardware.recording.recorder import Recorder
-from hardware.viewing.server import instant_text, serve, session_text
 from perception.frames import Frame
+from tests.browser import Browser, executable
 from tests.moving import raster
-from tests.recorded import whole_recording
-from tests.session_files import make_folder
+from tests.recorded import pose, whole_recording
+from tests.runs import breathing
+from tests.session_files import image, make_folder, rig
 
 CHROMIUM = executable()
 COUNT = 24
@@ -40,7 +50,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     world = synthetic_world("lively", seconds=COUNT / 20, rate=20.0, count=40)
     with Recorder(path, world.rig) as recorder:
         recorder.truth(world.truth)
-        for k, step in enumerate(steps(world, "seen")):
+        for k, step in enumerate(follow_steps(world, "seen")):
             for camera in range(3):
                 recorder.frame(Frame(camera, step.pose.stamp, np.full((720, 1280), 40 + 8 * k, np.uint8)))
             recorder.write(step.seen)
@@ -76,7 +86,7 @@ def got(address: str, **headers: str) -> bytes:
 
 def test_each_instant_has_its_own_pose_tracks_and_pictures(playback: Playback) -> None:
     assert playback.source == "live" and len(playback) == COUNT
-    book = PictureBook(playback)
+    book = PictureReader(playback)
     for k in (5, 20, 6):  # back as well
         pose, seen = playback.poses[k], playback.tracks[k]
         assert pose is not None and seen is not None
@@ -128,7 +138,7 @@ def test_a_picture_that_cannot_be_read_is_said(tmp_path: Path) -> None:
     shown = open_playback(folder)
     pictures = sorted(p for p in folder.rglob("*.png"))
     pictures[-1].write_bytes(b"no picture")
-    book, failed = PictureBook(shown), 0
+    book, failed = PictureReader(shown), 0
     for k in range(len(shown)):
         try:
             book(k)
@@ -184,3 +194,177 @@ def test_the_slider_moves_the_scene(address: str) -> None:
 def test_a_recording_without_tracks_has_no_surface(tmp_path: Path) -> None:
     shown = open_playback(whole_recording(tmp_path))
     assert shown.source == "live" and len(shown.scene.surface) == 0
+
+
+STAMPS = np.arange(90) / 30
+
+
+def posed(poses: Array, covariance: Array | None = None, stamps: Array = STAMPS) -> PoseSeries:
+    unknown = np.full((len(poses), 6, 6), np.nan)
+    return PoseSeries("made.tum", Trajectory(stamps, poses, exact=True), unknown if covariance is None else covariance)
+
+
+def moved(seed: int, sigma: float = 0.02) -> tuple[Array, Array]:
+    """Truth, and what a run in another base and on another surface frame makes of it."""
+    draw = np.random.default_rng(seed)
+    truth = breathing(STAMPS)
+    noise = se3.exp(draw.normal(size=(len(STAMPS), 6)) * sigma * np.repeat([0.01, 1.0], 3))
+    base, surface = (se3.exp(draw.normal(size=6) * np.repeat([0.1, 5.0], 3)) for _ in range(2))
+    return truth, base @ truth @ noise @ surface
+
+
+@pytest.mark.parametrize("aligned", [False, True])
+@pytest.mark.parametrize("delta", [1, 4])
+def test_the_figures_are_evos(aligned: bool, delta: int) -> None:
+    from evo.core import metrics
+    from evo.core.trajectory import PoseTrajectory3D
+
+    truth, found = moved(delta)
+    theirs, reference = (PoseTrajectory3D(poses_se3=list(p), timestamps=STAMPS) for p in (found, truth))
+    if aligned:
+        theirs.align(reference, correct_scale=False)
+    ours = compare(posed(found), posed(truth), delta).of(ALIGNMENTS[int(aligned)])
+    assert ours is not None
+    parts = metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad
+    for part, absolute, relative in zip(
+        parts,
+        (ours.absolute.translation, ours.absolute.rotation),
+        (ours.relative.translation, ours.relative.rotation),
+        strict=True,
+    ):
+        for metric, values in (
+            (metrics.APE(part), absolute),
+            (metrics.RPE(part, delta, metrics.Unit.frames, all_pairs=False), relative),
+        ):
+            metric.process_data((reference, theirs))
+            for name, value in metric.get_all_statistics().items():
+                assert getattr(error_statistics(values), name) == pytest.approx(value, rel=1e-6, abs=1e-9), (name, part)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_moving_the_base_or_the_surface_frame_changes_only_what_it_may(seed: int) -> None:
+    truth, found = moved(seed)
+    shift = se3.exp(np.random.default_rng(seed + 1).normal(size=6) * np.repeat([0.3, 20.0], 3))
+    plain, base, surface = (compare(posed(p), posed(truth)) for p in (found, shift @ found, found @ shift))
+
+    def rmse(result: object, name: str, relative: bool = False) -> float:
+        judged = result.of(name)  # type: ignore[attr-defined]
+        part = judged.relative if relative else judged.absolute
+        return error_statistics(part.translation).rmse
+
+    assert rmse(base, ALIGNMENTS[1]) == pytest.approx(rmse(plain, ALIGNMENTS[1]), rel=1e-6)
+    assert rmse(base, ALIGNMENTS[0], relative=True) == pytest.approx(
+        rmse(plain, ALIGNMENTS[0], relative=True), rel=1e-6
+    )
+    judged, expected = (r.of(ALIGNMENTS[2]) for r in (surface, plain))
+    assert judged is not None and expected is not None
+    assert judged.absolute.rotation == pytest.approx(expected.absolute.rotation, abs=1e-3)
+    assert rmse(plain, ALIGNMENTS[1]) <= rmse(plain, ALIGNMENTS[0]) + 1e-9
+
+
+def test_honest_covariances_have_a_nees_of_six() -> None:
+    draw, truth = np.random.default_rng(4), breathing(np.arange(600) / 30)
+    sigma = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.05])
+    found = truth @ se3.exp(draw.normal(size=(600, 6)) * sigma)
+    covariance = np.broadcast_to(np.diag(sigma**2), (600, 6, 6))
+    stamps = np.arange(600) / 30
+    judged = compare(posed(found, covariance, stamps), posed(truth, stamps=stamps)).judged
+    assert judged[0].absolute.mean_nees / 6 == pytest.approx(1.0, abs=0.05)
+    assert 0.93 < judged[0].absolute.nees_inside < 0.97
+    bold = compare(posed(found, covariance / 4, stamps), posed(truth, stamps=stamps)).judged[0]
+    assert bold.absolute.mean_nees == pytest.approx(4 * judged[0].absolute.mean_nees)
+
+
+@pytest.mark.parametrize("held", [0, 17])
+def test_covariances_relative_to_a_pose_that_is_held_are_judged_in_its_frame(held: int) -> None:
+    draw, truth = np.random.default_rng(4), breathing(np.arange(600) / 30)
+    sigma = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.05])
+    off = draw.normal(size=(600, 6)) * sigma
+    off[held] = 0.0
+    covariance = np.tile(np.diag(sigma**2), (600, 1, 1))
+    covariance[held] *= 1e-6
+    frame = se3.exp(np.array([0.1, -0.2, 0.3, 5.0, -3.0, 2.0]))  # the truth's surface frame is another
+    stamps = np.arange(600) / 30
+    judged = compare(posed(truth @ se3.exp(off), covariance, stamps), posed(truth @ frame, stamps=stamps)).laid
+    assert judged.absolute.mean_nees / 6 == pytest.approx(1.0, abs=0.05)
+
+
+def test_positions_on_a_line_determine_no_alignment() -> None:
+    truth = np.tile(np.eye(4), (30, 1, 1))
+    truth[:, 2, 3] = np.arange(30)
+    result = compare(posed(truth, stamps=STAMPS[:30]), posed(truth, stamps=STAMPS[:30]))
+    assert [judged.name for judged in result.judged] == [name for name in ALIGNMENTS if name != ALIGNMENTS[1]]
+
+
+def test_a_denser_trajectory_gives_each_instant_once() -> None:
+    truth, dense = breathing(STAMPS), np.arange(2900) / 1000
+    result = compare(posed(breathing(dense), stamps=dense), posed(truth))
+    assert len(result.stamps) == np.sum(dense[-1] + 5e-4 >= STAMPS)
+    assert result.gap <= 5e-4
+
+
+def test_a_recording_gives_its_poses_by_channel(tmp_path: Path) -> None:
+    recording = whole_recording(tmp_path)
+    found = read_pose_series(str(recording))
+    assert found.name.endswith("x.mcap:pose") and len(found) == 24
+    assert np.isfinite(found.covariance).all()
+    assert len(read_pose_series(f"{recording}:pose")) == 24
+    for words, what in ((f"{recording}:smoothed", "poses"), (f"{recording}:wrong", "channel")):
+        with pytest.raises(InputError) as told:
+            read_pose_series(words)
+        assert told.value.what == what
+
+
+def test_the_command_writes_page_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth, found = moved(3)
+    write_tum(tmp_path / "found.tum", Trajectory(STAMPS, found, exact=False))
+    write_tum(tmp_path / "truth.tum", Trajectory(STAMPS, truth, exact=True))
+    out = tmp_path / "out"
+    assert main(["compare", str(tmp_path / "found.tum"), str(tmp_path), "-o", str(out)]) == 0
+    told = capsys.readouterr().out
+    figures = json.loads((out / "compare.json").read_text())
+    assert figures["pairs"] == 90 and figures["reference_is_exact"]
+    assert (
+        figures[ALIGNMENTS[1]]["ape"]["translation_mm"]["rmse"]
+        < figures[ALIGNMENTS[0]]["ape"]["translation_mm"]["rmse"]
+    )
+    assert f"{figures[ALIGNMENTS[0]]['ape']['translation_mm']['rmse']:#.3g} mm" in told
+    page = (out / "report.html").read_text()
+    assert "Absolute pose error" in page and "NEES" not in page and "http" not in page.replace("http://www.w3.org", "")
+
+
+def test_the_truth_in_a_recording_is_found_by_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
+        poses = [pose(float(stamp), k) for k, stamp in enumerate(STAMPS[:9])]
+        placed = np.stack([each.base_from_surface for each in poses])
+        recorder.truth(Trajectory(STAMPS[:9], placed, exact=True))
+        for each in poses:
+            recorder.frame(Frame(0, each.stamp, image(0, 0)))
+            recorder.write(each)
+    assert main(["compare", str(tmp_path / "x.mcap")]) == 0
+    assert "9 of 9 poses" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "poses = 'none'"),
+        ("1 2 3\n", "line 1"),
+        ("9 0 0 0 0 0 0 1\n10 0 0 0 0 0 0 1\n11 0 0 0 0 0 0 1\n", "one clock"),
+    ],
+)
+def test_what_cannot_be_compared_is_one_clear_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, words: str
+) -> None:
+    write_tum(tmp_path / "truth.tum", Trajectory(STAMPS, breathing(STAMPS), exact=True))
+    (tmp_path / "a.tum").write_text(text)
+    assert main(["compare", str(tmp_path / "a.tum"), str(tmp_path / "truth.tum")]) == WRONG_INPUT
+    told = capsys.readouterr().err
+    assert words in told and told.count("\n") == 1
+
+
+def test_a_missing_file_and_an_empty_folder_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("nothing.tum", "."):
+        assert main(["compare", str(tmp_path / name), str(tmp_path)]) == WRONG_INPUT
+        assert "allowed a TUM or CSV file" in capsys.readouterr().err

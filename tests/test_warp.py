@@ -11,19 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.online.deformation import WarpFilter
+from estimation.online.deformation import WarpFilter, WarpModes, modes_from_map
 from estimation.online.estimator import Estimator
-from estimation.online.pose_solver import solve_pose
+from estimation.online.pose_solver import PointTracks, solve_pose
+from estimation.online.surface_state import StateSettings
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from estimation.state_machine import StateSettings
-from estimation.surface_map import SurfaceMap
-from estimation.synthetic.arc_rig import REST, arc_rig
-from estimation.synthetic.look import observations
-from estimation.synthetic.surfaces import patch
-from estimation.warp import Warp
-from estimation.warp_modes import WarpModes, modes_from_map
-from hardware.simulator.deformation import Deformation
+from estimation.surface_map import SurfaceMap, Warp
+from estimation.synthetic.movements import patch
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations
+from hardware.simulator.scene.shape import Deformation
 from tests.synthetic import Motion, breathing, still
 
 RIG = arc_rig()
@@ -85,7 +82,7 @@ def test_a_warp_survives_a_pipe() -> None:
 
 def test_a_warp_is_known_the_less_the_older_it_is_and_the_pose_says_so() -> None:
     warp = warp_of(1)
-    pose = SurfacePose(0.0, REST, np.zeros((6, 6)), np.zeros(6), TrackState.TRACKING, warp=warp)
+    pose = SurfacePose(0.0, BASE_FROM_REST, np.zeros((6, 6)), np.zeros(6), TrackState.TRACKING, warp=warp)
     now, later = pose.error_at(CHECKPOINTS), pose.predict(0.2).error_at(CHECKPOINTS)
     assert (later > now).all() and (now > 0).all()
     assert replace(pose, warp=None).error_at(CHECKPOINTS) == pytest.approx(np.zeros(30))
@@ -180,9 +177,9 @@ def _filtered(amounts: Array, seed: int = 0) -> WarpFilter:
     warps, rng = WarpFilter(MAP), np.random.default_rng(seed)
     for k, amount in enumerate(amounts):
         bent = LANDMARKS + BULGE.displacement(LANDMARKS, float(amount))
-        seen = observations(RIG, bent, REST, k / 30, rng, 0.1)
+        seen = observations(RIG, bent, BASE_FROM_REST, k / 30, rng, 0.1)
         points = warps.points(MAP)[seen.track]
-        fit = solve_pose(RIG, seen.camera, points, seen.pixels, seen.sigma, REST)
+        fit = solve_pose(RIG, PointTracks.of(seen, points), BASE_FROM_REST)
         warps.learn(seen, fit, seen.sigma, np.zeros(6), 0.0)
     return warps
 

@@ -8,20 +8,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from board_session import BOARD, LENSES, RATE, rendered, small_rig
-from boards import motion
-from browser import Browser, Page, executable
 
 from estimation import se3
 from estimation.rig import pixels_from_points
-from hardware.calibration.board_file import write_board
-from hardware.calibration.guide import TOGETHER, Guide
-from hardware.calibration.waving_page import WavingPage
-from hardware.files.rig_file import read_rig
-from hardware.operator.shared_state import Wish
-from hardware.operator.waving import WavingStage
+from hardware.calibration.corners import MIN_COMMON_SETS, CoverageGuide
+from hardware.calibration.live import WavingPage
+from hardware.files.rig_file import read_rig, write_board
+from hardware.operator.view import WavingStage, Wish
 from hardware.process.clock import WallClock
 from perception.frames import Frame, FrameSet
+from tests.board_session import BOARD, LENSES, RATE, rendered, small_rig
+from tests.boards import motion
+from tests.browser import Browser, Page, executable
 from tests.started import started
 
 CLOCK = WallClock()
@@ -62,13 +60,13 @@ def seen_at(instant: float) -> dict[int, np.ndarray]:
 def wished(shown: WavingPage) -> Wish:
     """The next thing that a window asks for."""
     end = CLOCK.now() + PATIENCE
-    while (wish := shown.wished()) is None:
+    while (wish := shown.poll()) is None:
         assert CLOCK.now() < end
         CLOCK.wait_until(CLOCK.now() + 0.05)
     return wish
 
 
-def tell(shown: WavingPage, page: Page, guide: Guide, looked: int, until: str) -> None:
+def tell(shown: WavingPage, page: Page, guide: CoverageGuide, looked: int, until: str) -> None:
     """Show the guide and its pictures until the page has it."""
     seen, end = seen_at(0.2), CLOCK.now() + 20
     pictures = tuple(Frame(c, 0.0, GREY) for c in range(3))
@@ -80,7 +78,7 @@ def tell(shown: WavingPage, page: Page, guide: Guide, looked: int, until: str) -
 
 
 def test_the_page_shows_what_is_missing_and_enough_is_enough(shown: WavingPage, browser: Browser) -> None:
-    guide = Guide(NAMES, (SIZE,) * 3, BOARD)
+    guide = CoverageGuide(NAMES, (SIZE,) * 3, BOARD)
     for instant in np.arange(0, 4, 0.25):
         guide.add(seen_at(float(instant)))
     page = browser.page(shown.address)
@@ -90,16 +88,16 @@ def test_the_page_shows_what_is_missing_and_enough_is_enough(shown: WavingPage, 
     assert page.js('[...document.querySelectorAll(".board")].map((each) => each.dataset.camera)') == list(NAMES)
     named = page.js('document.querySelector(".board[data-next=yes]").dataset.camera')
     assert hint.startswith(f"{named}:")
-    assert page.text("#together b") == f"{int(100 * guide.together / TOGETHER)} %"
+    assert page.text("#together b") == f"{int(100 * guide.together / MIN_COMMON_SETS)} %"
     parts = guide.coverage(0).parts
     first = page.text(".board .needs b")
     assert first == f"{int(100 * np.minimum(parts / 20, 1).mean())} %"
     page.click('footer [data-wish="end"]')
     assert wished(shown) is Wish.END
-    shown.tell(WavingStage.SOLVE)
+    shown.enter(WavingStage.SOLVE)
     page.until('document.body.dataset.stage === "solve"', timeout=PATIENCE)
     assert page.js('[...document.querySelectorAll("footer button")].every((each) => each.disabled)')
-    shown.tell(WavingStage.PASSED, "PASS", "good enough to print")
+    shown.enter(WavingStage.PASSED, "PASS", "good enough to print")
     page.until('document.querySelector("#result pre").textContent === "PASS\\ngood enough to print"', timeout=PATIENCE)
     assert page.text("#chip") == "Passed"
 
@@ -142,7 +140,7 @@ def test_a_board_before_live_cameras_becomes_a_rig_once_somebody_says_enough(
 
 
 def test_stop_stops_and_what_happened_stays_to_be_read(browser: Browser) -> None:
-    guide = Guide(NAMES, (SIZE,) * 3, BOARD)
+    guide = CoverageGuide(NAMES, (SIZE,) * 3, BOARD)
     with pytest.raises(KeyboardInterrupt), WavingPage(CLOCK) as shown:
         page = browser.page(shown.address)
         tell(shown, page, guide, 0, 'document.body?.dataset.stage === "wave"')

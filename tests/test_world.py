@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST as BASE_FROM_REST
-from hardware.simulator.deformation import Deformation
-from hardware.simulator.lag import lag_of
-from hardware.simulator.nozzle_log import NozzleLog
-from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.world import REST
-from planning.command import HASTE
-from planning.progress import Phase
+from estimation.synthetic.world import BASE_FROM_REST as BASE_FROM_REST
+from hardware.simulator.deposit import NozzleLog
+from hardware.simulator.nozzle_error import nozzle_lag
+from hardware.simulator.scenario import read_scenario
+from hardware.simulator.scene.shape import Deformation
+from hardware.simulator.world import RUN_OUT
+from planning.command import TICK_FRACTION
+from planning.progress import PrintPhase
 from tests.slowly import slowly
 from tests.worlds import HEADER, IDEAL, Heard, errors, heard, inner, world_of, write_path, write_scenario
 
@@ -31,7 +31,7 @@ def difference(log: NozzleLog) -> Array:
     return np.asarray((log.base_from_nozzle - log.base_from_target)[:, :3, 3])
 
 
-EARLY = (1 - HASTE) * 0.02  # s by which a move ends before the next begins, and the nozzle is ahead
+EARLY = (1 - TICK_FRACTION) * 0.02  # s by which a move ends before the next begins, and the nozzle is ahead
 
 
 # -- the measuring is right
@@ -130,7 +130,7 @@ def test_a_planted_offset_comes_out_as_that_offset(planted: str, motion: list[ob
 def test_the_lag_that_is_reported_is_the_one_that_was_planted(tmp_path: Path) -> None:
     sine = {"kind": "sine", "rate_hz": 0.8, "amplitude_mm": 1.5, "direction": [0, 1, 0]}
     usual, late = (
-        lag_of(heard(write_scenario(tmp_path, IDEAL, {"arm": arm}, motion=[sine], seconds=2.5)).log).seconds
+        nozzle_lag(heard(write_scenario(tmp_path, IDEAL, {"arm": arm}, motion=[sine], seconds=2.5)).log).seconds
         for arm in ({}, {"dead_time_s": 0.06})
     )
     assert late - usual == pytest.approx(0.06, abs=0.001)
@@ -157,8 +157,10 @@ def test_rows_lie_on_every_millisecond_until_the_very_end(tmp_path: Path) -> Non
 
 def test_a_run_ends_soon_after_the_path(tmp_path: Path) -> None:
     sink = heard(write_scenario(tmp_path, IDEAL, seconds=30.0))
-    finished = next(c.stamp for c, p in zip(sink.commands, sink.progress, strict=True) if p.phase is Phase.FINISHED)
-    assert sink.log.stamps[-1] == pytest.approx(finished + REST, abs=1.1e-3)
+    finished = next(
+        c.stamp for c, p in zip(sink.commands, sink.progress, strict=True) if p.phase is PrintPhase.FINISHED
+    )
+    assert sink.log.stamps[-1] == pytest.approx(finished + RUN_OUT, abs=1.1e-3)
     assert "path finished" in sink.reasons
     assert sink.log.place[-1] == pytest.approx(8.0)
     assert not sink.log.extrude[sink.log.stamps > finished].any()
@@ -202,8 +204,10 @@ def test_a_slow_tracker_takes_the_newest_frame_set_and_the_rest_is_counted(tmp_p
     for stamp in taken[1:]:
         start += 0.07
         assert stamp == pytest.approx(exposed[exposed + 0.003 <= start + 1e-9][-1])
-    assert world.tracked == len(taken) == 28
-    assert world.tracked + world.skipped == pytest.approx(95, abs=2)  # what waits at the end is neither
+    assert world.pipeline.tracked == len(taken) == 28
+    assert world.pipeline.tracked + world.pipeline.skipped == pytest.approx(
+        95, abs=2
+    )  # what waits at the end is neither
 
 
 def test_a_frame_set_that_is_left_out_has_a_print_head_all_the_same(tmp_path: Path) -> None:
@@ -254,7 +258,7 @@ def with_faults(folder: Path, *faults: str) -> tuple[Heard, NozzleLog]:
 
 def worked_off(since: Array) -> Array:
     """By how much less late, s, an arm is some time after a fault, s: moves leave a fiftieth of each tick free."""
-    return np.asarray((1 / HASTE - 1) * since)
+    return np.asarray((1 / TICK_FRACTION - 1) * since)
 
 
 def test_an_arm_that_stalls_is_late_by_as_much_and_works_it_off(tmp_path: Path) -> None:
@@ -270,7 +274,7 @@ def test_a_slow_arm_falls_behind(tmp_path: Path) -> None:
     _, log = with_faults(tmp_path, "arm slow 50% at 1s for 0.4s")
     distance = np.linalg.norm(difference(log), axis=1)
     after = inner(log) & (log.stamps > 1.45)
-    late = 0.4 - 0.5 * 0.4 / HASTE - worked_off(log.stamps[after] - 1.4)
+    late = 0.4 - 0.5 * 0.4 / TICK_FRACTION - worked_off(log.stamps[after] - 1.4)
     assert distance[after] == pytest.approx(late * SPEED, rel=0.02)
 
 

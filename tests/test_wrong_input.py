@@ -1,16 +1,27 @@
-"""Wrong input, whatever is wrong with it: one line that names it and what is allowed, exit code 2, nothing written."""
+"""Wrong input, whatever is wrong with it: one line that names it and what is allowed, exit code 2, nothing written.
+Processes that work for another end with it. Those of a bench do at Ctrl-C, too, whatever they are at. Commands that
+were started without standard streams: they do what they do, and say nothing.
+"""
 
 from __future__ import annotations
 
+import os
 import shlex
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from hardware.bench.figures import workers
 from hardware.cli.main import main
+from hardware.live.view import Console
 from hardware.recording.recorder import Recorder
+from tests.light_live import prepare_files
 from tests.recorded import write_frames
 from tests.session_files import rig
 from tests.started import ROOT
@@ -189,3 +200,158 @@ def test_a_cache_that_cannot_be_written_is_one_line_that_says_where_to_have_anot
         (line,) = [line for line in told.splitlines() if line.startswith("stillbed")]
         assert "Traceback" not in told
         assert line.startswith(f"stillbed: {cache}/stillbed: cache = ") and "XDG_CACHE_HOME" in line
+
+
+PATIENCE = 20.0  # s, on a busy machine
+AT_WORK = """
+import os, time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from hardware.bench.figures import workers
+from hardware.offline.track import _settle
+
+def work(number):
+    os.write(1, f"{os.getpid()}\\n".encode())
+    time.sleep(600)
+
+if __name__ == "__main__":
+    with {pool} as pool:
+        list(pool.map(work, range(8)))
+"""
+STARTS = """
+import os, time
+from hardware.process.system import set_up_process
+from hardware.live.ipc import ProcessGroup
+from hardware.offline.track import tracker
+
+def tracked():
+    with tracker(None, [None]):
+        time.sleep(60)
+
+def begun():
+    crew = ProcessGroup()
+    crew.start("small", set_up_process, ("small",))
+    try:
+        time.sleep(60)
+    finally:
+        crew.end("small")
+
+if __name__ == "__mp_main__":
+    os.write(1, b"loads\\n")
+    time.sleep(1)
+if __name__ == "__main__":
+    try:
+        {how}()
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+BENCH = "workers(2)"
+TRACKER = "ProcessPoolExecutor(2, get_context('spawn'), _settle)"
+
+
+def pipe_closed(pid: int) -> bool:
+    """Whether a process has ended; one that nobody has waited for yet has, too."""
+    try:
+        with open(f"/proc/{pid}/stat") as stat:
+            return stat.read().rsplit(")", 1)[1].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+ONE, ALL = os.kill, os.killpg  # who is told: the parent alone, or all of them as a terminal does
+ENDS = [
+    *((BENCH, ONE, signal.SIGKILL), (BENCH, ONE, signal.SIGTERM), (TRACKER, ONE, signal.SIGKILL)),
+    *((BENCH, ALL, signal.SIGKILL), (BENCH, ALL, signal.SIGTERM), (BENCH, ALL, signal.SIGINT)),
+]
+
+
+@pytest.mark.parametrize(("pool", "end", "word"), ENDS)
+def test_they_end_with_whoever_started_them(
+    pool: str, end: Callable[[int, int], None], word: int, tmp_path: Path
+) -> None:
+    (script := tmp_path / "at_work.py").write_text(AT_WORK.replace("{pool}", pool))
+    started = subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    assert started.stdout is not None
+    try:
+        own = [int(started.stdout.readline()) for _ in range(2)]
+        assert not any(map(pipe_closed, own))
+        end(started.pid, word)
+        assert started.wait(PATIENCE) != 0
+        until = time.monotonic() + PATIENCE
+        while not all(map(pipe_closed, own)) and time.monotonic() < until:
+            time.sleep(0.02)
+        assert all(map(pipe_closed, own))
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(started.pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("how", ["tracked", "begun"])
+def test_ctrl_c_while_a_process_loads_is_its_parents_alone(how: str, tmp_path: Path) -> None:
+    (script := tmp_path / "starts.py").write_text(STARTS.replace("{how}", how))
+    started = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    assert started.stdout is not None
+    try:
+        assert started.stdout.readline() == "loads\n"
+        os.killpg(started.pid, signal.SIGINT)
+        assert started.communicate(timeout=PATIENCE) == ("interrupted\n", "") and started.returncode == 0
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(started.pid, signal.SIGKILL)
+
+
+def test_what_has_not_begun_is_left_out() -> None:
+    begun = time.monotonic()
+    with pytest.raises(ZeroDivisionError), workers(1) as pool:
+        for _ in pool.map(time.sleep, [0.1] * 3000):
+            raise ZeroDivisionError
+    assert time.monotonic() - begun < PATIENCE
+
+
+SEEN = """
+import os, sys
+from hardware.cli import main as cli, sessions
+sessions._track = lambda a: print(sorted(os.listdir('/proc/self/fd')), file=open('seen', 'w'))
+sys.exit(cli.main(['track', 'x', '-o', 'y']))
+"""
+
+
+def without(streams: Sequence[int], *command: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """A command that begins with these streams closed; what it says on the others."""
+    closed = " ".join(f"{number}>&-" for number in streams)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    line = ["sh", "-c", f'exec "$0" "$@" {closed}', sys.executable, *command]
+    return subprocess.run(line, cwd=folder, capture_output=True, text=True, timeout=200, env=environment)
+
+
+@pytest.mark.parametrize("streams", [(0,), (1,), (2,), (0, 1), (0, 1, 2)])
+def test_what_is_opened_takes_no_closed_streams_number(streams: tuple[int, ...], tmp_path: Path) -> None:
+    done = without(streams, "-c", SEEN, folder=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert {"'0'", "'1'", "'2'", "'3'"} <= set((tmp_path / "seen").read_text().strip("[]\n").split(", "))
+
+
+def test_a_wrong_command_line_is_exit_code_2_where_nobody_hears_it() -> None:
+    done = without((0, 1, 2), "-m", "hardware.cli.main", "track", "nowhere", "-o", "nowhere")
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", "")
+
+
+def test_a_live_run_needs_no_standard_input(tmp_path: Path) -> None:
+    prepare_files(tmp_path, lines=2, speed=10.0)
+    done = without((0,), "-m", "tests.light_live", str(tmp_path), str(tmp_path / "x.mcap"), "--yes")
+    assert done.returncode == 0 and "the path is printed" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_console_without_a_standard_input_waits_for_no_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", None)
+    with Console() as console:
+        assert console.file is None

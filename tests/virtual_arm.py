@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.arm.protocol import G1, THESIS, encode
-from hardware.process.faults import Fault, Part, fault_from_text
+from hardware.arm.protocol import G1, THESIS_DIALECT, encode
+from hardware.process.faults import Fault, FaultPart, fault_from_text
 from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.settings import ArmSettings
 
@@ -15,7 +15,7 @@ IDEAL = ArmSettings(servo_lag=0.0)
 
 
 def virtual_arm(settings: ArmSettings = IDEAL, *faults: Fault) -> VirtualArm:
-    return VirtualArm(settings, THESIS, HOME, faults)
+    return VirtualArm(settings, THESIS_DIALECT, HOME, faults)
 
 
 def move(feed: float, **axes: float) -> bytes:
@@ -40,4 +40,4 @@ def motion(arm: VirtualArm) -> tuple[Array, Array]:
 
 def arm_fault(text: str) -> Fault:
     """A fault of the arm by its text, which need not name the arm."""
-    return fault_from_text("x.toml", "arm.faults", text, Part.ARM)
+    return fault_from_text("x.toml", "arm.faults", text, FaultPart.ARM)

@@ -13,17 +13,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import trustme
-from board_session import BOARD, rendered, small_rig
 
-from estimation.scan import scan_from_triangles
-from hardware.bookmark_file import keep_bookmark
-from hardware.calibration.board_file import write_board
+from estimation.scans.scan import scan_from_triangles
 from hardware.cli.main import main
-from hardware.files.path_file import read_path
-from hardware.files.rig_file import ImageSource, write_rig
+from hardware.files.path_file import read_path, write_progress_durably
+from hardware.files.rig_file import ImageSource, write_board, write_rig
 from hardware.live.prerender import prerender
 from hardware.process.clock import WallClock
 from planning.progress import fingerprint
+from tests.board_session import BOARD, rendered, small_rig
 from tests.live_runs import ROOT, SCENARIO, Running
 from tests.shown_commands import MADE
 from tests.test_arm_calibration import touched, touched_file
@@ -61,7 +59,7 @@ def prepare(folder: Path, sources: Sequence[str]) -> None:
     for name in ("out", "docs", "sessions", "traces", "monday"):
         (folder / name).mkdir()
     (folder / "path.csv").write_text(PATH, encoding="utf-8")
-    keep_bookmark(folder / "progress.toml", fingerprint(read_path(folder / "path.csv")), 1.5)
+    write_progress_durably(folder / "progress.toml", fingerprint(read_path(folder / "path.csv")), 1.5)
     (folder / "contour.csv").write_text("x_mm,y_mm\n0,0\n12,0\n12,8\n0,8\n", encoding="utf-8")
     (folder / "monday/session.toml").write_text(SESSION, encoding="utf-8")
     write_mesh(folder / "wound.stl", scan_from_triangles(*scan_of()))

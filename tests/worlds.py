@@ -18,22 +18,19 @@ from hardware.process.clock import SimClock
 from hardware.recording.schemas import WARNING
 from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.cameras import Shot
-from hardware.simulator.deformation import Deformation
-from hardware.simulator.look import Look
-from hardware.simulator.nozzle_error import NozzleErrors, nozzle_errors
-from hardware.simulator.nozzle_log import NozzleLog, joined
-from hardware.simulator.perfect import PerfectTracker
-from hardware.simulator.planned_line import planned_line
-from hardware.simulator.scenario import Scenario
-from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.scene.scene import STILL, Scene
-from hardware.simulator.scene.shape import flat
+from hardware.simulator.deposit import NozzleLog, join_logs, planned_line
+from hardware.simulator.nozzle_error import RowErrors, nozzle_errors
+from hardware.simulator.scenario import Scenario, read_scenario
+from hardware.simulator.scene.appearance import Appearance
+from hardware.simulator.scene.scene import UNDEFORMED, Scene
+from hardware.simulator.scene.shape import Deformation, flat
+from hardware.simulator.simulate import OracleTracker
 from hardware.simulator.truth import Truth
-from hardware.simulator.world import World
+from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet, PrintHead
 from perception.tracking.step import StepReport
 from planning.command import Command, Hold
-from planning.progress import Progress
+from planning.progress import PrintProgress
 
 HEADER = "x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,speed_mm_s,material,temperature_c,layer,extrude"
 IDEAL = {  # nothing takes time
@@ -58,7 +55,7 @@ class Heard:
         self.frames: list[FrameSet] = []
         self.poses: list[SurfacePose] = []
         self.commands: list[Command] = []
-        self.progress: list[Progress] = []
+        self.progress: list[PrintProgress] = []
         self.heads: list[tuple[float, PrintHead]] = []
         self.sent, self.received = b"", b""
         self.logs: list[NozzleLog] = []
@@ -75,7 +72,7 @@ class Heard:
         self.frames.append(frames)
         self.poses.append(pose)
 
-    def command(self, command: Command, progress: Progress, frame: bytes, received: bytes) -> None:
+    def command(self, command: Command, progress: PrintProgress, frame: bytes, received: bytes) -> None:
         self.commands.append(command)
         self.progress.append(progress)
         self.sent += frame
@@ -93,7 +90,7 @@ class Heard:
     @property
     def log(self) -> NozzleLog:
         """All rows so far."""
-        return joined(self.logs)
+        return join_logs(self.logs)
 
     @property
     def reasons(self) -> set[str]:
@@ -135,23 +132,23 @@ def _toml(value: object) -> str:
 
 
 @cache
-def patch(deformation: Deformation = STILL) -> Scene:
+def patch(deformation: Deformation = UNDEFORMED) -> Scene:
     """A flat scene that costs next to nothing, for runs that take no pictures."""
-    return Scene(flat((40.0, 30.0)), Look(texel=1.0, drape=False), deformation)
+    return Scene(flat((40.0, 30.0)), Appearance(texel=1.0, drape=False), deformation)
 
 
 def world_of(
-    scenario: Scenario, sink: Heard, line: Callable[[bytes], bytes] = bytes, deformation: Deformation = STILL
-) -> World:
+    scenario: Scenario, sink: Heard, line: Callable[[bytes], bytes] = bytes, deformation: Deformation = UNDEFORMED
+) -> SimulatedWorld:
     """A world without pictures whose tracker knows the truth, as `stillbed simulate` builds it, on a flat surface."""
     assert not scenario.tracking.pictures
     exposures: Exposures = {}
     scene = patch(deformation)
     truth = Truth(scenario.rest, scenario.motion, deformation, scenario.strain, scene.shape.surface_from_grid)
-    offset = scenario.told_rig.cameras[0].base_from_camera @ se3.inverse(scenario.rig.cameras[0].base_from_camera)
-    step = PerfectTracker(truth, offset, lambda camera, stamp: exposures[camera, stamp].exposed, len(scenario.rig))
+    offset = scenario.known_rig.cameras[0].base_from_camera @ se3.inverse(scenario.rig.cameras[0].base_from_camera)
+    step = OracleTracker(truth, offset, lambda camera, stamp: exposures[camera, stamp].exposed, len(scenario.rig))
     path = read_path(scenario.path)
-    return World(scenario, scene, path, truth, step, exposures, sink, SimClock(), line=line)
+    return SimulatedWorld(scenario, scene, path, truth, step, exposures, sink, SimClock(), line=line)
 
 
 def heard(file: Path) -> Heard:
@@ -161,7 +158,7 @@ def heard(file: Path) -> Heard:
     return sink
 
 
-def errors(file: Path, log: NozzleLog) -> NozzleErrors:
+def errors(file: Path, log: NozzleLog) -> RowErrors:
     """The errors of a run of the scenario in `file`."""
     return nozzle_errors(log, planned_line(read_path(read_scenario(file).path)))
 

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.se3 import Array
-from hardware.simulator.bodies import Wound as Carved
-from hardware.simulator.bodies import body
-from planning.layers.repair import repaired
-from planning.layers.tissue import Tissue
-from planning.layers.wound import Wound, wound_in
+from hardware.simulator.scene.shape import Wound as Carved
+from hardware.simulator.scene.shape import body
+from planning.layers.repair import repair_mesh
+from planning.layers.slicing import Tissue
+from planning.layers.wound import WoundVolume, find_wound
 
 Index = NDArray[np.int64]
 SKIN = (Tissue("hypodermis", None, "1"), Tissue("dermis", 1.6, "2"), Tissue("epidermis", 0.4, "3"))
@@ -25,10 +25,10 @@ def scan_of(kind: str = "forearm", size: tuple[float, float] = (24.0, 16.0), dep
 
 
 @cache
-def wound_of(kind: str = "forearm", size: tuple[float, float] = (24.0, 16.0), depth: float = 3.0) -> Wound:
+def wound_of(kind: str = "forearm", size: tuple[float, float] = (24.0, 16.0), depth: float = 3.0) -> WoundVolume:
     """The wound found in it."""
     vertices, triangles = scan_of(kind, size, depth)
-    return wound_in(repaired(vertices, triangles, "scan")[0], 0.4, "scan")
+    return find_wound(repair_mesh(vertices, triangles, "scan")[0], 0.4, "scan")
 
 
 def sheet(height: float = 0.0, size: float = 30.0, step: float = 1.0) -> tuple[Array, Index]:

@@ -10,7 +10,7 @@ from evo.core import metrics, sync
 from evo.core.trajectory import PosePath3D
 from evo.tools import file_interface
 
-from hardware.script import run_script
+from hardware.cli.parser import run_script
 
 
 def main(estimated: str, reference: str) -> None:

@@ -10,13 +10,13 @@ import numpy as np
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
+from hardware.cli.parser import run_script
 from hardware.files.path_file import read_path
-from hardware.script import run_script
 from planning.command import Command, Hold
-from planning.kinematics import SimpleArm, nozzle_from_axes
-from planning.limits import Limits
+from planning.limits import MotionLimits
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
+from planning.robot.kinematics import SimpleArm, nozzle_from_axes
 
 TICK, LAG = 0.02, 0.03  # s between lines, and what the arm is later than they say
 ARM = SimpleArm()
@@ -33,7 +33,7 @@ def line(command: Command) -> str:
 
 def main(path: str, seconds: float = 60.0) -> None:
     """Print the lines of a whole print, or of so many seconds of it."""
-    limits, checkpoints = Limits(), read_path(path)
+    limits, checkpoints = MotionLimits(), read_path(path)
     planner = Planner(checkpoints, limits, ARM, TICK, LAG)
     guard = Guard(limits, ARM, TICK, checkpoints.zone, LAG)
     for tick in range(round(float(seconds) / TICK)):

@@ -8,12 +8,11 @@ from __future__ import annotations
 import numpy as np
 
 from estimation import se3
-from estimation.forecast import Forecast
 from estimation.forecast.predictor import Predictor
-from estimation.pose import SurfacePose
+from estimation.pose import Forecast, SurfacePose
 from estimation.synthetic.follow import follow
 from estimation.synthetic.world import synthetic_world
-from hardware.script import run_script
+from hardware.cli.parser import run_script
 
 AHEAD = np.array([0.1, 0.2, 0.3, 0.5])  # s
 

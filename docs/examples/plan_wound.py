@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+from hardware.cli.parser import run_script
 from hardware.files.mesh_file import read_raw_mesh
 from hardware.files.path_file import write_path
-from hardware.script import run_script
-from planning.fill.pattern import Pattern
-from planning.layers.figures import figures_of, total_of
-from planning.layers.plan import Order, make_plan
-from planning.layers.repair import repaired
-from planning.layers.tissue import Tissue
-from planning.layers.wound import wound_in
+from planning.fill.bead import Pattern
+from planning.layers.plan import PlanOrder, figures_of, make_plan, total_of
+from planning.layers.repair import repair_mesh
+from planning.layers.slicing import Tissue
+from planning.layers.wound import find_wound
 
 BEAD = 0.8  # mm
 TISSUES = (  # from the wound's bed upwards; None: as thick as what the others leave
@@ -23,8 +22,8 @@ TISSUES = (  # from the wound's bed upwards; None: as thick as what the others l
 def main(scan: str, out: str) -> None:
     """Mend the scan, find the wound in it, fill it with layers of spiral beads, and say what came of it."""
     mesh = read_raw_mesh(scan)
-    mended, _ = repaired(mesh.vertices, mesh.triangles, scan)
-    plan = make_plan(wound_in(mended, 0.6 * BEAD, scan), Order(TISSUES, Pattern("spiral", BEAD)))
+    mended, _ = repair_mesh(mesh.vertices, mesh.triangles, scan)
+    plan = make_plan(find_wound(mended, 0.6 * BEAD, scan), PlanOrder(TISSUES, Pattern("spiral", BEAD)))
     write_path(out, plan.path)
     total = total_of(figures_of(plan))
     print(f"{len(plan.layers)} layers, {len(plan.path)} checkpoints, {100 * total.covered:.1f} % covered")

@@ -5,15 +5,15 @@ A session folder holds rig.toml, frames.csv and a video a camera (docs/conventio
 
 from __future__ import annotations
 
-from hardware.files.session import open_session
-from hardware.methods import MAP, step_by
-from hardware.script import run_script
+from hardware.cli.parser import run_script
+from hardware.offline.track import MAP_METHOD, step_by
+from hardware.recording.session_reader import open_session
 
 
 def main(folder: str) -> None:
     """Print stamp, state, place and its uncertainty for each frame set."""
     session = open_session(folder)
-    with step_by(MAP, session.rig, session.roi, session.surface) as step:
+    with step_by(MAP_METHOD, session.rig, session.roi, session.surface) as step:
         for frames in session.frame_sets():
             pose = step(frames)
             x, y, z = pose.base_from_surface[:3, 3]

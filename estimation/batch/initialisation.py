@@ -1,31 +1,100 @@
-"""Where to begin: rough poses of all frame sets and rough landmarks, from the tracks alone or from a run's poses."""
+"""The input of smoothing: all observations as parallel arrays, and rough poses and landmarks to start from.
+
+The start comes from the tracks alone, or from a run's poses.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
-from estimation.mapping.triangulation import rays, triangulate
+from estimation.mapping.triangulation import rays, triangulate, triangulated_map
 from estimation.observations import Observations
-from estimation.online.pose_solver import solve_pose
+from estimation.online.pose_solver import INLIER_WEIGHT, PointTracks, solve_pose
+from estimation.pose import Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.smoothing.packed import Packed
 from estimation.surface_map import SurfaceMap
-from estimation.trajectory import Trajectory
-from estimation.triangulated import triangulated
 
-STRIDE = 0.1  # s between frame sets that are fitted one by one; the joint solution finds the way between them
-LEAST = 10  # landmarks of a fit
-AGREED = 5  # of them with the rest
-LOOKS = 40  # frame sets in which a landmark's rays are met
-APART = 0.02  # smallest eigenvalue of its rays' information, in parts of one ray's: a degree or so between them
-ASTRAY = 6.0  # sigmas
+MIN_SIGMA_PX = 0.1  # alignment claims less on clean images, but interpolation and lens model err by it
+FIT_INTERVAL_S = 0.1  # between frame sets that are fitted one by one; the joint solution finds the way between them
+MIN_FIT_LANDMARKS = 10  # of a fit
+MIN_FIT_INLIERS = 5  # of them
+MIN_RAY_FRAMES = 40  # frame sets in which a landmark's rays are intersected
+MIN_RAY_ANGLE = 0.02  # smallest eigenvalue of its rays' information, in parts of one ray's: a degree or so between them
+MAX_TRIANGULATION_SIGMAS = 6.0
 
 
-def begin(rig: Rig, data: Packed, known: SurfaceMap | None, start: Trajectory | None) -> tuple[Array, Array]:
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackArrays:
+    """The N observations of K frame sets, of L landmarks."""
+
+    stamps: Array  # (K,) s, rising
+    starts: NDArray[np.int64]  # (K + 1,) where each frame set's observations begin
+    camera: NDArray[np.int64]  # (N,)
+    landmark: NDArray[np.int64]  # (N,) row below L
+    pixels: Array  # (N, 2) undistorted
+    precision: Array  # (N,) px^-2
+    tracks: NDArray[np.int64]  # (L,) the id that each landmark's observations bear
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def of(self, frame: int) -> slice:
+        """Where the observations of a frame set stand."""
+        return slice(int(self.starts[frame]), int(self.starts[frame + 1]))
+
+    def between(self, first: int, last: int) -> slice:
+        """Where the observations of frame sets first <= k < last stand."""
+        return slice(int(self.starts[first]), int(self.starts[last]))
+
+    def only(self, frames: NDArray[np.int64]) -> TrackArrays:
+        """The same of some frame sets (M,), rising."""
+        counts = np.diff(self.starts)[frames]
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        rows = np.repeat(self.starts[frames] - starts[:-1], counts) + np.arange(starts[-1])
+        return replace(self._rows(rows), stamps=self.stamps[frames], starts=starts)
+
+    def landmarks(self, chosen: NDArray[np.bool_]) -> TrackArrays:
+        """The same of some landmarks (L,) only."""
+        mine = chosen[self.landmark]
+        counts = np.add.reduceat(np.append(mine, 0), self.starts)[:-1] * (np.diff(self.starts) > 0)
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        row = (np.cumsum(chosen) - 1)[self.landmark[mine]]
+        return replace(self._rows(mine), starts=starts, landmark=row, tracks=self.tracks[chosen])
+
+    def _rows(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> TrackArrays:
+        observations = self.camera[rows], self.landmark[rows], self.pixels[rows], self.precision[rows]
+        return TrackArrays(self.stamps, self.starts, *observations, self.tracks)
+
+
+def pack_tracks(observations: Sequence[Observations], cameras: int) -> TrackArrays:
+    """Observations in order of stamp; InputError where that does not rise or a camera is not the rig's."""
+    where = "observations"
+    stamps = np.array([seen.stamp for seen in observations], float)
+    if len(stamps) < 2:
+        raise InputError(where, "frame sets", len(stamps), "two or more")
+    if not np.isfinite(stamps).all() or (np.diff(stamps) <= 0).any():
+        raise InputError(where, "stamps", "not rising", "each finite and later than the one before, s")
+    camera = np.concatenate([seen.camera for seen in observations]).astype(np.int64)
+    if len(camera) and not 0 <= camera.min() <= camera.max() < cameras:
+        raise InputError(where, "camera", f"{camera.min()}..{camera.max()}", f"0..{cameras - 1}, as the rig has")
+    pixels = np.concatenate([seen.pixels for seen in observations])
+    sigma = np.concatenate([seen.sigma for seen in observations])
+    if not np.isfinite(pixels).all() or not (np.isfinite(sigma) & (sigma > 0)).all():
+        raise InputError(where, "pixels and sigma", "not finite, or a sigma <= 0", "finite px, sigma > 0 px")
+    tracks, landmark = np.unique(np.concatenate([seen.track for seen in observations]), return_inverse=True)
+    starts = np.concatenate([[0], np.cumsum([len(seen) for seen in observations])]).astype(np.int64)
+    precision = 1 / np.maximum(sigma, MIN_SIGMA_PX) ** 2
+    return TrackArrays(stamps, starts, camera, landmark.astype(np.int64), pixels, precision, tracks.astype(np.int64))
+
+
+def rough_start(rig: Rig, data: TrackArrays, known: SurfaceMap | None, start: Trajectory | None) -> tuple[Array, Array]:
     """Rough poses (K, 4, 4) and landmarks (L, 3) mm, surface frame; nan where a landmark is not seen well enough.
 
     known: the landmarks' map where there is one; tracks count its rows. start: poses of a run, at any stamps; without
@@ -37,7 +106,7 @@ def begin(rig: Rig, data: Packed, known: SurfaceMap | None, start: Trajectory | 
             raise InputError("observations", "track", int(data.tracks[-1]), f"a row of the map, 0..{len(known) - 1}")
         points = known.points[data.tracks].copy()
     poses = _fitted(rig, data, points, known is not None) if start is None else at_stamps(start, data.stamps)
-    return poses, met(rig, data, poses, points)
+    return poses, intersected_landmarks(rig, data, poses, points)
 
 
 def at_stamps(trajectory: Trajectory, stamps: Array) -> Array:
@@ -50,58 +119,58 @@ def at_stamps(trajectory: Trajectory, stamps: Array) -> Array:
     return se3.interpolate(poses[k], poses[k + 1], share)
 
 
-def _seen(data: Packed, frame: int) -> Observations:
+def _frame_observations(data: TrackArrays, frame: int) -> Observations:
     """One frame set's observations; tracks count landmarks."""
     part = data.of(frame)
     sigma = data.precision[part] ** -0.5
     return Observations(float(data.stamps[frame]), data.camera[part], data.landmark[part], data.pixels[part], sigma)
 
 
-def _fitted(rig: Rig, data: Packed, points: Array, told: bool) -> Array:
+def _fitted(rig: Rig, data: TrackArrays, points: Array, mapped: bool) -> Array:
     """Poses by fits to some frame sets, one after the other; landmarks are added to `points` as they are seen."""
-    first, pose = _first(rig, data, points, told)
-    stamps, poses = [data.stamps[first]], [pose]
-    due = stamps[0] + STRIDE
+    first, start = _first(rig, data, points, mapped)
+    stamps, poses = [data.stamps[first]], [start]
+    due = stamps[0] + FIT_INTERVAL_S
     for frame in range(first + 1, len(data)):
         if data.stamps[frame] < due:
             continue
-        found = _fit(rig, _seen(data, frame), points, poses[-1])
-        if found is not None:
+        pose = _fit(rig, _frame_observations(data, frame), points, poses[-1])
+        if pose is not None:
             stamps.append(float(data.stamps[frame]))
-            poses.append(found)
-            due = stamps[-1] + STRIDE
+            poses.append(pose)
+            due = stamps[-1] + FIT_INTERVAL_S
     return at_stamps(Trajectory(np.array(stamps), np.stack(poses), exact=False), data.stamps)
 
 
-def _first(rig: Rig, data: Packed, points: Array, told: bool) -> tuple[int, Array]:
+def _first(rig: Rig, data: TrackArrays, points: Array, mapped: bool) -> tuple[int, Array]:
     """The first frame set that two cameras see enough of, and its pose; its landmarks are laid into `points`."""
     for frame in range(len(data)):
-        seen = _seen(data, frame)
-        if len(np.unique(seen.camera)) < 2 or len(seen) < 2 * LEAST:
+        seen = _frame_observations(data, frame)
+        if len(np.unique(seen.camera)) < 2 or len(seen) < 2 * MIN_FIT_LANDMARKS:
             continue
-        laid = triangulated(rig, seen)
-        if len(laid.tracks) < LEAST:
+        laid = triangulated_map(rig, seen)
+        if len(laid.tracks) < MIN_FIT_LANDMARKS:
             continue
-        if not told:
+        if not mapped:
             points[laid.tracks] = laid.map.points
             return frame, laid.base_from_surface
         mine = se3.rigid_from_points(points[laid.tracks], laid.map.points)
         start = laid.base_from_surface @ mine
-        found = _fit(rig, seen, points, start)
-        return frame, start if found is None else found
-    raise InputError("observations", "tracks", "no frame set", f"one in which two cameras see {LEAST} landmarks alike")
+        fitted = _fit(rig, seen, points, start)
+        return frame, start if fitted is None else fitted
+    raise InputError(
+        "observations", "tracks", "no frame set", f"one in which two cameras see {MIN_FIT_LANDMARKS} landmarks alike"
+    )
 
 
 def _fit(rig: Rig, seen: Observations, points: Array, start: Array) -> Array | None:
     """The pose (4, 4) of a frame set by landmarks known so far, or None; what it shows anew is added to them."""
     usable = np.isfinite(points[seen.track, 0])
-    if usable.sum() < LEAST:
+    if usable.sum() < MIN_FIT_LANDMARKS:
         return None
     known = seen.only(usable)
-    fit = solve_pose(
-        rig, known.camera, points[known.track], known.pixels, known.sigma, start, scales=(8.0, 2.0), iterations=4
-    )
-    if (fit.weights > 0.2).sum() < AGREED or not np.isfinite(fit.base_from_surface).all():
+    fit = solve_pose(rig, PointTracks.of(known, points[known.track]), start, scales=(8.0, 2.0), iterations=4)
+    if (fit.weights > INLIER_WEIGHT).sum() < MIN_FIT_INLIERS or not np.isfinite(fit.base_from_surface).all():
         return None
     _add(rig, seen, ~usable, points, fit.base_from_surface)
     return fit.base_from_surface
@@ -117,13 +186,13 @@ def _add(rig: Rig, seen: Observations, new: NDArray[np.bool_], points: Array, po
         return
     rows, index = np.unique(seen.track[new][both], return_inverse=True)
     sigma = seen.sigma[new][both]
-    found, _, residual = triangulate(rig, index, seen.camera[new][both], seen.pixels[new][both], len(rows))
+    new_points, _, residual = triangulate(rig, index, seen.camera[new][both], seen.pixels[new][both], len(rows))
     off = np.bincount(index, ((residual / sigma[:, None]) ** 2).sum(1)) / np.bincount(index) / 2
-    good = np.isfinite(found).all(1) & (off < ASTRAY**2)
-    points[rows[good]] = se3.transform_points(se3.inverse(pose), found[good])
+    good = np.isfinite(new_points).all(1) & (off < MAX_TRIANGULATION_SIGMAS**2)
+    points[rows[good]] = se3.transform_points(se3.inverse(pose), new_points[good])
 
 
-def met(rig: Rig, data: Packed, poses: Array, points: Array) -> Array:
+def intersected_landmarks(rig: Rig, data: TrackArrays, poses: Array, points: Array) -> Array:
     """Landmarks (L, 3): those known (L, 3) as they are, others where the rays of some frame sets come nearest.
 
     Of a landmark whose rays are nearly parallel, nothing can be said: nan.
@@ -131,7 +200,7 @@ def met(rig: Rig, data: Packed, poses: Array, points: Array) -> Array:
     missing = ~np.isfinite(points[:, 0])
     if not missing.any():
         return points
-    frames = np.unique(np.linspace(0, len(data) - 1, max(LOOKS, int(len(data) ** 0.5) * 4)).astype(np.int64))
+    frames = np.unique(np.linspace(0, len(data) - 1, max(MIN_RAY_FRAMES, int(len(data) ** 0.5) * 4)).astype(np.int64))
     some = data.only(frames)
     of_frame = np.repeat(frames, np.diff(some.starts))
     mine = missing[some.landmark]
@@ -146,8 +215,10 @@ def met(rig: Rig, data: Packed, poses: Array, points: Array) -> Array:
         normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
         np.add.at(normal, landmark, weight[:, None, None] * across)
         np.add.at(right, landmark, weight[:, None] * (across @ origins[..., None])[..., 0])
-        told = missing & (np.linalg.eigvalsh(normal)[:, 0] > APART**2 * np.maximum(np.trace(normal, 0, 1, 2), 1e-12))
-        out[told] = np.linalg.solve(normal[told], right[told][..., None])[..., 0]
+        known = missing & (
+            np.linalg.eigvalsh(normal)[:, 0] > MIN_RAY_ANGLE**2 * np.maximum(np.trace(normal, 0, 1, 2), 1e-12)
+        )
+        out[known] = np.linalg.solve(normal[known], right[known][..., None])[..., 0]
         away = np.linalg.norm((across @ (out[landmark] - origins)[..., None])[..., 0], axis=1)
         away = np.where(np.isfinite(away), away, np.inf)
         usual = max(float(np.median(away[np.isfinite(away)])) if np.isfinite(away).any() else 1.0, 1e-3)

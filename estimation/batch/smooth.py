@@ -1,10 +1,11 @@
 """The best estimate of a whole recording: every pose, landmark and camera from all tracks, before and after.
 
-One Gauss-Newton problem over all frame sets (a full batch): robust pixels of landmarks, the continuous-time prior
+One Gauss-Newton problem over all frame sets (a full batch): robust reprojection errors, the continuous-time prior
 between poses, and the calibration as prior of the cameras. A frame set's tracks are condensed to its own state; states
-are eliminated one after the other, landmarks and cameras last. That is the Schur complement of the whole problem,
-with nothing left out: at convergence the gradient of the whole cost is zero, and covariances are those of all unknowns
-together. Outliers fall out by graduated non-convexity: the gate of a redescending loss narrows step by step.
+are eliminated one after the other, landmarks and cameras last. That is the Schur complement of the whole problem: at
+convergence the gradient of the whole cost is zero, and covariances are those of all unknowns together. Outliers are
+rejected by graduated non-convexity: the gate of a redescending loss narrows step by step. The noise is learned from the
+recording too: the tracks' size, the jitter and unrest that images share, and the density of the jerk.
 """
 
 from __future__ import annotations
@@ -16,51 +17,106 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.batch.initialisation import begin
-from estimation.batch.priors import States
-from estimation.batch.smoothed import Fitted, Smoothed
+from estimation.batch.initialisation import TrackArrays, pack_tracks, rough_start
+from estimation.batch.normal_equations import BatchProblem, Estimate, NoiseModel, whitened_squares
+from estimation.batch.priors import CalibrationPrior, States, cameras_of, correction_sigmas, prior_information
+from estimation.batch.smoothed import FitStatistics, Smoothed
 from estimation.batch.solve import (
-    ANYWHERE,
-    HELD,
-    Equations,
-    Estimate,
-    Known,
-    Pass,
+    FREE_POSE_SIGMA,
+    HELD_POSE_SIGMA,
+    Elimination,
+    NormalEquations,
+    Priors,
     shared_covariance,
     shared_step,
 )
 from estimation.errors import InputError
 from estimation.observations import Observations
-from estimation.online.pose_solver import EFFICIENCY
+from estimation.online.pose_solver import CHI2_MEDIAN, EFFICIENCY
+from estimation.pose import Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.smoothing.cameras import CalibrationPrior, cameras_of, prior_information, sigmas
-from estimation.smoothing.measured import Noise, Problem, whitened_squares
-from estimation.smoothing.noise import liveliness, shared_sizes, unit_of
-from estimation.smoothing.packed import Packed, packed
 from estimation.surface_map import SurfaceMap, local_normals
-from estimation.trajectory import Trajectory
 
-FREE = 50.0  # mm: how far a landmark may lie from where it was begun; only there to keep a hardly seen one finite
-SHARPEST = 1e-4  # mm: no map is known better
-LEAST_SIGHTINGS = 4
-KEY_FRAMES = 120  # of which landmarks and cameras are found first; then all frame sets correct them,
-STRETCH = 240  # neighbours of which the noise is, in recordings of several times that
-WIDENINGS = (8.0, 4.0, 2.0)  # of the gate, solved from coarse to fine (graduated non-convexity)
-SLOPE = 0.7  # of Geman-McClure's residuals for normal errors, over the mean of their weights
-MOST = 10  # steps at the last width
-ARRIVED = 0.3  # sigmas: the largest step of a landmark or camera at the end; the next is a tenth of it
-LIVELY = np.array([1e3] * 3 + [1e7] * 3)  # rad^2/s^5, mm^2/s^5: the jerk's density as first believed
-LEARNING = 10  # passes at most in which the jerk's density and the tracks' noise are learned,
-SAME = 0.15  # until the density changes by no more, on average of its logarithm
-LOOSER = 10.0  # times the density of a stretch is where the learning of the whole begins: from above it is safe
-SHARES = 1500  # frame sets at which the share of landmarks and cameras in the covariance is found; smooth between
-JITTER, UNREST = 5e-4, 0.02  # s, px, as first believed
+FREE_LANDMARK_MM = 50.0  # from where a landmark was begun: a prior that only keeps a hardly seen one finite
+MIN_MAP_SIGMA_MM = 1e-4  # no map is known better
+MIN_LANDMARK_SIGHTINGS = 4
+KEY_FRAMES = 120  # from which landmarks and cameras are estimated first; then all frame sets correct them
+NOISE_STRETCH = (
+    240  # neighbouring frame sets from which the noise is learned first, in recordings several times as long
+)
+GATE_WIDENINGS = (8.0, 4.0, 2.0)  # of the gate, solved from coarse to fine (graduated non-convexity)
+LOSS_SLOPE = 0.7  # of Geman-McClure's residuals for normal errors, over the mean of their weights
+MAX_STEPS = 10  # at the last width
+CONVERGED_SIGMAS = 0.3  # the largest step of a landmark or camera at the end; the next is a tenth of it
+INITIAL_JERK_PSD = np.array([1e3] * 3 + [1e7] * 3)  # rad^2/s^5, mm^2/s^5, as first believed
+INITIAL_JITTER_S, INITIAL_UNREST_PX = 5e-4, 0.02  # as first believed
+MAX_NOISE_PASSES = 10  # in which the jerk's density and the tracks' noise are learned,
+PSD_CONVERGED = 0.15  # until the density changes by no more, on average of its logarithm
+PSD_START_RATIO = 10.0  # times the density of a stretch: where learning of the whole begins; from above it is safe
+COVARIANCE_SAMPLES = 1500  # frame sets at which the landmarks' and cameras' part of the covariance is computed
 
-Told = Callable[[str, int, int], None]  # (what, done, total)
+MIN_UNIT = 0.3  # of what is claimed: better than that no track is believed to be
+MIN_JITTER_S, MIN_UNREST_PX = 1e-4, 3e-3  # no stamp and no lens is steadier
+GLOBAL_PSD_WEIGHT = 2.0  # numbers that the density of the whole recording counts for, at each moment
+FIXED_POINT_EXPONENT = 1.4  # over-relaxation of the fixed point, which otherwise converges slowly
+PRIOR_COUNT = 0.1  # numbers that the belief before counts for
+PSD_NEIGHBOURS = 1  # frame sets to either side over which the density is taken
+MIN_JERK_PSD = np.array([1e-4] * 3 + [1e-1] * 3)  # rad^2/s^5, mm^2/s^5: less is rest
 
 
-def silent(what: str, done: int, total: int) -> None:
+def unit_of(data: TrackArrays, estimate: Estimate) -> Array:
+    """(C,) residuals in parts of what is claimed of them: by the median, so that outliers do not count."""
+    square = whitened_squares(data, estimate)
+    out = np.ones(len(estimate.cameras))
+    for c in range(len(out)):
+        mine = square[data.camera == c]
+        mine = mine[np.isfinite(mine)]
+        if len(mine):
+            out[c] = max(np.sqrt(np.median(mine) / CHI2_MEDIAN), MIN_UNIT)
+    return out
+
+
+def shared_sizes(done: Elimination, steps: Array, own: Array, noise: NoiseModel) -> tuple[float, float]:
+    """Jitter, s, and unrest, px, of what each camera's tracks share in a frame set, by their evidence.
+
+    steps: (K, 18) that the states are about to take. own: (K, 18, 18) their covariances, the effects' own doubt apart.
+    """
+    through = np.einsum("kij,kjl,kil->ki", done.follows, own, done.follows, optimize=True)
+    n, known = len(noise.unit), noise.own_information()
+    apart = np.repeat([max(1 - 1 / n, 1e-6), 1.0], [n, 2 * n])  # of the delays, whose sum is held
+    known = known / apart
+    effects = done.effects + (done.follows @ steps[..., None])[..., 0]
+    counts = np.clip(1 - (done.doubts + through) * known, 0.0, 1.0)  # (K, 3C): zero where the camera was blind
+    sizes = []
+    for part, least in ((slice(0, n), MIN_JITTER_S), (slice(n, 3 * n), MIN_UNREST_PX)):
+        square, count = float((effects[:, part] ** 2).sum()), float(counts[:, part].sum())
+        before = 1 / known[part.start]
+        variance = (square + PRIOR_COUNT * before) / (count + PRIOR_COUNT) / apart[part.start]
+        sizes.append(max(float(np.sqrt(variance)), least))
+    return sizes[0], sizes[1]
+
+
+def jerk_psd(equations: NormalEquations, steps: Array, own: Array, after: Array) -> Array:
+    """(K - 1, 6) density of the jerk at each moment, as far as that is determined, else of the whole recording.
+
+    The fixed point of the evidence (MacKay, Neural Computation 4:415, 1992), which expectation maximisation needs
+    hundreds of passes for. Each axis has its own: a chest is lively along its normal only.
+    """
+    square, counts = equations.jerks(steps, own, after)
+    before = equations.known.psd
+    count = counts.sum(0)
+    ratio = ((square / before).sum(0) + PRIOR_COUNT) / (count + PRIOR_COUNT)
+    usual = np.exp(np.log(before).mean(0)) * np.clip(ratio**FIXED_POINT_EXPONENT, 1e-3, 1e3)
+    window = np.ones(2 * PSD_NEIGHBOURS + 1)
+    near = [np.stack([np.convolve(c, window, mode="same") for c in a.T], axis=1) for a in (square, counts)]
+    return np.asarray(np.maximum((near[0] + GLOBAL_PSD_WEIGHT * usual) / (near[1] + GLOBAL_PSD_WEIGHT), MIN_JERK_PSD))
+
+
+PassReport = Callable[[str, int, int], None]  # (what, done, total)
+
+
+def no_report(what: str, done: int, total: int) -> None:
     """Report nothing."""
 
 
@@ -70,7 +126,7 @@ def smooth(
     known: SurfaceMap | None = None,
     start: Trajectory | None = None,
     prior: CalibrationPrior | None = None,
-    progress: Told = silent,
+    progress: PassReport = no_report,
 ) -> Smoothed:
     """Smooth a recording's observations, in order of stamp, from the first frame set that shows anything to the last.
 
@@ -81,27 +137,27 @@ def smooth(
     observations do not determine a pose.
     """
     prior = CalibrationPrior() if prior is None else prior
-    data = packed(_tracked(observations), len(rig))
-    poses, points = begin(rig, data, known, start)
-    told = np.isfinite(points[:, 0]) & (np.bincount(data.landmark, minlength=len(points)) >= LEAST_SIGHTINGS)
-    if told.sum() < 6:
-        raise InputError("observations", "landmarks", f"{int(told.sum())} seen from apart", "6 or more")
-    data, points = data.landmarks(told), points[told]
+    data = pack_tracks(_tracked(observations), len(rig))
+    poses, points = rough_start(rig, data, known, start)
+    usable = np.isfinite(points[:, 0]) & (np.bincount(data.landmark, minlength=len(points)) >= MIN_LANDMARK_SIGHTINGS)
+    if usable.sum() < 6:
+        raise InputError("observations", "landmarks", f"{int(usable.sum())} seen from apart", "6 or more")
+    data, points = data.landmarks(usable), points[usable]
     held = 0 if start is None else int(np.abs(data.stamps - start.stamps[0]).argmin())
-    cameras, sigma = cameras_of(rig), sigmas(prior, len(rig))
-    before = Known(
-        cameras,
-        prior_information(sigma, len(rig)),
-        points.copy(),
-        np.eye(points.size) / FREE**2 if known is None else _information(known, data),
-        poses[held],
-        held,
-        HELD if known is None else ANYWHERE,
-        np.tile(LIVELY, (len(data) - 1, 1)),
+    cameras, sigma = cameras_of(rig), correction_sigmas(prior, len(rig))
+    before = Priors(
+        calibrated=cameras,
+        calibration=prior_information(sigma, len(rig)),
+        points=points.copy(),
+        map=np.eye(points.size) / FREE_LANDMARK_MM**2 if known is None else _information(known, data),
+        pose=poses[held],
+        held=held,
+        frame=HELD_POSE_SIGMA if known is None else FREE_POSE_SIGMA,
+        psd=np.tile(INITIAL_JERK_PSD, (len(data) - 1, 1)),
     )
     estimate = Estimate(_rates(poses, data.stamps), cameras, points)
-    noise = Noise(np.ones(len(rig)), JITTER, UNREST)
-    return _Solver(rig, Problem(data, np.flatnonzero(sigma > 0)), estimate, before, noise, progress).solve()
+    noise = NoiseModel(np.ones(len(rig)), INITIAL_JITTER_S, INITIAL_UNREST_PX)
+    return _Solver(rig, BatchProblem(data, np.flatnonzero(sigma > 0)), estimate, before, noise, progress).solve()
 
 
 def _tracked(observations: Sequence[Observations]) -> Sequence[Observations]:
@@ -118,119 +174,125 @@ def _rates(poses: Array, stamps: Array) -> States:
 
 
 class _Solver:
-    """The steps from a rough beginning to the result."""
+    """The steps from a rough start to the result."""
 
     def __init__(
-        self, rig: Rig, problem: Problem, estimate: Estimate, known: Known, noise: Noise, progress: Told
+        self,
+        rig: Rig,
+        problem: BatchProblem,
+        estimate: Estimate,
+        known: Priors,
+        noise: NoiseModel,
+        progress: PassReport,
     ) -> None:
         self._rig, self._problem, self._estimate = rig, problem, estimate
-        self._known, self._noise, self._told, self._passes = known, noise, progress, 0
+        self._known, self._noise, self._report, self._passes = known, noise, progress, 0
         self._data = problem.data
 
     def solve(self) -> Smoothed:
         """The result."""
-        if len(self._data) > 3 * STRETCH:
+        if len(self._data) > 3 * NOISE_STRETCH:
             self._from_key_frames()
             self._from_a_stretch()
-            self._carry(WIDENINGS[-1])
+            self._step_states(GATE_WIDENINGS[-1])
         else:
-            for gate in WIDENINGS:
-                self._carry(gate)
-            for gate in WIDENINGS:
+            for gate in GATE_WIDENINGS:
+                self._step_states(gate)
+            for gate in GATE_WIDENINGS:
                 self._step(gate)
         self._learn_all()
-        for _ in range(MOST):
-            if self._step(1.0) < ARRIVED:
+        for _ in range(MAX_STEPS):
+            if self._step(1.0) < CONVERGED_SIGMAS:
                 break
         return self._result()
 
     def _learn_all(self) -> None:
         """The noise, and with it the states, until it stays."""
-        for k in range(LEARNING):
-            if self._learn(*self._carry(1.0), settled=k > 1) < SAME and k > 2:
+        for k in range(MAX_NOISE_PASSES):
+            if self._learn(*self._step_states(1.0), settled=k > 1) < PSD_CONVERGED and k > 2:
                 break
 
-    def _part(self, frames: NDArray[np.int64], known: Known) -> _Solver:
+    def _part(self, frames: NDArray[np.int64], known: Priors) -> _Solver:
         """The same of some frame sets."""
-        whole = self._estimate.states
-        states = States(whole.poses[frames], whole.twists[frames], whole.accelerations[frames])
-        problem = Problem(self._data.only(frames), self._problem.free)
-        known = replace(known, psd=np.tile(LIVELY, (len(frames) - 1, 1)))
-        return _Solver(self._rig, problem, replace(self._estimate, states=states), known, self._noise, silent)
+        states = self._estimate.states[frames]
+        problem = BatchProblem(self._data.only(frames), self._problem.free)
+        known = replace(known, psd=np.tile(INITIAL_JERK_PSD, (len(frames) - 1, 1)))
+        return _Solver(self._rig, problem, replace(self._estimate, states=states), known, self._noise, no_report)
 
     def _from_key_frames(self) -> None:
-        """Landmarks and cameras as some frame sets have them: nearly right, at a small part of the work.
+        """Landmarks and cameras from some frame sets: nearly right, at a small part of the work.
 
-        So far apart they tell no velocity, and so nothing of the clocks.
+        So far apart they determine no velocity, and so no clocks.
         """
         spread = np.linspace(0, len(self._data) - 1, KEY_FRAMES).round().astype(np.int64)
         frames = np.union1d(spread, [self._known.held])
         few = self._part(frames, replace(self._known, held=int(np.searchsorted(frames, self._known.held))))
         few._problem = replace(few._problem, free=self._problem.free[self._problem.free >= len(self._rig)])
-        for gate in (*WIDENINGS, 1.0, 1.0, 1.0):
+        for gate in (*GATE_WIDENINGS, 1.0, 1.0, 1.0):
             few._step(gate)
         self._estimate = replace(self._estimate, cameras=few._estimate.cameras, points=few._estimate.points)
         self._noise = few._noise
 
     def _from_a_stretch(self) -> None:
-        """The noise as a stretch has it that shows most, which all frame sets then correct."""
-        seen = np.convolve(np.diff(self._data.starts), np.ones(STRETCH), mode="valid")
-        frames = int(seen.argmax()) + np.arange(STRETCH)
+        """The noise from the stretch with most observations, which all frame sets then correct."""
+        seen = np.convolve(np.diff(self._data.starts), np.ones(NOISE_STRETCH), mode="valid")
+        frames = int(seen.argmax()) + np.arange(NOISE_STRETCH)
         few = self._part(
-            frames, replace(self._known, frame=ANYWHERE, held=0, pose=self._estimate.states.poses[frames[0]])
+            frames, replace(self._known, frame=FREE_POSE_SIGMA, held=0, pose=self._estimate.states.poses[frames[0]])
         )
-        for gate in WIDENINGS:
-            few._carry(gate)
+        for gate in GATE_WIDENINGS:
+            few._step_states(gate)
         few._learn_all()
         usual = np.exp(np.log(few._known.psd).mean(0))
-        self._known = replace(self._known, psd=np.tile(LOOSER * usual, (len(self._data) - 1, 1)))
+        self._known = replace(self._known, psd=np.tile(PSD_START_RATIO * usual, (len(self._data) - 1, 1)))
         self._noise = few._noise
 
-    def _equations(self, gate: float, slope: float = 1.0) -> Equations:
+    def _equations(self, gate: float, slope: float = 1.0) -> NormalEquations:
         unit = unit_of(self._data, self._estimate)
         self._noise = replace(self._noise, unit=unit, gate=gate, slope=slope)
-        return Equations(self._problem, self._estimate, self._known, self._noise)
+        return NormalEquations(self._problem, self._estimate, self._known, self._noise)
 
     def _step(self, gate: float) -> float:
         """One step of everything; how far, in sigmas, the landmark or camera moved that moved most."""
-        equations = self._equations(gate, SLOPE if gate == 1.0 else 1.0)
-        done = equations.whole(self._say("landmarks and poses"))
+        equations = self._equations(gate, LOSS_SLOPE if gate == 1.0 else 1.0)
+        done = equations.eliminate(self._reporter("landmarks and poses"))
         step = shared_step(done)
         sigma = np.sqrt(np.diag(shared_covariance(done)))
-        self._move(equations.given(step, self._say("poses")), step)
+        self._move(equations.eliminate(self._reporter("poses"), step), step)
         return float(np.abs(step / sigma).max())
 
-    def _carry(self, gate: float) -> tuple[Equations, Pass]:
+    def _step_states(self, gate: float) -> tuple[NormalEquations, Elimination]:
         """One step of the states alone, and the equations before it."""
         step = np.zeros(self._problem.size)
         equations = self._equations(gate)
-        done = equations.given(step, self._say("poses"))
+        done = equations.eliminate(self._reporter("poses"), step)
         self._move(done, step)
         return equations, done
 
-    def _move(self, done: Pass, step: Array) -> None:
+    def _move(self, done: Elimination, step: Array) -> None:
         self._estimate = self._estimate.moved(done.chain.steps(), step, self._problem.free)
 
-    def _learn(self, equations: Equations, done: Pass, settled: bool) -> float:
-        """Take what a pass tells of the noise; of the images only once the motion is `settled`, or a jerk of the
-        surface would be taken for late cameras. How much the density's logarithm changed.
+    def _learn(self, equations: NormalEquations, done: Elimination, settled: bool) -> float:
+        """Learn the noise from a pass; how much the logarithm of the jerk's density changed.
+
+        That of the images is learned only once the motion is `settled`: a jerk would be taken for late cameras.
         """
         own, after = done.chain.covariances()
         steps = done.chain.steps()
         if settled:
             jitter, unrest = shared_sizes(done, steps, own, self._noise)
             self._noise = replace(self._noise, jitter=jitter, unrest=unrest)
-        before, psd = self._known.psd, liveliness(equations, steps, own, after)
+        before, psd = self._known.psd, jerk_psd(equations, steps, own, after)
         self._known = replace(self._known, psd=psd)
         return float(np.abs(np.log(psd / before)).mean())
 
-    def _say(self, what: str) -> Callable[[int, int], None]:
+    def _reporter(self, what: str) -> Callable[[int, int], None]:
         self._passes += 1
-        return lambda done, total: self._told(what, done, total)
+        return lambda done, total: self._report(what, done, total)
 
     def _result(self) -> Smoothed:
         equations = self._equations(1.0)
-        done = equations.whole(self._say("covariances"))
+        done = equations.eliminate(self._reporter("covariances"))
         shared = shared_covariance(done)
         own, after = done.chain.covariances()
         share = self._share(equations, done, shared)
@@ -257,17 +319,17 @@ class _Solver:
             self._fitted(done.cost + equations.prior_cost()),
         )
 
-    def _share(self, equations: Equations, done: Pass, shared: Array) -> Array:
+    def _share(self, equations: NormalEquations, done: Elimination, shared: Array) -> Array:
         """(K, 18, 18), what landmarks and cameras add to the states' covariances."""
-        every = -(-len(self._data) // SHARES)
+        every = -(-len(self._data) // COVARIANCE_SAMPLES)
         root = np.linalg.cholesky(shared + 1e-12 * np.diag(np.diag(shared)))
-        at, found = list[int](), list[Array]()
+        at, shares = list[int](), list[Array]()
         for k, response in equations.responses(done):
             if k % every == 0 or k == len(self._data) - 1:
                 through = response @ root
                 at.append(k)
-                found.append(through @ through.T)
-        where, known = np.array(at[::-1]), np.stack(found[::-1])
+                shares.append(through @ through.T)
+        where, known = np.array(at[::-1]), np.stack(shares[::-1])
         if every == 1:
             return known
         frames = np.arange(len(self._data))
@@ -275,9 +337,9 @@ class _Solver:
         part = ((frames - where[left]) / (where[left + 1] - where[left]))[:, None, None]
         return np.asarray((1 - part) * known[left] + part * known[left + 1])
 
-    def _fitted(self, cost: float) -> Fitted:
+    def _fitted(self, cost: float) -> FitStatistics:
         data, e, n = self._data, self._estimate, len(self._rig)
-        square = whitened_squares(data, e.states, e.cameras, e.points, 0, len(data))
+        square = whitened_squares(data, e)
         worth = EFFICIENCY / self._noise.unit[data.camera] ** 2
         agrees = 1 / (1 + square * worth / (9 * EFFICIENCY)) ** 2 > 0.2
         cell = np.repeat(np.arange(len(data)), np.diff(data.starts)) * n + data.camera
@@ -285,7 +347,7 @@ class _Solver:
         pixels = np.bincount(cell[agrees], (square / data.precision)[agrees], minlength=len(data) * n)
         rms = np.sqrt(np.divide(pixels, 2 * used, out=np.full(len(used), np.nan), where=used > 0))
         shape = len(data), n
-        return Fitted(
+        return FitStatistics(
             used.reshape(shape),
             seen.reshape(shape),
             rms.reshape(shape),
@@ -297,7 +359,9 @@ class _Solver:
         )
 
 
-def _information(surface: SurfaceMap, data: Packed) -> Array:
+def _information(surface: SurfaceMap, data: TrackArrays) -> Array:
     """(3L, 3L) information of the landmarks that are tracked, by the map's own covariance."""
     place = (3 * data.tracks[:, None] + np.arange(3)).ravel()
-    return np.asarray(np.linalg.inv(surface.covariance[np.ix_(place, place)] + SHARPEST**2 * np.eye(len(place))))
+    return np.asarray(
+        np.linalg.inv(surface.covariance[np.ix_(place, place)] + MIN_MAP_SIGMA_MM**2 * np.eye(len(place)))
+    )

@@ -1,4 +1,4 @@
-"""What smoothing gives: every pose with its claim, and the surface at any time between."""
+"""What smoothing gives: every pose with its covariance, and the surface at any time between."""
 
 from __future__ import annotations
 
@@ -9,80 +9,66 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.batch.priors import (
-    STATE,
+    STATE_DOF,
     States,
-    drive,
+    in_tangent_space,
     inverse_right_jacobian,
-    local,
+    jerk_covariance,
     right_jacobian,
     small_adjoint,
     transition,
 )
 from estimation.errors import InputError
+from estimation.pose import Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.trajectory import Trajectory
 
-CHUNK = 4096  # times taken at once
+TIMES_PER_CHUNK = 4096  # interpolated at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instants:
-    """The surface at M times. stamps: (M,) s. base_from_surface: (M, 4, 4) mm. covariance: (M, 6, 6) of its right
-    perturbation. twist: (M, 6) rad/s and mm/s, twist_covariance: (M, 6, 6).
-    """
+    """The surface at M times."""
 
-    stamps: Array
-    base_from_surface: Array
-    covariance: Array
-    twist: Array
-    twist_covariance: Array
+    stamps: Array  # (M,) s
+    base_from_surface: Array  # (M, 4, 4) mm
+    covariance: Array  # (M, 6, 6) of its right perturbation
+    twist: Array  # (M, 6) rad/s and mm/s
+    twist_covariance: Array  # (M, 6, 6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fitted:
-    """How the tracks stand to the result. used: (K, C) tracks that agree, seen: (K, C) all. rms: (K, C) px of those
-    that agree, nan without any. unit: (C,) residuals in parts of what is claimed of them. jitter: s, unrest: px, as in
-    CameraErrors. cost: half the squared sigmas of all, robust. passes: over all frame sets.
-    """
+class FitStatistics:
+    """How the tracks agree with the result."""
 
-    used: NDArray[np.int64]
-    seen: NDArray[np.int64]
-    rms: Array
-    unit: Array
-    jitter: float
-    unrest: float
-    cost: float
-    passes: int
+    used: NDArray[np.int64]  # (K, C) tracks that agree
+    seen: NDArray[np.int64]  # (K, C) all tracks
+    rms: Array  # (K, C) px of those that agree, nan without any
+    unit: Array  # (C,) size of the residuals in parts of what is claimed of them
+    jitter: float  # s, of a camera's delay in one frame set
+    unrest: float  # px, of an image's shift in one frame set
+    cost: float  # half the squared sigmas of all, robust
+    passes: int  # over all frame sets
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Smoothed:
-    """A whole recording's best estimate.
+    """A whole recording's best estimate: K states, L landmarks, C cameras."""
 
-    stamps: (K,) s. states: poses base_from_surface, twists and accelerations. own: (K, 18, 18) covariance of them
-    by the tracks' noise and next: (K - 1, 18, 18), of each with the one after; share: (K, 18, 18), what the landmarks'
-    and the cameras' doubt adds. psd: (K - 1, 6)
-    density of the jerk. map: landmarks of the surface frame with their joint covariance; tracks: (L,) the id that each
-    bears among the observations. rig: the cameras as corrected, clock offsets included; calibrated:
-    as they were told. offsets: (C,) s, how much later
-    than stamped each exposes beside the mean of all, offset_covariance: (C, C) s^2. fitted: the residuals.
-    """
-
-    stamps: Array
-    states: States
-    own: Array
-    next: Array
-    share: Array
-    psd: Array
-    map: SurfaceMap
-    tracks: NDArray[np.int64]
-    rig: Rig
-    calibrated: Rig
-    offsets: Array
-    offset_covariance: Array
-    fitted: Fitted
+    stamps: Array  # (K,) s
+    states: States  # poses base_from_surface, twists and accelerations
+    own: Array  # (K, 18, 18) covariance of them by the tracks' noise
+    next: Array  # (K - 1, 18, 18) likewise of each with the one after
+    share: Array  # (K, 18, 18) covariance by the doubt about landmarks and cameras
+    psd: Array  # (K - 1, 6) density of the jerk
+    map: SurfaceMap  # in the surface frame
+    tracks: NDArray[np.int64]  # (L,) the id that each landmark bears among the observations
+    rig: Rig  # the cameras as corrected, clock offsets included
+    calibrated: Rig  # as given
+    offsets: Array  # (C,) s, how much later than stamped each camera exposes, beside the mean of all
+    offset_covariance: Array  # (C, C) s^2
+    fitted: FitStatistics
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -120,15 +106,15 @@ class Smoothed:
         if len(times) and not (self.stamps[0] <= times.min() and times.max() <= self.stamps[-1]):
             span = f"{self.stamps[0]} .. {self.stamps[-1]} s, the recording's own"
             raise InputError("times", "s", f"{times.min()} .. {times.max()}", span)
-        parts = [self._between(times[i : i + CHUNK]) for i in range(0, len(times), CHUNK)]
+        parts = [self._between(times[i : i + TIMES_PER_CHUNK]) for i in range(0, len(times), TIMES_PER_CHUNK)]
         names = ("base_from_surface", "covariance", "twist", "twist_covariance")
         return Instants(times, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def _between(self, times: Array) -> Instants:
         k = np.clip(np.searchsorted(self.stamps, times, side="right") - 1, 0, len(self) - 2)
         by_before, by_after, left = _weights(times - self.stamps[k], self.stamps[k + 1] - self.stamps[k])
-        before, after = _some(self.states, k), _some(self.states, k + 1)
-        there, moved = local(before, after)
+        before, after = self.states[k], self.states[k + 1]
+        there, moved = in_tangent_space(before, after)
         here = np.concatenate([np.zeros((len(k), 6)), before.twists, before.accelerations], axis=-1)
         early, late = (np.kron(weights, np.eye(6)) for weights in (by_before, by_after))
         on_the_way = (early @ here[..., None] + late @ there[..., None])[..., 0]
@@ -136,7 +122,7 @@ class Smoothed:
         mixed = early @ self.next[k] @ np.swapaxes(late, 1, 2)
         spread = early @ self.own[k] @ np.swapaxes(early, 1, 2) + mixed + np.swapaxes(mixed, 1, 2)
         spread = spread + late @ self.own[k + 1] @ np.swapaxes(late, 1, 2)
-        axes = np.einsum("mij,ma,ab->miajb", left, self.psd[k], np.eye(6)).reshape(-1, STATE, STATE)
+        axes = np.einsum("mij,ma,ab->miajb", left, self.psd[k], np.eye(6)).reshape(-1, STATE_DOF, STATE_DOF)
         bend = right_jacobian(on_the_way[:, :6])
         turned = np.swapaxes(bend, 1, 2)
         part = ((times - self.stamps[k]) / (self.stamps[k + 1] - self.stamps[k]))[:, None, None]
@@ -154,18 +140,14 @@ class Smoothed:
 def _weights(passed: Array, whole: Array) -> tuple[Array, Array, Array]:
     """What the states before and after count for, (M, 3, 3) each, `passed` s of `whole` s; what is left to chance."""
     rest = np.swapaxes(transition(whole - passed), 1, 2)
-    after = drive(passed) @ rest @ np.linalg.inv(drive(whole))
+    after = jerk_covariance(passed) @ rest @ np.linalg.inv(jerk_covariance(whole))
     before = transition(passed) - after @ transition(whole)
-    return before, after, drive(passed) - after @ np.swapaxes(rest, 1, 2) @ drive(passed)
+    return before, after, jerk_covariance(passed) - after @ np.swapaxes(rest, 1, 2) @ jerk_covariance(passed)
 
 
 def _carried(moved: Array) -> Array:
     """How the later state's own errors show in the earlier one's tangent space, (M, 18, 18)."""
-    out = np.zeros((len(moved), STATE, STATE))
+    out = np.zeros((len(moved), STATE_DOF, STATE_DOF))
     out[:, :6, :6] = inverse_right_jacobian(moved)
     out[:, 6:12, 6:12] = out[:, 12:, 12:] = np.eye(6) + small_adjoint(moved) / 2
     return out
-
-
-def _some(states: States, rows: NDArray[np.int64]) -> States:
-    return States(states.poses[rows], states.twists[rows], states.accelerations[rows])

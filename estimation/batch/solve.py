@@ -1,138 +1,213 @@
-"""One Gauss-Newton step over all frame sets, and the covariances at its end."""
+"""One Gauss-Newton step over all frame sets, and the covariances at its end.
+
+The information of all states is block tridiagonal, with a border: every state is tied to the same landmarks and
+cameras. A Cholesky factorisation from the first state to the last needs only what the state before left of the border
+(18 rows). So a recording is taken in stretches that join exactly, in memory that does not grow with the border's size.
+GTSAM eliminates a graph likewise, but wants a factor for every observation (5.4 million in ten minutes) and a clique of
+all landmarks for each pose. Its factors and optimiser check the result in `tests/test_smoothing.py`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dtrtri
 
 from estimation import se3
-from estimation.batch.priors import STATE, Links, States, links
+from estimation.batch.normal_equations import BatchProblem, CondensedFrames, Estimate, NoiseModel, condense
+from estimation.batch.priors import STATE_DOF, CorrectedCameras, PriorFactors, prior_factors
 from estimation.se3 import Array
-from estimation.smoothing.cameras import Cameras
-from estimation.smoothing.chain import Chain
-from estimation.smoothing.measured import Condensed, Noise, Problem, condensed
 
-ROOM = 24e6  # numbers that the products of landmarks and cameras of one stretch may take: 200 MB
-LONGEST = 256  # frame sets of a stretch
-WIDE = np.array([2.0] * 3 + [300.0] * 3 + [30.0] * 3 + [5e3] * 3)  # twist and acceleration before anything is seen
-HELD = np.array([1e-6] * 3 + [1e-4] * 3)  # rad, mm: of the pose that lays the surface frame
-ANYWHERE = np.array([np.pi] * 3 + [1e4] * 3)
+MAX_PRODUCT_NUMBERS = 24e6  # that the products of landmarks and cameras of one stretch may take: 200 MB
+MAX_STRETCH_FRAMES = 256  # frame sets of a stretch
+# twist and acceleration before anything is seen
+INITIAL_MOTION_SIGMA = np.array([2.0] * 3 + [300.0] * 3 + [30.0] * 3 + [5e3] * 3)
+HELD_POSE_SIGMA = np.array([1e-6] * 3 + [1e-4] * 3)  # rad, mm: of the pose that lays the surface frame
+FREE_POSE_SIGMA = np.array([np.pi] * 3 + [1e4] * 3)
 
-Step = Callable[[int, int], None]  # (done, total) frame sets of a pass
+PassProgress = Callable[[int, int], None]  # (done, total) frame sets of a pass
+
+
+class BlockTridiagonal:
+    """The factorisation of K states, eliminated one by one; `take` is called for each stretch, from first to last."""
+
+    def __init__(self, count: int) -> None:
+        self.count, self._done = count, 0
+        self._inverse = np.zeros((count, STATE_DOF, STATE_DOF))  # of the Cholesky factors
+        self._links = np.zeros((count, STATE_DOF, STATE_DOF))  # inverse @ information with the next state
+        self._right = np.zeros((count, STATE_DOF))
+        self._left: Array | None = None  # what the last state takes from the next one's information,
+        self._left_border = np.zeros((0, 0))  # and from its border and gradient
+
+    def take(self, information: Array, ties: Array, border: Array, gradient: Array) -> Array:
+        """Eliminate the next F states; the border's square roots (18 F, S).
+
+        information: (F, 18, 18). ties: (F, 18, 18), with the state after each, zero for the last of all. border:
+        (F, 18, S). gradient: (F, 18).
+        """
+        frames, size = len(information), border.shape[2]
+        roots = np.empty((frames, STATE_DOF, size))
+        tall = np.concatenate([ties, border, gradient[..., None]], axis=2)
+        if self._left is None:
+            self._left, self._left_border = np.zeros((STATE_DOF, STATE_DOF)), np.zeros((STATE_DOF, size + 1))
+        for f in range(frames):
+            k = self._done + f
+            inverse = _inverse_root(information[f] - self._left)
+            tall[f, :, STATE_DOF:] -= self._left_border
+            solved = inverse @ tall[f]
+            link = solved[:, :STATE_DOF]
+            self._inverse[k], self._links[k], roots[f] = inverse, link, solved[:, STATE_DOF:-1]
+            self._right[k] = solved[:, -1]
+            self._left, self._left_border = link.T @ link, link.T @ solved[:, STATE_DOF:]
+        self._done += frames
+        return roots.reshape(frames * STATE_DOF, size)
+
+    @property
+    def border(self) -> Array:
+        """What the states eliminated so far take from the next one's border and gradient, (18, S + 1)."""
+        return self._left_border
+
+    def again(self, stretch: tuple[int, int], border: Array, entry: Array) -> Array:
+        """Square roots (18 F, S) of a border (F, 18, S) that `take` had before. entry: `border` before it."""
+        first, last = stretch
+        roots = np.empty_like(border)
+        left = entry[:, :-1] if entry.size else np.zeros(border.shape[1:])
+        for k in range(first, last):
+            roots[k - first] = self._inverse[k] @ (border[k - first] - left)
+            left = self._links[k].T @ roots[k - first]
+        return roots.reshape((last - first) * STATE_DOF, border.shape[2])
+
+    @property
+    def right(self) -> Array:
+        """(K, 18), the gradient times the Cholesky factors' inverse."""
+        return self._right
+
+    def steps(self) -> Array:
+        """(K, 18) that bring the states to their optimum, the shared unknowns as in the gradient."""
+        out, after = np.empty((self.count, STATE_DOF)), np.zeros(STATE_DOF)
+        for k in range(self.count - 1, -1, -1):
+            after = -self._inverse[k].T @ (self._right[k] + self._links[k] @ after)
+            out[k] = after
+        return out
+
+    def covariances(self) -> tuple[Array, Array]:
+        """(K, 18, 18) of the states, and (K - 1, 18, 18) of each with the next, were the shared unknowns known."""
+        own, next_ = (
+            np.empty((self.count, STATE_DOF, STATE_DOF)),
+            np.empty((max(self.count - 1, 0), STATE_DOF, STATE_DOF)),
+        )
+        after = np.zeros((STATE_DOF, STATE_DOF))
+        for k in range(self.count - 1, -1, -1):
+            root = self._inverse[k].T
+            gain = root @ self._links[k]
+            through = gain @ after
+            if k < self.count - 1:
+                next_[k] = -through
+            after = root @ root.T + through @ gain.T
+            own[k] = after = (after + after.T) / 2
+        return own, next_
+
+    def responses(self, stretch: tuple[int, int], roots: Array, after: Array) -> Iterator[tuple[int, Array]]:
+        """How states follow the shared unknowns, (18, S), of first <= k < last, from the last one on backwards.
+
+        roots: (18 F, S) as `take` gave them for this stretch. after: of the state behind it, zero at the end.
+        """
+        first, last = stretch
+        blocks = roots.reshape(last - first, STATE_DOF, -1)
+        for k in range(last - 1, first - 1, -1):
+            after = -self._inverse[k].T @ (blocks[k - first] + self._links[k] @ after)
+            yield k, after
+
+
+def _inverse_root(information: Array) -> Array:
+    """Inverse of the Cholesky factor of (18, 18); LinAlgError where that is not positive definite."""
+    upper = np.linalg.cholesky(information).T  # LAPACK reads it column by column
+    inverse, failed = dtrtri(upper, lower=0)
+    assert failed == 0
+    return cast(Array, inverse.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
-    """All unknowns: K states, the cameras, and landmarks (L, 3) mm in the surface frame."""
+class Priors:
+    """What is known besides the tracks."""
 
-    states: States
-    cameras: Cameras
-    points: Array
-
-    def moved(self, steps: Array, shared: Array, free: NDArray[np.int64]) -> Estimate:
-        """The same after steps of the states (K, 18) and of the shared unknowns (S,), the `free` cameras' first."""
-        corrections = np.zeros(11 * len(self.cameras))
-        corrections[free] = shared[: len(free)]
-        points = self.points + shared[len(free) :].reshape(-1, 3)
-        return Estimate(self.states.moved(steps), self.cameras.moved(corrections), points)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Known:
-    """What is known besides the tracks.
-
-    calibrated: the cameras before; calibration: (11 C, 11 C) information of their corrections. points: (L, 3) and
-    map: (3L, 3L), landmarks before and their information. pose: (4, 4), of frame set `held`; frame: (6,) its sigma.
-    psd: (K - 1, 6) density of the jerk, rad^2/s^5 and mm^2/s^5.
-    """
-
-    calibrated: Cameras
-    calibration: Array
-    points: Array
-    map: Array
-    pose: Array
+    calibrated: CorrectedCameras  # the C cameras before
+    calibration: Array  # (11 C, 11 C) information of their corrections
+    points: Array  # (L, 3) mm, landmarks before
+    map: Array  # (3L, 3L) their information
+    pose: Array  # (4, 4) of frame set `held`
     held: int
-    frame: Array
-    psd: Array
+    frame: Array  # (6,) sigma of that pose
+    psd: Array  # (K - 1, 6) density of the jerk, rad^2/s^5 and mm^2/s^5
 
 
-@dataclass(slots=True, eq=False)
-class Pass:
-    """What one pass over all frame sets gave. shared: (S, S) information and pull: (S,) of the shared unknowns with
-    the states eliminated; both empty where their step was given. effects, doubts, follows: as in Condensed, of all K.
-    """
+@dataclass(frozen=True, slots=True, eq=False)
+class Elimination:
+    """What one pass over all K frame sets gave."""
 
-    chain: Chain
-    shared: Array
-    pull: Array
-    effects: Array
-    doubts: Array
-    follows: Array
+    chain: BlockTridiagonal
+    shared: Array  # (S, S) information of the shared unknowns, the states eliminated; empty where their step was given
+    pull: Array  # (S,) their gradient
+    effects: Array  # (K, 3C) as in CondensedFrames,
+    doubts: Array  # (K, 3C)
+    follows: Array  # (K, 3C, 18)
     cost: float
-    entries: list[Array] = field(default_factory=list)  # (18, S + 1): what a stretch takes over from the one before
+    entries: list[Array]  # (18, S + 1): what a stretch takes over from the one before
 
 
-def stretches(problem: Problem, cameras: int) -> list[tuple[int, int]]:
+def stretches(problem: BatchProblem, cameras: int) -> list[tuple[int, int]]:
     """The frame sets in stretches that fit into memory, whatever the recording's length."""
-    each = 3 * max(problem.landmarks, 1) * (10 * cameras + STATE + 3 * cameras + len(problem.free) + STATE)
-    length = int(np.clip(ROOM // each, 8, LONGEST))
+    each = 3 * max(problem.landmarks, 1) * (10 * cameras + STATE_DOF + 3 * cameras + len(problem.free) + STATE_DOF)
+    length = int(np.clip(MAX_PRODUCT_NUMBERS // each, 8, MAX_STRETCH_FRAMES))
     count = len(problem.data)
     return [(first, min(first + length, count)) for first in range(0, count, length)]
 
 
-class Equations:
+class NormalEquations:
     """The normal equations at one estimate."""
 
-    def __init__(self, problem: Problem, estimate: Estimate, known: Known, noise: Noise) -> None:
+    def __init__(self, problem: BatchProblem, estimate: Estimate, known: Priors, noise: NoiseModel) -> None:
         self.problem, self.estimate, self.known, self.noise = problem, estimate, known, noise
-        self._links: Links = links(estimate.states, problem.data.stamps)
+        self._links: PriorFactors = prior_factors(estimate.states, problem.data.stamps)
         self._information = self._links.information(known.psd)
 
-    def whole(self, progress: Step) -> Pass:
-        """Eliminate all states; what is left are the shared unknowns."""
-        problem, size = self.problem, self.problem.size
-        out = Pass(Chain(len(problem.data)), np.zeros((size, size)), np.zeros(size), *self._noted(), 0.0)
+    def eliminate(self, progress: PassProgress, step: Array | None = None) -> Elimination:
+        """Eliminate all states; what is left are the shared unknowns. step: (S,), where theirs is given."""
+        problem, coupled = self.problem, step is None
+        size = problem.size if coupled else 0
+        shared, pull, cost = np.zeros((size, size)), np.zeros(size), 0.0
+        chain, entries, own = BlockTridiagonal(len(problem.data)), list[Array](), list[tuple[Array, Array, Array]]()
         for first, last in stretches(problem, len(self.estimate.cameras)):
-            part = self._condensed(first, last, None)
-            out.entries.append(out.chain.border)
-            roots = self._eliminate(out.chain, first, last, part, part.cross)
-            out.shared += part.shared - roots.T @ roots - part.own.T @ part.own
-            out.pull += part.pull - roots.T @ out.chain.right[first:last].ravel()
-            self._note(out, first, last, part)
+            part = condense(problem, first, last, self.estimate, self.noise, step)
+            entries.append(chain.border)
+            roots = self._take(chain, first, last, part, part.cross if coupled else part.cross[:, :, :0])
+            if coupled:
+                shared += part.shared - roots.T @ roots - part.own.T @ part.own
+                pull += part.pull - roots.T @ chain.right[first:last].ravel()
+            own.append((part.effects, part.doubts, part.follows))
+            cost += part.cost
             progress(last, len(problem.data))
-        self._add_prior(out)
-        return out
+        if coupled:
+            self._add_prior(shared, pull)
+        effects, doubts, follows = (np.concatenate(arrays) for arrays in zip(*own, strict=True))
+        return Elimination(chain, shared, pull, effects, doubts, follows, cost, entries)
 
-    def given(self, step: Array, progress: Step) -> Pass:
-        """Eliminate all states where the shared unknowns take a step (S,)."""
-        none = np.zeros((0, 0))
-        out = Pass(Chain(len(self.problem.data)), none, np.zeros(0), *self._noted(), 0.0)
-        for first, last in stretches(self.problem, len(self.estimate.cameras)):
-            part = self._condensed(first, last, step)
-            self._eliminate(out.chain, first, last, part, part.cross[:, :, :0])
-            self._note(out, first, last, part)
-            progress(last, len(self.problem.data))
-        return out
-
-    def responses(self, done: Pass) -> Iterator[tuple[int, Array]]:
-        """How each state follows the shared unknowns (18, S), from the last to the first, of a `whole` pass."""
-        after = np.zeros((STATE, self.problem.size))
+    def responses(self, done: Elimination) -> Iterator[tuple[int, Array]]:
+        """How each state follows the shared unknowns (18, S), from the last to the first, where those were free."""
+        after = np.zeros((STATE_DOF, self.problem.size))
         parts = stretches(self.problem, len(self.estimate.cameras))
         for (first, last), entry in zip(reversed(parts), reversed(done.entries), strict=True):
-            part = self._condensed(first, last, None)
+            part = condense(self.problem, first, last, self.estimate, self.noise, None)
             roots = done.chain.again((first, last), part.cross, entry)
             for k, after in done.chain.responses((first, last), roots, after):  # noqa: B020
                 yield k, after
 
-    def _condensed(self, first: int, last: int, step: Array | None) -> Condensed:
-        e = self.estimate
-        return condensed(self.problem, first, last, e.states, e.cameras, e.points, self.noise, step)
-
-    def _eliminate(self, chain: Chain, first: int, last: int, part: Condensed, cross: Array) -> Array:
+    def _take(self, chain: BlockTridiagonal, first: int, last: int, part: CondensedFrames, cross: Array) -> Array:
+        """Add the motion prior to a stretch and eliminate its states; the border's square roots."""
         information, gradient = part.information, part.gradient
         ties = np.zeros_like(information)
         prior, known = self._links, self._information
@@ -152,33 +227,25 @@ class Equations:
 
     def _begin(self, first: int, last: int, information: Array, gradient: Array) -> None:
         """What is known of the first state's motion, and of the pose that lays the surface frame."""
-        states, each = self.estimate.states, np.arange(STATE)
+        states, each = self.estimate.states, np.arange(STATE_DOF)
         if first == 0:
-            information[0][each[6:], each[6:]] += WIDE**-2.0
-            gradient[0][6:] += np.concatenate([states.twists[0], states.accelerations[0]]) * WIDE**-2.0
+            information[0][each[6:], each[6:]] += INITIAL_MOTION_SIGMA**-2.0
+            gradient[0][6:] += np.concatenate([states.twists[0], states.accelerations[0]]) * INITIAL_MOTION_SIGMA**-2.0
         if first <= self.known.held < last:
             f, weight = self.known.held - first, self.known.frame**-2.0
             off = se3.log(se3.inverse(self.known.pose) @ states.poses[self.known.held])
             information[f][each[:6], each[:6]] += weight
             gradient[f][:6] += weight * off
 
-    def _add_prior(self, out: Pass) -> None:
+    def _add_prior(self, shared: Array, pull: Array) -> None:
+        """Calibration and map, in place."""
         known, estimate, free = self.known, self.estimate, self.problem.free
         q = len(free)
         off = estimate.cameras.since(known.calibrated)
-        out.shared[:q, :q] += known.calibration[np.ix_(free, free)]
-        out.pull[:q] += (known.calibration @ off)[free]
-        out.shared[q:, q:] += known.map
-        out.pull[q:] += known.map @ (estimate.points - known.points).ravel()
-
-    def _noted(self) -> tuple[Array, Array, Array]:
-        shape = len(self.problem.data), 3 * len(self.estimate.cameras)
-        return np.zeros(shape), np.zeros(shape), np.zeros((*shape, STATE))
-
-    def _note(self, out: Pass, first: int, last: int, part: Condensed) -> None:
-        out.effects[first:last], out.doubts[first:last] = part.effects, part.doubts
-        out.follows[first:last] = part.follows
-        out.cost += part.cost
+        shared[:q, :q] += known.calibration[np.ix_(free, free)]
+        pull[:q] += (known.calibration @ off)[free]
+        shared[q:, q:] += known.map
+        pull[q:] += known.map @ (estimate.points - known.points).ravel()
 
     def prior_cost(self) -> float:
         """Half the squared sigmas by which the states part from the continuous-time prior."""
@@ -186,10 +253,10 @@ class Equations:
         return float(0.5 * (np.swapaxes(off, 1, 2) @ self._information @ off).sum())
 
     def jerks(self, steps: Array, own: Array, after: Array) -> tuple[Array, Array]:
-        """What each tie between neighbours tells of the jerk: its square (K - 1, 6), as a density times three, and for
-        how many of three numbers it counts (K - 1, 6): what the prior itself determined tells nothing of it.
+        """Squared jerk between neighbours (K - 1, 6), a density times three, and the numbers (0 to 3) it counts for.
 
-        steps: (K, 18) that the states are about to take. own, after: covariances of them and of each with the next.
+        The second, (K - 1, 6), leaves out what the prior itself determined. steps: (K, 18) that the states are about to
+        take. own, after: covariances of them and of each with the next.
         """
         prior = self._links
         a, b = prior.before, prior.after
@@ -205,15 +272,19 @@ class Equations:
         return square, np.clip(3 - open_, 0.0, 3.0)
 
 
-def shared_step(done: Pass) -> Array:
-    """(S,) of the shared unknowns, from a `whole` pass."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(done.shared), 1e-300))
-    factor = cho_factor(done.shared * scale[:, None] * scale, check_finite=False)
+def shared_step(done: Elimination) -> Array:
+    """(S,) of the shared unknowns, where they were free."""
+    scale, factor = _scaled_factor(done)
     return np.asarray(-scale * cho_solve(factor, scale * done.pull, check_finite=False))
 
 
-def shared_covariance(done: Pass) -> Array:
+def shared_covariance(done: Elimination) -> Array:
     """(S, S) of the shared unknowns."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(done.shared), 1e-300))
-    factor = cho_factor(done.shared * scale[:, None] * scale, check_finite=False)
+    scale, factor = _scaled_factor(done)
     return np.asarray(scale[:, None] * cho_solve(factor, np.eye(len(scale)), check_finite=False) * scale)
+
+
+def _scaled_factor(done: Elimination) -> tuple[Array, tuple[Array, bool]]:
+    """Scale (S,) that brings the diagonal to one, and the Cholesky factor of the scaled information."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(done.shared), 1e-300))
+    return scale, cho_factor(done.shared * scale[:, None] * scale, check_finite=False)

@@ -1,4 +1,7 @@
-"""Arm, tool and latency from all sightings at once, in GTSAM: robust first, then honest about what is left."""
+"""Pose, tool offset and latency of an arm by nonlinear least squares (GTSAM): from tips in pictures, or touched points.
+
+Sightings are reweighted (Tukey) until outliers are out; a last fit without weights gives the covariance.
+"""
 
 from __future__ import annotations
 
@@ -10,24 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.arm_calibration.set_point import SetPoint
-from estimation.calibration.arm_model import OWN, ArmState, Kinematics, Predicted, Sightings, predict
+from estimation.calibration.arm_model import ArmParameters, Kinematics, SetPoint, Sightings, TipPrediction, predict
+from estimation.calibration.arm_start import ARM_CALIBRATION, check_places, check_turns
+from estimation.calibration.lens_model import CAMERA_PARAMETERS
 from estimation.errors import InputError
-from estimation.median import median
 from estimation.rig import Rig
+from estimation.runtime import median
 from estimation.se3 import Array
 
-ROUNDS = 6  # of weighing and solving: blunders are out after two or three
-CUT = 5.0  # scatters at which a sighting counts for nothing while weighing (Tukey's biweight)
-OUT = 4.0  # scatters beyond which a sighting is left out in the end: of pure noise one in 3000
+REWEIGHT_ROUNDS = 6  # outliers are out after two or three
+TUKEY_CUTOFF = 5.0  # scatters at which a sighting's weight is zero (Tukey's biweight)
+MAX_SCATTERS = 4.0  # scatters beyond which a sighting is left out of the last fit: of pure noise one in 3000
 RAYLEIGH = 1.1774  # median length of a vector whose two entries are normal, in their sigmas
-TOOL, TIME, BLUNT = 100.0, 0.2, 0.2  # mm, s, mm: one sigma of what is believed before anything is seen
-PLACE, TIMING, TIP, END, CAMERAS = (gtsam.symbol(letter, 0) for letter in "ptxer")
+TOOL_SIGMA, TIMING_SIGMA, BLUNT_SIGMA = 100.0, 0.2, 0.2  # mm, s, mm: one sigma of the priors
+ARM_KEY, TIMING_KEY, TOOL_KEY, BLUNT_KEY, CAMERAS_KEY = (gtsam.symbol(letter, 0) for letter in "ptxer")
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """What is sought beside the arm's place; what is not stays as it was given."""
+class ArmUnknowns:
+    """What is estimated beside the arm's pose; the rest stays as given."""
 
     tool: bool = True
     latency: bool = True
@@ -36,18 +40,18 @@ class Asked:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmFit:
-    """state: as found. covariance: (12, 12) of [rx ry rz tx ty tz] of base_from_arm, rad and mm, right perturbation,
-    tool offset mm, dead time s, lag s, blunt mm; zero for what was not asked. residuals: (N, 2) px, as predicted less
-    seen. used: (N,) sightings that lie where they should. scatter: of those, in the sigmas they came with. widened_by:
-    what the covariance was multiplied by, beyond what the scatter says.
+    """The estimate.
+
+    covariance: of [rx ry rz tx ty tz] (right perturbation of base_from_arm, rad and mm), tool mm, dead time s, lag s,
+    blunt mm; zero for what was not estimated.
     """
 
-    state: ArmState
-    covariance: Array
-    residuals: Array
-    used: NDArray[np.bool_]
-    scatter: float
-    widened_by: float = 1.0
+    state: ArmParameters
+    covariance: Array  # (12, 12)
+    residuals: Array  # (N, 2) px, prediction less measurement
+    used: NDArray[np.bool_]  # (N,) which sightings are inliers
+    scatter: float  # of the inliers' residuals, in their stated sigmas
+    widened_by: float = 1.0  # factor on the covariance by `jackknife`
 
     @property
     def sigma(self) -> Array:
@@ -55,8 +59,8 @@ class ArmFit:
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
 
-class _Problem:
-    """The sightings and what explains them; `graph` puts them into factors with given weights."""
+class _ArmProblem:
+    """The sightings and their model; `graph` makes factors with given weights."""
 
     def __init__(
         self,
@@ -64,87 +68,86 @@ class _Problem:
         set_point: SetPoint,
         kinematics: Kinematics,
         rig: Rig,
-        start: ArmState,
-        asked: Asked,
+        start: ArmParameters,
+        unknowns: ArmUnknowns,
         rig_covariance: Array | None,
     ) -> None:
-        self.sightings, self.start, self.asked, self.rig_covariance = sightings, start, asked, rig_covariance
+        self.sightings, self.start, self.unknowns, self.rig_covariance = sightings, start, unknowns, rig_covariance
         self._world = set_point, kinematics, rig
         self._cameras = len(rig)
-        self.keys: list[int] = [PLACE]
-        for key, wanted in ((TIP, asked.tool), (TIMING, asked.latency), (END, asked.blunt)):
-            self.keys += [key] * wanted
-        self.keys += [CAMERAS] * (rig_covariance is not None)
+        self.keys: list[int] = [ARM_KEY]
+        for key, free in ((TOOL_KEY, unknowns.tool), (TIMING_KEY, unknowns.latency), (BLUNT_KEY, unknowns.blunt)):
+            self.keys += [key] * free
+        self.keys += [CAMERAS_KEY] * (rig_covariance is not None)
 
-    def state(self, values: gtsam.Values) -> ArmState:
-        """The state in GTSAM's values; what is not asked is the start's."""
-        tool = values.atVector(TIP) if self.asked.tool else self.start.tool
-        dead, lag = values.atVector(TIMING) if self.asked.latency else (self.start.dead_time, self.start.lag)
-        blunt = float(values.atVector(END)[0]) if self.asked.blunt else self.start.blunt
-        return ArmState(values.atPose3(PLACE).matrix(), np.asarray(tool), float(dead), abs(float(lag)), blunt)
+    def state(self, values: gtsam.Values) -> ArmParameters:
+        """The parameters in GTSAM's values; what is not estimated is the start's."""
+        tool = values.atVector(TOOL_KEY) if self.unknowns.tool else self.start.tool
+        dead, lag = values.atVector(TIMING_KEY) if self.unknowns.latency else (self.start.dead_time, self.start.lag)
+        blunt = float(values.atVector(BLUNT_KEY)[0]) if self.unknowns.blunt else self.start.blunt
+        return ArmParameters(values.atPose3(ARM_KEY).matrix(), np.asarray(tool), float(dead), abs(float(lag)), blunt)
 
-    def values(self, state: ArmState) -> gtsam.Values:
-        """GTSAM's values of a state."""
+    def values(self, state: ArmParameters) -> gtsam.Values:
         values = gtsam.Values()
-        values.insert(PLACE, gtsam.Pose3(state.base_from_arm))
+        values.insert(ARM_KEY, gtsam.Pose3(state.base_from_arm))
         for key, vector in self._vectors(state):
             if key in self.keys:
                 values.insert(key, vector)
         if self.rig_covariance is not None:
-            values.insert(CAMERAS, np.zeros(OWN * self._cameras))
+            values.insert(CAMERAS_KEY, np.zeros(CAMERA_PARAMETERS * self._cameras))
         return values
 
-    def _vectors(self, state: ArmState) -> list[tuple[int, Array]]:
+    def _vectors(self, state: ArmParameters) -> list[tuple[int, Array]]:
         timing = np.array([state.dead_time, state.lag])
-        return [(TIP, np.asarray(state.tool, float)), (TIMING, timing), (END, np.array([state.blunt]))]
+        return [(TOOL_KEY, np.asarray(state.tool, float)), (TIMING_KEY, timing), (BLUNT_KEY, np.array([state.blunt]))]
 
-    def seen(self, values: gtsam.Values) -> tuple[Predicted, Array]:
-        """What should be seen, and residuals (N, 2), px."""
+    def predict(self, values: gtsam.Values) -> tuple[TipPrediction, Array]:
+        """The predicted pixels, and residuals (N, 2), px."""
         s, (set_point, kinematics, rig) = self.sightings, self._world
-        found = predict(self.state(values), set_point, kinematics, rig, s.stamp, s.camera)
-        left = found.pixels - s.pixels
+        prediction = predict(self.state(values), set_point, kinematics, rig, s.stamp, s.camera)
+        residuals = prediction.pixels - s.pixels
         if self.rig_covariance is not None:
-            own = values.atVector(CAMERAS).reshape(-1, OWN)[s.camera]
-            left = left + np.einsum("nij,nj->ni", found.by_camera, own)
-        return found, left
+            own = values.atVector(CAMERAS_KEY).reshape(-1, CAMERA_PARAMETERS)[s.camera]
+            residuals = residuals + np.einsum("nij,nj->ni", prediction.by_camera, own)
+        return prediction, residuals
 
     def graph(self, weights: Array, rows: NDArray[np.bool_]) -> gtsam.NonlinearFactorGraph:
-        """All factors; weights: (N,) of the sightings, rows: (N,) which take part."""
+        """All factors. weights: (N,) of the sightings. rows: (N,) which of them are used."""
         graph, root = gtsam.NonlinearFactorGraph(), (np.sqrt(weights) / self.sightings.sigma)[rows]
 
-        def error(_: object, values: gtsam.Values, slopes: list[Array] | None) -> Array:
-            found, left = self.seen(values)
-            if slopes is not None:
-                for i, slope in enumerate(self._slopes(found, values)):
-                    slopes[i] = np.asfortranarray((slope[rows] * root[:, None, None]).reshape(2 * len(root), -1))
-            return np.asarray((left[rows] * root[:, None]).ravel())
+        def error(_: object, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+            prediction, residuals = self.predict(values)
+            if jacobians is not None:
+                for i, slope in enumerate(self._slopes(prediction, values)):
+                    jacobians[i] = np.asfortranarray((slope[rows] * root[:, None, None]).reshape(2 * len(root), -1))
+            return np.asarray((residuals[rows] * root[:, None]).ravel())
 
         unit = gtsam.noiseModel.Unit.Create(2 * int(rows.sum()))
         graph.add(gtsam.CustomFactor(unit, self.keys, error))
-        beliefs = {TIP: TOOL, TIMING: TIME, END: BLUNT}
+        priors = {TOOL_KEY: TOOL_SIGMA, TIMING_KEY: TIMING_SIGMA, BLUNT_KEY: BLUNT_SIGMA}
         for key, vector in self._vectors(self.start):
             if key in self.keys:
-                noise = gtsam.noiseModel.Isotropic.Sigma(len(vector), beliefs[key])
-                graph.add(gtsam.PriorFactorVector(key, vector, noise))
+                isotropic = gtsam.noiseModel.Isotropic.Sigma(len(vector), priors[key])
+                graph.add(gtsam.PriorFactorVector(key, vector, isotropic))
         if self.rig_covariance is not None:
-            doubt = gtsam.noiseModel.Gaussian.Covariance(_positive(self.rig_covariance))
-            graph.add(gtsam.PriorFactorVector(CAMERAS, np.zeros(OWN * self._cameras), doubt))
+            noise = gtsam.noiseModel.Gaussian.Covariance(_invertible(self.rig_covariance))
+            graph.add(gtsam.PriorFactorVector(CAMERAS_KEY, np.zeros(CAMERA_PARAMETERS * self._cameras), noise))
         return graph
 
-    def _slopes(self, found: Predicted, values: gtsam.Values) -> list[Array]:
-        by = {PLACE: found.by_arm, TIP: found.by_tool, TIMING: found.by_time, END: found.by_blunt}
-        if self.asked.latency and values.atVector(TIMING)[1] < 0:  # which stands for a lag as long
-            by[TIMING] = found.by_time * [1.0, -1.0]
+    def _slopes(self, p: TipPrediction, values: gtsam.Values) -> list[Array]:
+        by = {ARM_KEY: p.by_arm, TOOL_KEY: p.by_tool, TIMING_KEY: p.by_time, BLUNT_KEY: p.by_blunt}
+        if self.unknowns.latency and values.atVector(TIMING_KEY)[1] < 0:  # a negative lag stands for its absolute value
+            by[TIMING_KEY] = p.by_time * [1.0, -1.0]
         slopes = [by[key] for key in self.keys if key in by]
         if self.rig_covariance is not None:
-            spread = np.zeros((len(self.sightings), 2, self._cameras, OWN))
-            spread[np.arange(len(self.sightings)), :, self.sightings.camera] = found.by_camera
-            slopes.append(spread.reshape(len(self.sightings), 2, -1))
+            by_cameras = np.zeros((len(self.sightings), 2, self._cameras, CAMERA_PARAMETERS))
+            by_cameras[np.arange(len(self.sightings)), :, self.sightings.camera] = p.by_camera
+            slopes.append(by_cameras.reshape(len(self.sightings), 2, -1))
         return slopes
 
     def covariance(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Array:
-        """(12, 12) as `ArmFit` has it."""
-        sizes = {PLACE: (0, 6), TIP: (6, 3), TIMING: (9, 2), END: (11, 1)}
+        """The marginal covariance (12, 12) of `ArmFit`."""
+        sizes = {ARM_KEY: (0, 6), TOOL_KEY: (6, 3), TIMING_KEY: (9, 2), BLUNT_KEY: (11, 1)}
         marginals = gtsam.Marginals(graph, values)
         keys = [key for key in self.keys if key in sizes]
         joint, out = marginals.jointMarginalCovariance(keys), np.zeros((12, 12))
@@ -160,86 +163,91 @@ def fit_arm(
     set_point: SetPoint,
     kinematics: Kinematics,
     rig: Rig,
-    start: ArmState,
-    asked: Asked | None = None,
+    start: ArmParameters,
+    unknowns: ArmUnknowns | None = None,
     rig_covariance: Array | None = None,
 ) -> ArmFit:
-    """The state under which the sightings lie where they should; from a start within some degrees and millimetres.
+    """The parameters that fit the sightings best, from a start within some degrees and millimetres.
 
-    rig_covariance: (16 C, 16 C) of lens, place and clock of each camera, as cameras' calibration states it, if it is
-    known: then what the rig may be off by is in the covariance too. InputError where nothing fits.
+    rig_covariance: (16 C, 16 C) of lens, pose and clock of each camera, if known: then the covariance includes the
+    rig's uncertainty. InputError where nothing fits.
     """
-    problem = _Problem(sightings, set_point, kinematics, rig, start, asked or Asked(), rig_covariance)
-    values, away, scatter = _weighed(problem, problem.values(start))
-    found = problem.state(values)
-    if problem.asked.latency:  # two valleys: dead time taken for lag, and lag for dead time
-        late = max(found.dead_time + found.lag, 0.0)
-        shares = (0.2, 0.8) if found.lag < found.dead_time else (0.8, 0.2)
-        other = replace(found, dead_time=shares[0] * late, lag=shares[1] * late)
-        again = _weighed(problem, problem.values(other))
+    problem = _ArmProblem(sightings, set_point, kinematics, rig, start, unknowns or ArmUnknowns(), rig_covariance)
+    values, away, scatter = _reweighted_fit(problem, problem.values(start))
+    first = problem.state(values)
+    if problem.unknowns.latency:  # two local minima: dead time taken for lag, and lag for dead time
+        late = max(first.dead_time + first.lag, 0.0)
+        shares = (0.2, 0.8) if first.lag < first.dead_time else (0.8, 0.2)
+        other = replace(first, dead_time=shares[0] * late, lag=shares[1] * late)
+        again = _reweighted_fit(problem, problem.values(other))
         if again[2] < scatter:
             values, away, scatter = again
-    used = away < OUT * scatter
+    used = away < MAX_SCATTERS * scatter
     values = _solve(problem.graph(np.ones(len(sightings)), used), values)
-    left = problem.seen(values)[1]
-    spare = 2 * int(used.sum()) - 12
+    residuals = problem.predict(values)[1]
+    spare = 2 * int(used.sum()) - 12  # degrees of freedom
     if spare <= 0:
-        raise InputError("arm calibration", "sightings that agree", int(used.sum()), "12 or more")
-    scatter = float(np.sqrt(((left[used] / sightings.sigma[used, None]) ** 2).sum() / spare))
+        raise InputError(ARM_CALIBRATION, "sightings that agree", int(used.sum()), "12 or more")
+    scatter = float(np.sqrt(((residuals[used] / sightings.sigma[used, None]) ** 2).sum() / spare))
     graph = problem.graph(np.full(len(sightings), 1 / max(scatter, 1e-6) ** 2), used)
-    return ArmFit(problem.state(values), problem.covariance(graph, values), left, used, scatter)
+    return ArmFit(problem.state(values), problem.covariance(graph, values), residuals, used, scatter)
 
 
-def _weighed(problem: _Problem, values: gtsam.Values) -> tuple[gtsam.Values, Array, float]:
-    """The values once blunders have lost their weight, how far off (N,) sightings are, in sigmas, and their scatter."""
+def _reweighted_fit(problem: _ArmProblem, values: gtsam.Values) -> tuple[gtsam.Values, Array, float]:
+    """The values once outliers have no weight, each sighting's residual (N,) in sigmas, and their scatter."""
     sightings = problem.sightings
     weights, rows, away, scatter = np.ones(len(sightings)), np.ones(len(sightings), bool), np.zeros(0), 0.0
-    for _ in range(ROUNDS):
+    for _ in range(REWEIGHT_ROUNDS):
         values = _solve(problem.graph(weights, rows), values)
-        away = np.linalg.norm(problem.seen(values)[1], axis=1) / sightings.sigma
+        away = np.linalg.norm(problem.predict(values)[1], axis=1) / sightings.sigma
         scatter = max(median(away[weights > 0]) / RAYLEIGH, 1e-9)
-        weights = np.clip(1 - (away / (CUT * scatter)) ** 2, 0.0, None) ** 2
+        weights = np.clip(1 - (away / (TUKEY_CUTOFF * scatter)) ** 2, 0.0, None) ** 2
     return values, away, scatter
 
 
 def _solve(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
-    wishes = gtsam.LevenbergMarquardtParams()
-    wishes.setDiagonalDamping(True)  # in each number's own unit: radians, mm and s lie far apart
-    return gtsam.LevenbergMarquardtOptimizer(graph, values, wishes).optimize()
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setDiagonalDamping(True)  # radians, mm and s differ by orders of magnitude
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
 
 
-def _positive(covariance: Array) -> Array:
-    """A covariance that can be inverted: what is exactly known is known to a millionth of the rest."""
+def _invertible(covariance: Array) -> Array:
+    """The covariance, regularised: zero variances become tiny ones."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-16))
     correlated = covariance / np.outer(scale, scale)
     return np.asarray((correlated + 1e-9 * np.eye(len(scale))) * np.outer(scale, scale))
 
 
-def held_out(
-    sightings: Sightings, fold: Callable[[Sightings], ArmFit], again: Callable[[ArmState, Sightings], Array], folds: int
-) -> tuple[Array, list[ArmState]]:
-    """Residuals (N, 2), px, of sightings by fits that did not see their place; on the way, their stretch of time.
+def cross_validate(
+    sightings: Sightings,
+    fold: Callable[[Sightings], ArmFit],
+    residuals_of: Callable[[ArmParameters, Sightings], Array],
+    folds: int,
+) -> tuple[Array, list[ArmParameters]]:
+    """Residuals (N, 2), px, of sightings under fits without their place, and the parameters of those fits.
 
-    And what those fits found, one for each part of the places that was left out.
+    Sightings on the way are grouped with the place that follows them in time.
     """
-    group = np.where(sightings.place >= 0, sightings.place, np.searchsorted(_ends(sightings), sightings.stamp))
-    out, states = np.full((len(sightings), 2), np.nan), list[ArmState]()
+    numbers = np.unique(sightings.place[sightings.place >= 0])
+    starts = np.array([sightings.stamp[sightings.place == number].min() for number in numbers])
+    group = np.where(sightings.place >= 0, sightings.place, np.searchsorted(starts, sightings.stamp))
+    out, states = np.full((len(sightings), 2), np.nan), list[ArmParameters]()
     for number in range(folds):
         mine = group % folds == number
         if mine.any() and not mine.all():
             states.append(fold(sightings.take(~mine)).state)
-            out[mine] = again(states[-1], sightings.take(mine))
+            out[mine] = residuals_of(states[-1], sightings.take(mine))
     return out, states
 
 
-def widened(fit: ArmFit, states: Sequence[ArmState]) -> ArmFit:
-    """The fit, its covariance as wide as fits that left out a part of the places each say it is, never narrower.
+def jackknife(fit: ArmFit, states: Sequence[ArmParameters]) -> ArmFit:
+    """The fit with its covariance scaled to the spread of fits that each left out some places; never narrower.
 
-    What is off alike in all pictures of a place, as the end of a needle is that a camera sees at one angle, is no noise
-    that more pictures of it would average. Left out in turn, whole places tell what it does (delete-a-group jackknife,
-    Kott 2001); by the mean over all numbers, as a few parts tell no more.
+    Errors common to all pictures of a place, as the end of a needle seen at one angle, do not average out over more
+    pictures. Leaving out whole places shows their effect (delete-a-group jackknife, Kott 2001). One factor for all
+    parameters, as a few groups tell no more.
     """
-    off = np.array([_apart(state, fit.state) for state in states])
+    off = np.array([_state_difference(state, fit.state) for state in states])
     known = np.diag(fit.covariance) > 0
     if len(states) < 2 or not known.any():
         return fit
@@ -250,14 +258,61 @@ def widened(fit: ArmFit, states: Sequence[ArmState]) -> ArmFit:
     return replace(fit, covariance=fit.covariance * factor, widened_by=factor)
 
 
-def _apart(state: ArmState, other: ArmState) -> Array:
-    """How far (12,) a state lies from another one, in the order of a fit's covariance."""
+def _state_difference(state: ArmParameters, other: ArmParameters) -> Array:
+    """Difference (12,) of two states in the order of the covariance."""
     pose = se3.log(se3.inverse(other.base_from_arm) @ state.base_from_arm)
     rest = [state.dead_time - other.dead_time, state.lag - other.lag, state.blunt - other.blunt]
     return np.concatenate([pose, np.asarray(state.tool) - other.tool, rest])
 
 
-def _ends(sightings: Sightings) -> Sequence[float] | Array:
-    """Stamps at which one place after the other begins."""
-    places = np.unique(sightings.place[sightings.place >= 0])
-    return np.array([sightings.stamp[sightings.place == p].min() for p in places])
+@dataclass(frozen=True, slots=True, eq=False)
+class TouchFit:
+    """An arm's pose from touched points."""
+
+    base_from_arm: Array  # (4, 4) mm
+    tool: Array  # (3,) mm
+    covariance: Array  # (9, 9) of base_from_arm (right perturbation, rad and mm) and tool; zero for a given tool
+    residuals: Array  # (N, 3) mm, prediction less known point
+
+
+def fit_touches(arm_from_nozzle: Array, points: Array, sigma: Array, tool: Array, seek_tool: bool) -> TouchFit:
+    """The arm's pose from its own nozzle poses (N, 4, 4), mm, and the points (N, 3), mm, base, that the tip touched.
+
+    sigma: (N,) mm, of each point. tool: (3,) mm, tip in the nozzle's frame, or the start of its estimate. InputError
+    unless there are four points or more, not in a plane, and for the tool turned ones.
+    """
+    check_places(arm_from_nozzle[:, :3, 3])
+    if seek_tool:
+        check_turns(arm_from_nozzle)
+    keys = [ARM_KEY, TOOL_KEY] if seek_tool else [ARM_KEY]
+
+    def parts(values: gtsam.Values) -> tuple[Array, Array, Array]:
+        pose = values.atPose3(ARM_KEY).matrix()
+        at = np.asarray(values.atVector(TOOL_KEY)) if seek_tool else tool
+        return pose, at, se3.transform_points(arm_from_nozzle, at[None])[:, 0]
+
+    def error(_: object, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        pose, _tool, inside = parts(values)
+        residuals = (se3.transform_points(pose, inside) - points) / sigma[:, None]
+        if jacobians is not None:
+            turn = pose[:3, :3]
+            held = np.broadcast_to(turn, (len(inside), 3, 3))
+            by = [np.concatenate([turn @ -se3.hat(inside), held], -1), turn @ arm_from_nozzle[:, :3, :3]]
+            for i in range(len(keys)):
+                jacobians[i] = np.asfortranarray((by[i] / sigma[:, None, None]).reshape(3 * len(inside), -1))
+        return np.asarray(residuals.ravel())
+
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3 * len(points)), keys, error))
+    tips = se3.transform_points(arm_from_nozzle, tool[None])[:, 0]
+    values.insert(ARM_KEY, gtsam.Pose3(se3.rigid_from_points(tips, points)))
+    if seek_tool:
+        values.insert(TOOL_KEY, np.asarray(tool, float))
+        graph.add(gtsam.PriorFactorVector(TOOL_KEY, tool, gtsam.noiseModel.Isotropic.Sigma(3, TOOL_SIGMA)))
+    values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    joint, covariance = gtsam.Marginals(graph, values).jointMarginalCovariance(keys), np.zeros((9, 9))
+    for i, a in enumerate(keys):
+        for j, b in enumerate(keys):
+            covariance[6 * i : 6 * i + 6 - 3 * i, 6 * j : 6 * j + 6 - 3 * j] = joint.at(a, b)
+    pose, at, inside = parts(values)
+    return TouchFit(pose, at, covariance, se3.transform_points(pose, inside) - points)

@@ -1,28 +1,39 @@
-"""First guesses from planes: homographies, the focal length of all of them, and each view's pose (Zhang 2000)."""
+"""One camera's lens from its own views: homographies (Zhang 2000), refined by Levenberg-Marquardt, with covariance.
+
+Each view has its own pose, so no common clock is needed: the distortion model is chosen before time is estimated.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.camera_calibration.views import Views
+from estimation.calibration.lens_model import MODELS, BoardViews, lens_prior, project_lens
 from estimation.se3 import Array
 
-LEAST = 4  # corners that fix a homography
-SUSPICIOUS = 3.0  # px off a homography: strong distortion over a board in the corner of the image leaves 2
-CLEARER = 2.0  # times by which the rest lies better without a blunder
+MIN_PLANE_CORNERS = 4  # corners that fix a homography
+MIN_VIEW_CORNERS = 6  # of a view: four fix its pose and leave nothing to check it by
+SUSPICIOUS_PX = 3.0  # px off a homography: strong distortion over a board in the corner of the image leaves 2
+BLUNDER_RATIO = 2.0  # of the worst residual with and without an outlier
+HUBER_SIGMAS = 3.0  # 0.3 % of pure noise is beyond, so that the covariance needs no correction for it
+MAX_LM_STEPS, MIN_GAIN = 40, 1e-7  # steps; relative cost reduction below which the iteration ends
+MAX_DAMPING = 1e8  # beyond, no step reduces the cost
 
 
 def homography(plane: Array, pixels: Array) -> Array:
-    """(3, 3), of unit length, that carries (N, 2) of the plane to (N, 2) pixels, by the direct linear transform."""
+    """Homography (3, 3) of unit norm from plane points (N, 2) to pixels (N, 2), by the direct linear transform."""
     to_plane, to_pixels = _normaliser(plane), _normaliser(pixels)
     a, b = (np.c_[p, np.ones(len(p))] @ t.T for p, t in ((plane, to_plane), (pixels, to_pixels)))
     nothing = np.zeros_like(a)
     rows = np.concatenate([np.hstack([a, nothing, -b[:, :1] * a]), np.hstack([nothing, a, -b[:, 1:2] * a])])
-    found = np.linalg.svd(rows)[2][-1].reshape(3, 3)
-    whole = np.linalg.inv(to_pixels) @ found @ to_plane
-    return np.asarray(whole / np.linalg.norm(whole))
+    normalised = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    out = np.linalg.inv(to_pixels) @ normalised @ to_plane
+    return np.asarray(out / np.linalg.norm(out))
 
 
 def _normaliser(points: Array) -> Array:
@@ -31,51 +42,51 @@ def _normaliser(points: Array) -> Array:
     return np.array([[scale, 0, -scale * middle[0]], [0, scale, -scale * middle[1]], [0, 0, 1]])
 
 
-def homographies(views: Views) -> Array:
+def homographies(views: BoardViews) -> Array:
     """(V, 3, 3) from the board's plane, mm, to pixels about each image's middle; nan with fewer than four corners."""
     out = np.full((len(views), 3, 3), np.nan)
     for v, seen in enumerate(views.seen):
-        if seen.sum() >= LEAST:
+        if seen.sum() >= MIN_PLANE_CORNERS:
             middle = (np.array(views.sizes[views.camera[v]]) - 1) / 2
             out[v] = homography(views.points[seen, :2], views.pixels[v, seen] - middle)
     return out
 
 
-def plane_blunders(views: Views) -> NDArray[np.bool_]:
-    """(V, P) corners without which the rest of their view lies on one plane much better: found before any lens is."""
+def plane_outliers(views: BoardViews) -> NDArray[np.bool_]:
+    """(V, P) corners without which the rest of their view fits a homography much better; needs no lens."""
     out = np.zeros(views.seen.shape, bool)
     for v, seen in enumerate(views.seen):
         rows = np.flatnonzero(seen)
-        while len(rows) >= LEAST + 2:
-            away = _away(views, v, rows)
+        while len(rows) >= MIN_PLANE_CORNERS + 2:
+            away = _homography_residuals(views, v, rows)
             worst = float(away.max())
-            if worst < SUSPICIOUS:
+            if worst < SUSPICIOUS_PX:
                 break
-            rest = [float(_away(views, v, np.delete(rows, i)).max()) for i in range(len(rows))]
-            if min(rest) > worst / CLEARER:
+            rest = [float(_homography_residuals(views, v, np.delete(rows, i)).max()) for i in range(len(rows))]
+            if min(rest) > worst / BLUNDER_RATIO:
                 break
             out[v, rows[int(np.argmin(rest))]] = True
             rows = np.delete(rows, int(np.argmin(rest)))
     return out
 
 
-def _away(views: Views, v: int, rows: NDArray[np.int64]) -> Array:
+def _homography_residuals(views: BoardViews, v: int, rows: NDArray[np.int64]) -> Array:
     plane, pixels = views.points[rows, :2], views.pixels[v, rows]
     there = np.c_[plane, np.ones(len(rows))] @ homography(plane, pixels).T
     return np.asarray(np.linalg.norm(there[:, :2] / there[:, 2:] - pixels, axis=1))
 
 
-def focal(found: Array) -> float:
-    """The focal length, px, with square pixels about the image's middle that suits all homographies (V, 3, 3); or nan.
+def focal_length(planes: Array) -> float:
+    """The focal length, px, of homographies (V, 3, 3), with square pixels about the image's middle; or nan.
 
     Each gives h1' w h2 = 0 and h1' w h1 = h2' w h2 with w = diag(1/f^2, 1/f^2, 1): linear in 1/f^2, weighted by tilt.
     """
-    return focal_of(focal_terms(found))
+    return focal_from_terms(focal_terms(planes))
 
 
-def focal_terms(found: Array) -> Array:
-    """(3,) of homographies (V, 3, 3), what a focal length is found from; terms of several add up."""
-    h = found[np.isfinite(found).all((1, 2))]
+def focal_terms(planes: Array) -> Array:
+    """(3,) sums over homographies (V, 3, 3) that determine the focal length; sums of several sets add up."""
+    h = planes[np.isfinite(planes).all((1, 2))]
     a, b = h[:, :, 0], h[:, :, 1]
     flat = np.concatenate([(a[:, :2] * b[:, :2]).sum(1), (a[:, :2] ** 2 - b[:, :2] ** 2).sum(1)])
     deep = np.concatenate([a[:, 2] * b[:, 2], a[:, 2] ** 2 - b[:, 2] ** 2])
@@ -84,23 +95,232 @@ def focal_terms(found: Array) -> Array:
     return np.array([flat @ flat, deep @ deep, flat @ deep])
 
 
-def focal_of(terms: Array) -> float:
-    """The focal length, px, by summed terms (3,); nan where they tell none."""
+def focal_from_terms(terms: Array) -> float:
+    """The focal length, px, by summed terms (3,); nan where they do not determine it."""
     flat, deep, both = terms
     if not both < 0:
         return float("nan")
-    return float((flat / deep) ** 0.25)  # neither of the two is free of noise
+    return float((flat / deep) ** 0.25)  # total least squares: both sides are noisy
 
 
-def poses(found: Array, f: Array) -> Array:
+def poses(planes: Array, f: Array) -> Array:
     """camera_from_board (V, 4, 4) of homographies (V, 3, 3) and focal lengths (V,)."""
-    columns = found / np.stack([f, f, np.ones_like(f)], -1)[:, :, None]
+    columns = planes / np.stack([f, f, np.ones_like(f)], -1)[:, :, None]
     size = np.linalg.norm(columns[:, :, :2], axis=1).mean(1) * np.where(columns[:, 2, 2] < 0, -1, 1)
     columns = columns / size[:, None, None]
     x, y, shift = columns[:, :, 0], columns[:, :, 1], columns[:, :, 2]
-    return np.stack(
-        [
-            se3.orthonormalise(se3.make(np.stack([a, b, np.cross(a, b)], 1), t))
-            for a, b, t in zip(x, y, shift, strict=True)
-        ]
+    turns = [np.stack([a, b, np.cross(a, b)], 1) for a, b in zip(x, y, strict=True)]
+    return np.stack([se3.orthonormalise(se3.make(turn, t)) for turn, t in zip(turns, shift, strict=True)])
+
+
+def huber(squares: Array) -> tuple[Array, Array]:
+    """Huber's cost and weight (...) of squared residual lengths (...), in sigmas."""
+    length = np.sqrt(squares)
+    out = length > HUBER_SIGMAS
+    cost = np.where(out, 2 * HUBER_SIGMAS * length - HUBER_SIGMAS**2, squares)
+    return cost, np.where(out, HUBER_SIGMAS / np.maximum(length, HUBER_SIGMAS), 1.0)
+
+
+class HasCost(Protocol):
+    """The normal equations at one state."""
+
+    @property
+    def cost(self) -> float:
+        """Of residuals and priors."""
+
+
+State = TypeVar("State")
+Normal = TypeVar("Normal", bound=HasCost)
+
+
+def minimise(
+    state: State,
+    normal: Callable[[State], Normal],
+    step: Callable[[State, Normal, float], State | None],
+    min_gain: float = MIN_GAIN,
+) -> tuple[State, Normal]:
+    """The state of least cost by Levenberg-Marquardt, and its normal equations.
+
+    step: the state after a damped step, None where the equations cannot be solved. min_gain: relative cost reduction
+    below which the iteration ends.
+    """
+    at, damping = normal(state), 1e-4
+    for _ in range(MAX_LM_STEPS):
+        while damping < MAX_DAMPING:
+            tried = step(state, at, damping)
+            there = None if tried is None else normal(tried)
+            if tried is not None and there is not None and there.cost < at.cost:
+                break
+            damping *= 10
+        else:
+            break
+        assert tried is not None and there is not None
+        gain, state, at = at.cost - there.cost, tried, there
+        damping = max(damping / 10, 1e-9)
+        if gain <= min_gain * at.cost:
+            break
+    return state, at
+
+
+def damped(matrix: Array, damping: float) -> Array:
+    """Matrices (..., n, n) with diagonals multiplied by 1 + damping."""
+    out = np.array(matrix)
+    n = np.arange(matrix.shape[-1])
+    out[..., n, n] *= 1 + damping
+    out[..., n, n] += 1e-12
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensFit:
+    """A lens fitted to one camera's views."""
+
+    model: str
+    lens: Array  # (9,)
+    covariance: Array  # (9, 9) at the pixels' stated sigma; zero for parameters that are not free
+    camera_from_board: Array  # (V, 4, 4)
+    residuals: Array  # (V, P, 2) px, projection less measurement, or nan
+    scale: float  # of the residuals, in stated sigmas
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LensState:
+    lens: Array
+    poses: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LensEquations:
+    cost: float
+    residuals: Array
+    lens: Array  # (9, 9)
+    cross: Array  # (V, 9, 6)
+    pose: Array  # (V, 6, 6)
+    lens_slope: Array  # (9,)
+    pose_slope: Array  # (V, 6)
+
+
+def first_lens(views: BoardViews) -> tuple[Array, Array]:
+    """A lens (9,) without distortion and poses (V, 4, 4) of one camera's views, from homographies alone."""
+    planes = homographies(views)
+    size = np.array(views.sizes[int(views.camera[0])], float)
+    f = focal_length(planes)
+    if not 0.3 * size.max() < f < 20 * size.max():
+        f = float(size.max())
+    lens = np.array([f, f, *(size - 1) / 2, 0, 0, 0, 0, 0])
+    return lens, poses(planes, np.full(len(views), f))
+
+
+def fit_lens(
+    views: BoardViews, model: str, begin: tuple[Array, Array] | None = None, min_gain: float = MIN_GAIN
+) -> LensFit:
+    """The lens that fits one camera's views best. begin: a lens (9,) and poses (V, 4, 4) to start from."""
+    free = MODELS[model]
+    lens, camera_from_board = first_lens(views) if begin is None else begin
+    lens = np.where(np.isin(np.arange(9), free), lens, 0.0)
+
+    def normal(state: _LensState) -> _LensEquations:
+        return _lens_equations(views, state)
+
+    def step(state: _LensState, at: _LensEquations, damping: float) -> _LensState | None:
+        return _lens_step(state, at, damping, free)
+
+    state, at = minimise(_LensState(lens, camera_from_board), normal, step, min_gain)
+    covariance, scale = _lens_covariance(at, free), _scale(views, at.residuals, len(free))
+    return LensFit(model, state.lens, covariance, state.poses, at.residuals, scale)
+
+
+def fit_poses(
+    views: BoardViews, lens: Array, camera_from_board: Array, min_gain: float = MIN_GAIN
+) -> tuple[Array, Array]:
+    """Poses (V, 4, 4) with a fixed lens, and residuals (V, P, 2) px."""
+    state, at = minimise(
+        _LensState(lens, camera_from_board),
+        lambda state: _lens_equations(views, state),
+        lambda state, at, damping: _lens_step(state, at, damping, np.zeros(0, np.int64)),
+        min_gain,
     )
+    return state.poses, at.residuals
+
+
+def _lens_equations(views: BoardViews, state: _LensState) -> _LensEquations:
+    if not (state.lens[:2] > 1).all():
+        return _infinite_cost(views)
+    points = se3.transform_points(state.poses, views.points)  # (V, P, 3)
+    seen = views.seen
+    if (points[..., 2][seen] < 1.0).any():
+        return _infinite_cost(views)
+    points[..., 2] = np.where(seen, points[..., 2], 1.0)
+    pixels, by_lens, by_point = project_lens(state.lens, points)
+    residuals = np.where(seen[..., None], pixels - np.nan_to_num(views.pixels), 0.0)
+    cost, weight = huber((residuals**2).sum(-1) / views.sigma[:, None] ** 2)
+    weight = weight * seen / views.sigma[:, None] ** 2
+    turned = by_point @ state.poses[:, None, :3, :3]
+    by_pose = np.concatenate([-turned @ se3.hat(views.points), turned], -1)
+    count = len(views)
+    a, b = by_lens.reshape(count, -1, 9), by_pose.reshape(count, -1, 6)
+    w, r = np.repeat(weight, 2, axis=1)[..., None], residuals.reshape(count, -1, 1)
+    prior = lens_prior(views.sizes[int(views.camera[0])], state.lens)
+    return _LensEquations(
+        float(cost[seen].sum()) + prior.cost,
+        np.where(seen[..., None], residuals, np.nan),
+        (np.swapaxes(a, 1, 2) @ (w * a)).sum(0) + prior.information,
+        np.swapaxes(a, 1, 2) @ (w * b),
+        np.swapaxes(b, 1, 2) @ (w * b),
+        (np.swapaxes(a, 1, 2) @ (w * r)).sum((0, 2)) + prior.slope,
+        (np.swapaxes(b, 1, 2) @ (w * r))[..., 0],
+    )
+
+
+def _infinite_cost(views: BoardViews) -> _LensEquations:
+    """An impossible state: a corner behind the lens, or a negative focal length."""
+    v, p = views.seen.shape
+    nothing = np.zeros((v, p, 2)), np.zeros((9, 9)), np.zeros((v, 9, 6)), np.zeros((v, 6, 6))
+    return _LensEquations(np.inf, *nothing, np.zeros(9), np.zeros((v, 6)))
+
+
+def _schur_complement(at: _LensEquations, free: NDArray[np.int64], damping: float) -> tuple[Array, Array]:
+    """The lens's equations with all poses eliminated: matrix (F, F) and slope (F,)."""
+    cross = at.cross[:, free]
+    factor = cross @ np.linalg.inv(damped(at.pose, damping))  # (V, F, 6)
+    matrix = damped(at.lens[np.ix_(free, free)], damping) - (factor @ np.swapaxes(cross, 1, 2)).sum(0)
+    return matrix, at.lens_slope[free] - (factor @ at.pose_slope[..., None]).sum((0, 2))
+
+
+def _lens_step(state: _LensState, at: _LensEquations, damping: float, free: NDArray[np.int64]) -> _LensState | None:
+    try:
+        matrix, slope = _schur_complement(at, free, damping)
+        change = np.zeros(9)
+        change[free] = -np.linalg.solve(matrix, slope)
+        rest = at.pose_slope + np.einsum("vij,i->vj", at.cross, change)
+        turn = -np.linalg.solve(damped(at.pose, damping), rest[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        return None
+    if not np.isfinite(turn).all() or np.abs(turn[:, :3]).max(initial=0.0) > 1.0:
+        return None
+    return _LensState(state.lens + change, state.poses @ se3.exp(turn))
+
+
+def _lens_covariance(at: _LensEquations, free: NDArray[np.int64]) -> Array:
+    matrix = _schur_complement(at, free, 0.0)[0]
+    out = np.zeros((9, 9))
+    try:
+        out[np.ix_(free, free)] = np.linalg.inv((matrix + matrix.T) / 2)
+    except np.linalg.LinAlgError:
+        out[free, free] = np.inf
+    return out
+
+
+def fit_given_lens(views: BoardViews, lens: Array) -> LensFit:
+    """One camera's views with a given lens (9,); its model is the simplest that has its non-zero parameters."""
+    f = np.full(len(views), float(np.sqrt(lens[0] * lens[1])))
+    camera_from_board, residuals = fit_poses(views, lens, poses(homographies(views), f))
+    model = next(name for name, free in MODELS.items() if not lens[np.setdiff1d(np.arange(9), free)].any())
+    return LensFit(model, lens, np.zeros((9, 9)), camera_from_board, residuals, _scale(views, residuals, 0))
+
+
+def _scale(views: BoardViews, residuals: Array, free: int) -> float:
+    """Scatter of the residuals in stated sigmas, corrected for the degrees of freedom."""
+    squares = np.nansum(residuals**2, -1) / views.sigma[:, None] ** 2
+    cost = huber(squares[views.seen])[0].sum()
+    return float(np.sqrt(cost / max(2 * views.seen.sum() - 6 * len(views) - free, 1)))

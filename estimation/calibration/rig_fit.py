@@ -1,8 +1,12 @@
-"""All cameras at once: lenses, places, clock offsets and the board's motion, adjusted to every corner that was seen.
+"""Bundle adjustment of a rig: lenses, camera poses, clock offsets and the board's motion from all corners at once.
 
-GTSAM's Python has no stock factor in which a camera's place, its lens and a moving board are unknown together, and one
-written in Python is called once per corner and step. The equations here are GTSAM's own (tangents, right perturbation,
-Levenberg and Marquardt, robust weights), made for all views at once: a step over 300 views takes tens of milliseconds.
+GTSAM's Python has no stock factor with camera pose, lens and a moving board as unknowns, and a custom one is called
+once per corner and step. The equations here are GTSAM's own (tangents, right perturbation, Levenberg-Marquardt, robust
+weights), for all views at once: a step over 300 views takes tens of milliseconds.
+
+Between frame sets the board moves on the exponential of the Lagrange polynomial through the logarithms of up to four
+neighbouring poses, two on either side where there are two (fourth order): no parameters, and a pose depends on its
+neighbours alone.
 """
 
 from __future__ import annotations
@@ -15,73 +19,151 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from estimation import se3
-from estimation.calibration.lens_model import MODELS, KnownLenses, belief, image, knowledge
-from estimation.camera_calibration.board_motion import WIDTH, Stencils, carried, stencils
-from estimation.camera_calibration.least_squares import damped, huber, minimise
-from estimation.camera_calibration.views import Views
+from estimation.calibration.lens_fit import damped, huber, minimise
+from estimation.calibration.lens_model import (
+    CAMERA_PARAMETERS,
+    MODELS,
+    BoardViews,
+    KnownLenses,
+    given_prior,
+    lens_prior,
+    project_lens,
+)
 from estimation.se3 import Array
 
-OWN = 16  # numbers per camera: lens 9, place 6, offset 1
-OFFSET = slice(15, 16)
-FAR = 0.5  # s: one sigma of an offset before any view; beyond it frames would have been paired otherwise
-MEAN = 1e-6  # s: the mean of the offsets is held at zero, since the board's own clock is nobody's
+MAX_INSTANT_GAP = 0.5  # s between instants, beyond which the motion is not interpolated: the board is taken to rest
+STENCIL_SIDE = 2  # neighbours on either side
+STENCIL_WIDTH = 2 * STENCIL_SIDE  # K below
+OFFSET_SIGMA = 0.5  # s: prior of a clock offset; frames with a larger one would have been paired otherwise
+MEAN_OFFSET_SIGMA = 1e-6  # s: the mean of the offsets is held at zero, as only their differences are observable
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stencils:
+    """The neighbours through which each instant's motion is interpolated."""
+
+    neighbours: NDArray[np.int64]  # (S, K) instants, the own number where there is none
+    times: Array  # (S, K) s after the own instant, or nan
+
+
+def stencils(stamps: Array) -> Stencils:
+    """The neighbours of instants with the rising stamps (S,), s."""
+    count = len(stamps)
+    neighbours, times = np.repeat(np.arange(count)[:, None], STENCIL_WIDTH, 1), np.full((count, STENCIL_WIDTH), np.nan)
+    for run in np.split(np.arange(count), np.flatnonzero(np.diff(stamps) > MAX_INSTANT_GAP) + 1):
+        for k, i in enumerate(run):
+            first = min(max(k - STENCIL_SIDE, 0), max(len(run) - STENCIL_WIDTH - 1, 0))  # one-sided at a run's ends
+            others = np.delete(run[first : first + STENCIL_WIDTH + 1], k - first)
+            neighbours[i, : len(others)], times[i, : len(others)] = others, stamps[others] - stamps[i]
+    return Stencils(neighbours, times)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardPoses:
+    """The board's pose in each view, and the Jacobians of its right perturbation."""
+
+    pose: Array  # (V, 4, 4)
+    by_delay: Array  # (V, 6) per s
+    by_pose: Array  # (V, 6, 6 + 6 K) by the own pose, then by the neighbours
+
+
+def interpolate_board(poses: Array, who: Stencils, instant: NDArray[np.int64], delay: Array) -> BoardPoses:
+    """The board's poses in views exposed `delay` (V,), s, after their instants (V,); poses: (S, 4, 4)."""
+    own, others, times = poses[instant], poses[who.neighbours[instant]], who.times[instant]
+    way = se3.log(se3.inverse(own)[:, None] @ others)  # (V, K, 6)
+    weight, slope = _lagrange(times, delay)
+    xi, rate = np.einsum("vk,vki->vi", weight, way), np.einsum("vk,vki->vi", slope, way)
+    right = _right(xi)
+    by_pose = np.empty((len(own), 6, 6 + 6 * STENCIL_WIDTH))
+    there = weight[..., None, None] * _right_inverse(way)
+    here = (weight[..., None, None] * _right_inverse(-way)).sum(1)
+    step = se3.exp(xi)
+    by_pose[:, :, :6] = se3.adjoint(se3.inverse(step)) - right @ here
+    by_pose[:, :, 6:] = (right[:, None] @ there).transpose(0, 2, 1, 3).reshape(-1, 6, 6 * STENCIL_WIDTH)
+    return BoardPoses(own @ step, (right @ rate[..., None])[..., 0], by_pose)
+
+
+def _lagrange(times: Array, at: Array) -> tuple[Array, Array]:
+    """Lagrange weights (V, K) of the neighbours at `at` (V,), and their derivatives; the own node at 0 adds nothing."""
+    there = np.isfinite(times)
+    t = np.where(there, times, 0.0)
+    safe = np.where(there, times, 1.0)
+    weight, slope = at[:, None] / safe, 1 / safe
+    for m in range(STENCIL_WIDTH):
+        other = np.arange(STENCIL_WIDTH) != m
+        used = there[:, m : m + 1] & other
+        gap = np.where(used, t - t[:, m : m + 1], 1.0)
+        factor = np.where(used, (at[:, None] - t[:, m : m + 1]) / gap, 1.0)
+        slope = slope * factor + np.where(used, weight / gap, 0.0)
+        weight = weight * factor
+    return np.where(there, weight, 0.0), np.where(there, slope, 0.0)
+
+
+def _ad(xi: Array) -> Array:
+    out = np.zeros((*xi.shape[:-1], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = se3.hat(xi[..., :3])
+    out[..., 3:, :3] = se3.hat(xi[..., 3:])
+    return out
+
+
+def _right(xi: Array) -> Array:
+    """Right Jacobian (..., 6, 6) by its series: exact to 1e-6 up to 0.3 rad, more than a hand turns between frames."""
+    ad = _ad(xi)
+    two = ad @ ad
+    return np.asarray(np.eye(6) - ad / 2 + two / 6 - two @ ad / 24 + two @ two / 120)
+
+
+def _right_inverse(xi: Array) -> Array:
+    """Inverse of the right Jacobian (..., 6, 6), by its series."""
+    ad = _ad(xi)
+    two = ad @ ad
+    return np.asarray(np.eye(6) + ad / 2 + two / 12 - two @ two / 720)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigState:
-    """What is unknown. lens: (C, 9). base_from_camera: (C, 4, 4). offset: (C,) s, added to the stamps. jitter: (V,) s,
-    beyond it, of single pictures. base_from_board: (S, 4, 4) at the instants' mean stamps.
-    """
+    """The unknowns."""
 
-    lens: Array
-    base_from_camera: Array
-    offset: Array
-    jitter: Array
-    base_from_board: Array
+    lens: Array  # (C, 9)
+    base_from_camera: Array  # (C, 4, 4)
+    offset: Array  # (C,) s, added to the stamps
+    jitter: Array  # (V,) s, additional delay of single pictures
+    base_from_board: Array  # (S, 4, 4) at the instants' mean stamps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigFit:
-    """The state that fits best.
-
-    covariance: (16 C, 16 C) at the views' stated sigma, camera by camera: fx .. k3, place (a right perturbation of
-    base_from_camera), offset; zero where nothing was free or doubted. residuals: (V, P, 2) px, imaged less
-    seen. pace: (V, P, 2) px/s by which the board passed. scale: of the residuals, in stated sigmas.
-    """
+    """The estimate. covariance: camera by camera fx .. k3, pose (right perturbation of base_from_camera), offset."""
 
     state: RigState
-    covariance: Array
-    residuals: Array
-    pace: Array
-    scale: float
+    covariance: Array  # (16 C, 16 C) at the views' stated sigma; zero for parameters that are not free
+    residuals: Array  # (V, P, 2) px, projection less measurement
+    pace: Array  # (V, P, 2) px/s, image velocity of the corners
+    scale: float  # of the residuals, in stated sigmas
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rival:
-    """A richer model that may be the true one. free: (16 C,) what it seeks. chance: 0 to 1."""
+class RivalModel:
+    """A richer model that may be the true one."""
 
-    free: NDArray[np.bool_]
-    chance: float
+    free: NDArray[np.bool_]  # (16 C,) its additional parameters
+    chance: float  # 0 to 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Problem:
-    """What stays the same from step to step.
+class RigProblem:
+    """What is constant over the iterations."""
 
-    free: (16 C,) which of the cameras' numbers are sought. jitter: s, one sigma of single pictures' own delays, 0 for
-    none. known: of the lenses, if anything. late: (V,) s, each view's stamp after its instant's.
-    """
-
-    views: Views
+    views: BoardViews
     who: Stencils
-    late: Array
-    free: NDArray[np.bool_]
-    jitter: float
-    known: KnownLenses | None
+    late: Array  # (V,) s, each view's stamp after its instant's
+    free: NDArray[np.bool_]  # (16 C,) which of the cameras' parameters are estimated
+    jitter: float  # s, one sigma of single pictures' delays, 0 for none
+    known: KnownLenses | None  # prior of the lenses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Normal:
+class _RigEquations:
     cost: float
     matrix: Array
     slope: Array
@@ -90,34 +172,25 @@ class _Normal:
     jitter_slope: Array  # (V,)
     jitter_own: Array  # (V,)
     jitter_cross: Array  # (V, K)
-    places: NDArray[np.int64]  # (V, K) rows of the views' numbers in `matrix`
-
-
-def instant_stamps(views: Views) -> Array:
-    """(S,) s: the mean stamp of each instant's views."""
-    first = views.stamp[0]
-    return np.asarray(first + np.bincount(views.instant, views.stamp - first) / np.bincount(views.instant))
+    places: NDArray[np.int64]  # (V, K) rows of the views' parameters in `matrix`
 
 
 def free_numbers(models: tuple[str, ...], known: KnownLenses | None = None) -> NDArray[np.bool_]:
-    """(16 C,) what is sought with these distortion models: the first camera's place is the base.
-
-    known: what of the lenses is known; what is known exactly is not sought.
-    """
-    free = np.zeros((len(models), OWN), bool)
+    """(16 C,) which parameters are free with these distortion models: not the first pose, nor exactly known numbers."""
+    free = np.zeros((len(models), CAMERA_PARAMETERS), bool)
     for c, model in enumerate(models):
         free[c, MODELS[model]] = True
         if known is not None:
             free[c, :9] = known.sigma[c] > 0
         free[c, 9:15] = c > 0
-        free[c, OFFSET] = len(models) > 1
+        free[c, 15] = len(models) > 1
     return free.ravel()
 
 
 def fit_rig(
-    views: Views, state: RigState, free: NDArray[np.bool_], jitter: float, known: KnownLenses | None = None
+    views: BoardViews, state: RigState, free: NDArray[np.bool_], jitter: float, known: KnownLenses | None = None
 ) -> RigFit:
-    """The state that fits the views best, from a near one. jitter: s, one sigma of single pictures' delays."""
+    """The state that fits the views best, from a start near it. jitter: s, one sigma of single pictures' delays."""
     problem = _problem(views, free, jitter, known)
     state, at = minimise(state, lambda s: _equations(problem, s), lambda s, at, damping: _step(problem, s, at, damping))
     seen, instants = views.seen, len(state.base_from_board)
@@ -127,11 +200,13 @@ def fit_rig(
     return RigFit(state, _covariance(problem, at), at.residuals, at.pace, scale)
 
 
-def with_rivals(views: Views, fit: RigFit, free: NDArray[np.bool_], jitter: float, rivals: Sequence[Rival]) -> RigFit:
-    """The fit with a covariance in real units, which also holds which model is the true one.
+def with_rivals(
+    views: BoardViews, fit: RigFit, free: NDArray[np.bool_], jitter: float, rivals: Sequence[RivalModel]
+) -> RigFit:
+    """The fit with a covariance scaled by the residuals, which includes the uncertainty of the model.
 
-    Residuals larger than stated widen it. Each rival adds, by its chance, what it knows less and how far it lies away
-    (the total covariance over the models), to first order at the fit's state.
+    Each rival adds, times its chance, its larger covariance and the outer product of its distance (law of total
+    covariance), to first order at the fit's state.
     """
     problem, size = _problem(views, free, jitter), max(fit.scale, 1.0)
     covariance = size**2 * fit.covariance
@@ -141,32 +216,34 @@ def with_rivals(views: Views, fit: RigFit, free: NDArray[np.bool_], jitter: floa
         change = _change(wider, at, 0.0)
         if change is not None:
             away = change[: len(free)]
-            less, known = np.zeros_like(fit.covariance), np.isfinite(fit.covariance)  # of what is not, nothing is less
-            less[known] = size**2 * (_covariance(wider, at)[known] - fit.covariance[known])
-            covariance = covariance + rival.chance * (less + np.outer(away, away))
+            excess, known = np.zeros_like(fit.covariance), np.isfinite(fit.covariance)  # infinite entries stay
+            excess[known] = size**2 * (_covariance(wider, at)[known] - fit.covariance[known])
+            covariance = covariance + rival.chance * (excess + np.outer(away, away))
     return replace(fit, covariance=covariance)
 
 
-def _problem(views: Views, free: NDArray[np.bool_], jitter: float, known: KnownLenses | None = None) -> Problem:
-    stamps = instant_stamps(views)
-    return Problem(views, stencils(stamps), views.stamp - stamps[views.instant], free, jitter, known)
+def _problem(views: BoardViews, free: NDArray[np.bool_], jitter: float, known: KnownLenses | None = None) -> RigProblem:
+    first = views.stamp[0]
+    stamps = first + np.bincount(views.instant, views.stamp - first) / np.bincount(views.instant)  # (S,) mean
+    return RigProblem(views, stencils(stamps), views.stamp - stamps[views.instant], free, jitter, known)
 
 
-def _equations(problem: Problem, state: RigState) -> _Normal:
+def _equations(problem: RigProblem, state: RigState) -> _RigEquations:
     views = problem.views
     camera, seen = views.camera, views.seen
     delay = problem.late + state.offset[camera] + state.jitter
-    board = carried(state.base_from_board, problem.who, views.instant, delay)
+    board = interpolate_board(state.base_from_board, problem.who, views.instant, delay)
     camera_from_base = se3.inverse(state.base_from_camera)[camera]
     points = se3.transform_points(camera_from_base @ board.pose, views.points)
-    if not (state.lens[:, :2] > 1).all():
+    if not (state.lens[:, :2] > 1).all():  # an impossible state gets an infinite cost
         state = replace(state, lens=np.maximum(state.lens, [1, 1, *[-np.inf] * 7]))
     infinite = bool((points[..., 2][seen] < 1.0).any()) or bool((state.lens[:, :2] <= 1).any())
     points[..., 2] = np.where(seen & (points[..., 2] >= 1.0), points[..., 2], 1.0)
-    pixels, by_lens, by_point = image(state.lens[camera][:, None], points)
+    pixels, by_lens, by_point = project_lens(state.lens[camera][:, None], points)
     residuals = np.where(seen[..., None], pixels - np.nan_to_num(views.pixels), 0.0)
     cost, weight = huber((residuals**2).sum(-1) / views.sigma[:, None] ** 2)
     weight = weight * seen / views.sigma[:, None] ** 2
+    # Jacobians of each pixel: lens 9, camera pose 6, board pose 6 (right perturbations)
     turned = by_point @ (camera_from_base @ board.pose)[:, None, :3, :3]
     by_board = np.concatenate([-turned @ se3.hat(views.points), turned], -1)
     by_place = np.concatenate([by_point @ se3.hat(points), -by_point], -1)
@@ -175,32 +252,28 @@ def _equations(problem: Problem, state: RigState) -> _Normal:
     weighted = rows * np.repeat(weight, 2, axis=1)[..., None]
     square = np.swapaxes(rows, 1, 2) @ weighted
     slope = np.einsum("vri,vr->vi", weighted, residuals.reshape(count, -1))
-    chain = np.zeros((count, 21, 16 + 6 + 6 * WIDTH))
+    # Chain rule from the board's pose in the view to delay, own pose and neighbours
+    chain = np.zeros((count, 21, 16 + 6 + 6 * STENCIL_WIDTH))
     chain[:, :15, :15] = np.eye(15)
     chain[:, 15:, 15], chain[:, 15:, 16:] = board.by_delay, board.by_pose
     blocks, slopes = np.swapaxes(chain, 1, 2) @ square @ chain, np.einsum("vij,vi->vj", chain, slope)
     pace = np.einsum("vpij,vj->vpi", by_board, board.by_delay)
     total = float(cost[seen].sum()) if not infinite else np.inf
-    shown = np.where(seen[..., None], residuals, np.nan)
-    return _assembled(problem, state, total, blocks, slopes, shown, pace)
+    return _assemble(problem, state, total, blocks, slopes, np.where(seen[..., None], residuals, np.nan), pace)
 
 
-def _assembled(
-    problem: Problem, state: RigState, cost: float, blocks: Array, slopes: Array, residuals: Array, pace: Array
-) -> _Normal:
-    """The views' equations, blocks (V, K, K) and slopes (V, K), put together, with what is believed beforehand."""
+def _assemble(
+    problem: RigProblem, state: RigState, cost: float, blocks: Array, slopes: Array, residuals: Array, pace: Array
+) -> _RigEquations:
+    """The normal equations from the views' blocks (V, K, K) and slopes (V, K), with jitter eliminated, and priors."""
     views, cameras, instants = problem.views, len(problem.views.names), len(state.base_from_board)
-    size = OWN * cameras + 6 * instants
+    size = CAMERA_PARAMETERS * cameras + 6 * instants
     who = np.concatenate([views.instant[:, None], problem.who.neighbours[views.instant]], 1)
-    places = np.concatenate(
-        [
-            OWN * views.camera[:, None] + np.arange(OWN),
-            (OWN * cameras + 6 * who[..., None] + np.arange(6)).reshape(len(views), -1),
-        ],
-        1,
-    )
+    camera_rows = CAMERA_PARAMETERS * views.camera[:, None] + np.arange(CAMERA_PARAMETERS)
+    board_rows = (CAMERA_PARAMETERS * cameras + 6 * who[..., None] + np.arange(6)).reshape(len(views), -1)
+    places = np.concatenate([camera_rows, board_rows], 1)
     own, cross, jitter_slope = np.ones(len(views)), np.zeros((len(views), blocks.shape[1])), np.zeros(len(views))
-    if problem.jitter:
+    if problem.jitter:  # one delay per view: its Schur complement
         own = blocks[:, 15, 15] + 1 / problem.jitter**2
         cross = blocks[:, :, 15].copy()
         jitter_slope = slopes[:, 15] + state.jitter / problem.jitter**2
@@ -210,29 +283,30 @@ def _assembled(
     flat = places[:, :, None] * size + places[:, None]
     matrix: Array = np.bincount(flat.ravel(), blocks.ravel(), size * size).reshape(size, size).astype(float)
     slope: Array = np.bincount(places.ravel(), slopes.ravel(), size).astype(float)
-    offsets = OWN * np.arange(cameras) + 15
-    mean = state.offset.sum() / MEAN**2
-    matrix[np.ix_(offsets, offsets)] += 1 / MEAN**2 + np.eye(cameras) / FAR**2
-    slope[offsets] += mean + state.offset / FAR**2
+    offsets = CAMERA_PARAMETERS * np.arange(cameras) + 15
+    mean = state.offset.sum() / MEAN_OFFSET_SIGMA**2
+    matrix[np.ix_(offsets, offsets)] += 1 / MEAN_OFFSET_SIGMA**2 + np.eye(cameras) / OFFSET_SIGMA**2
+    slope[offsets] += mean + state.offset / OFFSET_SIGMA**2
     for c in range(cameras):
-        lens, beliefs = slice(OWN * c, OWN * c + 9), [belief(views.sizes[c], state.lens[c])]
+        lens = slice(CAMERA_PARAMETERS * c, CAMERA_PARAMETERS * c + 9)
+        priors = [lens_prior(views.sizes[c], state.lens[c])]
         if problem.known is not None:
-            beliefs.append(knowledge(problem.known, c, state.lens[c]))
-        for believed in beliefs:
-            matrix[lens, lens] += believed.information
-            slope[lens] += believed.slope
-            cost += believed.cost
-    cost += float(mean * state.offset.sum() + (state.offset**2).sum() / FAR**2)
-    return _Normal(cost, matrix, slope, residuals, pace, jitter_slope, own, cross, places)
+            priors.append(given_prior(problem.known, c, state.lens[c]))
+        for prior in priors:
+            matrix[lens, lens] += prior.information
+            slope[lens] += prior.slope
+            cost += prior.cost
+    cost += float(mean * state.offset.sum() + (state.offset**2).sum() / OFFSET_SIGMA**2)
+    return _RigEquations(cost, matrix, slope, residuals, pace, jitter_slope, own, cross, places)
 
 
-def _sought(problem: Problem, size: int) -> NDArray[np.int64]:
+def _free_rows(problem: RigProblem, size: int) -> NDArray[np.int64]:
     return np.flatnonzero(np.concatenate([problem.free, np.ones(size - len(problem.free), bool)]))
 
 
-def _change(problem: Problem, at: _Normal, damping: float) -> Array | None:
-    """(16 C + 6 S,) what a damped step adds to all numbers; None where the equations cannot be solved."""
-    sought = _sought(problem, len(at.slope))
+def _change(problem: RigProblem, at: _RigEquations, damping: float) -> Array | None:
+    """A damped step (16 C + 6 S,) of all parameters; None where the equations cannot be solved."""
+    sought = _free_rows(problem, len(at.slope))
     change = np.zeros(len(at.slope))
     try:
         factor = cho_factor(damped(at.matrix[np.ix_(sought, sought)], damping), overwrite_a=True, check_finite=False)
@@ -242,12 +316,12 @@ def _change(problem: Problem, at: _Normal, damping: float) -> Array | None:
     return change
 
 
-def _step(problem: Problem, state: RigState, at: _Normal, damping: float) -> RigState | None:
+def _step(problem: RigProblem, state: RigState, at: _RigEquations, damping: float) -> RigState | None:
     change = _change(problem, at, damping)
     if change is None:
         return None
-    split = OWN * len(state.lens)
-    own, boards = change[:split].reshape(-1, OWN), change[split:].reshape(-1, 6)
+    split = CAMERA_PARAMETERS * len(state.lens)
+    own, boards = change[:split].reshape(-1, CAMERA_PARAMETERS), change[split:].reshape(-1, 6)
     if not np.isfinite(change).all() or max(np.abs(own[:, 9:12]).max(), np.abs(boards[:, :3]).max()) > 1.0:
         return None
     jitter = state.jitter
@@ -263,9 +337,9 @@ def _step(problem: Problem, state: RigState, at: _Normal, damping: float) -> Rig
     )
 
 
-def _covariance(problem: Problem, at: _Normal) -> Array:
-    """(16 C, 16 C) of the cameras' numbers, boards and jitters being unknown too."""
-    sought = _sought(problem, len(at.slope))
+def _covariance(problem: RigProblem, at: _RigEquations) -> Array:
+    """(16 C, 16 C) marginal covariance of the cameras' parameters."""
+    sought = _free_rows(problem, len(at.slope))
     count = int(problem.free.sum())
     out = np.zeros((len(problem.free), len(problem.free)))
     try:

@@ -1,37 +1,175 @@
-"""What a calibration's doubt does to points in the working volume, in millimetres.
+"""How far a calibration can be trusted: cross-validation of models and rig, and predicted error in the working volume.
 
-Points that two cameras or more see are triangulated; how far lens, place and clock may be off moves them. What moves
-all of them as one rigid body is no error for printing: the surface is followed in the same frame that it is printed in.
+Stretches of the recording are held out in turn. Of a held-out stretch only the board's poses are estimated, which all
+cameras share: a rig whose cameras fit their own views but not each other's shows here.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from estimation import se3
-from estimation.calibration.camera_rig import Calibration
-from estimation.calibration.lens_model import image, lens_of
-from estimation.calibration.rig_fit import OWN
+from estimation.calibration.lens_fit import LensFit, first_lens, fit_lens, fit_poses
+from estimation.calibration.lens_model import (
+    CAMERA_PARAMETERS,
+    MODELS,
+    BoardViews,
+    Implausible,
+    KnownLenses,
+    check_lens,
+    lens_of,
+    project_lens,
+)
+from estimation.calibration.rig_fit import RigState, fit_rig
 from estimation.rig import Rig
 from estimation.se3 import Array
 
-SIDE = 5  # points of the grid along each axis
-REACH = 0.9  # share of the board's places, along each axis, that the working volume holds
+CROSS_FOLDS = 4
+FOLD_BLOCKS = 12  # stretches of neighbouring views that are held out as one: neighbours look alike
+USUAL_MODEL = "k1 k2"  # of any webcam: a number left out is claimed to be zero, a free one has its uncertainty stated
+MIN_RICHER_CHANCE = 0.15  # of a richer lens, whatever the test says: the views' free poses hide part of the error
+RICHEST_MODEL = list(MODELS)[-1]
+FOLD_MIN_GAIN = 1e-5  # relative cost at which a held-out fit ends: models differ by a hundred times that
+MIN_LEAD = 2.0  # standard errors by which another model must beat the usual one: one is exceeded by chance in six
+MIN_TRAINING_VIEWS = 6  # of each camera outside a fold: fewer do not determine its pose
+
+
+@dataclass(frozen=True, slots=True)
+class ModelScore:
+    """One distortion model's error on held-out views."""
+
+    model: str
+    held_out: float  # px, RMS
+    ahead: float  # px^2, mean square error of the usual model less this one's
+    doubt: float  # px^2, standard error of `ahead`
+
+    @property
+    def chance(self) -> float:
+        """Probability that `ahead` is positive, its mean over the views being normal."""
+        return float(ndtr(self.ahead / self.doubt)) if self.doubt > 0 else 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensChoice:
+    """The chosen model and its fit to all views."""
+
+    fit: LensFit
+    scores: tuple[ModelScore, ...]  # of all models
+    rival: str = ""  # the richest model, '' if it was chosen
+    chance: float = 0.0  # probability that a richer model predicts better
+
+
+def choose_model(views: BoardViews) -> LensChoice:
+    """The usual model, or one that is clearly better on held-out views; of one camera's views.
+
+    Models with an implausible fit are left out, unless all are.
+    """
+    folds = folds_of(len(views))
+    fits = _fits(views)
+    errors = {model: _fold_errors(views, fits[model], folds) for model in MODELS}
+    possible = [model for model in MODELS if _is_possible(views, fits[model].lens)] or list(MODELS)
+    usual = USUAL_MODEL if USUAL_MODEL in possible else possible[0]
+    scores = tuple(_score(model, errors[model], errors[usual]) for model in MODELS)
+    better = [s for s in scores if s.model in possible and s.ahead > MIN_LEAD * s.doubt]
+    chosen = max(better, key=lambda s: s.ahead).model if better else usual
+    richer = [_score(m, errors[m], errors[chosen]) for m in possible if len(MODELS[m]) > len(MODELS[chosen])]
+    if not richer:
+        return LensChoice(fits[chosen], scores)
+    chance = max(MIN_RICHER_CHANCE, *(score.chance for score in richer))
+    return LensChoice(fits[chosen], scores, richer[-1].model, chance)
+
+
+def doubt_given_lens(views: BoardViews, given: LensFit) -> LensChoice:
+    """A given lens, with the probability that a lens fitted to these views would predict held-out ones better."""
+    fits, folds = _fits(views), folds_of(len(views))
+    kept = _squares(views, given.residuals)
+    rivals = [_score(model, _fold_errors(views, fits[model], folds), kept) for model in (USUAL_MODEL, RICHEST_MODEL)]
+    return LensChoice(given, (), RICHEST_MODEL, max(score.chance for score in rivals))
+
+
+def _is_possible(views: BoardViews, lens: Array) -> bool:
+    try:
+        check_lens("", views.sizes[int(views.camera[0])], lens)
+    except Implausible:
+        return False
+    return True
+
+
+def _fits(views: BoardViews) -> dict[str, LensFit]:
+    """Every model's fit to all views, started from the next simpler one's."""
+    begin, out = first_lens(views), {}
+    for model in MODELS:
+        out[model] = fit_lens(views, model, begin)
+        begin = out[model].lens, out[model].camera_from_board
+    return out
+
+
+def folds_of(count: int) -> NDArray[np.int64]:
+    """(N,) the fold of each view; neighbours stay together, each fold is spread over the recording."""
+    blocks = min(FOLD_BLOCKS, count)
+    return np.asarray(np.arange(count) * blocks // count % min(CROSS_FOLDS, blocks), np.int64)
+
+
+def _fold_errors(views: BoardViews, whole: LensFit, folds: NDArray[np.int64]) -> Array:
+    """(V,) mean squared error, px^2, of each view under the lens fitted outside its fold; whole: the fit to all."""
+    out = np.zeros(len(views))
+    for fold in range(folds.max() + 1):
+        kept, held = folds != fold, folds == fold
+        lens = fit_lens(views.only(kept), whole.model, (whole.lens, whole.camera_from_board[kept]), FOLD_MIN_GAIN).lens
+        rest = views.only(held)
+        out[held] = _squares(rest, fit_poses(rest, lens, whole.camera_from_board[held], FOLD_MIN_GAIN)[1])
+    return out
+
+
+def _squares(views: BoardViews, residuals: Array) -> Array:
+    """(V,) mean squared length, px^2, of each view's residuals (V, P, 2)."""
+    limit = (6 * views.sigma[:, None]) ** 2  # bounds the effect of outliers
+    return np.asarray(np.nanmean(np.minimum((residuals**2).sum(-1), limit * 4), axis=1))
+
+
+def _score(model: str, errors: Array, usual: Array) -> ModelScore:
+    ahead = usual - errors
+    rms, doubt = float(np.sqrt(errors.mean() / 2)), float(ahead.std() / np.sqrt(len(ahead)))
+    return ModelScore(model, rms, float(ahead.mean()), doubt)
+
+
+def held_out_residuals(
+    views: BoardViews, state: RigState, free: NDArray[np.bool_], jitter: float, known: KnownLenses | None = None
+) -> Array:
+    """Residuals (V, P, 2) px of every view under the rig of the other folds; nan where those do not determine it.
+
+    state, free, jitter, known: of the fit to all views.
+    """
+    out = np.full(views.pixels.shape, np.nan)
+    folds = folds_of(len(state.base_from_board))[views.instant]
+    for fold in range(folds.max() + 1):
+        held, cameras = folds == fold, range(len(views.names))
+        if min(int((~held & (views.camera == c)).sum()) for c in cameras) < MIN_TRAINING_VIEWS:
+            continue
+        rig = fit_rig(views.only(~held), _state_of(views, state, ~held), free, jitter, known).state
+        own = _state_of(views, state, held)
+        begin = replace(own, lens=rig.lens, base_from_camera=rig.base_from_camera, offset=rig.offset)
+        out[held] = fit_rig(views.only(held), begin, np.zeros_like(free), jitter, known).residuals
+    return out
+
+
+def _state_of(views: BoardViews, state: RigState, kept: NDArray[np.bool_]) -> RigState:
+    boards = state.base_from_board[np.unique(views.instant[kept])]
+    return replace(state, jitter=state.jitter[kept], base_from_board=boards)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VolumeError:
-    """Predicted errors over a working volume. points: (N, 3) mm, base. error: (N,) mm, one sigma in 3D by calibration.
+    """Predicted errors over a working volume."""
 
-    pixel: (N,) mm by one pixel's noise per camera. seen: (N,) cameras that see the point; fewer than two: nan.
-    """
-
-    points: Array
-    error: Array
-    pixel: Array
-    seen: Array
+    points: Array  # (N, 3) mm, base
+    error: Array  # (N,) mm, one sigma in 3D from the calibration; nan if fewer than two cameras see the point
+    pixel: Array  # (N,) mm, from one pixel of noise per camera; nan likewise
+    seen: Array  # (N,) number of cameras that see the point
 
     @property
     def typical(self) -> float:
@@ -41,47 +179,37 @@ class VolumeError:
 
     @property
     def worst(self) -> float:
-        """The error, mm, that nineteen points in twenty stay below; nan likewise."""
+        """95th percentile of the error, mm; nan likewise."""
         known = self.error[np.isfinite(self.error)]
         return float(np.percentile(known, 95)) if len(known) else float("nan")
 
 
-def working_volume(calibration: Calibration, side: int = SIDE) -> Array:
-    """Grid (side^3, 3) mm, base, over where the board's corners were, without the outermost."""
-    boards = calibration.fit.state.base_from_board
-    corners = se3.transform_points(boards, calibration.views.points).reshape(-1, 3)
-    low, high = np.percentile(corners, [50 - 50 * REACH, 50 + 50 * REACH], axis=0)
-    axes = [np.linspace(a, b, side) for a, b in zip(low, high, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-
-
-def predicted_error(calibration: Calibration, points: Array, speed: float = 0.0) -> VolumeError:
-    """The error at points (N, 3) mm, base, of a surface that moves at `speed`, mm/s, in any direction."""
-    return volume_error(calibration.rig, calibration.fit.covariance, points, speed)
-
-
 def volume_error(rig: Rig, covariance: Array, points: Array, speed: float = 0.0) -> VolumeError:
-    """As `predicted_error`, of a rig with the covariance (16 C, 16 C) of its cameras' numbers."""
-    count, cameras = len(points), len(rig)
-    by_point, by_rig, seen = np.zeros((count, 2 * cameras, 3)), np.zeros((count, 2 * cameras, OWN * cameras)), []
+    """Errors of triangulated points (N, 3) mm, base, of a surface that moves at `speed`, mm/s, in any direction.
+
+    covariance: (16 C, 16 C) of the cameras' parameters. What moves all points as one rigid body is no error for
+    printing: the surface is tracked in the same frame that it is printed in.
+    """
+    count, cameras, seen = len(points), len(rig), []
+    by_point = np.zeros((count, 2 * cameras, 3))
+    by_rig = np.zeros((count, 2 * cameras, CAMERA_PARAMETERS * cameras))
     for c, camera in enumerate(rig.cameras):
         camera_from_base = se3.inverse(camera.base_from_camera)
         inside = se3.transform_points(camera_from_base, points)
         front = inside[:, 2] > 1.0
         inside[:, 2] = np.where(front, inside[:, 2], 1.0)
-        pixels, by_lens, by_place = image(lens_of(camera), inside)
+        pixels, by_lens, by_place = project_lens(lens_of(camera), inside)
         visible = front & (pixels >= 0).all(1) & (pixels <= np.array(camera.size) - 1).all(1)
-        rows, columns = slice(2 * c, 2 * c + 2), OWN * c
+        rows, columns = slice(2 * c, 2 * c + 2), CAMERA_PARAMETERS * c
         by_point[:, rows] = np.where(visible[:, None, None], by_place @ camera_from_base[:3, :3], 0.0)
         own = np.concatenate([by_lens, by_place @ se3.hat(inside), -by_place], -1)
         by_rig[:, rows, columns : columns + 15] = np.where(visible[:, None, None], own, 0.0)
         seen.append(visible)
     number = np.sum(seen, axis=0)
-    held = np.swapaxes(by_point, 1, 2) @ by_point
-    held = np.where((number >= 2)[:, None, None], held, np.eye(3))
-    spread = np.linalg.inv(held)
-    moves = -spread @ np.swapaxes(by_point, 1, 2) @ by_rig  # (N, 3, 16 C)
     known = number >= 2
+    information = np.where(known[:, None, None], np.swapaxes(by_point, 1, 2) @ by_point, np.eye(3))
+    spread = np.linalg.inv(information)
+    moves = -spread @ np.swapaxes(by_point, 1, 2) @ by_rig  # (N, 3, 16 C): triangulation, linearised
     error, pixel = np.full(count, np.nan), np.sqrt(np.trace(spread, axis1=1, axis2=2))
     if known.any():
         moved = _without_rigid(points[known], moves[known])
@@ -92,7 +220,7 @@ def volume_error(rig: Rig, covariance: Array, points: Array, speed: float = 0.0)
 
 
 def _without_rigid(points: Array, moves: Array) -> Array:
-    """Moves (N, 3, K) of points less the rigid motion of all of them that comes nearest; a single point keeps none."""
+    """Moves (N, 3, K) of points less their best common rigid motion; nothing is left of a single point's."""
     middle = points - points.mean(0)
     size = max(float(np.abs(middle).max()), 1.0)
     rigid = np.concatenate([-se3.hat(middle / size), np.broadcast_to(np.eye(3), (len(points), 3, 3))], -1)
@@ -103,18 +231,14 @@ def _without_rigid(points: Array, moves: Array) -> Array:
 
 
 def _by_clock(covariance: Array, spread: Array, by_point: Array, cameras: int, speed: float) -> Array:
-    """Variance (N,), mm^2, by what the offsets may be off by, at `speed` mm/s, in the mean over all directions."""
-    if not speed:
-        return np.zeros(len(spread))
-    offsets = covariance[15::OWN, 15::OWN]
+    """Variance (N,), mm^2, from the clock offsets at `speed` mm/s, as the mean over all directions."""
     out = np.zeros(len(spread))
+    if not speed:
+        return out
+    offsets = covariance[15::CAMERA_PARAMETERS, 15::CAMERA_PARAMETERS]
+    own = [by_point[:, 2 * c : 2 * c + 2] for c in range(cameras)]  # (N, 2, 3) of each camera
     for direction in np.eye(3):
-        pulls = [
-            spread
-            @ np.swapaxes(by_point[:, 2 * c : 2 * c + 2], 1, 2)
-            @ (by_point[:, 2 * c : 2 * c + 2] @ direction)[..., None]
-            for c in range(cameras)
-        ]
+        pulls = [spread @ np.swapaxes(by, 1, 2) @ (by @ direction)[..., None] for by in own]
         by_offset = np.concatenate(pulls, -1) * speed  # (N, 3, C)
         out += np.einsum("nia,ab,nib->n", by_offset, offsets, by_offset) / 3
     return out

@@ -1,9 +1,9 @@
 """Where the surface will be in the next half second, learned from its own motion while it is followed.
 
-Experts (hold, constant velocity and the `Members`) each say where it will be; the `Stack` weighs them by their delayed
-errors, and the `Intervals` say how far off that was. All are trained directly for each horizon, at samples STEP s apart
-that are interpolated from the poses as they come: the camera's rate and its jitter do not matter. What is a `Surprise`
-nobody learns from: no forecast could have known, and the next ones are not worse for it.
+Experts (hold, constant velocity and the learned `Experts`) each predict it; the `ExpertStack` weighs them by their
+delayed errors, and the `IntervalCalibration` gives the covariance. All are trained directly for each horizon, at
+samples SAMPLE_INTERVAL_S apart that are interpolated from the poses as they come: the camera's rate and its jitter do
+not matter. Nobody learns from what the `InnovationGate` sets aside: no forecast could have known it.
 """
 
 from __future__ import annotations
@@ -15,30 +15,123 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from estimation import se3
-from estimation.calibration import Intervals
-from estimation.early import Early
-from estimation.forecast import Forecast, body_rate, prepare
-from estimation.forecast.innovation_gate import Surprise
-from estimation.history import History
-from estimation.members import LAGS, LEVER, Members
-from estimation.pose import SurfacePose
+from estimation.forecast.experts import LAGS, TURN_LEVER_MM, Experts, ExpertStack, IntervalCalibration
+from estimation.forecast.innovation_gate import InnovationGate, WarmupForecast
+from estimation.pose import Forecast, SurfacePose, body_rate, prepare
+from estimation.runtime import CONTIGUOUS, compiled
 from estimation.se3 import Array
-from estimation.stacking import Stack
 
 HORIZONS = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # s
-STEP = 0.1  # s between samples learned from; a camera that is faster only predicts in between
-GAP = 0.5  # s without a pose, after which the surface may be anywhere
-YOUNG = 8.0  # s of judged forecasts, two breaths: until then errors still to come are not known by those seen
-BREATHS = 10.0  # s in which the fastest motion seen is forgotten to a third
-SETTLE = 50  # samples judged before the first forecast
-SCALE = np.array([LEVER] * 3 + [1.0] * 3)  # rad to mm at the lever
-PROBES = 10  # points at most, at which the intervals are judged
-EARLY = 1e-3  # s: stamps that are equal but for rounding
+SAMPLE_INTERVAL_S = 0.1  # between samples learned from; a camera that is faster only predicts in between
+MAX_POSE_GAP_S = 0.5  # without a pose, after which the surface may be anywhere
+YOUNG_FORECASTS_S = 8.0  # of judged forecasts, two breaths: until then their errors do not represent those to come
+SPEED_MEMORY_S = 10.0  # in which the fastest motion is forgotten to a third
+MIN_JUDGED_SAMPLES = 50  # before the first forecast
+TANGENT_SCALE = np.array([TURN_LEVER_MM] * 3 + [1.0] * 3)  # rad to mm at the lever
+MAX_PROBES = 10  # points at which the intervals are judged
+STAMP_TOLERANCE_S = 1e-3  # of stamps that are equal but for rounding
+
+MIN_TURN_COSINE = -0.9  # of a turn: beyond, its axis is lost in rounding
+MIN_POSE_GAP_S = 0.01  # poses nearer to the one before replace it, so that a faster camera keeps no shorter memory
+
+
+class PoseHistory:
+    """A window of poses over `span` s, of bounded memory: one pose in each APART s at most."""
+
+    def __init__(self, span: float) -> None:
+        self._span = span
+        self._room = int(span / MIN_POSE_GAP_S) + 4
+        self._stamps, self._poses = np.zeros(2 * self._room), np.zeros((2 * self._room, 4, 4))
+        self._first = self._end = 0
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._first = self._end = 0
+
+    def add(self, stamp: float, pose: Array) -> None:
+        """Take a pose (4, 4) newer than all before."""
+        stamps = self._stamps
+        if self._end - self._first > 1 and stamp - stamps[self._end - 2] < MIN_POSE_GAP_S:
+            self._end -= 1
+        if self._end == 2 * self._room:
+            count = self._end - self._first
+            stamps[:count], self._poses[:count] = stamps[self._first :].copy(), self._poses[self._first :].copy()
+            self._first, self._end = 0, count
+        stamps[self._end], self._poses[self._end] = stamp, pose
+        self._end += 1
+        while self._end - self._first > 2 and stamps[self._first + 1] <= stamp - self._span:
+            self._first += 1
+
+    @property
+    def reach(self) -> float:
+        """s from the oldest pose to the newest."""
+        return float(self._stamps[self._end - 1] - self._stamps[self._first]) if self._end > self._first else 0.0
+
+    def carry(self, moved: Array) -> None:
+        """Put all poses where they are carried by `moved` (4, 4), in the base frame."""
+        own = slice(self._first, self._end)
+        self._poses[own] = moved @ self._poses[own]
+
+    @property
+    def newest(self) -> Array:
+        """The last pose (4, 4); only where there is one."""
+        return np.asarray(self._poses[self._end - 1])
+
+    def increments(self, poses: Array, stamps: Array) -> Array:
+        """Tangent vectors (N, 6) from poses (N, 4, 4), or one (4, 4) for all, to where the surface was at stamps (N,).
+
+        Between two poses of the window the increment is taken as linear; outside, its end counts.
+        """
+        own = self._stamps[self._first : self._end]
+        after = np.clip(np.searchsorted(own, stamps), 1, len(own) - 1)
+        before = after - 1
+        share = np.clip((stamps - own[before]) / (own[after] - own[before]), 0.0, 1.0)[:, None]
+        ends = self._poses[self._first + np.stack([before, after])]  # (2, N, 4, 4)
+        vectors = _increments(np.broadcast_to(poses, (len(stamps), 4, 4)), ends)
+        return np.asarray((1 - share) * vectors[0] + share * vectors[1])
+
+
+def _increments(a: Array, b: Array) -> Array:
+    """log(inverse(a) @ b) (2, N, 6) of poses a (N, 4, 4) and b (2, N, 4, 4), compiled for turns below half a turn."""
+    vectors, within = _short_increments(np.require(a, float, CONTIGUOUS), np.require(b, float, CONTIGUOUS))
+    return vectors if within else np.asarray(se3.log(se3.inverse(a) @ b))
+
+
+@compiled("Tuple((f8[:,:,::1], b1))(f8[:,:,::1], f8[:,:,:,::1])")
+def _short_increments(a: Array, b: Array) -> tuple[Array, bool]:
+    """As `_increments`, and whether no turn came near half a turn, where this is not exact."""
+    vectors, within = np.empty((2, len(a), 6)), True
+    turn, shift = np.empty((3, 3)), np.empty(3)
+    for end in range(2):
+        for n in range(len(a)):
+            here, there = a[n], b[end, n]
+            for i in range(3):
+                shift[i] = 0.0
+                for k in range(3):
+                    shift[i] += here[k, i] * (there[k, 3] - here[k, 3])
+                for j in range(3):
+                    turn[i, j] = here[0, i] * there[0, j] + here[1, i] * there[1, j] + here[2, i] * there[2, j]
+            cosine = (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1) / 2
+            within = within and cosine >= MIN_TURN_COSINE
+            x, y, z = (turn[2, 1] - turn[1, 2]) / 2, (turn[0, 2] - turn[2, 0]) / 2, (turn[1, 0] - turn[0, 1]) / 2
+            sine = np.sqrt(x * x + y * y + z * z)
+            angle = np.arctan2(sine, cosine)
+            stretch = angle / sine if angle >= 1e-4 else 1.0
+            small = 1 / 12 + angle**2 / 720
+            bend = small if angle < 0.05 else (1 - angle * (1 + cosine) / (2 * sine)) / angle**2
+            x, y, z = stretch * x, stretch * y, stretch * z
+            u, v, w = y * shift[2] - z * shift[1], z * shift[0] - x * shift[2], x * shift[1] - y * shift[0]
+            out = vectors[end, n]
+            out[0], out[1], out[2] = x, y, z
+            out[3] = shift[0] - u / 2 + bend * (y * w - z * v)
+            out[4] = shift[1] - v / 2 + bend * (z * u - x * w)
+            out[5] = shift[2] - w / 2 + bend * (x * v - y * u)
+    return vectors, within
 
 
 @dataclass(slots=True)
 class _Sample:
-    """A past instant, and what was expected of it. known: horizons whose truth has come. spoilt: surprised since."""
+    """A past instant, and what was expected of it."""
 
     stamp: float
     pose: Array
@@ -46,8 +139,8 @@ class _Sample:
     experts: Array  # (H, E, 6)
     expected: Array  # (H, 6)
     claimed: Array  # (H, N)
-    known: int = 0
-    spoilt: bool = False
+    known: int = 0  # horizons whose truth has come
+    spoilt: bool = False  # something was set aside since
     moved: Array = field(default_factory=lambda: np.zeros((len(HORIZONS), 6)))
 
 
@@ -57,18 +150,18 @@ class Predictor:
     def __init__(self, points: Array | None = None) -> None:
         """points: (N, 3) mm of the surface, for which the intervals shall hold."""
         if points is None:
-            points = LEVER * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+            points = TURN_LEVER_MM * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
         prepare(HORIZONS)  # before the first frame set: the first forecast comes in the middle of a run
-        probes = points[:: -(-len(points) // PROBES)]
-        self._members = Members(len(HORIZONS))
-        count = self._members.count
-        self._history = History(LAGS[-1] + STEP)
-        self._stack = Stack(len(HORIZONS), np.concatenate([np.zeros(2), np.full(count, 1 / count)]))
-        self._intervals = Intervals(len(HORIZONS), probes / LEVER)
+        probes = points[:: -(-len(points) // MAX_PROBES)]
+        self._experts = Experts(len(HORIZONS))
+        count = self._experts.count
+        self._history = PoseHistory(LAGS[-1] + SAMPLE_INTERVAL_S)
+        self._stack = ExpertStack(len(HORIZONS), np.concatenate([np.zeros(2), np.full(count, 1 / count)]))
+        self._intervals = IntervalCalibration(len(HORIZONS), probes / TURN_LEVER_MM)
         self._samples: deque[_Sample] = deque()
         self._judged = 0
         self._before = -np.inf
-        self._surprise, self._early = Surprise(), Early()
+        self._gate, self._warmup = InnovationGate(), WarmupForecast()
         self._fastest = 0.0  # mm/s at the lever, of the last breaths
         self._last: tuple[Forecast, Array] | None = None  # the newest forecast, and what was claimed of it, mm^2
 
@@ -79,46 +172,44 @@ class Predictor:
         """
         if not (np.isfinite(pose.base_from_surface).all() and np.isfinite(pose.twist).all()):
             return None
-        if not 0 < pose.stamp - self._before <= GAP:
+        if not 0 < pose.stamp - self._before <= MAX_POSE_GAP_S:
             self._history.clear()
             self._samples.clear()
-            self._surprise.forget()
-            self._early.forget()
+            self._gate.forget()
+            self._warmup.forget()
             self._last = None
         lasting = np.zeros((6, 6)) if lasting is None else lasting
-        seconds, twist = pose.stamp - self._before, self._heed(pose)
+        seconds, twist = pose.stamp - self._before, self._known_twist(pose)
         self._before = pose.stamp
-        return self._learned(pose, twist, lasting) or self._unlearned(pose, seconds, twist)
+        return self._learned_forecast(pose, twist, lasting) or self._warmup_forecast(pose, seconds, twist)
 
-    def _learned(self, pose: SurfacePose, twist: Array, lasting: Array) -> Forecast | None:
+    def _learned_forecast(self, pose: SurfacePose, twist: Array, lasting: Array) -> Forecast | None:
         """Learn from the pose, and forecast by what is learned; None while too little is known."""
         self._history.add(pose.stamp, pose.base_from_surface)
-        if self._history.reach < STEP / 2:
+        if self._history.reach < SAMPLE_INTERVAL_S / 2:
             return None
         due = self._due(pose.stamp)
         ends, now = [s.stamp + HORIZONS[k] for s, k in due], np.broadcast_to(pose.base_from_surface, (len(LAGS), 4, 4))
         starts = np.concatenate([np.array([s.pose for s, _ in due]).reshape(-1, 4, 4), now])
-        moved = self._history.increments(starts, np.concatenate([ends, pose.stamp - LAGS])) * SCALE
+        moved = self._history.increments(starts, np.concatenate([ends, pose.stamp - LAGS])) * TANGENT_SCALE
         self._learn(due, moved[: len(due)])
-        if self._history.reach < LAGS[-1] - EARLY:
+        if self._history.reach < LAGS[-1] - STAMP_TOLERANCE_S:
             return None
         return self._forecast(pose, twist, moved[len(due) :], lasting)
 
-    def _unlearned(self, pose: SurfacePose, seconds: float, twist: Array) -> Forecast | None:
-        """Constant velocity, by which the next pose is judged; said only where the pose itself claims too much."""
-        claims = self._early(pose, seconds, twist if self._surprise.active else None, HORIZONS)
-        self._last = (
-            Forecast(HORIZONS, HORIZONS[:, None] * self._early.twist, claims),
-            claims[0] * np.outer(SCALE, SCALE),
-        )
-        if not self._early.calmer:
+    def _warmup_forecast(self, pose: SurfacePose, seconds: float, twist: Array) -> Forecast | None:
+        """Constant velocity, by which the next pose is judged; given only where the pose's covariance is wider."""
+        claims = self._warmup(pose, seconds, twist if self._gate.active else None, HORIZONS)
+        forecast = Forecast(HORIZONS, HORIZONS[:, None] * self._warmup.twist, claims)
+        self._last = forecast, claims[0] * np.outer(TANGENT_SCALE, TANGENT_SCALE)
+        if not self._warmup.calmer:
             return None
-        return self._with_surprise(replace(self._last[0], covariances=claims + pose.covariance))
+        return self._with_drift(replace(forecast, covariances=claims + pose.covariance))
 
-    def _heed(self, pose: SurfacePose) -> Array:
-        """The twist (6,) that forecasts reckon with: what suddenly moves the surface is set aside.
+    def _known_twist(self, pose: SurfacePose) -> Array:
+        """The twist (6,) of the known motion: what suddenly moves the surface is set aside.
 
-        The past goes along with it, as if the surface had been there all the time.
+        The past poses are shifted along with it, as if the surface had been there all the time.
         """
         if self._last is None:
             return pose.twist
@@ -126,9 +217,9 @@ class Predictor:
         steps, rates = forecast.at(np.array([seconds]))
         step, rate = self._bounded(steps[0], rates[0], seconds)
         foretold = self._history.newest @ se3.exp(step)
-        off = se3.log(se3.inverse(foretold) @ pose.base_from_surface) * SCALE
-        if not self._surprise(off, seconds, float(HORIZONS[0]), claim):
-            self._fastest = max(_size(pose.twist), self._fastest * np.exp(-seconds / BREATHS))
+        off = se3.log(se3.inverse(foretold) @ pose.base_from_surface) * TANGENT_SCALE
+        if not self._gate(off, seconds, float(HORIZONS[0]), claim):
+            self._fastest = max(_size(pose.twist), self._fastest * np.exp(-seconds / SPEED_MEMORY_S))
             return pose.twist
         moved = pose.base_from_surface @ se3.inverse(foretold)
         self._history.carry(moved)
@@ -139,7 +230,7 @@ class Predictor:
     def _bounded(self, step: Array, rate: Array, seconds: float) -> tuple[Array, Array]:
         """A step (6,) of `seconds` s, and its rate, no faster than the surface lately was.
 
-        What is set aside for a second is foretold from what was foretold: a young regression may run away in that.
+        While motion is set aside, forecasts feed on forecasts: a young regression may run away.
         """
         faster = max(_size(step) / seconds, _size(rate)) / max(self._fastest, 1e-9)
         return (step, rate) if faster <= 1 else (step / faster, rate / faster)
@@ -147,38 +238,38 @@ class Predictor:
     def _due(self, now: float) -> list[tuple[_Sample, int]]:
         """The samples and horizons whose time has come."""
         waiting = ((s, k) for s in self._samples for k in range(s.known, len(HORIZONS)))
-        return [(s, k) for s, k in waiting if s.stamp + HORIZONS[k] <= now + EARLY]
+        return [(s, k) for s, k in waiting if s.stamp + HORIZONS[k] <= now + STAMP_TOLERANCE_S]
 
     def _forecast(self, pose: SurfacePose, twist: Array, past: Array, lasting: Array) -> Forecast | None:
-        twist = twist * SCALE
-        inputs = self._members.inputs(past, twist)
+        twist = twist * TANGENT_SCALE
+        inputs = self._experts.inputs(past, twist)
         ahead = (HORIZONS[:, None] * twist)[:, None]  # (H, 1, 6)
-        experts = np.concatenate([np.zeros_like(ahead), ahead, self._members(inputs) + ahead], axis=1)
+        experts = np.concatenate([np.zeros_like(ahead), ahead, self._experts(inputs) + ahead], axis=1)
         expected = self._stack(experts)
         spread, claimed = self._intervals()
-        due = not self._samples or pose.stamp - self._samples[-1].stamp > STEP - EARLY
-        if due and not self._surprise.active:
-            self._members.watch(past)
+        due = not self._samples or pose.stamp - self._samples[-1].stamp > SAMPLE_INTERVAL_S - STAMP_TOLERANCE_S
+        if due and not self._gate.active:
+            self._experts.watch(past)
             self._samples.append(_Sample(pose.stamp, pose.base_from_surface, inputs, experts, expected, claimed))
-        if self._judged < SETTLE:
+        if self._judged < MIN_JUDGED_SAMPLES:
             return None
-        covariances = spread / np.outer(SCALE, SCALE) + lasting + self._unseen(pose)
-        known = Forecast(HORIZONS, expected / SCALE, covariances)
-        self._last = known, spread[0] + lasting * np.outer(SCALE, SCALE)
-        return self._with_surprise(known)
+        covariances = spread / np.outer(TANGENT_SCALE, TANGENT_SCALE) + lasting + self._unseen(pose)
+        known = Forecast(HORIZONS, expected / TANGENT_SCALE, covariances)
+        self._last = known, spread[0] + lasting * np.outer(TANGENT_SCALE, TANGENT_SCALE)
+        return self._with_drift(known)
 
-    def _with_surprise(self, known: Forecast) -> Forecast:
-        """The forecast with what was set aside on top."""
-        sudden, doubt = self._surprise.ahead(HORIZONS)
-        covariances = known.covariances + doubt / np.outer(SCALE, SCALE)
-        return Forecast(HORIZONS, known.increments + sudden / SCALE, covariances)
+    def _with_drift(self, known: Forecast) -> Forecast:
+        """The forecast, plus the motion that was set aside."""
+        sudden, doubt = self._gate.ahead(HORIZONS)
+        covariances = known.covariances + doubt / np.outer(TANGENT_SCALE, TANGENT_SCALE)
+        return Forecast(HORIZONS, known.increments + sudden / TANGENT_SCALE, covariances)
 
     def _unseen(self, pose: SurfacePose) -> Array:
-        """Covariances (H, 6, 6) of what errors seen so far do not tell, fading as the first breaths are seen.
+        """Covariances (H, 6, 6) added while few errors are known, fading as the first breaths are seen.
 
-        It is what white noise on acceleration makes of the twist: errors of one phase of a breath say little of others.
+        That is white noise on acceleration: errors of one phase of a breath say little of others.
         """
-        young = max(0.0, 1 - self._judged * STEP / YOUNG)
+        young = max(0.0, 1 - self._judged * SAMPLE_INTERVAL_S / YOUNG_FORECASTS_S)
         ahead = HORIZONS[:, None, None]
         return young**2 * (ahead**2 * pose.twist_covariance + ahead**3 / 3 * np.diag(pose.acceleration_psd))
 
@@ -197,13 +288,13 @@ class Predictor:
         while self._samples and self._samples[0].known == len(HORIZONS):
             sample = self._samples.popleft()
             if not sample.spoilt:
-                self._members.learn(sample.inputs, sample.experts[:, 1:], sample.moved)
+                self._experts.learn(sample.inputs, sample.experts[:, 1:], sample.moved)
                 self._judged += 1
 
 
 def _size(vector: Array) -> float:
     """Of a tangent vector (6,), mm, turns at the lever."""
-    return float(np.linalg.norm(vector * SCALE))
+    return float(np.linalg.norm(vector * TANGENT_SCALE))
 
 
 def _once_each(due: list[tuple[_Sample, int]]) -> Iterator[list[int]]:

@@ -1,9 +1,9 @@
 """Refining the map from key frames: one GTSAM bundle adjustment, made away from the frame's path (it takes 20-300 ms).
 
-Unknown are the landmarks, the surface's pose at each key frame, and, because cameras are seldom exposed together, each
-camera's own pose of the surface at its own instant, tied to the key frame's by how far it may have moved meanwhile.
-The surface frame stays where it was given out: the refined poses of the key frames agree with the published ones on
-the whole, so that the path does not jump under the nozzle when a better map comes into force.
+The unknowns are the landmarks, the surface's pose at each key frame, and each camera's own pose of the surface at its
+own instant, since cameras are seldom exposed together. The latter is tied to the key frame's pose by how far it
+may have moved meanwhile. The surface frame is kept: on average the refined poses of the key frames agree with the
+published ones, so the path does not jump under the nozzle when a better map comes into force.
 """
 
 from __future__ import annotations
@@ -15,50 +15,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.heap import give_back
 from estimation.mapping.local_surface import smooth_normals
 from estimation.observations import Observations
 from estimation.online.camera_errors import Delays
-from estimation.online.pose_solver import PoseFit, project, solve_pose
+from estimation.online.pose_solver import PointTracks, PoseFit, project, solve_pose
 from estimation.rig import Rig
+from estimation.runtime import trim_heap
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, motion_of
 
-LEAST_SIGHTINGS = 3
-LEAST_JUDGES = 6  # key frames: fewer cannot tell a stray landmark from a bent map, and a stray one is not asked again
-ASTRAY = 3.0  # px: rolling shutters and late cameras bend images that much
-FREE = 50.0  # mm: how far a landmark may lie from where it was; only there to keep a hardly seen one finite
-ROBUST = 3.0  # sigmas
-ONE_EYED = 1.0  # mm: of the depth that one camera gives
-SINGLE = np.diag([1 / 0.05**2] * 3 + [1 / 10.0**2] * 3)  # rad, mm: how far one camera's instant may be from another's
-LEAST_DRIFT = np.array([1e-5] * 3 + [1e-3] * 3)  # rad, mm: so that the tie stays well conditioned
+MIN_SIGHTINGS = 3
+MIN_KEYFRAMES_TO_REJECT = 6  # fewer cannot tell a stray landmark from a bent map; a rejected one never comes back
+MAX_REPROJECTION_PX = 3.0  # rolling shutters and late cameras bend images that much
+FREE_SIGMA_MM = 50.0  # how far a landmark may lie from where it was: only keeps a hardly seen one finite
+CAUCHY_SIGMAS = 3.0
+SINGLE_CAMERA_SIGMA_MM = 1.0  # of the depth that one camera gives
+# rad, mm: how far one camera's instant may be from another's
+SINGLE_CAMERA_PRIOR = np.diag([1 / 0.05**2] * 3 + [1 / 10.0**2] * 3)
+MIN_DRIFT = np.array([1e-5] * 3 + [1e-3] * 3)  # rad, mm: keeps the tie well conditioned
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyFrame:
-    """One frame set worth keeping.
+    """One frame set worth keeping."""
 
-    observations.track counts rows of the map. twist: (6,) rad/s and mm/s, the surface's own: it tells how far it may
-    have moved from one camera's instant to the next's.
-    """
-
-    base_from_surface: Array
-    observations: Observations
-    twist: Array
+    base_from_surface: Array  # (4, 4)
+    observations: Observations  # tracks count rows of the map
+    twist: Array  # (6,) rad/s and mm/s: how far the surface may have moved between the cameras' instants
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anchors:
-    """What a scan, or the surface around it, says of each landmark, surface frame: the nearer to it, the likelier.
+    """What a scan, or the surface around it, says of each landmark: it lies near a plane."""
 
-    points, normals: (N, 3), the plane each lies on. sigma: (N,) mm across it; FREE for one that nothing is said of.
-    frame: (6, 6) covariance of the scan's own place, a right perturbation, rad and mm; zero without one.
-    """
-
-    points: Array
-    normals: Array
-    sigma: Array
-    frame: Array
+    points: Array  # (N, 3) surface frame, on the plane
+    normals: Array  # (N, 3)
+    sigma: Array  # (N,) mm across it; FREE_SIGMA_MM where nothing is known
+    frame: Array  # (6, 6) covariance of the scan's own place, right perturbation, rad and mm; zero without a scan
 
     def extended(self, new: Anchors) -> Anchors:
         """The same with those of further rows."""
@@ -67,36 +60,35 @@ class Anchors:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Adjusted:
-    """The refined map, same rows, same surface frame. agrees: (N,) which landmarks move with the rest."""
+class AdjustedMap:
+    """The refined map, same rows, same surface frame."""
 
     map: SurfaceMap
-    agrees: NDArray[np.bool_]
+    agrees: NDArray[np.bool_]  # (N,) which landmarks move with the rest
 
 
 def adjust(
     rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], delays: Delays, anchors: Anchors | None = None
-) -> Adjusted | None:
+) -> AdjustedMap | None:
     """The map that fits all key frames best, or None if they do not determine one.
 
-    delays: how much later than stamped the cameras expose, as is known now. anchors: of the map's first rows, where
-    there is a scan or one camera alone sees them.
+    delays: as known now. anchors: of the map's first rows, where there is a scan or one camera alone sees them.
 
-    Base and surface swap roles (X = surface_from_base), so that GTSAM's stock projection factor with
-    body_P_sensor = base_from_camera is the measurement.
+    Base and surface swap roles (X = surface_from_base), so that GTSAM's stock projection factor with body_P_sensor =
+    base_from_camera is the measurement.
     """
     adjusted = _adjusted(rig, surface_map, keyframes, delays, anchors)
-    give_back()
+    trim_heap()
     return adjusted
 
 
 def _adjusted(
     rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], delays: Delays, anchors: Anchors | None
-) -> Adjusted | None:
+) -> AdjustedMap | None:
     sightings = np.zeros(len(surface_map), int)
     for frame in keyframes:
         np.add.at(sightings, frame.observations.track, 1)
-    rows = np.nonzero(sightings >= LEAST_SIGHTINGS)[0]
+    rows = np.nonzero(sightings >= MIN_SIGHTINGS)[0]
     if len(rows) < 12 or len(keyframes) < 2:
         return None
     graph, values = _graph(rig, surface_map, keyframes, set(rows.tolist()), delays, anchors)
@@ -123,17 +115,17 @@ def _adjusted(
     points = se3.transform_points(frame_change(keyframes, refined, delays.sigma), points)
     normals = surface_map.normals.copy()
     normals[agrees] = smooth_normals(points[agrees], surface_map.normals[agrees])
-    return Adjusted(SurfaceMap(points, normals, whole), agrees)
+    return AdjustedMap(SurfaceMap(points, normals, whole), agrees)
 
 
 def without_frame(covariance: Array, points: Array) -> Array:
-    """Covariance (3N, 3N) of points (N, 3) without the part that moves all of them as one: the frame is theirs.
+    """Covariance (3N, 3N) of points (N, 3) without the part that moves all of them as one, since they define the frame.
 
-    Each point holds the frame by what it is worth itself. Counted alike, one that a single camera sees, unknown by
-    centimetres along its ray, was measured to lend a tenth of a millimetre to each of two hundred others.
+    Each point counts by its own precision. Counted alike, a point of a single camera, unknown by centimetres along its
+    ray, was measured to add a tenth of a millimetre to each of two hundred others.
     """
     motion = motion_of(points) * [0.01, 0.01, 0.01, 1, 1, 1]  # of about one size
-    worth = 1 / np.maximum(np.repeat(np.diag(covariance).reshape(-1, 3).sum(1), 3), LEAST_DRIFT[3] ** 2)
+    worth = 1 / np.maximum(np.repeat(np.diag(covariance).reshape(-1, 3).sum(1), 3), MIN_DRIFT[3] ** 2)
     held = motion.T * worth
     of_frame = motion @ np.linalg.solve(held @ motion, held)
     left = covariance - of_frame @ covariance
@@ -147,16 +139,16 @@ def of_frame(points: Array, covariance: Array) -> Array:
 
 
 def frame_change(keyframes: list[KeyFrame], refined: Array, skew: float) -> Array:
-    """old_surface_from_new (4, 4): what makes refined poses (K, 4, 4) agree with the published ones in the mean.
+    """old_surface_from_new (4, 4): makes refined poses (K, 4, 4) agree with the published ones in the mean.
 
-    Both are plain fits to the same pixels, with the old map and with the new, so what the cameras' instants do to a fit
-    cancels. A key frame counts the less the farther the surface may have moved between its cameras' instants, and
-    hardly where one camera alone saw it: its depth is the map's doubt many times over.
+    Both are plain fits to the same pixels, with the old map and the new, so the cameras' instants cancel. A key frame
+    counts less the farther the surface may have moved between its cameras' instants, and hardly where one camera alone
+    saw it: its depth is many times the map's doubt.
     """
     published = np.stack([f.base_from_surface for f in keyframes])
     drift = skew * np.array([np.linalg.norm(f.twist[3:]) for f in keyframes])
     alone = np.array([len(np.unique(f.observations.camera)) < 2 for f in keyframes])
-    weight = 1 / (0.05**2 + drift**2 + np.where(alone, ONE_EYED**2, 0.0))
+    weight = 1 / (0.05**2 + drift**2 + np.where(alone, SINGLE_CAMERA_SIGMA_MM**2, 0.0))
     change = np.eye(4)
     for _ in range(3):
         rest = se3.log(se3.inverse(published) @ refined @ se3.inverse(change))
@@ -167,16 +159,13 @@ def frame_change(keyframes: list[KeyFrame], refined: Array, skew: float) -> Arra
 def single_fit(rig: Rig, points: Array, seen: Observations, camera: int, near: Array) -> PoseFit:
     """The fit to one camera's tracks alone, at its own instant, held to `near` (4, 4) where it sees little."""
     mine = seen.only(seen.camera == camera)
-    return solve_pose(
-        rig, mine.camera, points[mine.track], mine.pixels, mine.sigma, near, scales=(4.0, 1.0), prior=SINGLE
-    )
+    tracks = PointTracks.of(mine, points[mine.track])
+    return solve_pose(rig, tracks, near, scales=(4.0, 1.0), prior=SINGLE_CAMERA_PRIOR)
 
 
 def _fit(rig: Rig, points: Array, frame: KeyFrame) -> Array:
-    seen = frame.observations
-    return solve_pose(
-        rig, seen.camera, points[seen.track], seen.pixels, seen.sigma, frame.base_from_surface, scales=(4.0, 1.0)
-    ).base_from_surface
+    tracks = PointTracks.of(frame.observations, points[frame.observations.track])
+    return solve_pose(rig, tracks, frame.base_from_surface, scales=(4.0, 1.0)).base_from_surface
 
 
 def _camera_key(camera: int, frame: int) -> int:
@@ -194,7 +183,7 @@ def _graph(
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     lenses = [gtsam.Cal3_S2(m[0, 0], m[1, 1], 0.0, m[0, 2], m[1, 2]) for m in rig.matrices]
     sensors = [gtsam.Pose3(c.base_from_camera) for c in rig.cameras]
-    loss = gtsam.noiseModel.mEstimator.Cauchy.Create(ROBUST)
+    loss = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_SIGMAS)
     for i, frame in enumerate(keyframes):
         body = gtsam.symbol("x", i)
         start = gtsam.Pose3(se3.inverse(frame.base_from_surface))
@@ -202,7 +191,7 @@ def _graph(
         # T exp(d) has the inverse X exp(-Ad(T) d): the same drift, seen from the base
         carry = se3.adjoint(frame.base_from_surface)
         drift = frame.twist * delays.sigma
-        along = np.outer(drift, drift) + np.diag((0.3 * np.abs(drift) + LEAST_DRIFT) ** 2)
+        along = np.outer(drift, drift) + np.diag((0.3 * np.abs(drift) + MIN_DRIFT) ** 2)
         loose = gtsam.noiseModel.Gaussian.Covariance(carry @ along @ carry.T)
         seen = frame.observations
         for c in np.unique(seen.camera):
@@ -220,7 +209,7 @@ def _graph(
                 )
     held = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
     graph.add(gtsam.PriorFactorPose3(gtsam.symbol("x", 0), values.atPose3(gtsam.symbol("x", 0)), held))
-    far = gtsam.noiseModel.Isotropic.Sigma(3, FREE)
+    far = gtsam.noiseModel.Isotropic.Sigma(3, FREE_SIGMA_MM)
     for row in sorted(rows):
         key = gtsam.symbol("l", row)
         values.insert(key, surface_map.points[row])
@@ -228,7 +217,7 @@ def _graph(
             graph.add(gtsam.PriorFactorPoint3(key, surface_map.points[row], far))
             continue
         across = np.outer(anchors.normals[row], anchors.normals[row])
-        loose = FREE**2 * (np.eye(3) - across) + anchors.sigma[row] ** 2 * across
+        loose = FREE_SIGMA_MM**2 * (np.eye(3) - across) + anchors.sigma[row] ** 2 * across
         graph.add(gtsam.PriorFactorPoint3(key, anchors.points[row], gtsam.noiseModel.Gaussian.Covariance(loose)))
     return graph, values
 
@@ -249,9 +238,9 @@ def _joint_covariance(linear: gtsam.GaussianFactorGraph, rows: NDArray[np.int64]
 
 
 def _agreement(rig: Rig, points: Array, keyframes: list[KeyFrame], solved: gtsam.Values) -> NDArray[np.bool_]:
-    """Which landmarks (N,) fit most of their sightings: what stands still while the surface moves does not."""
+    """Which landmarks (N,) fit most of their sightings; those that stand still while the surface moves do not."""
     fits, total = np.zeros(len(points)), np.zeros(len(points))
-    if len(keyframes) < LEAST_JUDGES:
+    if len(keyframes) < MIN_KEYFRAMES_TO_REJECT:
         return np.ones(len(points), bool)
     for i, frame in enumerate(keyframes):
         seen = frame.observations
@@ -260,6 +249,8 @@ def _agreement(rig: Rig, points: Array, keyframes: list[KeyFrame], solved: gtsam
             pose = se3.inverse(solved.atPose3(_camera_key(int(c), i)).matrix())
             predicted = project(rig, seen.camera[mine], pose, points[seen.track[mine]])[0]
             away = np.linalg.norm(predicted - seen.pixels[mine], axis=1)
-            np.add.at(fits, seen.track[mine], away < np.maximum(4 * ROBUST * seen.sigma[mine], ASTRAY))
+            np.add.at(
+                fits, seen.track[mine], away < np.maximum(4 * CAUCHY_SIGMAS * seen.sigma[mine], MAX_REPROJECTION_PX)
+            )
             np.add.at(total, seen.track[mine], 1)
-    return np.asarray((total < LEAST_SIGHTINGS) | (fits >= 0.5 * total))
+    return np.asarray((total < MIN_SIGHTINGS) | (fits >= 0.5 * total))

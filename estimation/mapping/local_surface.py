@@ -1,9 +1,9 @@
-"""Where rays meet a surface that is known at points only: a smooth local fit, and how far it can be trusted.
+"""Where rays meet a surface that is known at points only: a smooth local fit, and its uncertainty.
 
 A landmark that one camera sees has no depth of its own; its neighbours tell where the surface goes on. Around each ray
 the height of the nearest points over their mean plane is a polynomial of fourth order (moving least squares; Levin
-1998), whose coefficients have the size they have on bodies (Bayesian linear regression; Bishop 2006, 3.3): between the
-points the scatter about it decides how sure a height is, beyond them what a body's curvature may still do.
+1998), whose coefficients have the sizes they have on bodies (Bayesian linear regression; Bishop 2006, 3.3). Between the
+points their scatter decides how sure a height is; beyond them, what a body's curvature may still do.
 """
 
 from __future__ import annotations
@@ -14,62 +14,56 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from estimation.ray_cast import feet
+from estimation.scans.scan import foot_jacobians
 from estimation.se3 import Array
 
-NEIGHBOURS = 24  # points: twice what the polynomial asks for where they lie on one side
-LEAST = 12  # points: fewer are no surface
-ORDER = 4
-RADIUS = 30.0  # mm: of a wrist, the most strongly curved body that is printed on
-ROUGH = 0.02  # mm: no skin is smoother, no landmark better known
-OUTLYING = 3.0  # times the scatter, from which a point counts by its distance only
-STEEP = 0.15  # cosine between ray and normal: beyond, nothing is visible
-POWERS = [(n - j, j) for n in range(ORDER + 1) for j in range(n + 1)]
+FIT_NEIGHBOURS = 24  # twice what the polynomial asks for where they lie on one side
+MIN_SURFACE_POINTS = 12  # fewer are no surface
+POLYNOMIAL_ORDER = 4
+MIN_BODY_RADIUS_MM = 30.0  # of a wrist, the most strongly curved body that is printed on
+MIN_SCATTER_MM = 0.02  # no skin is smoother, no landmark better known
+OUTLIER_SCATTERS = 3.0  # times the scatter, from which a point counts by its distance only (Huber)
+MIN_RAY_COSINE = 0.15  # between ray and normal: beyond, nothing is visible
+POWERS = [(n - j, j) for n in range(POLYNOMIAL_ORDER + 1) for j in range(n + 1)]
 # mm^(1 - order), one standard deviation: h = y^2 / 2R + y^4 / 8R^3 on a cylinder, and as much askew in between
-SIZES = (1e2, 1e1, 0.5 / RADIUS, 0.25 / RADIUS**2, 0.125 / RADIUS**3)
-PRIOR = np.array([SIZES[a + b] ** -2 for a, b in POWERS])
+COEFFICIENT_SIGMAS = (1e2, 1e1, 0.5 / MIN_BODY_RADIUS_MM, 0.25 / MIN_BODY_RADIUS_MM**2, 0.125 / MIN_BODY_RADIUS_MM**3)
+COEFFICIENT_PRIOR = np.array([COEFFICIENT_SIGMAS[a + b] ** -2 for a, b in POWERS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Met:
-    """Where rays meet the surface.
+class RaySurfaceHits:
+    """Where M rays meet the surface."""
 
-    points: (M, 3) mm. normals: (M, 3) unit, against the rays. sigma: (M,) mm across the surface. covariance: (3M, 3M)
-    mm^2, joint: neighbours share a part of their heights' errors. good: (M,) whether there is a surface to meet.
-    """
-
-    points: Array
-    normals: Array
-    sigma: Array
-    covariance: Array
-    good: NDArray[np.bool_]
+    points: Array  # (M, 3) mm
+    normals: Array  # (M, 3) unit, against the rays
+    sigma: Array  # (M,) mm across the surface
+    covariance: Array  # (3M, 3M) mm^2, joint: neighbours share a part of their heights' errors
+    good: NDArray[np.bool_]  # (M,) whether there is a surface to meet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fits:
-    """One fit a ray. near: (M, K) rows. frames: (M, 3, 3), rows u, v and up; centres: (M, 3). maps: (M, P, K), from the
-    neighbours' heights to the coefficients. coefficients: (M, P). doubt: (M, P, P) of those beyond the neighbours'
-    scatter. scatter: (M,) mm, one sigma. reach: (M,) mm, of the neighbours."""
+    """One polynomial fit for each of M rays, with P coefficients, to K neighbours."""
 
-    near: NDArray[np.int64]
-    frames: Array
-    centres: Array
-    maps: Array
-    coefficients: Array
-    doubt: Array
-    scatter: Array
-    reach: Array
+    near: NDArray[np.int64]  # (M, K) rows of the points
+    frames: Array  # (M, 3, 3) rows u, v and up
+    centres: Array  # (M, 3)
+    maps: Array  # (M, P, K) from the neighbours' heights to the coefficients
+    coefficients: Array  # (M, P)
+    doubt: Array  # (M, P, P) covariance of those beyond the neighbours' scatter
+    scatter: Array  # (M,) mm, one sigma
+    reach: Array  # (M,) mm, of the neighbours
 
 
-def meet(points: Array, covariance: Array, origins: Array, directions: Array, angle: Array) -> Met:
+def meet_rays(points: Array, covariance: Array, origins: Array, directions: Array, angle: Array) -> RaySurfaceHits:
     """Where rays meet the surface through points (N, 3) with joint covariance (3N, 3N), mm^2.
 
     origins, directions: (M, 3), unit, the points' frame. angle: (M,) rad, one sigma of each ray.
     """
     count = len(origins)
-    if len(points) < LEAST or not count:
+    if len(points) < MIN_SURFACE_POINTS or not count:
         nothing = origins.copy(), -directions, np.full(count, np.inf), np.zeros((3 * count, 3 * count))
-        return Met(*nothing, np.zeros(count, bool))
+        return RaySurfaceHits(*nothing, np.zeros(count, bool))
     fits = _fits(points, _own(covariance), _nearest(points, origins, directions), -directions)
     places = np.stack([((origins - fits.centres)[:, None] * fits.frames).sum(2), _turned(fits.frames, directions)], 1)
     u, v, good = _crossing(fits.coefficients, places)
@@ -79,13 +73,13 @@ def meet(points: Array, covariance: Array, origins: Array, directions: Array, an
     height = np.einsum("mp,mp->m", at, fits.coefficients)
     met = fits.centres + np.einsum("mk,mki->mi", np.stack([u, v, height], -1), fits.frames)
     normals = np.einsum("mk,mki->mi", up, fits.frames)
-    good &= (np.einsum("mi,mi->m", normals, directions) < -STEEP) & np.isfinite(met).all(1)
+    good &= (np.einsum("mi,mi->m", normals, directions) < -MIN_RAY_COSINE) & np.isfinite(met).all(1)
     heights = _heights(fits, at, met, covariance) * up[:, 2:] * up[:, 2]  # across the surface, not along the fit's up
-    shift, depth = feet(met - origins, normals)
+    shift, depth = foot_jacobians(met - origins, normals)
     side = (np.linalg.norm(met - origins, axis=1) * angle)[:, None, None] ** 2 * shift @ np.swapaxes(shift, 1, 2)
     joint = np.einsum("mi,mn,nj->minj", depth, heights, depth)
     joint[np.arange(count), :, np.arange(count)] += side
-    return Met(met, normals, np.sqrt(np.diag(heights)), joint.reshape(3 * count, -1), good)
+    return RaySurfaceHits(met, normals, np.sqrt(np.diag(heights)), joint.reshape(3 * count, -1), good)
 
 
 def _turned(frames: Array, directions: Array) -> Array:
@@ -98,7 +92,7 @@ def smooth_normals(points: Array, outward: Array) -> Array:
     A plane through a point's neighbours leans inwards at the rim of a bent surface, where they lie on one side of it.
     """
     outward = np.broadcast_to(outward, points.shape)
-    near = np.asarray(cKDTree(points).query(points, k=min(NEIGHBOURS, len(points)))[1], np.int64)
+    near = np.asarray(cKDTree(points).query(points, k=min(FIT_NEIGHBOURS, len(points)))[1], np.int64)
     fits = _fits(points, np.zeros((len(points), 3, 3)), near, outward)
     u, v, _ = np.einsum("mki,mi->km", fits.frames, points - fits.centres)
     slopes = _slopes(fits.coefficients, u, v)
@@ -130,17 +124,19 @@ def _fits(points: Array, own_covariance: Array, near: NDArray[np.int64], outward
     scatter, weight = np.full(len(near), 0.1), np.ones(near.shape)
     for _ in range(4):
         trusted = weight / (scatter[:, None] ** 2 + known)
-        normal = np.einsum("mkp,mk,mkq->mpq", design, trusted, design) + np.diag(PRIOR)
+        normal = np.einsum("mkp,mk,mkq->mpq", design, trusted, design) + np.diag(COEFFICIENT_PRIOR)
         doubt = np.linalg.inv(normal)
         maps = doubt @ np.swapaxes(design * trusted[..., None], 1, 2)
         coefficients = np.einsum("mpk,mk->mp", maps, local[..., 2])
         off = local[..., 2] - np.einsum("mkp,mp->mk", design, coefficients)
         free = np.maximum(weight.sum(1) - np.einsum("mkp,mpk->m", design, maps), 1.0)
-        seen = (weight * (off**2 - known)).sum(1) / free
-        scatter = np.sqrt(np.maximum(seen, ROUGH**2))
-        weight = np.minimum(1.0, OUTLYING * np.sqrt(scatter[:, None] ** 2 + known) / np.maximum(np.abs(off), 1e-9))
-    told = np.maximum(free, 3.0)
-    scatter = scatter * np.sqrt(told / (told - 2))  # known from few neighbours: Student's t
+        variance = (weight * (off**2 - known)).sum(1) / free
+        scatter = np.sqrt(np.maximum(variance, MIN_SCATTER_MM**2))
+        weight = np.minimum(
+            1.0, OUTLIER_SCATTERS * np.sqrt(scatter[:, None] ** 2 + known) / np.maximum(np.abs(off), 1e-9)
+        )
+    freedom = np.maximum(free, 3.0)
+    scatter = scatter * np.sqrt(freedom / (freedom - 2))  # known from few neighbours: Student's t
     return _Fits(near, frames, centres, maps, coefficients, doubt, scatter, reach)
 
 
@@ -149,10 +145,10 @@ def _nearest(points: Array, origins: Array, directions: Array) -> NDArray[np.int
     away = points - origins[:, None]  # (M, N, 3)
     along = np.einsum("mni,mi->mn", away, directions)
     aside = np.linalg.norm(away - along[..., None] * directions[:, None], axis=2)
-    beside = np.argsort(aside, axis=1)[:, :LEAST]
+    beside = np.argsort(aside, axis=1)[:, :MIN_SURFACE_POINTS]
     depth = np.median(np.take_along_axis(along, beside, 1), axis=1)
     places = origins + depth[:, None] * directions
-    return np.asarray(cKDTree(points).query(places, k=min(NEIGHBOURS, len(points)))[1], np.int64)
+    return np.asarray(cKDTree(points).query(places, k=min(FIT_NEIGHBOURS, len(points)))[1], np.int64)
 
 
 def _basis(u: Array, v: Array) -> Array:
@@ -168,7 +164,7 @@ def _slopes(coefficients: Array, u: Array, v: Array) -> tuple[Array, Array]:
 def _crossing(coefficients: Array, places: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Where (u, v), each (M,), rays with origin and direction places (M, 2, 3) meet the fits, by Newton's method."""
     origin, direction = places[:, 0], places[:, 1]
-    level = np.where(np.abs(direction[:, 2]) < STEEP, -STEEP, direction[:, 2])
+    level = np.where(np.abs(direction[:, 2]) < MIN_RAY_COSINE, -MIN_RAY_COSINE, direction[:, 2])
     reach = -origin[:, 2] / level
     step = np.zeros(len(reach))
     for _ in range(6):
@@ -182,10 +178,10 @@ def _crossing(coefficients: Array, places: Array) -> tuple[Array, Array, NDArray
 
 
 def _heights(fits: _Fits, at: Array, met: Array, covariance: Array) -> Array:
-    """Covariance (M, M) mm^2 of the heights at `met`.
+    """Covariance (M, M) mm^2 of the heights at `met`, the sum of three parts.
 
-    Three parts: the surface's own scatter, anew at each place; that of the neighbours and their own errors, by the
-    weights that the fits give them; and what the coefficients may still be, alike for places that lie close together.
+    The surface's own scatter, anew at each place; the neighbours' scatter and errors, by their weights in the fits; and
+    the remaining doubt about the coefficients, shared by places that lie close together.
     """
     rays, count = np.arange(len(at)), len(covariance) // 3
     weights = np.einsum("mp,mpk->mk", at, fits.maps)  # of the neighbours' heights

@@ -1,13 +1,21 @@
-"""Points from pixels of several cameras, all points at once."""
+"""Landmarks from pixels: triangulated from several cameras at once, or refined look by look as the surface turns."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.observations import Observations
 from estimation.online.pose_solver import Index, project
 from estimation.rig import Rig
 from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap, local_normals, surface_frame
+
+MAX_RESIDUAL_SIGMAS = 4.0  # RMS over the sightings of a landmark: beyond, one of them is wrong
+MAX_LOOK_CHI2 = 16.0  # two degrees of freedom: beyond, it is another spot; one in three thousand by chance
 
 
 def rays(rig: Rig, camera: Index, pixels: Array) -> tuple[Array, Array]:
@@ -55,3 +63,81 @@ def epipolar_distance(rig: Rig, a: int, b: int, pixels_a: Array, pixels_b: Array
     fundamental = np.linalg.inv(rig.matrices[b]).T @ essential @ np.linalg.inv(rig.matrices[a])
     lines = np.c_[pixels_a, np.ones(len(pixels_a))] @ fundamental.T
     return np.asarray((np.c_[pixels_b, np.ones(len(pixels_b))] * lines).sum(1) / np.hypot(lines[:, 0], lines[:, 1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriangulatedMap:
+    """A map from one frame set."""
+
+    map: SurfaceMap
+    base_from_surface: Array  # (4, 4), which defines the surface frame
+    tracks: NDArray[np.int64]  # (N,) id of each landmark among the observations
+
+
+def triangulated_map(rig: Rig, seen: Observations) -> TriangulatedMap:
+    """The map of all landmarks that two cameras or more see alike, with the covariance that the pixels give.
+
+    The surface frame has its origin in the landmarks' middle and z out of the surface, as without a scan.
+    """
+    ids, point, count = np.unique(seen.track, return_inverse=True, return_counts=True)
+    several = count[point] > 1
+    ids, point = np.unique(seen.track[several], return_inverse=True)
+    camera, pixels, sigma = seen.camera[several], seen.pixels[several], seen.sigma[several]
+    points, covariance, residual = triangulate(rig, point, camera, pixels, len(ids))
+    off = np.bincount(point, ((residual / sigma[:, None]) ** 2).sum(1)) / np.bincount(point) / 2
+    good = np.isfinite(points).all(1) & (off < MAX_RESIDUAL_SIGMAS**2)
+    widest = np.zeros(len(ids))
+    np.maximum.at(widest, point, sigma)
+    return _in_own_frame(rig, points[good], (covariance * widest[:, None, None] ** 2)[good], ids[good])
+
+
+def _in_own_frame(rig: Rig, points: Array, covariance: Array, tracks: NDArray[np.int64]) -> TriangulatedMap:
+    """The map in its own frame."""
+    poses = np.stack([c.base_from_camera for c in rig.cameras])
+    base_from_surface = surface_frame(points, poses[:, :3, 3].mean(0), poses[:, :3, 0].mean(0))
+    turn = base_from_surface[:3, :3].T
+    own = se3.transform_points(se3.inverse(base_from_surface), points)
+    joint = np.zeros((len(own), 3, len(own), 3))
+    joint[np.arange(len(own)), :, np.arange(len(own))] = turn @ covariance @ turn.T
+    normals = local_normals(own, np.array([0.0, 0.0, 1.0]))
+    whole = SurfaceMap(own, normals, joint.reshape(3 * len(own), -1))
+    return TriangulatedMap(whole, base_from_surface, tracks)
+
+
+def updated_by_looks(
+    surface_map: SurfaceMap,
+    track: NDArray[np.int64],
+    residuals: Array,
+    jacobians: Array,
+    sigma: Array,
+    pose_covariance: Array,
+) -> tuple[SurfaceMap, NDArray[np.bool_]]:
+    """The map after a look at some of its landmarks from known poses, and which looks (M,) agree with it.
+
+    One joint Kalman update: the landmarks' errors are correlated, and all looks share the pose's. track: (M,) rows,
+    residuals: (M, 2) px, predicted minus seen, jacobians: (M, 2, 6) by the pose, sigma: (M,) px. pose_covariance:
+    (6, 6).
+    """
+    count, looks = len(surface_map), len(track)
+    if not looks:
+        return surface_map, np.zeros(0, bool)
+    by_map = np.zeros((looks, 2, count, 3))
+    by_map[np.arange(looks), :, track] = jacobians[:, :, 3:]
+    design = by_map.reshape(2 * looks, -1)
+    by_pose = jacobians.reshape(-1, 6)
+    noise = by_pose @ pose_covariance @ by_pose.T + np.diag(np.repeat(sigma**2, 2))
+    across = surface_map.covariance @ design.T
+    spread = design @ across + noise
+    agrees = _agreeing(residuals, spread)
+    rows = np.repeat(agrees, 2)
+    gain = np.linalg.solve(spread[np.ix_(rows, rows)], across[:, rows].T).T
+    covariance = surface_map.covariance - gain @ across[:, rows].T
+    points = surface_map.points - (gain @ residuals[agrees].ravel()).reshape(-1, 3)
+    return SurfaceMap(points, surface_map.normals, (covariance + covariance.T) / 2), agrees
+
+
+def _agreeing(residuals: Array, spread: Array) -> NDArray[np.bool_]:
+    """Which residuals (M, 2) px their own covariance, blocks of `spread` (2M, 2M), explains."""
+    count = len(residuals)
+    own = np.einsum("minj->mnij", spread.reshape(count, 2, count, 2))[np.arange(count), np.arange(count)]
+    return np.asarray(np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(own), residuals) < MAX_LOOK_CHI2)

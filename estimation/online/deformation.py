@@ -1,32 +1,110 @@
-"""The warp of the newest frame set, from what a rigid fit to the warped map leaves over.
+"""The warp of soft tissue: what a rigid fit to the warped map leaves over, as a few modes followed by a Kalman filter.
 
-A Kalman filter in information form (Thrun et al. 2005, 3.5) over two vectors of modes: the deformation, which wanders
-and slowly decays, and beside it what the map's own smooth error adds, which stays. At the first frame set the
-deformation is zero: the surface is as it was mapped. How lively it wanders is learned from the residuals, and what
-chance may add does not count, so that on a rigid surface the deformation stays exactly zero.
+Modes: a Gaussian process with a bell as covariance, known at a dozen control points, spans the smooth fields. Those
+that move or turn the landmarks as a whole are taken out; of the rest the strongest are kept, orthonormal over the
+landmarks: the length of a mode vector is the root mean square displacement in mm.
+
+Filter, in information form (Thrun et al. 2005, 3.5), over two vectors of modes: the deformation, which wanders and
+slowly decays, and the map's own smooth error, which stays. At the first frame set the deformation is zero: the surface
+is as it was mapped. Its liveliness is learned from the residuals, less what chance may add, so that on a rigid surface
+the deformation stays exactly zero.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation import se3
 from estimation.observations import Observations
 from estimation.online.pose_solver import PoseFit
-from estimation.runtime import NEW
+from estimation.runtime import CONTIGUOUS, compiled
 from estimation.se3 import Array
-from estimation.surface_map import SurfaceMap
-from estimation.track_loops import rows_of_modes
-from estimation.warp import Warp
-from estimation.warp_modes import WarpModes, modes_from_map
+from estimation.surface_map import SurfaceMap, Warp, bells, farthest_points
 
-DECAY = 30.0  # s: some breaths; a deformation that nobody sees any more is forgotten over them
-ASLEEP = 0.05  # of the greatest liveliness: then it is over
-MEMORY = 1.0  # s: over which the liveliness is learned
-CHANCE = 4.0  # standard errors that the liveliness must reach, else it is put down to chance
-BIAS = 0.01  # mm: of a mode in one frame set, by patches that are not quite what they were
-MAP_SIGMA = 0.02  # mm: no map is known better at the start, mode by mode
-LEAST = 12  # landmarks: with fewer there are no modes
+CONTROL_POINTS = 12
+MODE_COUNT = 24  # of 3 * CONTROL_POINTS - 6: with 15 the error on tissue was twice as large, 30 gained nothing
+BELL_OVERLAP = 1.5  # distances of neighbouring control points: bells that overlap this far add up to smooth fields
+WELL_KNOWN_MM = 0.1  # better known landmarks all count alike
+BELL_JITTER = 1e-6  # of a bell's height: keeps the covariance of near control points invertible
+
+DECAY_S = 30.0  # some breaths, over which a deformation that is no longer seen is forgotten
+RIGID_SHARE = 0.05  # of the greatest liveliness: below, it is over
+LIVELINESS_MEMORY_S = 1.0  # over which the liveliness is learned
+CHANCE_SIGMAS = 4.0  # standard errors that the liveliness must reach, else it is put down to chance
+MODE_BIAS_MM = 0.01  # of a mode in one frame set, by patches that are not quite what they were
+MAP_MODE_SIGMA_MM = 0.02  # no map is known better at the start, mode by mode
+MIN_MODE_LANDMARKS = 12  # with fewer there are no modes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WarpModes:
+    """M shapes that a deformation can take: smooth fields about K control points, none of them a rigid motion."""
+
+    control: Array  # (K, 3) mm
+    reach: float  # mm, one sigma of a bell
+    fields: Array  # (3K, M) coefficients of each mode
+    share: Array  # (M,) of the variance of a typical smooth field, sum 1
+    landmarks: Array  # (N, 3, M) displacement of each landmark by each mode
+    weights: Array  # (N,) how much each landmark counts, sum 1
+
+    def modes_of(self, moved: Array) -> Array:
+        """The modes (M,) mm in displacements (N, 3) mm of the first N landmarks, which hold all that count."""
+        count = len(moved)
+        return np.asarray(np.einsum("nim,n,ni->m", self.landmarks[:count], self.weights[:count], moved))
+
+    def extended(self, points: Array) -> WarpModes:
+        """The same modes with further landmarks at `points` (N, 3): they are moved by them, but do not count."""
+        further = _displacements(points, self.control, self.reach, self.fields)
+        weights = np.concatenate([self.weights, np.zeros(len(points))])
+        return replace(self, landmarks=np.concatenate([self.landmarks, further]), weights=weights)
+
+    def warp(self, modes: Array, covariance: Array, liveliness: float) -> Warp:
+        """The warp of a mode vector (M,) mm with covariance (M, M), which wanders by `liveliness`, mm^2/s in all."""
+        size = float(np.linalg.norm(modes))
+        along = modes / size if size else np.zeros(len(modes))
+        sigma = float(np.sqrt(max(along @ covariance @ along if size else np.linalg.eigvalsh(covariance)[-1], 0.0)))
+        coefficients = (self.fields @ modes).reshape(-1, 3)
+        spread = self.fields @ covariance @ self.fields.T
+        growth = liveliness * (self.fields * self.share) @ self.fields.T
+        return Warp(self.control, coefficients, spread, growth, self.reach, size, sigma)
+
+
+def modes_from_map(surface_map: SurfaceMap) -> WarpModes:
+    """The modes of the surface that a map of twelve landmarks or more shows."""
+    points = surface_map.points
+    known = np.diag(surface_map.covariance).reshape(-1, 3).mean(1)
+    weights = 1 / np.maximum(known, WELL_KNOWN_MM**2)
+    weights = weights / weights.sum()
+    control = _control_points(points, weights)
+    apart = np.linalg.norm(control[:, None] - control, axis=-1) + np.diag(np.full(len(control), np.inf))
+    reach = BELL_OVERLAP * float(apart.min(1).mean())
+    own = bells(control, control, reach) + BELL_JITTER * np.eye(len(control))
+    whiten = np.kron(np.linalg.inv(np.linalg.cholesky(own)).T, np.eye(3))  # coefficients of unit variance fields
+    field = np.kron(bells(points, control, reach), np.eye(3)) @ whiten  # (3N, 3K)
+    root = np.sqrt(np.repeat(weights, 3))[:, None]
+    lever = se3.point_jacobians(points - weights @ points)
+    rigid = (lever.reshape(-1, 6) * root).T @ (field * root)  # (6, 3K)
+    free = np.linalg.svd(rigid)[2][6:].T  # (3K, 3K - 6)
+    _, size, modes = np.linalg.svd(field * root @ free, full_matrices=False)
+    fields = whiten @ free @ (modes[:MODE_COUNT] / size[:MODE_COUNT, None]).T
+    landmarks = _displacements(points, control, reach, fields)
+    share = size[:MODE_COUNT] ** 2
+    return WarpModes(control, reach, fields, share / share.sum(), landmarks, weights)
+
+
+def _displacements(points: Array, control: Array, reach: float, fields: Array) -> Array:
+    """How far (N, 3, M) mm each mode, coefficients (3K, M), moves points (N, 3)."""
+    return np.asarray((np.kron(bells(points, control, reach), np.eye(3)) @ fields).reshape(len(points), 3, -1))
+
+
+def _control_points(points: Array, weights: Array) -> Array:
+    """Up to CONTROL_POINTS points (K, 3), far from each other, of the half that is known best."""
+    known = points[weights >= np.median(weights)]
+    first = int(np.argmin(np.linalg.norm(known - weights @ points, axis=1)))
+    return np.asarray(known[farthest_points(known, first, min(CONTROL_POINTS, len(known)))])
 
 
 class WarpFilter:
@@ -34,14 +112,18 @@ class WarpFilter:
 
     def __init__(self, surface_map: SurfaceMap) -> None:
         self._points = surface_map.points
-        self._modes: WarpModes | None = modes_from_map(surface_map) if len(surface_map) >= 2 * LEAST else None
+        enough = len(surface_map) >= 2 * MIN_MODE_LANDMARKS
+        self._modes: WarpModes | None = modes_from_map(surface_map) if enough else None
         count = 0 if self._modes is None else len(self._modes.share)
         self._state = np.zeros(2 * count)  # deformation, and the map's error
         self._covariance = np.zeros((2 * count, 2 * count))
         if self._modes is not None:
-            self._covariance[count:, count:] = _of_map(self._modes, surface_map)
+            self._covariance[count:, count:] = _map_mode_covariance(self._modes, surface_map)
         self._stamp: float | None = None
-        self._seen, self._doubt = 0.0, 0.0  # liveliness, mm^2/s, signed, and the variance of one look at it
+        self._rate, self._doubt = (
+            0.0,
+            0.0,
+        )  # liveliness of the last second, mm^2/s, signed, and the variance of one look at it
         self._liveliness = self._liveliest = 0.0
         self._warp: Warp | None = None
 
@@ -61,7 +143,7 @@ class WarpFilter:
     @property
     def _clear(self) -> float:
         """The liveliness of the last second, 0 where chance explains it."""
-        return self._seen if self._seen > CHANCE * float(np.sqrt(self._doubt)) else 0.0
+        return self._rate if self._rate > CHANCE_SIGMAS * float(np.sqrt(self._doubt)) else 0.0
 
     def points(self, surface_map: SurfaceMap) -> Array:
         """The landmarks (N, 3) mm, surface frame, where the deformation puts them."""
@@ -70,7 +152,7 @@ class WarpFilter:
         return np.asarray(surface_map.points + self._modes.landmarks @ self._state[: len(self._modes.share)])
 
     def pull(self, track: NDArray[np.int64], weighted: Array, by_point: Array) -> Array:
-        """Covariance (6, 6) of the weighted sum of residuals that the deformation's own doubt makes.
+        """Covariance (6, 6) that the deformation's covariance adds to the weighted sum of residuals.
 
         track: (N,) rows of the map. weighted: (N, 2, 6) Jacobians times weights. by_point: (N, 2, 3) px per mm.
         """
@@ -82,42 +164,40 @@ class WarpFilter:
         return np.asarray(sensitivity @ self._covariance[:count, :count] @ sensitivity.T)
 
     def replace_map(self, surface_map: SurfaceMap, right: bool = False) -> None:
-        """A refined or longer map: what it has taken in of the map's error, or of the deformation, is no error now.
+        """Take a refined or longer map: what it has absorbed of the map's error or the deformation is no error now.
 
-        right: whether it is known to be that of the undeformed surface: then what the other was off by was no
-        deformation.
+        right: whether it is that of the undeformed surface: then the error of the other was no deformation.
         """
         if self._modes is not None:
             count, before = len(self._modes.share), len(self._points)
             change = self._modes.modes_of(surface_map.points[:before] - self._points)
             if right:
-                self._map_told(change, _of_map(self._modes, surface_map))
+                self._set_map_error(change, _map_mode_covariance(self._modes, surface_map))
             self._state[count:] -= change
             if len(surface_map) > before:
                 self._modes = self._modes.extended(surface_map.points[before:])
         self._points = surface_map.points
 
-    def _map_told(self, error: Array, doubt: Array) -> None:
+    def _set_map_error(self, error: Array, doubt: Array) -> None:
         """The map's error was `error` (M,), and what is left of it is known to `doubt` (M, M).
 
-        The sum of both vectors is what was seen, so the rest of it was deformation.
+        The sum of both vectors is what was observed, so the rest of it was deformation.
         """
         count = len(error)
-        total, spread = self._state[:count] + self._state[count:], _sum(self._covariance, count)
+        total, spread = self._state[:count] + self._state[count:], _sum_covariance(self._covariance, count)
         self._state = np.concatenate([total - error, error])
         self._covariance = np.block([[spread + doubt, -doubt], [-doubt, doubt]])
 
     def learn(self, observations: Observations, fit: PoseFit, sigma: Array, twist: Array, skew: float) -> None:
         """Take the residuals of a fit to `points`. sigma: (N,) px.
 
-        twist: (6,) and skew: s, what the cameras' instants may differ by: as with the pose, no deformation is seen in
-        what a late camera explains.
+        twist: (6,). skew: s, by which the cameras' instants may differ: what a late camera explains is no deformation.
         """
         dt = 0.0 if self._stamp is None else observations.stamp - self._stamp
         self._stamp = observations.stamp
         if self._modes is None or dt <= 0:
             return
-        information, gradient = _seen(self._modes, observations, fit, sigma, twist, skew, self._state)
+        information, gradient = _mode_evidence(self._modes, observations, fit, sigma, twist, skew, self._state)
         self._predict(dt, information, gradient)
         self._update(information, gradient)
         count = len(self._modes.share)
@@ -125,74 +205,114 @@ class WarpFilter:
             self._warp = self._modes.warp(self._state[:count], self._covariance[:count, :count], self.liveliness)
 
     def _predict(self, dt: float, information: Array, gradient: Array) -> None:
-        """Let the deformation wander for dt s, as lively as it is seen to."""
+        """Let the deformation wander for dt s, with the liveliness learned from this frame set too."""
         assert self._modes is not None
         count, share = len(self._modes.share), self._modes.share
-        keep = np.concatenate([np.full(count, np.exp(-dt / DECAY)), np.ones(count)])
+        keep = np.concatenate([np.full(count, np.exp(-dt / DECAY_S)), np.ones(count)])
         self._covariance = keep[:, None] * self._covariance * keep
-        prior = _sum(self._covariance, count)
-        told = share[:, None] * information
-        looks = float(np.einsum("ij,ji->", told, told))
-        expected = float(np.trace(told) + np.einsum("ij,ji->", told @ prior, information))
-        recent = min(1.0, dt / MEMORY)
+        prior = _sum_covariance(self._covariance, count)
+        shared = share[:, None] * information
+        looks = float(np.einsum("ij,ji->", shared, shared))
+        expected = float(np.trace(shared) + np.einsum("ij,ji->", shared @ prior, information))
+        recent = min(1.0, dt / LIVELINESS_MEMORY_S)
         if looks > 0:
-            seen = (float(gradient @ (share * gradient)) - expected) / (looks * dt)
-            self._seen += recent * (seen - self._seen)
+            rate = (float(gradient @ (share * gradient)) - expected) / (looks * dt)
+            self._rate += recent * (rate - self._rate)
             self._doubt = recent / (looks * dt**2)
-            now = max(self._clear, self._liveliness * float(np.exp(-dt / DECAY)))
+            now = max(self._clear, self._liveliness * float(np.exp(-dt / DECAY_S)))
             self._liveliest = max(self._liveliest, now)
-            self._liveliness = now if now > ASLEEP * self._liveliest else 0.0
+            self._liveliness = now if now > RIGID_SHARE * self._liveliest else 0.0
         wander = self.liveliness * dt * share
         self._covariance[:count, :count] += np.diag(wander)
         self._state = keep * self._state
 
     def _update(self, information: Array, gradient: Array) -> None:
-        """Take what the frame set says of the sum of both vectors: information (M, M) and gradient (M,) of the miss."""
+        """Kalman update by information (M, M) and gradient (M,) on the sum of both vectors, about the predicted one."""
         count = len(information)
         across = self._covariance[:, :count] + self._covariance[:, count:]  # (2M, M)
-        gain = across @ np.linalg.inv(np.eye(count) + information @ _sum(self._covariance, count))
+        gain = across @ np.linalg.inv(np.eye(count) + information @ _sum_covariance(self._covariance, count))
         self._state = self._state + gain @ gradient
         covariance = self._covariance - gain @ information @ across.T
         self._covariance = (covariance + covariance.T) / 2
 
 
-def _of_map(modes: WarpModes, surface_map: SurfaceMap) -> Array:
+def _map_mode_covariance(modes: WarpModes, surface_map: SurfaceMap) -> Array:
     """Covariance (M, M), mm^2, of the modes in a map's error."""
     known = 3 * len(modes.weights)
     fields = (modes.landmarks * modes.weights[:, None, None]).reshape(known, -1)
     return np.asarray(
-        fields.T @ surface_map.covariance[:known, :known] @ fields + MAP_SIGMA**2 * np.eye(len(modes.share))
+        fields.T @ surface_map.covariance[:known, :known] @ fields + MAP_MODE_SIGMA_MM**2 * np.eye(len(modes.share))
     )
 
 
-def _sum(covariance: Array, count: int) -> Array:
+def _sum_covariance(covariance: Array, count: int) -> Array:
     """Covariance (M, M) of the sum of both vectors, from the joint one (2M, 2M)."""
     a, b = covariance[:count], covariance[count:]
     return np.asarray(a[:, :count] + a[:, count:] + b[:, :count] + b[:, count:])
 
 
-def _seen(
+def _mode_evidence(
     modes: WarpModes, observations: Observations, fit: PoseFit, sigma: Array, twist: Array, skew: float, state: Array
 ) -> tuple[Array, Array]:
     """Information (M, M) and gradient (M,) of both vectors' sum about the predicted one, pose and delays solved for."""
     count, cameras = len(modes.share), int(observations.camera.max()) + 1
     root = np.sqrt(fit.weights) / (sigma * fit.scale)
-    row, camera = np.require(observations.track, np.int64, NEW), np.require(observations.camera, np.int64, NEW)
-    seen = np.require(fit.jacobians, float, NEW), np.require(fit.residuals, float, NEW)
+    row, camera = (
+        np.require(observations.track, np.int64, CONTIGUOUS),
+        np.require(observations.camera, np.int64, CONTIGUOUS),
+    )
+    fitted = np.require(fit.jacobians, float, CONTIGUOUS), np.require(fit.residuals, float, CONTIGUOUS)
     # the fit's points hold the deformation, but not the map's error
-    landmarks = np.require(modes.landmarks, float, NEW)
-    whole = rows_of_modes(cameras, camera, row, *seen, root, landmarks, state[count:].copy(), twist)
+    fields = np.require(modes.landmarks, float, CONTIGUOUS)
+    whole = rows_of_modes(cameras, camera, row, *fitted, root, fields, state[count:].copy(), twist)
     normal = whole.T @ whole
     own, other = slice(0, count), slice(count, count + 6 + cameras)
     held = normal[other, other] + np.diag([1e-9] * 6 + [1 / max(skew, 1e-4) ** 2] * cameras)
     solved = np.linalg.solve(held, np.concatenate([normal[other, own], normal[other, -1:]], 1))
     information = normal[own, own] - normal[own, other] @ solved[:, :-1]
     gradient = normal[own, -1] - normal[own, other] @ solved[:, -1]
-    dull = np.linalg.inv(np.eye(count) + BIAS**2 * information)
+    dull = np.linalg.inv(np.eye(count) + MODE_BIAS_MM**2 * information)
     information = dull @ information
     return np.asarray((information + information.T) / 2), np.asarray(dull @ gradient)
 
 
-def landmarks(surface_map: SurfaceMap, warp: WarpFilter | None) -> Array:
+def warped_points(surface_map: SurfaceMap, warp: WarpFilter | None) -> Array:
     """Points (N, 3), mm, of a map in the surface frame, as a warp has moved them; without one, as they were mapped."""
     return surface_map.points if warp is None else warp.points(surface_map)
+
+
+@compiled("f8[:,::1](i8, i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[::1], f8[::1])")
+def rows_of_modes(
+    cameras: int,
+    camera: NDArray[np.int64],
+    landmark: NDArray[np.int64],
+    jacobian: Array,
+    residual: Array,
+    root: Array,
+    modes: Array,
+    error: Array,
+    twist: Array,
+) -> Array:
+    """Rows (2N, M + 6 + C + 1) of the regression on modes, pose and delays, each times its track's `root` (N,), px^-1.
+
+    modes: (L, 3, M) mm of each landmark, rows `landmark` (N,). error: (M,), modes that the residuals (N, 2) px hold and
+    the points do not. The last column is what is left. The rest as in `gram_by_camera`.
+    """
+    count = modes.shape[2]
+    rows = np.zeros((2 * len(camera), count + 7 + cameras))
+    for i in range(len(camera)):
+        own = modes[landmark[i]]
+        for k in range(2):
+            row, along, left = rows[2 * i + k], 0.0, -residual[i, k]
+            for m in range(count):
+                moved = 0.0
+                for a in range(3):
+                    moved += jacobian[i, k, 3 + a] * own[a, m]
+                row[m] = root[i] * moved
+                left -= moved * error[m]
+            for a in range(6):
+                row[count + a] = root[i] * jacobian[i, k, a]
+                along += jacobian[i, k, a] * twist[a]
+            row[count + 6 + camera[i]] = root[i] * along
+            row[count + 6 + cameras] = root[i] * left
+    return rows

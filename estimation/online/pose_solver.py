@@ -1,13 +1,12 @@
-"""The pose of a known map in one frame set: robust multi-camera Gauss-Newton.
+"""The pose of a known map in one frame set: robust multi-camera Gauss-Newton on reprojection errors.
 
-Residuals are pixels, the unknown is the right perturbation of base_from_surface. Weights are Geman-McClure's, which
-redescend: on 30 % of tracks stuck to a static drape Huber stood at 0.107 mm, a redescending loss at 0.023.
+The unknown is the right perturbation of base_from_surface. Weights are Geman-McClure's, which redescend: with 30 % of
+the tracks stuck to a static drape, the error was 0.107 mm with Huber's loss and 0.023 mm with a redescending one.
 
-What all tracks of a camera share does not average out over tracks: a camera exposed late, a lens or a grazing view that
-shifts its whole image. `Shared` says how large that may be. It is solved for beside the pose (a linear mixed-effects
-model; Henderson 1975), so that it is not taken for outliers and can be learned. The pose stays that of all cameras as
-they are: which of them is late just now nobody knows, and weights by that model took poses farther from the reference
-of the webcams' recordings.
+Some errors are shared by all tracks of a camera and do not average out: a late exposure, or a lens that shifts its
+image. `SharedErrors` holds their expected size. They are solved for beside the pose (linear mixed-effects model;
+Henderson 1975), so that they are not mistaken for outliers and can be learned. They do not change the weights between
+cameras: that moved poses farther from the reference of the webcams' recordings.
 """
 
 from __future__ import annotations
@@ -18,25 +17,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.observations import Observations
 from estimation.rig import Rig
-from estimation.runtime import NEW
+from estimation.runtime import CONTIGUOUS, compiled
 from estimation.se3 import Array
-from estimation.track_loops import gram_by_camera, project_tracks, shared_residuals, weights_of
+
+TRACK_COLUMNS = 10  # of a track's row: six of the pose, its camera's delay and two shifts, its residual
+CHI2_MEDIAN = 1.386  # of the squared length of two normal entries, in their variance
 
 Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shared:
-    """What all tracks of one camera may be off by together.
+class PointTracks:
+    """Points of the surface and where cameras see them: N parallel rows."""
 
-    twist: (6,) rad/s and mm/s, the surface's own: a delay shows along it. delay: (C, C) s^2, covariance of the cameras'
-    delays; may be singular. shift: (C,) px^2, variance of an image's shift, per axis.
-    """
+    camera: Index  # (N,) number in the rig
+    points: Array  # (N, 3) mm, surface frame
+    pixels: Array  # (N, 2) undistorted px
+    sigma: Array  # (N,) px, one standard deviation per axis
 
-    twist: Array
-    delay: Array
-    shift: Array
+    @staticmethod
+    def of(seen: Observations, points: Array) -> PointTracks:
+        """Observations of points (N, 3), one for each row."""
+        return PointTracks(seen.camera, points, seen.pixels, seen.sigma)
+
+    def only(self, rows: NDArray[np.bool_]) -> PointTracks:
+        """Those of the rows (N,)."""
+        return PointTracks(self.camera[rows], self.points[rows], self.pixels[rows], self.sigma[rows])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SharedErrors:
+    """The expected size of the errors that all tracks of one camera share in one frame set."""
+
+    twist: Array  # (6,) rad/s and mm/s of the surface: a delay shows along it
+    delay: Array  # (C, C) s^2, covariance of the cameras' delays; may be singular
+    shift: Array  # (C,) px^2, variance of an image's shift, per axis
 
     def covariance(self) -> Array:
         """Of (delays (C,), shifts (C,) right, shifts (C,) down): (3C, 3C)."""
@@ -49,31 +66,26 @@ class Shared:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedFit:
-    """What the tracks alone say of what their cameras share: information @ effect = pull, the pose allowed for.
+    """What the tracks alone say of the shared errors, with the pose marginalised: information @ effect = pull.
 
-    effect: (3C,) delays (C,) s and shifts (2C,) px: rights, then downs. information: (3C, 3C), pull: (3C,).
+    effect: (3C,), delays (C,) s, then shifts px: (C,) right, (C,) down.
     """
 
-    information: Array
-    pull: Array
+    information: Array  # (3C, 3C)
+    pull: Array  # (3C,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseFit:
-    """A pose and how the tracks stand to it.
+    """A pose, and how the tracks agree with it."""
 
-    base_from_surface: (4, 4). information: (6, 6) of its right perturbation. residuals: (N, 2) px, predicted minus
-    seen, without what the camera's tracks share. weights: (N,) in [0, 1], one for a track that fits. jacobians:
-    (N, 2, 6) px per rad and mm. scale: the residuals' robust size in sigmas. shared: where it was asked for.
-    """
-
-    base_from_surface: Array
-    information: Array
-    residuals: Array
-    weights: Array
-    jacobians: Array
-    scale: float
-    shared: SharedFit | None = None
+    base_from_surface: Array  # (4, 4)
+    information: Array  # (6, 6) of its right perturbation
+    residuals: Array  # (N, 2) px, predicted minus seen, without the shared errors
+    weights: Array  # (N,) in [0, 1], one for a track that fits
+    jacobians: Array  # (N, 2, 6) px per rad and mm
+    scale: float  # robust size of the residuals, in sigmas
+    shared: SharedFit | None = None  # where it was asked for
 
 
 def project(rig: Rig, camera: Index, base_from_surface: Array, points: Array) -> tuple[Array, Array, Array]:
@@ -81,53 +93,50 @@ def project(rig: Rig, camera: Index, base_from_surface: Array, points: Array) ->
 
     base_from_surface: (4, 4), or (C, 4, 4) where each camera exposes at its own instant.
     """
-    points = np.require(points, float, NEW)
-    return project_tracks(
-        rig.camera_from_base @ base_from_surface, rig.matrices, np.require(camera, np.int64, NEW), points
-    )
+    camera, points = np.require(camera, np.int64, CONTIGUOUS), np.require(points, float, CONTIGUOUS)
+    return project_tracks(rig.camera_from_base @ base_from_surface, rig.matrices, camera, points)
 
 
 # What the weights, at a gate of 3, take from the information of Gaussian noise beyond what the estimate itself
 # loses (Huber 1981, 4.6, integrated over two dimensions): the weights' mean is 0.72, the estimate is worth 0.89.
 EFFICIENCY = 1.235
 GATE = 3.0  # residual in sigmas at which a track's weight has fallen to a quarter
-ARRIVED = 1e-3  # squared sigmas of the pose: a last step as small as that leaves a hundredth of a sigma to go
+INLIER_WEIGHT = 0.2  # from there on a track agrees with the fit
+CONVERGED_CHI2 = 1e-3  # squared sigmas of the pose: a last step as small as that leaves a hundredth of a sigma to go
 
 
 def solve_pose(
     rig: Rig,
-    camera: Index,
-    points: Array,
-    pixels: Array,
-    sigma: Array,
+    tracks: PointTracks,
     start: Array,
+    *,
     gate: float = GATE,
     scales: tuple[float, ...] = (1.0,),
     prior: Array | None = None,
     iterations: int = 8,
     tolerance: float = 1e-4,
-    shared: Shared | None = None,
+    shared: SharedErrors | None = None,
 ) -> PoseFit:
-    """Fit base_from_surface to tracks.
+    """Fit base_from_surface to tracks, from `start` (4, 4).
 
-    camera: (N,), points: (N, 3) mm in the surface frame, pixels: (N, 2) undistorted, sigma: (N,) px. gate: residual in
-    sigmas at which a track's weight has fallen to a quarter. scales: widenings of the gate, solved one after the other
-    from coarse to fine. The unit is also widened to the tracks' own median residual, so that tracks worse than they
-    claim are averaged, not played off against each other. prior: (6, 6) information that holds `start`.
-    iterations: at the last scale, three at those before. tolerance: rad and mm, the last step's largest entry. shared:
-    what each camera's tracks may be off by together.
+    gate: residual in sigmas at which a weight is a quarter. scales: factors of the gate, from coarse to fine. The unit
+    of residuals grows to the tracks' own median, so that tracks worse than they claim are averaged. prior: (6, 6)
+    information that holds `start`. iterations: at the last scale, three at those before. tolerance: rad and mm, largest
+    entry of the last step. shared: expected size of the cameras' shared errors.
     """
-    pose, unit, precision = start, 1.0, np.require(1 / sigma**2, float, NEW)
-    camera, points = np.require(camera, np.int64, NEW), np.require(points, float, NEW)
+    pose, unit, precision = start, 1.0, np.require(1 / tracks.sigma**2, float, CONTIGUOUS)
+    camera, points = np.require(tracks.camera, np.int64, CONTIGUOUS), np.require(tracks.points, float, CONTIGUOUS)
+    pixels = tracks.pixels
     predicted, depth, jacobian = project(rig, camera, pose, points)
     residual = predicted - pixels
-    common = None if shared is None else _Common(shared, camera)
+    common = None if shared is None else _SharedErrorSolver(shared, camera)
     weight, moved = np.zeros(len(points)), np.zeros(6)
     information = np.zeros((6, 6))
     for widening in scales:
         for iteration in range(iterations if widening == scales[-1] else 3):
-            anew = 0.0 if iteration < 3 else unit
-            weight, unit = weights_of(residual, precision, depth, gate * widening, anew)
+            # robust weights; the unit of residuals is estimated anew in the first three iterations
+            weight, unit = weights_of(residual, precision, depth, gate * widening, 0.0 if iteration < 3 else unit)
+            # normal equations (information, gradient), damped
             if common is None:
                 whole = gram_by_camera(len(rig), camera, jacobian, residual, weight * precision, np.zeros(6)).sum(0)
                 information, gradient = whole[:6, :6], whole[:6, 9]
@@ -138,23 +147,24 @@ def solve_pose(
             if prior is not None:
                 damped = damped + prior
                 gradient = gradient + prior @ moved
+            # Gauss-Newton step, right perturbation
             step = -np.linalg.solve(damped, gradient)
             pose, moved = pose @ se3.exp(step), moved + step
             predicted, depth, jacobian = project(rig, camera, pose, points)
             residual = predicted - pixels
             if common is not None:
                 residual = residual + common.explained(jacobian, anew=iteration < 2)
-            if np.abs(step).max() < tolerance or -step @ gradient < ARRIVED:
+            if np.abs(step).max() < tolerance or -step @ gradient < CONVERGED_CHI2:
                 break
     if common is None:
         return PoseFit(pose, EFFICIENCY / unit**2 * information, residual, weight, jacobian, unit)
-    return PoseFit(pose, information, residual, weight, jacobian, unit, common.found())
+    return PoseFit(pose, information, residual, weight, jacobian, unit, common.fit())
 
 
-class _Common:
-    """The normal equations of the pose, and of what each camera's tracks share."""
+class _SharedErrorSolver:
+    """The normal equations of the pose and of the errors that each camera's tracks share."""
 
-    def __init__(self, shared: Shared, camera: Index) -> None:
+    def __init__(self, shared: SharedErrors, camera: Index) -> None:
         self._twist, self._prior, self._count = shared.twist, shared.covariance(), len(shared.shift)
         self._camera = camera
         self._effect, self._eye = np.zeros((3, self._count)), np.eye(3 * self._count)
@@ -168,36 +178,33 @@ class _Common:
         self._own = np.zeros((3, n, 3, n))
         each = np.arange(n)
         self._own[:, each, :, each] = grams[:, 6:9, 6:9]
-        self._found: SharedFit | None = None
+        self._fit: SharedFit | None = None
         return self._whole[:, :6], self._whole[:, 9]
 
     def explained(self, jacobian: Array, anew: bool) -> Array:
-        """What of the residuals (N, 2) px is shared, were the pose allowed to follow; anew: of the last `normal`."""
+        """The shared part of the residuals (N, 2) px, the pose free; anew: estimated from the last `normal`."""
         if anew:
-            found = self.found()
+            fit = self.fit()
             # (information + prior^-1)^-1, also where the prior is singular
-            gain = self._prior @ np.linalg.inv(self._eye + found.information @ self._prior)
-            self._effect = (gain @ found.pull).reshape(3, -1)
+            gain = self._prior @ np.linalg.inv(self._eye + fit.information @ self._prior)
+            self._effect = (gain @ fit.pull).reshape(3, -1)
         return shared_residuals(self._camera, jacobian, self._twist, self._effect)
 
-    def found(self) -> SharedFit:
-        """Of the last `normal` (Schur complement)."""
-        if self._found is None:
-            self._found = self._find()
-        return self._found
-
-    def _find(self) -> SharedFit:
-        pose = self._whole[:, :6]
-        information = pose + (1e-9 * np.trace(pose) + 1e-12) * np.eye(6)
-        solved = np.linalg.solve(information, np.concatenate([self._cross, self._whole[:, 9:]], axis=1))
-        own = self._own.reshape(self._cross.shape[1], -1) - self._cross.T @ solved[:, :-1]
-        return SharedFit((own + own.T) / 2, -(self._right - self._cross.T @ solved[:, -1]))
+    def fit(self) -> SharedFit:
+        """Of the last `normal`, with the pose eliminated (Schur complement)."""
+        if self._fit is None:
+            pose = self._whole[:, :6]
+            information = pose + (1e-9 * np.trace(pose) + 1e-12) * np.eye(6)
+            solved = np.linalg.solve(information, np.concatenate([self._cross, self._whole[:, 9:]], axis=1))
+            own = self._own.reshape(self._cross.shape[1], -1) - self._cross.T @ solved[:, :-1]
+            self._fit = SharedFit((own + own.T) / 2, -(self._right - self._cross.T @ solved[:, -1]))
+        return self._fit
 
 
 def own_residuals(camera: Index, fit: PoseFit, sure: Array) -> Array:
-    """Residuals (N, 2) px that are left when each camera may move for itself, to first order.
+    """Residuals (N, 2) px that are left when each camera has a pose of its own, to first order.
 
-    sure: (N,) weights of the tracks that say how each camera moves. Cameras with fewer than eight keep theirs whole.
+    sure: (N,) weights of the tracks that determine it. Cameras with fewer than eight keep their residuals.
     """
     left = fit.residuals.copy()
     for c in np.unique(camera):
@@ -208,3 +215,104 @@ def own_residuals(camera: Index, fit: PoseFit, sure: Array) -> Array:
             own = np.linalg.lstsq(jacobian * root[:, None], residual * root, rcond=None)[0]
             left[mine] = (residual - jacobian @ own).reshape(-1, 2)
     return left
+
+
+@compiled("Tuple((f8[:,::1], f8[::1], f8[:,:,::1]))(f8[:,:,::1], f8[:,:,::1], i8[::1], f8[:,::1])")
+def project_tracks(
+    camera_from_surface: Array, matrices: Array, camera: NDArray[np.int64], points: Array
+) -> tuple[Array, Array, Array]:
+    """Ideal pixels (N, 2), depths (N,) mm and Jacobians (N, 2, 6) by the right perturbation of the pose.
+
+    camera_from_surface: (C, 4, 4). matrices: (C, 3, 3). camera: (N,). points: (N, 3) mm, surface frame.
+    """
+    count = len(points)
+    pixels, depths, jacobians = np.empty((count, 2)), np.empty(count), np.empty((count, 2, 6))
+    for i in range(count):
+        pose, lens = camera_from_surface[camera[i]], matrices[camera[i]]
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        depth = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        inverse = 1.0 / depth if abs(depth) >= 1e-6 else 1e6
+        for k in range(2):
+            focal = lens[k, k]
+            tangent = (pose[k, 0] * px + pose[k, 1] * py + pose[k, 2] * pz + pose[k, 3]) * inverse
+            pixels[i, k] = focal * tangent + lens[k, 2]
+            scale = focal * inverse
+            x = (pose[k, 0] - tangent * pose[2, 0]) * scale
+            y = (pose[k, 1] - tangent * pose[2, 1]) * scale
+            z = (pose[k, 2] - tangent * pose[2, 2]) * scale
+            jacobians[i, k, 0] = py * z - pz * y  # row @ -hat(p) = cross(p, row)
+            jacobians[i, k, 1] = pz * x - px * z
+            jacobians[i, k, 2] = px * y - py * x
+            jacobians[i, k, 3] = x
+            jacobians[i, k, 4] = y
+            jacobians[i, k, 5] = z
+        depths[i] = depth
+    return pixels, depths, jacobians
+
+
+@compiled("f8[:,:,::1](i8, i8[::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[::1])")
+def gram_by_camera(
+    cameras: int, camera: NDArray[np.int64], jacobian: Array, residual: Array, weight: Array, twist: Array
+) -> Array:
+    """Weighted products (C, 10, 10) of the columns of each camera's tracks: pose, own delay, own two shifts, residual.
+
+    camera: (N,). jacobian: (N, 2, 6). residual: (N, 2) px. weight: (N,) px^-2. twist: (6,), along which a delay shows.
+    """
+    grams = np.zeros((cameras, TRACK_COLUMNS, TRACK_COLUMNS))
+    row = np.empty(TRACK_COLUMNS)
+    for i in range(len(camera)):
+        gram = grams[camera[i]]
+        for k in range(2):
+            along = 0.0
+            for a in range(6):
+                row[a] = jacobian[i, k, a]
+                along += row[a] * twist[a]
+            row[6], row[7], row[8], row[9] = along, 1.0 - k, float(k), residual[i, k]
+            for a in range(TRACK_COLUMNS):
+                scaled = weight[i] * row[a]
+                for b in range(a, TRACK_COLUMNS):
+                    gram[a, b] += scaled * row[b]
+    for c in range(cameras):
+        for a in range(TRACK_COLUMNS):
+            for b in range(a):
+                grams[c, a, b] = grams[c, b, a]
+    return grams
+
+
+@compiled("f8[:,::1](i8[::1], f8[:,:,::1], f8[::1], f8[:,::1])")
+def shared_residuals(camera: NDArray[np.int64], jacobian: Array, twist: Array, effect: Array) -> Array:
+    """What of the residuals (N, 2) px the cameras' delays and shifts, effect (3, C), make."""
+    explained = np.empty((len(camera), 2))
+    for i in range(len(camera)):
+        c = camera[i]
+        for k in range(2):
+            along = 0.0
+            for a in range(6):
+                along += jacobian[i, k, a] * twist[a]
+            explained[i, k] = effect[0, c] * along + effect[1 + k, c]
+    return explained
+
+
+@compiled("Tuple((f8[::1], f8))(f8[:,::1], f8[::1], f8[::1], f8, f8)")
+def weights_of(residual: Array, precision: Array, depth: Array, gate: float, unit: float) -> tuple[Array, float]:
+    """Geman-McClure's weights (N,), zero behind the camera, and the unit of residuals, in sigmas, that they hold for.
+
+    residual: (N, 2) px. precision: (N,) px^-2. depth: (N,) mm. gate: units at which a weight is a quarter. unit: 0
+    where it is to be found: by the median residual of what is in front, one at least.
+    """
+    squared = np.empty(len(depth))
+    front = 0
+    for i in range(len(depth)):
+        squared[i] = (residual[i, 0] * residual[i, 0] + residual[i, 1] * residual[i, 1]) * precision[i]
+        front += depth[i] > 0
+    if unit == 0.0:
+        unit = 1.0
+        if front > 0:
+            middle = np.sort(squared[depth > 0])[front // 2] / CHI2_MEDIAN
+            unit = np.sqrt(max(middle, 1.0))
+    weight = np.zeros(len(depth))
+    for i in range(len(depth)):
+        if depth[i] > 0:
+            beside = 1.0 + squared[i] / (gate * unit) ** 2
+            weight[i] = 1.0 / (beside * beside)
+    return weight, unit

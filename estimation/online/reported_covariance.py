@@ -1,68 +1,255 @@
-"""What is claimed of a pose when it is given out, beside what the estimator reckons with in its own decisions.
+"""Reported covariance: window marginal + lasting errors + smear, corrected by what was learned since the start.
 
-Which camera is odd, where a landmark is looked for and what gets into the window is decided by covariances that hold
-from the first frame set on, when little is known of the cameras: too wide later on, and decided well by. Claims learn.
-What the first pose is off by, and what the window has averaged since, is claimed smaller once the images are known to
-rest and the tracks to scatter less; what lasts in the tracks' errors and what patches seen from elsewhere do is added.
-After trouble the narrow claim waits until all has been well for a second.
+The estimator's own decisions (which camera is an outlier, where a landmark is searched, what enters the window) use
+covariances from the first frame set on, when little is known of the cameras: wide, and good for deciding. The reported
+covariance learns:
+
+- the error of the first pose and the window's marginal shrink once images are known to rest and tracks to scatter less;
+- the lasting part of the tracks' errors, and the drift of the images' shifts, are added;
+- after trouble the wide covariance is reported again until all has been well for a second.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from estimation.averaged import Averaged
-from estimation.first_pose import FirstPose
-from estimation.fit import Fit
 from estimation.observations import Observations
 from estimation.online.camera_errors import CameraErrors
+from estimation.online.fit import FrameFit
+from estimation.online.pose_solver import INLIER_WEIGHT, PoseFit, SharedFit
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from estimation.straying import Straying
-from estimation.track_noise import TrackNoise
 
-WARY = 1.0  # s without trouble until less is claimed: what slid over the wound is gone by then, and the window is new
-MEMORY = 2.0  # s over which it is learned what is usual
-FEWER, WORSE = 0.8, 2.0  # times the tracks that usually carry the pose, and their usual variance: something is there
+NOISE_MEMORY_SETS = 300.0  # ten seconds, over which the shares of the tracks' noise are learned
+PRIOR_TRACKS = 20.0  # tracks as which the initial belief counts: that all of their noise is new
+MIN_NEW_SHARE = 0.02  # of the variance: no track errs alike to the last bit
+MAX_NEW_GAP_S = 0.2  # what has changed in more need not be new
+LASTING_GAP_S = 1.0  # and up to twice that: a breath has gone half its way
+
+CLEAR_SHIFT_PX = 0.02  # shifts known better than that show the size of all of them
+MIN_LASTING_SHARE = 0.01  # of the variance claimed of tracks: something in them lasts
+DRIFT_MEMORY_SETS = 100  # over which the drift of the shifts is averaged
+
+CALM_BEFORE_NARROWING_S = 1.0  # without trouble: what slid over the wound is gone by then, and the window is new
+USUAL_MEMORY_S = 2.0  # over which it is learned what is usual
+FEWER_TRACKS, WORSE_SCATTER = 0.8, 2.0  # times the usual tracks and the usual scatter: something is there
 
 
-class Claim:
-    """The claims of the poses of one map."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _TrackResiduals:
+    """The inliers of one fit."""
+
+    stamp: float  # s
+    key: NDArray[np.int64]  # (N,) of a track in a camera
+    value: Array  # (N, 2) residuals in sigmas, as they pull at the pose
+
+
+class TrackNoise:
+    """How much of the tracks' noise is drawn anew with each frame set, and how much lasts, as shares of its variance.
+
+    The window averages what is new, not what lasts: where between pixels a landmark lies, how its patch is seen from
+    here. Both show in the change of a track's residual: the first from one frame set to the next, the second over
+    seconds. What never changes is the map's error, or was in the first pose, too.
+    """
 
     def __init__(self, cameras: int) -> None:
-        self._tracks, self._straying = TrackNoise(cameras), Straying()
-        self._first: tuple[FirstPose, Array] | None = None  # and its covariance (6, 6) as it was believed at once
+        self._cameras = cameras
+        self._past: list[_TrackResiduals] = []  # of some seconds ago, of one, and the last
+        # sums of squares per axis: all, new; all, changed in seconds
+        self._sums = PRIOR_TRACKS * np.array([1.0, 1.0, 0.0, 0.0])
+
+    @property
+    def anew(self) -> float:
+        """The share that is drawn anew with each frame set."""
+        return float(np.clip(self._sums[1] / self._sums[0], MIN_NEW_SHARE, 1.0))
+
+    @property
+    def lasting(self) -> float:
+        """The share that is alike from one frame set to the next, and another after seconds."""
+        whole, changed = self._sums[2:]
+        return float(np.clip(changed / max(whole, PRIOR_TRACKS) - self.anew, 0.0, 1.0 - self.anew))
+
+    def learn(self, seen: Observations, solution: PoseFit, sigma: Array) -> None:
+        """Take the residuals of one fit. sigma: (N,) px as claimed."""
+        good = solution.weights > INLIER_WEIGHT
+        key = seen.track[good] * self._cameras + seen.camera[good]
+        pull = solution.weights[good] / (sigma[good] * solution.scale)
+        now = _TrackResiduals(seen.stamp, key, solution.residuals[good] * pull[:, None])
+        if not self._past:
+            self._past = [now] * 3
+            return
+        old, middle, last = self._past
+        new = _squared_changes(now, last) if now.stamp - last.stamp < MAX_NEW_GAP_S else np.zeros(2)
+        self._sums = (1 - 1 / NOISE_MEMORY_SETS) * self._sums + np.r_[new, _squared_changes(now, old)]
+        self._past = [middle, now, now] if now.stamp - middle.stamp >= LASTING_GAP_S else [old, middle, now]
+
+
+def _squared_changes(now: _TrackResiduals, then: _TrackResiduals) -> Array:
+    """Sums (2,), an axis, of the squared residuals of tracks that both have, and of half their squared changes."""
+    _, rows, before = np.intersect1d(now.key, then.key, assume_unique=True, return_indices=True)
+    value = now.value[rows]
+    change = value - then.value[before]
+    return np.array([(value**2).sum(), (change**2).sum() / 2]) / 2
+
+
+class WindowNoise:
+    """The window's marginal of one pose, to be rescaled by what is known of tracks and images later on.
+
+    The window uses the tracks' and images' noise as believed at first. In the axes in which the two are independent,
+    its marginal is a part of the fit's covariance whatever their sizes, so each axis is rescaled by itself.
+    """
+
+    def __init__(self, window: Array, fit: FrameFit, unrest: float) -> None:
+        """window: (6, 6), with `fit` the newest of the fits averaged there. unrest: px^2, as assumed in it."""
+        root = np.linalg.cholesky((fit.parts.noise + fit.parts.noise.T) / 2)
+        back = np.linalg.inv(root)
+        whitened = back @ fit.parts.tracks @ back.T
+        share, axes = np.linalg.eigh((whitened + whitened.T) / 2)
+        self._by_tracks = np.clip(share, 0.0, 1.0)  # (6,) of the fit's variance, axis by axis
+        self._axes = root @ axes  # (6, 6) pose_from_axes
+        inner = axes.T @ back @ window @ back.T @ axes
+        self._window = (inner + inner.T) / 2
+        self._scatter, self._unrest = fit.parts.scatter, unrest
+
+    def covariance(self, tracks: TrackNoise, unrest: float) -> Array:
+        """(6, 6), by what is known of the tracks now, and of the images' unrest, px^2."""
+        by_images = (1 - self._by_tracks) * (unrest / self._unrest)
+        scaled = self._axes * np.sqrt(self._by_tracks * (tracks.anew * self._scatter) + by_images)
+        return np.asarray(scaled @ self._window @ scaled.T)
+
+
+class FrameOriginError:
+    """The error of the first pose given out: the path is placed in it, so all later poses share it.
+
+    At that moment the images' unrest and the cameras' delays are hardly known, and assumed large. The error was drawn
+    once and stays; its expected size is known better with every frame set.
+    """
+
+    def __init__(self, window: Array, fit: FrameFit, cameras: CameraErrors) -> None:
+        """window: (6, 6), the window's marginal, with `fit` the newest of the fits averaged there."""
+        self._averaged = WindowNoise(window, fit, cameras.unrest)
+        self._tracks = fit.parts.scatter * fit.parts.tracks
+        self._late, self._corrected = fit.parts.late, cameras.offset
+
+    def covariance(self, cameras: CameraErrors, tracks: TrackNoise) -> Array:
+        """(6, 6) of the error, by what is known of cameras and tracks now."""
+        late = self._late @ cameras.beyond(self._corrected) @ self._late.T
+        averaged = self._averaged.covariance(tracks, cameras.unrest)
+        return np.asarray(averaged + tracks.lasting * self._tracks + late)
+
+
+class ImageShiftDrift:
+    """How far the images' shifts have drifted since the first pose, as patches are seen from elsewhere: a mean square.
+
+    Only shifts that a fit shows clearly count. The pose absorbs the others: that is the covariance to be reported.
+    """
+
+    def __init__(self) -> None:
+        self._start: tuple[Array, Array] | None = None  # shifts (2C,) px, and the information (2C, 2C) of a fit of them
+        self._variance, self._since = 0.0, 0  # px^2; frame sets of which it is the mean
+
+    @property
+    def variance(self) -> float:
+        """px^2 per axis; zero before there is a first pose."""
+        return self._variance
+
+    def start(self, fit: SharedFit, shift: Array) -> None:
+        """Remember the shifts (C, 2), px, and how clearly a fit shows them, with the first pose that is given out."""
+        self._start = shift.T.ravel(), _shift_information(fit)
+        self._variance, self._since = 0.0, 0
+
+    def learn(self, fit: SharedFit, shift: Array, alike: float) -> None:
+        """Take the shifts (C, 2), px, after one more fit.
+
+        alike: the part of the variance claimed of tracks that lasts from one frame set to the next.
+        """
+        if self._start is None:
+            return
+        before, then = self._start
+        both = np.linalg.inv(np.linalg.inv(_shift_information(fit)) + np.linalg.inv(then))
+        both = both / max(alike, MIN_LASTING_SHARE)
+        self._since = min(self._since + 1, DRIFT_MEMORY_SETS)
+        self._variance += (_mean_square(both, shift.T.ravel() - before) - self._variance) / self._since
+
+
+def _shift_information(fit: SharedFit) -> Array:
+    """(2C, 2C) of the shifts: right (C,), then down (C,)."""
+    count = len(fit.pull) // 3
+    part = fit.information[count:, count:]
+    return np.asarray(part + 1e-9 * np.trace(part) * np.eye(len(part)))
+
+
+def _mean_square(information: Array, shift: Array) -> float:
+    """Mean square, px^2, of shifts (2C,), weighted by their information (2C, 2C), less their own error.
+
+    Three cameras show three of six shifts: one sigma of what so few may be off by is added.
+    """
+    known, axes = np.linalg.eigh(information)
+    square = (axes.T @ shift) ** 2
+    weight = (CLEAR_SHIFT_PX**2 + 1 / known) ** -2
+    weight = weight / weight.sum()
+    return float(weight @ np.maximum(square - 1 / known, 0.0) * (1 + (2 * (weight @ weight)) ** 0.5))
+
+
+class CalibrationError:
+    """What imperfect lenses do to the pose, since the first pose.
+
+    The map was made through the same lenses, so at the start they do nothing: what counts is the change since then.
+    """
+
+    def __init__(self) -> None:
+        self._first: Array | None = None  # (6, 2C), effect of the images' shifts on the first pose
+
+    def covariance(self, fit: FrameFit, cameras: CameraErrors) -> Array:
+        """(6, 6) of it, at an accepted fit."""
+        if self._first is None:
+            self._first = fit.parts.bias
+        change = fit.parts.bias - self._first
+        size = 2 * np.mean(cameras.shift**2)  # px^2: of six shifts of three cameras the pose takes up about half
+        return np.asarray(size * change @ change.T)
+
+
+class ReportedCovariance:
+    """The covariances of the poses of one map, as they are given out."""
+
+    def __init__(self, cameras: int) -> None:
+        self._tracks, self._drift = TrackNoise(cameras), ImageShiftDrift()
+        self._first: tuple[FrameOriginError, Array] | None = None  # its covariance (6, 6) as believed at once
         self._usual = np.zeros(2)  # tracks that carry the pose; their scatter
         self._stamp, self._trouble = -np.inf, -np.inf  # s, of the last pose, and of the last that was not plain
         self._more = np.zeros((6, 6))
 
-    def learn(self, seen: Observations, fit: Fit, cameras: CameraErrors) -> None:
+    def learn(self, seen: Observations, fit: FrameFit, cameras: CameraErrors) -> None:
         """Take the residuals of an accepted fit, after the cameras did. seen.sigma: as claimed."""
         assert fit.solution.shared is not None
         self._tracks.learn(seen, fit.solution, seen.sigma)
-        self._straying.learn(fit.solution.shared, cameras.shift, self._tracks.lasting * fit.scatter)
+        self._drift.learn(fit.solution.shared, cameras.shift, self._tracks.lasting * fit.parts.scatter)
 
     def measured(
-        self, pose: SurfacePose, fit: Fit, cameras: CameraErrors, first: Array | None, averaged: Array
+        self, pose: SurfacePose, fit: FrameFit, cameras: CameraErrors, first: Array | None, averaged: Array
     ) -> SurfacePose:
         """The pose of an accepted fit as it is given out.
 
-        first: (6, 6), what was believed of the first pose. averaged: (6, 6), the window's part of `pose.covariance`.
+        first: (6, 6), as believed of the first pose at once. averaged: (6, 6), the window's part of `pose.covariance`.
         """
         self._watch(pose, fit)
         if self._first is None and first is not None:
             self._begin(first, fit, cameras)
+        # added: lasting part of the tracks' errors, drift of the shifts, clock offsets that are not corrected yet
+        parts = fit.parts
         late = cameras.beyond(cameras.offset) - cameras.delays.covariance
-        strayed = self._straying.variance * fit.bias @ fit.bias.T
-        more = self._tracks.lasting * fit.scatter * fit.tracks + strayed + fit.late @ late @ fit.late.T
+        drifted = self._drift.variance * parts.bias @ parts.bias.T
+        more = self._tracks.lasting * parts.scatter * parts.tracks + drifted + parts.late @ late @ parts.late.T
         self._more = (more + more.T) / 2
-        if self._first is None or pose.stamp - self._trouble < WARY:  # the first pose itself is among these
+        if self._first is None or pose.stamp - self._trouble < CALM_BEFORE_NARROWING_S:  # or it is the first pose
             return widened(pose, self._more)
+        # subtracted: what the first pose's error and the window's marginal were assumed too large by
         known, believed = self._first
         first_less = known.covariance(cameras, self._tracks) - believed
-        window_less = Averaged(averaged, fit, cameras.unrest).covariance(self._tracks, cameras.unrest) - averaged
+        window_less = WindowNoise(averaged, fit, cameras.unrest).covariance(self._tracks, cameras.unrest) - averaged
         return widened(pose, self._more + first_less + window_less)
 
     def missed(self, pose: SurfacePose) -> SurfacePose:
@@ -70,23 +257,24 @@ class Claim:
         self._trouble = pose.stamp
         return widened(pose, self._more)
 
-    def _begin(self, believed: Array, fit: Fit, cameras: CameraErrors) -> None:
+    def _begin(self, believed: Array, fit: FrameFit, cameras: CameraErrors) -> None:
         assert fit.solution.shared is not None
-        self._first = FirstPose(believed - fit.smear, fit, cameras), believed
-        self._straying.start(fit.solution.shared, cameras.shift)
+        self._first = FrameOriginError(believed - fit.parts.smear, fit, cameras), believed
+        self._drift.start(fit.solution.shared, cameras.shift)
         self._trouble = fit.stamp
 
-    def _watch(self, pose: SurfacePose, fit: Fit) -> None:
-        now = np.array([float(fit.used.sum()), fit.scatter])
-        share = min(1.0, (pose.stamp - self._stamp) / MEMORY)
-        unlike = now[0] < FEWER * self._usual[0] or now[1] > WORSE * self._usual[1]
+    def _watch(self, pose: SurfacePose, fit: FrameFit) -> None:
+        """Note trouble: a reason, a state below TRACKING, or fewer or worse tracks than usual."""
+        now = np.array([float(fit.used.sum()), fit.parts.scatter])
+        share = min(1.0, (pose.stamp - self._stamp) / USUAL_MEMORY_S)
+        unlike = now[0] < FEWER_TRACKS * self._usual[0] or now[1] > WORSE_SCATTER * self._usual[1]
         if pose.state is not TrackState.TRACKING or pose.reason or unlike:
             self._trouble = pose.stamp
         self._usual, self._stamp = self._usual + share * (now - self._usual), pose.stamp
 
 
 def widened(pose: SurfacePose, more: Array) -> SurfacePose:
-    """The pose with `more` (6, 6) in all its claims of where it is."""
+    """The pose with `more` (6, 6) added to its covariance and to those of its forecast."""
     ahead = pose.forecast
     if ahead is not None:
         ahead = replace(ahead, covariances=ahead.covariances + more)

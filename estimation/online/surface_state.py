@@ -1,11 +1,13 @@
-"""Motion detection: whether the surface has left its place of rest, and since when (thesis 1.3: 300 um or 0.1 degree).
+"""The state of the surface's pose (TRACKING, DEGRADED, ...), and whether the surface moves or rests.
 
-While the surface is at rest its measured poses scatter about one place, which the mean of the first ones gives. A
-movement is a mean of the newest poses that lies away from it by more than chance allows: a generalised likelihood
-ratio over unknown size, direction and onset (Basseville and Nikiforov 1993, 2.4.3), for turns and for shifts apart.
-How much chance allows is learned while at rest, for each number of poses averaged: a covariance that is wrong by a
-factor, and noise that lasts over frames, both show there. The place of rest is not moved along, so a slow drift adds
-up until it is seen.
+State: each threshold has two values. A fault lowers the state at once; it is raised only after a while without a
+fault, so that it does not flicker.
+
+Motion (thesis 1.3: 300 um or 0.1 degree): at rest the measured poses scatter about one place, the mean of the first
+ones. A movement is a mean of the newest poses that lies farther from it than chance allows: a generalised likelihood
+ratio over unknown size, direction and onset (Basseville and Nikiforov 1993, 2.4.3), for turns and for shifts apart. How
+much chance allows is learned at rest, for each number of poses averaged: a covariance that is wrong by a factor, and
+noise that lasts over frames, both show there. The place of rest stays fixed, so a slow drift adds up until it is seen.
 """
 
 from __future__ import annotations
@@ -16,23 +18,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation import se3
-from estimation.pose import SurfaceMotion
+from estimation.pose import MotionState, TrackState
 from estimation.se3 import Array
 
-AVERAGED = (2, 4, 8)  # newest poses looked at together; one alone may be a glitch
-BEFORE = 16  # poses before the newest ones, against which a step is seen too: what lasts in the noise is alike in both
-REST = 32  # poses, a second of three cameras, whose mean is the place of rest
-BLOCK = 8  # poses: a part of them, whose mean must lie near that of all
-SURE = 0.01  # of what must be flagged: no pose is known better
-HISTORY = 4 * REST  # poses in which the onset is looked for
+AVERAGED_POSES = (2, 4, 8)  # newest poses looked at together; one alone may be a glitch
+POSES_BEFORE = 16  # before the newest ones, to which a step is compared too: lasting noise is alike in both
+REST_POSES = 32  # a second of three cameras, whose mean is the place of rest
+BLOCK_POSES = 8  # a part of them, whose mean must lie near that of all
+MIN_SIGMA_SHARE = 0.01  # of what must be flagged: no pose is known better
+ONSET_HISTORY = 4 * REST_POSES  # poses in which the onset is searched
 
 
 @dataclass(frozen=True, slots=True)
 class MotionSettings:
     """What counts as a movement, and how sure it must be.
 
-    A movement is flagged from half of `moved` or `turned` on where it is beyond chance, so that half of it is left
-    for noise; the surface is at rest when a second's poses stay within an eighth. That are the two thresholds.
+    A movement beyond chance is flagged from half of `moved` or `turned` on, which leaves the other half for noise. The
+    surface is at rest when a second's poses stay within an eighth.
     """
 
     moved: float = 0.3  # mm, thesis 1.3
@@ -53,46 +55,46 @@ class MotionDetector:
         self.settings = settings or MotionSettings()
         self._centre, self._at_centre = centre.copy(), np.hstack([-se3.hat(centre), np.eye(3)])
         self._wanted = np.array([self.settings.turned, self.settings.moved])
-        self._least = (SURE * self._wanted[:, None, None]) ** 2 * np.eye(3)
+        self._least = (MIN_SIGMA_SHARE * self._wanted[:, None, None]) ** 2 * np.eye(3)
         self._anchor: Array | None = None  # the first base_from_surface, from which turns and shifts are counted
-        self._stamps: deque[float] = deque(maxlen=HISTORY)
-        self._states = _Rows()  # turn, rad, and shift, mm
-        self._claims = _Rows(3)  # (2, 3, 3) covariances of them
+        self._stamps: deque[float] = deque(maxlen=ONSET_HISTORY)
+        self._states = _PoseBuffer()  # turn, rad, and shift, mm
+        self._covariances = _PoseBuffer(3)  # (2, 3, 3) covariances of them
         self._rest: Array | None = None  # (2, 3)
-        self._noise = _Noise(self.settings)
-        self._motion = SurfaceMotion()
+        self._noise = _RestNoise(self.settings)
+        self._motion = MotionState()
 
     @property
-    def motion(self) -> SurfaceMotion:
+    def motion(self) -> MotionState:
         """The last answer."""
         return self._motion
 
-    def __call__(self, stamp: float, base_from_surface: Array, covariance: Array) -> SurfaceMotion:
-        """What a measured pose (4, 4) with covariance (6, 6) at `stamp`, s, says of the surface's motion.
+    def __call__(self, stamp: float, base_from_surface: Array, covariance: Array) -> MotionState:
+        """The surface's motion after a measured pose (4, 4) with covariance (6, 6) at `stamp`, s.
 
-        The pose is that of one frame set alone: a smoothed one follows a step too late. Its covariance is that of the
-        tracks' noise: what late cameras add grows with the very speed that is to be seen.
+        The pose is that of one frame set alone: a smoothed one follows a step too late. The covariance is that of the
+        tracks' noise, without late cameras, whose part grows with the very speed that is to be detected.
         """
         if self._anchor is None:
             self._anchor = base_from_surface.copy()
         self._stamps.append(stamp)
-        self._states.append(self._state(self._anchor, base_from_surface))
-        self._claims.append(self._claim(self._anchor, base_from_surface, covariance))
+        self._states.append(self._turn_and_shift(self._anchor, base_from_surface))
+        self._covariances.append(self._turn_and_shift_covariances(self._anchor, base_from_surface, covariance))
         if self._motion.moving:
             self._settle()
         else:
             self._watch()
         return self._motion
 
-    def _state(self, anchor: Array, base_from_surface: Array) -> Array:
+    def _turn_and_shift(self, anchor: Array, base_from_surface: Array) -> Array:
         """Turn and shift of the centre (2, 3) since the anchor, in the anchor's own axes."""
         back = anchor[:3, :3].T
         turn = se3.log(se3.inverse(anchor) @ base_from_surface)[:3]
         there, here = (t[:3, :3] @ self._centre + t[:3, 3] for t in (anchor, base_from_surface))
         return np.stack([turn, back @ (here - there)])
 
-    def _claim(self, anchor: Array, base_from_surface: Array, covariance: Array) -> Array:
-        """Covariances (2, 3, 3) of turn and shift, as the pose's own says."""
+    def _turn_and_shift_covariances(self, anchor: Array, base_from_surface: Array, covariance: Array) -> Array:
+        """Covariances (2, 3, 3) of turn and shift, by that of the pose."""
         turn = anchor[:3, :3].T @ base_from_surface[:3, :3]
         both = np.stack([covariance[:3, :3], self._at_centre @ covariance @ self._at_centre.T])
         return np.asarray(turn @ both @ turn.T + self._least)
@@ -104,48 +106,48 @@ class MotionDetector:
     # -- moving: until it settles
 
     def _settle(self) -> None:
-        """At rest again once the means of the last second's parts stay together."""
-        if len(self._claims) < REST:
-            return self._tell(moving=True, onset=self._motion.onset)
-        newest = self._states.newest(REST)
-        claim = self._claims.newest(REST).mean(0)
+        """At rest again once the means of the last second's blocks stay together."""
+        if len(self._covariances) < REST_POSES:
+            return self._set_motion(moving=True, onset=self._motion.onset)
+        newest = self._states.newest(REST_POSES)
+        claimed = self._covariances.newest(REST_POSES).mean(0)
         rest = newest.mean(0)
-        away = newest.reshape(-1, BLOCK, 2, 3).mean(1) - rest
-        white = self._noise.white(newest, claim)
-        spread = 3.5 * np.sqrt(white * np.trace(claim, axis1=1, axis2=2) / BLOCK)
+        away = newest.reshape(-1, BLOCK_POSES, 2, 3).mean(1) - rest
+        white = self._noise.white(newest, claimed)
+        spread = 3.5 * np.sqrt(white * np.trace(claimed, axis1=1, axis2=2) / BLOCK_POSES)
         allowed = np.maximum(self.settings.settled, spread / self._wanted)
         if (self._sizes(away).max(0) > allowed).any():
-            return self._tell(moving=True, onset=self._motion.onset)
+            return self._set_motion(moving=True, onset=self._motion.onset)
         self._rest = rest
-        self._noise.begin(newest, claim, white)
-        return self._tell(moving=False, onset=self._motion.onset)
+        self._noise.begin(newest, claimed, white)
+        return self._set_motion(moving=False, onset=self._motion.onset)
 
     # -- at rest: until it moves
 
     def _watch(self) -> None:
         assert self._rest is not None
-        newest = self._states.newest(REST)
-        claim = self._claims.newest(AVERAGED[0]).mean(0)
-        away = self._sizes(newest[-AVERAGED[0] :].mean(0) - self._rest) > self.settings.flagged
-        looks = [(count, self._rest, self._noise.variance(count)) for count in AVERAGED]
-        for count, since, variance in [*looks, (AVERAGED[0], _before(newest), self._noise.step)]:
+        newest = self._states.newest(REST_POSES)
+        claimed = self._covariances.newest(AVERAGED_POSES[0]).mean(0)
+        away = self._sizes(newest[-AVERAGED_POSES[0] :].mean(0) - self._rest) > self.settings.flagged
+        looks = [(count, self._rest, self._noise.variance(count)) for count in AVERAGED_POSES]
+        for count, since, variance in [*looks, (AVERAGED_POSES[0], _mean_before(newest), self._noise.step)]:
             part = newest[-count:] - since
-            kind = self._moved(part, claim, variance)
+            kind = self._moved(part, claimed, variance)
             if kind is not None and (since is self._rest or away[kind]):  # not where those before hold a wrong pose
-                self._claims.clear()  # rest is a second of poses that are all later
-                return self._tell(moving=True, onset=self._onset(since, part.mean(0), kind))
-        self._noise.learn(newest, claim)
-        return self._tell(moving=False, onset=self._motion.onset)
+                self._covariances.clear()  # rest is a second of poses that are all later
+                return self._set_motion(moving=True, onset=self._onset(since, part.mean(0), kind))
+        self._noise.learn(newest, claimed)
+        return self._set_motion(moving=False, onset=self._motion.onset)
 
-    def _moved(self, part: Array, claim: Array, variance: Array) -> int | None:
+    def _moved(self, part: Array, claimed: Array, variance: Array) -> int | None:
         """0 where the newest poses' mean has turned, 1 where it has shifted, None where it is at rest.
 
-        part: (count, 2, 3) since rest, or since just before. variance: (2,) of their mean, in parts of the claim.
+        part: (count, 2, 3) since rest, or since just before. variance: (2,) of their mean, in parts of the claimed one.
         """
         count, mean = len(part), part.mean(0)
         sizes = self._sizes(mean)
         for kind in np.flatnonzero(sizes > self.settings.flagged):
-            spread = claim[kind] * variance[kind]
+            spread = claimed[kind] * variance[kind]
             halves = part[:, kind].reshape(2, -1, 3).sum(1) / (count / 2)
             along = halves @ mean[kind] / (mean[kind] @ mean[kind])
             least = min(self.settings.agree, self.settings.flagged / sizes[kind])
@@ -154,32 +156,29 @@ class MotionDetector:
         return None
 
     def _onset(self, since: Array, moved: Array, kind: int) -> float:
-        """Stamp of the first pose of the movement: from it on all have gone a quarter of the way.
-
-        That of the newest pose where that one is nearly back.
-        """
-        along = (self._states.newest(HISTORY)[:, kind] - since[kind]) @ moved[kind] / (moved[kind] @ moved[kind])
+        """Stamp of the first pose from which on all have gone a quarter of the way; the newest one's if it is back."""
+        along = (self._states.newest(ONSET_HISTORY)[:, kind] - since[kind]) @ moved[kind] / (moved[kind] @ moved[kind])
         before = np.flatnonzero(along < 0.25)
         return self._stamps[min(int(before[-1]) + 1, len(along) - 1) if len(before) else 0]
 
-    def _tell(self, moving: bool, onset: float) -> None:
+    def _set_motion(self, moving: bool, onset: float) -> None:
         since = np.zeros((2, 3)) if self._rest is None else self._rest
-        newest = self._states.newest(AVERAGED[0]).mean(0) - since
+        newest = self._states.newest(AVERAGED_POSES[0]).mean(0) - since
         turned, moved = np.linalg.norm(newest, axis=1).tolist()
-        self._motion = SurfaceMotion(moving, onset, moved, turned)
+        self._motion = MotionState(moving, onset, moved, turned)
 
 
-def _before(newest: Array) -> Array:
+def _mean_before(newest: Array) -> Array:
     """The mean (2, 3) of the poses just before the newest ones."""
-    return np.asarray(newest[-BEFORE - AVERAGED[0] : -AVERAGED[0]].mean(0))
+    return np.asarray(newest[-POSES_BEFORE - AVERAGED_POSES[0] : -AVERAGED_POSES[0]].mean(0))
 
 
-class _Rows:
-    """The newest HISTORY arrays (2, 3), or of more axes, in one piece."""
+class _PoseBuffer:
+    """The newest ONSET_HISTORY arrays (2, 3), or of more axes, in one piece."""
 
     def __init__(self, *more: int) -> None:
         """more: lengths of the axes after those."""
-        self._room = np.empty((8 * HISTORY, 2, 3, *more))
+        self._room = np.empty((8 * ONSET_HISTORY, 2, 3, *more))
         self._count = 0
 
     def __len__(self) -> int:
@@ -190,59 +189,59 @@ class _Rows:
 
     def append(self, row: Array) -> None:
         if self._count == len(self._room):
-            self._room[:HISTORY] = self._room[-HISTORY:]
-            self._count = HISTORY
+            self._room[:ONSET_HISTORY] = self._room[-ONSET_HISTORY:]
+            self._count = ONSET_HISTORY
         self._room[self._count] = row
         self._count += 1
 
     def newest(self, count: int) -> Array:
         """The last `count` (M, 2, 3, ...), or as many as there are."""
-        return self._room[max(self._count - min(count, HISTORY), 0) : self._count]
+        return self._room[max(self._count - min(count, ONSET_HISTORY), 0) : self._count]
 
 
-class _Noise:
-    """How far means of poses scatter at rest, in parts of what one pose's covariance claims; turn and shift apart."""
+class _RestNoise:
+    """The variance of means of poses at rest, in parts of one pose's claimed covariance; turn and shift apart."""
 
-    COUNTS = (*AVERAGED, REST)
-    TRUST = 60.0  # poses that the first second's scatter is worth
-    LEAST = 0.01  # of the variance claimed; no covariance is wider than that
-    MOST = 4.0  # times the noise known: a movement that is not yet flagged must not pass for noise
+    COUNTS = (*AVERAGED_POSES, REST_POSES)
+    FIRST_WEIGHT = 60.0  # poses that the first second's scatter is worth
+    MIN_SHARE = 0.01  # of the variance claimed; no covariance is wider than that
+    MAX_RISE = 4.0  # times the noise known: a movement that is not yet flagged must not pass for noise
 
     def __init__(self, settings: MotionSettings) -> None:
         self._settings = settings
         self._sum = np.ones((len(self.COUNTS), 2)) / np.array(self.COUNTS)[:, None]
-        self._step = np.full(2, 1 / AVERAGED[0] + 1 / BEFORE)  # of the newest poses' mean since just before
+        self._step = np.full(2, 1 / AVERAGED_POSES[0] + 1 / POSES_BEFORE)  # of the newest poses' mean since just before
         self._weight = 0.0
         self._mean = np.zeros((2, 3))  # of the last seconds: noise is counted from here, not from the place of rest
 
-    def white(self, states: Array, claim: Array) -> Array:
-        """Variance (2,) of single poses (N, 2, 3) by their second differences, in parts of the claim (2, 3, 3)."""
+    def white(self, states: Array, claimed: Array) -> Array:
+        """Variance (2,) of single poses (N, 2, 3) by second differences, in parts of the claim (2, 3, 3)."""
         change = np.diff(states, 2, axis=0)
-        return self._parts(change, claim) / 6
+        return self._parts(change, claimed) / 6
 
-    def begin(self, states: Array, claim: Array, white: Array) -> None:
-        """The surface has come to rest: poses (REST, 2, 3) of it, and their white noise (2,)."""
+    def begin(self, states: Array, claimed: Array, white: Array) -> None:
+        """The surface has come to rest: poses (REST_POSES, 2, 3) of it, and their white noise (2,)."""
         self._mean = states.mean(0)
         if self._weight:
             return
-        both = np.maximum(white, self._parts(states - self._mean, claim))
-        self._sum = np.maximum(both, self.LEAST) / np.array(self.COUNTS)[:, None]
-        self._step = np.maximum(both, self.LEAST) * (1 / AVERAGED[0] + 1 / BEFORE)
-        self._weight = self.TRUST
+        both = np.maximum(white, self._parts(states - self._mean, claimed))
+        self._sum = np.maximum(both, self.MIN_SHARE) / np.array(self.COUNTS)[:, None]
+        self._step = np.maximum(both, self.MIN_SHARE) * (1 / AVERAGED_POSES[0] + 1 / POSES_BEFORE)
+        self._weight = self.FIRST_WEIGHT
 
-    def learn(self, newest: Array, claim: Array) -> None:
-        """Take the newest poses (REST, 2, 3) at rest."""
+    def learn(self, newest: Array, claimed: Array) -> None:
+        """Take the newest poses (REST_POSES, 2, 3) at rest."""
         self._mean = self._mean + (newest[-1] - self._mean) / self._settings.steady
         away = np.stack([newest[-count:].sum(0) / count for count in self.COUNTS]) - self._mean
-        seen = np.einsum("nki,kij,nkj->nk", away, np.linalg.inv(claim), away) / 3
-        seen = np.minimum(seen, self.MOST * self._sum)
+        square = np.einsum("nki,kij,nkj->nk", away, np.linalg.inv(claimed), away) / 3
+        square = np.minimum(square, self.MAX_RISE * self._sum)
         self._weight = min(self._weight + 1, self._settings.memory)
-        self._sum = self._sum + (seen - self._sum) / self._weight
-        step = self._parts((newest[-AVERAGED[0] :].mean(0) - _before(newest))[None], claim)
-        self._step = self._step + (np.minimum(step, self.MOST * self._step) - self._step) / self._weight
+        self._sum = self._sum + (square - self._sum) / self._weight
+        step = self._parts((newest[-AVERAGED_POSES[0] :].mean(0) - _mean_before(newest))[None], claimed)
+        self._step = self._step + (np.minimum(step, self.MAX_RISE * self._step) - self._step) / self._weight
 
     def variance(self, count: int) -> Array:
-        """(2,) of a mean of `count` poses against the place of rest, in parts of one pose's claim."""
+        """(2,) of a mean of `count` poses against the place of rest, in parts of one pose's claimed covariance."""
         return np.asarray(self._sum[self.COUNTS.index(count)] + self._sum[-1])
 
     @property
@@ -251,7 +250,89 @@ class _Noise:
         return self._step
 
     @staticmethod
-    def _parts(away: Array, claim: Array) -> Array:
+    def _parts(away: Array, claimed: Array) -> Array:
         """Mean square (2,) of deviations (N, 2, 3) in parts of their claimed covariance (2, 3, 3)."""
-        told = np.linalg.inv(claim)
-        return np.asarray(np.einsum("nki,kij,nkj->k", away, told, away) / (3 * len(away)))
+        return np.asarray(np.einsum("nki,kij,nkj->k", away, np.linalg.inv(claimed), away) / (3 * len(away)))
+
+
+@dataclass(frozen=True, slots=True)
+class StateSettings:
+    """Thresholds. `leave` ends TRACKING, `enter` begins it."""
+
+    enter_cameras: int = 2  # that carry the pose: one alone hardly tells depth
+    enter_tracks: int = 30
+    leave_tracks: int = 20
+    enter_sigma: float = 2.0  # mm, of the pose's position
+    leave_sigma: float = 2.5
+    enter_deformation: float = 0.2  # mm, RMS over the landmarks
+    leave_deformation: float = 0.3  # a rigid pose alone is then off by half a bead in places
+    first: int = 4  # poses that are averaged before one is given out: what that is off by, all later ones are
+    settle: float = 0.06  # s without a fault until TRACKING again: the second frame set of 30 a second
+    coast: float = 0.5  # s without a measurement until LOST
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """What a measured pose stands on."""
+
+    cameras: tuple[str, ...]  # names of those that carry it
+    tracks: int  # of all cameras
+    sigma: float  # mm, of the position
+    trouble: str = ""  # cameras that are missed, and why
+    caveat: str = ""  # any other reservation
+    deformation: float = 0.0  # mm, of the surface
+
+
+class PoseStateMachine:
+    """Remembers the state, and since when nothing spoke against TRACKING."""
+
+    def __init__(self, settings: StateSettings | None = None) -> None:
+        self.settings = settings or StateSettings()
+        self.state = TrackState.INITIALISING
+        self._bad_stamp = float("-inf")  # s, of the last pose with a fault
+        self._measured_stamp = float("-inf")
+        self._poses = 0  # measured since the first map
+
+    def begin(self, stamp: float) -> tuple[TrackState, str]:
+        """A first map, made at `stamp`."""
+        self.state, self._bad_stamp, self._measured_stamp = TrackState.INITIALISING, float("-inf"), stamp
+        self._poses = 0
+        return self.state, "a first map, to be confirmed"
+
+    def measured(self, stamp: float, seen: Measurement) -> tuple[TrackState, str]:
+        """State and reason of a measured pose."""
+        fault = self._fault(seen)
+        if fault:
+            self._bad_stamp = stamp
+        elif stamp - self._bad_stamp < self.settings.settle:
+            fault = f"seen well again for {stamp - self._bad_stamp:.2f} s, {self.settings.settle:.2f} s wanted"
+        self._measured_stamp = stamp
+        self._poses += 1
+        if self._poses < self.settings.first:
+            self.state = TrackState.INITIALISING
+            return self.state, f"pose {self._poses} of {self.settings.first} that are averaged into the first"
+        self.state = TrackState.DEGRADED if fault else TrackState.TRACKING
+        return self.state, fault
+
+    def _fault(self, seen: Measurement) -> str:
+        """What speaks against TRACKING, or ''."""
+        s, inside = self.settings, self.state is TrackState.TRACKING
+        if len(seen.cameras) < s.enter_cameras:
+            alone = f"one camera alone carries the pose: {', '.join(seen.cameras) or 'none clearly'}"
+            return f"{alone}; {seen.trouble}" if seen.trouble else alone
+        if seen.sigma > (s.leave_sigma if inside else s.enter_sigma):
+            return f"the pose is uncertain to {seen.sigma:.1f} mm"
+        if seen.tracks < (s.leave_tracks if inside else s.enter_tracks):
+            return f"{seen.tracks} tracks carry the pose, {s.enter_tracks} wanted"
+        if seen.trouble:
+            return seen.trouble
+        if seen.deformation > (s.leave_deformation if inside else s.enter_deformation):
+            return f"the surface is deformed by {seen.deformation:.2f} mm"
+        return seen.caveat
+
+    def missed(self, stamp: float, why: str) -> tuple[TrackState, str]:
+        """State and reason of a pose that is only predicted."""
+        away = stamp - self._measured_stamp
+        self._bad_stamp = stamp
+        self.state = TrackState.LOST if away > self.settings.coast else TrackState.COASTING
+        return self.state, f"{why}; {away:.2f} s since the last measurement"

@@ -1,10 +1,10 @@
-"""The sliding window of poses and twists: the only owner of a GTSAM smoother, which it rebuilds when it breaks.
+"""The sliding window of poses and twists: GTSAM's fixed-lag smoother, rebuilt when it breaks.
 
-One factor per frame: the Gauss-Newton pose with its information. Measured with 120 landmarks this is as accurate as
-keeping every landmark in the window (0.024 mm) at a thirtieth of the time. Between poses stands GTSAM's prior of white
-noise on acceleration (`WnoaMotionFactorPose3`; Barfoot 2017, 11.1). The window holds base_from_surface, not its
-inverse: its twist is then the surface's own velocity about its own origin, and the prior does not couple turns with the
-far-away base.
+One factor per frame set: the Gauss-Newton pose with its information. Measured with 120 landmarks this is as accurate
+as keeping every landmark in the window (0.024 mm), at a thirtieth of the time. Between poses stands GTSAM's prior of
+white noise on acceleration (`WnoaMotionFactorPose3`; Barfoot 2017, 11.1). The window holds base_from_surface, not its
+inverse: the twist is then the surface's own velocity about its own origin, and the prior does not couple turns with
+the far-away base. The prior's density follows the surface's recent motion, axis by axis (`AccelerationPsd`).
 """
 
 from __future__ import annotations
@@ -15,81 +15,154 @@ import gtsam
 import numpy as np
 
 from estimation import se3
-from estimation.liveliness import Liveliness
+from estimation.runtime import compiled
 from estimation.se3 import Array
 
-LAG = 0.6  # s: longer changed the newest pose by nothing (0.5, 1 s and windows of 5 to 20 agree to 1e-4 mm)
-SURPRISE = 4.0  # squared sigmas of an axis, mean: a prior that is off by more gives way to the measurement
+WINDOW_LAG_S = 0.6  # longer changed the newest pose by nothing (0.5, 1 s, windows of 5 to 20 agree to 1e-4 mm)
+MAX_PRIOR_CHI2 = 4.0  # squared sigmas of an axis, mean: a prior that is off by more gives way to the measurement
+
+GRID_RATIO = 10**0.5  # between densities of the grid: closer ones cannot be told apart in a second
+ROTATION_PSD_GRID = 1e-7 * GRID_RATIO ** np.arange(18)  # rad^2/s^3, from a surface at rest to a shaken one
+TRANSLATION_PSD_GRID = 1e-2 * GRID_RATIO ** np.arange(18)  # mm^2/s^3
+PSD_MEMORY_S = 1.0  # over which a density is judged
+STUDENT_DOF = 4.0  # degrees of freedom of Student's t: a single jerk is not a lively motion, ten in a second are
+INITIAL_RATE_SIGMA = 100.0  # rad/s and mm/s, standard deviation of a velocity before anything is known of it
+
+
+class AccelerationPsd:
+    """The density of white-noise acceleration that explains the recent motion best, axis by axis.
+
+    A hand waves a thousand times livelier than a chest, and a chest along its normal only; a prior tuned to one drags
+    or shakes on the other. So a bank of constant-velocity Kalman filters runs beside the window, one for each density
+    of a grid, weighed by how well it predicted the last measurements (multiple-model estimation; Magill 1965).
+    """
+
+    def __init__(self) -> None:
+        self._grid = np.stack([ROTATION_PSD_GRID] * 3 + [TRANSLATION_PSD_GRID] * 3)  # (6, K)
+        self._score = np.zeros_like(self._grid)  # log likelihoods
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin with an unknown velocity, as after an outage; the densities' scores stay."""
+        shape = self._grid.shape
+        self._off, self._rate = np.zeros(shape), np.zeros(shape)  # filtered minus last measured pose, and its rate
+        self._var, self._cross = np.full(shape, np.inf), np.zeros(shape)
+        self._rate_var = np.full(shape, INITIAL_RATE_SIGMA**2)
+
+    @property
+    def psd(self) -> Array:
+        """(6,) rad^2/s^3 and mm^2/s^3: the mean of the densities under their likelihoods."""
+        weight = np.exp(self._score - self._score.max(1, keepdims=True))
+        weight = weight / weight.sum(1, keepdims=True)
+        return np.asarray((weight * self._grid).sum(1))
+
+    def add(self, moved: Array, seconds: float, variance: Array) -> None:
+        """Take a measured pose: moved (6,) from the measured pose before it, variance (6,) of the new one."""
+        if np.isinf(self._var).any():
+            self._var = np.tile(variance[:, None], (1, self._grid.shape[1]))
+        filters = self._off, self._rate, self._var, self._cross, self._rate_var
+        keep = float(np.exp(-seconds / PSD_MEMORY_S))
+        _update_filters(self._grid, self._score, *filters, moved, variance.copy(), float(seconds), keep)
+
+
+@compiled(f"void({', '.join(['f8[:,::1]'] * 7)}, f8[::1], f8[::1], f8, f8)")
+def _update_filters(
+    grid: Array,
+    score: Array,
+    off: Array,
+    rate: Array,
+    var: Array,
+    cross: Array,
+    rate_var: Array,
+    moved: Array,
+    variance: Array,
+    dt: float,
+    keep: float,
+) -> None:
+    """Predict all filters (6, K) by dt, s, score them by the pose that was measured, and update them, in place."""
+    for i in range(grid.shape[0]):
+        for k in range(grid.shape[1]):
+            q = grid[i, k]
+            ahead = off[i, k] + rate[i, k] * dt - moved[i]  # predicted minus measured
+            spread = var[i, k] + 2 * dt * cross[i, k] + dt**2 * rate_var[i, k] + q * dt**3 / 3
+            both = cross[i, k] + dt * rate_var[i, k] + q * dt**2 / 2
+            total = spread + variance[i]
+            one = -0.5 * (np.log(total) + (STUDENT_DOF + 1) * np.log1p(ahead**2 / (STUDENT_DOF * total)))
+            score[i, k] = keep * score[i, k] + one
+            gain, gain_rate = spread / total, both / total
+            off[i, k], rate[i, k] = ahead * (1 - gain), rate[i, k] - gain_rate * ahead
+            rate_var[i, k] += q * dt - gain_rate * both
+            var[i, k], cross[i, k] = spread * (1 - gain), both * (1 - gain)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
-    """A pose as one frame set gives it. stamp: s. pose: (4, 4). covariance: (6, 6) of its right perturbation."""
+class MeasuredPose:
+    """A pose as one frame set gives it."""
 
-    stamp: float
-    pose: Array
-    covariance: Array
+    stamp: float  # s
+    pose: Array  # (4, 4)
+    covariance: Array  # (6, 6) of its right perturbation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Window:
-    """The newest estimate. pose (4, 4), twist (6,), their covariances (6, 6), acceleration_psd (6,)."""
+class WindowEstimate:
+    """The window's newest state."""
 
-    stamp: float
-    pose: Array
-    covariance: Array
-    twist: Array
-    twist_covariance: Array
-    acceleration_psd: Array
+    stamp: float  # s
+    pose: Array  # (4, 4)
+    covariance: Array  # (6, 6)
+    twist: Array  # (6,)
+    twist_covariance: Array  # (6, 6)
+    acceleration_psd: Array  # (6,)
 
 
 class Smoother:
-    """Fixed-lag smoothing of measured poses; flat in time and memory, and never destroyed for good."""
+    """Fixed-lag smoothing of measured poses, in constant time and memory; a broken window is rebuilt."""
 
     def __init__(self) -> None:
-        self._last: Measured | None = None
-        self._liveliness = Liveliness()
-        self._psd = self._liveliness.psd
+        self._last: MeasuredPose | None = None
+        self._motion = AccelerationPsd()
+        self._psd = self._motion.psd
         self.restarts = 0
         self._clear()
 
     def _clear(self) -> None:
         parameters = gtsam.ISAM2Params()
         parameters.findUnusedFactorSlots = True
-        self._window = gtsam.IncrementalFixedLagSmoother(LAG, parameters)
+        self._window = gtsam.IncrementalFixedLagSmoother(WINDOW_LAG_S, parameters)
         self._key = 0
-        self._newest: Window | None = None
+        self._newest: WindowEstimate | None = None
 
     @property
-    def newest(self) -> Window | None:
+    def newest(self) -> WindowEstimate | None:
         """The last estimate, or None before the first measurement."""
         return self._newest
 
     def reset(self) -> None:
         """Forget everything, as after an outage longer than the window."""
         self._last = None
-        self._liveliness.restart()
+        self._motion.restart()
         self._clear()
 
-    def add(self, measured: Measured) -> Window:
+    def add(self, measured: MeasuredPose) -> WindowEstimate:
         """Take one measurement, newer than the ones before, and give the estimate at its stamp."""
         assert np.isfinite(measured.pose).all() and np.isfinite(measured.covariance).all()
-        measured = replace(measured, covariance=_proper(measured.covariance))
+        measured = replace(measured, covariance=_floored_covariance(measured.covariance))
         before = self._newest
-        if before is not None and measured.stamp - before.stamp > LAG:
+        if before is not None and measured.stamp - before.stamp > WINDOW_LAG_S:
             self.reset()
         if self._last is not None:
             moved = se3.log(se3.inverse(self._last.pose) @ measured.pose)
-            self._liveliness.add(moved, measured.stamp - self._last.stamp, np.diag(measured.covariance))
-        self._last, self._psd = measured, self._liveliness.psd
+            self._motion.add(moved, measured.stamp - self._last.stamp, np.diag(measured.covariance))
+        self._last, self._psd = measured, self._motion.psd
         try:
             self._newest = self._extend(measured)
         except (RuntimeError, IndexError, ValueError):
             self._newest = self._rebuild(measured)
         return self._newest
 
-    def _density(self, measured: Measured) -> Array:
-        """Of the acceleration since the last pose, (6,): what the motion was, or more where it now surprises.
+    def _density(self, measured: MeasuredPose) -> Array:
+        """Density (6,) of the acceleration since the last pose: the recent motion's, or more if need be.
 
         A jerk of the hand loosens the prior at once: where motion is not smooth it must not drag the pose.
         """
@@ -99,11 +172,12 @@ class Smoother:
         expected = self._newest.covariance + measured.covariance + dt**2 * self._newest.twist_covariance
         variance = np.diag(expected) + psd * dt**3 / 3
         for group in (slice(0, 3), slice(3, 6)):
-            if np.mean(off[group] ** 2 / variance[group]) > SURPRISE:
+            if np.mean(off[group] ** 2 / variance[group]) > MAX_PRIOR_CHI2:
                 psd[group] = np.maximum(psd[group], np.mean(off[group] ** 2) * 3 / dt**3)
         return psd
 
-    def _extend(self, measured: Measured) -> Window:
+    def _extend(self, measured: MeasuredPose) -> WindowEstimate:
+        """Add one pose and twist, with the motion prior to those before, and the measurement."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         pose, twist = gtsam.symbol("x", self._key), gtsam.symbol("v", self._key)
         start = np.zeros(6)
@@ -113,13 +187,9 @@ class Smoother:
         else:
             start = self._newest.twist
             old_pose, old_twist = gtsam.symbol("x", self._key - 1), gtsam.symbol("v", self._key - 1)
-            graph.add(
-                gtsam.WnoaMotionFactorPose3(
-                    gtsam.StateData(old_pose, old_twist, self._newest.stamp),
-                    gtsam.StateData(pose, twist, measured.stamp),
-                    self._density(measured),
-                )
-            )
+            before = gtsam.StateData(old_pose, old_twist, self._newest.stamp)
+            now = gtsam.StateData(pose, twist, measured.stamp)
+            graph.add(gtsam.WnoaMotionFactorPose3(before, now, self._density(measured)))
         noise = gtsam.noiseModel.Gaussian.Covariance(_symmetric(measured.covariance))
         graph.add(gtsam.PriorFactorPose3(pose, gtsam.Pose3(measured.pose), noise))
         values.insert(pose, gtsam.Pose3(measured.pose))
@@ -127,7 +197,7 @@ class Smoother:
         self._window.update(graph, values, {pose: measured.stamp, twist: measured.stamp})
         estimate = self._window.calculateEstimate()
         self._key += 1
-        window = Window(
+        window = WindowEstimate(
             measured.stamp,
             np.asarray(estimate.atPose3(pose).matrix()),
             _symmetric(self._window.marginalCovariance(pose)),
@@ -135,20 +205,19 @@ class Smoother:
             _symmetric(self._window.marginalCovariance(twist)),
             self._psd,
         )
-        if not all(
-            np.isfinite(a).all() for a in (window.pose, window.covariance, window.twist, window.twist_covariance)
-        ):
+        parts = window.pose, window.covariance, window.twist, window.twist_covariance
+        if not all(np.isfinite(part).all() for part in parts):
             raise ValueError("the window's estimate is not finite")
         return window
 
-    def _rebuild(self, newest: Measured) -> Window:
-        """Start a fresh window from the newest measurement alone: GTSAM's smoother is of no use after it has thrown."""
+    def _rebuild(self, newest: MeasuredPose) -> WindowEstimate:
+        """A fresh window from the newest measurement alone: GTSAM's smoother cannot be used after it has thrown."""
         self.restarts += 1
         self._clear()
         return self._extend(newest)
 
 
-def _proper(covariance: Array) -> Array:
+def _floored_covariance(covariance: Array) -> Array:
     """The covariance with no direction surer than 1e-6 rad or mm: GTSAM accepts a worse one and fails later."""
     values, vectors = np.linalg.eigh(_symmetric(covariance))
     return np.asarray((vectors * np.maximum(values, 1e-12)) @ vectors.T)

@@ -1,4 +1,4 @@
-"""What points on a surface say about a pose and what they leave open: slides and turns along which nothing changes."""
+"""What points on a surface determine of a pose, and along which slides and turns nothing changes."""
 
 from __future__ import annotations
 
@@ -10,33 +10,29 @@ from estimation import se3
 from estimation.scans.scan import ScanIndex
 from estimation.se3 import Array
 
-FREE_STD = 0.3  # mm: a direction known no better than this is called free; three times the error that is wanted
+FREE_STD = 0.3  # mm: a direction known no better is called free; three times the error that is wanted
 FREE_SLOPE = 0.012  # mm of distance per mm of motion (0.7 degrees): below, errors of the scan's own shape decide
-PURE = 0.2  # share of turning below which a motion is called a slide
+SLIDE_TURN_SHARE = 0.2  # of turning, below which a motion is called a slide
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Freedom:
-    """What is held and what is not.
+class Observability:
+    """Which motions are determined and which are free."""
 
-    directions: (K, 6) free right perturbations, rad and mm, that move the points by about 1 mm. names: one each.
-    covariance: (6, 6), as wide as the scan along them. weakest: mm, one standard deviation of the worst direction held.
-    """
-
-    directions: Array
-    names: tuple[str, ...]
-    covariance: Array
-    weakest: float
+    directions: Array  # (K, 6) free right perturbations, rad and mm, that move the points by about 1 mm
+    names: tuple[str, ...]  # one each
+    covariance: Array  # (6, 6), as wide as the scan along them
+    weakest: float  # mm, one standard deviation of the worst direction that is determined
 
 
-def freedom(points: Array, normals: Array, sigma: float, index: ScanIndex) -> Freedom:
-    """What point-to-plane distances at points (N, 3) with normals (N, 3), surface frame, `sigma` mm each, hold.
+def observability_of(points: Array, normals: Array, sigma: float, index: ScanIndex) -> Observability:
+    """What point-to-plane distances, `sigma` mm each, at points (N, 3) with normals (N, 3), surface frame, determine.
 
     Turns are counted about the points' centre and in mm at their rms radius, so that the six directions compare.
     """
     size = float(np.ptp(index.samples, axis=0).max())
     if not len(points):
-        return Freedom(np.eye(6), ("everything",), np.diag([np.pi**2] * 3 + [size**2] * 3), np.inf)
+        return Observability(np.eye(6), ("everything",), np.diag([np.pi**2] * 3 + [size**2] * 3), np.inf)
     centre, radius = _middle(points)
     slope, vectors = _slopes(points, normals)
     std = sigma / np.maximum(slope * np.sqrt(len(points)), 1e-12)
@@ -46,11 +42,11 @@ def freedom(points: Array, normals: Array, sigma: float, index: ScanIndex) -> Fr
     motions = _slides_and_turns(vectors[:, free].T)
     names = tuple(_name(m, centre, radius) for m in motions)
     weakest = float(std[~free].max(initial=0.0))
-    return Freedom(motions @ perturbation.T, names, spread @ spread.T, weakest)
+    return Observability(motions @ perturbation.T, names, spread @ spread.T, weakest)
 
 
 def without_free(points: Array, normals: Array, step: Array) -> Array:
-    """A right perturbation (6,) without its parts along which distances at points (N, 3), normals (N, 3) hardly change.
+    """A right perturbation (6,) without motions that hardly change the distances at points (N, 3), normals (N, 3).
 
     Both in the surface frame.
     """
@@ -91,7 +87,7 @@ def _slides_and_turns(motions: Array) -> Array:
 
 def _name(motion: Array, centre: Array, radius: float) -> str:
     turn, move = motion[:3] / radius, motion[3:]
-    if np.linalg.norm(motion[:3]) < PURE:
+    if np.linalg.norm(motion[:3]) < SLIDE_TURN_SHARE:
         return f"slide along {_vector(move / np.linalg.norm(move), 2)}"
     axis = turn / np.linalg.norm(turn)
     through = centre + np.cross(turn, move) / (turn @ turn)

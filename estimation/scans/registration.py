@@ -1,8 +1,8 @@
-"""Where a scan lies: triangulated points against its surface, and an honest word on what its shape leaves open.
+"""Where a scan lies: triangulated points against its surface, and what its shape leaves open.
 
-Many starts (every part of the scan laid under the points, turned in steps about the normal) are ranked by how far the
-points stand off, the best are refined by robust point-to-plane steps (Chen and Medioni 1992), and what the shape holds
-is read from the eigenvalues of the information matrix (Gelfand et al., Geometrically Stable Sampling, 2003).
+Many starts (every part of the scan laid under the points, turned in steps about the normal) are ranked by the points'
+distances, and the best are refined by robust point-to-plane steps (Chen and Medioni 1992). What the shape determines is
+read from the eigenvalues of the information matrix (Gelfand et al., Geometrically Stable Sampling, 2003).
 """
 
 from __future__ import annotations
@@ -13,48 +13,42 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from estimation import se3
-from estimation.scan import Index, Scan
-from estimation.scans.observability import Freedom, freedom, without_free
-from estimation.scans.scan import ScanIndex
+from estimation.scans.observability import Observability, observability_of, without_free
+from estimation.scans.scan import Index, Scan, ScanIndex
 from estimation.se3 import Array
+from estimation.surface_map import farthest_points
 
-FEWEST = 12  # points: six unknowns, and as many again to see that they fit
-YAWS = 24  # starts per place: 15 degrees apart, half of it is within reach of the refinement
-PLACES = 150  # at most
+MIN_REGISTRATION_POINTS = 12  # six unknowns, and as many again to see that they fit
+YAW_STARTS = 24  # starts per place: 15 degrees apart, half of it is within reach of the refinement
+MAX_PLACES = 150  # at most
 FIRST_POINTS, COARSE_POINTS = 24, 60  # spread over all, while there are many poses to be tried
 FIRST_STEPS = 3  # of all starts: ranked as they are laid down, those near the truth on a steep surface are lost
-KEPT = 80  # starts that are refined roughly
-FINE = 6  # and of these, those refined with exact nearest points
-FINAL = 3  # and of these, those refined with all points: more than one, to see whether the best is alone
+ROUGH_STARTS = 80  # starts that are refined roughly
+FINE_STARTS = 6  # and of these, those refined with exact nearest points
+FINAL_STARTS = 3  # and of these, those refined with all points: more than one, to see whether the best is alone
 COARSE_SAMPLES = 4000  # of the scan: enough to lay a part of it under the points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """Where the scan lies.
+    """Where the scan lies."""
 
-    base_from_surface: (4, 4) mm. rms: mm, of the points that fit, across the surface. covariance: (6, 6) of the right
-    perturbation, rad and mm; as wide as the scan along what is free. free: (K, 6) directions of that perturbation that
-    the shape does not hold. sure: whether the pose is fixed, unique and fits. verdict: the same in words. rival: (4, 4)
-    another pose that fits as well, or None.
-    """
-
-    base_from_surface: Array
-    rms: float
-    covariance: Array
-    free: Array
-    sure: bool
-    verdict: str
-    rival: Array | None = None
+    base_from_surface: Array  # (4, 4) mm
+    rms: float  # mm, of the points that fit, across the surface
+    covariance: Array  # (6, 6) of the right perturbation, rad and mm; as wide as the scan along what is free
+    free: Array  # (K, 6) directions of that perturbation that the shape does not determine
+    sure: bool  # whether the pose is determined, unique and fits
+    verdict: str  # the same in words
+    rival: Array | None = None  # (4, 4) another pose that fits as well
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
+class _Candidate:
     pose: Array  # (4, 4) base_from_surface
     cost: float  # mm^2, mean of capped squared distances
     rms: float  # mm, of the points that count
     share: float  # of points that count
-    freedom: Freedom
+    observability: Observability
 
 
 def register(points_base: Array, sigma: float, scan: Scan, outward: Array) -> Registration:
@@ -66,41 +60,41 @@ def register(points_base: Array, sigma: float, scan: Scan, outward: Array) -> Re
     """
     assert sigma > 0 and np.isfinite(points_base).all()
     index = ScanIndex(scan)
-    if len(points_base) < FEWEST:
-        return _nothing(index, len(points_base))
+    if len(points_base) < MIN_REGISTRATION_POINTS:
+        return _no_registration(index, len(points_base))
     few = points_base[_spread_out(points_base, min(COARSE_POINTS, len(points_base)))]  # the first ones furthest apart
     reach = 0.1 * _radius(points_base) + 3 * sigma  # mm: further off counts no more
     poses = _starts(points_base, outward, index)
     for _ in range(FIRST_STEPS):
         poses = _rough_step(index, poses, few[:FIRST_POINTS], reach)
-    poses = poses[np.argsort(_costs(index, poses, few[:FIRST_POINTS], reach), kind="stable")[:KEPT]]
+    poses = poses[np.argsort(_costs(index, poses, few[:FIRST_POINTS], reach), kind="stable")[:ROUGH_STARTS]]
     for step in range(8):
         poses = _rough_step(index, poses, few, reach * 0.75**step)
     ranked = poses[np.argsort(_costs(index, poses, few, reach), kind="stable")]
-    finer = [_refine(index, pose, few, sigma, reach, 12) for pose in _distinct(ranked, few, FINE)]
+    finer = [_refine(index, pose, few, sigma, reach, 12) for pose in _distinct(ranked, few, FINE_STARTS)]
     fits = [_measure(index, pose, gate, points_base, sigma) for pose, gate in finer]
-    best = sorted(zip(fits, finer, strict=True), key=lambda f: f[0].cost)[:FINAL]
+    best = sorted(zip(fits, finer, strict=True), key=lambda f: f[0].cost)[:FINAL_STARTS]
     finest = [_refine(index, pose, points_base, sigma, gate, 40) for _, (pose, gate) in best]
     fits = [_measure(index, pose, gate, points_base, sigma) for pose, gate in finest]
     return _judge(sorted(fits, key=lambda f: f.cost), points_base, sigma)
 
 
-def settle(points_base: Array, sigma: float, shared: float, index: ScanIndex, near: Array) -> Registration:
+def register_near(points_base: Array, sigma: float, shared: float, index: ScanIndex, near: Array) -> Registration:
     """Refine a pose `near` (4, 4) that is right to a millimetre or two, from points (N, 3), mm, base frame.
 
-    sigma: mm, of a point across the surface; shared: how much wider that is for what they tell together, where the
-    errors of neighbours are alike. Along what the shape leaves open the pose stays where it was.
+    sigma: mm, of a point across the surface. shared: factor of that for all points together, where the errors of
+    neighbours are alike. Along what the shape leaves open the pose stays.
     """
-    if len(points_base) < FEWEST:
-        return replace(_nothing(index, len(points_base)), base_from_surface=near)
+    if len(points_base) < MIN_REGISTRATION_POINTS:
+        return replace(_no_registration(index, len(points_base)), base_from_surface=near)
     pose, gate = _refine(index, near, points_base, sigma, 10 * sigma, 20, held=True)
     fit = _measure(index, pose, gate, points_base, sigma, shared)
     return _judge([fit], points_base, max(sigma, fit.rms))
 
 
-def _judge(fits: list[_Fit], points: Array, sigma: float) -> Registration:
+def _judge(fits: list[_Candidate], points: Array, sigma: float) -> Registration:
     best = fits[0]
-    free = best.freedom
+    free = best.observability
     words = []
     if best.rms > 2 * sigma:
         words.append(f"poor fit: {best.rms:.3g} mm rms, {sigma:.3g} mm expected")
@@ -119,13 +113,15 @@ def _judge(fits: list[_Fit], points: Array, sigma: float) -> Registration:
     return Registration(best.pose, best.rms, free.covariance, free.directions, not words, verdict, other)
 
 
-def _nothing(index: ScanIndex, count: int) -> Registration:
+def _no_registration(index: ScanIndex, count: int) -> Registration:
     size = float(np.ptp(index.samples, axis=0).max())
     covariance = np.diag([np.pi**2] * 3 + [size**2] * 3)
-    return Registration(np.eye(4), np.inf, covariance, np.eye(6), False, f"{count} points, {FEWEST} needed")
+    return Registration(
+        np.eye(4), np.inf, covariance, np.eye(6), False, f"{count} points, {MIN_REGISTRATION_POINTS} needed"
+    )
 
 
-def _rival(fits: list[_Fit], points: Array, sigma: float) -> _Fit | None:
+def _rival(fits: list[_Candidate], points: Array, sigma: float) -> _Candidate | None:
     """Another pose that fits as well as the best, within what chance explains."""
     bound = max(fits[0].cost, sigma**2) * (1 + 4 * np.sqrt(2 / len(points)))
     near = 0.1 * _radius(points)
@@ -161,15 +157,17 @@ def _refine(
     return pose, gate
 
 
-def _measure(index: ScanIndex, pose: Array, gate: float, points: Array, sigma: float, shared: float = 1.0) -> _Fit:
-    """How well points (N, 3), base frame, fit at a pose; those within two gates count. shared: see `settle`."""
+def _measure(
+    index: ScanIndex, pose: Array, gate: float, points: Array, sigma: float, shared: float = 1.0
+) -> _Candidate:
+    """How well points (N, 3), base frame, fit at a pose; those within two gates count. shared: see `register_near`."""
     inner = se3.transform_points(se3.inverse(pose), points)
     near = index.closest(inner)
     distance = np.linalg.norm(inner - near.points, axis=1)
     counts = (distance < 2 * gate) & ~near.rim
     rms = float(np.sqrt(np.mean(distance[counts] ** 2))) if counts.any() else np.inf
-    held = freedom(inner[counts], near.normals[counts], shared * max(sigma, min(rms, gate)), index)
-    return _Fit(pose, float(np.mean(np.minimum(distance, 2 * gate) ** 2)), rms, float(counts.mean()), held)
+    held = observability_of(inner[counts], near.normals[counts], shared * max(sigma, min(rms, gate)), index)
+    return _Candidate(pose, float(np.mean(np.minimum(distance, 2 * gate) ** 2)), rms, float(counts.mean()), held)
 
 
 def _pull(index: ScanIndex, pose: Array, points: Array) -> tuple[Array, Array, Array]:
@@ -220,8 +218,8 @@ def _starts(points: Array, outward: Array, index: ScanIndex) -> Array:
     base_from_cap = _cap(points, np.asarray(outward, float))
     stride = max(1, len(index.samples) // COARSE_SAMPLES)
     samples, normals = index.samples[::stride], index.normals[::stride]
-    places = samples[_spread_out(samples, PLACES, 0.5 * radius)]
-    yaws = se3.exp_rotation(np.arange(YAWS)[:, None] * [0.0, 0.0, 2 * np.pi / YAWS])
+    places = samples[_spread_out(samples, MAX_PLACES, 0.5 * radius)]
+    yaws = se3.exp_rotation(np.arange(YAW_STARTS)[:, None] * [0.0, 0.0, 2 * np.pi / YAW_STARTS])
     turned = base_from_cap @ se3.make(yaws, np.zeros(3))  # (Y, 4, 4)
     poses = []
     for near in cKDTree(samples).query_ball_point(places, 1.6 * radius):
@@ -254,24 +252,17 @@ def _apart(a: Array, b: Array, points: Array) -> float:
 
 def _distinct(poses: Array, points: Array, count: int) -> list[Array]:
     """The first `count` poses (H, 4, 4) of which no two are nearly the same."""
-    found: list[Array] = []
+    distinct: list[Array] = []
     near = 0.1 * _radius(points)
     for pose in poses:
-        if all(_apart(pose, other, points) > near for other in found):
-            found.append(pose)
-        if len(found) == count:
+        if all(_apart(pose, other, points) > near for other in distinct):
+            distinct.append(pose)
+        if len(distinct) == count:
             break
-    return found
+    return distinct
 
 
 def _spread_out(points: Array, count: int, nearest: float = 0.0) -> Index:
-    """Numbers of up to `count` points (N, 3) as far apart as can be, farthest first, none nearer than `nearest` mm."""
+    """Rows of up to `count` points (N, 3) as far apart as can be, from the centre on, none nearer than `nearest` mm."""
     first = int(np.argmin(np.linalg.norm(points - points.mean(0), axis=1)))
-    chosen, distance = [first], np.linalg.norm(points - points[first], axis=1)
-    while len(chosen) < count:
-        next_one = int(np.argmax(distance))
-        if distance[next_one] <= nearest:
-            break
-        chosen.append(next_one)
-        distance = np.minimum(distance, np.linalg.norm(points - points[next_one], axis=1))
-    return np.array(chosen)
+    return farthest_points(points, first, count, nearest)

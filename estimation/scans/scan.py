@@ -1,22 +1,187 @@
-"""The nearest point of a scan: exact on the triangles near by, quick where only its neighbourhood matters."""
+"""A scan of the surface, a triangle mesh in the surface frame: where rays meet it, and its nearest points."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from estimation.scan import Index, Scan, face_areas, normals_at, open_edges
-from estimation.se3 import Array
+from estimation.se3 import Array, inverse, transform_points
 
-SAMPLES = 15_000  # about so many spread over the scan; a 100 x 100 mm scan gets one every 0.8 mm
-_FINEST = 24  # divisions of a triangle's side at most
+Index = NDArray[np.int64]
+
+MIN_INCIDENCE = 0.1  # cosine of ray and normal: no landmark is seen more from the side
+_EDGE_SLACK = 1e-9  # barycentric, so that no ray slips through between two triangles
+SAMPLE_COUNT = 15_000  # about so many spread over the scan; a 100 x 100 mm scan gets one every 0.8 mm
+_MAX_DIVISIONS = 24  # of a triangle's side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Closest:
+class Scan:
+    """A triangle mesh without duplicated vertices."""
+
+    vertices: Array  # (V, 3) mm, surface frame
+    triangles: Index  # (T, 3) numbers of vertices, anticlockwise as seen from outside
+    normals: Array  # (V, 3) unit, out of the surface, the mean of the triangles around, weighted by area
+
+    @property
+    def corners(self) -> Array:
+        """Corners of the triangles (T, 3, 3), mm."""
+        return np.asarray(self.vertices[self.triangles])
+
+
+def scan_from_triangles(vertices: ArrayLike, triangles: ArrayLike) -> Scan:
+    """The scan with vertices (V, 3) mm and triangles (T, 3); equal vertices are merged, empty triangles left out."""
+    points, faces = np.asarray(vertices, float), np.asarray(triangles, np.int64)
+    points, number = np.unique(points + 0.0, axis=0, return_inverse=True)  # + 0.0: -0 is 0
+    faces = number.reshape(-1)[faces]
+    crosses = _crosses(points, faces)
+    largest = float(np.abs(points).max(initial=0.0))
+    faces = faces[np.linalg.norm(crosses, axis=1) > 1e-12 * largest**2]
+    used, number = np.unique(faces, return_inverse=True)
+    points, faces = points[used], number.reshape(-1, 3)
+    return Scan(points, faces, _vertex_normals(points, faces))
+
+
+def open_edges(scan: Scan) -> Index:
+    """Edges (E, 2) that belong to one triangle only: the rim of the scan and of its holes; none if it is closed."""
+    edges = np.sort(scan.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    different, count = np.unique(edges, axis=0, return_counts=True)
+    return np.asarray(different[count == 1])
+
+
+def face_normals(scan: Scan) -> Array:
+    """Unit normals (T, 3) of the triangles, out of the surface."""
+    crosses = _crosses(scan.vertices, scan.triangles)
+    return np.asarray(crosses / np.linalg.norm(crosses, axis=1, keepdims=True))
+
+
+def face_areas(scan: Scan) -> Array:
+    """Areas (T,) of the triangles, mm^2."""
+    return np.asarray(np.linalg.norm(_crosses(scan.vertices, scan.triangles), axis=1) / 2)
+
+
+def normals_at(scan: Scan, triangle: Index, weights: Array) -> Array:
+    """Unit normals (N, 3), interpolated between the corners of `triangle` (N,) by barycentric weights (N, 3)."""
+    mixed = np.einsum("nk,nki->ni", weights, scan.normals[scan.triangles[triangle]])
+    return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12))
+
+
+def _crosses(points: Array, faces: Index) -> Array:
+    a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
+    return np.cross(b - a, c - a)
+
+
+def _vertex_normals(points: Array, faces: Index) -> Array:
+    """Unit normals (V, 3); where the triangles around a vertex cancel out, that of one of them."""
+    crosses = _crosses(points, faces)
+    sums = np.zeros_like(points)
+    some = np.zeros_like(points)
+    for corner in range(3):
+        np.add.at(sums, faces[:, corner], crosses)
+        some[faces[:, corner]] = crosses
+    length = np.linalg.norm(sums, axis=1)
+    lone = length <= 1e-9 * np.linalg.norm(some, axis=1)
+    sums[lone] = some[lone]
+    return np.asarray(sums / np.linalg.norm(sums, axis=1, keepdims=True))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hits:
+    """Where rays first meet the scan. points, normals: (N, 3), surface frame, mm; NaN where hit (N,) is False."""
+
+    points: Array
+    normals: Array
+    hit: NDArray[np.bool_]
+
+
+def cast_rays(scan: Scan, surface_from_camera: Array, directions: Array) -> Hits:
+    """Where rays (N, 3), camera frame, first meet the scan, on either side; all within 80 degrees of their mean.
+
+    Only triangles whose picture on a plane across the mean ray covers the ray's are tried (Moeller and Trumbore 1997).
+    They are looked up by their circles, octave by octave, so that a few large triangles do not slow the small ones.
+    """
+    miss = np.full((len(directions), 3), np.nan)
+    if not len(directions) or not len(scan.triangles):
+        return Hits(miss, miss.copy(), np.zeros(len(directions), bool))
+    corners = transform_points(inverse(surface_from_camera), scan.vertices)[scan.triangles]  # (T, 3, 3) camera frame
+    ray, triangle = _candidates(corners, directions)
+    depth, weights = _meet(corners[triangle], directions[ray])
+    keep = np.flatnonzero(np.isfinite(depth))
+    keep = keep[np.argsort(depth[keep], kind="stable")]
+    first_ray, first = np.unique(ray[keep], return_index=True)
+    chosen = keep[first]
+    points, normals = miss, miss.copy()
+    met = depth[chosen, None] * directions[first_ray]
+    points[first_ray] = transform_points(surface_from_camera, met)
+    normals[first_ray] = normals_at(scan, triangle[chosen], weights[chosen])
+    return Hits(points, normals, np.isfinite(points[:, 0]))
+
+
+def foot_jacobians(rays: Array, normals: Array) -> tuple[Array, Array]:
+    """How the foot of each ray (N, 3), from the camera, moves along the plane with unit normal (N, 3) that it meets.
+
+    (N, 3, 3) by a shift of the ray, and (N, 3) by a shift of the plane along its normal.
+    """
+    along = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    slope = np.einsum("ni,ni->n", along, normals)
+    slope = np.where(np.abs(slope) < MIN_INCIDENCE, -MIN_INCIDENCE, slope)
+    return np.eye(3) - along[:, :, None] * normals[:, None] / slope[:, None, None], along / slope[:, None]
+
+
+def _meet(corners: Array, directions: Array) -> tuple[Array, Array]:
+    """Distances (M,) to triangles (M, 3, 3), in lengths of `directions` (M, 3), NaN for a miss; barycentric weights.
+
+    Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997.
+    """
+    a = corners[:, 0]
+    ab, ac = corners[:, 1] - a, corners[:, 2] - a
+    p, q = np.cross(directions, ac), np.cross(-a, ab)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1 / np.einsum("mi,mi->m", ab, p)
+        u = np.einsum("mi,mi->m", -a, p) * scale
+        v = np.einsum("mi,mi->m", directions, q) * scale
+        t = np.einsum("mi,mi->m", ac, q) * scale
+        inside = (u >= -_EDGE_SLACK) & (v >= -_EDGE_SLACK) & (u + v <= 1 + _EDGE_SLACK) & (t > 0)
+    return np.where(inside, t, np.nan), np.column_stack([1 - u - v, u, v])
+
+
+def _candidates(corners: Array, directions: Array) -> tuple[Index, Index]:
+    """Pairs (M,) of ray and triangle (T, 3, 3), camera frame, that may meet."""
+    across = _across(directions)
+    flat = directions @ across[:, :2] / (directions @ across[:, 2:])  # (N, 2) on a plane one unit away
+    turned = corners @ across
+    front = turned[..., 2] > 1e-6 * np.abs(turned).max()
+    whole = np.flatnonzero(front.all(1))  # the others reach behind the camera: tried against every ray
+    odd = np.flatnonzero(front.any(1) & ~front.all(1))
+    pictures = turned[whole, :, :2] / turned[whole, :, 2:]  # (W, 3, 2)
+    low, high = pictures.min(1), pictures.max(1)
+    centres, radii = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
+    rays = [np.repeat(np.arange(len(flat)), len(odd))]
+    triangles = [np.tile(odd, len(flat))]
+    tree = cKDTree(flat)
+    for octave in np.unique(np.frexp(radii)[1]):
+        some = np.flatnonzero(np.frexp(radii)[1] == octave)
+        near = tree.query_ball_tree(cKDTree(centres[some]), float(np.ldexp(1.0, octave)) * (1 + 1e-9))
+        rays.append(np.repeat(np.arange(len(flat)), [len(f) for f in near]))
+        triangles.append(whole[some[np.array([t for f in near for t in f], np.int64)]])
+    return np.concatenate(rays), np.concatenate(triangles)
+
+
+def _across(directions: Array) -> Array:
+    """Rotation (3, 3) whose last column is the mean ray."""
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    z = unit.mean(0) / np.linalg.norm(unit.mean(0))
+    assert (unit @ z).min() > 0.17, "rays of one camera stand within 80 degrees of their mean"
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosestPoints:
     """Nearest points of a scan. points, normals: (N, 3), surface frame, mm. rim: (N,) whether on an open edge."""
 
     points: Array
@@ -25,16 +190,14 @@ class Closest:
 
 
 class ScanIndex:
-    """A scan made ready for many queries.
+    """A scan made ready for many queries, by samples spread over its triangles, at least one on each."""
 
-    samples, normals: (S, 3), surface frame, mm: points spread over the triangles, at least one on each. triangle: (S,)
-    the one each lies on. spacing: mm, how far apart they are at most, roughly.
-    """
+    # samples, normals: (S, 3) mm, surface frame. triangle: (S,) that each lies on. spacing: mm, about the largest
 
     def __init__(self, scan: Scan) -> None:
         self.scan = scan
         areas = face_areas(scan)
-        self.spacing = float(np.sqrt(areas.sum() / SAMPLES))
+        self.spacing = float(np.sqrt(areas.sum() / SAMPLE_COUNT))
         self.triangle, weights = _spread(scan, self.spacing)
         self._corners = scan.corners
         self.samples = np.einsum("sk,ski->si", weights, self._corners[self.triangle])
@@ -43,19 +206,19 @@ class ScanIndex:
         self.spacing = max(self.spacing, float(np.sqrt(np.quantile(areas, 0.9))))
         self._open = _open_sides(scan)
 
-    def closest(self, points: Array, candidates: int = 8) -> Closest:
+    def closest(self, points: Array, candidates: int = 8) -> ClosestPoints:
         """Nearest points of the scan to points (N, 3), on the triangles of the nearest samples."""
         count = min(candidates, len(self.samples))
         _, near = self.tree.query(points, k=count)
         triangle = self.triangle[near.reshape(len(points), count)]  # (N, K)
         corners = self._corners[triangle.ravel()]
         weights = closest_weights(np.repeat(points, count, axis=0), corners)
-        found = np.einsum("mk,mki->mi", weights, corners).reshape(len(points), count, 3)
-        best = np.argmin(np.linalg.norm(found - points[:, None], axis=2), axis=1)
+        nearest = np.einsum("mk,mki->mi", weights, corners).reshape(len(points), count, 3)
+        best = np.argmin(np.linalg.norm(nearest - points[:, None], axis=2), axis=1)
         row = np.arange(len(points))
         chosen, weight = triangle[row, best], weights.reshape(len(points), count, 3)[row, best]
         rim = ((weight < 1e-9) & self._open[chosen]).any(axis=1)
-        return Closest(found[row, best], normals_at(self.scan, chosen, weight), rim)
+        return ClosestPoints(nearest[row, best], normals_at(self.scan, chosen, weight), rim)
 
 
 def closest_weights(points: Array, corners: Array) -> Array:
@@ -89,7 +252,7 @@ def _spread(scan: Scan, spacing: float) -> tuple[Index, Array]:
     """Triangles (S,) and barycentric weights (S, 3) of samples about `spacing` apart: centres of sub-triangles."""
     corners = scan.corners
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    divisions = np.clip(np.ceil(longest / (1.5 * spacing)).astype(int), 1, _FINEST)
+    divisions = np.clip(np.ceil(longest / (1.5 * spacing)).astype(int), 1, _MAX_DIVISIONS)
     triangles, weights = [], []
     for n in np.unique(divisions):
         some = np.flatnonzero(divisions == n)

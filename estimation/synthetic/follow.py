@@ -1,8 +1,8 @@
-"""The estimator on the tracks of a synthetic world, fed as the tracker feeds it, and how far off its poses are."""
+"""The estimator on a synthetic world's tracks, fed as the tracker feeds it: its errors beside the Cramer-Rao bound."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,28 +11,63 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
-from estimation.fit import Fit
-from estimation.mapping.bundle_adjustment import Adjusted
+from estimation.mapping.bundle_adjustment import AdjustedMap
 from estimation.mapping.refiner import Refiner
+from estimation.mapping.triangulation import TriangulatedMap, triangulated_map
 from estimation.observations import Observations
 from estimation.online.estimator import Estimator
+from estimation.online.fit import FrameFit
+from estimation.online.pose_solver import project
+from estimation.online.surface_state import StateSettings
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.state_machine import StateSettings
-from estimation.synthetic.bound import filtered_bound, pose_bound, pose_information
-from estimation.synthetic.world import World
-from estimation.triangulated import Triangulated, triangulated
+from estimation.synthetic.world import SYNTHETIC_WORLD, World
 
-LEAST = StateSettings().first + 3  # frame sets: the map's, those averaged into the first pose, and two to be judged
-Mapping = Literal["told", "seen"]  # the world's own map; or one that is triangulated from the first look and refined
+MIN_FRAME_SETS = StateSettings().first + 3  # the map's, those averaged into the first pose, and two to be judged
+Mapping = Literal["told", "seen"]  # the world's own map, or one triangulated from the first frame set and refined
+
+
+def pose_information(rig: Rig, base_from_surface: Array, points: Array, seen: Observations) -> Array:
+    """Fisher information (6, 6) of one frame set about the right perturbation of the true pose (4, 4), rad and mm.
+
+    rig: the true cameras. points: (N, 3) mm, the true landmarks; seen.track are their rows. seen.sigma: px, white.
+    """
+    _, _, jacobian = project(rig, seen.camera, base_from_surface, points[seen.track])
+    return np.asarray(np.einsum("nki,n,nkj->ij", jacobian, seen.sigma**-2.0, jacobian))
+
+
+def pose_bound(information: Array) -> Array:
+    """The least covariance (..., 6, 6) that an unbiased estimate from one frame set can have."""
+    return np.asarray(np.linalg.inv(information))
+
+
+def filtered_bound(informations: Iterable[Array], dt: float, acceleration_psd: Array) -> Array:
+    """The least covariance (K, 6, 6) of each pose from all frame sets up to it, `dt` s apart.
+
+    The motion is white noise on acceleration with spectral density acceleration_psd (6,), rad^2/s^3 and mm^2/s^3
+    (Barfoot 2017, 11.1): the posterior bound of Tichavsky et al., IEEE TSP 46:1386 (1998), linear between frames.
+    """
+    psd, one = np.diag(acceleration_psd), np.eye(6)
+    transition = np.block([[one, dt * one], [np.zeros((6, 6)), one]])
+    drive = np.block([[psd * dt**3 / 3, psd * dt**2 / 2], [psd * dt**2 / 2, psd * dt]])
+    known = np.zeros((12, 12))
+    bounds: list[Array] = []
+    for information in informations:
+        if known.any():
+            known = np.linalg.inv(transition @ np.linalg.inv(known) @ transition.T + drive)
+        known[:6, :6] += information
+        if not bounds:
+            known[6:, 6:] += 1e-9 * one  # the first velocity is nearly unknown
+        bounds.append(np.asarray(np.linalg.inv(known)[:6, :6]))
+    return np.array(bounds)
 
 
 class Follower:
-    """One surface, followed by its tracks from the first frame set on, whose map it is given."""
+    """Follows one surface from its first frame set and map on."""
 
-    def __init__(self, rig: Rig, first: Observations, start: Triangulated, refine: bool) -> None:
-        """first: the frame set in which `start` was seen. refine: whether key frames refine the map."""
+    def __init__(self, rig: Rig, first: Observations, start: TriangulatedMap, refine: bool) -> None:
+        """first: the frame set of `start`. refine: whether key frames refine the map."""
         self.estimator = Estimator(rig)
         self.refiner = Refiner(rig) if refine else None
         self._row = np.full(int(start.tracks.max(initial=-1)) + 1, -1)
@@ -47,14 +82,14 @@ class Follower:
         estimator, seen = self.estimator, self.of_map(seen)
         fit = estimator.fit(seen, estimator.predict(seen.stamp))
         if not estimator.confirmed:
-            if len(estimator.carriers(fit)) < 2:
-                return estimator.wait(seen.stamp, fit.reason or "one camera sees the surface")
+            if len(estimator.carrying_cameras(fit)) < 2:
+                return estimator.hold(seen.stamp, fit.reason or "one camera sees the surface")
             refined = None if self.refiner is None else self.refiner.confirm(fit, seen, estimator.cameras.delays)
             if self.refiner is not None and refined is not None:
                 self._take(refined)
-                estimator.moving(self.refiner.speed(fit))
+                estimator.set_twist(self.refiner.speed(fit))
                 fit = self._again(fit, seen)
-        elif self.refiner is not None and fit.measured and not fit.odd and estimator.hasty(fit):
+        elif self.refiner is not None and fit.measured and not fit.odd and estimator.too_fast_for_map(fit):
             refined = self.refiner.rebuild(fit, seen, estimator.cameras.delays)
             if refined is not None:
                 self._take(refined)
@@ -66,67 +101,60 @@ class Follower:
             self.refiner.offer(fit, seen, pose.twist, estimator.cameras.delays)
         return pose
 
-    def _again(self, fit: Fit, seen: Observations) -> Fit:
-        """The fit to a corrected map, where that is a measurement."""
+    def _again(self, fit: FrameFit, seen: Observations) -> FrameFit:
+        """The fit to a corrected map, if that is a measurement."""
         refit = self.estimator.fit(seen, fit.solution.base_from_surface)
         return refit if refit.measured else fit
 
     def idle(self) -> None:
-        """What no pose waits for: a refined map that is due."""
+        """Take over a refined map that is ready; called between frame sets."""
         refined = None if self.refiner is None else self.refiner.poll()
         if refined is not None:
             self._take(refined)
 
     @property
     def offsets(self) -> Array:
-        """How much later than stamped each camera exposes (C,), s, as estimated."""
+        """Estimated exposure offset of each camera after its stamps, (C,) s."""
         return self.estimator.cameras.offset
 
     def of_map(self, seen: Observations) -> Observations:
-        """The observations of landmarks that are in the map and agree with it, numbered by its rows."""
+        """The observations of landmarks in the map that agree with it, numbered by the map's rows."""
         known = seen.track < len(self._row)
         row = np.where(known, self._row[np.where(known, seen.track, 0)], -1)
         keep = row >= 0
         keep[keep] = self._agrees[row[keep]]
         return Observations(seen.stamp, seen.camera[keep], row[keep], seen.pixels[keep], seen.sigma[keep])
 
-    def _take(self, refined: Adjusted) -> None:
+    def _take(self, refined: AdjustedMap) -> None:
         self.estimator.replace_map(refined.map)
         self._agrees = refined.agrees
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Followed:
-    """A run over a world beside its truth, after the first pose that is given out, which places the surface frame.
+class FollowResult:
+    """A run over a world beside its truth, after the first measured pose.
 
-    poses: K of them. seconds: (K,) by the clock. Of the estimated surface frame, into which the truth is carried at the
-    start, and never fitted: expected: (K, 4, 4) true base_from_surface. twists: (K, 6) true ones. informations:
-    (K, 6, 6), Fisher's, of each true pose from its own tracks, were all of them right. frame: (6, 6), the least
-    covariance with which one frame set could tell the pose that places the surface frame. offsets: (C,) s, of the
-    cameras' instants from their stamps, as estimated at the end; None where they are not.
+    That pose places the estimated surface frame. The truth is moved into this frame once and never fitted.
     """
 
-    poses: tuple[SurfacePose, ...]
-    seconds: Array
-    expected: Array
-    twists: Array
-    informations: Array
-    frame: Array
-    offsets: Array
+    poses: tuple[SurfacePose, ...]  # K of them
+    seconds: Array  # (K,) s: computing time of each pose
+    expected: Array  # (K, 4, 4) true base_from_surface of the estimated surface frame
+    twists: Array  # (K, 6) true body velocity, rad/s and mm/s
+    informations: Array  # (K, 6, 6) Fisher information of each frame set, as if it had no outliers
+    frame: Array  # (6, 6) bound of the pose that places the surface frame
+    offsets: Array  # (C,) s: exposure offsets as estimated at the end
 
     @property
     def bounds(self) -> Array:
-        """(K, 6, 6), the least covariance of each error, one frame set by itself; inf where nothing was seen.
-
-        An estimated frame was laid by a pose that is no better than the others, and its error is in all of them.
-        """
+        """(K, 6, 6) least covariance of each error from one frame set alone; inf where nothing is seen."""
         bounds = np.full_like(self.informations, np.inf)
         seen = self.informations.any(axis=(1, 2))
         bounds[seen] = pose_bound(self.informations[seen]) + self.frame
         return bounds
 
     def filtered_bounds(self) -> Array:
-        """(K, 6, 6), the same with all frame sets before, for a motion as lively as this one was on the whole."""
+        """(K, 6, 6) the same from all frame sets so far, for this run's mean acceleration."""
         dt = self.poses[1].stamp - self.poses[0].stamp
         drive = (np.diff(self.twists, axis=0) ** 2).mean(0) / dt
         psd = np.repeat([drive[:3].mean(), drive[3:].mean()], 3)
@@ -139,7 +167,7 @@ class Followed:
 
     @property
     def states(self) -> tuple[TrackState, ...]:
-        """The states, one after the other, each once as long as it lasts."""
+        """The sequence of states, without repetitions."""
         states = [pose.state for pose in self.poses]
         return tuple(s for i, s in enumerate(states) if not i or s is not states[i - 1])
 
@@ -151,7 +179,7 @@ class Followed:
 
     @property
     def covariances(self) -> Array:
-        """(K, 6, 6) as claimed."""
+        """(K, 6, 6) as reported."""
         return np.stack([pose.covariance for pose in self.poses])
 
     @property
@@ -161,50 +189,50 @@ class Followed:
 
     @property
     def twist_covariances(self) -> Array:
-        """(K, 6, 6) as claimed."""
+        """(K, 6, 6) as reported."""
         return np.stack([pose.twist_covariance for pose in self.poses])
 
 
-def beginning(world: World, first: Observations, mapping: Mapping) -> Triangulated:
-    """The map to begin with and its place in the world's first frame set."""
+def first_map(world: World, first: Observations, mapping: Mapping) -> TriangulatedMap:
+    """The first map and its pose in the world's first frame set."""
     if mapping == "seen":
-        return triangulated(world.rig, first)
+        return triangulated_map(world.rig, first)
     pose = world.base_from_surface(np.array(first.stamp))
-    return Triangulated(world.map, pose, np.arange(len(world.map)))
+    return TriangulatedMap(world.map, pose, np.arange(len(world.map)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Step:
-    """One frame set: the pose, what was seen, the s by a clock that the pose took, and the offsets then known.
-
-    Refinement is not counted.
-    """
+class FollowStep:
+    """One frame set of a run."""
 
     pose: SurfacePose
     seen: Observations
-    seconds: float
-    offsets: Array
+    seconds: float  # computing time of the pose, without map refinement
+    offsets: Array  # (C,) s: exposure offsets as estimated by then
 
 
-def steps(world: World, mapping: Mapping = "told", clock: Callable[[], float] = lambda: 0.0) -> Iterator[Step]:
-    """The estimator's way through a world, step by step; the first one only begins."""
+def follow_steps(
+    world: World, mapping: Mapping = "told", clock: Callable[[], float] = lambda: 0.0
+) -> Iterator[FollowStep]:
+    """Run the estimator through a world, step by step; the first step only initialises it."""
     seen = world.observations()
     first = next(seen)
-    follower = Follower(world.rig, first, beginning(world, first, mapping), refine=mapping == "seen")
+    follower = Follower(world.rig, first, first_map(world, first, mapping), refine=mapping == "seen")
     assert follower.estimator.pose is not None
-    yield Step(follower.estimator.pose, first, 0.0, follower.offsets)
+    yield FollowStep(follower.estimator.pose, first, 0.0, follower.offsets)
     for observations in seen:
         follower.idle()
         start = clock()
         pose = follower(observations)
-        yield Step(pose, observations, clock() - start, follower.offsets)
+        yield FollowStep(pose, observations, clock() - start, follower.offsets)
 
 
-def follow(world: World, mapping: Mapping = "told", clock: Callable[[], float] = lambda: 0.0) -> Followed:
-    """Run the estimator over the whole world; InputError where that is too short to be judged."""
-    if len(world) < LEAST:
-        raise InputError("synthetic world", "length", f"{len(world)} frame sets", f"{LEAST} or more to be followed")
-    every = list(steps(world, mapping, clock))
+def follow(world: World, mapping: Mapping = "told", clock: Callable[[], float] = lambda: 0.0) -> FollowResult:
+    """Run the estimator over the whole world; InputError if the world is too short."""
+    if len(world) < MIN_FRAME_SETS:
+        allowed = f"{MIN_FRAME_SETS} or more to be followed"
+        raise InputError(SYNTHETIC_WORLD, "length", f"{len(world)} frame sets", allowed)
+    every = list(follow_steps(world, mapping, clock))
     given = next((i for i, step in enumerate(every) if step.pose.state.measured), 0)
     begun, rest = every[given], every[given + 1 :]
     stamps = np.array([step.pose.stamp for step in rest])
@@ -214,7 +242,7 @@ def follow(world: World, mapping: Mapping = "told", clock: Callable[[], float] =
     points = se3.transform_points(se3.inverse(true_from_estimated), world.landmarks.points)
     poses = zip([true_start @ true_from_estimated, *expected], [begun, *rest], strict=True)
     first, *informations = (pose_information(world.true_rig, pose, points, step.seen) for pose, step in poses)
-    return Followed(
+    return FollowResult(
         poses=tuple(step.pose for step in rest),
         seconds=np.array([step.seconds for step in rest]),
         expected=expected,

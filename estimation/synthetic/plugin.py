@@ -14,6 +14,6 @@ if TYPE_CHECKING:
 @pytest.fixture(scope="session")
 def synthetic_world() -> Callable[..., World]:
     """`estimation.synthetic.world.synthetic_world`: trajectory, rig, landmarks, pixels and noise in one line."""
-    from estimation.synthetic.world import synthetic_world as made  # pytest starts as fast as without this plugin
+    from estimation.synthetic.world import synthetic_world as make_world  # pytest starts as fast as without this plugin
 
-    return made
+    return make_world

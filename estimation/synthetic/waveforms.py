@@ -1,6 +1,6 @@
-"""Scalar functions of time that drive the simulated world: unit amplitude, smooth, with their exact derivatives.
+"""Scalar functions of time that drive simulated motion: unit amplitude, smooth, with exact derivatives.
 
-Every random draw is made when a waveform is built; afterwards it depends on the time alone, which may be any.
+Random numbers are drawn when a waveform is made; after that its value depends on the time alone.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 
 from estimation.se3 import Array
 
-WALK_SECONDS = 600  # how long a random walk goes on before it comes back the way it went
+WALK_SECONDS = 600  # length of a random walk; after it the walk is played backwards
 
 
 class Waveform(Protocol):
@@ -21,15 +21,13 @@ class Waveform(Protocol):
 
     def __call__(self, times: Array) -> Array:
         """Values (N,) at times (N,), s."""
-        ...
 
     def rate(self, times: Array) -> Array:
         """Derivatives (N,), 1/s, at times (N,), s."""
-        ...
 
 
 def ease(u: Array) -> Array:
-    """0 before u = 0, 1 after u = 1 and between them the quintic with no speed and no acceleration at its ends."""
+    """0 before u = 0, 1 after u = 1, and between them the quintic with zero speed and acceleration at its ends."""
     u = np.clip(u, 0.0, 1.0)
     return np.asarray(u**3 * (10 + u * (6 * u - 15)))
 
@@ -54,13 +52,13 @@ def corner_rate(x: Array, rounding: float) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Sine:
-    """sin(2 pi rate t + phase). rate_hz: Hz. phase: rad."""
+    """sin(2 pi rate t + phase)."""
 
     rate_hz: float
-    phase: float = 0.0
+    phase: float = 0.0  # rad
 
     def __call__(self, times: Array) -> Array:
-        """Values (N,) at times (N,), s."""
+        """Values (N,)."""
         return np.sin(2 * np.pi * self.rate_hz * times + self.phase)
 
     def rate(self, times: Array) -> Array:
@@ -71,20 +69,16 @@ class Sine:
 
 @dataclass(frozen=True, slots=True)
 class Bump:
-    """A rise from 0 and a fall back to it within one cycle, skewed: sin^exponent about the peak.
+    """A rise from 0 and a fall back within one cycle: sin^exponent about a peak that need not be in the middle."""
 
-    start, peak, end: shares of the cycle, 0 <= start < peak < end <= 1. exponent: >= 2; the larger, the longer the
-    rest at both ends. height: of the peak.
-    """
-
-    start: float
+    start: float  # share of the cycle, as peak and end: 0 <= start < peak < end <= 1
     peak: float
     end: float
-    exponent: float
-    height: float = 1.0
+    exponent: float  # >= 2; larger values stay longer near 0 at both ends
+    height: float = 1.0  # of the peak
 
     def __call__(self, u: Array) -> Array:
-        """Values (N,) at phases u (N,) of the cycle, 0 to 1."""
+        """Values (N,)."""
         return np.asarray(self.height * np.sin(self._angle(u)[0]) ** self.exponent)
 
     def rate(self, u: Array) -> Array:
@@ -93,7 +87,7 @@ class Bump:
         return np.asarray(self.height * self.exponent * np.sin(angle) ** (self.exponent - 1) * np.cos(angle) * slope)
 
     def _angle(self, u: Array) -> tuple[Array, Array]:
-        """0 at the start, pi/2 at the peak, pi at the end, linear between: its kink stands where the slope is 0."""
+        """0 at the start, pi/2 at the peak, pi at the end, linear between: the kink is where sin has zero slope."""
         u = np.clip(u, self.start, self.end)
         slope = np.pi / 2 / np.where(u < self.peak, self.peak - self.start, self.end - self.peak)
         return np.clip(np.pi / 2 + (u - self.peak) * slope, 0.0, np.pi), slope
@@ -103,28 +97,24 @@ PULSE_BUMPS = (Bump(0.0, 0.15, 0.55, 2.0), Bump(0.38, 0.5, 0.95, 2.0, 0.35))  # 
 
 
 def breath_bumps(inspiration: float, exponent: float) -> tuple[Bump, ...]:
-    """One breath: up within the share `inspiration` of it, down in the rest of it, still at end-expiration.
+    """One breath: up within the share `inspiration`, then down; at rest at end-expiration.
 
-    sin^exponent is the cos^2n of Lujan et al., Med Phys 26:715 (1999), with the two halves of unequal length.
+    sin^exponent is cos^2n of Lujan et al., Med Phys 26:715 (1999), with two halves of unequal length.
     """
     return (Bump(0.0, inspiration, 1.0, exponent),)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cycles:
-    """Cycles of one shape, each with its own start, length and depth; between two of them it rests at 0.
+    """Cycles of one shape, each with its own start, length and depth; 0 between them."""
 
-    starts: (K + 1,) s, starts[0] = 0 and the last one is where the draw begins again from the first. lengths: (K,) s,
-    at most the step to the next start. depths: (K,). bumps: of a cycle of depth 1.
-    """
-
-    starts: Array
-    lengths: Array
-    depths: Array
-    bumps: tuple[Bump, ...]
+    starts: Array  # (K + 1,) s, starts[0] = 0; at the last one everything repeats from the first
+    lengths: Array  # (K,) s, at most up to the next start
+    depths: Array  # (K,)
+    bumps: tuple[Bump, ...]  # of a cycle of depth 1
 
     def __call__(self, times: Array) -> Array:
-        """Values (N,) at times (N,), s."""
+        """Values (N,)."""
         k, u = self._phase(times)
         return np.asarray(self.depths[k] * sum(bump(u) for bump in self.bumps))
 
@@ -140,15 +130,15 @@ class Cycles:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Noise:
-    """A sum of sines of random frequency and phase. omegas, amplitudes, phases: (M,) rad/s, 1, rad."""
+class BandNoise:
+    """A sum of sines of random frequency and phase."""
 
-    omegas: Array
-    amplitudes: Array
-    phases: Array
+    omegas: Array  # (M,) rad/s
+    amplitudes: Array  # (M,)
+    phases: Array  # (M,) rad
 
     def __call__(self, times: Array) -> Array:
-        """Values (N,) at times (N,), s."""
+        """Values (N,)."""
         return np.asarray((np.sin(np.outer(times, self.omegas) + self.phases) * self.amplitudes).sum(axis=1))
 
     def rate(self, times: Array) -> Array:
@@ -158,19 +148,16 @@ class Noise:
 
 
 @dataclass(frozen=True, slots=True)
-class Steps:
-    """A step every so often, each along `ease`. first: s, its start. every, rise: s, rise <= every.
+class StepWave:
+    """Periodic steps, each along `ease`."""
 
-    stairs: each goes up by 1; else they go up and down in turn.
-    """
-
-    first: float
-    every: float
-    rise: float
-    stairs: bool
+    first: float  # s: start of the first step
+    every: float  # s: period
+    rise: float  # s: duration of a step, at most `every`
+    stairs: bool  # True: every step goes up by 1; False: up and down in turn
 
     def __call__(self, times: Array) -> Array:
-        """Values (N,) at times (N,), s."""
+        """Values (N,)."""
         done, u = self._phase(times)
         if self.stairs:
             return np.asarray(done + ease(u))
@@ -183,7 +170,6 @@ class Steps:
         return np.asarray(sign * ease_rate(u) / self.rise)
 
     def _phase(self, times: Array) -> tuple[Array, Array]:
-        """Steps done before the present one, and phase of the present one."""
         since = times - self.first
         done = np.maximum(np.floor(since / self.every), 0.0)
         return done, (since - done * self.every) / self.rise
@@ -191,16 +177,15 @@ class Steps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Levels:
-    """From level to level along `ease`, 0 before the first. starts, steps: (K,) s and 1, when each change begins and
-    how far it goes. rise: s. period: s after which it all begins again (from 0 to 0), inf for never."""
+    """Changes of level, each along `ease`; 0 before the first."""
 
-    starts: Array
-    steps: Array
-    rise: float
-    period: float = np.inf
+    starts: Array  # (K,) s: when each change begins
+    steps: Array  # (K,): size of each change
+    rise: float  # s: duration of each change
+    period: float = np.inf  # s after which everything repeats (from level 0), inf for never
 
     def __call__(self, times: Array) -> Array:
-        """Values (N,) at times (N,), s."""
+        """Values (N,)."""
         return np.asarray((ease(self._phase(times)) * self.steps).sum(axis=1))
 
     def rate(self, times: Array) -> Array:
@@ -213,18 +198,15 @@ class Levels:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Corners:
-    """Straight lines with rounded corners: the slope is 0 and changes by `bends` (K,), 1/s, at `times` (K,), s.
+class RoundedCorners:
+    """Straight lines with rounded corners; the first line has slope 0."""
 
-    rounding: s, how long each change of slope takes, half of it before its time.
-    """
-
-    times: Array
-    bends: Array
-    rounding: float
+    times: Array  # (K,) s: when the slope changes
+    bends: Array  # (K,) 1/s: change of the slope
+    rounding: float  # s: duration of each change, half of it before its time
 
     def __call__(self, times: Array) -> Array:
-        """Values (N,) at times (N,), s."""
+        """Values (N,)."""
         return np.asarray((corner(times[:, None] - self.times, self.rounding) * self.bends).sum(axis=1))
 
     def rate(self, times: Array) -> Array:
@@ -234,14 +216,13 @@ class Corners:
 
 @dataclass(frozen=True, slots=True)
 class Zigzag:
-    """There and back at slope +-1: 0 at t = 0, up to `reach` (s, so that it goes at 1/s), to -reach and back, with
-    corners rounded over `rounding`, s, at most 2 * reach."""
+    """A triangle wave of slope +-1 with rounded corners: 0 at t = 0, up to `reach`, down to -reach, and back."""
 
-    reach: float
-    rounding: float
+    reach: float  # s, as the slope is 1/s
+    rounding: float  # s: at most 2 * reach
 
     def __call__(self, times: Array) -> Array:
-        """Values (N,) at times (N,), s."""
+        """Values (N,)."""
         return np.asarray(self.reach - folded(times - self.reach, 2 * self.reach, self.rounding))
 
     def rate(self, times: Array) -> Array:
@@ -250,14 +231,10 @@ class Zigzag:
 
 
 def folded(x: Array, length: float, rounding: float) -> Array:
-    """Distance (N,) from x to the nearest even multiple of `length`, 0 to `length`, its corners rounded."""
+    """Distance (N,) from x to the nearest even multiple of `length`, 0 to `length`, with rounded corners."""
     y = np.mod(x + length / 2, 2 * length) - length / 2
-    low, high = y, y - length
-    return np.where(
-        y < length / 2,
-        2 * corner(low, rounding) - low,
-        length - (2 * corner(high, rounding) - high),
-    )
+    high = y - length
+    return np.where(y < length / 2, 2 * corner(y, rounding) - y, length - (2 * corner(high, rounding) - high))
 
 
 def folded_rate(x: Array, length: float, rounding: float) -> Array:
@@ -268,12 +245,12 @@ def folded_rate(x: Array, length: float, rounding: float) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Walk:
-    """A smoothed random walk that goes back the way it came after WALK_SECONDS. spline: from 0 at 0 s, flat ends."""
+    """A smoothed random walk, played backwards after WALK_SECONDS."""
 
-    spline: CubicSpline
+    spline: CubicSpline  # 0 at 0 s, zero slope at both ends
 
     def __call__(self, times: Array) -> Array:
-        """Values (N,) at times (N,), s."""
+        """Values (N,)."""
         return np.asarray(self.spline(self._mirrored(times)))
 
     def rate(self, times: Array) -> Array:

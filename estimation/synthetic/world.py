@@ -1,52 +1,257 @@
-"""A synthetic world: a moving surface with landmarks, the cameras that watch it, and what they find, with all truth."""
+"""Synthetic worlds for tests: a moving surface with landmarks, cameras, their observations, and the whole truth.
+
+`synthetic_world` makes one in a line; `Conditions` says what may go wrong in it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
 from estimation.observations import Observations
-from estimation.rig import Rig
+from estimation.pose import Trajectory
+from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.synthetic.arc_rig import REST, arc_rig
-from estimation.synthetic.calibration import miscalibrated, undistorting
-from estimation.synthetic.conditions import WHERE, Conditions
-from estimation.synthetic.look import gathered, imaged
-from estimation.synthetic.movements import MOVEMENTS
-from estimation.synthetic.surfaces import SURFACES, Landmarks, Surface
-from estimation.synthetic.tracks import Errors, Found, Seen, lives
-from estimation.trajectory import Trajectory
+from estimation.synthetic.movements import MOVEMENTS, SURFACES, Surface, SurfaceLandmarks
 
 Displacement = Callable[[Array], Array]  # times (...), s -> rest_from_surface (..., 4, 4), mm
+Outage = tuple[float, float] | tuple[float, float, int]  # from, to, s; the camera, all cameras without one
+Visibility = NDArray[np.bool_]  # (C, N)
 
-LEAST_SIGMA = 0.02  # px: no track is sharper, and none may claim to be exact
-MOVING, LANDMARKS, CALIBRATION, MAPPING, TRACKS = range(5)  # each draws by itself, so that none shifts another
+SYNTHETIC_WORLD = "synthetic world"  # where an InputError says it comes from
+SHARE_FIELDS = ("outliers", "coherent", "dropouts")
+SIZE_FIELDS = (
+    *("noise", "dropout_seconds", "jitter", "calibration", "map_error", "correlated", "correlated_seconds", "churn"),
+)
+MAX_OUTLIER = 40.0  # px: largest shift of an outlier along an axis
+MIN_TRACK_SIGMA = 0.02  # px: no track is sharper, and none may claim to be exact
+MIN_FACING_COSINE = 0.17  # at 80 degrees to the normal a patch of skin is a line
+MIN_CAMERA_DEPTH = 1.0  # mm
+MOTION_STREAM, LANDMARK_STREAM, CALIBRATION_STREAM, MAP_STREAM, TRACK_STREAM = range(5)  # each has its own generator
+
+ARC_ANGLES_DEG = (0.0, 36.0, 84.0)  # of the cameras about the wound, thesis Fig. 4.3
+WOUND_CENTRE = np.array([180.0, 40.0, 60.0])  # mm, base frame: the middle of the room, where the wound rests
+WOUND_TILT = np.deg2rad(-38.0)  # of the wound, so that its normal stands amid the cameras and none of them grazes it
+BASE_FROM_REST = se3.make(se3.exp_rotation([WOUND_TILT, 0.0, 0.0]), WOUND_CENTRE)  # base_from_surface at rest
+WEBCAM_DISTORTION = (-0.12, 0.06, 6e-4, -4e-4, 0.0)  # a plain webcam's
+
+# Proportions of the errors that a calibration with a board leaves, before they are scaled to the wanted RMS
+DISTORTION_ERROR = np.array([2e-3, 4e-3, 2e-4, 2e-4, 0.0])  # k1 k2 p1 p2 k3
+FOCAL_ERROR, CENTRE_ERROR = 1.0, 1.0  # px
+ROTATION_ERROR, POSITION_ERROR = 1e-3, 0.2  # rad, mm
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """What degrades the cameras' tracks; all but the noise is off by default. InputError for a value out of range."""
+
+    noise: float = 0.25  # px: standard deviation per axis of white noise, and the sigma that observations state
+    outliers: float = 0.0  # share of the observations that are shifted by up to 40 px, drawn anew in each frame
+    coherent: float = 0.0  # share of the tracks that stay where they were in the image, as on a drape or a highlight
+    dropouts: float = 0.0  # share of the time for which a track is not found
+    dropout_seconds: float = 0.3  # s: mean length of a dropout
+    outages: tuple[Outage, ...] = ()  # periods in which one camera, or all of them, find nothing
+    views: int | None = None  # number of cameras that ever find a landmark, at random; None: all that see it
+    offsets: tuple[float, ...] = ()  # s: delay of each camera's true instant after its stamp; not in the rig
+    jitter: float = 0.0  # s: standard deviation of each camera's instant from frame to frame
+    calibration: float = (
+        0.0  # px: RMS distance between the given rig's image of the landmarks and the true one, at rest
+    )
+    map_error: float = 0.0  # mm: standard deviation per axis of the map's landmarks; the map's covariance states it
+    correlated: float = 0.0  # px: standard deviation of an error that lasts for `correlated_seconds`; not stated
+    correlated_seconds: float = 2.0  # s: time constant of that error
+    churn: float = 0.0  # s: mean life of a landmark before another one replaces it; 0: for ever
+    reveal: tuple[float, float] | None = None  # s: from and to when the half with x > 0 is uncovered; None: always is
+
+    def __post_init__(self) -> None:
+        for name in SHARE_FIELDS:
+            _check_condition(name, getattr(self, name), 0 <= getattr(self, name) <= 1, "a share, 0 to 1")
+        for name in SIZE_FIELDS:
+            _check_condition(name, getattr(self, name), 0 <= getattr(self, name) < math.inf, "a finite number >= 0")
+        if self.dropouts:
+            _check_condition("dropout_seconds", self.dropout_seconds, self.dropout_seconds > 0, "> 0 s with dropouts")
+        for spell in [*self.outages, *([self.reveal] if self.reveal else [])]:
+            _check_condition("spell", spell, spell[0] <= spell[1], "from <= to, s")
+        _check_condition("views", self.views, self.views is None or self.views >= 1, "None, or at least 1")
+
+
+def _check_condition(name: str, value: object, good: bool, allowed: str) -> None:
+    if not good:
+        raise InputError(SYNTHETIC_WORLD, name, value, allowed)
+
+
+def arc_rig(
+    angles_deg: Sequence[float] = ARC_ANGLES_DEG,
+    distance: float = 400.0,
+    focal: float = 1100.0,
+    size: tuple[int, int] = (1280, 720),
+    distortion: Sequence[float] = WEBCAM_DISTORTION,
+) -> Rig:
+    """Cameras on an arc about WOUND_CENTRE, `angles_deg` from straight above, `distance` mm away, `focal` px."""
+    cameras = []
+    for i, angle in enumerate(np.deg2rad(angles_deg)):
+        out = np.array([0.0, np.sin(angle), np.cos(angle)])  # from the wound to the camera
+        right = np.array([1.0, 0.0, 0.0])
+        rotation = np.stack([right, np.cross(-out, right), -out], axis=1)
+        cx, cy = size[0] / 2 - 3 + 5 * i, size[1] / 2 + 4 - 3 * i
+        matrix = np.array([[focal * (1 + 0.01 * i), 0, cx], [0, focal, cy], [0, 0, 1]])
+        pose = se3.make(rotation, WOUND_CENTRE + distance * out)
+        cameras.append(Camera(f"cam_{i}", size, matrix, np.array(distortion, float), pose))
+    return Rig(tuple(cameras))
+
+
+def undistorting(rig: Rig) -> Rig:
+    """The same cameras without distortion: observations hold undistorted pixels."""
+    return Rig(tuple(replace(c, distortion=np.zeros(5)) for c in rig.cameras))
+
+
+def _miscalibrated(camera: Camera, points_base: Array, rms: float, rng: np.random.Generator) -> Camera:
+    """The camera with lens and pose so far off that points (N, 3) mm are imaged `rms` px per axis away from before."""
+    draw = rng.standard_normal(14)
+    size = 1.0
+    for _ in range(6):  # nearly linear in the size
+        moved = _perturbed(camera, size * draw)
+        away = pixels_from_points(moved, points_base)[0] - pixels_from_points(camera, points_base)[0]
+        size *= rms / float(np.sqrt((away**2).sum(1).mean() / 2))  # per axis, as the noise is
+    return _perturbed(camera, size * draw)
+
+
+def _perturbed(camera: Camera, draw: Array) -> Camera:
+    matrix, distortion = camera.matrix.copy(), camera.distortion + DISTORTION_ERROR * draw[9:14]
+    matrix[[0, 1], [0, 1]] += FOCAL_ERROR * draw[0]
+    matrix[:2, 2] += CENTRE_ERROR * draw[1:3]
+    pose = camera.base_from_camera @ se3.exp(np.r_[ROTATION_ERROR * draw[3:6], POSITION_ERROR * draw[6:9]])
+    return replace(camera, matrix=matrix, distortion=distortion, base_from_camera=pose)
+
+
+def project_landmarks(rig: Rig, points: Array, poses: Array, normals: Array | None = None) -> tuple[Array, Visibility]:
+    """Pixels (C, N, 2) of points (N, 3), surface frame, and which (C, N) each camera has in view.
+
+    rig: without distortion for the pixels of Observations. poses: (C, 4, 4) base_from_surface at each camera's instant.
+    normals: (N, 3); without them all points face all cameras.
+    """
+    pixels, seen = zip(*(_project(rig.cameras[c], points, pose, normals) for c, pose in enumerate(poses)), strict=True)
+    return np.stack(pixels), np.stack(seen)
+
+
+def _project(camera: Camera, points: Array, pose: Array, normals: Array | None) -> tuple[Array, Visibility]:
+    points_base = se3.transform_points(pose, points)
+    pixels, depth = pixels_from_points(camera, points_base)
+    seen = (depth > MIN_CAMERA_DEPTH) & (pixels > 0).all(1) & (pixels < np.array(camera.size) - 1).all(1)
+    if normals is not None:
+        to_camera = camera.base_from_camera[:3, 3] - points_base
+        facing = ((normals @ pose[:3, :3].T) * to_camera).sum(1)
+        seen &= facing > MIN_FACING_COSINE * np.linalg.norm(to_camera, axis=1)
+    return pixels, seen
+
+
+def _observations(stamp: float, pixels: Array, seen: Visibility, sigma: float) -> Observations:
+    """Observations of pixels (C, N, 2) where seen (C, N), all of `sigma` px; a track's id is its column."""
+    camera, track = np.nonzero(seen)
+    return Observations(stamp, camera, track, pixels[camera, track], np.full(len(camera), sigma))
+
+
+def observations(
+    rig: Rig,
+    points: Array,
+    base_from_surface: Array,
+    stamp: float,
+    rng: np.random.Generator,
+    sigma: float = 0.3,
+    outliers: float = 0.0,
+    visible: Visibility | None = None,
+) -> Observations:
+    """Observations of points (N, 3), surface frame, by all cameras at one instant, with white noise of `sigma` px.
+
+    outliers: share of the observations that are shifted by up to 40 px instead. visible: (C, N) which may be seen.
+    """
+    pixels, seen = project_landmarks(undistorting(rig), points, np.broadcast_to(base_from_surface, (len(rig), 4, 4)))
+    error = sigma * rng.standard_normal(pixels.shape)
+    wrong = rng.random(seen.shape) < outliers
+    error[wrong] = rng.uniform(-MAX_OUTLIER, MAX_OUTLIER, (int(wrong.sum()), 2))
+    return _observations(stamp, pixels + error, seen if visible is None else seen & visible, sigma)
+
+
+class _TrackErrors:
+    """Pixel errors (C, N, 2) of all tracks, frame by frame: white noise, correlated noise and outliers.
+
+    Every frame draws the same amount whatever is seen, so worlds that differ in one condition share all other draws.
+    """
+
+    def __init__(self, conditions: Conditions, shape: tuple[int, int], rng: np.random.Generator) -> None:
+        self._conditions, self._shape, self._rng = conditions, shape, rng
+        self._correlated = rng.standard_normal((*shape, 2))
+
+    def __call__(self, dt: float) -> Array:
+        c, rng = self._conditions, self._rng
+        white, fresh = rng.standard_normal((2, *self._shape, 2))
+        keep = np.exp(-dt / c.correlated_seconds) if c.correlated_seconds else 0.0
+        self._correlated = keep * self._correlated + np.sqrt(1 - keep**2) * fresh  # Gauss-Markov, first order
+        error = c.noise * white + c.correlated * self._correlated
+        wrong, shift = rng.random(self._shape), rng.uniform(-MAX_OUTLIER, MAX_OUTLIER, (*self._shape, 2))
+        return np.where((wrong < c.outliers)[..., None], shift, error)
+
+
+class _TrackVisibility:
+    """Which tracks (C, N) in view a matcher finds, frame by frame."""
+
+    def __init__(self, conditions: Conditions, shape: tuple[int, int], rng: np.random.Generator) -> None:
+        self._conditions, self._shape, self._rng = conditions, shape, rng
+        views = shape[0] if conditions.views is None else conditions.views
+        self._ever = rng.random(shape).argsort(axis=0).argsort(axis=0) < views
+        self._dropped = rng.random(shape) < conditions.dropouts
+
+    def __call__(self, stamp: float, dt: float) -> Visibility:
+        self._dropped = self._rng.random(self._shape) < np.where(self._dropped, *self._dropout_chances(dt))
+        visible = self._ever & ~self._dropped
+        for start, end, *camera in self._conditions.outages:
+            if start <= stamp < end:
+                visible[camera or slice(None)] = False
+        return visible
+
+    def _dropout_chances(self, dt: float) -> tuple[float, float]:
+        """Chance that a dropped track stays dropped, and that another one is dropped: a two-state Markov chain."""
+        share = self._conditions.dropouts
+        if share in (0.0, 1.0):
+            return share, share
+        end = -np.expm1(-dt / self._conditions.dropout_seconds)
+        return 1 - end, min(end * share / (1 - share), 1.0)
+
+
+def _life_spans(count: int, seconds: float, life: float, rng: np.random.Generator) -> Array:
+    """First and last instant (N, 2), s, of landmarks: `count` at a time, each for `life` s on average, 0: for ever."""
+    if not life:
+        return np.tile([-np.inf, np.inf], (count, 1))
+    spans = []
+    for _ in range(count):
+        start = -np.inf
+        while start < seconds:
+            end = max(start, 0.0) + rng.exponential(life)
+            spans.append((start, end))
+            start = end
+    return np.array(sorted(spans))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """One world; iterate over it for the observations of each frame set.
+    """One world. Iterate over it for the observations of each frame set; a track's id is its landmark's row."""
 
-    rig: the calibrated cameras, as an estimator is told. true_rig: what makes the pixels, undistorted.
-    landmarks: the true ones; a track's id is its landmark's row. spans: (N, 2) s, from when to when each can be seen.
-    map: of all landmarks, as an estimator is told. motion: rest_from_surface over time. rest: (4, 4) base_from_rest.
-    stamps: (K,) s.
-    """
-
-    rig: Rig
-    true_rig: Rig
-    landmarks: Landmarks
-    spans: Array
-    map: SurfaceMap
-    motion: Displacement
-    rest: Array
-    stamps: Array
+    rig: Rig  # the calibrated cameras that an estimator is given
+    true_rig: Rig  # the cameras that make the pixels, without distortion
+    landmarks: SurfaceLandmarks  # the true ones
+    spans: Array  # (N, 2) s: from when to when each landmark can be seen
+    map: SurfaceMap  # of all landmarks, as an estimator is given it
+    motion: Displacement  # rest_from_surface over time
+    rest: Array  # (4, 4) base_from_rest, mm
+    stamps: Array  # (K,) s
     conditions: Conditions
     seed: int
 
@@ -62,7 +267,7 @@ class World:
 
     @property
     def truth(self) -> Trajectory:
-        """The true poses at the stamps, which are camera 0's instants where no offset is given to it."""
+        """The true poses at the stamps, which are the exposure instants of cameras without an offset."""
         return Trajectory(self.stamps, self.base_from_surface(self.stamps), exact=True)
 
     def __len__(self) -> int:
@@ -72,34 +277,34 @@ class World:
         return self.observations()
 
     def observations(self) -> Iterator[Observations]:
-        """What the cameras find at each stamp; the same bits each time it is asked for."""
-        shape = (len(self.rig), len(self.landmarks))
-        finding, erring, timing, sticking = np.random.default_rng([self.seed, TRACKS]).spawn(4)
-        errors, found = Errors(self.conditions, shape, erring), Found(self.conditions, shape, finding)
-        stuck = sticking.random(shape) < self.conditions.coherent
-        first, _ = self.imaged(np.zeros(shape[0]))
-        offsets = np.array(self.conditions.offsets or np.zeros(shape[0]))
+        """The observations at each stamp; every iteration gives the same bits."""
+        c, shape = self.conditions, (len(self.rig), len(self.landmarks))
+        finding, erring, timing, sticking = np.random.default_rng([self.seed, TRACK_STREAM]).spawn(4)
+        errors, visibility = _TrackErrors(c, shape, erring), _TrackVisibility(c, shape, finding)
+        stuck = sticking.random(shape) < c.coherent
+        first, _ = self.pixels_at(np.zeros(shape[0]))
+        offsets = np.array(c.offsets or np.zeros(shape[0]))
         step = float(self.stamps[1] - self.stamps[0]) if len(self) > 1 else 0.0
-        for stamp in self.stamps:
-            instants = stamp + offsets + self.conditions.jitter * timing.standard_normal(shape[0])
-            pixels, seen = self.imaged(instants)
+        for stamp in map(float, self.stamps):
+            pixels, seen = self.pixels_at(stamp + offsets + c.jitter * timing.standard_normal(shape[0]))
             pixels = np.where(stuck[..., None], first, pixels) + errors(step)
-            seen = seen & found(float(stamp), step) & self._there(float(stamp))
-            yield gathered(float(stamp), pixels, seen, max(self.conditions.noise, LEAST_SIGMA))
+            seen = seen & visibility(stamp, step) & self._uncovered(stamp)
+            yield _observations(stamp, pixels, seen, max(c.noise, MIN_TRACK_SIGMA))
 
-    def imaged(self, instants: Array) -> tuple[Array, Seen]:
+    def pixels_at(self, instants: Array) -> tuple[Array, Visibility]:
         """True pixels (C, N, 2) at each camera's own instant (C,), s, and which landmarks (C, N) it has in view."""
-        return imaged(self.true_rig, self.landmarks.points, self.base_from_surface(instants), self.landmarks.normals)
+        poses = self.base_from_surface(instants)
+        return project_landmarks(self.true_rig, self.landmarks.points, poses, self.landmarks.normals)
 
-    def _there(self, stamp: float) -> Seen:
+    def _uncovered(self, stamp: float) -> Visibility:
         """Which landmarks (N,) are alive and uncovered at `stamp`, s."""
         alive = (self.spans[:, 0] <= stamp) & (stamp < self.spans[:, 1])
         if self.conditions.reveal is None:
             return np.asarray(alive)
         start, end = self.conditions.reveal
         x = self.landmarks.points[:, 0]
-        shown = np.clip((stamp - start) / max(end - start, 1e-9), 0.0, 1.0)
-        return np.asarray(alive & (x <= shown * x.max()))
+        share = np.clip((stamp - start) / max(end - start, 1e-9), 0.0, 1.0)
+        return np.asarray(alive & (x <= share * x.max()))
 
 
 def synthetic_world(
@@ -110,50 +315,48 @@ def synthetic_world(
     surface: str | Surface = "patch",
     seed: int = 0,
     rig: Rig | None = None,
-    rest: Array = REST,
+    rest: Array = BASE_FROM_REST,
     **conditions: Any,
 ) -> World:
     """A world in one line: `synthetic_world("breathing", noise=0.25, outliers=0.05, offsets=(0, 8e-3, -5e-3), seed=3)`.
 
-    movement: a name of `MOVEMENTS`, or rest_from_surface over time. seconds, rate: frame sets so long, at so many Hz.
-    count: landmarks at a time. surface: a name of `SURFACES`, or what draws landmarks. rig: three cameras about the
-    wound without one. rest: (4, 4) base_from_rest. conditions: the fields of `Conditions`. Raises InputError.
+    movement: a name in `MOVEMENTS`, or rest_from_surface over time. seconds, rate: duration, and frame sets per second.
+    count: landmarks at a time. surface: a name in `SURFACES`, or a function that draws landmarks. rig: None for three
+    cameras about the wound. rest: (4, 4) base_from_rest. conditions: the fields of `Conditions`. Raises InputError.
     """
-    asked = Conditions(**conditions)
+    given = Conditions(**conditions)
     rig = arc_rig() if rig is None else rig
-    _check(asked, rig, seconds, rate, count)
+    _check_world(given, rig, seconds, rate, count)
     stamps = np.arange(max(1, round(seconds * rate))) / rate
-    drawn = [np.random.default_rng([seed, stream]) for stream in range(TRACKS)]
-    motion = _named(movement, MOVEMENTS, "movement")(drawn[MOVING]) if isinstance(movement, str) else movement
-    spans = lives(count, float(stamps[-1]), asked.churn, drawn[LANDMARKS])
-    landmarks = _named(surface, SURFACES, "surface")(len(spans), drawn[LANDMARKS])
+    streams = [np.random.default_rng([seed, stream]) for stream in range(TRACK_STREAM)]
+    motion = (
+        _by_name(movement, MOVEMENTS, "movement")(streams[MOTION_STREAM]) if isinstance(movement, str) else movement
+    )
+    spans = _life_spans(count, float(stamps[-1]), given.churn, streams[LANDMARK_STREAM])
+    landmarks = _by_name(surface, SURFACES, "surface")(len(spans), streams[LANDMARK_STREAM])
     true_rig = undistorting(rig)
-    if asked.calibration:
-        points = se3.transform_points(rest, landmarks.points)
-        true_rig = miscalibrated(true_rig, points, asked.calibration, drawn[CALIBRATION])
-    known = _known(landmarks, asked.map_error, drawn[MAPPING])
-    return World(rig, true_rig, landmarks, spans, known, motion, rest, stamps, asked, seed)
+    if given.calibration:
+        points, rng = se3.transform_points(rest, landmarks.points), streams[CALIBRATION_STREAM]
+        true_rig = Rig(tuple(_miscalibrated(c, points, given.calibration, rng) for c in true_rig.cameras))
+    mapped = landmarks.points + given.map_error * streams[MAP_STREAM].standard_normal(landmarks.points.shape)
+    surface_map = SurfaceMap(mapped, landmarks.normals, given.map_error**2 * np.eye(3 * len(mapped)))
+    return World(rig, true_rig, landmarks, spans, surface_map, motion, rest, stamps, given, seed)
 
 
-def _check(asked: Conditions, rig: Rig, seconds: float, rate: float, count: int) -> None:
-    if asked.offsets and len(asked.offsets) != len(rig):
-        raise InputError(WHERE, "offsets", asked.offsets, f"one for each of {len(rig)} cameras")
-    for spell in asked.outages:
+def _check_world(given: Conditions, rig: Rig, seconds: float, rate: float, count: int) -> None:
+    if given.offsets and len(given.offsets) != len(rig):
+        raise InputError(SYNTHETIC_WORLD, "offsets", given.offsets, f"one for each of {len(rig)} cameras")
+    for spell in given.outages:
         if len(spell) == 3 and not 0 <= spell[2] < len(rig):
-            raise InputError(WHERE, "outages", spell, f"a camera, 0 to {len(rig) - 1}")
+            raise InputError(SYNTHETIC_WORLD, "outages", spell, f"a camera, 0 to {len(rig) - 1}")
     for name, value in (("seconds", seconds), ("rate", rate), ("count", count)):
         if not 0 < value < np.inf:
-            raise InputError(WHERE, name, value, "a finite number > 0")
+            raise InputError(SYNTHETIC_WORLD, name, value, "a finite number > 0")
 
 
-def _named(name: Any, table: dict[str, Any], what: str) -> Any:
+def _by_name(name: Any, table: dict[str, Any], what: str) -> Any:
     if not isinstance(name, str):
         return name
     if name not in table:
-        raise InputError(WHERE, what, name, f"one of {', '.join(table)}")
+        raise InputError(SYNTHETIC_WORLD, what, name, f"one of {', '.join(table)}")
     return table[name]
-
-
-def _known(landmarks: Landmarks, error: float, rng: np.random.Generator) -> SurfaceMap:
-    points = landmarks.points + error * rng.standard_normal(landmarks.points.shape)
-    return SurfaceMap(points, landmarks.normals, error**2 * np.eye(3 * len(points)))

@@ -9,24 +9,22 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.link import Arm
+from hardware.arm.device import ArmState, ArmStatus
+from hardware.arm.link import Arm, shut_down
 from hardware.arm.port import Opener
-from hardware.arm.profile import ArmProfile
-from hardware.arm_status import ArmState, ArmStatus
-from hardware.farewell import farewell
-from hardware.link_settings import LinkSettings
+from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.process import checks
 from hardware.process.clock import Clock
 
-AXES = "XYZABC"
-LISTEN = 1.0  # s before a move, in which an arm that answers has told where it stands ten times
-SAY = 0.5  # s between lines
-SETTLE = 1.0  # s after a move, in which its end is answered
+AXIS_NAMES = "XYZABC"
+LISTEN_TIME = 1.0  # s before a move, in which an arm that answers has told where it stands ten times
+REPORT_PERIOD = 0.5  # s between lines
+SETTLE_TIME = 1.0  # s after a move, in which its end is answered
 _UNITS = np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Request:
+class ArmRequest:
     """What is asked of an arm. seconds: to listen, infinite until interrupted. home: go there. jog: (6,) to go by, mm
     and rad. origin: (3,) mm, to be its work origin, before a move. stands: (6,) where it stands, for one that does not
     answer. All that is sent needs `confirmed`.
@@ -48,7 +46,7 @@ class Request:
 def run_arm(
     opener: Opener,
     profile: ArmProfile,
-    request: Request,
+    request: ArmRequest,
     clock: Clock,
     say: Callable[[str], None] = print,
     settings: LinkSettings | None = None,
@@ -74,7 +72,7 @@ def run_arm(
         else:
             console.watch(request.seconds)
     finally:
-        farewell(arm, "interrupted", clock, settings.poll)
+        shut_down(arm, "interrupted", clock, settings.poll)
         status = arm.status(clock.now())
         arm.close()
     say(findings(status, profile))
@@ -104,9 +102,9 @@ def jog_from_text(texts: list[str]) -> Array:
             value = float(amount)
         except ValueError:
             value = float("nan")
-        if axis not in AXES or len(axis) != 1 or not np.isfinite(value):
+        if axis not in AXIS_NAMES or len(axis) != 1 or not np.isfinite(value):
             raise InputError("command line", "--jog", text, "such as X=+5 (mm) or B=-2.5 (degrees)")
-        jog[AXES.index(axis)] = value
+        jog[AXIS_NAMES.index(axis)] = value
     return np.asarray(jog / _UNITS)
 
 
@@ -144,15 +142,15 @@ class _Console:
             self.arm.poll(now)
             for event in self.arm.events():
                 self._say(f"{event.stamp - self._start:.3f} s: {event.text}")
-            if now >= self._said + SAY:
+            if now >= self._said + REPORT_PERIOD:
                 self._said = now
                 self._say(_line(self.arm.status(now)))
             self.clock.wait_until(now + self.arm.settings.poll)
 
 
-def _move(console: _Console, request: Request) -> None:
+def _move(console: _Console, request: ArmRequest) -> None:
     arm, clock = console.arm, console.clock
-    console.watch(LISTEN)
+    console.watch(LISTEN_TIME)
     target = arm.profile.arm.home
     reason = arm.arm(clock.now())
     if not reason and request.jog is not None:
@@ -160,13 +158,13 @@ def _move(console: _Console, request: Request) -> None:
         target = arm.target + request.jog
     if not reason and request.origin is not None:
         reason = arm.set_origin(request.origin, clock.now())
-        console.watch(SETTLE)
+        console.watch(SETTLE_TIME)
     if request.home or request.jog is not None:
         reason = reason or arm.go(target, clock.now(), lift=request.home)
     if reason:
         raise InputError("arm", "move", reason, "an arm that is armed, knows where it stands and may go there")
     console.watch(float("inf"), lambda now: arm.state is not ArmState.ARMED or arm.arrived(now))
-    console.watch(SETTLE)
+    console.watch(SETTLE_TIME)
     if arm.state is ArmState.ARMED:
         arm.disarm(clock.now())
 
@@ -178,4 +176,4 @@ def _line(status: ArmStatus) -> str:
 
 
 def _shown(axes: Array) -> str:
-    return " ".join(f"{name}{value:.2f}" for name, value in zip(AXES, axes * _UNITS, strict=True))
+    return " ".join(f"{name}{value:.2f}" for name, value in zip(AXIS_NAMES, axes * _UNITS, strict=True))

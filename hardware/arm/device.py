@@ -1,51 +1,176 @@
-"""One arm's device, opened, read and written, and what is known of the arm by what was sent and what was answered.
+"""One arm's device, read and written, and what is known of the arm by what was sent and what it answered.
 
-Nothing here waits and nothing knows the time, and nothing here decides what is sent: that is `hardware/arm.py`.
+Nothing here waits, reads a clock or decides what is sent; that is `hardware/arm/link.py`.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
+from dataclasses import dataclass
+from enum import Enum
+from math import degrees
 
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.arm.feedback import ArmEcho
-from hardware.arm.port import Opener, UnpluggedError
-from hardware.arm.profile import BITS_PER_BYTE, ArmProfile
-from hardware.arm.protocol import G1, G4, Instruction, Pause, encode
-from hardware.arm.queue import ArmQueue, Stretch
-from hardware.arm_insistence import Insistence
-from hardware.arm_line import ArmLine
-from hardware.arm_status import ArmEvent, ArmState, told
-from hardware.link_settings import LinkSettings
-from hardware.replies import REPLY_LENGTH, Reply, ReplyKind
+from hardware.arm.feedback import ArmFeedback
+from hardware.arm.port import ArmLine, Opener, UnpluggedError
+from hardware.arm.profile import BITS_PER_BYTE, ArmProfile, LinkSettings
+from hardware.arm.protocol import G1, G4, REPLY_LENGTH, Instruction, Pause, Reply, ReplyKind, encode
+from hardware.arm.queue import ArmQueue, QueuedCommand
 
-REMEMBERED = 1000  # events and stray bytes that are kept until somebody takes them
+RESEND_AFTER = 0.09  # s: a frame on the wire, the lag, the way to rest, and the slowest answer of a public driver
+MAX_REMEMBERED = 1000  # stops, events and stray reads
+BLIND_RESENDS = 3  # times, to an arm that does not answer
+
+
+class ArmState(Enum):
+    """Whether the arm may be moved. Only an operator's order leads to ARMED."""
+
+    DISARMED = "disarmed"  # connected, and listened to; nothing is sent
+    ARMED = "armed"  # moves are sent
+    STOPPED = "stopped"  # by an order or a fault; nothing is sent until it is armed again
+    UNPLUGGED = "unplugged"  # the device is gone; it is looked for, and disarmed when it is back
+
+
+class LinkCode(Enum):
+    """Why the link does not do what it is asked, for code to decide by; the words are a Reason's."""
+
+    DISARMED = "disarmed"
+    STOPPED = "stopped"
+    UNPLUGGED = "unplugged"
+    ARMED = "armed"  # what is asked is done before the arm is armed
+    OPERATOR = "operator"  # of a stop: the operator asked for it
+    MOVING = "moving"  # the arm still moves
+    UNKNOWN_PLACE = "unknown_place"  # nobody knows where the arm stands
+    FAR_FROM_PATH = "far_from_path"  # too far from where the motion left off
+    OUT_OF_BOUNDS = "out_of_bounds"
+    OWN_MOVE = "own_move"  # the link makes a move of its own
+    RECALLED = "recalled"  # what was queued is called back
+    FLOW_CONTROL = "flow_control"  # enough is under way
+    FEEDBACK = "feedback"  # the arm's answers are late, missing or off its way
+    LIMIT = "limit"  # the command breaks a limit of the link
+
+
+class Reason(str):
+    """Why the link does not do what it is asked: words for a person, with a code beside them; empty where it does."""
+
+    code: LinkCode | None
+
+    def __new__(cls, words: str = "", code: LinkCode | None = None) -> Reason:  # noqa: D102
+        reason = super().__new__(cls, words)
+        reason.code = code if words else None
+        return reason
+
+
+DONE = Reason()
+BY_OPERATOR = Reason("by the operator", LinkCode.OPERATOR)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmStatus:
+    """The arm at one instant."""
+
+    stamp: float  # s
+    state: ArmState
+    reason: str  # of the state
+    axes: Array | None  # (6,) mm and rad, by dead reckoning; None where nobody knows
+    answered: Array | None  # (6,) mm and rad, by its last answers; None without
+    off: float  # mm, distance of its answers from its way
+    lag: float  # s, measured, from set-point to answer; NaN until known
+    answer_rate: float  # Hz, NaN without
+    in_flight: float  # s of motion under way
+    queued: int  # commands under way
+    frames: int  # sent
+    answers: int  # received
+    strays: int  # bytes that belong to no answer
+
+
+@dataclass(frozen=True, slots=True)
+class ArmEvent:
+    """Something that a person should be able to read afterwards."""
+
+    stamp: float  # s
+    text: str
+    state: ArmState | None = None  # the new state; None where it stayed
+    by_operator: bool = False
+
+
+def axes_text(axes: Array) -> str:
+    """Axes (6,), mm and rad, for a person: mm and degrees."""
+    return ", ".join([*(f"{v:.1f}" for v in axes[:3]), *(f"{degrees(v):.2f}" for v in axes[3:])])
+
+
+class StopRetry:
+    """When the frame that stops the arm is to be sent again, as it may be lost or garbled on the line.
+
+    stops: instants, s, at which each stop was decided, and at which it was on the wire.
+    active: whether a stop was decided since the arm was last known to obey.
+    """
+
+    def __init__(self) -> None:
+        self.stops: deque[tuple[float, float]] = deque(maxlen=MAX_REMEMBERED)
+        self._sent, self._blind = -math.inf, 0  # s, the last time; times left without an answer
+        self._decided: float | None = None
+        self.active = False
+
+    def begin(self, now: float) -> None:
+        """A stop is decided at `now`, s, unless an earlier one has yet to go out, and its frame is sent."""
+        self._sent, self._blind, self.active = now, BLIND_RESENDS, True
+        self._decided = now if self._decided is None else self._decided
+
+    def on_wire(self, instant: float) -> None:
+        """A frame that stops the arm is on the wire at `instant`, s."""
+        if self._decided is not None:
+            self.stops.append((self._decided, instant))
+        self._decided = None
+
+    def drop(self) -> None:
+        """The arm obeys again, or the device is gone."""
+        self._decided, self.active = None, False
+
+    def pending(self, feedback: ArmFeedback, now: float) -> bool:
+        """Whether the arm may not have read it: it is too soon to say, the arm moves, or blind retries are left."""
+        soon, blind = now - self._sent < RESEND_AFTER, feedback.axes(now) is None and self._blind > 0
+        return self.active and (soon or blind or not feedback.still(now))
+
+    def due(self, feedback: ArmFeedback, now: float) -> bool:
+        """Whether to send it again: RESEND_AFTER later the arm still moves by its answers, or gives none."""
+        if not self.active or now - self._sent < RESEND_AFTER:
+            return False
+        if not feedback.restless(self._sent + RESEND_AFTER):
+            if feedback.axes(now) is not None or self._blind == 0:
+                return False
+            self._blind -= 1
+        self._sent = now
+        return True
 
 
 class ArmDevice:
-    """What an arm is connected by, and its queue and answers as they are known.
+    """The line to an arm, and its queue and answers as far as they are known.
 
-    state, reason: and why it is so, for a person. frames: sent. strays: bytes that were in no answer, stray_bytes the
-    last of them with their instants, s. origin: (3,) mm in machine axes, from which the arm counts. stops: when each
-    was decided, and when it was on the wire, s.
+    state, reason: whether the arm may be moved, and why, for a person.
+    frames: sent.
+    strays: bytes that were in no answer; stray_bytes: the last of them with their instants, s.
+    origin: (3,) mm in machine axes, from which the arm counts.
+    stops: of each stop the instants, s, of its decision and of its frame on the wire.
     """
 
     def __init__(self, opener: Opener, profile: ArmProfile, now: float, settings: LinkSettings) -> None:
-        """opener: opens the device, and opens it again when it was away. InputError where another program has it."""
+        """opener: opens the device, and opens it again after it was away. InputError where another program has it."""
         self.profile, self.settings = profile, settings
         self.state, self.reason = ArmState.UNPLUGGED, "not opened yet"
         self.frames, self.strays = 0, 0
-        self.stray_bytes: deque[tuple[float, bytes]] = deque(maxlen=REMEMBERED)
+        self.stray_bytes: deque[tuple[float, bytes]] = deque(maxlen=MAX_REMEMBERED)
         self.origin = np.zeros(3)
-        self._events: deque[ArmEvent] = deque(maxlen=REMEMBERED)
+        self._events: deque[ArmEvent] = deque(maxlen=MAX_REMEMBERED)
         self._opener = opener
         self._line: ArmLine | None = None
         self._queue: ArmQueue | None = None  # None while nobody knows where the arm stands
-        self._echo, self._insistence = ArmEcho(settings, profile.lag), Insistence()
-        self.stops = self._insistence.stops
-        self._look = now  # when the device is looked for next
+        self._feedback, self._stop_retry = ArmFeedback(settings, profile.lag), StopRetry()
+        self.stops = self._stop_retry.stops
+        self._reopen_at = now  # s
         self._open(now)
 
     @property
@@ -58,74 +183,71 @@ class ArmDevice:
         return 0.0 if self._queue is None else self._queue.in_flight(now)
 
     def reckoned(self, instant: float) -> Array | None:
-        """Where the arm is at `instant`, s, by what was sent (6,), the servo's lag included; None if not known."""
+        """Axes (6,) at `instant`, s, by dead reckoning, the servo's lag included; None where nobody knows."""
         late = self.profile.lag - self.profile.frame_time
         return None if self._queue is None else np.array(self._queue.at(instant - max(late, 0.0)))
 
-    def ways(self, since: float) -> list[Stretch]:
+    def ways(self, since: float) -> list[QueuedCommand]:
         """The ways of the set-point that end after `since`, s, as far as they are known."""
         return [] if self._queue is None else self._queue.ways(since)
 
     def events(self) -> list[ArmEvent]:
         """What happened since the last call."""
-        taken = list(self._events)
+        events = list(self._events)
         self._events.clear()
-        return taken
+        return events
 
     def close(self) -> None:
-        """Let the device go, without a word to the arm."""
+        """Close the device; the arm is sent nothing."""
         if self._line is not None:
             self._line.port.close()
         self._line, self.state, self.reason = None, ArmState.UNPLUGGED, "closed"
-        self._look = float("inf")
+        self._reopen_at = float("inf")
 
     def _open(self, now: float) -> None:
         try:
             self._line = ArmLine(self._opener())
         except UnpluggedError as error:
-            self._look, self.reason = now + self.settings.reopen, str(error)
+            self._reopen_at, self.reason = now + self.settings.reopen, str(error)
             return
-        self._echo.restart()
+        self._feedback.restart()
         self._change(ArmState.DISARMED, "connected; the operator has not armed it", now)
 
     def _unplugged(self, reason: str, now: float) -> None:
-        """The device is gone: where the arm stands when it comes back, nobody knows."""
+        """The device is gone: nobody knows where the arm will stand when it comes back."""
         if self._line is not None:
             self._line.port.close()
         self._line, self._queue = None, None
-        self._insistence.drop()
+        self._stop_retry.drop()
         self.origin = np.zeros(3)
-        self._look = now + self.settings.reopen
+        self._reopen_at = now + self.settings.reopen
         self._change(ArmState.UNPLUGGED, reason, now)
 
     def _read(self, line: ArmLine, now: float) -> list[Reply]:
-        """Take what has come; of the answers those about the arm's origin."""
+        """Take the answers that have come; gives those about the arm's origin."""
         replies, strays = line.receive()
         now -= REPLY_LENGTH * BITS_PER_BYTE / self.profile.baud  # that an answer took on the wire
         if strays:
             self.strays += len(strays)
             self.stray_bytes.append((now, strays))
-        places = [reply for reply in replies if reply.kind is not ReplyKind.ORIGIN]
-        for reply in places:
+        for reply in replies:
+            if reply.kind is ReplyKind.ORIGIN:
+                continue
             if self._queue is not None:
-                self._echo.take(reply, self._queue, self.origin, now)
-            else:
-                self._find(reply, now)
+                self._feedback.take(reply, self._queue, self.origin, now)
+            else:  # nobody knows where the arm stands; its answers say so, and are believed when it is armed
+                place = [*reply.values, 0, 0, 0] if reply.kind is ReplyKind.PLACE else [0, 0, 0, *reply.values]
+                self._feedback.take(reply, ArmQueue(place, self.profile.frame_time, now), np.zeros(3), now)
         return [reply for reply in replies if reply.kind is ReplyKind.ORIGIN]
 
-    def _find(self, reply: Reply, now: float) -> None:
-        """While nobody knows where the arm stands, its answers say so; they are believed when it is armed."""
-        place = [*reply.values, 0, 0, 0] if reply.kind is ReplyKind.PLACE else [0, 0, 0, *reply.values]
-        self._echo.take(reply, ArmQueue(place, self.profile.frame_time, now), np.zeros(3), now)
-
     def _give(self, instruction: Instruction, now: float, frame: bytes | None = None) -> None:
-        """Put a frame on the line. Machine axes are told from the arm's origin."""
+        """Put an instruction in machine axes on the line. frame: its frame, where it is encoded already."""
         assert self._line is not None
         if frame is None:
-            told = instruction
-            if isinstance(instruction, G1) and self.origin.any():
-                told = G1(instruction.axes - np.concatenate([self.origin, np.zeros(3)]), instruction.feed)
-            frame = encode(told, self.profile.dialect)
+            shifted = instruction
+            if isinstance(instruction, G1) and self.origin.any():  # the arm counts from its origin
+                shifted = G1(instruction.axes - np.concatenate([self.origin, np.zeros(3)]), instruction.feed)
+            frame = encode(shifted, self.profile.dialect)
 
         def sent(at: float, share: float) -> None:
             self.frames += 1
@@ -139,7 +261,7 @@ class ArmDevice:
             self._unplugged(str(error), now)
 
     def _book(self, instruction: Instruction, now: float, share: float) -> None:
-        """The last byte of a frame is gone: what the arm will do because of it."""
+        """The last byte of a frame is given out: enter what the arm will do because of it."""
         if isinstance(instruction, G1 | G4):
             assert self._queue is not None
             self._queue.add(instruction, now, share)
@@ -149,19 +271,20 @@ class ArmDevice:
             if self._queue is not None:
                 self._queue.stop()
             on_wire = now + share * self.profile.frame_time if self._queue is None else self._queue.wire_free
-            self._insistence.heard(on_wire)
+            self._stop_retry.on_wire(on_wire)
 
-    def _believe(self, now: float) -> None:
-        """Where the arm stands is for its answers to say, as far as their rounding tells it from what was known."""
+    def _adopt_answers(self, now: float) -> None:
+        """Take it that the arm stands where its answers say, unless their rounding allows what was known before."""
         known = self.target
-        stands = self._echo.stands(known, now)
+        stands = self._feedback.stands(known, now)
         if stands is not None and (known is None or (stands != known).any()):
             self._queue = ArmQueue(stands.tolist(), self.profile.frame_time, now)
-            self._note(f"stands at {told(stands)} by its own answer", now)
+            self._note(f"stands at {axes_text(stands)} by its own answer", now)
 
     def _change(self, state: ArmState, reason: str, now: float) -> None:
         if (state, reason) != (self.state, self.reason):
-            self._note(f"{state.value}: {reason}", now)
+            by_operator = isinstance(reason, Reason) and reason.code is LinkCode.OPERATOR
+            self._events.append(ArmEvent(now, f"{state.value}: {reason}", state, by_operator))
         self.state, self.reason = state, reason
 
     def _note(self, text: str, now: float) -> None:

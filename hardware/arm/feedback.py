@@ -1,6 +1,6 @@
-"""What the arm answers, set beside what it was told: measured lag, how far off its way it is, whether it has arrived.
+"""The arm's answers compared with its queue's model: measured lag, distance from its way, whether it is at rest.
 
-An answer need not come; then all of this stays unknown. Answers have no check sum, so one alone proves nothing: what
+The arm need not answer; then all of this stays unknown. Answers have no checksum, so one alone proves nothing: what
 counts is the smaller of the last two deviations, which a single garbled answer cannot raise.
 """
 
@@ -13,34 +13,34 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimation.se3 import Array
+from hardware.arm.profile import LinkSettings
+from hardware.arm.protocol import Reply, ReplyKind, unit
 from hardware.arm.queue import ArmQueue, Axes
-from hardware.link_settings import LinkSettings
-from hardware.replies import Reply, ReplyKind, unit
 
-ENOUGH = 3  # answers before their absence means anything, as noise that looks like one comes alone
-SPAN = 0.05  # s over which the set-point's speed is taken, and the slowest answers of a public driver come
-FORGET = 0.98  # of the lag's sums with each answer: two or three seconds of them
-STILL = 0.15, float(np.deg2rad(0.015))  # mm and rad between answers of an arm at rest: one count of rounding
-HALF = 0.5001 * np.repeat([unit(ReplyKind.PLACE), unit(ReplyKind.TOOL)], 3)  # mm and rad, by which it rounds
-NEAR = 0.07  # mm by which rounding puts an answer beside its way at most, and a little: what is wider tells late
-TWICE = 0.6  # of the slack, which an arm that goes too slowly passes in two answers before one passes all of it
-MISSED = 3  # answers: noise spoils one of them now and then, and the next may come late
-RESTS = 0.2  # s after which it counts as at rest: four of the slowest answers
-SETTLED = 0.04  # s after which one that was called back does: two of the slowest answers that agree
-MOVING = 2.0  # mm/s below which an answer says nothing about the lag
-KNOWN = 100.0  # (mm/s)^2 in all, after which the lag is told: one answer at 10 mm/s
+MIN_ANSWERS = 3  # answers before their absence means anything, as noise that looks like one comes alone
+SPEED_SPAN = 0.05  # s over which the set-point's speed is taken, and the slowest answers of a public driver come
+LAG_MEMORY = 0.98  # decay of the lag's sums with each answer: two or three seconds of them
+REST_TOLERANCE = 0.15, float(np.deg2rad(0.015))  # mm and rad between answers of an arm at rest: one count of rounding
+ANSWER_ROUNDING = 0.5001 * np.repeat([unit(ReplyKind.PLACE), unit(ReplyKind.TOOL)], 3)  # mm and rad, by which it rounds
+ON_WAY_TOLERANCE = 0.07  # mm: a little more than rounding puts an answer beside its way; a wider one detects later
+REPEATED_LATE_SHARE = 0.6  # of the slack: an arm that is too slow exceeds it twice before it exceeds all of it once
+MAX_MISSED_ANSWERS = 3  # answers: noise spoils one of them now and then, and the next may come late
+REST_TIME = 0.2  # s without motion after which the arm is at rest: four of the slowest answers
+RECALL_REST_TIME = 0.04  # s, the same after its queue was called back: two of the slowest answers that agree
+MIN_LAG_SPEED = 2.0  # mm/s below which an answer says nothing about the lag
+MIN_LAG_INFORMATION = 100.0  # (mm/s)^2, sum from which the lag counts as known: one answer at 10 mm/s
 
 
 @dataclass(slots=True)
-class _Part:
-    """The last answer about one half of the axes: X Y Z, or A B C."""
+class _AnsweredAxes:
+    """The last answer about one half of the axes: X Y Z, mm, or A B C, rad."""
 
-    values: Array | None = None
-    stamp: float = -math.inf
+    values: Array | None = None  # (3,)
+    stamp: float = -math.inf  # s
     before: float = 0.0  # deviation of the answer before
     off: float = 0.0  # deviation, confirmed by two answers
-    first: Array | None = None  # answer from where it still is
-    since: float = math.inf  # when that came
+    first: Array | None = None  # (3,) the first answer since the arm rests here
+    since: float = math.inf  # s, when that came
 
     def take(self, values: Array, deviation: float, still: float, now: float) -> None:
         if self.first is None or np.abs(values - self.first).max() > still:
@@ -50,43 +50,43 @@ class _Part:
 
 
 @dataclass(slots=True)
-class ArmEcho:
-    """Answers so far. late: s that the arm is known to be behind its set-point. count: of places.
+class ArmFeedback:
+    """The answers so far, compared with the queue's model.
 
-    behind: an answer that is on the way of the last second tells it by itself: what is garbled is hardly ever there.
-    lasting: the less of it and of what the answer before told, once the lag is known.
+    An answer on the way of the last second gives the delay by itself: a garbled one is hardly ever there.
     """
 
     settings: LinkSettings
-    late: float
-    count: int = 0
-    behind: float = 0.0  # s that the last answer on its way was later there than its lag
-    lasting: float = 0.0  # s
+    late: float  # s that the arm is known to be behind its set-point
+    count: int = 0  # answered places
+    behind: float = 0.0  # s, delay of the last answer on the way, beyond the lag
+    lasting: float = 0.0  # s, the smaller delay of the last two, once the lag is known
     _period: float = math.nan  # s between places, smoothed
-    _place: _Part = field(default_factory=_Part)
-    _turn: _Part = field(default_factory=_Part)
+    _place: _AnsweredAxes = field(default_factory=_AnsweredAxes)
+    _turn: _AnsweredAxes = field(default_factory=_AnsweredAxes)
     _sums: tuple[float, float] = (0.0, 0.0)
 
     def take(self, reply: Reply, queue: ArmQueue, origin: Array, now: float) -> None:
-        """An answer that came at `now`, s. origin: (3,) mm, from which the arm counts its place."""
+        """Take an answer that came at `now`, s. origin: (3,) mm, from which the arm counts its place."""
         if reply.kind is ReplyKind.PLACE:
             place = reply.values + origin
             gap = now - self._place.stamp
             if math.isfinite(gap):
                 self._period = gap if math.isnan(self._period) else self._period + 0.1 * (gap - self._period)
             self.count += 1
-            self._place.take(place, self._deviation(place, slice(0, 3), queue, now), STILL[0], now)
+            self._place.take(place, self._deviation(place, slice(0, 3), queue, now), REST_TOLERANCE[0], now)
             self._time(place, queue, now)
             if self.behind <= self.settings.slack:
                 self._learn(place, queue, now)
         elif reply.kind is ReplyKind.TOOL:
-            self._turn.take(reply.values, self._deviation(reply.values, slice(3, 6), queue, now), STILL[1], now)
+            off = self._deviation(reply.values, slice(3, 6), queue, now)
+            self._turn.take(reply.values, off, REST_TOLERANCE[1], now)
 
     @property
     def lag(self) -> float:
         """Measured s from set-point to answer; NaN until known."""
         product, square = self._sums
-        return product / square if square >= KNOWN else math.nan
+        return product / square if square >= MIN_LAG_INFORMATION else math.nan
 
     @property
     def off(self) -> float:
@@ -99,7 +99,7 @@ class ArmEcho:
         return 1 / self._period if self._period > 0 else math.nan
 
     def axes(self, now: float) -> Array | None:
-        """The answered axes (6,), mm and rad; None where they are older than a silence."""
+        """The answered axes (6,), mm and rad; None where they are older than `silence`."""
         place, turn = self._place, self._turn
         if place.values is None or turn.values is None or now - min(place.stamp, turn.stamp) > self.settings.silence:
             return None
@@ -113,18 +113,18 @@ class ArmEcho:
         answered = self.axes(now)
         if answered is None or known is None or not near(answered, known):
             return answered
-        return np.clip(known, answered - HALF, answered + HALF)
+        return np.clip(known, answered - ANSWER_ROUNDING, answered + ANSWER_ROUNDING)
 
     def still(self, now: float) -> bool:
         """Whether its answers say that it is at rest; an arm that does not answer says nothing against it."""
         fresh = [part for part in (self._place, self._turn) if now - part.stamp <= self.settings.silence]
-        return all(now - part.since >= RESTS for part in fresh)
+        return all(now - part.since >= REST_TIME for part in fresh)
 
     def settled(self, since: float) -> bool:
-        """Whether answers agree that it is at rest, of which the newest was given after `since`, s, and its lag."""
+        """Whether answers agree that it rests, the newest of them given after `since`, s, and the lag."""
         place, turn = self._place, self._turn
         late = min(place.stamp, turn.stamp) >= since + self.late
-        return late and place.stamp - place.since >= SETTLED and turn.stamp - turn.since >= SETTLED
+        return late and place.stamp - place.since >= RECALL_REST_TIME and turn.stamp - turn.since >= RECALL_REST_TIME
 
     def answered(self, since: float) -> bool:
         """Whether a place has come that the arm gave after `since`, s."""
@@ -139,20 +139,23 @@ class ArmEcho:
         return any(part.first is not None and part.since > since for part in (self._place, self._turn))
 
     def forgive(self) -> None:
-        """Where it stands is its place from now on: what was said against it no longer counts."""
+        """Forget deviations and delays: it counts as standing where it should."""
         self.behind = self.lasting = 0.0
         for part in (self._place, self._turn):
             part.off = part.before = 0.0
 
     def doubt(self, now: float) -> str:
-        """Why the arm may not be where it should be; "" if it answers from there, or never answered."""
-        if self.count < ENOUGH:
+        """Why the arm may not be where it should be; "" where it answers from there, or never answered."""
+        if self.count < MIN_ANSWERS:
             return ""
-        quiet = min(self.settings.silence, max(MISSED * self._period, self.settings.slack))
+        quiet = min(self.settings.silence, max(MAX_MISSED_ANSWERS * self._period, self.settings.slack))
         if (since := now - self._place.stamp) > quiet:
             return f"the arm has not answered for {since:.2f} s, limit {quiet:.2g} s"
         slack = self.settings.slack
-        for late, limit, often in (self.behind, slack, ""), (self.lasting, TWICE * slack, " twice in a row"):
+        for late, limit, often in (
+            (self.behind, slack, ""),
+            (self.lasting, REPEATED_LATE_SHARE * slack, " twice in a row"),
+        ):
             if late > limit:
                 words = f"the arm is {1000 * late:.0f} ms later on its way than its lag"
                 return f"{words}, limit {1000 * limit:g} ms{often}"
@@ -164,9 +167,9 @@ class ArmEcho:
         return ""
 
     def restart(self) -> None:
-        """Forget what was answered before: a device was away, or the arm was told where it stands."""
+        """Forget all answers: the device was away, or the operator said where the arm stands."""
         self.count, self.behind, self.lasting, self._period, self._sums = 0, 0.0, 0.0, math.nan, (0.0, 0.0)
-        self._place, self._turn = _Part(), _Part()
+        self._place, self._turn = _AnsweredAxes(), _AnsweredAxes()
 
     def _deviation(self, values: Array, axes: slice, queue: ArmQueue, now: float) -> float:
         """How far an answer (3,) is from where the set-point was since the arm could be there."""
@@ -174,33 +177,33 @@ class ArmEcho:
         return _beyond(values.tolist(), low[axes], high[axes])
 
     def _time(self, place: Array, queue: ArmQueue, now: float) -> None:
-        """How late the arm is where it answers from."""
-        passed = queue.passed(place.tolist(), NEAR, now)
+        """How long ago the set-point was where the arm answers from."""
+        passed = queue.passed(place.tolist(), ON_WAY_TOLERANCE, now)
         if math.isnan(passed):
-            passed = queue.passed(place.tolist(), STILL[0], now)
+            passed = queue.passed(place.tolist(), REST_TOLERANCE[0], now)
         if not math.isnan(passed):
             behind = now - passed - (self.late if math.isnan(self.lag) else max(self.late, self.lag))
             self.lasting = 0.0 if math.isnan(self.lag) else min(behind, self.behind)
             self.behind = behind
 
     def _learn(self, place: Array, queue: ArmQueue, now: float) -> None:
-        """Fit the lag: the set-point's lead over the answer is its speed times that."""
-        ahead, before = (np.asarray(queue.at(t)[:3]).tolist() for t in (now, now - SPAN))
-        speed = [(a - b) / SPAN for a, b in zip(ahead, before, strict=True)]
+        """Least squares of the lag: the set-point leads the answer by its speed times the lag."""
+        ahead, before = (np.asarray(queue.at(t)[:3]).tolist() for t in (now, now - SPEED_SPAN))
+        speed = [(a - b) / SPEED_SPAN for a, b in zip(ahead, before, strict=True)]
         lead = [a - p for a, p in zip(ahead, place.tolist(), strict=True)]
-        if math.hypot(*speed) < MOVING or self.off > self.settings.off:
+        if math.hypot(*speed) < MIN_LAG_SPEED or self.off > self.settings.off:
             return
         product = sum(v * e for v, e in zip(speed, lead, strict=True))
         square = sum(v * v for v in speed)
-        self._sums = FORGET * self._sums[0] + product, FORGET * self._sums[1] + square
+        self._sums = LAG_MEMORY * self._sums[0] + product, LAG_MEMORY * self._sums[1] + square
 
 
 def near(answered: Array | None, axes: Array | None) -> bool:
-    """Whether an arm answers from `axes` (6,), mm and rad, to rounding."""
+    """Whether an answer (6,) is `axes` (6,), mm and rad, to rounding."""
     if answered is None or axes is None:
         return False
     away = np.abs(answered - axes)
-    return bool(away[:3].max() <= STILL[0] and away[3:].max() <= STILL[1])
+    return bool(away[:3].max() <= REST_TOLERANCE[0] and away[3:].max() <= REST_TOLERANCE[1])
 
 
 def _beyond(values: Sequence[float], low: Axes, high: Axes) -> float:

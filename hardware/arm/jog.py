@@ -1,22 +1,29 @@
-"""The link's own moves, home and back to where a stop caught the arm: slow, in small steps, lifted where they cross.
+"""The link's own moves: slow steps home or back to the path, and the recovery of an arm that does not follow.
 
 Where the arm stands is known to a fraction of a millimetre only. At a feed made for a step of a micrometre, that
-fraction would take the arm a minute, with all that is sent meanwhile behind it. So a travel never asks for less than
-its speed: it begins with a step to where the arm should be, and moves and turns one after the other, each at its feed.
+fraction would take the arm a minute, and all that is sent meanwhile would wait. So an own move begins with a step to
+where the arm should be, never asks for less than its speed, and moves and turns one after the other.
+
+An arm that stalls, that frames do not reach, or that a garbled frame sent astray is known by its answers. What it has
+queued is called back, so that it comes to rest. Then one short trial step towards its goal, with a pause before it, is
+repeated until its answers show that it has begun. Axes are absolute: a step sent twice goes no farther than one. What
+was called back was not done, and whoever sends goes on from where the arm came to rest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.arm.protocol import G1
+from hardware.arm.feedback import REST_TOLERANCE, ArmFeedback, near
+from hardware.arm.protocol import G1, Pause
 
 
-def travel(start: Array, goal: Array, speed: float, turning: float, tick: float) -> Iterator[G1]:
+def travel_steps(start: Array, goal: Array, speed: float, turning: float, tick: float) -> Iterator[G1]:
     """Steps of a tick at most: to `start` (6,), mm and rad, straight to the place of `goal` (6,), then its angles.
 
     speed: mm/s. turning: rad/s. The last step ends at the goal exactly.
@@ -26,14 +33,14 @@ def travel(start: Array, goal: Array, speed: float, turning: float, tick: float)
     yield from _turned(np.concatenate([goal[:3], start[3:]]), goal, turning, tick)
 
 
-def lifted(start: Array, goal: Array, speed: float, turning: float, tick: float) -> Iterator[G1]:
-    """The same by way of above: up first if the goal is higher, across and turned, and down last: never low across."""
+def lifted_travel_steps(start: Array, goal: Array, speed: float, turning: float, tick: float) -> Iterator[G1]:
+    """The same, never low across: up first if the goal is higher, then across and turned, down last."""
     height = max(start[2], goal[2])
     above = np.array([*goal[:2], height, *goal[3:]])
     lift = np.array([*start[:2], height, *start[3:]])
     yield G1(start, speed)
     yield from _moved(start, lift, speed, tick)
-    yield from travel(lift, above, speed, turning, tick)
+    yield from travel_steps(lift, above, speed, turning, tick)
     yield from _moved(above, goal, speed, tick)
 
 
@@ -47,13 +54,12 @@ def _moved(start: Array, goal: Array, speed: float, tick: float) -> Iterator[G1]
 
 
 def _turned(start: Array, goal: Array, turning: float, tick: float) -> Iterator[G1]:
-    """Steps to the angles of `goal`, on the spot; their feed counts degrees."""
+    """Steps to the angles of `goal`, on the spot; their feed is in degrees/s."""
     way = goal[3:] - start[3:]
     count = int(np.ceil(np.linalg.norm(way) / (turning * tick) - 1e-9))
     for k in range(1, count + 1):
-        yield G1(
-            np.concatenate([goal[:3], goal[3:] if k == count else start[3:] + k / count * way]), np.rad2deg(turning)
-        )
+        angles = goal[3:] if k == count else start[3:] + k / count * way
+        yield G1(np.concatenate([goal[:3], angles]), np.rad2deg(turning))
 
 
 class OwnMoves:
@@ -67,8 +73,8 @@ class OwnMoves:
         self._steps: Iterator[G1] = iter(())
 
     def go(self, start: Array, goal: Array, lift: bool = False, then: Iterable[G1] = ()) -> None:
-        """From `start` (6,) to `goal` (6,), mm and rad, are the next steps, and `then` those. lift: by way of above."""
-        self._begin(chain((lifted if lift else travel)(start, goal, *self._rates), then))
+        """Step from `start` (6,) to `goal` (6,), mm and rad, and then take the steps `then`. lift: by way of above."""
+        self._begin(chain((lifted_travel_steps if lift else travel_steps)(start, goal, *self._rates), then))
 
     def take(self) -> G1:
         """The next step, once."""
@@ -78,9 +84,9 @@ class OwnMoves:
         return step
 
     def break_off(self) -> Iterator[G1] | None:
-        """The steps that come no more, as what was sent last is called back; None where that was not a step's way.
+        """Drop and return the steps that are left; None where the last move sent was no step.
 
-        The last one is among them, as none of it may have gone out; given twice it goes no farther.
+        The last one sent is among them, as none of it may have gone out; sent twice it goes no farther.
         """
         known = [step for step in (self.last, self.step) if step is not None]
         rest = chain(known, self._steps) if known else None
@@ -95,3 +101,113 @@ class OwnMoves:
     def _begin(self, steps: Iterator[G1]) -> None:
         self._steps = steps
         self.step = next(steps, None)
+
+
+MIN_TRIAL_STEP = 2 * REST_TOLERANCE[0]  # mm that answers tell from no step
+TRIAL_START_TIME = 0.01  # s of a step, beyond the lag, after which answers from its start mean that it did not begin
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecalledMoves:
+    """What whoever sends must know before anything more is sent; (6,) each, mm and rad."""
+
+    place: Array  # where the arm came to rest
+    stands: Array  # where it is by now, at most a part of a trial step farther; the next move begins there
+
+    @property
+    def rows(self) -> Array:
+        """Both (2, 6)."""
+        return np.stack([self.place, self.stands])
+
+
+class AbortRecovery:
+    """What was called back from one arm, until the arm is known to obey again.
+
+    why: for a person.
+    goal: (6,) mm and rad, where the arm had been sent; None while nothing is called back.
+    since: s, when it was called back.
+    place: (6,) where the arm first came to rest; None until it has.
+    rest: the steps left of an own move; None where moves of a motion were called back.
+    stepped: s, when the last trial step was sent; None where none is. stood: (6,) where that step began.
+    obeys: whether the arm is known to move again.
+    undone: whether moves of a motion were called back, and a stop came before the motion was informed.
+    """
+
+    def __init__(self, longest: float, speed: float, lag: float) -> None:
+        """longest: s of a step, and speed: mm/s. lag: s that the arm is later at a command's axes than one tick."""
+        self._longest, self._speed, self._lag = longest, speed, lag
+        self.why = ""
+        self.goal: Array | None = None
+        self.since = 0.0
+        self.place: Array | None = None
+        self.rest: Iterator[G1] | None = None
+        self.stepped: float | None = None
+        self.obeys = self.undone = False
+        self.stood: Array | None = None
+
+    @property
+    def waits(self) -> bool:
+        """Whether the arm has yet to come to rest, and no trial step was sent since."""
+        return self.goal is not None and self.stepped is None and not self.obeys
+
+    def begin(self, why: str, goal: Array, rest: Iterator[G1] | None, now: float) -> None:
+        """What was sent, to `goal` (6,), is called back at `now`, s."""
+        self.drop()
+        self.why, self.goal, self.since, self.rest = why, goal, now, rest
+
+    def drop(self) -> None:
+        """Nothing is called back any more."""
+        self.goal = self.place = self.stood = self.rest = self.stepped = None
+        self.why, self.obeys, self.undone = "", False, False
+
+    def break_off(self) -> None:
+        """A stop, or the device is gone: what was called back stays undone."""
+        undone = self.undone or (self.goal is not None and self.rest is None)
+        self.drop()
+        self.undone = undone
+
+    def resume(self, place: Array) -> None:
+        """The arm is armed again, at rest at `place` (6,): whoever sends is to learn what is undone."""
+        if self.undone:
+            self.place, self.obeys = place, True
+
+    def next(self, feedback: ArmFeedback, target: Array, now: float) -> tuple[G1 | Pause, ...]:
+        """What to send to an arm that has nothing under way and, by dead reckoning, stands at `target` (6,)."""
+        answered = feedback.axes(now)
+        if self.stepped is None:
+            return self._rested(feedback, target, now) if feedback.settled(self.since) else ()
+        if near(answered, target) or is_underway(answered, self.stood, target):
+            self._obey(feedback)
+        elif feedback.answered(self.stepped + self._lag + TRIAL_START_TIME):
+            if near(answered, self.stood):  # it did not begin: once more, behind a pause
+                self.stepped = now
+                return Pause(), G1(target, self._speed)
+            self.since, self.stepped, self.stood = now, None, None
+            return (Pause(),)
+        return ()
+
+    def _rested(self, feedback: ArmFeedback, stands: Array, now: float) -> tuple[G1, ...]:
+        """The arm rests: the trial step, unless the arm has moved since, or its goal is too near for one."""
+        feedback.forgive()
+        self.stood, self.place = stands, stands if self.place is None else self.place
+        assert self.goal is not None
+        way = self.goal[:3] - stands[:3]
+        length = float(np.linalg.norm(way))
+        if feedback.moved(self.since) or (length <= MIN_TRIAL_STEP and feedback.still(now)):
+            self._obey(feedback)
+        elif length > MIN_TRIAL_STEP:
+            self.stepped = now
+            share = min(self._longest * self._speed / length, 1.0)
+            return (G1(np.concatenate([stands[:3] + share * way, stands[3:]]), self._speed),)
+        return ()
+
+    def _obey(self, feedback: ArmFeedback) -> None:
+        self.obeys = True
+        feedback.forgive()
+
+
+def is_underway(answered: Array | None, start: Array | None, end: Array) -> bool:
+    """Whether the answer is from between `start` (6,) and `end` (6,), mm and rad, and no longer from the start."""
+    if answered is None or start is None or near(answered, start):
+        return False
+    return near(answered, np.clip(answered, np.minimum(start, end), np.maximum(start, end)))

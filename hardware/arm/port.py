@@ -1,4 +1,13 @@
-"""The port to an arm: bytes out and in without ever waiting, over anything that pyserial opens by its URL."""
+"""The port to an arm: frames out, answers in, without ever waiting, over anything that pyserial opens by its URL.
+
+Two programs can never write to one arm, and a crash leaves nothing to clean up. The lock file is where terminal
+programs look for theirs (LCK..NAME in the folder for locks, the owner's process number in its first line), so minicom
+and others respect it. Between two of ours the kernel's lock on the open file decides. It goes with its process, however
+that ends; a process number left behind by a crash, or taken over by another process since, stops nobody.
+
+A frame of which the port took a part is always completed first: torn, it would take bytes of the next one with it. One
+of which nothing went out yet may be called back.
+"""
 
 from __future__ import annotations
 
@@ -8,22 +17,93 @@ import io
 import os
 import stat
 import struct
+import tempfile
 import termios
+from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from typing import Protocol
 
 import serial
 from serial.tools import list_ports
 
 from estimation.errors import InputError, StillbedError
-from hardware.port_lock import PortLock
+from hardware.arm.protocol import FRAME_LENGTH, Reply, reply_stream
 
-PATIENCE = 0.1  # s of a write, where it can wait at all: loop:// is gone after that
+LOCK_FOLDERS = ("/run/lock", "/var/lock")  # of the Filesystem Hierarchy Standard, new and old
+LOCK_OWNER = "stillbed"
+
+
+class PortLock:
+    """Holds `url` from construction until `release`, or until the process ends. InputError where somebody has it."""
+
+    def __init__(self, url: str, folder: Path | None = None) -> None:
+        self.url = url
+        path = (folder or lock_folder()) / f"LCK..{_name(url)}"
+        try:
+            self._file: int | None = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise InputError("arm", "port", url, f"a port whose lock {path} this user may write ({error})") from error
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            owner = _owner(self._file)
+            os.close(self._file)
+            raise InputError("arm", "port", url, f"a port that is free; process {owner[0]} has it") from error
+        process, whose = _owner(self._file)
+        if process and whose != LOCK_OWNER and process != os.getpid() and _lives(process):
+            os.close(self._file)
+            raise InputError("arm", "port", url, f"a port that is free; process {process} has it by {path}")
+        os.ftruncate(self._file, 0)
+        os.pwrite(self._file, f"{os.getpid():10d}\n{LOCK_OWNER}\n".encode(), 0)
+
+    def release(self) -> None:
+        """Let the port go; the file stays and says nothing, as removing it would race with the next owner."""
+        if self._file is not None:
+            os.ftruncate(self._file, 0)
+            os.close(self._file)
+        self._file = None
+
+
+def lock_folder() -> Path:
+    """Where locks are kept: the first usual place that can be written to."""
+    usable = (Path(name) for name in LOCK_FOLDERS if os.access(name, os.W_OK))
+    return next(usable, Path(tempfile.gettempdir()))
+
+
+def _name(url: str) -> str:
+    """A file name for a port: of a device what it is called below /dev, whichever link it was reached by."""
+    path = url if "://" in url else os.path.realpath(url).removeprefix("/dev/")
+    return path.replace("/", "_").replace(":", "_")
+
+
+def _owner(file: int) -> tuple[int, str]:
+    """Process number, 0 if there is none, and the program that a lock file names."""
+    words = os.pread(file, 100, 0).decode("ascii", "replace").split()
+    number = int(words[0]) if words and words[0].isdigit() else 0
+    return number, words[1] if len(words) > 1 else ""
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+LOOP_WRITE_TIMEOUT = 0.1  # s of a write, where it can wait at all: loop:// is gone after that
 _CHUNK = 4096  # bytes: two seconds of answers
 
 
 class UnpluggedError(StillbedError):
     """The device is not there, or not any more."""
+
+
+class PortTakenError(UnpluggedError):
+    """Another program has the device to itself."""
 
 
 class Port(Protocol):
@@ -58,12 +138,13 @@ class SerialPort:
         except ValueError as error:
             raise InputError("arm", "port", url, f"a device's path or a URL of pyserial's ({error})") from error
         except (serial.SerialException, OSError) as error:
-            missing = error.errno == errno.ENOENT
-            raise UnpluggedError(f"{url}: {os.strerror(errno.ENOENT).lower() if missing else error}") from error
+            missing, locked = error.errno == errno.ENOENT, error.errno == errno.EAGAIN  # of pyserial's lock
+            fault = PortTakenError if locked else UnpluggedError
+            raise fault(f"{url}: {os.strerror(errno.ENOENT).lower() if missing else error}") from error
         try:
             self._file: int | None = self._serial.fileno()
         except io.UnsupportedOperation:  # loop:// and others that are no file of the system's
-            self._file, self._serial.write_timeout = None, PATIENCE
+            self._file, self._serial.write_timeout = None, LOOP_WRITE_TIMEOUT
         self._device = self._file is not None and not stat.S_ISSOCK(os.fstat(self._file).st_mode)
 
     def write(self, data: bytes) -> int:
@@ -110,7 +191,7 @@ class SerialPort:
         return answer
 
 
-class Device:
+class PortOpener:
     """Opens one device, and that very one again when it has been away; nobody else may meanwhile.
 
     A USB adapter is known by its ids and serial number, or by its socket where it has no number: it may come back under
@@ -130,10 +211,8 @@ class Device:
             self._lock = PortLock(url)
         try:
             return SerialPort(url, self._baud)
-        except UnpluggedError as error:
-            if "exclusively lock" in str(error):
-                raise InputError("arm", "port", url, "a port that no other program has open") from error
-            raise
+        except PortTakenError as error:
+            raise InputError("arm", "port", url, "a port that no other program has open") from error
 
     def release(self) -> None:
         """Let others have it."""
@@ -171,3 +250,62 @@ def _adapters() -> list[tuple[str, Identity]]:
         for port in list_ports.comports()
         if port.vid is not None
     ]
+
+
+SentCallback = Callable[[float, float], None]  # (now, share of the frame that went just now, and not before)
+
+
+class ArmLine:
+    """Frames on their way out through one port."""
+
+    def __init__(self, port: Port) -> None:
+        self.port = port
+        self._frames: deque[tuple[bytes, SentCallback]] = deque()
+        self._done = 0  # bytes of the first frame that went out
+        self._since = 0.0  # when the first frame was to go
+        self._stream = reply_stream()
+
+    @property
+    def blocked(self) -> bool:
+        """Whether frames wait because the port takes no more."""
+        return bool(self._frames)
+
+    def blocked_for(self, now: float) -> float:
+        """Seconds that the first frame has waited."""
+        return now - self._since if self._frames else 0.0
+
+    def send(self, frame: bytes, sent: SentCallback, now: float) -> float:
+        """Give out a frame behind those that wait; `sent` is told when its last byte is gone. Gives what flush does."""
+        if not self._frames:
+            self._since = now
+        self._frames.append((frame, sent))
+        return self.flush(now)
+
+    def flush(self, now: float) -> float:
+        """Write what the port takes; the share of a frame that went out of one that is not complete."""
+        share = 0.0
+        while self._frames:
+            frame, sent = self._frames[0]
+            written = self.port.write(frame[self._done :])
+            self._done += written
+            share += written / FRAME_LENGTH
+            if self._done == FRAME_LENGTH:
+                self._frames.popleft()
+                self._done, self._since = 0, now
+                sent(now, share)
+                share = 0.0
+            elif not written:
+                break
+        return share
+
+    def recall(self) -> int:
+        """Take back the frames of which no byte is gone; how many."""
+        started = 1 if self._done else 0
+        count = len(self._frames) - started
+        for _ in range(count):
+            self._frames.pop()
+        return count
+
+    def receive(self) -> tuple[list[Reply], bytes]:
+        """Answers that have come, and the bytes known to be in none."""
+        return self._stream(self.port.read())

@@ -2,57 +2,56 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import math
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.protocol import LENGTH, THESIS, Dialect
-from perception.tool_profile import SYRINGE, check_profile
-from planning.kinematics import SimpleArm, joints_from_axes, nozzle_from_axes
-from planning.limits import Limits
-from planning.motion.follow import LEAD
-from planning.robot.kinematics import JointModel
+from hardware.arm.protocol import FRAME_LENGTH, THESIS_DIALECT, Dialect
+from perception.frames import SYRINGE, check_profile
+from planning.limits import MotionLimits
+from planning.motion.follow import LOOKAHEAD
+from planning.robot.kinematics import JointModel, SimpleArm, joints_from_axes, nozzle_from_axes
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
-LONGEST_LAG = 1.0  # s: nothing moving can be followed that far ahead
-TO_DEG = np.array([1.0, 1, 1, *np.rad2deg([1.0, 1, 1])])  # of axes, mm and rad
-BENCH = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # arm_from_surface under the thesis's home, z up
+MAX_LAG = 1.0  # s: nothing moving can be followed that far ahead
+DISPLAY_UNITS = np.array([1.0, 1, 1, *np.rad2deg([1.0, 1, 1])])  # of axes, mm and rad
+ARM_FROM_BENCH = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # arm_from_surface under the thesis's home, z up
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmProfile:
     """One arm. InputError names a setting that makes no sense.
 
-    arm: its frame and home. limits: what it bears. dialect: its frames. baud: bits/s, 8N1. tick: s between commands.
-    lag: s that it is later at a command's axes than one tick after the command was sent: wire, dead time, servo.
-    tool: (K, 2) mm, what hangs on it, turned about the nozzle: height above the tip, rising, and radius there.
+    lag: s from one tick after a command was sent until the arm is at its axes: wire, dead time, servo.
     """
 
-    arm: SimpleArm = field(default_factory=SimpleArm)
-    limits: Limits = field(default_factory=Limits)
-    dialect: Dialect = THESIS
-    baud: int = 115_200  # thesis 6.2; one public driver uses 9600, at which a frame takes 50 ms
-    tick: float = 0.02  # 50 commands a second: faster than any camera here, a fifth of what the wire carries
-    lag: float = 0.024  # 4 ms of wire, and 20 ms that a hobby servo is taken to follow behind until it is measured
-    tool: Array = field(default_factory=SYRINGE.copy)
+    arm: SimpleArm = field(default_factory=SimpleArm)  # frame, home and joints
+    limits: MotionLimits = field(default_factory=MotionLimits)
+    dialect: Dialect = THESIS_DIALECT
+    baud: int = 115_200  # bits/s, 8N1; thesis 6.2; one public driver uses 9600, at which a frame takes 50 ms
+    tick: float = 0.02  # s, 50 commands a second: faster than any camera here, a fifth of what the wire carries
+    lag: float = 0.024  # s, 4 ms of wire, and 20 ms that a hobby servo is taken to follow behind until it is measured
+    tool: Array = field(default_factory=SYRINGE.copy)  # (K, 2) mm, of what hangs on it: height above the tip, radius
 
     def __post_init__(self) -> None:
         if not self.baud > 0:
             raise InputError("arm profile", "baud", self.baud, "> 0 bits/s")
         wire = self.frame_time
-        if not wire <= self.tick <= LEAD / 2:
-            raise InputError("arm profile", "tick", self.tick, f"{wire:.5f} s, one frame on the wire, to {LEAD / 2} s")
-        if not 0 <= self.lag <= LONGEST_LAG:
-            raise InputError("arm profile", "lag", self.lag, f"0 to {LONGEST_LAG} s")
+        if not wire <= self.tick <= LOOKAHEAD / 2:
+            allowed = f"{wire:.5f} s, one frame on the wire, to {LOOKAHEAD / 2} s"
+            raise InputError("arm profile", "tick", self.tick, allowed)
+        if not 0 <= self.lag <= MAX_LAG:
+            raise InputError("arm profile", "lag", self.lag, f"0 to {MAX_LAG} s")
         check_profile("arm profile", "tool", self.tool)
         arm, limits = self.arm, self.limits
         if (arm.home < limits.low).any() or (arm.home > limits.high).any():
-            low, high = (np.round(axes * TO_DEG, 9).tolist() for axes in (limits.low, limits.high))
+            low, high = (np.round(axes * DISPLAY_UNITS, 9).tolist() for axes in (limits.low, limits.high))
             allowed = f"X Y Z in mm, A B C in degrees, within {low} and {high}"
-            raise InputError("arm profile", "home", np.round(arm.home * TO_DEG, 9).tolist(), allowed)
+            raise InputError("arm profile", "home", np.round(arm.home * DISPLAY_UNITS, 9).tolist(), allowed)
         tip = nozzle_from_axes(arm, arm.home)[:3, 3] if limits.zones else np.zeros(3)
         for zone in limits.zones:
             if zone.depth(tip) > 0:
@@ -63,7 +62,7 @@ class ArmProfile:
     @property
     def frame_time(self) -> float:
         """Seconds that one frame takes on the wire: 4.17 ms at 115200 bits/s."""
-        return LENGTH * BITS_PER_BYTE / self.baud
+        return FRAME_LENGTH * BITS_PER_BYTE / self.baud
 
 
 def at_baud(profile: ArmProfile, baud: int) -> ArmProfile:
@@ -71,11 +70,11 @@ def at_baud(profile: ArmProfile, baud: int) -> ArmProfile:
 
     At 9600 bits/s that is 20 ticks a second of 50 ms. The limits of one tick stay: 3 mm of jump are 60 mm/s there.
     """
-    wire = LENGTH * BITS_PER_BYTE / baud if baud > 0 else 0.0
+    wire = FRAME_LENGTH * BITS_PER_BYTE / baud if baud > 0 else 0.0
     return replace(profile, baud=baud, tick=max(profile.tick, wire), lag=profile.lag - profile.frame_time + wire)
 
 
-def _check_joints(arm: SimpleArm, model: JointModel, limits: Limits) -> None:
+def _check_joints(arm: SimpleArm, model: JointModel, limits: MotionLimits) -> None:
     """That A B C may do no more than the joints that they are, and that home can be reached."""
     for name, most in (("speed", model.speed), ("acceleration", model.acceleration), ("high", model.high)):
         if (getattr(limits, name)[3:] > most[3:] + 1e-9).any():
@@ -88,7 +87,37 @@ def _check_joints(arm: SimpleArm, model: JointModel, limits: Limits) -> None:
         raise InputError("arm profile", "home", arm.home.tolist(), "a place that the arm's posture reaches")
 
 
-def placed(profile: ArmProfile, base_from_surface: Array, arm_from_surface: Array = BENCH) -> ArmProfile:
+def placed(profile: ArmProfile, base_from_surface: Array, arm_from_surface: Array = ARM_FROM_BENCH) -> ArmProfile:
     """The profile with its arm put where the surface (4, 4), mm, then lies at `arm_from_surface`: below home, level."""
     arm_from_base = arm_from_surface @ se3.inverse(base_from_surface)
     return replace(profile, arm=replace(profile.arm, arm_from_base=arm_from_base))
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSettings:
+    """Limits of the link, the same for any arm that speaks the protocol. InputError names one that makes no sense."""
+
+    flight: float = 0.05  # s of motion that may be under way, on the wire and in the arm's queue
+    frames: int = 4  # that may be under way
+    ease: float = 0.005  # share of a tick by which ticks are longer than their moves: more than clocks differ by, and
+    # what a stall of 0.6 s has piled up is gone in 120 s
+    poll: float = 0.002  # s between looks at the line: half a frame on the wire
+    write_timeout: float = 0.2  # s that the port may take no bytes: ten ticks
+    off: float = 1.0  # mm beside its way: a bead's width; answers count 0.1 mm, and come some ms late
+    off_turn: float = float(np.deg2rad(2.0))  # rad beside its way
+    slack: float = 0.05  # s later on its way than its lag: two ticks and what scheduling does to the stamp of an answer
+    lost: float = 10.0  # mm beside its way, from which the arm is stopped: three times what one command may jump
+    silence: float = 0.5  # s without an answer, after some have come: ten of 27 bytes on the slowest line
+    patience: float = 2.0  # s of a hold by the link before it is a stop: three times the longest stall to be lived with
+    reopen: float = 0.5  # s between looks for a device that is gone
+    speed: float = 20.0  # mm/s of the link's own moves; one public driver homes at 1000 mm/min, 17 mm/s
+    turning: float = float(np.deg2rad(20.0))  # rad/s of the link's own moves
+    pause_frame: bool = True  # whether the arm understands the control frame that stops it; the thesis knows none
+
+    def __post_init__(self) -> None:
+        for name in (f.name for f in fields(self) if f.name != "pause_frame"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and (value > 0 or (name == "ease" and value == 0))):
+                raise InputError("link", name, value, "a finite number > 0")
+        if self.ease > 0.1:
+            raise InputError("link", "ease", self.ease, "0 to 0.1")

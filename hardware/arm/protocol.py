@@ -1,8 +1,12 @@
-"""The arm's wire: motion and control frames of 48 bytes. Degrees, mm/min and ms exist only here and in replies.py.
+"""The arm's wire: motion and control frames of 48 bytes out, answers of 9 bytes in. Degrees and mm/min exist only here.
 
-G1, G4 and G54 are of thesis Table 6.1, the control frames of public drivers of the arm. Floats are IEEE 754 binary32,
-little-endian, as those drivers send them; there is no checksum. `decode` takes what `encode` can have made and refuses
-all else: for every frame it takes, encode(decode(frame)) == frame.
+G1, G4 and G54 are of thesis Table 6.1, control frames and answers of public drivers of the arm. Floats are IEEE 754
+binary32, little-endian; there is no checksum. `decode` takes what `encode` can have made and refuses all else: for
+every frame it takes, encode(decode(frame)) == frame.
+
+An answer is three numbers: byte 0 is 0xCE, 1 to 6 are three int16, big-endian, 7 is the kind, 8 is 0xCF. Places count
+tenths of a millimetre, angles hundredths of a degree. The thesis knows only stray single bytes (6.2), so the reader
+gives those back as well. `decode_reply` takes what `encode_reply` can have made.
 """
 
 from __future__ import annotations
@@ -11,22 +15,25 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from enum import IntEnum
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from planning.command import Command, Move
 
-LENGTH = 48
+FRAME_LENGTH = 48
 _G1 = struct.Struct("<BcB6ff12xfB")  # X Y Z, three angles, pwm, reserved, feed
 _G4 = struct.Struct("<BcBf40xB")  # pause
 _G54 = struct.Struct("<BBB3f32xB")  # X Y Z
 _SINGLE = struct.Struct("<f")
 _MOTION, _MOTION_END, _SYSTEM, _SYSTEM_END = 238, 239, 252, 253
-TAILS = {_MOTION: _MOTION_END, _SYSTEM: _SYSTEM_END}  # last byte of a frame by its first
+_MOVE, _WAIT = ord("1"), ord("6")  # byte 1 of a motion frame
+FRAME_TAILS = {_MOTION: _MOTION_END, _SYSTEM: _SYSTEM_END}  # last byte of a frame by its first
 
-JOINTS = ("J4", "J5", "J6")  # the machine axes A B C
+ANGLE_JOINTS = ("J4", "J5", "J6")  # the machine axes A B C
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,14 +47,14 @@ class Dialect:
     """
 
     motion_byte: int = 1
-    slots: tuple[str, str, str] = JOINTS
+    slots: tuple[str, str, str] = ANGLE_JOINTS
     origin_scale: int = 1
     pwm: float = 0.0
 
     def __post_init__(self) -> None:
         if self.motion_byte not in (0, 1):
             raise InputError("dialect", "motion_byte", self.motion_byte, "0 or 1")
-        if sorted(self.slots) != list(JOINTS):
+        if sorted(self.slots) != list(ANGLE_JOINTS):
             raise InputError("dialect", "slots", self.slots, "J4, J5 and J6, each once")
         if self.origin_scale not in (1, 10):
             raise InputError("dialect", "origin_scale", self.origin_scale, "1 or 10")
@@ -55,7 +62,7 @@ class Dialect:
             raise InputError("dialect", "pwm", self.pwm, "0 or 1500")
 
 
-THESIS = Dialect()
+THESIS_DIALECT = Dialect()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +113,7 @@ Instruction = G1 | G4 | G54 | Pause | Reset | ControllerReset | Mode
 
 
 def _control(*code: int) -> bytes:
-    return bytes([_SYSTEM, *code]).ljust(LENGTH - 1, b"\0") + bytes([_SYSTEM_END])
+    return bytes([_SYSTEM, *code]).ljust(FRAME_LENGTH - 1, b"\0") + bytes([_SYSTEM_END])
 
 
 _FRAMES: dict[Instruction, bytes] = {  # of what has no numbers
@@ -119,10 +126,10 @@ _FRAMES: dict[Instruction, bytes] = {  # of what has no numbers
 _CONTROLS = {frame: instruction for instruction, frame in _FRAMES.items()}
 
 
-def encode(instruction: Instruction, dialect: Dialect = THESIS) -> bytes:
+def encode(instruction: Instruction, dialect: Dialect = THESIS_DIALECT) -> bytes:
     """The frame of an instruction; InputError for what no frame can hold: not finite, too large, feed or pause <= 0."""
     if isinstance(instruction, G1):
-        angles = dict(zip(JOINTS, np.rad2deg(instruction.axes[3:]), strict=True))
+        angles = dict(zip(ANGLE_JOINTS, np.rad2deg(instruction.axes[3:]), strict=True))
         turns = (angles[joint] for joint in dialect.slots)
         body = _singles([*instruction.axes[:3], *turns, dialect.pwm, instruction.feed * 60], "G1")
         _positive("G1", "feed", body[7], "mm/min")
@@ -139,17 +146,28 @@ def encode(instruction: Instruction, dialect: Dialect = THESIS) -> bytes:
     return _FRAMES[instruction]
 
 
-def decode(frame: bytes, dialect: Dialect = THESIS) -> Instruction:
+def frame_from_command(command: Command, dialect: Dialect = THESIS_DIALECT) -> bytes:
+    """The frame of a command, G1 of a move and G4 of a hold; InputError as `encode`."""
+    motion = G1(command.axes, command.feed) if isinstance(command, Move) else G4(command.duration)
+    return encode(motion, dialect)
+
+
+def motion_from_frame(frame: bytes, dialect: Dialect = THESIS_DIALECT) -> G1 | G4:
+    """What the arm reads in a frame of `frame_from_command`: the command rounded to binary32."""
+    return _decode_move(frame, dialect) if frame[1] == _MOVE else _decode_pause(frame)
+
+
+def decode(frame: bytes, dialect: Dialect = THESIS_DIALECT) -> Instruction:
     """The instruction in a frame; InputError where `encode` in this dialect cannot have made it."""
-    if len(frame) != LENGTH:
-        raise InputError("frame", "length", len(frame), f"{LENGTH} bytes")
+    if len(frame) != FRAME_LENGTH:
+        raise InputError("frame", "length", len(frame), f"{FRAME_LENGTH} bytes")
     if frame in _CONTROLS:
         return _CONTROLS[frame]
     head, tail = frame[:3], frame[-1]
-    if head == bytes([_MOTION, ord("1"), dialect.motion_byte]) and tail == _MOTION_END:
-        instruction: Instruction = _decode_move(_G1.unpack(frame), dialect)
-    elif head == bytes([_MOTION, ord("6"), 0]) and tail == _MOTION_END:
-        instruction = G4(_G4.unpack(frame)[3] / 1000)
+    if head == bytes([_MOTION, _MOVE, dialect.motion_byte]) and tail == _MOTION_END:
+        instruction: Instruction = _decode_move(frame, dialect)
+    elif head == bytes([_MOTION, _WAIT, 0]) and tail == _MOTION_END:
+        instruction = _decode_pause(frame)
     elif head == bytes([_SYSTEM, 20, 1]) and tail == _SYSTEM_END:
         instruction = G54(np.array(_G54.unpack(frame)[3:6]) / dialect.origin_scale)
     else:
@@ -159,10 +177,15 @@ def decode(frame: bytes, dialect: Dialect = THESIS) -> Instruction:
     return instruction
 
 
-def _decode_move(fields: tuple[Any, ...], dialect: Dialect) -> G1:
+def _decode_move(frame: bytes, dialect: Dialect) -> G1:
+    fields = _G1.unpack(frame)
     angles = dict(zip(dialect.slots, fields[6:9], strict=True))
-    axes = np.array([*fields[3:6], *np.deg2rad([angles[joint] for joint in JOINTS])])
+    axes = np.array([*fields[3:6], *np.deg2rad([angles[joint] for joint in ANGLE_JOINTS])])
     return G1(axes, fields[10] / 60)
+
+
+def _decode_pause(frame: bytes) -> G4:
+    return G4(_G4.unpack(frame)[3] / 1000)
 
 
 def _singles(numbers: list[float], where: str) -> list[float]:
@@ -184,23 +207,23 @@ def _positive(where: str, what: str, value: float, unit: str) -> None:
         raise InputError(where, what, value, f"> 0 {unit}")
 
 
-Taken = TypeVar("Taken")
+Decoded = TypeVar("Decoded")
 
 
-class FrameStream(Generic[Taken]):
+class FrameStream(Generic[Decoded]):
     """Finds frames in bytes that come in any split, and finds the next one again after bytes that are none.
 
     length: bytes of a frame. tails: its last byte by its first. decode: what it says, InputError where it is none.
     """
 
-    def __init__(self, length: int, tails: Mapping[int, int], decode: Callable[[bytes], Taken]) -> None:
+    def __init__(self, length: int, tails: Mapping[int, int], decode: Callable[[bytes], Decoded]) -> None:
         self._length, self._tails, self._decode = length, tails, decode
         self._rest = b""
 
-    def __call__(self, data: bytes) -> tuple[list[Taken], bytes]:
+    def __call__(self, data: bytes) -> tuple[list[Decoded], bytes]:
         """What the frames that `data` completes say, and the bytes that by now are known to be in no frame."""
         rest, start = self._rest + data, 0
-        taken: list[Taken] = []
+        decoded: list[Decoded] = []
         stray = bytearray()
         while start < len(rest):
             tail, end = self._tails.get(rest[start]), start + self._length
@@ -208,7 +231,7 @@ class FrameStream(Generic[Taken]):
                 break
             if tail is not None and rest[end - 1] == tail:
                 try:
-                    taken.append(self._decode(rest[start:end]))
+                    decoded.append(self._decode(rest[start:end]))
                 except InputError:
                     pass  # looks like a frame and is none: the next one may begin inside it
                 else:
@@ -217,9 +240,69 @@ class FrameStream(Generic[Taken]):
             stray.append(rest[start])
             start += 1
         self._rest = rest[start:]
-        return taken, bytes(stray)
+        return decoded, bytes(stray)
 
     @property
     def pending(self) -> int:
         """Bytes held back because a frame may begin with them."""
         return len(self._rest)
+
+
+REPLY_LENGTH = 9
+_REPLY = struct.Struct(">B3hBB")
+_REPLY_FIRST, _REPLY_LAST = 0xCE, 0xCF
+REPLY_TAILS = {_REPLY_FIRST: _REPLY_LAST}
+_MAX_COUNT = 32_767  # int16; its -32768 has no opposite and is not sent
+
+
+class ReplyKind(IntEnum):
+    """Which three numbers a reply holds; the value is byte 7. The driver knows a 4 and a 5, and does not use them."""
+
+    PLACE = 0  # X Y Z
+    TOOL = 1  # J4 J5 J6
+    ARM = 2  # J1 J2 J3
+    ORIGIN = 3  # X Y Z of the work origin
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reply:
+    """One answer. values: (3,) mm, or rad where `kind` is TOOL or ARM."""
+
+    kind: ReplyKind
+    values: Array
+
+
+def encode_reply(reply: Reply) -> bytes:
+    """The 9 bytes of a reply, its numbers rounded to what they count in; InputError for one that does not fit."""
+    counts = np.asarray(reply.values) / unit(reply.kind)
+    if not (np.abs(counts) < _MAX_COUNT + 0.5).all():  # NaN too
+        allowed = f"at most {_MAX_COUNT / 10:g} mm or {_MAX_COUNT / 100:g} degrees either way"
+        raise InputError("reply", reply.kind.name.lower(), reply.values.tolist(), allowed)
+    return _REPLY.pack(_REPLY_FIRST, *np.rint(counts).astype(int).tolist(), reply.kind, _REPLY_LAST)
+
+
+def decode_reply(frame: bytes) -> Reply:
+    """The reply in 9 bytes; InputError where `encode_reply` cannot have made them."""
+    if len(frame) != REPLY_LENGTH:
+        raise InputError("reply", "length", len(frame), f"{REPLY_LENGTH} bytes")
+    head, *counts, kind, tail = _REPLY.unpack(frame)
+    if (head, tail) != (_REPLY_FIRST, _REPLY_LAST):
+        raise InputError("reply", "first and last byte", [head, tail], f"{_REPLY_FIRST} and {_REPLY_LAST}")
+    if kind not in list(ReplyKind):
+        raise InputError("reply", "kind", kind, "0 to 3")
+    if min(counts) < -_MAX_COUNT:
+        raise InputError("reply", "values", counts, f"-{_MAX_COUNT} to {_MAX_COUNT}")
+    return Reply(ReplyKind(kind), np.array(counts) * unit(ReplyKind(kind)))
+
+
+def reply_stream() -> FrameStream[Reply]:
+    """A reader of what the arm sends: replies, and the stray bytes between them.
+
+    A stray byte just before a reply never costs it: byte 8 would then be the reply's kind, which is no 0xCF.
+    """
+    return FrameStream(REPLY_LENGTH, REPLY_TAILS, decode_reply)
+
+
+def unit(kind: ReplyKind) -> float:
+    """What its values count in, mm or rad."""
+    return 0.1 if kind in (ReplyKind.PLACE, ReplyKind.ORIGIN) else float(np.deg2rad(0.01))

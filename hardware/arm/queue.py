@@ -1,8 +1,8 @@
-"""The arm's queue as it must be by what was sent: a model in virtual time, and the dead reckoning that it gives.
+"""A model of the arm's queue in virtual time: what is under way, where the set-point is, and whether more may be sent.
 
-The arm's answers need not come, so this is all that is always known (thesis 6.2: home, plus what was commanded). A
-frame takes its time on the wire, then waits for those before it; a move goes straight from the last target at its
-feed. A move of less than TURNING along X Y Z turns, and its feed counts degrees/s.
+The arm need not answer, so the model is all that is always known (thesis 6.2: home, plus what was commanded). A frame
+takes its time on the wire, then waits for those before it. A move goes straight from the last target at its feed; one
+of less than MIN_TRAVEL along X Y Z turns, and its feed is in degrees/s.
 """
 
 from __future__ import annotations
@@ -13,19 +13,22 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hardware.arm.protocol import G1, G4
-from planning.command import TURNING
+from hardware.arm.port import ArmLine
+from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.protocol import FRAME_LENGTH, G1, G4
+from planning.command import MIN_TRAVEL
 
 Axes = tuple[float, ...]  # X Y Z A B C, mm and rad: six floats, quicker than an array of six
-REMEMBERED = 64  # stretches, more than a second of them at 50 frames/s
+MAX_QUEUED_COMMANDS = 64  # remembered: more than a second of them at 50 frames/s
+WIRE_ROUNDING_BYTES = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
-    """One command in the queue: from `start` to `end`, both s, between two places."""
+class QueuedCommand:
+    """What one command in the queue does to the set-point."""
 
-    start: float
-    end: float
+    start: float  # s
+    end: float  # s
     source: Axes
     target: Axes
 
@@ -38,19 +41,19 @@ class Stretch:
 
 
 class ArmQueue:
-    """What the arm has yet to do, and where its set-point is; it is told of every frame that has been sent."""
+    """What the arm has yet to do, and where its set-point is; every frame that is sent is entered."""
 
     def __init__(self, axes: Sequence[float], frame_time: float, now: float) -> None:
         """axes: (6,) where the arm stands. frame_time: s of one frame on the wire."""
         self._frame_time = frame_time
         self._wire = now
-        self._stretches: deque[Stretch] = deque(maxlen=REMEMBERED)
+        self._commands: deque[QueuedCommand] = deque(maxlen=MAX_QUEUED_COMMANDS)
         self.stand(axes, now)
 
     @property
     def target(self) -> Axes:
         """Where the last command ends."""
-        return self._stretches[-1].target
+        return self._commands[-1].target
 
     @property
     def wire_free(self) -> float:
@@ -61,86 +64,86 @@ class ArmQueue:
         """Nothing is queued, and the arm stands at `axes` (6,)."""
         place = tuple(float(a) for a in axes)
         assert len(place) == 6 and all(map(math.isfinite, place))
-        self._stretches.append(Stretch(now, now, place, place))
+        self._commands.append(QueuedCommand(now, now, place, place))
 
     def duration(self, instruction: G1 | G4) -> float:
-        """Seconds that the arm will be busy with an instruction, after all those before it. G1: in machine axes."""
+        """Seconds that an instruction takes after all those before it. G1: in machine axes."""
         if isinstance(instruction, G4):
             return instruction.duration
         way = [float(b) - a for a, b in zip(self.target, instruction.axes, strict=True)]
         length, turn = math.hypot(*way[:3]), math.hypot(*way[3:])
-        return length / instruction.feed if length > TURNING or not turn else math.degrees(turn) / instruction.feed
+        return length / instruction.feed if length > MIN_TRAVEL or not turn else math.degrees(turn) / instruction.feed
 
     def add(self, instruction: G1 | G4, now: float, left: float = 1.0) -> None:
-        """An instruction was given out whole at `now`, s. left: share of its frame that went then, the rest before."""
+        """The last byte of an instruction was given out at `now`, s. left: share of its frame that went just then."""
         duration, source = self.duration(instruction), self.target
         self.occupy(now, left)
-        start = max(self._wire, self._stretches[-1].end)
+        start = max(self._wire, self._commands[-1].end)
         target = source if isinstance(instruction, G4) else tuple(float(a) for a in instruction.axes)
-        self._stretches.append(Stretch(start, start + duration, source, target))
+        self._commands.append(QueuedCommand(start, start + duration, source, target))
 
     def occupy(self, now: float, share: float) -> None:
         """A share of a frame's bytes was given out at `now`, s."""
         self._wire = max(self._wire, now) + share * self._frame_time
 
     def stop(self) -> None:
-        """A frame that stops the arm was given out: it rests where the set-point is when that arrives."""
-        if self._stretches[-1].end <= self._wire:
+        """A frame that stops the arm was given out: the arm rests where the set-point is when that arrives."""
+        if self._commands[-1].end <= self._wire:
             return  # it rests already
         arrival, place = self._wire, self.at(self._wire)
-        while self._stretches and self._stretches[-1].end > arrival:
-            cut = self._stretches.pop()
+        while self._commands and self._commands[-1].end > arrival:
+            cut = self._commands.pop()
             if cut.start < arrival:
-                self._stretches.append(Stretch(cut.start, arrival, cut.source, place))
+                self._commands.append(QueuedCommand(cut.start, arrival, cut.source, place))
         self.stand(place, arrival)
 
     def in_flight(self, now: float) -> float:
         """Seconds until all that was given out is done."""
-        return max(self._stretches[-1].end - now, self._wire - now, 0.0)
+        return max(self._commands[-1].end - now, self._wire - now, 0.0)
 
     def in_flight_with(self, duration: float, now: float) -> float:
         """The same if a command of `duration` s were given out at `now`."""
-        return max(max(self._wire, now) + self._frame_time, self._stretches[-1].end) + duration - now
+        return max(max(self._wire, now) + self._frame_time, self._commands[-1].end) + duration - now
 
     def frames(self, now: float) -> int:
         """Commands that are not done, those on the wire included."""
         count = 0
-        for stretch in reversed(self._stretches):
-            if stretch.end <= now:
+        for command in reversed(self._commands):
+            if command.end <= now:
                 break
             count += 1
         return count
 
     def at(self, instant: float) -> Axes:
         """The set-point (6,) at `instant`, s, no more than a second ago."""
-        index = bisect_right(self._stretches, instant, key=lambda stretch: stretch.start) - 1
-        return self._stretches[max(index, 0)].at(instant)
+        index = bisect_right(self._commands, instant, key=lambda command: command.start) - 1
+        return self._commands[max(index, 0)].at(instant)
 
-    def ways(self, since: float) -> list[Stretch]:
-        """What ends after `since`, s, in order: of the last second, and of what is queued."""
-        return [stretch for stretch in self._stretches if stretch.end > since]
+    def ways(self, since: float) -> list[QueuedCommand]:
+        """The commands that end after `since`, s, in order: of the last second and of the queue."""
+        return [command for command in self._commands if command.end > since]
 
     def passed(self, place: Sequence[float], still: float, until: float) -> float:
-        """When X Y Z of the set-point last were within `still` mm of a place (3,) each, s; NaN if not of late."""
+        """When X Y Z of the set-point were last within `still` mm of a place (3,), s; NaN if not of late."""
         after = until
-        for stretch in reversed(self._stretches):
-            if stretch.end <= after and _share(stretch.target, stretch.target, place, still, 1.0) is not None:
+        for command in reversed(self._commands):
+            if command.end <= after and _share(command.target, command.target, place, still, 1.0) is not None:
                 return after
-            if stretch.start < min(after, stretch.end):
-                length = stretch.end - stretch.start
-                most = min((after - stretch.start) / length, 1.0)
-                if (share := _share(stretch.source, stretch.target, place, still, most)) is not None:
-                    return stretch.start + share * length
-            after = min(after, stretch.start)
+            if command.start < min(after, command.end):
+                length = command.end - command.start
+                most = min((after - command.start) / length, 1.0)
+                if (share := _share(command.source, command.target, place, still, most)) is not None:
+                    return command.start + share * length
+            after = min(after, command.start)
         return math.nan
 
     def bounds(self, since: float, until: float) -> tuple[Axes, Axes]:
         """Least and greatest set-point of each axis between two instants, s."""
         knots = [self.at(since), self.at(until)]
-        for stretch in reversed(self._stretches):
-            if stretch.end <= since:
+        for command in reversed(self._commands):
+            if command.end <= since:
                 break
-            ends = (stretch.start, stretch.source), (stretch.end, stretch.target)
+            ends = (command.start, command.source), (command.end, command.target)
             knots += [place for instant, place in ends if since <= instant <= until]
         return tuple(map(min, *knots)), tuple(map(max, *knots))
 
@@ -156,3 +159,46 @@ def _share(source: Axes, target: Axes, place: Sequence[float], still: float, mos
         ends = (p - still - a) / (b - a), (p + still - a) / (b - a)
         first, last = max(first, min(ends)), min(last, max(ends))
     return last if first <= last else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlowControl:
+    """The limits of one arm's link: what is on the wire, in the port and in the arm's queue."""
+
+    profile: ArmProfile
+    settings: LinkSettings
+
+    @property
+    def flight(self) -> float:
+        """Seconds that may be under way, wire included: the settings' flight, or on a slow line one frame and its move.
+
+        Either way a tick, of 50 ms at most, is all that is added to what the arm's queue holds.
+        """
+        slow = self.profile.frame_time * (1 + WIRE_ROUNDING_BYTES / FRAME_LENGTH) + self.profile.tick
+        return max(self.settings.flight, slow)
+
+    def full(self, line: ArmLine, queue: ArmQueue, more: float, now: float) -> str:
+        """Why a frame of `more` s must wait; "" where it need not."""
+        if line.blocked:
+            return f"the port has taken no bytes for {line.blocked_for(now):.3f} s"
+        passing = max(queue.wire_free - now, 0.0) / self.profile.frame_time * FRAME_LENGTH
+        if passing > WIRE_ROUNDING_BYTES:
+            return f"{passing:.0f} bytes are on the wire: a stop would wait for two frames"
+        waiting = line.port.waiting() - passing
+        if waiting > FRAME_LENGTH:
+            return f"{waiting:.0f} bytes wait in the port"
+        if (count := queue.frames(now)) >= self.settings.frames:
+            return f"{count} frames are under way, limit {self.settings.frames}"
+        if queue.in_flight_with(more, now) > self.flight:
+            return f"{1000 * queue.in_flight(now):.0f} ms are under way, limit {1000 * self.flight:g} ms"
+        return ""
+
+    def excess(self, instruction: G1 | G4, queue: ArmQueue, now: float) -> str:
+        """Why the arm is stopped rather than sent this; "" where it may be sent."""
+        limit = self.profile.limits.feed
+        if isinstance(instruction, G1) and instruction.feed > limit * (1 + 1e-6):
+            return f"feed of {instruction.feed:g} mm/s, limit {limit:g}"
+        flight = queue.in_flight_with(queue.duration(instruction), now)
+        if flight > self.flight:
+            return f"{1000 * flight:.1f} ms would be under way, limit {1000 * self.flight:g} ms"
+        return ""

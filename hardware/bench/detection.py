@@ -1,45 +1,302 @@
-"""Steps and rest: how soon a movement of 300 um or 0.1 degree is flagged, and how often one that never was.
+"""Subjects `cameras`, `bumps` and `steps`: frames paired, cameras that are knocked, a surface that moves by little.
 
-Noise is that of fits to synthetic tracks at rest, which is linear in them: a white part, and one that lasts. Poses are
-drawn with it, so that an hour costs half a minute; the detector is the tracker's own.
+`cameras`: frames that jitter, skip and carry offsets, put into sets as they arrive; what a frame costs.
+`bumps`: cameras bumped and lenses turned by little before a breathing surface, and neither. Tracks are drawn, not
+rendered: an hour of them passes in minutes. What bumps do in pictures, `bench outages` shows.
+`steps`: how soon a movement of 300 um or 0.1 degree is flagged, and how often one that never was. Noise is that of fits
+to synthetic tracks at rest, which is linear in them: a white part, and one that lasts. Poses are drawn with it, so that
+an hour costs half a minute; the detector is the tracker's own.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.online.estimator import Estimator
 from estimation.online.surface_state import MotionDetector
+from estimation.pose import SurfacePose, TrackState
+from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.synthetic.bound import pose_information
-from estimation.synthetic.world import synthetic_world
-from hardware.bench.figures import Figure, at_least, at_most
+from estimation.surface_map import SurfaceMap
+from estimation.synthetic.follow import pose_information
+from estimation.synthetic.movements import irregular, patch
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations, synthetic_world
+from hardware.bench.figures import Figure, at_least, at_most, with_progress
+from hardware.cameras.feed import Arrival, FrameWatch
+from hardware.cameras.frame_sets import FrameSetBuilder
+from hardware.cameras.stamping import FrameStamper
+from hardware.process.clock import CpuClock
+from perception.frames import Frame, FrameSet, Image
 
-RATE = 30.0  # Hz
-HOUR = 108_000  # frames
-EVERY = 90  # frames between steps: 3 s, of which a second is spent until it counts as rest again
-LASTING, SECONDS = 0.5, 2.0  # share of the white noise, and its time: what tracks drag along from frame to frame
-SOON = 2  # frames
-SIZES = np.array([np.deg2rad(0.1), 0.3])  # rad, mm
+FRAME_PERIOD = 1 / 30  # s
+CAMERA_OFFSETS = np.array([0.0, 0.016, -0.016])  # s
+OFFSET_SIGMA = 0.0005  # s, sigma of an offset as the estimator learns it
+TRANSPORT, MEAN_DELAY = 0.025, 0.002  # s, on the way to arrival; mean of what comes on top
+MAX_SET_WAIT = 1.5 * FRAME_PERIOD  # s that a set may be waited for
+IMAGE = np.zeros((1, 1), np.uint8)
 
 
-def run(options: argparse.Namespace) -> list[Figure]:
+@dataclass(frozen=True, slots=True)
+class SentFrame:
+    """A frame on its way."""
+
+    camera: int
+    instant: int  # number of the exposure it belongs to
+    stamp: float  # s
+    arrival: float  # s
+
+
+@dataclass(frozen=True, slots=True)
+class CameraJitter:
+    """How cameras that expose together are seen."""
+
+    jitter: float = 0.005  # s, of stamps: the largest, or one sigma
+    normal: bool = False
+    drop: float = 0.02  # share lost
+
+
+def sent_frames(
+    rng: np.random.Generator, count: int, shaking: CameraJitter, offsets: Array = CAMERA_OFFSETS
+) -> list[SentFrame]:
+    """The frames of `count` instants in order of arrival; true instant = stamp + offset, a camera's stamps rise."""
+    out: list[SentFrame] = []
+    for camera, offset in enumerate(offsets):
+        exposed = np.arange(count) * FRAME_PERIOD
+        noise = rng.standard_normal(count) if shaking.normal else rng.uniform(-1, 1, count)
+        stamps = np.maximum.accumulate(exposed - offset + shaking.jitter * noise + 1e-9 * np.arange(count))
+        arrivals = np.maximum.accumulate(
+            exposed + TRANSPORT + rng.exponential(MEAN_DELAY, count) + 1e-9 * np.arange(count)
+        )
+        kept = np.flatnonzero(rng.random(count) >= shaking.drop)
+        out += [SentFrame(camera, int(k), float(stamps[k]), float(arrivals[k])) for k in kept]
+    return sorted(out, key=lambda one: one.arrival)
+
+
+@dataclass(frozen=True, slots=True)
+class FramePairing:
+    """What became of frames that were put into sets."""
+
+    complete: float  # share of the instants that all cameras delivered, found as one set
+    wrong: int  # sets of two instants
+    sets: int  # given out
+    wait: float  # s, the longest from the arrival of a set's first frame until it was given out
+
+
+def pair_frames(frames: Sequence[SentFrame], offsets: Array, period: float | None = FRAME_PERIOD) -> FramePairing:
+    """Put frames into sets with these offsets (C,), s, looking every 5 ms as live cameras do."""
+    cameras = len(offsets)
+    gathering, stampings = (
+        FrameSetBuilder(cameras, FRAME_PERIOD, offsets),
+        [FrameStamper(period) for _ in range(cameras)],
+    )
+    instant_of: dict[tuple[int, float], SentFrame] = {}
+    sets: list[tuple[float, FrameSet]] = []
+    for one, following in pairwise([*frames, None]):
+        assert one is not None
+        stamped = stampings[one.camera](one.arrival, one.stamp, True)
+        frame = Frame(one.camera, stamped.stamp, IMAGE, stamped.by)
+        instant_of[one.camera, stamped.stamp] = one
+        arrival = Arrival(frame, stamped.steady, stampings[one.camera].pll.period, one.arrival)
+        sets += [(one.arrival, s) for s in gathering.add(arrival)]
+        until = one.arrival + 1.0 if following is None else following.arrival
+        for look in np.arange(one.arrival + 0.005, until, 0.005):
+            sets += [(float(look), s) for s in gathering.due(float(look))]
+    return _judged(frames, [(now, [instant_of[f.camera, f.stamp] for f in s.frames]) for now, s in sets], cameras)
+
+
+def _judged(frames: Sequence[SentFrame], sets: Sequence[tuple[float, list[SentFrame]]], cameras: int) -> FramePairing:
+    delivered = np.bincount([one.instant for one in frames])
+    instants = [{one.instant for one in members} for _, members in sets]
+    whole = sum(len(i) == 1 and len(m) == cameras for i, (_, m) in zip(instants, sets, strict=True))
+    return FramePairing(
+        complete=whole / int((delivered == cameras).sum()),
+        wrong=sum(len(i) > 1 for i in instants),
+        sets=len(sets),
+        wait=max(now - min(one.arrival for one in members) for now, members in sets),
+    )
+
+
+def run_cameras(options: argparse.Namespace) -> list[Figure]:
+    """Pairing under the target's jitter, with the rate told and not, and under a normal one; what a frame costs."""
+    rng = np.random.default_rng(options.seed)
+    count = round(60 * options.minutes / FRAME_PERIOD)
+    learned = CAMERA_OFFSETS + OFFSET_SIGMA * rng.standard_normal(len(CAMERA_OFFSETS))
+    at_target = pair_frames(sent_frames(rng, count, CameraJitter()), learned)
+    normal = pair_frames(sent_frames(rng, count, CameraJitter(normal=True)), learned)
+    untold = pair_frames(sent_frames(rng, count, CameraJitter()), learned, None)
+    figures, longest = list[Figure](), at_most(1e3 * MAX_SET_WAIT)
+    for how, pairing in (("+-5 ms", at_target), ("+-5 ms, rate not told", untold), ("5 ms sigma", normal)):
+        name = f"offsets +-16 ms, 2 % drops, jitter {how}"
+        figures += [
+            Figure(f"{name}: complete sets not found", 100 * (1 - pairing.complete), "%", at_most(0.5)),
+            Figure(f"{name}: wrong pairs", pairing.wrong, "", at_most(0), note=f"of {pairing.sets} sets"),
+            Figure(f"{name}: longest wait", 1e3 * pairing.wait, "ms", longest, note="after its first frame"),
+        ]
+    return [*figures, _cost(rng)]
+
+
+def _cost(rng: np.random.Generator) -> Figure:
+    images: list[Image] = [rng.integers(0, 255, (720, 1280, 3), np.uint8) for _ in range(2)]
+    clock, watch, stamping, frames = CpuClock(), FrameWatch((1280, 720)), FrameStamper(FRAME_PERIOD), 200
+    start = clock.now()
+    for k in range(frames):
+        stamping(k * FRAME_PERIOD, k * FRAME_PERIOD, True)
+        watch.fault(images[k % 2])
+    each = 1e3 * (clock.now() - start) / frames
+    return Figure("a 1280x720 frame watched and stamped", each, "ms", at_most(1.0), note="CPU, without its decoding")
+
+
+BUMP_RATE = 30.0  # Hz
+CALM_BEFORE, WATCHED_AFTER = 6.0, 4.0  # s before a bump, and after it
+TRACK_NOISE_PX = 0.3  # px
+LANDMARKS = 60
+NO_REFERENCE = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class Knock:
+    """One kind of knock, in a direction drawn across the view."""
+
+    name: str
+    shift: float = 0.0  # mm
+    turn: float = 0.0  # degrees
+    scale: float = 1.0  # of the focal length
+    wanted: bool = True
+
+    def struck(self, rig: Rig, camera: int, rng: np.random.Generator) -> Rig:
+        """The rig with one camera knocked."""
+        own, angle = rig.cameras[camera], rng.uniform(0, 2 * np.pi)
+        across = np.array([np.cos(angle), np.sin(angle), 0.0])
+        moved = own.base_from_camera @ se3.exp(np.concatenate([across * np.deg2rad(self.turn), across * self.shift]))
+        matrix = own.matrix * np.array([[self.scale, 1, 1], [1, self.scale, 1], [1, 1, 1]])
+        cameras = list(rig.cameras)
+        cameras[camera] = replace(own, base_from_camera=moved, matrix=matrix)
+        return Rig(tuple(cameras))
+
+
+KNOCKS = (
+    Knock("0.25 mm", shift=0.25, wanted=False),
+    Knock("0.5 mm", shift=0.5),
+    Knock("1 mm", shift=1.0),
+    Knock("2 mm", shift=2.0),
+    Knock("0.2 degrees", turn=0.2),
+    Knock("lens 0.5 %", scale=1.005, wanted=False),
+    Knock("lens 1 %", scale=1.01),
+    Knock("lens -1 %", scale=0.99),
+)
+
+
+def run_bumps(options: argparse.Namespace) -> list[Figure]:
+    """Knocks found, named and how soon; and false alarms of a calm run."""
+    cases = [(kind, number) for kind in range(len(KNOCKS)) for number in range(options.count)]
+    results: list[list[KnockResult]] = [[] for _ in KNOCKS]
+    for kind, number in with_progress("knocks", "runs", cases, len(cases)):
+        results[kind].append(_knocked(KNOCKS[kind], number % 3, options.seed + 1000 * kind + number))
+    figures = [f for knock, of_kind in zip(KNOCKS, results, strict=True) for f in _knock_figures(knock, of_kind)]
+    if options.minutes > 0:
+        figures.append(_calm(options.seed, options.minutes))
+    return figures
+
+
+@dataclass(frozen=True, slots=True)
+class KnockResult:
+    """s until the state was no longer TRACKING, until the right camera was named, and as what; inf: never."""
+
+    flagged: float
+    named: float
+    right: bool
+
+
+def _knock_figures(knock: Knock, results: list[KnockResult]) -> Iterator[Figure]:
+    flagged, named = (np.array([getattr(r, name) for r in results]) for name in ("flagged", "named"))
+    target = at_least(1.0) if knock.wanted else None
+    share = float(np.isfinite(flagged).mean())
+    note = f"{len(results)} knocks, each camera in turn, {TRACK_NOISE_PX:g} px, {LANDMARKS} landmarks"
+    yield Figure(f"{knock.name}: DEGRADED, share", share, "", target, NO_REFERENCE, note)
+    longest = 1000 * float(max(flagged[np.isfinite(flagged)], default=np.nan))
+    yield Figure(f"{knock.name}: time, largest", longest, "ms")
+    yield Figure(f"{knock.name}: camera named, share", float(np.isfinite(named).mean()), "", target)
+    right = [r.right for r in results if np.isfinite(r.named)]
+    yield Figure(f"{knock.name}: bump told from lens, share", float(np.mean(right)) if right else float("nan"), "")
+
+
+class _BreathingTracks:
+    """An estimator that is shown drawn tracks of a breathing surface."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rig, self._rng = arc_rig(), rng
+        self._motion, self._landmarks = irregular(rng), patch(LANDMARKS, rng).points
+        up, exact = np.tile([0.0, 0.0, 1.0], (LANDMARKS, 1)), np.zeros((3 * LANDMARKS,) * 2)
+        self.estimator = Estimator(self.rig)
+        self.estimator.begin(0.0, BASE_FROM_REST @ self._motion(0.0), SurfaceMap(self._landmarks, up, exact))
+
+    def step(self, rig: Rig, stamp: float) -> SurfacePose:
+        """The pose at `stamp`, s, from what the cameras of `rig` see."""
+        seen = observations(
+            rig, self._landmarks, BASE_FROM_REST @ self._motion(stamp), stamp, self._rng, TRACK_NOISE_PX
+        )
+        fit = self.estimator.fit(seen, self.estimator.predict(stamp))
+        return self.estimator.accept(fit, seen) if fit.measured else self.estimator.coast(fit)
+
+
+def _knocked(knock: Knock, camera: int, seed: int) -> KnockResult:
+    rng = np.random.default_rng([seed, 101])
+    tracks = _BreathingTracks(rng)
+    rig, struck = tracks.rig, knock.struck(tracks.rig, camera, rng)
+    flagged, named, right = np.inf, np.inf, False
+    for number in range(1, round((CALM_BEFORE + WATCHED_AFTER) * BUMP_RATE)):
+        stamp = number / BUMP_RATE
+        pose = tracks.step(struck if stamp >= CALM_BEFORE else rig, stamp)
+        if stamp >= CALM_BEFORE and pose.state is not TrackState.TRACKING:
+            flagged = min(flagged, stamp - CALM_BEFORE)
+            if rig.cameras[camera].name in pose.reason:
+                named = min(named, stamp - CALM_BEFORE)
+                right = ("lens was turned" in pose.reason) == (knock.scale != 1.0)
+    return KnockResult(flagged, named, right)
+
+
+def _calm(seed: int, minutes: float) -> Figure:
+    """Frame sets in which a camera is called bumped though none is, over several breathings of five minutes."""
+    alarms, left = 0, minutes * 60.0
+    for part in range(max(1, int(np.ceil(minutes / 5)))):
+        tracks = _BreathingTracks(np.random.default_rng([seed, 103, part]))
+        for number in range(1, round(min(left, 300.0) * BUMP_RATE)):
+            tracks.step(tracks.rig, number / BUMP_RATE)
+            alarms += bool(tracks.estimator.health.bumps.bumped)
+        left -= 300.0
+    note = f"{minutes:g} min of irregular breathing"
+    return Figure("false alarms, frame sets", alarms, "", at_most(0), NO_REFERENCE, note)
+
+
+STEP_RATE = 30.0  # Hz
+FRAMES_AN_HOUR = 108_000  # frames
+FRAMES_A_STEP = 90  # frames between steps: 3 s, of which a second is spent until it counts as rest again
+LASTING_NOISE = 0.5  # share of the white noise: what tracks drag along from frame to frame
+LASTING_TIME = 2.0  # s
+MAX_FLAG_FRAMES = 2  # frames
+STEP_SIZES = np.array([np.deg2rad(0.1), 0.3])  # rad, mm
+
+
+def run_steps(options: argparse.Namespace) -> list[Figure]:
     """Measure steps, turns and rest."""
     rng = np.random.default_rng(options.seed)
     covariance = _covariance(options.noise)
-    note = f"{options.noise:g} px, white, and {LASTING:.0%} of it over {SECONDS:g} s"
-    figures = []
+    note = f"{options.noise:g} px, white, and {LASTING_NOISE:.0%} of it over {LASTING_TIME:g} s"
+    figures, asked = [], at_least(99.9)
     for kind, name in enumerate(("turns of 0.1 degree", "steps of 300 um")):
         late = _lateness(kind, options.steps, covariance, rng)
-        share = 100 * float(np.mean(late < SOON))
-        figures.append(
-            Figure(f"{name} flagged within {SOON} frames", share, "%", at_least(99.9), "thesis: asked", note)
-        )
+        share = 100 * float(np.mean(late < MAX_FLAG_FRAMES))
+        what = f"{name} flagged within {MAX_FLAG_FRAMES} frames"
+        figures.append(Figure(what, share, "%", asked, "thesis: asked", note))
         figures.append(Figure(f"{name}, latest", float(late.max()) + 1, "frames", note=f"of {len(late)}"))
-    false = _false_alarms(round(options.hours * HOUR), covariance, rng) / options.hours
+    false = _false_alarms(round(options.hours * FRAMES_AN_HOUR), covariance, rng) / options.hours
     return [*figures, Figure("false alarms at rest", false, "1/h", at_most(1.0), note=f"{options.hours:g} h; {note}")]
 
 
@@ -52,23 +309,23 @@ def _covariance(noise: float) -> Array:
 
 
 def _noise(count: int, covariance: Array, rng: np.random.Generator) -> Array:
-    """Right perturbations (count, 6): white ones, and ones that last, LASTING times as large."""
+    """Right perturbations (count, 6): white ones, and ones that last, LASTING_NOISE times as large."""
     root = np.linalg.cholesky(covariance)
-    keep = np.exp(-1 / (SECONDS * RATE))
+    keep = np.exp(-1 / (LASTING_TIME * STEP_RATE))
     lasting = np.empty((count, 6))
     now = rng.normal(size=6)
     for k, drive in enumerate(np.sqrt(1 - keep**2) * rng.normal(size=(count, 6))):
         now = keep * now + drive
         lasting[k] = now
-    return np.asarray((rng.normal(size=(count, 6)) + LASTING * lasting) @ root.T)
+    return np.asarray((rng.normal(size=(count, 6)) + LASTING_NOISE * lasting) @ root.T)
 
 
 def _lateness(kind: int, steps: int, covariance: Array, rng: np.random.Generator) -> Array:
     """Frames (steps,) from the first pose of each movement, 0, to its flag; kind: 0 turns, 1 shifts."""
-    first = EVERY * np.arange(1, steps + 1)
-    places = np.zeros((EVERY * (steps + 2), 6))
+    first = FRAMES_A_STEP * np.arange(1, steps + 1)
+    places = np.zeros((FRAMES_A_STEP * (steps + 2), 6))
     axes = rng.normal(size=(steps, 3))
-    moved = SIZES[kind] * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    moved = STEP_SIZES[kind] * axes / np.linalg.norm(axes, axis=1, keepdims=True)
     for k, (start, change) in enumerate(zip(first, moved, strict=True)):
         if k % 2:
             places[start:] = 0.0  # back, so that it stays near
@@ -76,11 +333,9 @@ def _lateness(kind: int, steps: int, covariance: Array, rng: np.random.Generator
             places[start:, 3 * kind : 3 * kind + 3] = change
     poses = se3.exp(places) @ se3.exp(_noise(len(places), covariance, rng))
     moving = _moving(poses, covariance)
-    late = [
-        int(np.argmax(moving[start : start + EVERY])) if moving[start : start + EVERY].any() else EVERY
-        for start in first
-    ]
-    return np.where(moving[first - 1], EVERY, late)  # one that was not at rest before was not seen to begin
+    after = [moving[start : start + FRAMES_A_STEP] for start in first]
+    late = [int(np.argmax(flags)) if flags.any() else FRAMES_A_STEP for flags in after]
+    return np.where(moving[first - 1], FRAMES_A_STEP, late)  # one that was not at rest before was not seen to begin
 
 
 def _false_alarms(count: int, covariance: Array, rng: np.random.Generator) -> int:
@@ -92,4 +347,4 @@ def _false_alarms(count: int, covariance: Array, rng: np.random.Generator) -> in
 def _moving(poses: Array, covariance: Array) -> NDArray[np.bool_]:
     """What the detector says (N,) of poses (N, 4, 4)."""
     detector = MotionDetector(np.zeros(3))
-    return np.array([detector(k / RATE, pose, covariance).moving for k, pose in enumerate(poses)], bool)
+    return np.array([detector(k / STEP_RATE, pose, covariance).moving for k, pose in enumerate(poses)], bool)

@@ -16,51 +16,88 @@ from numpy.typing import NDArray
 
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.arm.link import RECALLED, Arm
-from hardware.arm.profile import ArmProfile
-from hardware.arm_status import ArmState
-from hardware.bench.axes_judge import AxesJudge
+from hardware.arm.device import ArmState, LinkCode
+from hardware.arm.link import Arm
+from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.files.path_file import read_path
-from hardware.link_settings import LinkSettings
-from hardware.live.silence import silence
+from hardware.live.state_machine import silence_text
 from hardware.motion.loop import MotionLoop, Order, Tick
 from hardware.motion.step import MotionStep
 from hardware.process.clock import SimClock
-from hardware.process.faults import Fault, Kind, Part, struck
+from hardware.process.faults import FAULT_SPECS, Fault, FaultKind, FaultPart, FaultRunner, faults_striking
 from hardware.recording.schemas import WARNING
-from hardware.simulator.agenda import Agenda
 from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.ports import PortFaults, VirtualDevice
-from hardware.simulator.arm.settings import Replies
-from hardware.simulator.camera_pipeline import Exposures, Sight
+from hardware.simulator.arm.settings import ReplyMode
+from hardware.simulator.camera_pipeline import CameraPipeline, EventQueue, Exposures
 from hardware.simulator.cameras import Shot
-from hardware.simulator.laying import laid
-from hardware.simulator.ledger import Ledger, executed_rows
-from hardware.simulator.nozzle_log import NozzleLog
-from hardware.simulator.scenario import Scenario, Tracking
-from hardware.simulator.scenario_file import read_scenario
+from hardware.simulator.deposit import NozzleLog
+from hardware.simulator.scenario import Scenario, TrackingSettings, read_scenario
+from hardware.simulator.scenario_tables import bare_scene
 from hardware.simulator.scene.shape import Shape
-from hardware.simulator.scene_table import bare_scene
-from hardware.simulator.struck_surface import folded, struck_motion
-from hardware.simulator.track_tracker import TrackTracker
-from hardware.simulator.truth import Truth
+from hardware.simulator.simulate import LandmarkTracker
+from hardware.simulator.truth import Truth, TruthLog, disturbed_motion, drape_path, fold_deformation, row_instants
 from perception.frames import FrameSet, PrintHead
 from perception.tracking.step import StepReport
 from planning.command import Move
-from planning.kinematics import axes_from_nozzle
+from planning.limits import MotionLimits
 from planning.path import Path
-from planning.progress import Phase
+from planning.progress import PrintPhase
+from planning.robot.kinematics import axes_from_nozzle
 
-LOOK = 0.005  # s between looks at the line
-CONDUCTED = 0.02  # s between looks of whoever conducts the run
-ABOVE = 3.0  # mm over its first checkpoint, where the nozzle begins
-WATCHED = 1.5  # s that the rest of the world goes on without the motion
-AGAIN = 0.3  # s between an operator's words
-BEFORE, SECONDS = 3.0, 30.0  # s: nothing goes wrong until then; of a run at most
+AXES_LIMITS = "speed", "acceleration", "jerk", "jump", "turn"
+LIMIT_SLACK = 1.001  # a sample counts as over a limit from 0.1 % on
+
+
+class AxesOracle:
+    """What each axis does tick by tick, by differences of the commands alone.
+
+    samples: ticks judged. over: how many broke each of AXES_LIMITS. worst: (5,) shares.
+    """
+
+    def __init__(self, axes: Array, limits: MotionLimits, tick: float) -> None:
+        """axes: (6,) where the arm stands at first, at rest."""
+        self._limits, self._tick = limits, tick
+        self._bounds = np.stack([limits.speed, limits.acceleration, limits.jerk]) * tick ** np.arange(1, 4)[:, None]
+        self.samples = 0
+        self.over, self.worst = np.zeros(len(AXES_LIMITS), np.int64), np.zeros(len(AXES_LIMITS))
+        self._last = np.tile(axes, (4, 1))  # (4, 6), the newest last
+
+    def rest(self) -> None:
+        """The arm has come to rest by itself, where it was sent last."""
+        self._last = np.tile(self._last[-1], (4, 1))
+
+    def stands(self, axes: Array) -> None:
+        """What was sent beyond was called back: the arm stands at `axes` (6,)."""
+        self._last = np.tile(axes, (4, 1))
+
+    def __call__(self, axes: Array | None) -> None:
+        """One tick: the axes (6,) that are reached by its end, None where the arm is held."""
+        self._last = np.vstack([self._last[1:], self._last[-1] if axes is None else axes])
+        shares = self._shares()
+        self.samples += 1
+        self.over += ~(shares <= LIMIT_SLACK)  # NaN is over
+        self.worst = np.maximum(self.worst, np.where(np.isfinite(shares), shares, np.inf))
+
+    def _shares(self) -> Array:
+        """How much of each limit the last tick took (5,)."""
+        p = self._last
+        step = p[3] - p[2]
+        quotients = np.abs(np.stack([step, step - (p[2] - p[1]), p[3] - 3 * p[2] + 3 * p[1] - p[0]])) / self._bounds
+        jump, turn = np.linalg.norm(step[:3]) / self._limits.jump, np.abs(step[3:]).max() / self._limits.turn
+        return np.array([*quotients.max(axis=1), jump, turn])
+
+
+POLL_PERIOD = 0.005  # s between looks at the line
+CONDUCTOR_PERIOD = 0.02  # s between looks of whoever conducts the run
+START_HEIGHT = 3.0  # mm over its first checkpoint, where the nozzle begins
+WATCHED_AFTER_KILL = 1.5  # s that the rest of the world goes on without the motion
+ORDER_PERIOD = 0.3  # s between an operator's words
+FAULT_FREE_S, SECONDS = 3.0, 30.0  # s: nothing goes wrong until then; of a run at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stage:
+class PreparedScenario:
     """What all runs of one scenario share. path: in the surface frame, laid on its shape."""
 
     scenario: Scenario
@@ -69,50 +106,42 @@ class Stage:
     path: Path
 
 
-def stage(file: File) -> Stage:
+def prepare_scenario(file: File) -> PreparedScenario:
     """A scenario made ready for runs without pictures; its own arm answers."""
     scenario = read_scenario(file)
     shape, _, deformation = bare_scene(file, scenario.scene, file.parent, scenario.seed)
     path = read_path(scenario.path)
     if scenario.clearance is not None:
-        path = laid(path, shape, scenario.clearance, scenario.path)
+        path = drape_path(path, shape, scenario.clearance, scenario.path)
     truth = Truth(scenario.rest, scenario.motion, deformation, scenario.strain, shape.surface_from_grid)
-    tracked = Tracking(pictures=False, tracks=True)
-    answering = replace(scenario.arm, replies=Replies.STREAM)
-    plain = replace(scenario, tracking=tracked, arm=answering, told_rig=scenario.rig, seconds=SECONDS)
-    return Stage(plain, shape, truth, path)
+    tracked = TrackingSettings(pictures=False, tracks=True)
+    answering = replace(scenario.arm, replies=ReplyMode.STREAM)
+    plain = replace(scenario, tracking=tracked, arm=answering, known_rig=scenario.rig, seconds=SECONDS)
+    return PreparedScenario(plain, shape, truth, path)
 
 
 @dataclass(frozen=True, slots=True)
-class Word:
-    """What was known at one instant, s.
+class Statement:
+    """What was known at one instant."""
 
-    said: a reservation, a hold's reason, or why the arm does not move; "" if all is well. moving: whether a move was
-    sent. own: whether the link moves the arm by itself. seen: stamp of the newest pose, s, -inf before any; of what no
-    pose told, stamp.
-    """
-
-    stamp: float
-    said: str
-    moving: bool
-    own: bool
-    seen: float
+    stamp: float  # s
+    said: str  # a reservation, a hold's reason, or why the arm does not move; "" if all is well
+    moving: bool  # whether a move was sent
+    own: bool  # whether the link moves the arm by itself
+    seen: float  # s, stamp of the newest pose, -inf before any; of what no pose told, `stamp`
+    hold: LinkCode | None = None  # why the link sends nothing
 
 
 @dataclass(slots=True, eq=False)
-class Ran:
-    """One run. words: a tick each. log: of nozzle and target. over: ticks of commands beyond a limit. ended: s.
+class FaultRunRecord:
+    """What one run came to."""
 
-    missed: what the conducting process said of one that was silent. stopped: instants, s, at which the arm was stopped
-    and an operator was needed.
-    """
-
-    words: list[Word] = field(default_factory=list)
-    missed: list[Word] = field(default_factory=list)
-    log: NozzleLog | None = None
-    over: int = 0
-    ended: float = 0.0
-    stopped: list[float] = field(default_factory=list)
+    words: list[Statement] = field(default_factory=list)  # a tick each
+    missed: list[Statement] = field(default_factory=list)  # what the conducting process said of one that was silent
+    log: NozzleLog | None = None  # of nozzle and target
+    over: int = 0  # ticks of commands beyond a limit
+    ended: float = 0.0  # s
+    stopped: list[float] = field(default_factory=list)  # s, at which the arm was stopped and an operator was needed
 
 
 class _KilledError(Exception):
@@ -122,37 +151,37 @@ class _KilledError(Exception):
 class FaultRun:
     """One run with faults, from the first frame until the path is printed, the motion is killed, or `SECONDS`."""
 
-    def __init__(self, on: Stage, faults: Sequence[Fault], seed: int) -> None:
-        self._agenda, self._clock = Agenda(), SimClock()
+    def __init__(self, on: PreparedScenario, faults: Sequence[Fault], seed: int) -> None:
+        self._agenda, self._clock = EventQueue(), SimClock()
         scenario = replace(on.scenario, faults=tuple(faults), seed=seed)
-        fold = folded("faults", on.truth.deformation, faults)
+        fold = fold_deformation("faults", on.truth.deformation, faults)
         deformation, strain = (on.truth.deformation, on.truth.strain) if fold is None else fold
-        motion = struck_motion(on.truth.motion, faults)
+        motion = disturbed_motion(on.truth.motion, faults)
         self._truth = replace(on.truth, motion=motion, deformation=deformation, strain=strain)
         taken: Exposures = {}
 
         def shot(camera: int, stamp: float) -> Shot:
             return taken[camera, stamp]
 
-        step = TrackTracker(scenario.rig, scenario.told_rig, self._truth, on.shape, shot, seed)
-        self._sight = Sight(scenario, self._agenda, step, taken, self, SimClock(), self._know)
-        self._profile = near(scenario.profile, self._truth, on.path)
+        step = LandmarkTracker(scenario.rig, scenario.known_rig, self._truth, on.shape, shot, seed)
+        self._sight = CameraPipeline(scenario, self._agenda, step, taken, self, SimClock(), self._know)
+        self._profile = arm_near_path(scenario.profile, self._truth, on.path)
         home = self._profile.arm.home
         self._virtual = VirtualArm(scenario.arm, self._profile.dialect, home, faults, self._profile.baud)
         self._device = VirtualDevice(self._virtual, self._clock, self._profile.baud)
-        self._arm = Arm(self._device, self._profile, 0.0, LinkSettings(poll=LOOK))
+        self._arm = Arm(self._device, self._profile, 0.0, LinkSettings(poll=POLL_PERIOD))
         self._motion = MotionStep(on.path, self._profile)
-        self._ledger = Ledger(on.path, scenario.true_arm, self._truth, self._profile.tick, self._profile.lag)
-        self._hangs = struck(faults, Part.MOTION)
+        self._ledger = TruthLog(on.path, scenario.true_arm, self._truth, self._profile.tick, self._profile.lag)
+        self._hangs = faults_striking(faults, FaultPart.MOTION)
         self._pose: SurfacePose | None = None
         self._asked, self._stands = -np.inf, False
         self._interval = scenario.cameras.period
         self._ticked = self._heard = np.inf  # when motion and tracking last said something, s
         self._looks = 0.0  # when the conducting process looks next, s
-        self._judge, self._sent = AxesJudge(home, self._profile.limits, self._profile.tick), -np.inf
-        self._ran = Ran()
+        self._judge, self._sent = AxesOracle(home, self._profile.limits, self._profile.tick), -np.inf
+        self._ran = FaultRunRecord()
 
-    def __call__(self) -> Ran:
+    def __call__(self) -> FaultRunRecord:
         """Let it happen."""
         self._sight.begin()
         loop = MotionLoop(self._motion, self._arm, self, self._newest, self._orders, self._tell)
@@ -160,11 +189,11 @@ class FaultRun:
             loop.run(SECONDS)
         except _KilledError:
             self._device.faults = PortFaults(away=[(self._clock.now(), np.inf)])
-            self._advance(self._clock.now() + WATCHED)
+            self._advance(self._clock.now() + WATCHED_AFTER_KILL)
         ran = self._ran
         ran.ended = self._clock.now()
         self._virtual.advance(ran.ended)
-        ran.log = self._ledger.rows(executed_rows(0.0, ran.ended), self._virtual.axes_at)
+        ran.log = self._ledger.rows(row_instants(0.0, ran.ended), self._virtual.axes_at)
         ran.over = int(self._judge.over.sum())
         return ran
 
@@ -179,17 +208,17 @@ class FaultRun:
         self._advance(instant)
         for fault in self._hangs:
             if fault.covers(self._clock.now()):
-                if fault.kind is Kind.KILL or fault.end >= SECONDS:
+                if fault.kind is FaultKind.KILL or fault.end >= SECONDS:
                     raise _KilledError
                 self._advance(fault.end)
-        if self._motion.progress.phase is Phase.FINISHED:
+        if self._motion.progress.phase is PrintPhase.FINISHED:
             raise _KilledError
 
     def _advance(self, instant: float) -> None:
         while self._looks <= instant:
             self._pass(self._looks)
             self._conduct(self._looks)
-            self._looks += CONDUCTED
+            self._looks += CONDUCTOR_PERIOD
         self._pass(instant)
 
     def _pass(self, instant: float) -> None:
@@ -199,9 +228,9 @@ class FaultRun:
 
     def _conduct(self, now: float) -> None:
         """What a live run's conducting process sees of the others, and says."""
-        motion = silence("motion", self._ticked, self._profile.tick, now)
-        if said := motion or silence("tracking", self._heard, self._interval, now):
-            self._ran.missed.append(Word(now, said, False, False, now))
+        motion = silence_text("motion", self._ticked, self._profile.tick, now)
+        if said := motion or silence_text("tracking", self._heard, self._interval, now):
+            self._ran.missed.append(Statement(now, said, False, False, now))
 
     # -- what the motion is given, and what becomes of it
 
@@ -217,7 +246,7 @@ class FaultRun:
         if not self._stands:
             self._stands = True
             return [Order.AT_HOME]
-        if self._pose is None or self._pose.state is not TrackState.TRACKING or now < self._asked + AGAIN:
+        if self._pose is None or self._pose.state is not TrackState.TRACKING or now < self._asked + ORDER_PERIOD:
             return []
         self._asked = now
         return [Order.ARM] if self._arm.state in (ArmState.STOPPED, ArmState.DISARMED) else []
@@ -226,7 +255,7 @@ class FaultRun:
         ran, pose, status = self._ran, self._pose, tick.status
         self._ticked = self._clock.now()
         said = tick.command.reason or reservation(pose)
-        if status.state is ArmState.STOPPED and (not ran.stopped or now_stopped(ran, tick.stamp)):
+        if status.state is ArmState.STOPPED and (not ran.stopped or stopped_anew(ran, tick.stamp)):
             ran.stopped.append(tick.stamp)
         self._ledger.write(tick.command, self._motion.progress)
         if tick.stamp - self._sent > 1.5 * self._profile.tick or self._arm.travels:
@@ -237,9 +266,9 @@ class FaultRun:
         if axes is not None or tick.frame:
             self._judge(axes)
             self._sent = tick.stamp
-        own = self._arm.travels or said == RECALLED
+        own = self._arm.travels or tick.hold is LinkCode.RECALLED
         seen = -np.inf if pose is None else pose.stamp
-        ran.words.append(Word(tick.stamp, said, isinstance(tick.command, Move), own, seen))
+        ran.words.append(Statement(tick.stamp, said, isinstance(tick.command, Move), own, seen, tick.hold))
 
     # -- nobody looks at pictures
 
@@ -263,25 +292,70 @@ def reservation(pose: SurfacePose | None) -> str:
     return pose.reason or ("" if pose.state is TrackState.TRACKING else pose.state.value)
 
 
-def now_stopped(ran: Ran, stamp: float) -> bool:
+def stopped_anew(ran: FaultRunRecord, stamp: float) -> bool:
     """Whether the arm is stopped anew: the tick before, it was not."""
-    return bool(ran.words) and not ran.words[-1].said.startswith("the arm is stopped") and stamp > ran.stopped[-1]
+    return bool(ran.words) and ran.words[-1].hold is not LinkCode.STOPPED and stamp > ran.stopped[-1]
 
 
-def near(profile: ArmProfile, truth: Truth, path: Path) -> ArmProfile:
+def arm_near_path(profile: ArmProfile, truth: Truth, path: Path) -> ArmProfile:
     """The arm with its home over the first checkpoint: the way there is not what is looked at."""
     over = path.surface_from_nozzle[:1].copy()
-    over[:, :3, 3] += ABOVE * over[:, :3, 2]
+    over[:, :3, 3] += START_HEIGHT * over[:, :3, 2]
     place = truth.base_from_surface(np.zeros(1)) @ over
     return replace(profile, arm=replace(profile.arm, home=axes_from_nozzle(profile.arm, place)[0]))
 
 
-Rows = NDArray[np.bool_]
+RowFlags = NDArray[np.bool_]
 
 
-def speeds(log: NozzleLog) -> Array:
+def nozzle_speeds(log: NozzleLog) -> Array:
     """Of the nozzle (N,), mm/s, executed, over 10 ms."""
     places = log.base_from_nozzle[:, :3, 3]
     way = np.zeros(len(log))
     way[10:] = np.linalg.norm(places[10:] - places[:-10], axis=1) / np.maximum(log.stamps[10:] - log.stamps[:-10], 1e-9)
     return way
+
+
+FAULT_SPACING, FAULTS_A_RUN = 2.6, 7  # s from one fault to the next, and faults of a run
+MIN_DURATION, MAX_DURATION = 0.15, 1.0  # s: long enough to be seen, short enough to be over before the next
+AMOUNTS = {  # of what has one, uniform in the logarithm
+    (FaultPart.CAMERA, FaultKind.SLOW): (0.03, 0.3),  # s
+    (FaultPart.CAMERA, FaultKind.BUMP): (2.0, 10.0),  # mm: what is less is no harm to three cameras
+    (FaultPart.CLOCK, FaultKind.JUMP): (0.05, 5.0),  # s
+    (FaultPart.TRACKING, FaultKind.SLOW): (5.0, 60.0),  # %
+    (FaultPart.ARM, FaultKind.SLOW): (30.0, 90.0),  # %
+    (FaultPart.SURFACE, FaultKind.FAST): (30.0, 200.0),  # mm/s
+    (FaultPart.SURFACE, FaultKind.FOLD): (0.5, 5.0),  # mm
+}
+CAMPAIGN_KINDS = [key for key, spec in FAULT_SPECS.items() if FaultRunner.SIMULATE in spec.runners]
+ENDING_KINDS = [
+    (part, kind) for part, kind in CAMPAIGN_KINDS if kind is FaultKind.KILL
+]  # after which a run has nothing to go on with
+PASSING_KINDS = [key for key in CAMPAIGN_KINDS if key not in ENDING_KINDS]
+
+
+def draw_faults(seed: int, number: int) -> list[Fault]:
+    """The faults of a campaign's run; kinds take turns from run to run."""
+    rng = np.random.default_rng([seed, number, 83])
+    first = number * (FAULTS_A_RUN - 1)
+    keys = [PASSING_KINDS[k % len(PASSING_KINDS)] for k in range(first, first + FAULTS_A_RUN - 1)]
+    keys.append(ENDING_KINDS[number % len(ENDING_KINDS)])
+    return [_fault(key, FAULT_FREE_S + FAULT_SPACING * place, rng) for place, key in enumerate(keys)]
+
+
+def _fault(key: tuple[FaultPart, FaultKind], slot: float, rng: np.random.Generator) -> Fault:
+    start = round(slot + float(rng.uniform(0.0, 0.4)), 3)
+    duration = round(_between(rng, MIN_DURATION, MAX_DURATION), 3)
+    amount = round(_between(rng, *AMOUNTS[key]), 3) if key in AMOUNTS else 0.0
+    if key == (FaultPart.CLOCK, FaultKind.JUMP):
+        amount *= float(rng.choice([-1.0, 1.0]))
+    if key[1] is FaultKind.KILL:
+        duration = np.inf
+    if key in ((FaultPart.ARM, FaultKind.DROP), (FaultPart.ARM, FaultKind.GARBLE)) and rng.random() < 0.5:
+        duration = 0.0
+    number = int(rng.integers(3)) if key[0] is FaultPart.CAMERA else 0
+    return Fault(*key, start, duration, amount, number, int(rng.integers(10**6)))
+
+
+def _between(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))

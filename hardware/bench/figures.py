@@ -1,9 +1,33 @@
-"""One measured figure beside what it should be and what others reach."""
+"""Figures beside their targets, as a table and as files, with the machine; and what subjects share to get them."""
 
 from __future__ import annotations
 
+import argparse
+import csv
+import json
 import math
-from dataclasses import dataclass
+import os
+import platform
+import signal
+import subprocess
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress
+from hardware.process.system import exit_with_parent
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,20 +58,20 @@ def at_least(value: float) -> Target:
     return Target(low=value)
 
 
+CONSISTENT_NEES = Target(0.8, 1.25)  # squared error by the stated covariance, per degree of freedom
+INSIDE_95 = Target(0.93, 0.97)  # share of errors inside their 95 % intervals
+
+
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One measured figure.
+    """One measured figure."""
 
-    what: in words, unique within a subject. value: in `unit`, nan where it could not be measured. target: None for a
-    figure that only informs. reference: what others reach, in words. note: how it was measured, or why it is missing.
-    """
-
-    what: str
-    value: float
+    what: str  # unique within a subject
+    value: float  # in `unit`; nan where it could not be measured
     unit: str = ""
-    target: Target | None = None
-    reference: str = ""
-    note: str = ""
+    target: Target | None = None  # None for a figure that only informs
+    reference: str = ""  # what others reach
+    note: str = ""  # how it was measured, or why it is missing
 
     @property
     def verdict(self) -> str:
@@ -55,3 +79,193 @@ class Figure:
         if self.target is None:
             return ""
         return "met" if self.target.met(self.value) else "MISSED"
+
+
+LIBRARIES = ("stillbed", "numpy", "scipy", "gtsam", "opencv-python-headless", "toppra", "ruckig")
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """What figures were measured on and with."""
+
+    cpu: str
+    cores: int  # that this process may use
+    system: str
+    commit: str  # of the code, with a + where files differ from it, "" if unknown
+    versions: dict[str, str]
+
+
+def this_machine() -> Machine:
+    """What this process runs on and with."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    versions = {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}}
+    return Machine(_cpu(), cores, platform.platform(), _commit(), versions)
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:  # not Linux
+        lines = []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return ""
+
+
+def _commit() -> str:
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty=+", "--abbrev=12"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):  # no git, or an installed package
+        return ""
+    return done.stdout.strip()
+
+
+FIGURE_COLUMNS = ("what", "value", "unit", "low", "high", "verdict", "reference", "note")
+
+
+def save(
+    folder: Path, subject: str, options: Mapping[str, object], figures: Sequence[Figure], machine: Machine
+) -> None:
+    """Write figures.json and figures.csv into an existing folder; a number that does not exist is null, or empty."""
+    from hardware.report.summary import finite
+
+    rows = [_row(figure) for figure in figures]
+    plain = {name: value if isinstance(value, (int, float, bool)) else str(value) for name, value in options.items()}
+    whole = {"subject": subject, "options": plain, "machine": asdict(machine), "figures": rows}
+    (folder / "figures.json").write_text(json.dumps(finite(whole), indent=2) + "\n", encoding="utf-8")
+    with (folder / "figures.csv").open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, FIGURE_COLUMNS)
+        writer.writeheader()
+        writer.writerows(finite(rows))
+
+
+def _row(figure: Figure) -> dict[str, object]:
+    low, high = (None, None) if figure.target is None else (figure.target.low, figure.target.high)
+    values = (figure.what, figure.value, figure.unit, low, high, figure.verdict, figure.reference, figure.note)
+    return dict(zip(FIGURE_COLUMNS, values, strict=True))
+
+
+def read_figures(file: Path) -> list[Figure]:
+    """The figures that `save` wrote."""
+    return [_figure(row) for row in json.loads(file.read_text(encoding="utf-8"))["figures"]]
+
+
+def _figure(row: Mapping[str, Any]) -> Figure:
+    low, high = row["low"], row["high"]
+    target = None
+    if row["verdict"]:
+        target = Target(-math.inf if low is None else low, math.inf if high is None else high)
+    value = math.nan if row["value"] is None else row["value"]
+    return Figure(row["what"], value, row["unit"], target, row["reference"], row["note"])
+
+
+def whole_table(parts: Mapping[str, Sequence[Figure]], machine: Machine) -> dict[str, object]:
+    """The figures of several subjects, ready for JSON."""
+    from hardware.report.summary import finite
+
+    subjects = {name: [_row(figure) for figure in figures] for name, figures in parts.items()}
+    table: dict[str, object] = finite({"machine": asdict(machine), "subjects": subjects})
+    return table
+
+
+TABLE_HEADER = ("figure", "value", "unit", "target", "", "reference", "note")
+
+
+def table_text(figures: Sequence[Figure]) -> str:
+    """The figures, a line each, and a line that counts the missed ones."""
+    rows = [TABLE_HEADER, *map(_cells, figures)]
+    shown = [i for i in range(len(TABLE_HEADER)) if any(row[i] for row in rows[1:])]
+    text = aligned([[row[i] for i in shown] for row in rows], [shown.index(1)] if 1 in shown else [])
+    verdicts = [figure.verdict for figure in figures if figure.target is not None]
+    return f"{text}\n\n{verdicts.count('met')} of {len(verdicts)} targets met"
+
+
+def _cells(figure: Figure) -> tuple[str, ...]:
+    from hardware.report.summary import figure as digits
+
+    target = "" if figure.target is None else str(figure.target)
+    return (figure.what, digits(figure.value), figure.unit, target, figure.verdict, figure.reference, figure.note)
+
+
+def aligned(rows: Sequence[Sequence[str]], right: Collection[int]) -> str:
+    """Rows of cells as lines; columns whose number is in `right` hold numbers, which stand under each other."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = zip(range(len(row)), row, widths, strict=True)
+        lines.append("  ".join(c.rjust(width) if i in right else c.ljust(width) for i, c, width in cells).rstrip())
+    return "\n".join(lines)
+
+
+def write_page(out: Path | None, name: str, page: Callable[[], str], what: str) -> None:
+    """Make a page, write it into the output folder, if there is one, and say where it is."""
+    if out is not None:
+        (out / name).write_text(page(), encoding="utf-8")
+        print(f"{what}: {out / name}\n")
+
+
+def append_rows(file: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Add rows to a CSV file, with its header where it is new."""
+    new = not file.exists()
+    with file.open("a", newline="", encoding="utf-8") as stream:
+        csv.writer(stream).writerows([columns, *rows] if new else rows)
+
+
+def log_rows(file: Path, columns: Sequence[str]) -> Iterator[tuple[int, dict[str, str]]]:
+    """Line number and cells of each row that `append_rows` wrote; InputError where the file has another header."""
+    with file.open(newline="", encoding="utf-8") as stream:
+        table = csv.DictReader(stream)
+        if tuple(table.fieldnames or ()) != tuple(columns):
+            raise InputError(file, "header", table.fieldnames, ",".join(columns))
+        for row in table:
+            yield table.line_num, row
+
+
+def require_positive(options: argparse.Namespace, *names: str) -> None:
+    """InputError where an option is less than 1."""
+    for name in names:
+        if getattr(options, name) < 1:
+            raise InputError("command line", f"--{name}", getattr(options, name), ">= 1")
+
+
+def rms(values: Array) -> float:
+    """Root mean square of all values."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def percentile(values: Array, share: float) -> float:
+    """The value that `share` % of all lie below; nan where there are none."""
+    return float(np.percentile(values, share)) if len(values) else math.nan
+
+
+def with_progress(what: str, unit: str, items: Iterable[Item], count: int) -> Iterator[Item]:
+    """The items one by one; how many of `count` are done with is told on stderr."""
+    with Progress(what, unit, WallClock().now) as progress:
+        for done, item in enumerate(items, 1):
+            yield item
+            progress(done, count)
+
+
+@contextmanager
+def workers(count: int) -> Iterator[ProcessPoolExecutor]:
+    """`count` processes that end with whoever started them, however that ends.
+
+    Where the block is left early, what has not begun is left out; Ctrl-C ends what has, too.
+    """
+    with ProcessPoolExecutor(count, get_context("spawn"), _settle) as pool:
+        try:
+            yield pool
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _settle() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    exit_with_parent()

@@ -1,96 +1,255 @@
-"""A stretch of tracking with one outage after the other, and what the tracker said and did in each frame set."""
+"""A stretch of tracking with one camera outage after the other, and what the tracker said and did in each frame set.
+
+Outages are laid over the images of one instant: each is a kind, the cameras it strikes, when, and how hard; all chance
+is drawn once, when the outage is.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
-from estimation.rig import Rig
+from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST, arc_rig
-from hardware.simulator.bodies import Wound, with_wound
-from hardware.simulator.look import Look
-from hardware.simulator.outage import LONGEST, Kind, Outage, Spoiler, draw_outage
-from hardware.simulator.picture_loop import PictureLoop, closed_motion
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
+from hardware.simulator.camera_pipeline import draw_cover, draw_glare
+from hardware.simulator.scene.appearance import Appearance
 from hardware.simulator.scene.scene import Scene, rois
-from hardware.simulator.scene.shape import cylinder
+from hardware.simulator.scene.shape import Wound, cylinder, with_wound
+from hardware.simulator.watched_arm import PictureLoop, closed_motion
 from perception.frames import Frame, FrameSet, Image
+from perception.lens import undistort
 from perception.tracking.step import TrackingStep
 
+Map = NDArray[np.float32]  # (H, W)
+
+MAX_OCCLUSION, MIN_OCCLUSION = 5.0, 0.2  # s, of an occlusion; other faults are over within 2 s
+FLASH = (0.03, 0.2)  # s
+BUMP_TURN, BUMP_SHIFT = np.deg2rad(0.5), 2.0  # rad, mm: the least bump; the hardest is twice that
+HAND_SLIDE = 0.15  # s in which a hand comes and goes
+RAY_SPACING = 8  # px between the rays that are traced for a bumped camera
+
+
+class OutageKind(Enum):
+    """What goes wrong. The last five may leave a camera of some use."""
+
+    OCCLUDED = "occluded"  # something lies over the whole wound, from one frame to the next
+    DEAD = "dead"  # no picture comes
+    BLACK = "black"  # the picture is black
+    FROZEN = "frozen"  # the same picture again and again
+    SWAPPED = "swapped"  # two cables exchanged
+    BUMPED = "bumped"  # the camera stands and looks a little differently
+    HAND = "hand"  # slides in, covers the wound wholly or in part, slides out
+    GLARE = "glare"
+    FLASH = "flash"
+    EXPOSURE = "exposure"
+    BLUR = "blur"
+
+    @property
+    def blinds(self) -> bool:
+        """Whether a camera struck by it is of no use at all."""
+        return self in tuple(OutageKind)[:6]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outage:
+    """One outage."""
+
+    kind: OutageKind
+    cameras: tuple[int, ...]  # numbers in the rig
+    start: float  # s
+    end: float  # s; the view is free again then
+    strength: float  # in [0, 1]
+    bump: Array  # (4, 4), camera_from_bumped, mm
+    seed: int  # of what else is drawn
+
+
+def draw_outage(
+    kind: OutageKind, rig: Rig, start: float, rng: np.random.Generator, longest: float = MAX_OCCLUSION
+) -> Outage:
+    """An outage of a kind that begins at `start`, s, and lasts `longest` s at most; uniform in the logarithm."""
+    low, high = {
+        OutageKind.OCCLUDED: (MIN_OCCLUSION, MAX_OCCLUSION),
+        OutageKind.HAND: (MIN_OCCLUSION + 2 * HAND_SLIDE, MAX_OCCLUSION),
+        OutageKind.FLASH: FLASH,
+    }.get(kind, (MIN_OCCLUSION, 2.0))
+    length = min(float(np.exp(rng.uniform(np.log(low), np.log(high)))), longest)
+    most = {OutageKind.SWAPPED: (2,), OutageKind.BUMPED: (1,)}.get(kind, (1, 1, 2, 3))
+    count = min(int(rng.choice(most)), len(rig))
+    cameras = tuple(sorted(rng.choice(len(rig), count, replace=False).tolist()))
+    across = np.array([*_unit(rng), 0.3 * rng.normal()])  # pan and tilt show, roll hardly
+    shift = np.array([*_unit(rng), 0.3 * rng.normal()])
+    hard = rng.uniform(1.0, 2.0)
+    turn = bool(rng.integers(2))
+    xi = np.concatenate([across * BUMP_TURN * hard * turn, shift * BUMP_SHIFT * hard * (not turn)])
+    return Outage(kind, cameras, start, start + length, float(rng.random()), se3.exp(xi), int(rng.integers(2**31)))
+
+
+def _unit(rng: np.random.Generator) -> Array:
+    angle = rng.uniform(0, 2 * np.pi)
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+class Spoiler:
+    """Applies outages to the images of one rig, in order of time."""
+
+    def __init__(self, rig: Rig, extent: Array) -> None:
+        """extent: (N, 3) mm, surface frame, points around what is to be covered."""
+        self.rig, self._extent = rig, extent
+        self._maps: tuple[Outage, tuple[Map, Map]] | None = None
+
+    def __call__(
+        self, outage: Outage, stamp: float, images: list[Image], last: list[Image], base_from_surface: Array
+    ) -> list[Image | None]:
+        """What the cameras deliver at `stamp` instead of `images` (grey); last: what they did before the outage."""
+        spoilt: list[Image | None] = list(images)
+        for c in outage.cameras:
+            spoilt[c] = self._one(outage, stamp, c, images, last, base_from_surface)
+        return spoilt
+
+    def _one(
+        self, outage: Outage, stamp: float, c: int, images: list[Image], last: list[Image], base_from_surface: Array
+    ) -> Image | None:
+        image, hard = images[c], outage.strength
+        draw = np.random.default_rng([outage.seed, c])
+        match outage.kind:
+            case OutageKind.DEAD:
+                return None
+            case OutageKind.BLACK:
+                return np.full_like(image, 2)
+            case OutageKind.FROZEN:
+                return last[c]
+            case OutageKind.SWAPPED:
+                return images[outage.cameras[1 - outage.cameras.index(c)]]
+            case OutageKind.BUMPED:
+                return self._bumped(outage, c, image, base_from_surface)
+            case OutageKind.FLASH:
+                return _relit(image, 3.0 + 5.0 * hard, 30.0)
+            case OutageKind.EXPOSURE:
+                return _relit(image, 0.35 + 0.35 * hard if hard < 0.5 else 0.9 + 1.4 * hard, 0.0)
+            case OutageKind.BLUR:
+                return np.asarray(cv2.GaussianBlur(image, (0, 0), 1.5 + 6.0 * hard), np.uint8)
+            case OutageKind.GLARE:
+                return draw_glare(image, self._box(c, base_from_surface), 0.25 + 0.5 * hard, draw)
+            case OutageKind.OCCLUDED:
+                return draw_cover(image, self._box(c, base_from_surface), 0.0, draw)
+            case OutageKind.HAND:
+                away = min(stamp - outage.start, outage.end - stamp) / HAND_SLIDE
+                reach = 0.6 if hard < 0.4 else 0.0  # two in five leave more than half of the wound free
+                return draw_cover(image, self._box(c, base_from_surface), max(reach, 1.0 - away), draw)
+
+    def _box(self, camera: int, base_from_surface: Array) -> tuple[Array, Array]:
+        """Low and high corner (2,) px of the wound in a camera's image."""
+        pixels, _ = pixels_from_points(self.rig.cameras[camera], se3.transform_points(base_from_surface, self._extent))
+        return pixels.min(0), pixels.max(0)
+
+    def _bumped(self, outage: Outage, camera: int, image: Image, base_from_surface: Array) -> Image:
+        """As the bumped camera sees the surface's tangent plane; what is nearer or farther shifts by far less."""
+        if self._maps is None or self._maps[0] is not outage:
+            self._maps = outage, _bump_maps(self.rig.cameras[camera], outage.bump, base_from_surface)
+        return np.asarray(cv2.remap(image, *self._maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
+def _relit(image: Image, gain: float, offset: float) -> Image:
+    return np.asarray(cv2.convertScaleAbs(image, alpha=gain, beta=offset), np.uint8)
+
+
+def _bump_maps(camera: Camera, camera_from_bumped: Array, base_from_surface: Array) -> tuple[Map, Map]:
+    """Where each pixel of the bumped camera lies in the camera's own image, x and y (H, W)."""
+    w, h = camera.size
+    across, down = (np.arange(-RAY_SPACING, n + 2 * RAY_SPACING, RAY_SPACING, dtype=float) for n in (w, h))
+    grid = np.stack(np.meshgrid(across, down), -1)
+    ideal = undistort(camera, grid.reshape(-1, 2))
+    tangents = (ideal - camera.matrix[:2, 2]) / camera.matrix[[0, 1], [0, 1]]
+    base_from_bumped = camera.base_from_camera @ camera_from_bumped
+    rays = np.c_[tangents, np.ones(len(tangents))] @ base_from_bumped[:3, :3].T
+    centre, plane = base_from_bumped[:3, 3], base_from_surface[:3, 2]
+    reach = (base_from_surface[:3, 3] - centre) @ plane / (rays @ plane)
+    source = pixels_from_points(camera, centre + reach[:, None] * rays)[0].reshape(grid.shape)
+    x, y = np.meshgrid((np.arange(w) / RAY_SPACING + 1), (np.arange(h) / RAY_SPACING + 1))
+    fine: Map = np.asarray(
+        cv2.remap(source.astype(np.float32), x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR), np.float32
+    )
+    return np.ascontiguousarray(fine[..., 0]), np.ascontiguousarray(fine[..., 1])
+
+
 FPS = 30.0
-PERIOD = 96  # frame sets of the motion's loop: a breath of 3.2 s
-WOUND = Wound((40.0, 28.0))
-EXTENT = np.array([[x, y, 0.0] for x in (-24.0, 0.0, 24.0) for y in (-17.0, 0.0, 17.0)])  # mm, around the wound
-JUDGED = np.array([[0, 0, 0], [15.0, 0, 0], [-15.0, 0, 0], [0, 10.0, 0], [0, -10.0, 0]])  # mm: where prints are laid
-WITHIN = 2.8  # 95 % of a normal error in space lie within so many standard deviations
-START, CALM, REST_AFTER = 1.5, 0.5, 0.7  # s before the first outage, before each, and watched after each
-JUMPS = 0.3  # of the outages in which nobody sees the surface it goes elsewhere meanwhile
+MOTION_SETS = 96  # frame sets of the motion's loop: a breath of 3.2 s
+LOOP_WOUND = Wound((40.0, 28.0))
+WOUND_EXTENT = np.array([[x, y, 0.0] for x in (-24.0, 0.0, 24.0) for y in (-17.0, 0.0, 17.0)])  # mm, around the wound
+JUDGED_POINTS = np.array(
+    [[0, 0, 0], [15.0, 0, 0], [-15.0, 0, 0], [0, 10.0, 0], [0, -10.0, 0]]
+)  # mm: where prints are laid
+SPACE_95 = 2.8  # 95 % of a normal error in space lie within so many standard deviations
+START_S, CALM_S, REST_S = 1.5, 0.5, 0.7  # s before the first outage, before each, and watched after each
+JUMP_SHARE = 0.3  # of the outages in which nobody sees the surface it goes elsewhere meanwhile
 ELSEWHERE = se3.exp(np.array([0.08, -0.06, 0.2, 12.0, -9.0, 6.0]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pictures:
-    """What all stretches of one scene look at. near, far: loops of the motion at two places; rest: (4, 4)."""
+class ScenePictures:
+    """What all stretches of one scene look at."""
 
     rig: Rig
     scene: Scene
-    near: PictureLoop
+    near: PictureLoop  # of the motion at one place, and at another
     far: PictureLoop
 
 
 def make_pictures(
-    seed: int, period: int = PERIOD, size: tuple[int, int] = (640, 360), focal: float = 560.0
-) -> Pictures:
+    seed: int, period: int = MOTION_SETS, size: tuple[int, int] = (640, 360), focal: float = 560.0
+) -> ScenePictures:
     """Render the loops of one scene, some 20 s for the default."""
-    rig, scene, near = looped(seed, period, size, focal)
-    return Pictures(rig, scene, near, PictureLoop(scene, rig, near.poses @ ELSEWHERE, seed + 1))
+    rig, scene, near = picture_loop(seed, period, size, focal)
+    return ScenePictures(rig, scene, near, PictureLoop(scene, rig, near.poses @ ELSEWHERE, seed + 1))
 
 
-def looped(
-    seed: int, period: int = PERIOD, size: tuple[int, int] = (640, 360), focal: float = 560.0
+def picture_loop(
+    seed: int, period: int = MOTION_SETS, size: tuple[int, int] = (640, 360), focal: float = 560.0
 ) -> tuple[Rig, Scene, PictureLoop]:
     """Cameras, a scene, and the loop of its pictures at the nearer place: `period` frame sets."""
     rng = np.random.default_rng([seed, 61])
     rig = arc_rig(size=size, focal=focal)
-    shape = with_wound(cylinder((80.0, 60.0), float(rng.uniform(50, 120))), WOUND, seed)
-    scene = Scene(shape, Look(texel=0.2, wetness=0.3, drape=False), seed=seed)
-    poses = closed_motion(period, REST, rng, lively=period / PERIOD)  # at one speed, however short the loop
+    shape = with_wound(cylinder((80.0, 60.0), float(rng.uniform(50, 120))), LOOP_WOUND, seed)
+    scene = Scene(shape, Appearance(texel=0.2, wetness=0.3, drape=False), seed=seed)
+    poses = closed_motion(
+        period, BASE_FROM_REST, rng, lively=period / MOTION_SETS
+    )  # at one speed, however short the loop
     return rig, scene, PictureLoop(scene, rig, poses, seed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Watched:
-    """Frame sets of one outage, from the calm before it to the rest after it.
-
-    stamps: (K,) s. error: (K,) mm, the largest of the judged points. radius: (K,) mm, within which 95 % of the errors
-    there are claimed to lie. states, reasons: K each. used: (K, C) tracks that carry the pose. jumped: whether the
-    surface came back elsewhere.
-    """
+class WatchedOutage:
+    """Frame sets of one outage, from the calm before it to the rest after it."""
 
     outage: Outage
-    stamps: Array
-    error: Array
-    radius: Array
-    states: tuple[TrackState, ...]
-    reasons: tuple[str, ...]
-    used: NDArray[np.int64]
-    jumped: bool
+    stamps: Array  # (K,) s
+    error: Array  # (K,) mm, the largest of the judged points
+    radius: Array  # (K,) mm, within which 95 % of the errors there are claimed to lie
+    states: tuple[TrackState, ...]  # K
+    reasons: tuple[str, ...]  # K
+    used: NDArray[np.int64]  # (K, C) tracks that carry the pose
+    jumped: bool  # whether the surface came back elsewhere
 
 
-class Stretch:
+class TrackedStretch:
     """One tracker, driven over the loop of pictures."""
 
-    def __init__(self, pictures: Pictures, seed: int, step: Callable[[Pictures], TrackingStep] | None = None) -> None:
+    def __init__(
+        self, pictures: ScenePictures, seed: int, step: Callable[[ScenePictures], TrackingStep] | None = None
+    ) -> None:
         self._rng = np.random.default_rng([seed, 67])
         self._pictures = pictures
         self._loop, self._at = pictures.near, int(self._rng.integers(len(pictures.near)))
         self._count = 0
-        self._spoiler = Spoiler(pictures.rig, EXTENT)
+        self._spoiler = Spoiler(pictures.rig, WOUND_EXTENT)
         self._last: list[Image] = []
         roi = rois(pictures.scene, pictures.rig, self._loop.poses[self._at % len(self._loop)], 0.0)
         self._step = TrackingStep(pictures.rig, roi) if step is None else step(pictures)
@@ -100,42 +259,38 @@ class Stretch:
     def begin(self) -> bool:
         """Start up; whether the tracker then tracks. What stands between the two surface frames is taken here."""
         offsets = []
-        for _ in range(round(START * FPS)):
+        for _ in range(round(START_S * FPS)):
             truth, pose = self._frame(None)
             if pose.state is TrackState.TRACKING:
                 offsets.append(se3.inverse(truth) @ pose.base_from_surface)
-        if len(offsets) < START * FPS / 2:
+        if len(offsets) < START_S * FPS / 2:
             return False
         middle = offsets[len(offsets) // 2]
         self._constant = middle @ se3.exp(se3.log(se3.inverse(middle) @ np.stack(offsets)).mean(0))
         self._rows.clear()
         return True
 
-    def outage(self, kind: Kind, longest: float = LONGEST) -> Watched:
+    def outage(self, kind: OutageKind, longest: float = MAX_OCCLUSION) -> WatchedOutage:
         """Calm, one outage of `longest` s at most, and the rest after it."""
         self._rows.clear()
-        for _ in range(round(CALM * FPS)):
+        for _ in range(round(CALM_S * FPS)):
             self._frame(None)
         outage = draw_outage(kind, self._pictures.rig, self._count / FPS, self._rng, longest)
-        hidden = len(outage.cameras) == len(self._pictures.rig) and kind in (Kind.OCCLUDED, Kind.DEAD, Kind.BLACK)
-        before, jumps = self._loop, hidden and outage.end - outage.start > 1.0 and self._rng.random() < JUMPS
+        hidden = len(outage.cameras) == len(self._pictures.rig) and kind in (
+            OutageKind.OCCLUDED,
+            OutageKind.DEAD,
+            OutageKind.BLACK,
+        )
+        before, jumps = self._loop, hidden and outage.end - outage.start > 1.0 and self._rng.random() < JUMP_SHARE
         while self._count / FPS < outage.end - 1e-9:
             if jumps and self._count / FPS > outage.start + 0.5:
                 jumps, self._loop = False, self._other()
             self._frame(outage)
-        for _ in range(round(REST_AFTER * FPS)):
+        for _ in range(round(REST_S * FPS)):
             self._frame(None)
         stamps, error, radius, states, reasons, used = zip(*self._rows, strict=True)
-        return Watched(
-            outage,
-            np.array(stamps),
-            np.array(error),
-            np.array(radius),
-            states,
-            reasons,
-            np.stack(used),
-            self._loop is not before,
-        )
+        numbers, jumped = (np.array(stamps), np.array(error), np.array(radius)), self._loop is not before
+        return WatchedOutage(outage, *numbers, states, reasons, np.stack(used), jumped)
 
     def _other(self) -> PictureLoop:
         return self._pictures.far if self._loop is self._pictures.near else self._pictures.near
@@ -165,29 +320,29 @@ class Stretch:
         error = radius = np.nan
         if self._constant is not None:
             expected = truth @ self._constant
-            points = se3.transform_points(se3.inverse(self._constant), JUDGED)
+            points = se3.transform_points(se3.inverse(self._constant), JUDGED_POINTS)
             gap = se3.transform_points(pose.base_from_surface, points) - se3.transform_points(expected, points)
             error = float(np.linalg.norm(gap, axis=1).max())
-            radius = WITHIN * float(pose.error_at(points).max())
+            radius = SPACE_95 * float(pose.error_at(points).max())
         self._rows.append((pose.stamp, error, radius, pose.state, pose.reason, self._step.last.used.copy()))
 
 
-def calm(watched: Watched, good: float) -> bool:
+def may_go_on(watched: WatchedOutage, good: float) -> bool:
     """Whether the stretch may go on: the last frame sets are TRACKING and within `good` mm."""
     last = slice(-5, None)
     return all(s is TrackState.TRACKING for s in watched.states[last]) and float(watched.error[last].max()) < good
 
 
-def run_stretch(pictures: Pictures, kinds: Sequence[Kind], seed: int, good: float) -> list[Watched]:
+def run_stretch(pictures: ScenePictures, kinds: Sequence[OutageKind], seed: int, good: float) -> list[WatchedOutage]:
     """Outages of these kinds in this order; where one is not recovered from, the tracker starts anew for the next."""
-    done: list[Watched] = []
-    stretch: Stretch | None = None
+    done: list[WatchedOutage] = []
+    stretch: TrackedStretch | None = None
     for k, kind in enumerate(kinds):
         if stretch is None:
-            stretch = Stretch(pictures, seed + 1000 * k)
+            stretch = TrackedStretch(pictures, seed + 1000 * k)
             if not stretch.begin():
                 raise RuntimeError(f"no start in scene of seed {seed}")
         done.append(stretch.outage(kind))
-        if not calm(done[-1], good):
+        if not may_go_on(done[-1], good):
             stretch = None
     return done

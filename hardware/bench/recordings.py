@@ -1,60 +1,154 @@
-"""`stillbed bench thesis`: the thesis's estimator and ours, on the same frame sets in the same run."""
+"""Subjects `thesis`, `latency` and `growth`: short made recordings, or recorded sessions, before a tracking method.
+
+`thesis`: the thesis's estimator and ours, on the same frame sets in the same run.
+`latency`: from three decoded frames to the pose, flow included, by wall clock and by processor.
+`growth`: what a pose and a path cost, as tracks, cameras, pixels, checkpoints and minutes grow.
+"""
 
 from __future__ import annotations
 
 import argparse
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from hardware.bench.figures import Figure, Target, at_least
-from hardware.bench.thesis_scenes import MADE, Shown, made, recorded
+from estimation.pose import TrackState, Trajectory
+from estimation.rig import Rig
+from estimation.se3 import Array
+from estimation.synthetic.follow import follow_steps
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig, synthetic_world
+from hardware.bench.figures import Figure, Target, at_least, at_most, percentile, with_progress, write_page
+from hardware.bench.planner import carries
+from hardware.files.images import decode, encode
 from hardware.files.pose_file import PoseWriter, read_poses
-from hardware.methods import MAP, step_by
-from hardware.process.clock import ProcessorClock, WallClock
+from hardware.files.session import Session
+from hardware.offline.track import MAP_METHOD, step_by, tracker
+from hardware.process.checks import Table
+from hardware.process.clock import CpuClock, ProcessorClock, WallClock
+from hardware.recording.session_reader import open_session
 from hardware.report.evaluation import Evaluation, evaluate, spread
+from hardware.report.page import Plot, document, legend, line_key, section, spanning
 from hardware.report.summary import measured_share, percent
+from hardware.simulator.motion_table import motion_from_tables
+from hardware.simulator.scenario_tables import scene_from_table
+from hardware.simulator.scene.appearance import Appearance, Sensor
+from hardware.simulator.scene.render import render
+from hardware.simulator.scene.scene import Scene, WorldState, rois
+from hardware.simulator.scene.shape import Wound, flat, with_wound
+from hardware.simulator.truth import Truth
+from perception.frames import Frame, FrameSet, Roi
 from perception.tracking.step import STAGES
 
-ACCURACY, SPEED = 10.0, 5.0  # times better than the thesis's, which ours is to be
+FRAME_RATE = 30.0  # frame sets a second
+SCENE_SEED = 1
+TABLE_SOURCE = "stillbed bench thesis"
+PATCH_SIZE = (80.0, 60.0)  # mm, flat and textured: what the thesis's method is best at
+SLIDING: Table = {"kind": "sine", "rate_hz": 0.5, "mm_per_frame": 0.47, "direction": [1.0, 0.0, 0.0]}
+CUBE: Table = {"kind": "constant", "unit_mm": 50.0}
+TURNING: Table = {"kind": "breathing", "amplitude_mm": 4.0, "rate_hz": 0.25, "turn_deg": [4.0, 2.0, 0.0]}
+CALM_BREATHING: Table = {"kind": "breathing", "amplitude_mm": 4.0, "rate_hz": 0.25, "turn_deg": [1.0, 0.4, 0.0]}
+MADE_RECORDINGS: dict[str, tuple[Table | None, Table]] = {
+    "flat patch, shaking table": (None, SLIDING),
+    "flat patch, constant speed in six axes": (None, CUBE),
+    "wet forearm, breathing": ({"body": "forearm", "wetness": 1.0}, TURNING),
+    "chest, breathing": ({"body": "chest"}, CALM_BREATHING),
+}  # body, None for the patch, and motion: thesis 4.6's two experiments, and two of the wounds it is meant for
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """One recording."""
+
+    name: str
+    rig: Rig
+    roi: tuple[Roi, ...]  # where the surface is at the start
+    truth: Trajectory | None  # None where nothing is known of it
+    source: Session | RenderedFrames
+    surface: Path | None = None
+
+    def frame_sets(self) -> Iterator[FrameSet]:
+        """Its frame sets in order of stamp."""
+        return self.source.frame_sets()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedFrames:
+    """Pictures rendered as they are asked for. stamps: (N,) s."""
+
+    scene: Scene
+    rig: Rig
+    truth: Truth
+    stamps: Array
+
+    def frame_sets(self) -> Iterator[FrameSet]:
+        """A frame set a stamp; the same ones each time."""
+        rng, cameras = np.random.default_rng([SCENE_SEED, 31]), self.rig.cameras
+        for stamp in self.stamps.tolist():
+            times = np.array([stamp])
+            instant = WorldState(stamp, 0.0, self.truth.base_from_surface(times)[0], self.truth.twist(times)[0])
+            images = render(self.scene, cameras, [instant] * len(cameras), Sensor(), rng.spawn(len(cameras)))
+            yield FrameSet(stamp, tuple(Frame(c, stamp, image) for c, image in enumerate(images)))
+
+
+def made_recording(name: str, seconds: float, rig: Rig | None = None) -> Recording:
+    """The recording `name` of MADE; rig: three cameras as in the thesis, if no other."""
+    table, motion = MADE_RECORDINGS[name]
+    if table is None:
+        shape = with_wound(flat(PATCH_SIZE), Wound((26.0, 18.0)), SCENE_SEED)
+        scene = Scene(shape, Appearance(texel=0.2, wetness=0.3, drape=False), seed=SCENE_SEED)
+    else:
+        scene = scene_from_table(TABLE_SOURCE, dict(table), Path(), SCENE_SEED)
+    rig, truth = (
+        rig or arc_rig(),
+        Truth(BASE_FROM_REST, motion_from_tables(TABLE_SOURCE, [dict(motion)], Path(), SCENE_SEED)),
+    )
+    stamps = np.arange(round(seconds * FRAME_RATE)) / FRAME_RATE
+    poses = truth.base_from_surface(stamps)
+    exact = Trajectory(stamps, poses, exact=True)
+    return Recording(name, rig, rois(scene, rig, poses[0], 0.0), exact, RenderedFrames(scene, rig, truth, stamps))
+
+
+def recorded_session(path: Path) -> Recording:
+    """A recorded session; InputError says what is wrong with it."""
+    session = open_session(path)
+    return Recording(path.name, session.rig, session.roi, session.truth, session, session.surface)
+
+
+MIN_ACCURACY_RATIO, MIN_SPEED_RATIO = 10.0, 5.0  # times better than the thesis's, which ours is to be
 REFERENCE_MM = "1.6, 4.0, 1.8 on other rendered sequences"
 REFERENCE_MS = "70, thesis Fig. 4.17"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
-    """What a method made of a recording. processor: ms (median) of all threads on a frame set after initialisation."""
+class MethodResult:
+    """What a method made of a recording."""
 
     run: Evaluation
-    processor: float
-
-    @property
-    def millimetres(self) -> float:
-        """RMSE of the measured poses' place from the start; NaN without a truth."""
-        comparison = self.run.comparison
-        return float("nan") if comparison is None else spread(comparison.start.translation).rmse
-
-    @property
-    def degrees(self) -> float:
-        """RMSE of the measured poses' rotation from the start; NaN without a truth."""
-        comparison = self.run.comparison
-        return float("nan") if comparison is None else float(np.degrees(spread(comparison.start.rotation).rmse))
+    millimetres: float  # RMSE of the measured poses' place from the start; NaN without a truth
+    degrees: float  # RMSE of the measured poses' rotation from the start; NaN without a truth
+    processor: float  # ms, median of all threads on a frame set after initialisation
 
 
-def run(options: argparse.Namespace) -> list[Figure]:
+def run_thesis(options: argparse.Namespace) -> list[Figure]:
     """Errors and latencies of both on each recording, and how many times ours are smaller."""
-    shown = [recorded(path) for path in options.sessions] or [made(name, options.seconds) for name in MADE]
+    shown = [recorded_session(path) for path in options.sessions] or [
+        made_recording(name, options.seconds) for name in MADE_RECORDINGS
+    ]
     figures = []
     for each in shown:
-        ours, theirs = side_by_side(each, (MAP, options.method))
+        ours, theirs = compare_methods(each, (MAP_METHOD, options.method))
         figures += _figures(each.name, ours, theirs)
     return figures
 
 
-def side_by_side(shown: Shown, methods: tuple[str, ...]) -> list[Judged]:
+def compare_methods(shown: Recording, methods: tuple[str, ...]) -> list[MethodResult]:
     """What each method makes of a recording; on each frame set they take turns, so the machine is the same to all."""
     now, processor = WallClock().now, ProcessorClock().now
     cameras = [camera.name for camera in shown.rig.cameras]
@@ -76,41 +170,230 @@ def side_by_side(shown: Shown, methods: tuple[str, ...]) -> list[Judged]:
         return [_judged(shown, Path(folder) / m / "poses.csv", m, costs[m]) for m in methods]
 
 
-def _judged(shown: Shown, file: Path, method: str, costs: list[float]) -> Judged:
+def _judged(shown: Recording, file: Path, method: str, costs: list[float]) -> MethodResult:
     since = min((roi.stamp for roi in shown.roi), default=-np.inf)
     result = evaluate(read_poses(file), shown.truth, shown.name, since, method=method)
-    later = costs[result.latency.initial_sets :]
-    return Judged(result, 1000 * float(np.median(later)) if later else float("nan"))
+    later, place, turn = costs[result.latency.initial_sets :], math.nan, math.nan
+    if result.comparison is not None:
+        start = result.comparison.start
+        place, turn = spread(start.translation).rmse, float(np.degrees(spread(start.rotation).rmse))
+    return MethodResult(result, place, turn, 1000 * float(np.median(later)) if later else math.nan)
 
 
-def _figures(name: str, ours: Judged, theirs: Judged) -> list[Figure]:
+def _figures(name: str, ours: MethodResult, theirs: MethodResult) -> list[Figure]:
     label = theirs.run.method
     shares = f"measured: {label} {percent(measured_share(theirs.run))}, ours {percent(measured_share(ours.run))}"
     late, their_late = ours.run.latency, theirs.run.latency
     return [
-        *_pair(f"{name}: error", label, "mm RMSE", (ours.millimetres, theirs.millimetres), REFERENCE_MM, ACCURACY),
-        *_pair(f"{name}: turn", label, "deg RMSE", (ours.degrees, theirs.degrees), "", ACCURACY, shares),
-        *_pair(f"{name}: pose after", label, "ms, median", (late.p50[-1], their_late.p50[-1]), REFERENCE_MS, SPEED),
+        *_pair(
+            f"{name}: error", label, "mm RMSE", (ours.millimetres, theirs.millimetres), REFERENCE_MM, MIN_ACCURACY_RATIO
+        ),
+        *_pair(f"{name}: turn", label, "deg RMSE", (ours.degrees, theirs.degrees), "", MIN_ACCURACY_RATIO, shares),
+        *_pair(
+            f"{name}: pose after",
+            label,
+            "ms, median",
+            (late.p50[-1], their_late.p50[-1]),
+            REFERENCE_MS,
+            MIN_SPEED_RATIO,
+        ),
         *_pair(f"{name}: pose after, 99 %", label, "ms", (late.p99[-1], their_late.p99[-1])),
         *_pair(f"{name}: processor", label, "ms, median", (ours.processor, theirs.processor)),
     ]
 
 
 def _pair(
-    what: str,
-    label: str,
-    unit: str,
-    values: tuple[float, float],
-    reference: str = "",
-    times: float | None = None,
+    what: str, label: str, unit: str, values: tuple[float, float], reference: str = "", times: float | None = None,
     note: str = "",
-) -> list[Figure]:
+) -> list[Figure]:  # fmt: skip
     """Ours, the thesis's and how many times ours is smaller, which should be at least `times`."""
     ours, theirs = map(float, values)
-    target: Target | None = None if times is None else at_least(times)
-    ratio = theirs / ours if ours > 0 else float("nan")
+    target, ratio = None if times is None else at_least(times), theirs / ours if ours > 0 else math.nan
     return [
         Figure(f"{what}, ours", ours, unit, note=note),
         Figure(f"{what}, {label}", theirs, unit, reference=reference),
         Figure(f"{what}, {label} / ours", ratio, "times", target),
     ]
+
+
+LATENCY_REFERENCE = "thesis 70"
+LATENCY_TARGETS = ("median", 50, at_most(8)), ("99 %", 99, at_most(16)), ("largest", 100, at_most(33))
+TRACK_TARGETS = ("median", 50, at_most(5)), ("99 %", 99, at_most(10))  # 120 a camera
+ESTIMATION_TARGET = at_most(4)  # ms, 99 %
+JPEG_QUALITY = 95  # of JPEG: what is held in memory until it is shown
+WARM_UP_STEPS = 10  # frame sets after the first map that only fill caches and the window
+
+
+def run_latency(options: argparse.Namespace) -> list[Figure]:
+    """Latencies on each recording."""
+    shown = [recorded_session(path) for path in options.sessions]
+    shown = shown or [made_recording(name, options.seconds) for name in options.scene]
+    return [figure for each in shown for figure in latency_figures(each.name, *time_steps(each))]
+
+
+def time_steps(shown: Recording) -> tuple[Array, Array]:
+    """Wall time (N, 1 + len(STAGES)) s, in all and by stage, and processor time (N,), s, of each tracked frame set."""
+    now, processor = WallClock().now, ProcessorClock().now
+    rows, costs, known = [], [], 0
+    with tracker(shown.rig, shown.roi, shown.surface, now) as step:
+        for frames in _held(shown.frame_sets()):
+            start, cost = now(), processor()
+            pose = step(frames)
+            cost, spent = processor() - cost, now() - start
+            step.idle()
+            known += pose.state is not TrackState.INITIALISING
+            if known > WARM_UP_STEPS:
+                rows.append([spent, *step.last.seconds])
+                costs.append(cost)
+    return np.array(rows).reshape(-1, 1 + len(STAGES)), np.array(costs)
+
+
+def _held(frame_sets: Iterable[FrameSet]) -> Iterator[FrameSet]:
+    """All frame sets, made before the first is given out: whatever renders them is done by then."""
+    packed = [
+        (frames.stamp, [(f.camera, f.stamp, encode(f.image, JPEG_QUALITY)[1]) for f in frames.frames])
+        for frames in frame_sets
+    ]
+    for stamp, frames in packed:
+        yield FrameSet(stamp, tuple(Frame(c, t, decode(data, "bench", "picture")) for c, t, data in frames))
+
+
+def latency_figures(name: str, wall: Array, processor: Array) -> list[Figure]:
+    """Figures in ms of wall times (N, 1 + len(STAGES)) s and processor times (N,) s."""
+    if not len(wall):
+        return [Figure(f"{name}: pose after", math.nan, "ms", note="no surface was followed for long enough")]
+    note = f"{len(wall)} frame sets; the machine's load was {os.getloadavg()[0]:.1f}"
+    what = f"{name}: pose after"
+    figures = [_figure(what, wall[:, 0], *target, LATENCY_REFERENCE, note) for target in LATENCY_TARGETS]
+    figures.append(_figure(f"{name}: processor", processor, "median", 50, note="all threads"))
+    columns = dict(zip(STAGES, wall[:, 1:].T, strict=True))
+    figures += [_figure(f"{name}: {stage}", column, "median", 50) for stage, column in columns.items()]
+    tracking = columns["flow"] + columns["align"]
+    figures += [_figure(f"{name}: tracks of all cameras", tracking, *target) for target in TRACK_TARGETS]
+    figures.append(_figure(f"{name}: estimation alone", columns["pose"], "99 %", 99, ESTIMATION_TARGET))
+    asked = float(np.mean(columns["flow"] > 0))
+    return [*figures, Figure(f"{name}: frame sets that asked for flow", 100 * asked, "%")]
+
+
+def _figure(
+    what: str,
+    seconds: Array,
+    word: str,
+    share: float,
+    target: Target | None = None,
+    reference: str = "",
+    note: str = "",
+) -> Figure:
+    return Figure(f"{what}, {word}", 1000 * percentile(seconds, share), "ms", target, reference, note)
+
+
+ANGLES_DEG = (0.0, 36.0, 84.0, -36.0, 60.0, -60.0)  # the thesis's three cameras, and three more on the same arc
+PICTURE_SIZE, PICTURE_FOCAL = (1280, 720), 1100.0
+GROWTH_RECORDING = "chest, breathing"
+MOVED_PATHS = 50
+WORLD_MINUTES = 0.25, 0.5, 1.0, 2.0  # of one world
+
+
+@dataclass(frozen=True, slots=True)
+class CostAxis:
+    """One thing that grows."""
+
+    name: str
+    unit: str  # of its values
+    what: str  # costs, and in what
+    values: tuple[float, ...]
+    cost: Callable[[float], tuple[float, float]]  # (median, 99 %), ms, of one value
+
+
+def run_growth(options: argparse.Namespace) -> list[Figure]:
+    """Costs along every axis, and how steeply they grow."""
+    axes = [axis for axis in axes_for(options.seconds) if axis.name != "pixels" or not options.no_pictures]
+    points = [(axis, value) for axis in axes for value in axis.values]
+    costs: dict[str, list[tuple[float, float]]] = {axis.name: [] for axis in axes}
+    for axis, value in with_progress("growth", "points", points, len(points)):
+        costs[axis.name].append(axis.cost(value))
+    measured = [(axis, np.array(costs[axis.name])) for axis in axes]
+    write_page(options.out, "growth.html", lambda: growth_page(measured), "the curves")
+    return [figure for axis, table in measured for figure in growth_figures(axis, table)]
+
+
+def axes_for(seconds: float) -> tuple[CostAxis, ...]:
+    """All that grows."""
+    pose, path = "a pose from its tracks, processor time", "a path carried to a new pose, processor time"
+    frames = "three decoded frames to the pose, by the clock"
+
+    def tracked(count: int = 100, cameras: int = 3) -> tuple[float, float]:
+        return _two(_spent(seconds, count, cameras)[WARM_UP_STEPS:])
+
+    def moved(checkpoints: float) -> tuple[float, float]:
+        return _two(carries(round(checkpoints), MOVED_PATHS)[0])
+
+    return (
+        CostAxis("tracks", "landmarks", pose, (25, 50, 100, 200, 400), lambda n: tracked(count=round(n))),
+        CostAxis("cameras", "cameras", pose, (2, 3, 4, 6), lambda n: tracked(cameras=round(n))),
+        CostAxis("minutes", "min behind", pose, WORLD_MINUTES, lambda n: _behind(n, seconds)),
+        CostAxis("checkpoints", "checkpoints", path, (1e3, 1e4, 5e4, 2e5), moved),
+        CostAxis("pixels", "Mpx a camera", frames, (0.23, 0.52, 0.92, 2.07), lambda n: _pictures(n, seconds)),
+    )
+
+
+def _behind(minutes: float, last: float) -> tuple[float, float]:
+    """ms a step in the `last` s before so many minutes of a breathing world have passed."""
+    end = round(60 * minutes * FRAME_RATE)
+    return _two(_spent(60 * WORLD_MINUTES[-1])[end - round(last * FRAME_RATE) : end])
+
+
+@lru_cache(maxsize=1)
+def _spent(seconds: float, count: int = 100, cameras: int = 3) -> Array:
+    """s of processor time of each step (N,) in a breathing world."""
+    world = synthetic_world(seconds=seconds, rate=FRAME_RATE, count=count, rig=arc_rig(ANGLES_DEG[:cameras]))
+    return np.array([step.seconds for step in follow_steps(world, "told", CpuClock().now)])
+
+
+def _pictures(megapixels: float, seconds: float) -> tuple[float, float]:
+    scale = (megapixels * 1e6 / (PICTURE_SIZE[0] * PICTURE_SIZE[1])) ** 0.5
+    size = (8 * round(scale * PICTURE_SIZE[0] / 8), 8 * round(scale * PICTURE_SIZE[1] / 8))
+    wall, _ = time_steps(made_recording(GROWTH_RECORDING, seconds, arc_rig(size=size, focal=scale * PICTURE_FOCAL)))
+    return _two(wall[:, 0])
+
+
+def _two(seconds: Array) -> tuple[float, float]:
+    return 1000 * percentile(seconds, 50), 1000 * percentile(seconds, 99)
+
+
+def growth_figures(axis: CostAxis, costs: Array) -> list[Figure]:
+    """A figure for each value and the slope of the medians. costs: (N, 2) ms."""
+    points = [
+        Figure(f"{axis.name}: {value:g} {axis.unit}, median", half, "ms", note=f"99 %: {late:.2f} ms; {axis.what}")
+        for value, (half, late) in zip(axis.values, costs.tolist(), strict=True)
+    ]
+    power, note = slope(axis.values, costs[:, 0]), "0: not at all; 1: in proportion"
+    return [*points, Figure(f"{axis.name}: grows by the power", power, "", note=note)]
+
+
+def slope(values: Sequence[float], costs: Array) -> float:
+    """The exponent of the power law through costs (N,), by least squares over the logarithms."""
+    usable = np.isfinite(costs) & (costs > 0)
+    if usable.sum() < 2:
+        return math.nan
+    return float(np.polyfit(np.log(np.array(values)[usable]), np.log(costs[usable]), 1)[0])
+
+
+def growth_page(measured: Sequence[tuple[CostAxis, Array]]) -> str:
+    """All curves on one page."""
+    keys = legend([line_key("estimate", "median"), line_key("truth", "99 %")])
+    parts = [
+        section(axis.name.capitalize(), f"{axis.what}, ms, over {axis.unit}.", _plot(axis, costs) + keys)
+        for axis, costs in measured
+    ]
+    lead = "Each curve is one thing that grows while all else stays what it usually is."
+    return document("Bench", "How cost grows", lead, parts, "Made by stillbed bench growth.")
+
+
+def _plot(axis: CostAxis, costs: Array) -> str:
+    x = np.array(axis.values, float)
+    plot = Plot(1000, 220, spanning([x]), (0.0, 1.1 * float(np.nanmax(costs))), label=f"ms over {axis.unit}")
+    for column, style in ((1, "truth"), (0, "estimate")):
+        plot.line(x, costs[:, column], style)
+        plot.dots(x, costs[:, column], style, 3)
+    return plot.svg()

@@ -1,35 +1,309 @@
-"""`stillbed bench smoothing`: smoothed poses beside causal ones, from tracks and from pictures; clocks, Ceres, time."""
+"""Subject `smoothing`: smoothed poses beside causal ones, from tracks and from pictures; clocks, Ceres, time.
+
+Pictures: the simulator's scenarios, rendered and tracked as a live run would, and smoothed.
+Many small sessions: smoothed by one worker and by two, and by two of which one is killed on the way.
+Ceres, by pycolmap, solves what the smoother's elimination can be given too: a rig's bundle adjustment. pycolmap has no
+motion prior and no clocks, so ours are taken away: what is left are the squared pixels of all landmarks in all frame
+sets, cameras known, the first pose held (pycolmap's RigReprojErrorCost). Both begin at the same poses and landmarks, on
+one core, and stop where a step lowers the cost by less than a millionth of a per cent.
+"""
 
 from __future__ import annotations
 
 import argparse
+import math
+import os
 import resource
+import shutil
+import signal
 import sys
+import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from estimation import se3, smooth
+from estimation.batch import priors
+from estimation.batch.initialisation import TrackArrays, pack_tracks, rough_start
+from estimation.batch.normal_equations import BatchProblem, Estimate, NoiseModel
+from estimation.batch.smooth import FREE_LANDMARK_MM
 from estimation.batch.smoothed import Smoothed
+from estimation.batch.solve import HELD_POSE_SIGMA, NormalEquations, Priors, shared_step
+from estimation.errors import InputError
+from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.smoothing.cameras import REFINED
 from estimation.synthetic.follow import follow
 from estimation.synthetic.world import World, synthetic_world
-from hardware.bench.bundle_adjustment import ceres_figures
-from hardware.bench.figures import Figure, Target, at_most
-from hardware.bench.smoothing_many import many_figures
-from hardware.bench.smoothing_rendered import rendered_figures
-from hardware.process.clock import CpuClock
-from hardware.report.evaluation import best_constant
+from hardware.bench.figures import CONSISTENT_NEES, Figure, at_least, at_most, rms
+from hardware.files.session import Session
+from hardware.live.prerender import prerender
+from hardware.offline.smooth import Cluster, SmoothOptions, local_cluster, run_smooth, session_hash
+from hardware.offline.smooth_report import evaluate_smoothed
+from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks, reobserve, tracks_of
+from hardware.process.clock import CpuClock, ProcessorClock, WallClock
+from hardware.process.progress import cache_folder, no_progress
+from hardware.recording.recorder import Recorder
+from hardware.recording.session_reader import open_session
+from hardware.report.evaluation import best_constant, spread
+from perception.frames import Frame
+from perception.package_data import shipped_file
 
-CONSISTENT = Target(0.8, 1.25)
-NEES_NOTE = "from the first pose on, whose one draw is in all others: many seeds make it sure"
-LATE = (0.016, 0.0, -0.016)  # s
-MOST_SECONDS, MOST_GIGABYTES, AT_MINUTES = 60.0, 2.0, 10.0
+SESSION_SETTINGS = 5.0, 30.0, 60  # s, Hz, landmarks
+MIN_SPEED_UP = 1.8
+
+
+def many_figures(count: int) -> list[Figure]:
+    """The gain of a second worker, and how many sessions are smoothed where one is killed."""
+    names = f"{count} sessions: two workers by one", f"{count} sessions, a worker killed: smoothed"
+    with tempfile.TemporaryDirectory() as folder:
+        sessions = Path(folder) / "sessions"
+        _write_sessions(sessions, count)
+        try:
+            spent = [_smoothed(sessions, Path(folder) / f"by{workers}", workers)[0] for workers in (1, 2)]
+        except InputError as missing:
+            return [Figure(name, math.nan, "", None, "", str(missing)) for name in names]
+        _, done = _smoothed(sessions, Path(folder) / "killed", 2, kill=True)
+    note = f"{spent[0]:.1f} s and {spent[1]:.1f} s by the clock, at a load of {os.getloadavg()[0]:.1f}"
+    return [
+        Figure(names[0], spent[0] / spent[1], "", at_least(MIN_SPEED_UP), "", note),
+        Figure(names[1], float(done), "", at_least(count), "", "after the first session was done"),
+    ]
+
+
+def _write_sessions(folder: Path, count: int) -> None:
+    """So many recordings with tracks, all alike."""
+    folder.mkdir()
+    world = synthetic_world("breathing", *SESSION_SETTINGS)
+    blank = np.full((720, 1280), 90, np.uint8)
+    with Recorder(folder / "s000.mcap", world.rig) as recorder:
+        for k, seen in enumerate(world):
+            for camera in range(3 if k == 0 else 1):
+                recorder.frame(Frame(camera, seen.stamp, blank))
+            recorder.write(seen)
+    for k in range(1, count):
+        shutil.copy(folder / "s000.mcap", folder / f"s{k:03}.mcap")
+
+
+def _smoothed(sessions: Path, out: Path, workers: int, kill: bool = False) -> tuple[float, int]:
+    """Seconds by the clock, once the workers stand, and sessions done. kill: one worker, after the first session."""
+    clock, done = WallClock(), 0
+    with local_cluster(workers) as cluster:
+        start = clock.now()
+        for outcome in run_smooth([sessions], out, SmoothOptions(), Cluster(cluster.scheduler_address)):
+            done += not outcome.failed
+            if kill:
+                kill = False
+                os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
+        return clock.now() - start, done
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedErrors:
+    """RMS distances from the truth, mm, each after the constant that fits it best."""
+
+    causal: float
+    tracked: float  # smoothed by the run's own tracks
+    smoothed: float  # smoothed by what was found besides, too
+    found: ReobservedTracks
+
+
+def rendered_figures(names: Sequence[str], seconds: float) -> list[Figure]:
+    """A figure for each scenario, and the worst of them."""
+    figures = []
+    for name in names:
+        session = prerender(shipped_file("scenarios", f"{name}.toml"), cache_folder(), seconds=seconds).session
+        figures.append(figure := rendered_figure(name, smooth_rendered(session)))
+        print(f"{name}: {figure.value:.2f} of the causal error; {figure.note}", file=sys.stderr, flush=True)
+    if figures:
+        worst = max(figures, key=lambda figure: figure.value)
+        figures.append(Figure("pictures: worst of them", worst.value, "", at_most(1.0), "", worst.what))
+    return figures
+
+
+def rendered_figure(name: str, found: RenderedErrors) -> Figure:
+    """Smoothed by causal error of one scenario."""
+    tracks = found.found
+    note = (
+        f"{1000 * found.smoothed:.1f} against {1000 * found.causal:.1f} um RMS, aligned; {1000 * found.tracked:.1f} um "
+        f"without {tracks.looks} looks found besides, {tracks.early} of them before their landmarks joined"
+    )
+    what = f"pictures, {name}: error by the causal one's"
+    return Figure(what, found.smoothed / found.causal, "", at_most(0.6), "", note)
+
+
+def smooth_rendered(path: Path) -> RenderedErrors:
+    """A session of pictures with its truth, tracked and smoothed."""
+    session = open_session(path)
+    with tempfile.TemporaryDirectory() as folder:
+        contents, out = session_hash(path), Path(folder)
+        tracks = tracks_of(session, out, contents)
+        before = smooth(session.rig, tracks.observations, start=tracks.start)
+        found = reobserve(session, tracks, before, out, contents)
+    after = smooth(session.rig, found.tracks.observations, start=tracks.start) if found.looks else before
+    (tracked, causal), (smoothed, _) = (_errors(session, result, tracks) for result in (before, after))
+    return RenderedErrors(causal, tracked, smoothed, found)
+
+
+def _errors(session: Session, result: Smoothed, tracks: SessionTracks) -> tuple[float, float]:
+    """RMS distances, mm, of smoothed and of causal poses."""
+    errors = evaluate_smoothed(result, tracks, session.truth).errors
+    if errors is None or errors[1] is None:
+        raise InputError(session.path, "poses beside a truth", "none", "a rendered session that the tracker follows")
+    return spread(errors[0].translation).rmse, spread(errors[1].translation).rmse
+
+
+UNGATED = 1e4  # times the gate: no residual is that large, and all count by their squares
+NO_MOTION_PRIOR = np.array(
+    [1e10] * 3 + [1e15] * 3
+)  # rad^2/s^5, mm^2/s^5: neighbouring poses know nothing of each other
+NO_JITTER = 1e-7, 1e-5  # s, px: exposures and images without a jitter
+COST_TOLERANCE, MAX_STEPS = 1e-8, 50  # of the cost, and steps
+MISSING = "pycolmap is not installed (the extra [bench]): not compared"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdjustedBundle:
+    """What a solver made of it."""
+
+    rms: float  # px, of all residuals
+    spent: float  # s of one core
+    steps: int  # how many it took
+
+
+def ceres_figures(seconds: float, count: int) -> list[Figure]:
+    """Cost and time of ours by Ceres's; where pycolmap is not installed, that it is not."""
+    name = f"bundle adjustment, {seconds:g} s and {count} landmarks"
+    try:
+        import pycolmap
+    except ImportError:
+        whats = f"{name}: cost by Ceres's", f"{name}: time by Ceres's"
+        return [Figure(what, math.nan, "", None, "", MISSING) for what in whats]
+    world = synthetic_world("breathing", seconds, count=count)
+    data = pack_tracks(list(world), len(world.rig))
+    poses, points = rough_start(world.rig, data, None, None)
+    told = np.isfinite(points[:, 0])
+    data, points = data.landmarks(told), points[told]
+    own, theirs = adjust_ours(world.rig, data, poses, points), adjust_by_ceres(pycolmap, world.rig, data, poses, points)
+    costs = f"residuals of {own.rms:.6f} against {theirs.rms:.6f} px RMS"
+    times = f"{own.spent:.2f} s in {own.steps} steps against {theirs.spent:.2f} s in {theirs.steps}, of one core"
+    return [
+        Figure(f"{name}: cost by Ceres's", (own.rms / theirs.rms) ** 2, "", at_most(1 + 1e-6), "", costs),
+        Figure(f"{name}: time by Ceres's", own.spent / theirs.spent, "", None, "", times),
+    ]
+
+
+def adjust_ours(rig: Rig, data: TrackArrays, poses: Array, points: Array) -> AdjustedBundle:
+    """By our own elimination."""
+    clock = ProcessorClock()
+    start = clock.now()
+    cameras, rest = priors.cameras_of(rig), np.zeros((len(poses), 6))
+    none = priors.correction_sigmas(priors.CalibrationPrior(clock=0.0), len(rig))
+    known = Priors(
+        cameras, priors.prior_information(none, len(rig)), points, np.eye(points.size) / FREE_LANDMARK_MM**2,
+        poses[0], 0, HELD_POSE_SIGMA, np.tile(NO_MOTION_PRIOR, (len(poses) - 1, 1)),
+    )  # fmt: skip
+    problem = BatchProblem(data, np.zeros(0, np.int64))
+    noise = NoiseModel(np.ones(len(rig)), *NO_JITTER, gate=UNGATED)
+    estimate, costs = Estimate(priors.States(poses, rest, rest), cameras, points), list[float]()
+    while len(costs) < MAX_STEPS:
+        equations = NormalEquations(problem, estimate, known, noise)
+        whole = equations.eliminate(no_progress)
+        costs.append(whole.cost)
+        if len(costs) > 1 and costs[-2] - costs[-1] < COST_TOLERANCE * costs[-1]:
+            break
+        step = shared_step(whole)
+        estimate = estimate.moved(equations.eliminate(no_progress, step).chain.steps(), step, problem.free)
+    spent = clock.now() - start
+    return AdjustedBundle(residual_rms(rig, data, estimate.states.poses, estimate.points), spent, len(costs) - 1)
+
+
+def adjust_by_ceres(pycolmap: Any, rig: Rig, data: TrackArrays, poses: Array, points: Array) -> AdjustedBundle:
+    """By pycolmap, whose world is the surface, whose rig stands in its first camera."""
+    whole, first = pycolmap.Reconstruction(), rig.cameras[0].base_from_camera
+    model = pycolmap.Rig(rig_id=1)
+    for c, camera in enumerate(rig.cameras):
+        m, (width, height) = camera.matrix, camera.size
+        lens = [m[0, 0], m[1, 1], m[0, 2], m[1, 2]]
+        eye = pycolmap.Camera(camera_id=c + 1, model="PINHOLE", width=width, height=height, params=lens)
+        whole.add_camera(eye)
+        if c == 0:
+            model.add_ref_sensor(eye.sensor_id)
+        else:
+            model.add_sensor(eye.sensor_id, _rigid(pycolmap, se3.inverse(camera.base_from_camera) @ first))
+    whole.add_rig(model)
+    elements: list[list[Any]] = [[] for _ in points]
+    for k, pose in enumerate(poses):
+        _add_frame(pycolmap, whole, rig, data, k, se3.inverse(first) @ pose, elements)
+    for place, track in zip(points, elements, strict=True):
+        whole.add_point3D(place, pycolmap.Track(elements=track))
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = options.refine_sensor_from_rig = False
+    options.print_summary = False
+    solver = options.ceres.solver_options
+    solver.num_threads, solver.max_num_iterations, solver.function_tolerance = 1, MAX_STEPS, COST_TOLERANCE
+    solver.gradient_tolerance = 0.0
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in whole.images:
+        config.add_image(image)
+    config.set_constant_rig_from_world_pose(1)
+    clock = ProcessorClock()
+    start = clock.now()
+    summary = pycolmap.create_default_ceres_bundle_adjuster(options, config, whole).solve()
+    spent = clock.now() - start
+    matrices = np.stack([whole.frame(k + 1).rig_from_world.matrix() for k in range(len(poses))])
+    found = first @ se3.make(matrices[:, :, :3], matrices[:, :, 3])
+    places = np.stack([whole.point3D(n + 1).xyz for n in range(len(points))])
+    steps = summary.ceres_summary.num_successful_steps - 1  # the beginning counts as one
+    return AdjustedBundle(residual_rms(rig, data, found, places), spent, int(steps))
+
+
+def _add_frame(
+    pycolmap: Any, whole: Any, rig: Rig, data: TrackArrays, k: int, pose: Array, elements: list[Any]
+) -> None:
+    """Frame set k with its images; what each landmark is seen in goes to its `elements`."""
+    frame = pycolmap.Frame(frame_id=k + 1, rig_id=1)
+    part, images = slice(data.starts[k], data.starts[k + 1]), []
+    for c in range(len(rig)):
+        rows = np.flatnonzero(data.camera[part] == c) + data.starts[k]
+        number = k * len(rig) + c + 1
+        for i, row in enumerate(rows):
+            elements[data.landmark[row]].append(pycolmap.TrackElement(number, i))
+        image = pycolmap.Image(name=str(number), keypoints=data.pixels[rows], camera_id=c + 1, image_id=number)
+        image.frame_id = k + 1
+        frame.add_data_id(image.data_id)
+        images.append(image)
+    frame.rig_from_world = _rigid(pycolmap, pose)
+    whole.add_frame(frame)
+    for image in images:
+        whole.add_image(image)
+    whole.register_frame(k + 1)
+
+
+def residual_rms(rig: Rig, data: TrackArrays, poses: Array, points: Array) -> float:
+    """Px, of all residuals: the cost that both lower, by arithmetic of neither."""
+    frame = np.repeat(np.arange(len(poses)), np.diff(data.starts))
+    camera_from_base = se3.inverse(np.stack([camera.base_from_camera for camera in rig.cameras]))
+    there = (
+        camera_from_base[data.camera] @ poses[frame] @ np.insert(points, 3, 1.0, axis=1)[data.landmark][..., None]
+    )[:, :3, 0]
+    matrices = np.stack([camera.matrix for camera in rig.cameras])[data.camera]
+    seen = (matrices @ (there / there[:, 2:])[..., None])[:, :2, 0]
+    return float(np.sqrt(((seen - data.pixels) ** 2).mean()))
+
+
+def _rigid(pycolmap: Any, transform: Array) -> Any:
+    return pycolmap.Rigid3d(np.ascontiguousarray(transform[:3]))
+
+
+CAMERA_OFFSETS = (0.016, 0.0, -0.016)  # s
+MAX_SECONDS, MAX_GIGABYTES, TARGET_MINUTES = 60.0, 2.0, 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class MovementErrors:
     """One world: mean squared error, mm^2, of smoothed and of causal poses, aligned; NEES/6 of the smoothed ones."""
 
     smoothed: float
@@ -37,7 +311,7 @@ class Pair:
     nees: float
 
 
-def run(options: argparse.Namespace) -> list[Figure]:
+def run_smoothing(options: argparse.Namespace) -> list[Figure]:
     """All figures."""
     figures: list[Figure] = []
     for movement in options.movements:
@@ -56,21 +330,18 @@ def run(options: argparse.Namespace) -> list[Figure]:
     return figures + [_timed(1.0, count)[0] for count in options.landmarks]  # less memory than the longest run took
 
 
-def pair_figures(movement: str, pairs: list[Pair]) -> list[Figure]:
+def pair_figures(movement: str, pairs: list[MovementErrors]) -> list[Figure]:
     """The figures of one movement, over all its worlds."""
-    ours, causal = (
-        1000 * float(np.sqrt(np.mean(v))) for v in zip(*((p.smoothed, p.causal) for p in pairs), strict=True)
-    )
+    ours, causal = (1000 * float(np.sqrt(np.mean([getattr(p, n) for p in pairs]))) for n in ("smoothed", "causal"))
+    nees = float(np.mean([p.nees for p in pairs]))
     note = f"{ours:.1f} against {causal:.1f} um RMS, aligned"
     return [
         Figure(f"{movement}: error by the causal one's", ours / causal, "", at_most(0.6), "", note),
-        Figure(
-            f"{movement}: NEES/6", float(np.mean([p.nees for p in pairs])), "", CONSISTENT, "", "from the first pose"
-        ),
+        Figure(f"{movement}: NEES/6", nees, "", CONSISTENT_NEES, "", "from the first pose"),
     ]
 
 
-def _pair(movement: str, seed: int, options: argparse.Namespace) -> Pair:
+def _pair(movement: str, seed: int, options: argparse.Namespace) -> MovementErrors:
     world = synthetic_world(movement, options.seconds, count=options.count, seed=seed)
     result = smooth(world.rig, list(world))
     causal = [pose for pose in follow(world, "seen").poses if pose.state.measured]
@@ -78,7 +349,7 @@ def _pair(movement: str, seed: int, options: argparse.Namespace) -> Pair:
     truth = world.truth.base_from_surface
     poses = result.states.poses
     theirs = np.stack([pose.base_from_surface for pose in causal])
-    return Pair(_off(poses[rows], truth[rows]), _off(theirs, truth[rows]), _nees(result, truth))
+    return MovementErrors(_off(poses[rows], truth[rows]), _off(theirs, truth[rows]), _nees(result, truth))
 
 
 def _off(poses: Array, truth: Array) -> float:
@@ -98,30 +369,28 @@ def _late_figures(options: argparse.Namespace) -> list[Figure]:
     """With late cameras and an imperfect calibration, which the recording corrects."""
     errors, offsets = [], []
     for seed in range(options.seeds):
-        world = synthetic_world(
-            "lively", options.seconds, count=options.count, seed=seed, offsets=LATE, calibration=0.3
-        )
-        result = smooth(world.rig, list(world), prior=REFINED)
+        conditions: dict[str, Any] = {"seed": seed, "offsets": CAMERA_OFFSETS, "calibration": 0.3}
+        world = synthetic_world("lively", options.seconds, count=options.count, **conditions)
+        result = smooth(world.rig, list(world), prior=priors.REFINED_PRIOR)
         errors.append(_off(result.states.poses, world.truth.base_from_surface))
-        offsets.append(result.offsets - np.array(LATE))
+        offsets.append(result.offsets - np.array(CAMERA_OFFSETS))
     name = "lively, cameras 16 ms apart, calibrated to 0.3 px"
     return [
         Figure(f"{name}: error", float(np.sqrt(np.mean(errors))), "mm", at_most(0.05), "", "RMS, aligned"),
-        Figure(f"{name}: offsets off by", 1000 * float(np.sqrt(np.mean(np.square(offsets)))), "ms"),
+        Figure(f"{name}: offsets off by", 1000 * rms(np.array(offsets)), "ms"),
     ]
 
 
 def _timed(minutes: float, count: int) -> list[Figure]:
     world: World = synthetic_world("breathing", 60 * minutes, count=count)
-    seen = list(world)
-    clock = CpuClock()
+    tracks, clock = list(world), CpuClock()
     start = clock.now()
-    smooth(world.rig, seen)
+    smooth(world.rig, tracks)
     spent = clock.now() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    asked = minutes == AT_MINUTES
     name = f"{minutes:g} min, {len(world)} poses, {count} landmarks"
+    time, memory = (at_most(MAX_SECONDS), at_most(MAX_GIGABYTES)) if minutes == TARGET_MINUTES else (None, None)
     return [
-        Figure(f"{name}: time", spent, "s", at_most(MOST_SECONDS) if asked else None, "", "of one core"),
-        Figure(f"{name}: memory", peak, "GB", at_most(MOST_GIGABYTES) if asked else None, "", "peak, tracks included"),
+        Figure(f"{name}: time", spent, "s", time, "", "of one core"),
+        Figure(f"{name}: memory", peak, "GB", memory, "", "peak, tracks included"),
     ]

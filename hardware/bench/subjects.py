@@ -1,4 +1,7 @@
-"""What can be measured: one module each, imported when it is to run."""
+"""What `stillbed bench` can measure: each subject's function, options and summary.
+
+Listing the subjects, or reading their options, loads nothing that they measure with.
+"""
 
 from __future__ import annotations
 
@@ -6,115 +9,312 @@ import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from hardware.bench import options
-from hardware.bench.figures import Figure
+from hardware.offline.track import THESIS_FLOW_METHOD, THESIS_METHOD
+from planning.fill import PATTERN_KINDS
+
+if TYPE_CHECKING:
+    from hardware.bench.figures import Figure
+
+BREATHING = ("breathing_calm", "breathing_deep", "breathing_irregular")  # scenarios
+MOVEMENTS = ("still", "breathing", "irregular", "steps", "turns", "sway", "lively")  # of synthetic worlds
+RENDERED = (
+    *("still", *BREATHING, "shaking_table_0_5_hz", "steps_300um"),
+    *("turns", "hand", "camera_lost", "clock_offsets", "wet_glare", "deformation"),
+)  # scenarios
+MAPS = ("told", "seen")  # whose map the estimator has: the world's own, or one that it made
+MADE = (
+    "flat patch, shaking table",
+    "flat patch, constant speed in six axes",
+    "wet forearm, breathing",
+    "chest, breathing",
+)  # recordings that hardware/bench/recordings.py renders
+
+_Option = tuple[tuple[str, ...], dict[str, Any]]  # arguments of add_argument
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
     """One thing to measure.
 
-    module: has `run(options) -> list[Figure]`. add_options: adds the subject's own options to a parser. summary: a line
-    for the list of subjects.
+    function: "module:name" of a function that turns parsed options into a list of figures.
+    add_options: adds the subject's own options to a parser.
+    summary: a line for the list of subjects.
     """
 
-    module: str
+    function: str
     add_options: Callable[[argparse.ArgumentParser], None]
     summary: str
 
     @property
     def run(self) -> Callable[[argparse.Namespace], list[Figure]]:
-        """The module's `run`."""
-        found: Callable[[argparse.Namespace], list[Figure]] = import_module(self.module).run
-        return found
+        """The function itself; its module is loaded now."""
+        module, _, name = self.function.partition(":")
+        function: Callable[[argparse.Namespace], list[Figure]] = getattr(import_module(module), name)
+        return function
 
 
 Subjects = Mapping[str, Subject]
 
+
+def _subject(function: str, summary: str, *options: _Option) -> Subject:
+    def add(parser: argparse.ArgumentParser) -> None:
+        for names, settings in options:
+            parser.add_argument(*names, **settings)
+
+    return Subject(function, add, summary)
+
+
+def _option(*names: str, **settings: Any) -> _Option:
+    return names, settings
+
+
+def _number(name: str, default: float, metavar: str | None, text: str) -> _Option:
+    """An option that takes a number of the default's type."""
+    return _option(name, type=type(default), default=default, metavar=metavar, help=text)
+
+
+def _positive(text: str) -> int:
+    if int(text) < 1:
+        raise ValueError(text)
+    return int(text)
+
+
+SEED = _option("--seed", type=int, default=0)
+SESSIONS = _option("sessions", nargs="*", type=Path, metavar="SESSION", help="recorded sessions to show instead")
+
 SUBJECTS: Subjects = {
-    "arm-calibration": Subject(
-        "hardware.bench.arm_calibration",
-        options.arm_calibration,
+    "arm-calibration": _subject(
+        "hardware.bench.calibration:run_arm_calibration",
         "the arm's place, tool and latency from what cameras see of its tip",
+        _number("--rendered", 1, "N", "arms before rendered cameras; default 1"),
+        _number("--runs", 50, "N", "arms on drawn tips; default 50"),
+        _number("--seed", 0, None, "of the first arm; default 0"),
     ),
-    "bumps": Subject(
-        "hardware.bench.bumps", options.bumps, "cameras knocked and lenses turned by little: found, named, false alarms"
+    "bumps": _subject(
+        "hardware.bench.detection:run_bumps",
+        "cameras knocked and lenses turned by little: found, named, false alarms",
+        _number("--count", 9, "N", "of each knock; default 9"),
+        _number("--minutes", 10.0, "M", "of calm; default 10"),
+        _number("--seed", 0, None, "of motions and noise; default 0"),
     ),
-    "calibration": Subject(
-        "hardware.bench.calibration",
-        options.calibration,
+    "calibration": _subject(
+        "hardware.bench.calibration:run_calibration",
         "cameras calibrated from rendered boards, beside the exact rig",
+        _number("--instants", 60, "N", "frame sets that are rendered; default 60"),
+        _number("--runs", 50, "N", "runs without pictures; default 50"),
     ),
-    "cameras": Subject(
-        "hardware.bench.cameras", options.cameras, "frames of live cameras put into sets: complete, wrong, waited for"
+    "cameras": _subject(
+        "hardware.bench.detection:run_cameras",
+        "frames of live cameras put into sets: complete, wrong, waited for",
+        _number("--minutes", 10.0, None, "of three cameras at 30 fps; default 10"),
+        SEED,
     ),
-    "consistency": Subject(
-        "hardware.bench.consistency", options.consistency, "poses from pictures: are errors as large as is claimed?"
+    "consistency": _subject(
+        "hardware.bench.estimator:run_consistency",
+        "poses from pictures: are errors as large as is claimed?",
+        _number("--scenes", 2, "N", "rendered first, some 10 s each; default 2"),
+        _number("--seed", 300, None, "of the first scene (default: 300)"),
+        _number("--seconds", 5.0, "S", "of each scene; default 5"),
     ),
-    "estimator": Subject(
-        "hardware.bench.estimator", options.estimator, "the estimator on synthetic tracks: accuracy, honesty, time"
+    "estimator": _subject(
+        "hardware.bench.estimator:run_estimator",
+        "the estimator on synthetic tracks: accuracy, honesty, time",
+        _option("--only", default="*", metavar="PATTERN", help="scenes by name, e.g. 'breathing, c*'"),
+        _option("--maps", nargs="+", choices=MAPS, default=MAPS, help="whose map"),
+        _number("--seeds", 3, "N", "worlds of each scene"),
+        _option("--seconds", type=float, metavar="S", help="length of each world; 10 s or more without"),
+        _number("--count", 100, "N", "landmarks"),
+        _number("--noise", 0.25, "PX", "white, where a scene has no own"),
+        _option("--soak", type=float, metavar="HOURS", help="instead: one long run of breathing"),
     ),
-    "faults": Subject(
-        "hardware.bench.faults", options.faults, "prints in which everything goes wrong: said, harmless, back soon?"
+    "faults": _subject(
+        "hardware.bench.campaigns.faults:run_faults",
+        "prints in which everything goes wrong: said, harmless, back soon?",
+        _number("--count", 60, None, "faults, of all kinds in turn (default: 60)"),
+        _number("--seed", 1, None, "of all that chance decides (default: 1)"),
+        _number("--jobs", 1, None, "processes that share the runs (default: 1)"),
+        _option("--log", type=Path, metavar="X.csv", help="what came of each fault; runs in it are not repeated"),
+        _option("--scenarios", type=Path, metavar="FOLDER", help="where the scenarios are (default: the shipped)"),
     ),
-    "fill": Subject(
-        "hardware.bench.fill", options.fill, "beads laid into contours and random wounds: coverage and time"
+    "fill": _subject(
+        "hardware.bench.fill:run_fill",
+        "beads laid into contours and random wounds: coverage and time",
+        _option("contours", nargs="*", type=Path, metavar="CSV", help="x_mm,y_mm; two own without"),
+        _option("--kind", choices=PATTERN_KINDS, default="best", help="pattern; default best"),
+        _number("--contour-width", 0.8, "MM", "bead in contours; default 0.8"),
+        _number("--width", 0.4, "MM", "bead of the wounds; default 0.4"),
+        _number("--count", 1000, "N", "random wounds; default 1000"),
+        SEED,
+        _option("--picture", type=Path, metavar="SVG", help="also draw all patterns side by side"),
     ),
-    "fuzz": Subject(
-        "hardware.bench.fuzz", options.fuzz, "every reader of what comes from outside, given what is nearly valid"
+    "fuzz": _subject(
+        "hardware.bench.campaigns.fuzz:run_fuzz",
+        "every reader of what comes from outside, given what is nearly valid",
+        _number("--count", 20_000, None, "inputs, of all readers in equal shares (default: 20000)"),
+        _number("--seed", 1, None, "of what is made wrong (default: 1)"),
+        _option("--only", metavar="READER", help="one reader; see the table for their names"),
+        _number("--jobs", 1, None, "readers at a time, a process each (default: 1)"),
+        _option(
+            "--log",
+            type=Path,
+            metavar="X.csv",
+            help="how far each reader is, and what went wrong; goes on from there",
+        ),
     ),
-    "growth": Subject(
-        "hardware.bench.growth", options.growth, "how cost grows: with tracks, cameras, pixels, checkpoints, minutes"
+    "growth": _subject(
+        "hardware.bench.recordings:run_growth",
+        "how cost grows: with tracks, cameras, pixels, checkpoints, minutes",
+        _number("--seconds", 4.0, "S", "of each world; default 4"),
+        _option("--no-pictures", action="store_true", help="leave out resolution, which has to be rendered"),
     ),
-    "latency": Subject(
-        "hardware.bench.latency", options.latency, "from three decoded frames to the pose, by wall clock and processor"
+    "latency": _subject(
+        "hardware.bench.recordings:run_latency",
+        "from three decoded frames to the pose, by wall clock and processor",
+        SESSIONS,
+        _number("--seconds", 5.0, "S", "of each made recording; default 5"),
+        _option("--scene", nargs="+", choices=MADE, default=[MADE[-1]], metavar="NAME", help="; ".join(MADE)),
     ),
-    "link": Subject(
-        "hardware.bench.link", options.link, "the arm's line with everything going wrong; stops, jitter, the guard"
+    "link": _subject(
+        "hardware.bench.campaigns.link:run_link",
+        "the arm's line with everything going wrong; stops, jitter, the guard",
+        _number("--hours", 1.0, "H", "of virtual time; default 1"),
+        _number("--minutes", 0.0, "M", "of real time on a pty; default none"),
+        _number("--commands", 100_000, "N", "random ones before the guard"),
+        _number("--baud", 115_200, "B", "of the line in virtual time"),
+        _option("--only", choices=("guard",), help="the guard alone"),
+        _number("--seed", 0, None, "of the first run"),
+        _number("--busy", 1, "N", "processes that saturate a core each; default 1"),
+        _option("--ordinary", action="store_true", help="do not ask for real-time priority"),
     ),
-    "live": Subject(
-        "hardware.bench.live", options.live, "whole runs in real time: frames to wire, stops, nozzle, kills"
+    "live": _subject(
+        "hardware.bench.live:run_live",
+        "whole runs in real time: frames to wire, stops, nozzle, kills",
+        _number("--minutes", 1.0, "M", "of printing; 0: none; default 1"),
+        _number("--stops", 3, "N", "in a run of their own; default 3"),
+        _number("--kills", 0, "N", "of random processes; default none"),
+        _number("--seed", 0, None, "of what is killed when"),
+        _option("--pinned", action="store_true", help="motion and recorder on one core, tracking on the other"),
+        _option(
+            "--scenario",
+            type=Path,
+            default=Path("data/live/calm.toml"),
+            metavar="SCENARIO.toml",
+            help="which world",
+        ),
     ),
-    "loop": Subject("hardware.bench.loop", options.loop, "the closed loop at the nozzle, with and without prediction"),
-    "map": Subject(
-        "hardware.bench.mapping",
-        options.mapping,
+    "loop": _subject(
+        "hardware.bench.prediction:run_loop",
+        "the closed loop at the nozzle, with and without prediction",
+        _option(
+            "--scenario",
+            nargs="+",
+            default=list(BREATHING),
+            choices=BREATHING,
+            metavar="NAME",
+            help=f"of {', '.join(BREATHING)} (default: all)",
+        ),
+        _number("--seed", 1, None, "of the tracks' noise (default: 1)"),
+        _number("--jobs", 1, None, "processes that share the prints (default: 1)"),
+    ),
+    "map": _subject(
+        "hardware.bench.mapping:run_map",
         "landmarks off the true surface beside their claim, and the map's growth",
+        _number("--seconds", 3.0, "S", "of each still standing; default 3"),
     ),
-    "outages": Subject(
-        "hardware.bench.outages", options.outages, "cameras covered, dead, frozen, swapped, bumped: lost in silence?"
+    "outages": _subject(
+        "hardware.bench.campaigns.outages:run_outages",
+        "cameras covered, dead, frozen, swapped, bumped: lost in silence?",
+        _option("--count", type=_positive, default=66, help="outages, of all kinds in turn (default: 66)"),
+        _number("--seed", 0, None, "of scenes, motions and outages (default: 0)"),
+        _option("--processes", type=_positive, default=2, help="that share the scenes (default: 2)"),
     ),
-    "plan": Subject("hardware.bench.plan", options.plan, "a whole plan of a large wound: time, memory, coverage, ink"),
-    "registration": Subject(
-        "hardware.bench.registration", options.registration, "a scan laid into the first pictures: error and verdict"
+    "plan": _subject(
+        "hardware.bench.fill:run_plan",
+        "a whole plan of a large wound: time, memory, coverage, ink",
+        _option("--body", choices=("forearm", "chest", "foot"), default="forearm", help="default forearm"),
     ),
-    "prediction": Subject(
-        "hardware.bench.prediction", options.prediction, "where a breathing chest will be, 100 to 500 ms ahead"
+    "registration": _subject(
+        "hardware.bench.mapping:run_registration",
+        "a scan laid into the first pictures: error and verdict",
+        _number("--seeds", 2, "N", "bodies of each kind; default 2"),
     ),
-    "planner": Subject(
-        "hardware.bench.planner", options.planner, "random poses into planner and guard: limits kept, cost of a step"
+    "prediction": _subject(
+        "hardware.bench.prediction:run_prediction",
+        "where a breathing chest will be, 100 to 500 ms ahead",
+        _option(
+            "--traces",
+            type=Path,
+            metavar="DIR",
+            help="folder of traces: breathing*.tum (default: the simulator's breathing)",
+        ),
+        _option("--pattern", default="breathing*.tum", help="names of the traces in it"),
+        _number("--warm-up", 60.0, "S", "beginning that is not judged"),
+        _number("--seconds", 240.0, "S", "of the simulator's; default 240"),
     ),
-    "segmentation": Subject(
-        "hardware.bench.pictures",
-        options.segmentation,
+    "planner": _subject(
+        "hardware.bench.planner:run_planner",
+        "random poses into planner and guard: limits kept, cost of a step",
+        _number("--updates", 10_000, "N", "in all; default 10000"),
+        _option("--arm", type=Path, metavar="ARM.toml", help="instead of the default arm"),
+        _number("--seed", 0, None, "of the streams; runs with other seeds may go side by side"),
+    ),
+    "segmentation": _subject(
+        "hardware.bench.pictures:run_segmentation",
         "finding the wound: Dice, silence, a half covered one, time",
+        _option("dataset", type=Path, nargs="?", metavar="DATASET", help="folder with images/ and labels/"),
+        _option("--model", type=Path, metavar="X.onnx", help="another network than the one that comes along"),
+        _number("--rendered", 60, "N", "rendered pictures of each kind"),
+        _option("--sheet", type=Path, metavar="X.jpg", help="also draw best, median and worst, 8 of each"),
+        _number("--seed", 1, "N", "of pieces, covers and sizes drawn"),
     ),
-    "smoothing": Subject(
-        "hardware.bench.smoothing", options.smoothing, "smoothed poses beside causal ones, clocks, time by length"
+    "smoothing": _subject(
+        "hardware.bench.smoothing:run_smoothing",
+        "smoothed poses beside causal ones, clocks, time by length",
+        _option("--movements", nargs="*", choices=MOVEMENTS, default=MOVEMENTS, help="of the worlds; none: no worlds"),
+        _option("--scenarios", nargs="*", choices=RENDERED, default=RENDERED, help="rendered, tracked and smoothed"),
+        _number("--rendered", 8.0, "S", "of each scenario; kept rendered; default 8"),
+        _number("--seeds", 4, "N", "worlds of each movement; default 4"),
+        _number("--seconds", 6.0, "S", "of each world; default 6"),
+        _number("--count", 100, "N", "landmarks; default 100"),
+        _option("--minutes", type=float, nargs="*", default=[1.0, 3.0, 10.0], metavar="M", help="runs that are timed"),
+        _option(
+            "--landmarks", type=int, nargs="*", default=[200, 400], metavar="N", help="of more runs, a minute each"
+        ),
+        _number("--adjusted", 4.0, "S", "of the bundle adjustment beside Ceres's; default 4, 0: none"),
+        _number("--sessions", 40, "N", "smoothed by one and by two workers; default 40, 0: none"),
     ),
-    "steps": Subject(
-        "hardware.bench.detection",
-        options.steps,
-        "movements of 300 um and 0.1 degree: how soon flagged, how often false",
+    "steps": _subject(
+        "hardware.bench.detection:run_steps",
+        "movements of 300 um and 0.1 degree: how soon flagged, how often falsely",
+        _number("--steps", 2000, None, "of each kind (default: %(default)s)"),
+        _number("--hours", 1.0, None, "at rest (default: %(default)s)"),
+        _number("--noise", 0.1, None, "px of a track in a frame (default: %(default)s)"),
+        SEED,
     ),
-    "tracks": Subject(
-        "hardware.bench.tracks", options.tracks, "scatter and creep of tracks before a surface that stands still"
+    "tracks": _subject(
+        "hardware.bench.mapping:run_tracks",
+        "scatter and creep of tracks before a surface that stands still",
+        _number("--minutes", 10.0, "M", "that are stood for; default 10"),
+        _number("--pictures", 240, "N", "evenly over them; default 240"),
     ),
-    "views": Subject(
-        "hardware.bench.views", options.views, "skin that deforms, grazing views with glare, a cube's edges"
+    "views": _subject(
+        "hardware.bench.pictures:run_views",
+        "skin that deforms, grazing views with glare, a cube's edges",
+        _number("--seconds", 8.0, "S", "of each sequence; default 8"),
     ),
-    "thesis": Subject(
-        "hardware.bench.recordings", options.thesis, "the thesis's estimator beside ours, on the same frame sets"
+    "thesis": _subject(
+        "hardware.bench.recordings:run_thesis",
+        "the thesis's estimator beside ours, on the same frame sets",
+        SESSIONS,
+        _number("--seconds", 4.0, "S", "of each made recording; default 4"),
+        _option(
+            "--method",
+            choices=(THESIS_METHOD, THESIS_FLOW_METHOD),
+            default=THESIS_METHOD,
+            help="which of the thesis's ways",
+        ),
     ),
 }

@@ -1,56 +1,181 @@
-"""Drives an arm through set-points over its link: guarded, a frame a tick, stopped by whatever goes wrong."""
+"""Recording of an arm that moves before live cameras: planned moves, guarded driving, pictures and set-points.
+
+The moves go to places all over the cameras' room, turned and not, and end with a swing. All set-points pass the guard
+before the first one is sent, one per tick; whatever goes wrong stops the arm.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
 
 from estimation.errors import InputError
+from estimation.pose import SurfacePose, TrackState
+from estimation.rig import Rig
 from estimation.se3 import Array
+from hardware.arm.device import ArmState
 from hardware.arm.link import Arm
-from hardware.arm.protocol import G1, encode
-from hardware.arm_calibration.commanded import CommandedFile
-from hardware.arm_calibration.moves import still, watchful
-from hardware.arm_status import ArmState
+from hardware.arm.port import Opener
+from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.calibration.arm_solve import ARM_FILE, COMMANDED_FILE, CommandedFile
+from hardware.cameras.live import LiveCameras
+from hardware.files.arm_file import write_arm
+from hardware.files.folder_tables import SessionFolderWriter
+from hardware.files.images import encode
 from hardware.process.clock import Clock
-from hardware.process.progress import Report, silent
+from hardware.process.progress import ProgressReport, no_progress
 from planning.command import Move, Refusal, feed_for
+from planning.limits import AXIS_MARGIN, MotionLimits
+from planning.motion.guard import Guard
 
-LISTEN = 1.0  # s before the first move, in which an arm that answers has told where it stands
-REST = 0.5  # s after the last
+PEAK_SPEED_RATIO = 1.875  # peak to mean speed of a minimum-jerk move (10 s^3 - 15 s^4 + 6 s^5)
+HALTON_BASES = (2, 3, 5, 7, 11, 13)  # even for any number of places
+UPRIGHT_EVERY = 3  # one place in so many has no turn
+SWING_SINES = np.array([6.0, 5.0, 4.0]), np.array([2.2, 1.7, 1.3])  # mm and Hz of X Y Z
+SWING_LOAD = 0.6  # of the speed and acceleration limits
+STILL_VARIANCE = 1e-6  # mm^2 and rad^2, of a surface that is not tracked
+LISTEN_TIME = 1.0  # s before the first move, in which an arm reports its position
+SETTLE_TIME = 0.5  # s after the last move
+FIRST_PICTURES_TIMEOUT = 20.0  # s for the first pictures; a network camera takes five to open
+START_FRAME_SETS = 5  # before the arm begins to move
 
 
-class Drive:
-    """One arm, its clock, and the file of what it was sent."""
+@dataclass(frozen=True, slots=True)
+class MoveOptions:
+    """Options of a calibration's moves; InputError for a value out of range."""
+
+    places: int = 20  # number of resting places
+    reach: float = 50.0  # mm about the start along X and Y
+    up: float = 45.0  # mm above the start
+    down: float = 20.0  # mm below the start
+    turn: float = float(
+        np.deg2rad(35.0)
+    )  # rad of A, B and C at most: as far as a needle is seen, to tell tool from arm
+    speed: float = 80.0  # mm/s at most
+    dwell: float = 0.6  # s at each place
+    swing: float = 8.0  # s, at the end
+
+    def __post_init__(self) -> None:
+        most = {"places": 200, "reach": 300, "up": 300, "down": 300, "turn": np.pi / 3, "speed": 120, "swing": 60}
+        for name, high in {**most, "dwell": 10.0}.items():
+            value = getattr(self, name)
+            low = 4 if name == "places" else 0.3 if name == "dwell" else 0.0
+            if not (low <= value <= high):
+                raise InputError("moves", name, value, f"{low:g} to {high:g}")
+
+
+def plan_moves(start: Array, limits: MotionLimits, tick: float, options: MoveOptions) -> Array:
+    """Set-points (K, 6), mm and rad, one per tick, from and back to `start` (6,); those of a dwell repeat."""
+    parts, at = [], start
+    for place in [*places(start, limits, options), start]:
+        parts += list(_straight_move(at, place, tick, options))
+        parts.append(np.repeat(place[None], round(options.dwell / tick), axis=0))
+        at = place
+    parts.append(_swing(start, limits, tick, options))
+    parts.append(np.repeat(start[None], round(options.dwell / tick), axis=0))
+    return np.concatenate(parts)
+
+
+def places(start: Array, limits: MotionLimits, options: MoveOptions) -> Array:
+    """Places (P, 6), mm and rad, spread evenly about the start, within the arm's bounds."""
+    spread = np.array([[_halton(i + 1, base) for base in HALTON_BASES] for i in range(options.places)])
+    half = np.array([options.reach, options.reach, (options.up + options.down) / 2, *[options.turn] * 3])
+    middle = start + np.array([0, 0, (options.up - options.down) / 2, 0, 0, 0])
+    out = middle + (2 * spread - 1) * half
+    out[::UPRIGHT_EVERY, 3:] = start[3:]
+    return np.asarray(np.clip(out, limits.low + AXIS_MARGIN, limits.high - AXIS_MARGIN))
+
+
+def _halton(index: int, base: int) -> float:
+    out, share = 0.0, 1.0
+    while index:
+        share /= base
+        index, digit = divmod(index, base)
+        out += share * digit
+    return out
+
+
+def _straight_move(start: Array, goal: Array, tick: float, options: MoveOptions) -> Iterator[Array]:
+    """A straight minimum-jerk move, if there is any way to go."""
+    way = goal - start
+    length = max(float(np.linalg.norm(way[:3])), 60.0 * float(np.linalg.norm(way[3:])))  # 1 rad/s at 60 mm/s
+    if length > 0:
+        count = max(5, int(np.ceil(PEAK_SPEED_RATIO * length / (options.speed * tick))))
+        s = np.linspace(0, 1, count + 1)[1:, None]
+        yield start + (10 * s**3 - 15 * s**4 + 6 * s**5) * way
+
+
+def _swing(middle: Array, limits: MotionLimits, tick: float, options: MoveOptions) -> Array:
+    """Three sines with a smooth envelope: their acceleration separates dead time from lag."""
+    t = np.arange(1, round(options.swing / tick) + 1)[:, None] * tick
+    size, rate = SWING_SINES
+    omega = 2 * np.pi * rate
+    most = np.minimum(SWING_LOAD * limits.acceleration[:3] / omega**2, SWING_LOAD * limits.speed[:3] / omega)
+    out = np.repeat(middle[None], len(t), axis=0)
+    out[:, :3] += np.sin(np.pi * t / max(options.swing, tick)) ** 2 * np.minimum(size, most) * np.sin(omega * t)
+    return out
+
+
+def still_surface(now: float) -> SurfacePose:
+    """A surface that stands still at the base's origin, for the guard: a calibration has none."""
+    return SurfacePose(now, np.eye(4), STILL_VARIANCE * np.eye(6), np.zeros(6), TrackState.TRACKING)
+
+
+def guard_at(profile: ArmProfile, at: Array) -> Guard:
+    """A guard for an arm that stands at `at` (6,)."""
+    return Guard(profile.limits, replace(profile.arm, home=at), profile.tick, lag=profile.lag)
+
+
+def check_moves(profile: ArmProfile, start: Array, targets: Array) -> None:
+    """InputError with the guard's reason unless it accepts all set-points (K, 6), one per tick."""
+    guard, at = guard_at(profile, start), start
+    for number, target in enumerate(targets):
+        if (target == at).all():
+            continue
+        now = (number + 1) * profile.tick
+        answer = guard(Move(now, target, feed_for(at, target, profile.tick), 0, False), still_surface(now), now)
+        if isinstance(answer, Refusal):
+            allowed = "moves that the arm's limits and no-go zones allow: less --reach-mm, --turn-deg or --speed-mm-s"
+            raise InputError("moves", f"{number * profile.tick:.1f} s after their begin", answer.reason, allowed)
+        at = target
+
+
+class ArmDrive:
+    """Drives an arm and logs its set-points."""
 
     def __init__(self, arm: Arm, clock: Clock, log: CommandedFile) -> None:
         self.arm, self._clock, self._log = arm, clock, log
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
-        """Let time pass, looking at the line."""
+        """Wait, while polling the arm."""
         end = self._clock.now() + seconds
         while (now := self._clock.now()) < end and not until():
             self._look(now)
             self._clock.wait_until(now + self.arm.settings.poll)
 
     def ready(self, stands: Array | None) -> Array:
-        """Arm it, and where it then stands (6,). stands: where an arm that does not answer stands, mm and rad."""
+        """Arm it; returns its position (6,). stands: position of an arm that does not report it, mm and rad."""
         if stands is not None:
             self.arm.stand(stands, self._clock.now())
-        self.wait(LISTEN)
+        self.wait(LISTEN_TIME)
         reason = self.arm.arm(self._clock.now())
         if reason or self.arm.target is None:
             allowed = "an arm that answers from where it stands at rest, or --stands"
             raise InputError("arm", "ready", reason or "nobody knows where it stands", allowed)
         return self.arm.target
 
-    def follow(self, targets: Array, report: Report = silent) -> None:
-        """Send set-points (K, 6), one a tick; where the link asks to wait, all that follows comes later.
+    def follow(self, targets: Array, report: ProgressReport = no_progress) -> None:
+        """Send set-points (K, 6), one per tick; where the link asks to wait, the rest is delayed.
 
-        InputError where the guard or the link ends it; the arm is at rest then. It is left armed, at the last of them.
+        The arm stays armed at the last one. InputError where the guard or the link refuses; then the arm is at rest.
         """
         assert self.arm.target is not None
         arm, at = self.arm, self.arm.target
-        guard, due, number = watchful(arm.profile, at), self._clock.now(), 0
+        guard, due, number = guard_at(arm.profile, at), self._clock.now(), 0
         try:
             while number < len(targets):
                 now = self._clock.now()
@@ -61,8 +186,8 @@ class Drive:
                     target = targets[number]
                     if (target != at).any():
                         move = Move(now, target, feed_for(at, target, arm.profile.tick), 0, False)
-                        answer = guard(move, still(now), now)
-                        reason = answer.reason if isinstance(answer, Refusal) else self._send(move, now)
+                        answer = guard(move, still_surface(now), now)
+                        reason = answer.reason if isinstance(answer, Refusal) else arm.send(move, now)
                         if reason:
                             raise InputError("arm", "motion", reason, "moves that guard and link let pass")
                         at = target
@@ -70,20 +195,122 @@ class Drive:
                     number, due = number + 1, begun + arm.profile.tick * (1 + arm.settings.ease)
                     report(number, len(targets))
                 self._clock.wait_until(now + arm.settings.poll)
-            self.wait(REST, lambda: arm.state is not ArmState.ARMED)
+            self.wait(SETTLE_TIME, lambda: arm.state is not ArmState.ARMED)
         except BaseException:
             self.halt("the calibration was ended")
             raise
 
     def halt(self, reason: str) -> None:
-        """Bring it to rest at once, whatever it does."""
+        """Stop the arm at once."""
         if self.arm.state is ArmState.ARMED:
             self.arm.stop(reason, self._clock.now())
-        self.wait(REST)
-
-    def _send(self, move: Move, now: float) -> str:
-        return self.arm.send(encode(G1(move.axes, move.feed), self.arm.profile.dialect), now)
+        self.wait(SETTLE_TIME)
 
     def _look(self, now: float) -> None:
         self.arm.poll(now)
         self._log.note(self.arm, now)
+
+
+class PictureWriter(threading.Thread):
+    """Writes the pictures of live cameras into a session folder, without loss, until `end`.
+
+    count: frame sets so far. A failure is stored, and `check` raises it in the thread that moves the arm.
+    """
+
+    def __init__(self, live: LiveCameras, rig: Rig, clock: Clock, folder: Path) -> None:
+        super().__init__(name="pictures", daemon=True)
+        self._live, self._rig, self._clock, self._folder = live, rig, clock, folder
+        self._ended = threading.Event()
+        self._failed: Exception | None = None
+        self.count = 0
+
+    def run(self) -> None:
+        """Until `end`, or until something fails."""
+        try:
+            with SessionFolderWriter(self._folder, self._rig, ()) as session:
+                while not self._ended.is_set():
+                    self._write(session)
+        except Exception as error:  # raised by `check`
+            self._failed = error
+
+    def _write(self, session: SessionFolderWriter) -> None:
+        frames = self._live.next_set(self._clock.now() + 0.2)
+        for frame in frames.frames if frames is not None else ():
+            stamp = frame.stamp - self._rig.cameras[frame.camera].clock_offset
+            # lossless: JPEG stores a thin needle's colour at half the resolution
+            session.picture(frame.camera, stamp, *encode(frame.image))
+        self.count += frames is not None
+
+    def check(self) -> None:
+        """Raise the stored failure, if any."""
+        if self._failed is not None:
+            raise self._failed
+
+    def end(self) -> None:
+        """Finish the folder, and wait for it."""
+        self._ended.set()
+        self.join()
+
+
+def move_arm(
+    arm: Arm, clock: Clock, folder: Path, stands: Array | None, options: MoveOptions, report: ProgressReport
+) -> Array:
+    """Make the moves, after checking all of them, and write commanded.csv; returns the start (6,).
+
+    However it ends, the arm is at rest and disarmed, and the moves so far are recorded.
+    """
+    with CommandedFile(folder / COMMANDED_FILE) as log:
+        drive = ArmDrive(arm, clock, log)
+        try:
+            start = drive.ready(stands)
+            targets = plan_moves(start, arm.profile.limits, arm.profile.tick, options)
+            check_moves(arm.profile, start, targets)
+            drive.follow(targets, report)
+        finally:
+            drive.halt("the calibration was ended") if arm.travels else arm.disarm(clock.now())
+            log.note(arm, clock.now())
+    return start
+
+
+def record_live(
+    live: LiveCameras,
+    rig: Rig,
+    opener: Opener,
+    profile: ArmProfile,
+    clock: Clock,
+    folder: Path,
+    stands: Array | None,
+    options: MoveOptions,
+    report: ProgressReport,
+    link: LinkSettings,
+) -> None:
+    """Move an arm before live cameras and record both in a session folder; Ctrl-C stops the arm, keeping the record."""
+    write_arm(folder / ARM_FILE, profile, "the arm as it was taken to be while it was calibrated")
+    with live:
+        arm = Arm(opener, profile, clock.now(), link)
+        writer = PictureWriter(live, rig, clock, folder)
+        writer.start()
+
+        def progress(done: int, total: int) -> None:
+            writer.check()
+            report(done, total)
+
+        try:
+            _await_pictures(writer, arm, clock)
+            move_arm(arm, clock, folder, stands, options, progress)
+        finally:
+            writer.end()
+            arm.close()
+    writer.check()
+
+
+def _await_pictures(writer: PictureWriter, arm: Arm, clock: Clock) -> None:
+    """Wait for the first frame sets; InputError where they do not come."""
+    end = clock.now() + FIRST_PICTURES_TIMEOUT
+    while writer.count < START_FRAME_SETS:
+        writer.check()
+        if clock.now() > end:
+            allowed = "cameras that deliver: stillbed cameras RIG.toml shows what they do"
+            raise InputError("cameras", "frame sets", writer.count, allowed)
+        arm.poll(clock.now())
+        clock.wait_until(clock.now() + 0.01)

@@ -1,31 +1,92 @@
-"""The report of an arm's calibration: the verdict, the numbers, the tips as they were found, and what is left over."""
+"""Verdict and report of an arm's calibration: parameters, detected tips, residuals and latency."""
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from html import escape
 
 import numpy as np
 
 from estimation import se3
 from estimation.calibration.arm_model import predict
 from estimation.se3 import Array
-from hardware.arm_calibration.verdict import seen_words
 from hardware.calibration.arm_solve import ArmCalibration, kinematics_of
-from hardware.calibration.verdict import Verdict
+from hardware.calibration.report import CalibrationVerdict, bullets, figure, figure_row, picture_frame
 from hardware.files.images import encode
-from hardware.page import document, figures_table, legend, line_key, row_of_tiles, section, tile
+from hardware.report.page import document, figures_table, legend, line_key, row_of_tiles, section, tile
 
-STRETCH = 100  # times, residuals are drawn
-SCALED = 4  # times, pictures of tips are enlarged
-QUALITY = 90  # of JPEG
-PLOT = (900, 220)  # px of the chart of delays
-SHOWN = 0.35  # of the plot's height that the largest excursion takes
+MAX_TIP_ERROR = 0.1  # mm, of the tip in the working volume: a fourth of a bead
+MAX_HELD_OUT_ERROR = 0.3  # mm, median of held-out pictures: outliers and a bent arm are beyond it
+MAX_LAG_SIGMA = 0.005  # s, one sigma of the arm's lag: at 20 mm/s a tenth of a millimetre
+MIN_TIP_SHARE = 0.3  # of a camera's pictures in which the tip is found
+RESIDUAL_SCALE = 100  # enlargement of the residuals drawn
+CROP_SCALE = 4  # enlargement of the pictures of tips
+CROP_QUALITY = 90  # of JPEG
+PLOT_SIZE = (900, 220)  # px of the chart of delays
 
 
-def page(title: str, found: ArmCalibration, verdict: Verdict, against: Sequence[tuple[str, str, str]] = ()) -> str:
-    """The page as HTML. against: rows of what is known exactly, if it is: what, error, and its stated sigma."""
+def judge_arm(found: ArmCalibration, limit: float) -> CalibrationVerdict:
+    """The verdict. limit: mm, one sigma of the tip in 19 of 20 places."""
+    typical, worst = float(np.sqrt(np.mean(found.error**2))), float(np.percentile(found.error, 95))
+    beside, px = float(np.nanmedian(found.held_mm)), float(np.nanmedian(found.held_px))
+    sigma, state = found.fit.sigma, found.fit.state
+    late = float(np.sqrt(max(found.fit.covariance[9:11, 9:11].sum(), 0.0)))
+    good = [worst <= limit, beside <= MAX_HELD_OUT_ERROR, late <= MAX_LAG_SIGMA]
+    word = "good enough" if good[0] else "NOT good enough"
+    lines = [
+        f"{word} to print: the tip is where it is thought to be within {typical:.3f} mm (one sigma), in 19 of 20 "
+        f"places within {worst:.3f} mm; {limit:g} mm is allowed",
+        f"pictures that took no part lie {beside:.3f} mm ({px:.2f} px) beside where the arm should be (median); "
+        f"{MAX_HELD_OUT_ERROR:g} mm is allowed",
+    ]
+    if found.unknowns.tool:
+        x, y, z = state.tool
+        lines.append(
+            f"the tip is at X{x:+.2f} Y{y:+.2f} Z{z:+.2f} mm in the tool, beside where the arm takes it to be, "
+            f"± {np.linalg.norm(sigma[6:9]):.2f} mm"
+        )
+    if found.unknowns.latency:
+        lines.append(
+            f"the arm begins {1e3 * state.dead_time:.1f} ± {1e3 * sigma[9]:.1f} ms late and follows with a lag of "
+            f"{1e3 * state.lag:.1f} ± {1e3 * sigma[10]:.1f} ms; both together are known to ± {1e3 * late:.1f} ms, "
+            f"± {1e3 * MAX_LAG_SIGMA:g} ms is allowed"
+        )
+    out = 1 - found.fit.used.mean()
+    if out > 0.05:
+        lines.append(f"{100 * out:.0f} % of what was taken for the tip was something else, and is left out")
+    return CalibrationVerdict(all(good), tuple(lines), () if all(good) else tuple(_hints(found, good)))
+
+
+def detection_text(found: ArmCalibration, camera: int) -> str:
+    """In how many of a camera's pictures the tip was found, and in how many the tool hides it."""
+    tips, hidden = found.tips, int(found.hidden[camera])
+    text = f"found in {tips.found[camera]} of {tips.looked[camera]} pictures"
+    return f"{text}, hidden by the tool itself in {hidden}" if hidden else text
+
+
+def _hints(found: ArmCalibration, good: list[bool]) -> list[str]:
+    tips, hints = found.tips, []
+    for camera, looked, count, hidden in zip(found.rig.cameras, tips.looked, tips.found, found.hidden, strict=True):
+        if hidden > looked / 2:
+            hints.append(f"{camera.name} looks along the tool, which hides its own tip: a larger --turn-deg")
+        elif count < MIN_TIP_SHARE * (looked - hidden):
+            hints.append(
+                f"{camera.name} found the tip in {count} of {looked} pictures: is the needle in view, lit, and of "
+                "another colour than what is behind it?"
+            )
+    if not good[0]:
+        hints.append("more places, farther apart: --places 40 --reach-mm 70")
+    if not good[1]:
+        hints.append("calibrate the cameras anew, and see that nothing but the arm moves: stillbed calibrate cameras")
+    if not good[2]:
+        hints.append("a longer swing: --swing-s 20; and cameras that take more pictures a second")
+    return hints
+
+
+def arm_page(
+    title: str, found: ArmCalibration, verdict: CalibrationVerdict, against: Sequence[tuple[str, str, str]] = ()
+) -> str:
+    """The page as HTML. against: rows beside the truth, if it is known: what, error, stated sigma."""
     state, sigma = found.fit.state, found.fit.sigma
     latency = f"{1e3 * (state.dead_time + state.lag):.0f}"
     tiles = [
@@ -34,16 +95,16 @@ def page(title: str, found: ArmCalibration, verdict: Verdict, against: Sequence[
         tile(latency, "ms", "late in all"),
         tile(str(int(found.fit.used.sum())), "", "tips used"),
     ]
-    said = "".join(f"<li>{escape(words)}</li>" for words in (*verdict.lines, *verdict.hints))
-    body = [row_of_tiles(tiles), section("Verdict", "What was found, and what to do next.", f"<ul>{said}</ul>")]
+    lines = bullets((*verdict.lines, *verdict.hints))
+    body = [row_of_tiles(tiles), section("Verdict", "What was found, and what to do next.", lines)]
     body.append(section("Numbers", "One sigma behind each figure.", _numbers(found, sigma)))
     if against:
         rows = [list(row) for row in against]
         body.append(section("Beside the truth", "This arm is simulated.", figures_table(["", "off", "stated"], rows)))
     body.append(section("The tip as it was found", "A cross where its end is measured.", _crops(found)))
-    text = f"From each tip to where the arm puts it, {STRETCH} times as long."
+    text = f"From each tip to where the arm puts it, {RESIDUAL_SCALE} times as long."
     body.append(section("Residuals", text, _residuals(found)))
-    if found.asked.latency:
+    if found.unknowns.latency:
         text = "How far the tip lies behind where it was sent, over its speed; the line is what was found."
         body.append(section("Latency", text, _latency(found)))
     word = "passed" if verdict.passed else "failed"
@@ -55,11 +116,12 @@ def _numbers(found: ArmCalibration, sigma: Array) -> str:
     state = found.fit.state
     arm_from_base = se3.inverse(state.base_from_arm)
     turn = np.degrees(se3.angle_of(arm_from_base))
-    dead, lag = (f"{1e3 * s:.2f}" if found.asked.latency else "kept" for s in sigma[9:11])
+    dead, lag = (f"{1e3 * s:.2f}" if found.unknowns.latency else "kept" for s in sigma[9:11])
+    tool = _three(sigma[6:9], 3) if found.unknowns.tool else "kept"
     rows = [
         ["place of the base in the arm's frame, mm", _three(arm_from_base[:3, 3]), f"{np.linalg.norm(sigma[3:6]):.3f}"],
         ["its turn, degrees", f"{turn:.3f}", f"{np.degrees(np.linalg.norm(sigma[:3])):.4f}"],
-        ["tip in the tool, mm", _three(np.asarray(state.tool)), _three(sigma[6:9], 3) if found.asked.tool else "kept"],
+        ["tip in the tool, mm", _three(np.asarray(state.tool)), tool],
         ["dead time, ms", f"{1e3 * state.dead_time:.2f}", dead],
         ["servo's lag, ms", f"{1e3 * state.lag:.2f}", lag],
         ["radius of the needle's end, mm", f"{state.blunt:.2f}", f"{sigma[11]:.2f}"],
@@ -67,7 +129,7 @@ def _numbers(found: ArmCalibration, sigma: Array) -> str:
     ]
     for c, camera in enumerate(found.rig.cameras):
         place = (arm_from_base @ camera.base_from_camera)[:3, 3]
-        rows.append([f"{camera.name} in the arm's frame, mm", _three(place), seen_words(found, c)])
+        rows.append([f"{camera.name} in the arm's frame, mm", _three(place), detection_text(found, c)])
     return figures_table(["", "found", "±, or the tip"], rows)
 
 
@@ -77,46 +139,42 @@ def _three(values: Array, digits: int = 2) -> str:
 
 def _crops(found: ArmCalibration) -> str:
     figures = []
-    for camera, (images, pixels) in zip(found.rig.cameras, found.look.crops, strict=True):
+    for camera, (images, pixels) in zip(found.rig.cameras, found.tips.crops, strict=True):
         for image, pixel in zip(images, pixels, strict=True):
             h, w = image.shape[:2]
-            data = base64.b64encode(encode(np.ascontiguousarray(image), QUALITY)[1]).decode()
+            data = base64.b64encode(encode(np.ascontiguousarray(image), CROP_QUALITY)[1]).decode()
             x, y = pixel + 0.5
             cross = f'<path class="truth" stroke-width="0.4" d="M{x - 4:.2f} {y:.2f}h8M{x:.2f} {y - 4:.2f}v8"/>'
             place = f'width="{w}" height="{h}" style="image-rendering:pixelated"'
             picture = f'<image href="data:image/jpeg;base64,{data}" {place}/>'
-            svg = f'<svg class="plot" viewBox="0 0 {w} {h}" role="img" aria-label="tip" style="width:{SCALED * w}px">'
-            figures.append(
-                f"<figure>{svg}{picture}{cross}</svg><figcaption>{escape(camera.name)}</figcaption></figure>"
-            )
-    return f'<div class="pictures">{"".join(figures)}</div>'
+            width = f'style="width:{CROP_SCALE * w}px"'
+            svg = f'<svg class="plot" viewBox="0 0 {w} {h}" role="img" aria-label="tip" {width}>{picture}{cross}</svg>'
+            figures.append(figure(svg, camera.name))
+    return figure_row(figures)
 
 
 def _residuals(found: ArmCalibration) -> str:
-    s, figures = found.look.sightings, []
+    s, figures = found.tips.sightings, []
     for c, camera in enumerate(found.rig.cameras):
         rows = (s.camera == c) & found.fit.used
-        ends = s.pixels[rows] + STRETCH * found.fit.residuals[rows]
-        w, h = camera.size
+        ends = s.pixels[rows] + RESIDUAL_SCALE * found.fit.residuals[rows]
         lines = "".join(
             f'<path class="truth" stroke-width="3" d="M{a:.0f} {b:.0f}L{x:.0f} {y:.0f}"/>'
             f'<circle class="estimate" cx="{a:.0f}" cy="{b:.0f}" r="5"/>'
             for (a, b), (x, y) in zip(s.pixels[rows], ends, strict=True)
         )
-        frame = f'<rect class="frame" width="{w}" height="{h}" fill="none" stroke="var(--faint)" stroke-width="4"/>'
         median = float(np.median(np.linalg.norm(found.fit.residuals[rows], axis=1))) if rows.any() else float("nan")
-        words = f"{camera.name}: {int(rows.sum())} tips, median {median:.2f} px"
-        svg = f'<svg class="plot" viewBox="0 0 {w} {h}" role="img" aria-label="residuals">{frame}{lines}</svg>'
-        figures.append(f"<figure>{svg}<figcaption>{escape(words)}</figcaption></figure>")
-    return f'<div class="pictures">{"".join(figures)}</div>'
+        caption = f"{camera.name}: {int(rows.sum())} tips, median {median:.2f} px"
+        figures.append(figure(picture_frame(camera.size, lines, "residuals"), caption))
+    return figure_row(figures)
 
 
-def behind(found: ArmCalibration) -> tuple[Array, Array]:
-    """Speed (M,), mm/s, of the set-point at sightings on the way, and by how much (M,), mm, the tip lies behind it.
+def tip_lag(found: ArmCalibration) -> tuple[Array, Array]:
+    """Speed (M,), mm/s, of the set-point at sightings on the way, and lag (M,), mm, of the tip behind it.
 
-    Seen by one camera: along its image of the way, in the tip's depth.
+    By one camera each: along the image of the move, at the tip's depth.
     """
-    s, state = found.look.sightings, found.fit.state
+    s, state = found.tips.sightings, found.fit.state
     rows = (s.place < 0) & found.fit.used
     at = s.take(rows)
     kinematics = kinematics_of(found.profile.arm)
@@ -133,20 +191,20 @@ def behind(found: ArmCalibration) -> tuple[Array, Array]:
 
 
 def _latency(found: ArmCalibration) -> str:
-    speed, late = behind(found)
+    speed, late = tip_lag(found)
     if not len(speed):
         return '<p class="note">no pictures on the way</p>'
-    width, height = PLOT
+    width, height = PLOT_SIZE
     most, top = float(speed.max()) * 1.05, max(float(np.percentile(np.abs(late), 98)) * 1.2, 0.1)
     x, y = speed / most * width, height * (1 - np.clip(late / top, -0.1, 1.0))
     dots = "".join(f'<circle class="estimate" cx="{a:.1f}" cy="{b:.1f}" r="3"/>' for a, b in zip(x, y, strict=True))
     total = found.fit.state.dead_time + found.fit.state.lag
     line = f'<path class="truth" stroke-width="2" d="M0 {height}L{width} {height * (1 - total * most / top):.1f}"/>'
     axis = f'<path stroke="var(--faint)" d="M0 {height}H{width}M0 0V{height}"/>'
-    words = (
+    labels = (
         f'<text x="{width - 8}" y="{height - 8}" text-anchor="end">{most:.0f} mm/s</text>'
         f'<text x="8" y="16">{top:.1f} mm behind</text>'
     )
     svg = f'<svg class="plot" viewBox="0 0 {width} {height + 2}" role="img" aria-label="latency">'
     keys = [line_key("truth", f"{1e3 * total:.1f} ms")]
-    return f"{svg}{axis}{line}{dots}{words}</svg>{legend(keys)}"
+    return f"{svg}{axis}{line}{dots}{labels}</svg>{legend(keys)}"

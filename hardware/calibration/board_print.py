@@ -11,100 +11,102 @@ from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.calibration.board_file import MARKERS, read_board, write_board
-from hardware.out_folder import check_new
-from hardware.process.checks import meant
-from perception.boards.board import DICTIONARIES, Board, black, grid_of
+from hardware.files.rig_file import MARKER_SHARE_RANGE, read_board, write_board
+from hardware.process.checks import one_of_text
+from hardware.process.progress import check_new
+from perception.boards.board import DICTIONARIES, Board, cells_per_square, ink_cells
 
-PAGES = {"A5": (148, 210), "A4": (210, 297), "A3": (297, 420), "A2": (420, 594), "letter": (215.9, 279.4)}
-MARGIN = 10.0  # mm that no printer prints on, and of white around the board
-FOOT = 16.0  # mm below the board for the ruler and the words
-RULER = 100.0  # mm, or half of that on a small page
-POINT = 72 / 25.4  # a PDF's units a mm
+PAGE_SIZES = {"A5": (148, 210), "A4": (210, 297), "A3": (297, 420), "A2": (420, 594), "letter": (215.9, 279.4)}
+PAGE_MARGIN = 10.0  # mm that no printer prints on, and of white around the board
+PAGE_FOOTER = 16.0  # mm below the board for the ruler and the words
+RULER_LENGTH = 100.0  # mm, or half of that on a small page
+POINTS_PER_MM = 72 / 25.4  # a PDF's units a mm
 
 
 @dataclass(frozen=True, slots=True)
-class Print:
-    """What is to be printed; squares: columns and rows, or None for as many as fit the page."""
+class PrintOptions:
+    """Options of a printed board."""
 
     kind: str = "charuco"
-    squares: tuple[int, int] | None = None
-    square: float = 25.0
-    marker: float = 0.75
+    squares: tuple[int, int] | None = None  # columns and rows, or None for as many as fit the page
+    square: float = 25.0  # mm
+    marker: float = 0.75  # ratio of a marker's edge to a square's
     dictionary: str = "4X4_50"
     inverted: bool = False
     page: str = "A4"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawing:
-    """A page. size: (W, H) mm. ink: (N, 4) black rectangles x y w h, mm from the top left. words: what stands where."""
+class PageDrawing:
+    """A page."""
 
-    size: tuple[float, float]
-    ink: Array
-    words: tuple[tuple[float, float, str], ...]
+    size: tuple[float, float]  # (W, H) mm
+    ink: Array  # (N, 4) black rectangles x y w h, mm from the top left
+    words: tuple[tuple[float, float, str], ...]  # x, y mm and text
 
 
-def write_print(out: Path, wish: Print, force: bool = False) -> str:
-    """Write the page, and board.toml beside it; returns what was written, in words.
+def write_print(out: Path, options: PrintOptions, force: bool = False) -> str:
+    """Write the page, and board.toml beside it; returns a text about it.
 
-    InputError where the wish makes no sense, or one of the two exists and `force` is not set.
+    InputError where the options are impossible, or one of the two exists and `force` is not set.
     """
     if out.suffix not in (".svg", ".pdf"):
         raise InputError(out, "--out", out.name, "a file that ends in .svg or .pdf")
-    board, size = board_of(wish), page_size(wish)
-    made = drawing(board, size)
+    board, size = board_of(options), page_size(options)
+    page = drawing(board, size)
     beside = out.with_suffix(".toml")
     for file in (out, beside):
         check_new(file, force)
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_bytes(svg(made).encode() if out.suffix == ".svg" else pdf(made))
+    out.write_bytes(svg(page).encode() if out.suffix == ".svg" else pdf(page))
     write_board(beside, board)
     read_board(beside)  # what was wished is told to be wrong as it would be when read
     return f"{out}: {board}, on {size[0]:g} x {size[1]:g} mm; {beside} describes it. Print at 100 %, measure the ruler."
 
 
-def page_size(wish: Print) -> tuple[float, float]:
+def page_size(options: PrintOptions) -> tuple[float, float]:
     """(W, H) mm of the page."""
-    if wish.page in PAGES:
-        return PAGES[wish.page]
-    words = wish.page.lower().split("x")
+    if options.page in PAGE_SIZES:
+        return PAGE_SIZES[options.page]
+    words = options.page.lower().split("x")
     try:
         width, height = (float(word) for word in words)
     except ValueError:
-        raise InputError("--page", "size", wish.page, f"{', '.join(PAGES)}, or WxH in mm") from None
+        raise InputError("--page", "size", options.page, f"{', '.join(PAGE_SIZES)}, or WxH in mm") from None
     if not (width > 0 and height > 0):
-        raise InputError("--page", "size", wish.page, f"{', '.join(PAGES)}, or WxH in mm, both above 0")
+        raise InputError("--page", "size", options.page, f"{', '.join(PAGE_SIZES)}, or WxH in mm, both above 0")
     return width, height
 
 
-def board_of(wish: Print) -> Board:
-    """The board that is wished for; InputError where it does not fit its page."""
-    width, height = page_size(wish)
-    room = np.array([width - 2 * MARGIN, height - 2 * MARGIN - FOOT])
-    if not wish.square > 0:
-        raise InputError("--square-mm", "square", wish.square, "> 0 mm")
-    if not MARKERS[0] <= wish.marker <= MARKERS[1]:
-        raise InputError("--marker", "share", wish.marker, f"{MARKERS[0]:g} to {MARKERS[1]:g}")
-    if wish.dictionary not in DICTIONARIES:
-        raise InputError("--dictionary", "name", wish.dictionary, meant(wish.dictionary, DICTIONARIES))
-    fits = np.floor(room / wish.square + 1e-9).astype(int)
-    if wish.squares is None and wish.kind == "chessboard" and fits.sum() % 2 == 0:
+def board_of(options: PrintOptions) -> Board:
+    """The board to print; InputError where it does not fit its page."""
+    width, height = page_size(options)
+    room = np.array([width - 2 * PAGE_MARGIN, height - 2 * PAGE_MARGIN - PAGE_FOOTER])
+    if not options.square > 0:
+        raise InputError("--square-mm", "square", options.square, "> 0 mm")
+    if not MARKER_SHARE_RANGE[0] <= options.marker <= MARKER_SHARE_RANGE[1]:
+        raise InputError("--marker", "share", options.marker, f"{MARKER_SHARE_RANGE[0]:g} to {MARKER_SHARE_RANGE[1]:g}")
+    if options.dictionary not in DICTIONARIES:
+        raise InputError("--dictionary", "name", options.dictionary, one_of_text(options.dictionary, DICTIONARIES))
+    fits = np.floor(room / options.square + 1e-9).astype(int)
+    if options.squares is None and options.kind == "chessboard" and fits.sum() % 2 == 0:
         fits[1] -= 1
-    squares = (int(fits[0]), int(fits[1])) if wish.squares is None else wish.squares
-    board = Board(wish.kind, squares, wish.square, wish.marker, wish.dictionary, wish.inverted)
+    squares = (int(fits[0]), int(fits[1])) if options.squares is None else options.squares
+    board = Board(options.kind, squares, options.square, options.marker, options.dictionary, options.inverted)
     if min(squares) < 3 or (np.array(board.size) > room + 1e-6).any():
-        got = f"{squares[0]} x {squares[1]} of {wish.square:g} mm"
-        raise InputError("--squares", "board", got, f"3 x 3 to {fits[0]} x {fits[1]} squares on {wish.page}")
-    if not grid_of(board):
-        raise InputError("--marker", "share", wish.marker, "a share that whole bits of a marker make, as 0.75 or 0.6")
+        got = f"{squares[0]} x {squares[1]} of {options.square:g} mm"
+        raise InputError("--squares", "board", got, f"3 x 3 to {fits[0]} x {fits[1]} squares on {options.page}")
+    if not cells_per_square(board):
+        raise InputError(
+            "--marker", "share", options.marker, "a share that whole bits of a marker make, as 0.75 or 0.6"
+        )
     return board
 
 
-def drawing(board: Board, size: tuple[float, float]) -> Drawing:
+def drawing(board: Board, size: tuple[float, float]) -> PageDrawing:
     """The page: board, ruler and words."""
-    cells, edge = black(board)
-    left, top = (size[0] - board.size[0]) / 2, MARGIN
+    cells, edge = ink_cells(board)
+    left, top = (size[0] - board.size[0]) / 2, PAGE_MARGIN
     ink = _rectangles(cells) * edge + [left, top, 0, 0]
     if board.inverted:  # white squares at the rim need ink around them
         rim = 0.2 * board.square
@@ -112,20 +114,20 @@ def drawing(board: Board, size: tuple[float, float]) -> Drawing:
         frame = [[-rim, -rim, w + 2 * rim, rim], [-rim, h, w + 2 * rim, rim], [-rim, 0, rim, h], [w, 0, rim, h]]
         ink = np.vstack([ink, np.array(frame) + [left, top, 0, 0]])
     below = top + board.size[1] + 6
-    long = RULER if size[0] >= RULER + 2 * MARGIN else RULER / 2
+    long = RULER_LENGTH if size[0] >= RULER_LENGTH + 2 * PAGE_MARGIN else RULER_LENGTH / 2
     start = (size[0] - long) / 2
     ticks = [[start + x - 0.15, below, 0.3, 4 if x % 10 == 0 else 2] for x in np.arange(0, long + 1, 5)]
     ink = np.vstack([ink, [[start, below, long, 0.3]], ticks])
     words = (
         (start + long + 2, below + 3.5, f"{long:g} mm"),
-        (MARGIN, below + 8.0, f"{board}. Print at 100 %: the ruler must be {long:g} mm long."),
+        (PAGE_MARGIN, below + 8.0, f"{board}. Print at 100 %: the ruler must be {long:g} mm long."),
         (
-            MARGIN,
+            PAGE_MARGIN,
             below + 11.0,
             "If it is not, write the measured square_mm into board.toml. Mount the sheet on glass, flat.",
         ),
     )
-    return Drawing(size, ink, words)
+    return PageDrawing(size, ink, words)
 
 
 def _rectangles(cells: NDArray[np.bool_]) -> Array:
@@ -138,16 +140,16 @@ def _rectangles(cells: NDArray[np.bool_]) -> Array:
         for run in [r for r in open_runs if r not in runs]:
             out.append(open_runs.pop(run))
         for a, b in sorted(runs):
-            made = open_runs.setdefault((a, b), [a, y, b - a, 0])
-            made[3] += 1
+            page = open_runs.setdefault((a, b), [a, y, b - a, 0])
+            page[3] += 1
     return np.array(out, float).reshape(-1, 4)
 
 
-def svg(made: Drawing) -> str:
+def svg(page: PageDrawing) -> str:
     """The page as SVG in mm."""
-    w, h = made.size
-    path = "".join(f"M{x:.4f} {y:.4f}h{a:.4f}v{b:.4f}h{-a:.4f}z" for x, y, a, b in made.ink)
-    words = "".join(f'<text x="{x:.2f}" y="{y:.2f}">{escape(text)}</text>' for x, y, text in made.words)
+    w, h = page.size
+    path = "".join(f"M{x:.4f} {y:.4f}h{a:.4f}v{b:.4f}h{-a:.4f}z" for x, y, a, b in page.ink)
+    words = "".join(f'<text x="{x:.2f}" y="{y:.2f}">{escape(text)}</text>' for x, y, text in page.words)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{w:g}mm" height="{h:g}mm" viewBox="0 0 {w:g} {h:g}">'
         f'<rect width="{w:g}" height="{h:g}" fill="#fff"/><path fill="#000" shape-rendering="crispEdges" d="{path}"/>'
@@ -155,14 +157,16 @@ def svg(made: Drawing) -> str:
     )
 
 
-def pdf(made: Drawing) -> bytes:
+def pdf(page: PageDrawing) -> bytes:
     """The page as PDF 1.4: one content stream of rectangles filled as one, and text in Helvetica."""
-    w, h = (side * POINT for side in made.size)
+    w, h = (side * POINTS_PER_MM for side in page.size)
     boxes = "\n".join(
-        f"{x * POINT:.4f} {h - (y + b) * POINT:.4f} {a * POINT:.4f} {b * POINT:.4f} re" for x, y, a, b in made.ink
+        f"{x * POINTS_PER_MM:.4f} {h - (y + b) * POINTS_PER_MM:.4f} {a * POINTS_PER_MM:.4f} {b * POINTS_PER_MM:.4f} re"
+        for x, y, a, b in page.ink
     )
     text = "\n".join(
-        f"BT /F1 7.4 Tf {x * POINT:.3f} {h - y * POINT:.3f} Td ({_plain(t)}) Tj ET" for x, y, t in made.words
+        f"BT /F1 7.4 Tf {x * POINTS_PER_MM:.3f} {h - y * POINTS_PER_MM:.3f} Td ({_plain(t)}) Tj ET"
+        for x, y, t in page.words
     )
     stream = f"0 g\n{boxes}\nf\n{text}\n".encode("latin-1")
     parts = [

@@ -1,35 +1,58 @@
-"""Corners found in a recording, kept in a file so that they are looked for once, and go on where it was interrupted."""
+"""Corners of a recording, stored so that an interrupted search goes on; and the coverage of the cameras by the board.
+
+Coverage: which parts of each picture, which tilts and which depths the board has had. `CoverageGuide` says what is
+missing while the board is still being waved, before anything is calibrated.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from dataclasses import fields
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
-from hardware.files.session import Session
+from estimation import se3
+from estimation.calibration.camera_rig import Calibration
+from estimation.calibration.lens_fit import MIN_PLANE_CORNERS, focal_from_terms, focal_terms, homography, poses
+from estimation.se3 import Array
+from hardware.files.session import FrameReader, FrameRef, Session
+from hardware.process.progress import ProgressReport
 from perception.boards.board import Board
-from perception.boards.collection import CornerTable
+from perception.boards.corners import BoardCorners, CornerFinder, CornerTable, empty_table
 
-VERSION = 3  # of how corners are looked for: other ones are other corners
-BLOCK = 1 << 20  # bytes read at once
+CORNERS_VERSION = 3  # of the corner search, whose stored results are valid for this version only
+READ_BLOCK = 1 << 20  # bytes read at once
+SAVE_EVERY_SETS = 50  # some seconds of work
+CORNER_THREADS = 2  # search the pictures of one set at once
+COVERAGE_GRID = (4, 3)  # parts of a picture, across and down
+PART_NAMES = (("left", "left of the middle", "right of the middle", "right"), ("top", "middle", "bottom"))
+MIN_PART_CORNERS = 20  # in each part
+MIN_TILT = np.radians(15)  # of a tilted board; a smaller tilt does not show the focal length
+MIN_TILT_SHARE = 0.08  # of the views with each tilt
+TILT_NAMES = ("its left side nearer", "its right side nearer", "its top nearer", "its bottom nearer")
+MIN_DEPTH_RATIO = 1.3  # of far and near views, on which the focal length depends
+DEPTH_PERCENTILES = (10, 90)  # of the distances, that count as near and far
+MIN_COMMON_SETS = 40  # frame sets in which two cameras or more see the board
+FOCAL_LIMITS = (0.3, 20.0)  # of a focal length in longer sides of the picture; outside, one side is assumed
+FOCAL_CHANGE = 0.02  # relative change of the focal length that makes all poses new: half a degree of tilt
 
 
 def content_key(session: Session, board: Board) -> str:
-    """What the corners depend on, as one word: the recording's bytes, the board, and how corners are looked for."""
-    made = hashlib.sha256(f"{VERSION} {board}".encode())
-    for path in _files(session.path):
-        made.update(path.name.encode())
+    """Hash of all that the corners depend on: the recording's bytes, the board and the search's version."""
+    digest = hashlib.sha256(f"{CORNERS_VERSION} {board}".encode())
+    for path in _content_files(session.path):
+        digest.update(path.name.encode())
         with path.open("rb") as stream:
-            while block := stream.read(BLOCK):
-                made.update(block)
-    return made.hexdigest()
+            while block := stream.read(READ_BLOCK):
+                digest.update(block)
+    return digest.hexdigest()
 
 
-def _files(path: Path) -> list[Path]:
-    """The files that hold pictures and stamps."""
+def _content_files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     beside = {"roi.toml", "truth.tum", "reference.tum", "reference_async.tum", "rig.toml", "head.csv"}
@@ -37,7 +60,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def read_corners(path: Path, key: str) -> CornerTable | None:
-    """The corners of exactly this recording and board, as far as they were found; None where the file has none."""
+    """The stored corners of exactly this recording and board; None where the file has none."""
     names = [f.name for f in fields(CornerTable)]
     try:
         with np.load(path, allow_pickle=False) as stored:
@@ -46,7 +69,7 @@ def read_corners(path: Path, key: str) -> CornerTable | None:
             parts = {name: stored[name] for name in names}
     except (OSError, ValueError, KeyError, EOFError, RuntimeError):  # the last: a flag that no zip of ours has
         return None
-    except Exception as error:  # a cut zip raises zipfile's own, and zlib's
+    except Exception as error:  # a truncated zip raises zipfile's own errors, and zlib's
         if type(error).__module__ not in ("zipfile", "zlib"):
             raise
         return None
@@ -54,8 +77,218 @@ def read_corners(path: Path, key: str) -> CornerTable | None:
 
 
 def write_corners(path: Path, key: str, table: CornerTable) -> None:
-    """Store the corners; the file is whole at every instant."""
+    """Store the corners atomically."""
     near = path.with_name(path.name + ".part")
     with near.open("wb") as stream:
         np.savez_compressed(stream, key=np.array(key), **{f.name: getattr(table, f.name) for f in fields(table)})
     os.replace(near, path)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CornerRow:
+    """The corners of one picture."""
+
+    camera: int
+    instant: int
+    stamp: float  # s, by the camera's own clock
+    corners: BoardCorners
+
+
+def collect_corners(session: Session, board: Board, store: Path | None, report: ProgressReport) -> CornerTable:
+    """The corners of all pictures. store: the file for them, or None. InputError where a picture is missing."""
+    key = content_key(session, board) if store is not None else ""
+    known = None if store is None else read_corners(store, key)
+    table = empty_table(board, len(session.rig)) if known is None else known
+    reader = session.store.open()
+    finders = [CornerFinder(board) for _ in session.rig.cameras]
+    rows: list[CornerRow] = []
+    done = table.done
+    try:
+        with ThreadPoolExecutor(CORNER_THREADS) as pool:
+            for instant in range(table.done, len(session.sets)):
+                rows += _find_corners(pool, reader, finders, session.sets[instant], instant)
+                done = instant + 1
+                if done % SAVE_EVERY_SETS == 0:
+                    table, rows = _save(store, key, append_rows(table, rows, done)), []
+                report(done, len(session.sets))
+    finally:  # Ctrl-C included
+        table = _save(store, key, append_rows(table, rows, done))
+        reader.close()
+    return table
+
+
+def _save(store: Path | None, key: str, table: CornerTable) -> CornerTable:
+    if store is not None:
+        write_corners(store, key, table)
+    return table
+
+
+def _find_corners(
+    pool: ThreadPoolExecutor,
+    reader: FrameReader,
+    finders: list[CornerFinder],
+    refs: tuple[FrameRef, ...],
+    instant: int,
+) -> list[CornerRow]:
+    images = [reader.read(ref) for ref in refs]
+    found = pool.map(lambda ref, image: finders[ref.camera](image), refs, images)
+    return [CornerRow(ref.camera, instant, ref.camera_stamp, f) for ref, f in zip(refs, found, strict=True)]
+
+
+def append_rows(table: CornerTable, rows: list[CornerRow], done: int) -> CornerTable:
+    """The table with further pictures; done: number of instants searched by now."""
+    looked, views = table.looked.copy(), [row for row in rows if row.corners.count]
+    np.add.at(looked, [row.camera for row in rows], 1)
+    strangers = np.array([*table.strangers, *(i for r in rows for i in r.corners.strangers)], np.int64)
+    table = replace(table, looked=looked, strangers=strangers, done=done)
+    if not views:
+        return table
+    return replace(
+        table,
+        camera=np.append(table.camera, [r.camera for r in views]).astype(np.int64),
+        instant=np.append(table.instant, [r.instant for r in views]).astype(np.int64),
+        stamp=np.append(table.stamp, [r.stamp for r in views]),
+        pixels=np.concatenate([table.pixels, np.stack([r.corners.pixels for r in views])]),
+        sigma=np.append(table.sigma, [r.corners.sigma for r in views]),
+        blur=np.append(table.blur, [r.corners.blur for r in views]),
+        marker=np.append(table.marker, [r.corners.marker for r in views]),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardCoverage:
+    """The board's coverage of one camera."""
+
+    parts: Array  # (rows, columns) number of corners in each part of the picture
+    tilts: Array  # (4,) share of the views with each tilt
+    depth: float  # ratio of the far views' distance to the near ones', 1 without views
+
+
+def coverage_of(pixels: Array, size: tuple[int, int], camera_from_board: Array) -> BoardCoverage:
+    """Coverage by views with corners (V, P, 2) px, nan where not seen, and poses (V, 4, 4); size: (W, H) px."""
+    return coverage_from_parts(parts_of(pixels, size), board_orientations(camera_from_board))
+
+
+def coverage_from_parts(parts: Array, orientations: Array) -> BoardCoverage:
+    """Coverage by numbers of corners in the parts (rows, columns) and the board's orientations (V, 3)."""
+    if not len(orientations):
+        return BoardCoverage(parts, np.zeros(4), 1.0)
+    across, up, depth = orientations.T
+    tilted = [across < -MIN_TILT, across > MIN_TILT, up < -MIN_TILT, up > MIN_TILT]
+    near, far = np.percentile(depth, DEPTH_PERCENTILES)
+    return BoardCoverage(parts, np.array([t.mean() for t in tilted]), float(far / near))
+
+
+def board_orientations(camera_from_board: Array) -> Array:
+    """Orientations (V, 3) of poses (V, 4, 4): turn of the board across and up, rad, and its distance, mm."""
+    back = camera_from_board[:, :3, 2]  # normal of the board's back, camera frame
+    across, up = np.arctan2(back[:, 0], back[:, 2]), np.arctan2(back[:, 1], back[:, 2])
+    return np.stack([across, up, camera_from_board[:, 2, 3]], 1)
+
+
+def parts_of(pixels: Array, size: tuple[int, int]) -> Array:
+    """Numbers (rows, columns) of pixels (..., 2), nan where not seen, in the parts of a picture of `size` (W, H) px."""
+    at = pixels[np.isfinite(pixels[..., 0])]
+    w, h = size
+    return np.asarray(np.histogram2d(at[:, 1], at[:, 0], bins=COVERAGE_GRID[::-1], range=((0, h), (0, w)))[0])
+
+
+def coverage(calibration: Calibration, camera: int) -> BoardCoverage:
+    """The coverage of one camera."""
+    views, state = calibration.views, calibration.fit.state
+    rows = views.camera == camera
+    camera_from_board = se3.inverse(state.base_from_camera[camera]) @ state.base_from_board[views.instant[rows]]
+    return coverage_of(views.pixels[rows], views.sizes[camera], camera_from_board)
+
+
+def missing_coverage(name: str, covered: BoardCoverage) -> list[tuple[float, str]]:
+    """What one camera still needs: how much of it is missing, 0 to 1, and a text."""
+    out: list[tuple[float, str]] = []
+    empty = np.argwhere(covered.parts < MIN_PART_CORNERS)
+    if len(empty):
+        places = [f"{PART_NAMES[1][row]} {PART_NAMES[0][column]}" for row, column in empty[:3]]
+        more = f" and {len(empty) - 3} other parts" if len(empty) > 3 else ""
+        text = f"{name}: hold the board in its picture's {', '.join(places)}{more}"
+        out.append((len(empty) / covered.parts.size, text))
+    missing = [TILT_NAMES[k] for k in np.flatnonzero(covered.tilts < MIN_TILT_SHARE)]
+    if missing:
+        out.append((len(missing) / 4, f"{name}: tilt the board by 30 degrees: {', '.join(missing)}"))
+    if covered.depth < MIN_DEPTH_RATIO:
+        share = 1 - (covered.depth - 1) / (MIN_DEPTH_RATIO - 1)
+        out.append((share, f"{name}: hold the board nearer to it, and farther away"))
+    return out
+
+
+def _hints(names: Sequence[str], coverage_of_camera: Callable[[int], BoardCoverage]) -> list[str]:
+    """What all cameras still need, the worst first."""
+    missing = [one for c, name in enumerate(names) for one in missing_coverage(name, coverage_of_camera(c))]
+    return [text for _, text in sorted(missing, key=lambda one: -one[0])]
+
+
+def coverage_hints(calibration: Calibration) -> tuple[str, ...]:
+    """What to do next, the worst first; nothing where all is covered."""
+    return tuple(_hints(calibration.views.names, lambda camera: coverage(calibration, camera)))
+
+
+class CoverageGuide:
+    """Accumulates what each camera has seen, and says what is still missing."""
+
+    def __init__(self, names: tuple[str, ...], sizes: tuple[tuple[int, int], ...], board: Board) -> None:
+        self.names, self.sizes, self._board = names, sizes, board
+        self._cameras = [_CameraCoverage(size) for size in sizes]
+        self.together = 0  # frame sets in which two cameras saw the board
+
+    def remember(self, table: CornerTable) -> None:
+        """Add stored corners."""
+        for instant in np.unique(table.instant):
+            rows = np.flatnonzero(table.instant == instant)
+            self.add({int(table.camera[row]): table.pixels[row] for row in rows})
+
+    def add(self, seen: dict[int, Array]) -> None:
+        """Add one frame set: corners (P, 2) px by camera, nan where not seen."""
+        self.together += len(seen) > 1 or len(self.names) == 1
+        for camera, pixels in seen.items():
+            if np.isfinite(pixels[:, 0]).sum() >= MIN_PLANE_CORNERS:
+                self._cameras[camera].add(self._board, pixels)
+
+    def coverage(self, camera: int) -> BoardCoverage:
+        """The coverage of one camera so far, by a focal length from all its views."""
+        return self._cameras[camera].coverage()
+
+    def missing(self) -> tuple[str, ...]:
+        """What to do next, the most needed first; nothing where enough was seen."""
+        hints = _hints(self.names, self.coverage)
+        if self.together < MIN_COMMON_SETS:
+            hints.append(f"hold the board where two cameras see it, {MIN_COMMON_SETS - self.together} frame sets more")
+        return tuple(hints)
+
+
+class _CameraCoverage:
+    """The views of one camera. A new view has constant cost, unless the focal length changes."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self._size = size
+        self._parts, self._terms = np.zeros(COVERAGE_GRID[::-1]), np.zeros(3)
+        self._planes: list[Array] = []  # (3, 3) of each view
+        self._orientations: list[Array] = []  # (3,) of the views so far, by `_focal`
+        self._focal = float("nan")  # px
+
+    def add(self, board: Board, pixels: Array) -> None:
+        """Add a view's corners (P, 2) px, nan where not seen."""
+        known, middle = np.isfinite(pixels[:, 0]), (np.array(self._size) - 1) / 2
+        plane = homography(board.corners[known, :2], pixels[known] - middle)
+        self._planes.append(plane)
+        self._parts += parts_of(pixels, self._size)
+        self._terms += focal_terms(plane[None])
+
+    def coverage(self) -> BoardCoverage:
+        """The coverage so far."""
+        longest = max(self._size)
+        f = focal_from_terms(self._terms)
+        if not FOCAL_LIMITS[0] * longest < f < FOCAL_LIMITS[1] * longest:
+            f = float(longest)
+        if not abs(f / self._focal - 1) <= FOCAL_CHANGE:
+            self._focal, self._orientations = f, []
+        if fresh := self._planes[len(self._orientations) :]:
+            self._orientations += [*board_orientations(poses(np.stack(fresh), np.full(len(fresh), self._focal)))]
+        return coverage_from_parts(self._parts, np.array(self._orientations).reshape(-1, 3))

@@ -1,209 +1,293 @@
-"""The board before live cameras: corners are found while it is being waved, and it is said where to hold it next.
+"""Calibration with live cameras: corners are collected while the board is waved, and a page says where to hold it.
 
-What was found is kept when it is interrupted, and the next run goes on from there.
+An interrupted run keeps its corners, and the next one goes on from there.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import TracebackType
 from typing import Protocol
 
 import numpy as np
 
 from estimation import se3
 from estimation.calibration.lens_model import matrix_of
-from estimation.camera_calibration.board_motion import REACH
+from estimation.calibration.rig_fit import MAX_INSTANT_GAP
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
-from hardware.calibration.collect import KEEP, THREADS, Row, joined
-from hardware.calibration.corners import VERSION, read_corners, write_corners
-from hardware.calibration.guide import Guide
-from hardware.calibration.material import Material
-from hardware.calibration.waving_page import WavingPage
-from hardware.cameras.feed import Place
-from hardware.cameras.named import places_without_rig, sources_named
+from hardware.calibration.corners import (
+    CORNER_THREADS,
+    CORNERS_VERSION,
+    MIN_COMMON_SETS,
+    MIN_DEPTH_RATIO,
+    MIN_PART_CORNERS,
+    MIN_TILT_SHARE,
+    SAVE_EVERY_SETS,
+    CornerRow,
+    CoverageGuide,
+    append_rows,
+    read_corners,
+    write_corners,
+)
+from hardware.calibration.inputs import CalibrationInput
+from hardware.cameras.feed import CameraPhase, CameraPlace, LiveHealth
+from hardware.cameras.live import places_without_rig, sources_named
 from hardware.cameras.sources import CameraSource
-from hardware.cameras.state import LiveHealth, Phase
-from hardware.files.rig_file import NEAREST_RIG, ImageSource, read_rig
-from hardware.operator.shared_state import Wish
+from hardware.files.rig_file import MIN_RIG_SPAN, ImageSource, read_rig
+from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
+from hardware.operator.settings import OperatorSettings
+from hardware.operator.shared_state import OperatorLink
+from hardware.operator.view import RequestAnswer, WavingCamera, WavingStage, WavingView, Wish, refusal
 from hardware.process.clock import Clock
 from hardware.process.progress import Progress
 from perception.boards.board import Board
-from perception.boards.collection import empty_table
-from perception.boards.corners import CornerFinder
+from perception.boards.corners import CornerFinder, empty_table
 from perception.frames import FrameSet, Image
 
-OPENING = 15.0  # s until every camera has shown a picture
-LOOK = 0.5  # s between looks whether time is up
-AGAIN = 2 * REACH  # s put between what earlier runs saw and this one: the board has not moved smoothly since
-PICTURES = 5  # kept of each camera, the newest ones
+INITIAL_VIEW = WavingView(0.0, 1, WavingStage.WAVE)
+LAST_VIEW_TIME = 0.5  # s for windows to receive the last view
+OPENING_TIMEOUT = 15.0  # s until every camera has shown a picture
+WAVING_POLL = 0.5  # s between checks of the time
+RUN_GAP = 2 * MAX_INSTANT_GAP  # s put between the corners of two runs: the board's motion is not interpolated there
+RECENT_PICTURES = 5  # of each camera
+
+
+class WavingPage:
+    """The page beside a live calibration, as a context; `address` is for the browser. Nothing here waits for it."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock, self._link = clock, OperatorLink()
+        self._page = OperatorPage(self._link, OperatorSettings(page="waving.html"))
+        self._taker = Thumbnailer(self._link.pictures, self._link.requests, near=False)
+        self._view = INITIAL_VIEW
+        self.address = self._page.address
+
+    def __enter__(self) -> WavingPage:
+        self._page.tend(self._clock.now())
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, KeyboardInterrupt):
+            self.enter(WavingStage.STOPPED, "the corners are kept; the same command goes on from there")
+        elif error is not None:
+            self.enter(WavingStage.FAILED, str(error))
+        if self._link.requests.windows:
+            self._clock.wait_until(self._clock.now() + LAST_VIEW_TIME)
+        self._taker.close()
+        self._page.close()
+
+    def show(self, guide: CoverageGuide, hints: tuple[str, ...], looked: int, seen: Mapping[int, Array]) -> None:
+        """Show the guide's state. looked: frame sets so far. seen: corners (P, 2) px of the newest one, by camera."""
+        cameras = tuple(_camera(guide, c, seen.get(c)) for c in range(len(guide.names)))
+        together = min(guide.together / MIN_COMMON_SETS, 1.0)
+        self._put(replace(self._view, hints=hints, cameras=cameras, together=together, looked=looked))
+
+    def picture(self, names: tuple[str, ...], one: FrameSet, seen: Mapping[int, Array]) -> None:
+        """Show the pictures of a frame set with their corners (P, 2) px, nan where not seen."""
+        nothing = np.zeros((0, 2))
+        corners = {c: pixels[np.isfinite(pixels[:, 0])] for c, pixels in seen.items()}
+        shots = [CameraShot(names[f.camera], f.image, tracks=corners.get(f.camera, nothing)) for f in one.frames]
+        self._taker.offer(one.stamp, shots)
+
+    def enter(self, stage: WavingStage, *lines: str) -> None:
+        """Enter a stage in which nothing can be requested any more."""
+        self._put(replace(self._view, turn=self._view.turn + 1, stage=stage, words=lines, hints=()))
+
+    def poll(self) -> Wish | None:
+        """STOP or END if a window has requested it; keeps the page alive."""
+        self._page.tend(self._clock.now())
+        wish = None
+        for request in self._link.requests.take():
+            why = refusal(request.wish, request.turn, self._offers(), self._view.turn)
+            self._put(replace(self._view, answer=RequestAnswer(request.number, request.wish, not why, why)))
+            wish = wish if why else request.wish
+        return wish
+
+    def _offers(self) -> tuple[Wish, ...]:
+        return (Wish.END,) if self._view.stage is WavingStage.WAVE else ()
+
+    def _put(self, view: WavingView) -> None:
+        self._view = view  # its stage decides what is offered
+        self._view = replace(view, stamp=self._clock.now(), offers=self._offers())
+        self._link.views.put(self._view)
+
+
+def _camera(guide: CoverageGuide, camera: int, pixels: Array | None) -> WavingCamera:
+    covered = guide.coverage(camera)
+    parts, tilts = np.minimum(covered.parts / MIN_PART_CORNERS, 1.0), np.minimum(covered.tilts / MIN_TILT_SHARE, 1.0)
+    depth = float(np.clip((covered.depth - 1) / (MIN_DEPTH_RATIO - 1), 0, 1))
+    corners = 0 if pixels is None else int(np.isfinite(pixels[:, 0]).sum())
+    rows = tuple(tuple(map(float, row)) for row in parts)
+    return WavingCamera(guide.names[camera], guide.sizes[camera], corners, rows, tuple(map(float, tilts)), depth)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Devices:
-    """The cameras that are to be calibrated. rig: where they stood before, None for cameras that have none yet."""
+class CalibrationCameras:
+    """The cameras to calibrate."""
 
-    places: tuple[Place, ...]
+    places: tuple[CameraPlace, ...]
     sources: tuple[CameraSource, ...]
-    rig: Rig | None
-    lens_sigma: Sequence[Array | None]
+    rig: Rig | None  # their present calibration, if any
+    lens_sigma: Sequence[Array | None]  # of the given lenses, (9,) per camera or None
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the cameras."""
+        """Names of the cameras."""
         return tuple(place.name for place in self.places)
 
 
-def devices_named(which: Sequence[str]) -> Devices:
-    """Cameras named as `stillbed cameras` has them, or those of one rig.toml; offsets known so far are left out."""
+def devices_named(which: Sequence[str]) -> CalibrationCameras:
+    """Cameras named as for `stillbed cameras`, or those of one rig.toml, without their clock offsets."""
     rig, sources = sources_named(which)
     if rig is None:
-        return Devices(places_without_rig(len(which)), sources, None, [None] * len(which))
-    places = tuple(Place(i, camera.name, camera.size) for i, camera in enumerate(rig.cameras))
-    return Devices(places, sources, rig, read_rig(which[0]).lens_sigma)
+        return CalibrationCameras(places_without_rig(len(which)), sources, None, [None] * len(which))
+    places = tuple(CameraPlace(i, camera.name, camera.size) for i, camera in enumerate(rig.cameras))
+    return CalibrationCameras(places, sources, rig, read_rig(which[0]).lens_sigma)
 
 
-class Watched(Protocol):
-    """What is asked of live cameras."""
+class LiveSource(Protocol):
+    """Live cameras, as far as a calibration uses them."""
 
     def next_set(self, until: float) -> FrameSet | None:
         """Wait for a set newer than the last one until the instant `until`, s."""
-        ...
 
     def health(self) -> LiveHealth:
-        """How every camera fares now."""
-        ...
+        """The state of every camera."""
 
 
-class Waving:
-    """Takes frame sets in; holds the corners so far, the newest pictures and what is still missing."""
+class WavingRecorder:
+    """Collects corners from frame sets, with the newest pictures and the coverage so far."""
 
     def __init__(self, names: tuple[str, ...], sizes: tuple[tuple[int, int], ...], board: Board, store: Path) -> None:
         self._store, self._key = store, _key(names, sizes, board)
         known = read_corners(store, self._key)
         self._table = empty_table(board, len(names)) if known is None else known
         self._finders = [CornerFinder(board) for _ in names]
-        self._rows: list[Row] = []
+        self._rows: list[CornerRow] = []
         self._done, self._saved = self._table.done, self._table.done
-        self._late: float | None = None if len(self._table) else 0.0  # s, from the cameras' stamps to those kept
+        self._late: float | None = None if len(self._table) else 0.0  # s, added to the cameras' stamps
         self.seen: dict[int, Array] = {}  # corners (P, 2) px of the newest set by camera, nan where not seen
-        self.guide = Guide(names, sizes, board)
+        self.guide = CoverageGuide(names, sizes, board)
         self.guide.remember(self._table)
         self.pictures: list[list[Image]] = [[] for _ in names]
 
     @property
     def done(self) -> int:
-        """Frame sets looked at, those of earlier runs included."""
+        """Number of frame sets searched, with those of earlier runs."""
         return self._done
 
     def add(self, pool: ThreadPoolExecutor, one: FrameSet) -> None:
-        """Look for the board in one frame set."""
+        """Search the board in one frame set."""
         if self._late is None:
-            self._late = float(self._table.stamp.max()) + AGAIN - min(frame.stamp for frame in one.frames)
-        found = list(pool.map(lambda frame: self._finders[frame.camera](frame.image), one.frames))
-        for frame, corners in zip(one.frames, found, strict=True):
-            self._rows.append(Row(frame.camera, self._done, frame.stamp + self._late, corners))
-            self.pictures[frame.camera] = [*self.pictures[frame.camera][1 - PICTURES :], frame.image]
-        self.seen = {f.camera: c.pixels for f, c in zip(one.frames, found, strict=True) if c.count}
+            self._late = float(self._table.stamp.max()) + RUN_GAP - min(frame.stamp for frame in one.frames)
+        each = list(pool.map(lambda frame: self._finders[frame.camera](frame.image), one.frames))
+        for frame, corners in zip(one.frames, each, strict=True):
+            self._rows.append(CornerRow(frame.camera, self._done, frame.stamp + self._late, corners))
+            self.pictures[frame.camera] = [*self.pictures[frame.camera][1 - RECENT_PICTURES :], frame.image]
+        self.seen = {f.camera: c.pixels for f, c in zip(one.frames, each, strict=True) if c.count}
         self.guide.add(self.seen)
         self._done += 1
-        if self._done - self._saved >= KEEP:
+        if self._done - self._saved >= SAVE_EVERY_SETS:
             self.save()
 
     def save(self) -> None:
-        """Write down what was found."""
-        self._table, self._rows = joined(self._table, self._rows, self._done), []
+        """Store the corners."""
+        self._table, self._rows = append_rows(self._table, self._rows, self._done), []
         write_corners(self._store, self._key, self._table)
         self._saved = self._done
 
-    def material(self, devices: Devices, sizes: tuple[tuple[int, int], ...]) -> Material:
-        """What was found, once it is saved, to be calibrated from."""
-        rig = devices.rig if devices.rig is not None else _stand_in(devices.names, sizes)
+    def material(self, devices: CalibrationCameras, sizes: tuple[tuple[int, int], ...]) -> CalibrationInput:
+        """The calibration's input, once the corners are saved."""
+        rig = devices.rig if devices.rig is not None else _placeholder_rig(devices.names, sizes)
         images = [ImageSource("source", source.identity.text) for source in devices.sources]
         title = ", ".join(source.identity.shown for source in devices.sources)
         given = devices.rig is not None
-        return Material(title, rig, given, images, devices.lens_sigma, self._table, lambda c: self.pictures[c])
+        return CalibrationInput(title, rig, given, images, devices.lens_sigma, self._table, lambda c: self.pictures[c])
 
 
 def _key(names: tuple[str, ...], sizes: tuple[tuple[int, int], ...], board: Board) -> str:
-    return hashlib.sha256(f"live {VERSION} {names} {sizes} {board}".encode()).hexdigest()
+    return hashlib.sha256(f"live {CORNERS_VERSION} {names} {sizes} {board}".encode()).hexdigest()
 
 
-def _stand_in(names: tuple[str, ...], sizes: tuple[tuple[int, int], ...]) -> Rig:
+def _placeholder_rig(names: tuple[str, ...], sizes: tuple[tuple[int, int], ...]) -> Rig:
     """Cameras of which only names and sizes are known."""
     cameras = []
     for number, (name, size) in enumerate(zip(names, sizes, strict=True)):
         lens = [max(size), max(size), (size[0] - 1) / 2, (size[1] - 1) / 2]
-        place = se3.make(np.eye(3), np.array([NEAREST_RIG * number, 0.0, 0.0]))
+        place = se3.make(np.eye(3), np.array([MIN_RIG_SPAN * number, 0.0, 0.0]))
         cameras.append(Camera(name, size, matrix_of([*lens, 0, 0, 0, 0, 0]), np.zeros(5), place))
     return Rig(tuple(cameras))
 
 
 def watch(
-    live: Watched,
-    devices: Devices,
+    live: LiveSource,
+    devices: CalibrationCameras,
     board: Board,
     store: Path,
     seconds: float | None,
     clock: Clock,
     progress: Progress,
     page: WavingPage | None = None,
-) -> Material:
-    """Watch until enough was seen, for `seconds` at most (None: without end), or until the files end.
+) -> CalibrationInput:
+    """Collect corners until the coverage suffices, for `seconds` at most (None: without end), or until the files end.
 
-    What was found is in `store` then, also where it is interrupted. page: shows it, and may ask to stop
-    (KeyboardInterrupt) or to be content. InputError names a camera that shows nothing.
+    The corners are then in `store`, also after an interrupt. page: shows the progress; its user may stop
+    (KeyboardInterrupt) or end. InputError names a camera that delivers nothing.
     """
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(CORNER_THREADS) as pool:
         sizes, first = _sizes(live, clock)
-        waving = Waving(devices.names, sizes, board, store)
+        waving = WavingRecorder(devices.names, sizes, board, store)
         end = float("inf") if seconds is None else clock.now() + seconds
         try:
             for one in first:
                 waving.add(pool, one)
             missing = waving.guide.missing()
-            while missing and clock.now() < end and not _ended(live):
-                newest = live.next_set(min(end, clock.now() + LOOK))
+            while missing and clock.now() < end and not _all_ended(live):
+                newest = live.next_set(min(end, clock.now() + WAVING_POLL))
                 if newest is not None:
                     waving.add(pool, newest)
                     missing = waving.guide.missing()
                 progress.note = missing[0] if missing else "enough"
                 progress(waving.done, 0)
-                if page is not None and _shown(page, waving, missing, newest):
+                if page is not None and _update_page(page, waving, missing, newest):
                     break
         finally:  # Ctrl-C included
             waving.save()
     return waving.material(devices, sizes)
 
 
-def _shown(page: WavingPage, waving: Waving, missing: tuple[str, ...], newest: FrameSet | None) -> bool:
-    """Show the state on the page; whether somebody there is content. KeyboardInterrupt where somebody wants to stop."""
+def _update_page(page: WavingPage, waving: WavingRecorder, missing: tuple[str, ...], newest: FrameSet | None) -> bool:
+    """Show the progress on the page; True if its user ends the collection, KeyboardInterrupt if he stops it."""
     if newest is not None:
         page.picture(waving.guide.names, newest, waving.seen)
     page.show(waving.guide, missing, waving.done, waving.seen)
-    wish = page.wished()
+    wish = page.poll()
     if wish is Wish.STOP:
         raise KeyboardInterrupt
     return wish is Wish.END
 
 
-def _ended(live: Watched) -> bool:
-    return all(camera.phase is Phase.ENDED for camera in live.health().cameras)
+def _all_ended(live: LiveSource) -> bool:
+    return all(camera.phase is CameraPhase.ENDED for camera in live.health().cameras)
 
 
-def _sizes(live: Watched, clock: Clock) -> tuple[tuple[tuple[int, int], ...], list[FrameSet]]:
+def _sizes(live: LiveSource, clock: Clock) -> tuple[tuple[tuple[int, int], ...], list[FrameSet]]:
     """Each camera's picture (W, H) px, and the frame sets that came until all were known."""
-    end, sets = clock.now() + OPENING, []
+    end, sets = clock.now() + OPENING_TIMEOUT, []
     while any(camera.newest is None for camera in live.health().cameras):
         if clock.now() >= end:
             silent = next(camera for camera in live.health().cameras if camera.newest is None)
-            raise InputError(f"camera {silent.name}", "pictures", "none", f"one within {OPENING:g} s: {silent.trouble}")
-        one = live.next_set(clock.now() + LOOK)
+            allowed = f"one within {OPENING_TIMEOUT:g} s: {silent.trouble}"
+            raise InputError(f"camera {silent.name}", "pictures", "none", allowed)
+        one = live.next_set(clock.now() + WAVING_POLL)
         if one is not None:
             sets.append(one)
     pictures = [camera.newest for camera in live.health().cameras]

@@ -1,47 +1,148 @@
-"""The calibration's report: one page with the verdict, the cameras, where the board was, and what is left over."""
+"""Verdict and report of a rig's calibration: predicted error, residuals, cameras and the board's coverage."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
 
 import numpy as np
 
 from estimation import se3
-from estimation.calibration.camera_rig import Calibration
-from estimation.calibration.lens_model import PARAMETERS, lens_of
-from estimation.calibration.validation import SIDE, VolumeError
+from estimation.calibration.camera_rig import GRID_SIDE, Calibration
+from estimation.calibration.lens_model import PARAMETERS, lens_of, project_lens
+from estimation.calibration.validation import VolumeError
 from estimation.se3 import Array
-from hardware.calibration.coverage import coverage
-from hardware.calibration.verdict import Verdict, board_scatter, held_out, residual
-from hardware.page import document, figures_table, row_of_tiles, section, tile
+from hardware.calibration.corners import coverage
+from hardware.report.page import document, figures_table, row_of_tiles, section, tile
 
-WIDTH = 460  # px of one camera's picture
-STRETCH = 40  # times, residuals are drawn
-SCALE = ((0.05, "var(--green)"), (0.1, "#b3bf3a"), (0.2, "#eba53a"), (0.4, "#d0492f"))  # mm up to which, and the colour
-BEYOND, UNSEEN = "var(--violet)", "var(--faint)"
+MAX_PREDICTED_ERROR = 0.1  # mm: what printing needs of the rig in the working volume, one sigma in 3D
+MAX_RESIDUAL = 0.5  # px, median of the corners
+RESIDUAL_SCALE = 40  # enlargement of the residuals drawn
+ERROR_COLOURS = ((0.05, "var(--green)"), (0.1, "#b3bf3a"), (0.2, "#eba53a"), (0.4, "#d0492f"))  # up to so many mm
+WORST_COLOUR, UNSEEN_COLOUR = "var(--violet)", "var(--faint)"
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationVerdict:
+    """Whether a calibration is good enough to print with."""
+
+    passed: bool
+    lines: tuple[str, ...]  # the reasons, the decisive one first
+    hints: tuple[str, ...]  # what to do; empty if passed
+
+
+def median_residual(calibration: Calibration, camera: int | None = None) -> float:
+    """Median reprojection error, px, of one camera or of all."""
+    away = np.linalg.norm(calibration.fit.residuals, axis=-1)
+    return float(np.nanmedian(away if camera is None else away[calibration.views.camera == camera]))
+
+
+def held_out_residual(calibration: Calibration, camera: int | None = None) -> float:
+    """The same under rigs calibrated without the view's own stretch of the recording."""
+    away = np.linalg.norm(calibration.held_out, axis=-1)
+    away = away if camera is None else away[calibration.views.camera == camera]
+    return float(np.nanmedian(away)) if np.isfinite(away).any() else float("nan")
+
+
+def judge_rig(calibration: Calibration, error: VolumeError, limit: float, hints: tuple[str, ...]) -> CalibrationVerdict:
+    """The verdict. limit: mm, of the predicted error in 19 of 20 points of the working volume."""
+    off, spread = median_residual(calibration), error.worst
+    good = [spread <= limit, off <= MAX_RESIDUAL]
+    word = "good enough" if good[0] else "NOT good enough"
+    lines = [
+        f"{word} to print: points in the working volume are off by {error.typical:.3f} mm (one sigma), 19 of 20 by "
+        f"less than {spread:.3f} mm; {limit:g} mm is allowed",
+        f"corners lie {off:.2f} px from where they should (median); {MAX_RESIDUAL:g} px is allowed; "
+        f"{held_out_residual(calibration):.2f} px in stretches of the recording that were held out",
+    ]
+    if calibration.jitter:
+        lines.append(f"pictures are late by {1e3 * calibration.jitter:.1f} ms each for itself: the cameras run free")
+    return CalibrationVerdict(all(good), tuple(lines), () if all(good) else hints)
+
+
+def board_scatter(calibration: Calibration) -> float:
+    """RMS error, mm, of distances between triangulated corners, at instants that two cameras share."""
+    views, state = calibration.views, calibration.fit.state
+    corners = _triangulated_corners(calibration)
+    out = []
+    for i in range(len(state.base_from_board)):
+        known = np.isfinite(corners[i, :, 0])
+        a, b = corners[i, known], views.points[known]
+        if len(a) > 1:
+            rows = np.triu_indices(len(a), 1)
+            measured, true = (np.linalg.norm(p[rows[0]] - p[rows[1]], axis=1) for p in (a, b))
+            out.append(measured - true)
+    return float(np.sqrt(np.mean(np.concatenate(out) ** 2))) if out else float("nan")
+
+
+def _triangulated_corners(calibration: Calibration) -> Array:
+    """Corners (S, P, 3) mm, base, at their instant's time; nan where fewer than two cameras saw one.
+
+    One Gauss-Newton step from the rig's own board poses, which also bring all views to one time.
+    """
+    views, fit = calibration.views, calibration.fit
+    state, cameras = fit.state, len(views.names)
+    corners = se3.transform_points(state.base_from_board, views.points)
+    information = np.zeros((len(corners), views.pixels.shape[1], 3, 3))
+    slope, count = np.zeros((*information.shape[:3],)), np.zeros(information.shape[:2])
+    for c in range(cameras):
+        rows = np.flatnonzero(views.camera == c)
+        camera_from_base = se3.inverse(state.base_from_camera[c])
+        at = corners[views.instant[rows]]
+        by_point = project_lens(state.lens[c], se3.transform_points(camera_from_base, at))[2] @ camera_from_base[:3, :3]
+        seen = views.seen[rows]
+        residuals = np.where(seen[..., None], fit.residuals[rows], 0.0)
+        by_point = np.where(seen[..., None, None], by_point, 0.0)
+        np.add.at(information, views.instant[rows], np.swapaxes(by_point, -1, -2) @ by_point)
+        np.add.at(slope, views.instant[rows], np.einsum("vpij,vpi->vpj", by_point, residuals))
+        np.add.at(count, views.instant[rows], seen)
+    information = np.where((count >= 2)[..., None, None], information, np.eye(3))
+    points = corners - np.linalg.solve(information, slope[..., None])[..., 0]
+    return np.where((count >= 2)[..., None], points, np.nan)
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """A list in HTML."""
+    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
+
+
+def figure(drawing: str, caption: str) -> str:
+    """A figure with its caption in HTML."""
+    return f"<figure>{drawing}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def figure_row(figures: Iterable[str]) -> str:
+    """Figures side by side in HTML."""
+    return f'<div class="pictures">{"".join(figures)}</div>'
+
+
+def picture_frame(size: tuple[int, int], inside: str, label: str = "picture") -> str:
+    """A frame as large as a picture (W, H) px, with what is drawn in it, in SVG."""
+    w, h = size
+    border = f'<rect class="frame" width="{w}" height="{h}" fill="none" stroke="var(--faint)" stroke-width="4"/>'
+    return f'<svg class="plot" viewBox="0 0 {w} {h}" role="img" aria-label="{label}">{border}{inside}</svg>'
 
 
 def page(
     title: str,
     found: Calibration,
     error: VolumeError,
-    verdict: Verdict,
+    verdict: CalibrationVerdict,
     dropped: Mapping[tuple[str, str], int],
     pictures: Mapping[str, bytes],
 ) -> str:
-    """The page as HTML. dropped: views by camera and reason. pictures: undistorted JPEGs by camera, as far as there."""
+    """The page as HTML. dropped: views by camera and reason. pictures: undistorted JPEGs by camera."""
     word = "passed" if verdict.passed else "failed"
+    residuals = f"From each corner to where the rig puts it, {RESIDUAL_SCALE} times as long."
     body = [
         _tiles(found, error),
-        section("Verdict", ". ".join(verdict.lines) + ".", _hints(verdict)),
+        section("Verdict", ". ".join(verdict.lines) + ".", bullets(verdict.hints) if verdict.hints else ""),
         section("Cameras", "One sigma behind each figure.", _cameras(found) + _left_out(found, dropped)),
         section("Where the board was", "Every corner used, where the lens imaged it.", _each(found, _corners)),
-        section(
-            "Residuals", f"From each corner to where the rig puts it, {STRETCH} times as long.", _each(found, _rest)
-        ),
+        section("Residuals", residuals, _each(found, _residuals)),
         section("Predicted error", "mm, one sigma, over the working volume, layer by layer along z.", _volume(error)),
     ]
     if pictures:
@@ -64,124 +165,103 @@ def _tiles(found: Calibration, error: VolumeError) -> str:
     return row_of_tiles(
         [
             tile(f"{error.worst:.3f}", "mm", "predicted error, 19 of 20 points"),
-            tile(f"{residual(found):.2f}", "px", "median corner residual"),
+            tile(f"{median_residual(found):.2f}", "px", "median corner residual"),
             tile(f"{board_scatter(found):.2f}", "mm", "RMS of distances between corners"),
             tile(str(len(found.views)), "", "views used"),
         ]
     )
 
 
-def _hints(verdict: Verdict) -> str:
-    return "<ul>" + "".join(f"<li>{escape(h)}</li>" for h in verdict.hints) + "</ul>" if verdict.hints else ""
-
-
 def _cameras(found: Calibration) -> str:
-    head = ["", *found.views.names]
-    rows: list[list[str]] = [["views", *(str(int((found.views.camera == c).sum())) for c in _all(found))]]
-    rows.append(["distortion model", *found.models])
-    lone = [next((s.held_out for s in found.scores[c] if s.model == found.models[c]), np.nan) for c in _all(found)]
-    rows.append(["residual, median px", *(f"{residual(found, c):.2f}" for c in _all(found))])
-    rows.append(["in stretches held out of the whole, median px", *(f"{held_out(found, c):.2f}" for c in _all(found))])
-    rows.append(["lens alone, on views held out, RMS px", *(f"{v:.3f}" if np.isfinite(v) else "–" for v in lone)])
+    cameras = range(len(found.views.names))
+    lone = [next((s.held_out for s in found.scores[c] if s.model == found.models[c]), np.nan) for c in cameras]
     lenses = [lens_of(camera) for camera in found.rig.cameras]
-    sigmas = [np.sqrt(np.diag(found.covariance_of(c))) for c in _all(found)]
+    sigmas = [np.sqrt(np.diag(found.covariance_of(c))) for c in cameras]
+    rows = [
+        ["views", *(str(int((found.views.camera == c).sum())) for c in cameras)],
+        ["distortion model", *found.models],
+        ["residual, median px", *(f"{median_residual(found, c):.2f}" for c in cameras)],
+        ["in stretches held out of the whole, median px", *(f"{held_out_residual(found, c):.2f}" for c in cameras)],
+        ["lens alone, on views held out, RMS px", *(f"{v:.3f}" if np.isfinite(v) else "–" for v in lone)],
+    ]
     for i, name in enumerate(PARAMETERS):
         digits = 2 if i < 4 else 5
-        rows.append([name, *(f"{lenses[c][i]:.{digits}f} ± {sigmas[c][i]:.{digits}f}" for c in _all(found))])
-    rows.append(["place known to, mm", *(f"{np.linalg.norm(sigmas[c][12:15]):.3f}" for c in _all(found))])
-    turns = [np.degrees(np.linalg.norm(sigmas[c][9:12])) for c in _all(found)]
-    rows.append(["and degrees", *(f"{t:.4f}" for t in turns)])
-    offsets = [f"{1e3 * found.rig.cameras[c].clock_offset:.2f} ± {1e3 * sigmas[c][15]:.2f}" for c in _all(found)]
-    rows.append(["clock offset, ms", *offsets])
-    rows.append(["mm per pixel at the board", *(f"{millimetres_per_pixel(found, c):.3f}" for c in _all(found))])
-    return figures_table(head, rows)
-
-
-def _all(found: Calibration) -> range:
-    return range(len(found.views.names))
+        rows.append([name, *(f"{lenses[c][i]:.{digits}f} ± {sigmas[c][i]:.{digits}f}" for c in cameras)])
+    offsets = [f"{1e3 * found.rig.cameras[c].clock_offset:.2f} ± {1e3 * sigmas[c][15]:.2f}" for c in cameras]
+    rows += [
+        ["place known to, mm", *(f"{np.linalg.norm(s[12:15]):.3f}" for s in sigmas)],
+        ["and degrees", *(f"{np.degrees(np.linalg.norm(s[9:12])):.4f}" for s in sigmas)],
+        ["clock offset, ms", *offsets],
+        ["mm per pixel at the board", *(f"{millimetres_per_pixel(found, c):.3f}" for c in cameras)],
+    ]
+    return figures_table(["", *found.views.names], rows)
 
 
 def _left_out(found: Calibration, dropped: Mapping[tuple[str, str], int]) -> str:
     rows = [f"{name}: {count} views, {reason}" for (name, reason), count in sorted(dropped.items())]
     rows.append(f"{found.dropped} single corners lay apart from all others and were left out")
-    return "<ul>" + "".join(f"<li>{escape(row)}</li>" for row in rows) + "</ul>"
+    return bullets(rows)
 
 
-def _each(found: Calibration, draw: object) -> str:
-    assert callable(draw)
-    figures = [
-        f"<figure>{draw(found, c)}<figcaption>{escape(found.views.names[c])}</figcaption></figure>" for c in _all(found)
-    ]
-    return f'<div class="pictures">{"".join(figures)}</div>'
-
-
-def _frame(found: Calibration, camera: int, inside: str) -> str:
-    w, h = found.views.sizes[camera]
-    border = f'<rect class="frame" width="{w}" height="{h}" fill="none" stroke="var(--faint)" stroke-width="4"/>'
-    return f'<svg class="plot" viewBox="0 0 {w} {h}" role="img" aria-label="picture">{border}{inside}</svg>'
+def _each(found: Calibration, draw: Callable[[Calibration, int], str]) -> str:
+    cameras = zip(found.views.names, found.views.sizes, strict=True)
+    return figure_row(figure(picture_frame(s, draw(found, c)), name) for c, (name, s) in enumerate(cameras))
 
 
 def _corners(found: Calibration, camera: int) -> str:
     pixels = found.views.pixels[found.views.camera == camera].reshape(-1, 2)
     pixels = pixels[np.isfinite(pixels[:, 0])]
-    held = coverage(found, camera).parts
+    parts = coverage(found, camera).parts
     w, h = found.views.sizes[camera]
-    rows, columns = held.shape
-    words = "".join(
+    rows, columns = parts.shape
+    counts = "".join(
         f'<text x="{(x + 0.5) * w / columns:.0f}" y="{(y + 0.5) * h / rows:.0f}" text-anchor="middle" '
-        f'style="font-size:34px">{int(held[y, x])}</text>'
+        f'style="font-size:34px">{int(parts[y, x])}</text>'
         for y in range(rows)
         for x in range(columns)
     )
     dots = "".join(f'<circle class="estimate" cx="{x:.0f}" cy="{y:.0f}" r="4"/>' for x, y in pixels)
-    return _frame(found, camera, dots + words)
+    return dots + counts
 
 
-def _rest(found: Calibration, camera: int) -> str:
+def _residuals(found: Calibration, camera: int) -> str:
     rows = found.views.camera == camera
     pixels, rest = found.views.pixels[rows].reshape(-1, 2), found.fit.residuals[rows].reshape(-1, 2)
     known = np.isfinite(pixels[:, 0])
-    ends = pixels + STRETCH * rest
-    lines = "".join(
+    ends = pixels + RESIDUAL_SCALE * rest
+    return "".join(
         f'<path class="truth" stroke-width="3" d="M{a:.0f} {b:.0f}L{c:.0f} {d:.0f}"/>'
         for (a, b), (c, d) in zip(pixels[known], ends[known], strict=True)
     )
-    return _frame(found, camera, lines)
-
-
-def _colour(value: float) -> str:
-    return next((style for most, style in SCALE if value <= most), BEYOND)
 
 
 def _volume(error: VolumeError) -> str:
     """Layers of the volume as squares, coloured by the error; x to the right, y down, as the first camera sees them."""
-    at = error.points.reshape(SIDE, SIDE, SIDE, 3)
-    values = error.error.reshape(SIDE, SIDE, SIDE)
-    layers = [_layer(values[:, :, z], float(at[0, 0, z, 2])) for z in range(SIDE)]
-    edges = ["0", *(f"{most:g}" for most, _ in SCALE)]
+    at = error.points.reshape(GRID_SIDE, GRID_SIDE, GRID_SIDE, 3)
+    values = error.error.reshape(GRID_SIDE, GRID_SIDE, GRID_SIDE)
+    layers = [_layer(values[:, :, z], float(at[0, 0, z, 2])) for z in range(GRID_SIDE)]
+    edges = ["0", *(f"{most:g}" for most, _ in ERROR_COLOURS)]
     keys = [f"{a} to {b} mm" for a, b in pairwise(edges)] + [f"more than {edges[-1]} mm"]
-    styles = [style for _, style in SCALE] + [BEYOND]
-    legend = "".join(_key(style, words) for style, words in zip(styles, keys, strict=True)) + _key(
-        "", "not seen by two"
-    )
+    styles = [style for _, style in ERROR_COLOURS] + [WORST_COLOUR]
+    pairs = zip([*styles, ""], [*keys, "not seen by two"], strict=True)
     low, high = error.points.min(0), error.points.max(0)
     text = " x ".join(f"{b - a:.0f}" for a, b in zip(low, high, strict=True))
-    return (
-        f'<p class="note">{text} mm</p><div class="pictures">{"".join(layers)}</div><div class="legend">{legend}</div>'
-    )
+    legend = "".join(_key(style, words) for style, words in pairs)
+    return f'<p class="note">{text} mm</p>{figure_row(layers)}<div class="legend">{legend}</div>'
 
 
 def _layer(values: Array, z: float) -> str:
     cells = []
-    for x in range(SIDE):
-        for y in range(SIDE):
+    for x in range(GRID_SIDE):
+        for y in range(GRID_SIDE):
             value = values[x, y]
-            fill = _colour(value) if np.isfinite(value) else UNSEEN
+            colour = next((style for most, style in ERROR_COLOURS if value <= most), WORST_COLOUR)
+            fill = colour if np.isfinite(value) else UNSEEN_COLOUR
             words = f"{value:.3f} mm" if np.isfinite(value) else "not seen by two cameras"
             place = f'x="{20 * x + 1}" y="{20 * y + 1}" width="18" height="18"'
             cells.append(f'<rect style="fill:{fill}" {place}><title>{words}</title></rect>')
-    box = f'<svg class="plot heat" viewBox="0 0 {20 * SIDE} {20 * SIDE}">{"".join(cells)}</svg>'
-    return f"<figure>{box}<figcaption>z = {z:.0f} mm</figcaption></figure>"
+    box = f'<svg class="plot heat" viewBox="0 0 {20 * GRID_SIDE} {20 * GRID_SIDE}">{"".join(cells)}</svg>'
+    return figure(box, f"z = {z:.0f} mm")
 
 
 def _key(fill: str, words: str) -> str:
@@ -194,5 +274,5 @@ def _pictures(pictures: Mapping[str, bytes]) -> str:
     for name, data in pictures.items():
         text = base64.b64encode(data).decode()
         image = f'<img alt="{escape(name)}" src="data:image/jpeg;base64,{text}"/>'
-        figures.append(f"<figure>{image}<figcaption>{escape(name)}</figcaption></figure>")
-    return f'<div class="pictures">{"".join(figures)}</div>'
+        figures.append(figure(image, name))
+    return figure_row(figures)

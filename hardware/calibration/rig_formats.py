@@ -1,25 +1,128 @@
-"""A YAML file per camera: OpenCV's FileStorage and ROS's camera_info. Places go with them as `base_from_camera`, mm."""
+"""Rigs in other programs' files: OpenCV, ROS camera_info, Kalibr, aniposelib and caliscope.
+
+OpenCV and ROS: a YAML file per camera, with its pose as `base_from_camera`, mm. Kalibr: camchain.yaml, pinhole and
+radtan, metres, each camera's pose from the one before it. aniposelib and caliscope: TOML, a table per camera,
+camera_from_world as rotation vector and translation. What is read is checked as our own files are.
+"""
 
 from __future__ import annotations
 
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
+from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
-from hardware.calibration.formats.build import Entry, matrix, pinhole, rig_of
-from hardware.calibration.formats.yaml_file import read_yaml, write_yaml
+from hardware.files.rig_file import rig_from_table
 from hardware.process import checks
 from hardware.process.checks import Table
 
-SUFFIXES = (".yaml", ".yml")
+SHORT_FLOAT = re.compile(r"^[-+]?\d+[eE][-+]?\d+$")  # 1e-10, which YAML 1.1 takes for a text
+YAML_SUFFIXES = (".yaml", ".yml")
+MM_PER_M = 1000.0
+
+
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml ships no types
+    """A safe loader with OpenCV's matrices."""
+
+
+def _nd_matrix(loader: _Loader, node: Any) -> Any:
+    """A vector as OpenCV 5 writes it, with sizes instead of rows and cols."""
+    table = loader.construct_mapping(node, deep=True)
+    sizes = [1, *table.get("sizes", [])][-2:]
+    return {"rows": sizes[0], "cols": sizes[1], "data": table.get("data")} if len(sizes) == 2 else table
+
+
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", SHORT_FLOAT, list("-+0123456789"))
+_Loader.add_constructor(
+    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
+)
+_Loader.add_constructor("tag:yaml.org,2002:opencv-nd-matrix", _nd_matrix)
+
+
+def read_yaml(path: Path) -> Table:
+    """The file's table, OpenCV's dialect included; InputError where there is none."""
+    text = checks.read_bytes(path).decode("utf-8", "replace")
+    if text.startswith("%YAML"):  # OpenCV writes %YAML:1.0, which no YAML reader accepts
+        text = text.partition("\n")[2]
+    try:
+        table = yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # the last: deeply nested brackets
+        raise InputError(path, "file", " ".join(str(error).split())[:100], "a YAML file") from None
+    if not isinstance(table, dict):
+        raise InputError(path, "file", type(table).__name__, "a YAML table")
+    return table
+
+
+def _write_yaml(path: Path, table: Table) -> None:
+    path.write_text(yaml.safe_dump(table, sort_keys=False, default_flow_style=None), encoding="utf-8")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Entry:
+    name: str
+    size: Sequence[object]  # [W, H] px
+    focal: Array  # fx fy cx cy
+    distortion: Array  # k1 k2 p1 p2, maybe k3
+    place: Array | None  # (4, 4) base_from_camera, mm, or None
+    offset: float = 0.0  # s
+
+
+def _rig_of(path: Path, entries: Sequence[_Entry]) -> Rig:
+    """The rig; InputError where a camera is wrong, or several have no poses."""
+    if len(entries) > 1 and any(entry.place is None for entry in entries):
+        raise InputError(path, "places of the cameras", "none", "base_from_camera of each: this file holds lenses only")
+    return rig_from_table(path, {"camera": [_table(path, entry) for entry in entries]})
+
+
+def _table(path: Path, entry: _Entry) -> Table:
+    fx, fy, cx, cy = entry.focal.tolist()
+    if not 4 <= len(entry.distortion) <= 5:
+        allowed = "k1 k2 p1 p2, or k1 k2 p1 p2 k3"
+        raise InputError(path, f"camera {entry.name!r}: distortion", entry.distortion.tolist(), allowed)
+    return {
+        "name": entry.name,
+        "size": list(entry.size),
+        "matrix": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
+        "distortion": [*entry.distortion.tolist(), 0.0][:5],
+        "base_from_camera": (np.eye(4) if entry.place is None else entry.place).tolist(),
+        "clock_offset_s": entry.offset,
+    }
+
+
+def _numbers(path: Path, table: Table, key: str, shape: tuple[int | None, ...]) -> Array:
+    if key not in table:
+        raise InputError(path, key, "nothing", "numbers")
+    return checks.numbers(path, key, table[key], shape)
+
+
+def _matrix(path: Path, table: Table, key: str) -> Array:
+    """A matrix of rows, cols and data, as OpenCV and ROS write it."""
+    inner = table.get(key)
+    if not isinstance(inner, dict) or not {"rows", "cols", "data"} <= set(inner):
+        raise InputError(path, key, inner, "a matrix with rows, cols and data")
+    rows, columns = (checks.integer(path, f"{key}.{k}", inner[k], 1) for k in ("rows", "cols"))
+    return checks.numbers(path, f"{key}.data", inner["data"], (rows * columns,)).reshape(rows, columns)
+
+
+def _pinhole(path: Path, m: Array) -> Array:
+    """fx fy cx cy of a (3, 3) camera matrix without skew."""
+    if m.shape != (3, 3) or m[0, 1] or m[1, 0] or (m[2] != [0, 0, 1]).any():
+        raise InputError(path, "camera_matrix", m.tolist(), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px")
+    return m[[0, 1, 0, 1], [0, 1, 2, 2]]
 
 
 def read_opencv(path: Path) -> Rig:
-    """The rig in a folder of OpenCV's calibration files, or in one of them; each is named for its camera."""
-    return rig_of(path, [_opencv(p) for p in _files(path)])
+    """The rig in a folder of OpenCV's calibration files, or in one of them; each has its camera's name."""
+    return _rig_of(path, [_yaml_entry(file, read_yaml(file), file.stem) for file in _camera_files(path)])
 
 
 def write_opencv(path: Path, rig: Rig) -> None:
@@ -37,21 +140,21 @@ def write_opencv(path: Path, rig: Rig) -> None:
 
 def read_ros(path: Path) -> Rig:
     """The rig in a folder of camera_info files, or in one of them."""
-    return rig_of(path, [_ros(p) for p in _files(path)])
+    return _rig_of(path, [_ros_entry(file) for file in _camera_files(path)])
 
 
 def write_ros(path: Path, rig: Rig) -> None:
-    """Write a folder of camera_info files; rectification is none, since these are no stereo pairs."""
+    """Write a folder of camera_info files, without rectification."""
     path.mkdir(parents=True, exist_ok=True)
     for camera in rig.cameras:
-        write_yaml(path / f"{camera.name}.yaml", _ros_table(camera))
+        _write_yaml(path / f"{camera.name}.yaml", _ros_table(camera))
 
 
-def _files(path: Path) -> list[Path]:
-    found = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.suffix in SUFFIXES)
-    if not found:
+def _camera_files(path: Path) -> list[Path]:
+    files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.suffix in YAML_SUFFIXES)
+    if not files:
         raise InputError(path, "files", "none", "a .yaml file per camera")
-    return found
+    return files
 
 
 def _cv_matrix(name: str, values: Array) -> list[str]:
@@ -60,25 +163,23 @@ def _cv_matrix(name: str, values: Array) -> list[str]:
     return [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d", f"   data: [ {data} ]"]
 
 
-def _opencv(path: Path) -> Entry:
-    table = read_yaml(path)
-    focal = pinhole(path, matrix(path, table, "camera_matrix"))
-    bends = matrix(path, table, "distortion_coefficients").ravel()
-    return Entry(path.stem, _size(path, table), focal, bends, _place(path, table), _offset(path, table))
+def _yaml_entry(path: Path, table: Table, name: str) -> _Entry:
+    focal = _pinhole(path, _matrix(path, table, "camera_matrix"))
+    distortion = _matrix(path, table, "distortion_coefficients").ravel()
+    width, height = (checks.integer(path, key, table.get(key), 1) for key in ("image_width", "image_height"))
+    place = _matrix(path, table, "base_from_camera") if "base_from_camera" in table else None
+    offset = checks.number(path, "clock_offset_s", table.get("clock_offset_s", 0.0))
+    return _Entry(name, (width, height), focal, distortion, place, offset)
 
 
-def _ros(path: Path) -> Entry:
+def _ros_entry(path: Path) -> _Entry:
     table = read_yaml(path)
     if table.get("distortion_model") != "plumb_bob":
         raise InputError(path, "distortion_model", table.get("distortion_model"), "plumb_bob")
-    name = checks.text(path, "camera_name", table.get("camera_name"))
-    focal = pinhole(path, matrix(path, table, "camera_matrix"))
-    bends = matrix(path, table, "distortion_coefficients").ravel()
-    return Entry(name, _size(path, table), focal, bends, _place(path, table), _offset(path, table))
+    return _yaml_entry(path, table, checks.text(path, "camera_name", table.get("camera_name")))
 
 
 def _ros_table(camera: Camera) -> Table:
-    projection = np.hstack([camera.matrix, np.zeros((3, 1))])
     return {
         "image_width": camera.size[0],
         "image_height": camera.size[1],
@@ -87,7 +188,7 @@ def _ros_table(camera: Camera) -> Table:
         "distortion_model": "plumb_bob",
         "distortion_coefficients": _rows(camera.distortion[None]),
         "rectification_matrix": _rows(np.eye(3)),
-        "projection_matrix": _rows(projection),
+        "projection_matrix": _rows(np.hstack([camera.matrix, np.zeros((3, 1))])),
         "base_from_camera": _rows(camera.base_from_camera),
         "clock_offset_s": float(camera.clock_offset),
     }
@@ -97,14 +198,105 @@ def _rows(values: Array) -> Table:
     return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
 
 
-def _size(path: Path, table: Table) -> tuple[int, int]:
-    width, height = (checks.integer(path, key, table.get(key), 1) for key in ("image_width", "image_height"))
-    return width, height
+def read_kalibr(path: Path) -> Rig:
+    """The rig of a camchain; its base is the first camera. Cameras have the names of their topics, else cam0, cam1."""
+    chain = read_yaml(path)
+    place, entries = np.eye(4), []
+    for number, key in enumerate(sorted(chain, key=lambda k: int(k[3:]) if str(k)[3:].isdigit() else -1)):
+        table = chain[key]
+        if not isinstance(table, dict) or key != f"cam{number}":
+            raise InputError(path, str(key), type(table).__name__, f"cam{number}, a table")
+        for word, known in (("camera_model", "pinhole"), ("distortion_model", "radtan")):
+            if table.get(word) != known:
+                raise InputError(path, f"{key}.{word}", table.get(word), known)
+        if number:
+            place = place @ se3.inverse(_scaled(_numbers(path, table, "T_cn_cnm1", (4, 4)), MM_PER_M))
+        entries.append(_kalibr_entry(path, str(key), table, place))
+    return _rig_of(path, entries)
 
 
-def _place(path: Path, table: Table) -> Array | None:
-    return matrix(path, table, "base_from_camera") if "base_from_camera" in table else None
+def write_kalibr(path: Path, rig: Rig) -> None:
+    """Write a camchain; InputError where a lens has a k3, which radtan does not have."""
+    chain: Table = {}
+    for number, camera in enumerate(rig.cameras):
+        if camera.distortion[4]:
+            where = f"camera {camera.name}"
+            raise InputError(where, "k3", float(camera.distortion[4]), "0: Kalibr's radtan holds k1 k2 p1 p2 only")
+        entry: Table = {}
+        if number:
+            before = rig.cameras[number - 1].base_from_camera
+            entry["T_cn_cnm1"] = _scaled(se3.inverse(camera.base_from_camera) @ before, 1 / MM_PER_M).tolist()
+        m = camera.matrix
+        entry |= {
+            "camera_model": "pinhole",
+            "distortion_coeffs": camera.distortion[:4].tolist(),
+            "distortion_model": "radtan",
+            "intrinsics": [float(v) for v in (m[0, 0], m[1, 1], m[0, 2], m[1, 2])],
+            "resolution": list(camera.size),
+            "rostopic": f"/{camera.name}/image_raw",
+            "timeshift_cam_imu": float(camera.clock_offset),
+        }
+        chain[f"cam{number}"] = entry
+    _write_yaml(path, chain)
 
 
-def _offset(path: Path, table: Table) -> float:
-    return checks.number(path, "clock_offset_s", table.get("clock_offset_s", 0.0))
+def _kalibr_entry(path: Path, key: str, table: Table, place: Array) -> _Entry:
+    topic = str(table.get("rostopic", "")).strip("/").split("/")[0]
+    size = _numbers(path, table, "resolution", (2,)).astype(int).tolist()
+    focal, distortion = (_numbers(path, table, word, (4,)) for word in ("intrinsics", "distortion_coeffs"))
+    shift = checks.number(path, f"{key}.timeshift_cam_imu", table.get("timeshift_cam_imu", 0.0))
+    return _Entry(topic or key, size, focal, distortion, place, shift)
+
+
+def _scaled(transform: Array, factor: float) -> Array:
+    out = transform.copy()
+    out[:3, 3] *= factor
+    return out
+
+
+def read_anipose(path: Path) -> Rig:
+    """The rig; lengths are taken for mm, as aniposelib's are if its board was given in mm."""
+    entries = []
+    for key, table in checks.read_toml(path).items():
+        if not isinstance(table, dict) or "matrix" not in table:
+            continue  # metadata and other tables of caliscope
+        turn, shift = (_numbers(path, table, word, (3,)) for word in ("rotation", "translation"))
+        place = se3.inverse(se3.make(se3.exp_rotation(turn), shift))
+        focal = _pinhole(path, _numbers(path, table, "matrix", (3, 3)))
+        distortion = _numbers(path, table, "distortions", (None,))
+        offset = checks.number(path, f"{key}.clock_offset_s", table.get("clock_offset_s", 0.0))
+        entries.append(_Entry(str(table.get("name", key)), table.get("size", []), focal, distortion, place, offset))
+    return _rig_of(path, entries)
+
+
+def write_anipose(path: Path, rig: Rig) -> None:
+    """Write aniposelib's TOML, mm."""
+    blocks = []
+    for number, camera in enumerate(rig.cameras):
+        camera_from_base = se3.inverse(camera.base_from_camera)
+        lines = [f"[cam_{number}]", f"name = {json.dumps(camera.name)}", f"size = {list(camera.size)}"]
+        lines.append(f"matrix = {checks.toml_numbers(camera.matrix)}")
+        lines.append(f"distortions = {checks.toml_numbers(camera.distortion)}")
+        lines.append(f"rotation = {checks.toml_numbers(se3.log_rotation(camera_from_base[:3, :3]))}")
+        lines.append(f"translation = {checks.toml_numbers(np.asarray(camera_from_base[:3, 3]))}")
+        lines.append(f"clock_offset_s = {float(camera.clock_offset)!r}")
+        blocks.append("\n".join(lines) + "\n")
+    blocks.append("[metadata]\nadjusted = true\n")
+    path.write_text("\n".join(blocks), encoding="utf-8")
+
+
+@dataclass(frozen=True, slots=True)
+class RigFormat:
+    """One kind of file."""
+
+    read: Callable[[Path], Rig]
+    write: Callable[[Path, Rig], None]
+    folder: bool  # whether it is a folder with a file per camera
+
+
+FORMATS = {
+    "opencv": RigFormat(read_opencv, write_opencv, True),
+    "ros": RigFormat(read_ros, write_ros, True),
+    "kalibr": RigFormat(read_kalibr, write_kalibr, False),
+    "anipose": RigFormat(read_anipose, write_anipose, False),
+}

@@ -1,31 +1,147 @@
-"""A camera opened by OpenCV: a device, a stream or a file, one frame after the other (owns cv2.VideoCapture)."""
+"""A camera opened by OpenCV (device, stream or file), with its controls locked and read back.
+
+What the driver did not accept is named.
+"""
 
 from __future__ import annotations
 
 import math
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg's own lines on stderr: our words say it instead
-os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")  # s, as SILENT below; usually 10
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # instead of FFmpeg's own lines on stderr come our messages
+os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")  # s, as READ_TIMEOUT below; usually 10
 
 import cv2
 import numpy as np
 
-from hardware.cameras.controls import Control, ask_picture, lock, read_back, untaken
-from hardware.cameras.identity import Identity, Kind, device_node
-from hardware.cameras.sources import CameraSource
+from hardware.cameras.sources import CameraSource, Identity, SourceKind, device_node
 from hardware.process.clock import Clock
 from perception.frames import Image
 
-SILENT = 2  # s: a camera or stream that sends nothing for longer is opened anew
-OPEN_TIMEOUT = 3  # s until a stream that does not answer is given up
-FILE_FPS = 30.0  # Hz, where neither the container nor rig.toml tells a rate
+READ_TIMEOUT = 2  # s: a camera or stream that sends nothing for longer is opened again
+OPEN_TIMEOUT = 3  # s for a stream to answer
+FILE_FPS = 30.0  # Hz, where neither the container nor rig.toml has a rate
+EXPOSURE_UNIT = 1e-4  # s: V4L2 counts an absolute exposure in 100 us
+MANUAL_EXPOSURE, AUTOMATIC_OFF = 1.0, 0.0  # V4L2_EXPOSURE_MANUAL; the other automatics are switches
+CONTROL_TOLERANCE = 0.01  # relative: frame rates are fractions, white balance moves in steps of 10 K
+UNSUPPORTED_CONTROL = -1.0  # OpenCV's V4L2 backend returns it for a control that the camera does not have
 
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # an unplugged camera is told in our words
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # an unplugged camera has our own message
+
+
+class ControlPort(Protocol):
+    """Controls by number, as OpenCV's VideoCapture has them."""
+
+    def set(self, control: int, value: float) -> bool:
+        """Request a value; True does not mean that it was accepted."""
+
+    def get(self, control: int) -> float:
+        """The value now."""
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """One control, in rig.toml's units."""
+
+    name: str
+    asked: float | str | None  # requested value, None for none
+    got: float | str | None  # value read back, None if the camera does not have the control
+    automatic: bool = False
+
+    @property
+    def taken(self) -> bool:
+        """Whether the camera accepted the request, or there was none."""
+        if self.asked is None:
+            return True
+        if isinstance(self.asked, str) or isinstance(self.got, str) or self.got is None:
+            return self.asked == self.got
+        step = EXPOSURE_UNIT if self.name == "exposure_s" else 0.0
+        near = abs(self.got - self.asked) <= max(CONTROL_TOLERANCE * abs(self.asked), step / 2)
+        return near and not self.automatic
+
+    def __str__(self) -> str:
+        got = "not there" if self.got is None else f"{self.got:g}" if isinstance(self.got, float) else self.got
+        asked = f"{self.asked:g}" if isinstance(self.asked, float) else self.asked
+        text = f"{self.name} {got}" + " (automatic)" * self.automatic
+        return text if self.taken else f"{text}, asked for {asked}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Lockable:
+    name: str
+    number: int  # OpenCV's
+    automatic: int | None = None  # OpenCV's number of the automatic
+    off: float = AUTOMATIC_OFF  # value that ends the automatic
+    unit: float = 1.0  # of V4L2, in rig.toml's
+
+
+LOCKABLE_CONTROLS = (
+    _Lockable("exposure_s", cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE, EXPOSURE_UNIT),
+    _Lockable("gain", cv2.CAP_PROP_GAIN),
+    _Lockable("focus_abs", cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS),
+    _Lockable("white_balance_k", cv2.CAP_PROP_WB_TEMPERATURE, cv2.CAP_PROP_AUTO_WB),
+)
+
+
+def request_picture(port: ControlPort, source: CameraSource, size: tuple[int, int] | None) -> None:
+    """Request format, size (W, H) px and rate of a device: before the first frame, in this order."""
+    if source.format is not None:
+        port.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*source.format))
+    if size is not None:
+        port.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+        port.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+    if source.fps is not None:
+        port.set(cv2.CAP_PROP_FPS, source.fps)
+
+
+def lock_controls(port: ControlPort, source: CameraSource) -> None:
+    """Request a device's controls, after switching their automatics off, which would undo it."""
+    for one, asked in zip(LOCKABLE_CONTROLS, _requested(source), strict=True):
+        if asked is not None:
+            if one.automatic is not None:
+                port.set(one.automatic, one.off)
+            port.set(one.number, asked / one.unit)
+
+
+def read_controls(port: ControlPort, source: CameraSource) -> tuple[Control, ...]:
+    """A device's format, rate and controls, read back."""
+    code = int(port.get(cv2.CAP_PROP_FOURCC))
+    picture_format = "".join(chr(code >> 8 * i & 0xFF) for i in range(4)) if code > 0 else None
+    rate = port.get(cv2.CAP_PROP_FPS)
+    own = [_read_one(port, one, asked) for one, asked in zip(LOCKABLE_CONTROLS, _requested(source), strict=True)]
+    fps = Control("fps", source.fps, rate if rate > 0 else None)
+    return (Control("format", source.format, picture_format), fps, *own)
+
+
+def ignored_controls(source: CameraSource) -> tuple[Control, ...]:
+    """The controls requested of a stream or a file, which accepts none."""
+    wanted = zip(LOCKABLE_CONTROLS, _requested(source), strict=True)
+    return tuple(Control(one.name, asked, None) for one, asked in wanted if asked is not None)
+
+
+def locked_exposure(controls: Sequence[Control]) -> float:
+    """The exposure read back, s; 0 where it is not locked."""
+    for control in controls:
+        if control.name == "exposure_s" and control.taken and not control.automatic and isinstance(control.got, float):
+            return control.got
+    return 0.0
+
+
+def _read_one(port: ControlPort, one: _Lockable, asked: float | None) -> Control:
+    value = port.get(one.number)
+    if value == UNSUPPORTED_CONTROL:
+        return Control(one.name, asked, None)
+    automatic = one.automatic is not None and port.get(one.automatic) not in (one.off, UNSUPPORTED_CONTROL)
+    return Control(one.name, asked, value * one.unit, automatic)
+
+
+def _requested(source: CameraSource) -> tuple[float | None, ...]:
+    return source.exposure, source.gain, source.focus, source.white_balance  # in the order of LOCKABLE_CONTROLS
 
 
 def reads_videos() -> bool:
@@ -34,54 +150,49 @@ def reads_videos() -> bool:
 
 
 class Capture(Protocol):
-    """An open camera. ends: whether it comes to an end, as a file does. clocked: `position` may be the machine's."""
+    """An open camera."""
 
-    ends: bool
-    clocked: bool
+    ends: bool  # whether it can end, as a file does
+    clocked: bool  # whether `position` may be by the machine's own clock
 
     def grab(self) -> bool:
-        """Wait for the next frame; False where the camera has gone, or ended."""
-        ...
+        """Wait for the next frame; False if the camera is gone or has ended."""
 
     def position(self) -> float:
-        """The grabbed frame's instant as the source tells it, s on a clock of its own; nan where it tells none."""
-        ...
+        """The source's own time stamp of the grabbed frame, s; nan without one."""
 
     def retrieve(self) -> Image | None:
-        """The grabbed frame (H, W) or (H, W, 3) BGR; None where it cannot be decoded."""
-        ...
+        """The grabbed frame (H, W) or (H, W, 3) BGR; None if it cannot be decoded."""
 
     def lock(self) -> tuple[Control, ...]:
-        """Ask for the source's controls once more where need be, and read them back."""
-        ...
+        """Lock the source's controls again where necessary, and read them back."""
 
     def release(self) -> None:
-        """Give the camera back."""
-        ...
+        """Release the camera."""
 
 
-Opener = Callable[[CameraSource, "tuple[int, int] | None", Clock], "Capture | None"]
+CaptureOpener = Callable[[CameraSource, "tuple[int, int] | None", Clock], "Capture | None"]
 
 
 def open_capture(source: CameraSource, size: tuple[int, int] | None, clock: Clock) -> Capture | None:
-    """Open a camera, asked for pictures of `size` (W, H) px; None where that is not possible now."""
-    if source.identity.kind is Kind.DEVICE:
+    """Open a camera for pictures of `size` (W, H) px; None where that is not possible now."""
+    if source.identity.kind is SourceKind.DEVICE:
         node = device_node(source.identity)
-        found = None if node is None else cv2.VideoCapture(str(node), cv2.CAP_V4L2)
+        capture = None if node is None else cv2.VideoCapture(str(node), cv2.CAP_V4L2)
     else:
-        found = _open_ffmpeg(source.identity)
-    if found is None or not found.isOpened():
+        capture = _open_ffmpeg(source.identity)
+    if capture is None or not capture.isOpened():
         return None
-    if source.identity.kind is Kind.DEVICE:
-        ask_picture(found, source, size)
-        lock(found, source)
-    return _OpenCapture(found, source, clock)
+    if source.identity.kind is SourceKind.DEVICE:
+        request_picture(capture, source, size)
+        lock_controls(capture, source)
+    return _OpenCapture(capture, source, clock)
 
 
 def _open_ffmpeg(identity: Identity) -> cv2.VideoCapture:
     options = {
         cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: 1000 * OPEN_TIMEOUT,
-        cv2.CAP_PROP_READ_TIMEOUT_MSEC: 1000 * SILENT,
+        cv2.CAP_PROP_READ_TIMEOUT_MSEC: 1000 * READ_TIMEOUT,
         cv2.CAP_PROP_N_THREADS: 1,  # decoders of several threads hand each picture out that many frames later
     }
     return cv2.VideoCapture(identity.text, cv2.CAP_FFMPEG, [number for item in options.items() for number in item])
@@ -92,10 +203,10 @@ class _OpenCapture:
 
     def __init__(self, capture: cv2.VideoCapture, source: CameraSource, clock: Clock) -> None:
         self._capture, self._source, self._clock = capture, source, clock
-        self.clocked = source.identity.kind is Kind.DEVICE
-        self.ends = source.identity.kind is Kind.FILE and not _is_pipe(Path(source.identity.text))
-        told = capture.get(cv2.CAP_PROP_FPS)
-        self._period = 1 / (source.fps or (told if told > 0 else FILE_FPS))
+        self.clocked = source.identity.kind is SourceKind.DEVICE
+        self.ends = source.identity.kind is SourceKind.FILE and not _is_pipe(Path(source.identity.text))
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        self._period = 1 / (source.fps or (rate if rate > 0 else FILE_FPS))
         self._next = clock.now()
 
     def grab(self) -> bool:
@@ -108,8 +219,8 @@ class _OpenCapture:
             return False
 
     def position(self) -> float:
-        told = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-        return told if told > 0 or not self.clocked else math.nan
+        position = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+        return position if position > 0 or not self.clocked else math.nan
 
     def retrieve(self) -> Image | None:
         try:
@@ -120,12 +231,12 @@ class _OpenCapture:
 
     def lock(self) -> tuple[Control, ...]:
         if not self.clocked:
-            return untaken(self._source)
-        controls = read_back(self._capture, self._source)
+            return ignored_controls(self._source)
+        controls = read_controls(self._capture, self._source)
         if all(control.taken for control in controls):
             return controls
-        lock(self._capture, self._source)  # some drivers take a control only once pictures flow
-        return read_back(self._capture, self._source)
+        lock_controls(self._capture, self._source)  # some drivers take a control only once pictures flow
+        return read_controls(self._capture, self._source)
 
     def release(self) -> None:
         self._capture.release()

@@ -1,4 +1,4 @@
-"""Looking at cameras for a few seconds: what each delivers, how they stand to each other, in words and in JSON."""
+"""Inspection of live cameras: what each delivers, how their stamps differ, as text, JSON and a sheet of pictures."""
 
 from __future__ import annotations
 
@@ -7,15 +7,68 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
+from hardware.cameras.feed import CameraPhase, CameraState, LiveHealth
 from hardware.cameras.live import LiveCameras
-from hardware.cameras.sheet import brightness, sharpness, sheet
-from hardware.cameras.state import CameraState, LiveHealth, Phase
 from hardware.process.clock import Clock
 from perception.frames import FrameSet, Image
 
-STAMPED = {
+CELL_SIZE = (640, 360)  # px, width and height of a camera's picture on the sheet
+LINE_HEIGHT = 26  # px, height of a line of words
+SHEET_COLUMNS = 2
+BLOWN_LEVEL = 250  # grey level from which a pixel is blown out
+PAPER_COLOUR, INK_COLOUR, ALARM_COLOUR = (32, 32, 32), (235, 235, 235), (80, 80, 255)
+
+
+def sharpness(image: Image) -> float:
+    """Variance of the Laplacian (Pech-Pacheco 2000) of an (H, W) or (H, W, 3) BGR image; to be compared with itself."""
+    return float(cv2.Laplacian(_grey(image), cv2.CV_32F).var())
+
+
+def brightness(image: Image) -> tuple[float, float]:
+    """Mean grey level, and the share of pixels that are blown out, of an (H, W) or (H, W, 3) BGR image."""
+    grey = _grey(image)
+    return float(grey.mean()), float((grey >= BLOWN_LEVEL).mean())
+
+
+def preview_sheet(shown: Sequence[tuple[Image | None, Sequence[str], bool]]) -> Image:
+    """(H, W, 3) BGR: one cell per camera with its picture, if any, and lines of text, alarming unless all is well."""
+    lines = max(len(words) for _, words, _ in shown)
+    cells = [_cell(image, words, well, lines) for image, words, well in shown]
+    columns = min(SHEET_COLUMNS, len(cells))
+    empty = np.full_like(cells[0], PAPER_COLOUR)
+    rows = [cells[i : i + columns] for i in range(0, len(cells), columns)]
+    return np.vstack([np.hstack([*row, *[empty] * (columns - len(row))]) for row in rows])
+
+
+def _cell(image: Image | None, words: Sequence[str], well: bool, lines: int) -> Image:
+    cell = np.full((CELL_SIZE[1] + lines * LINE_HEIGHT + LINE_HEIGHT // 2, CELL_SIZE[0], 3), PAPER_COLOUR, np.uint8)
+    if image is not None:
+        scale = min(CELL_SIZE[0] / image.shape[1], CELL_SIZE[1] / image.shape[0])
+        size = (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0])))
+        small = cv2.resize(_colour(image), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+        x, y = (CELL_SIZE[0] - size[0]) // 2, (CELL_SIZE[1] - size[1]) // 2
+        cell[y : y + size[1], x : x + size[0]] = small
+    for i, line in enumerate(words):
+        place, colour = (
+            (8, CELL_SIZE[1] + LINE_HEIGHT * (i + 1) - LINE_HEIGHT // 4),
+            INK_COLOUR if well else ALARM_COLOUR,
+        )
+        cv2.putText(cell, line, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
+    return cell
+
+
+def _grey(image: Image) -> Image:
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def _colour(image: Image) -> Image:
+    return image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+
+
+STAMP_SOURCES = {
     "driver": "by its driver",
     "stream": "by its stream",
     "arrival": "by arrival",
@@ -25,20 +78,18 @@ STAMPED = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inspection:
-    """What was seen.
-
-    offsets, scatter: (C,) s, median and deviation of each camera's stamp from the first one's in the same set; nan
-    where they never met.
-    """
+    """What was seen."""
 
     health: LiveHealth
+    # offsets, scatter: (C,) s, median and deviation of each camera's stamp from the first one's in the same
+    # set; nan where they never met
     offsets: tuple[float, ...]
     scatter: tuple[float, ...]
 
     @property
     def faulty(self) -> bool:
         """Whether a camera is in trouble; a file that has been played is not."""
-        return any(camera.trouble and camera.phase is not Phase.ENDED for camera in self.health.cameras)
+        return any(camera.trouble and camera.phase is not CameraPhase.ENDED for camera in self.health.cameras)
 
 
 def inspect(live: LiveCameras, seconds: float, clock: Clock) -> Inspection:
@@ -131,7 +182,7 @@ def camera_lines(one: dict[str, Any]) -> list[str]:
     lines = [
         one["source"],
         f"{width} x {height} px, {_number(one['rate_hz'])} Hz, jitter {_number(one['jitter_ms'])} ms, "
-        f"lag {_number(one['lag_ms'])} ms, stamped {STAMPED[one['stamped'] or '']}",
+        f"lag {_number(one['lag_ms'])} ms, stamped {STAMP_SOURCES[one['stamped'] or '']}",
         _offset_words(one),
         f"sharpness {one['sharpness']:.0f}, grey level {one['grey_level']:.0f}, {one['blown_out']:.1%} blown out",
         f"{one['frames']} frames; {one['missed']} missed; left out: {left_out or 'none'}",
@@ -162,7 +213,7 @@ def inspection_sheet(inspection: Inspection) -> Image:
     """(H, W, 3) BGR: each camera's last picture with what is known of it."""
     tables = inspection_table(inspection)["cameras"]
     cameras = inspection.health.cameras
-    return sheet(
+    return preview_sheet(
         [
             (camera.newest, [one["name"], *camera_lines(one)[1:]], not one["trouble"])
             for camera, one in zip(cameras, tables, strict=True)

@@ -1,4 +1,4 @@
-"""Live cameras as frame sets: a grab thread each, the newest set wins, and a camera that fails holds up no other."""
+"""Live cameras as frame sets: one grab thread per camera, the newest set first; a failing camera delays no other."""
 
 from __future__ import annotations
 
@@ -6,51 +6,42 @@ import math
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from types import TracebackType
 
 from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware.cameras.capture import Opener, open_capture
-from hardware.cameras.feed import Arrival, Feed, Place
-from hardware.cameras.frame_sets import Gathering
-from hardware.cameras.sources import CameraSource
-from hardware.cameras.state import LiveHealth
+from hardware.cameras.feed import Arrival, CameraPlace, Feed, LiveHealth
+from hardware.cameras.frame_sets import FrameSetBuilder
+from hardware.cameras.sources import CameraSource, identity_from_text, read_live_rig
 from hardware.process.clock import Clock
 from perception.frames import FrameSet
 from perception.pairing import DEFAULT_PERIOD
 
-WAITING = 4  # frames a camera that nobody fetched yet: what is older is no longer worth a look
-LOOK = 0.005  # s between looks whether a set need not be waited for any longer
-JOINED = 0.5  # s that a thread has to end; one that waits for a dead stream ends with the process
-
-
-def places_of(rig: Rig) -> tuple[Place, ...]:
-    """What live cameras need of a rig."""
-    return tuple(Place(i, c.name, c.size, c.clock_offset) for i, c in enumerate(rig.cameras))
+MAX_WAITING_FRAMES = 4  # per camera that nobody has fetched yet; older ones are dropped
+SET_POLL = 0.005  # s between checks whether an incomplete set is due
+JOIN_TIMEOUT = 0.5  # s for a thread to end; one that waits for a dead stream ends with the process
 
 
 class LiveCameras:
-    """The frame sets of a rig's cameras, newest first served: iterate, or ask with `next_set`.
+    """The frame sets of a rig's cameras: iterate, or call `next_set`. Use it as a context, or `start` and `close` it.
 
-    What is older than the newest set when it is asked for is passed over and counted. Stamps are the cameras' own, by
-    `clock`, with the rig's clock offsets added; each frame tells by whom it was stamped. Cameras may come and go; files
-    end, and with the last of them the iteration does. Use it as a context, or `start` and `close` it.
+    Only the newest set is served; older ones are skipped and counted. Stamps are exposure instants by `clock` with the
+    rig's clock offsets added; each frame names the source of its stamp. Cameras may disconnect and come back. The
+    iteration ends when all cameras are files that have ended.
     """
 
     def __init__(
         self,
-        rig: Rig | Sequence[Place],
+        rig: Rig | Sequence[CameraPlace],
         sources: Sequence[CameraSource],
         clock: Clock,
-        offsets: Sequence[float] | Array | None = None,
-        opener: Opener = open_capture,
     ) -> None:
-        """rig: or the places of cameras that are not calibrated. sources: one per camera.
-
-        offsets: (C,) s, as `set_offsets` takes them.
-        """
-        places = places_of(rig) if isinstance(rig, Rig) else tuple(rig)
+        """rig: or the places of cameras that are not calibrated. sources: one per camera."""
+        if isinstance(rig, Rig):
+            rig = [CameraPlace(i, c.name, c.size, c.clock_offset) for i, c in enumerate(rig.cameras)]
+        places = tuple(rig)
         if len(sources) != len(places):
             raise InputError("live cameras", "sources", len(sources), f"one per camera of the rig, {len(places)}")
         self._clock, self._changed = clock, threading.Condition()
@@ -59,23 +50,19 @@ class LiveCameras:
         self._sets = self._complete = self._passed_over = 0
         self._closed = False
         period = min((1 / source.fps for source in sources if source.fps), default=DEFAULT_PERIOD)
-        self._gathering = Gathering(len(places), period, offsets)
-        self._feeds = tuple(
-            Feed(place, source, clock, self._deliver, opener) for place, source in zip(places, sources, strict=True)
-        )
-        names = [f"camera {feed.place.name}" for feed in self._feeds]
+        self._builder = FrameSetBuilder(len(places), period)
+        self._feeds = [Feed(p, source, clock, self._deliver) for p, source in zip(places, sources, strict=True)]
         self._threads = [
-            threading.Thread(target=feed.run, name=name, daemon=True)
-            for feed, name in zip(self._feeds, names, strict=True)
+            threading.Thread(target=feed.run, name=f"camera {feed.place.name}", daemon=True) for feed in self._feeds
         ]
 
     def start(self) -> None:
-        """Begin to open and grab; returns at once."""
+        """Begin to open the cameras and to grab; returns at once."""
         for thread in self._threads:
             thread.start()
 
     def close(self) -> None:
-        """Give the cameras back; whoever waits for a set gets none."""
+        """Release the cameras; whoever waits for a set gets None."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -83,7 +70,7 @@ class LiveCameras:
             feed.close()
         for thread in self._threads:
             if thread.ident is not None:
-                thread.join(JOINED)
+                thread.join(JOIN_TIMEOUT)
 
     def __enter__(self) -> LiveCameras:
         self.start()
@@ -93,7 +80,6 @@ class LiveCameras:
         self.close()
 
     def __iter__(self) -> Iterator[FrameSet]:
-        """The newest set, again and again, until closed or all files have ended."""
         while (one := self.next_set()) is not None:
             yield one
 
@@ -101,36 +87,25 @@ class LiveCameras:
         """Wait for a set newer than the last one; None at the instant `until` (s, None: never), or at the end."""
         with self._changed:
             while True:
-                ended = all(feed.ended for feed in self._feeds)  # asked first: what they delivered before is gathered
-                found = None if self._closed else self._gather(ended)
+                ended = all(feed.ended for feed in self._feeds)  # read first: what was delivered before is in the set
+                newest = None if self._closed else self._newest_set(ended)
                 over = self._closed or ended or (until is not None and self._clock.now() >= until)
-                if found is not None or over:
-                    return found
-                self._changed.wait(LOOK)
+                if newest is not None or over:
+                    return newest
+                self._changed.wait(SET_POLL)
 
-    def set_offsets(self, offsets: Sequence[float] | Array) -> None:
-        """How much later than its own stamps each camera exposes beyond its rig's offset, (C,) s.
+    def learn(self, offsets: Sequence[float] | Array) -> None:
+        """Pair frames by the exposure offsets that the estimator has learned: (C,) s, after the set's stamp.
 
-        Frames are paired by it from now on; their stamps stay as they are, so that whoever learns from them does not
-        learn from itself.
+        The frames' stamps stay as they are, so that the estimator does not learn from its own output.
         """
         with self._changed:
-            self._gathering.set_offsets(offsets)
-
-    def learn(self, learned: Sequence[float] | Array) -> None:
-        """Pair by what the estimator has learned: how much later than its set's stamp each camera exposes, (C,) s."""
-        with self._changed:
-            self._gathering.learn(learned)
-
-    def behind(self) -> Array:
-        """How much later than its set's stamp each camera is stamped, (C,) s, usually: cameras may be out of step."""
-        with self._changed:
-            return self._gathering.behind
+            self._builder.learn(offsets)
 
     def health(self) -> LiveHealth:
-        """How every camera fares now."""
+        """The state of every camera now."""
         with self._changed:
-            overrun, late = list(self._overrun), self._gathering.late
+            overrun, late = list(self._overrun), self._builder.late
             sets, complete, passed = self._sets, self._complete, self._passed_over
         states = tuple(feed.state(count) for feed, count in zip(self._feeds, overrun, strict=True))
         return LiveHealth(states, sets, complete, late, passed)
@@ -139,21 +114,36 @@ class LiveCameras:
         with self._changed:
             camera = arrival.frame.camera
             mine = [one for one in self._waiting if one.frame.camera == camera]
-            if len(mine) >= WAITING:
+            if len(mine) >= MAX_WAITING_FRAMES:
                 self._waiting.remove(mine[0])
                 self._overrun[camera] += 1
             self._waiting.append(arrival)
             self._changed.notify_all()
 
-    def _gather(self, ended: bool) -> FrameSet | None:
-        """The newest set of what has come, None if there is none. ended: nothing more will come."""
+    def _newest_set(self, ended: bool) -> FrameSet | None:
+        """The newest set of the waiting frames, or None. ended: no more frames will come."""
         sets: list[FrameSet] = []
         while self._waiting:
-            sets += self._gathering.add(self._waiting.popleft())
-        sets += self._gathering.due(math.inf if ended else self._clock.now())
+            sets += self._builder.add(self._waiting.popleft())
+        sets += self._builder.due(math.inf if ended else self._clock.now())
         if not sets:
             return None
         self._sets += 1
         self._complete += len(sets[-1].frames) == len(self._feeds)
         self._passed_over += len(sets) - 1
         return sets[-1]
+
+
+def sources_named(which: Sequence[str]) -> tuple[Rig | None, tuple[CameraSource, ...]]:
+    """The rig and camera sources of one RIG.toml, or no rig and the sources named one by one; InputError."""
+    rigs = [text for text in which if text.endswith(".toml")]
+    if rigs and len(which) > 1:
+        raise InputError("command line", "cameras", " ".join(which), "one RIG.toml alone, or cameras without one")
+    if rigs:
+        return read_live_rig(rigs[0])
+    return None, tuple(CameraSource(identity_from_text("command line", "camera", text, Path.cwd())) for text in which)
+
+
+def places_without_rig(count: int) -> tuple[CameraPlace, ...]:
+    """Places of uncalibrated cameras, counted from 1."""
+    return tuple(CameraPlace(i, f"camera {i + 1}", None) for i in range(count))

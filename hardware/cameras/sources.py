@@ -1,53 +1,162 @@
-"""Where a rig's live pictures come from and what each camera is told: keys of rig.toml's [[camera]].
+"""Camera sources: a camera's identity, which survives replugging and restarts, and its settings in rig.toml.
 
+[[camera]]
 source = "/dev/v4l/by-id/usb-046d_HD_Pro_Webcam_C920_A1B2C3D4-video-index0"
-exposure_s = 0.008             # locked; so are the following, each where it is given
+exposure_s = 0.008             # locked, as are the following where given
 gain = 32                      # in the driver's own units
 focus_abs = 40                 # in the driver's own units
 white_balance_k = 4500
 fps = 30.0
-format = "MJPG"                # as the driver calls it: MJPG, YUYV
+format = "MJPG"                # the driver's name: MJPG, YUYV
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 
 from estimation.errors import InputError
 from estimation.rig import Rig
-from hardware.cameras.identity import STAYS, Identity, identity_from_text
 from hardware.files.rig_file import LIVE_KEYS, RECORDED_KEYS, rig_from_table
 from hardware.process import checks
 from hardware.process.checks import Table
 
-RANGES = {  # both ends included
+FILE_ROOT = Path("/")
+URL_SCHEMES = ("rtsp://", "rtsps://", "http://", "https://")
+USB_PREFIX = "usb:"  # before a USB serial number
+IDENTITY_FORMS = "a path in /dev/v4l/by-id or /dev/v4l/by-path, usb:SERIAL, a URL (rtsp, http) or a video file"
+CONTROL_RANGES = {  # both ends included
     "exposure_s": (1e-5, 1.0),
     "gain": (0.0, 1e5),
     "focus_abs": (0.0, 1e5),
     "white_balance_k": (1000.0, 20000.0),
     "fps": (1.0, 1000.0),
 }
+_INDEX = re.compile(r"-?\d+|(/dev/)?video\d+")
+_PASSWORD = re.compile(r"(://[^/@:]*:)[^/]*@")
+_LINKS = ("dev/v4l/by-id", "dev/v4l/by-path")
+
+
+class SourceKind(Enum):
+    """Kind of source."""
+
+    DEVICE = "device"
+    STREAM = "stream"
+    FILE = "file"
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """A camera's name as written."""
+
+    kind: SourceKind
+    text: str  # a file's path is absolute
+
+    @property
+    def shown(self) -> str:
+        """The name without a password, for screens and recordings."""
+        return _PASSWORD.sub(r"\1***@", self.text)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraDevice:
+    """A camera that is plugged in now; "" for what it does not have."""
+
+    node: Path  # such as /dev/video0
+    name: str
+    serial: str
+    by_id: str
+    by_path: str
+
+    @property
+    def identity(self) -> str:
+        """What to write in rig.toml: the camera's own name rather than that of its socket."""
+        return self.by_id or self.by_path or (USB_PREFIX + self.serial if self.serial else "")
+
+
+def identity_from_text(where: object, key: str, text: str, folder: Path, root: Path = FILE_ROOT) -> Identity:
+    """The identity in a text; InputError where it could change, as an index does. A device need not be plugged in.
+
+    folder: where files are. root: of the file system, for tests.
+    """
+    if _INDEX.fullmatch(text):
+        raise InputError(where, key, text, _instead(text, root))
+    if text.startswith(URL_SCHEMES):
+        return Identity(SourceKind.STREAM, text)
+    if text.startswith("/dev/") or (text.startswith(USB_PREFIX) and text != USB_PREFIX):
+        return Identity(SourceKind.DEVICE, text)
+    path = folder / text
+    if "://" in text or not path.exists() or path.is_dir():
+        raise InputError(where, key, text, IDENTITY_FORMS)
+    return Identity(SourceKind.FILE, str(path.resolve()))
+
+
+def _instead(text: str, root: Path) -> str:
+    """What to write instead of an index, as text."""
+    number = re.sub(r"\D", "", text)
+    there = [device for device in list_devices(root) if device.identity]
+    for device in there:
+        if device.node.name == f"video{number}":
+            return f"a name that stays when cables move: {device.identity} is this one now"
+    if there:
+        return f"a name that stays when cables move, such as {there[0].identity}"
+    return f"a name that stays when cables move: {IDENTITY_FORMS}; `stillbed cameras` lists what is plugged in"
+
+
+def list_devices(root: Path = FILE_ROOT) -> tuple[CameraDevice, ...]:
+    """The cameras plugged in, in the order of their nodes; without nodes that carry no pictures."""
+    nodes = sorted((root / "sys/class/video4linux").glob("video*"), key=lambda p: int("0" + p.name[5:]))
+    return tuple(_device(entry, root) for entry in nodes if _read(entry / "index") in ("", "0"))
+
+
+def _device(entry: Path, root: Path) -> CameraDevice:
+    node = root / "dev" / entry.name
+    serial = _read((entry / "device").resolve().parent / "serial") if (entry / "device").exists() else ""
+    by_id, by_path = (_link_to(node, root / link) for link in _LINKS)
+    return CameraDevice(node, _read(entry / "name"), serial, by_id, by_path)
+
+
+def _link_to(node: Path, folder: Path) -> str:
+    """The first link in a folder to a node, without the tests' root; "" if there is none."""
+    links = sorted(folder.iterdir()) if folder.is_dir() else []
+    names = (link.name for link in links if link.resolve() == node.resolve())
+    return next((str(Path("/", *folder.parts[-3:], name)) for name in names), "")
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""
+
+
+def device_node(identity: Identity, root: Path = FILE_ROOT) -> Path | None:
+    """A device's node; None while it is unplugged, or if two cameras have its serial number."""
+    if identity.text.startswith(USB_PREFIX):
+        serial = identity.text.removeprefix(USB_PREFIX)
+        nodes = [device.node for device in list_devices(root) if device.serial == serial]
+        return nodes[0] if len(nodes) == 1 else None
+    link = root / identity.text.lstrip("/")
+    return link if link.exists() else None
 
 
 @dataclass(frozen=True, slots=True)
 class CameraSource:
-    """One camera of a live rig. None: left as the camera has it, and not locked.
-
-    exposure: s. gain, focus: the driver's units. white_balance: K. fps: Hz. format: four characters.
-    """
+    """One camera of a live rig. None: not requested and not locked."""
 
     identity: Identity
-    exposure: float | None = None
-    gain: float | None = None
-    focus: float | None = None
-    white_balance: float | None = None
-    fps: float | None = None
-    format: str | None = None
+    exposure: float | None = None  # s
+    gain: float | None = None  # the driver's units
+    focus: float | None = None  # the driver's units
+    white_balance: float | None = None  # K
+    fps: float | None = None  # Hz
+    format: str | None = None  # four characters
 
 
 def read_live_rig(path: str | Path) -> tuple[Rig, tuple[CameraSource, ...]]:
-    """The rig in a rig.toml and each camera's live source; InputError names the camera that has none."""
+    """The rig in a rig.toml and each camera's live source; InputError names a camera without one."""
     path = Path(path)
     table = checks.read_toml(path)
     checks.check_keys(path, "", table, ["camera"], ["surface"])
@@ -60,18 +169,18 @@ def source_from_table(where: object, name: str, camera: Table, folder: Path) -> 
     """The live source in a table [[camera]]; files are looked for in `folder`."""
     key = f"camera {name!r}: "
     if "source" not in camera:
-        raise InputError(where, key + "source", "missing", STAYS)
+        raise InputError(where, key + "source", "missing", IDENTITY_FORMS)
     written = camera["source"]
     text = str(written) if isinstance(written, int) else checks.text(where, key + "source", written)
     identity = identity_from_text(where, key + "source", text, folder)
-    exposure, gain, focus, white, fps = (_number(where, key, camera, one) for one in RANGES)
+    exposure, gain, focus, white, fps = (_number(where, key, camera, one) for one in CONTROL_RANGES)
     return CameraSource(identity, exposure, gain, focus, white, fps, _format(where, key + "format", camera))
 
 
 def _number(where: object, key: str, camera: Table, name: str) -> float | None:
     if name not in camera:
         return None
-    value, (low, high) = checks.number(where, key + name, camera[name]), RANGES[name]
+    value, (low, high) = checks.number(where, key + name, camera[name]), CONTROL_RANGES[name]
     if not low <= value <= high:
         raise InputError(where, key + name, value, f"{low:g} to {high:g}")
     return value

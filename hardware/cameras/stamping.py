@@ -1,4 +1,4 @@
-"""When a frame was exposed: by its driver's time stamp, by its stream's, or by when it came."""
+"""When a frame was exposed: by its driver's time stamp, its stream's, or its arrival, with a phase-locked loop."""
 
 from __future__ import annotations
 
@@ -6,61 +6,150 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-from hardware.cameras.rhythm import Rhythm
+import numpy as np
+
 from perception.frames import StampedBy
 
-OLDEST = 1.0  # s: four buffers of 4 Hz; a driver's stamp beyond is of another clock
-WINDOW = 60  # frames whose least delay is taken for the way's own: two seconds of a webcam
-LEAST = (
-    10  # one in so many frames comes sooner than what is taken for the way's own delay, where a beat is all there is
+PLL_BEATS = 30  # beats by which phase and period are smoothed: a second of a webcam
+SKIP_AFTER = (
+    0.6  # of a period after the expected beat: later, a beat is skipped rather than late (2 %, sigma 5 of 33 ms)
 )
-AGREE = 0.01  # s, that the least delays of both halves of the window may differ by: a stream whose clock runs as ours
+MIN_BEAT_GAP = 0.4  # of a period after the last beat: a sooner instant is no beat
+PAUSE_BEATS = 10  # without an instant, after which the phase starts again
+PERIOD_INSTANTS = 10  # from which a period is estimated
+CHANGE_INSTANTS = 20  # from which a change of the period is detected
+PERIOD_CHANGE = 0.25  # relative: twice the error of the median of so many steps with sigma 7 of 33 ms
+MAX_PULL, PULL_AFTER_BEATS = 2.0, 10  # bound of one residual in RMS jitters (Huber), once so many beats are known
+MIN_PERIOD = 0.004  # s: no camera is faster; a backlog comes faster
+MAX_DRIVER_LAG = 1.0  # s: four buffers of 4 Hz; an older driver stamp is by another clock
+DELAY_WINDOW = 60  # frames whose least delay is taken for the transport's: two seconds of a webcam
+EARLIEST_ONE_IN = 10  # frames arrive sooner than the transport delay that is assumed without any stamps
+MAX_DELAY_CHANGE = 0.01  # s between the least delays of both halves of the window: the stream's clock runs as ours
 
 
 @dataclass(frozen=True, slots=True)
-class Stamped:
-    """When a frame was exposed. stamp: s, middle of the exposure. steady: s, the same without jitter, for pairing.
+class Beat:
+    """An instant on the steady beat."""
 
-    lag: s, from stamp to arrival. fresh: False for what is only now worked off of a backlog, so that its instant is
-    unknown.
+    steady: float  # s, without jitter
+    count: int  # periods since the last beat; 0: no new beat
+
+
+class PhaseLockedLoop:
+    """Follows instants (s) of a steady period, some off by up to half of it, some missing.
+
+    The gains are those of a line fit through all beats, fixed from PLL_BEATS beats on (Brookner, Tracking and Kalman
+    Filtering Made Easy, 1.3). A lasting change of the period is adopted.
     """
 
-    stamp: float
-    steady: float
+    def __init__(self, period: float | None = None) -> None:
+        """period: s; None: estimated from the first PERIOD_INSTANTS instants, which are passed on as they are."""
+        self.period, self.missed = period, 0
+        self._beats = 0  # that determine the phase
+        self._known = PERIOD_INSTANTS if period else 0  # so many more determine the period
+        self._grid, self._off = -np.inf, 0.0
+        self._instants: deque[float] = deque(maxlen=CHANGE_INSTANTS)
+
+    @property
+    def jitter(self) -> float:
+        """RMS distance of the instants from the steady beat, s."""
+        return float(np.sqrt(self._off))
+
+    def __call__(self, instant: float) -> Beat:
+        """Take the next instant, s, not before the last one; steady instants never decrease either."""
+        if self.period and self._instants and instant - self._instants[-1] > PAUSE_BEATS * self.period:
+            self._beats = 0
+        self._instants.append(instant)
+        if self._is_due(self.period) and self._find():
+            return Beat(self._grid, 1)
+        if self.period is None or self._beats == 0:
+            self._grid, self._beats = max(instant, self._grid), 1
+            return Beat(self._grid, 1)
+        return self._follow(instant, self.period)
+
+    def _is_due(self, period: float | None) -> bool:
+        """Whether the period is to be estimated: for the first time, or as most of the last steps agree on another."""
+        if period is None:
+            return len(self._instants) >= PERIOD_INSTANTS
+        if len(self._instants) < CHANGE_INSTANTS:
+            return False
+        steps = np.diff(self._instants)
+        median = max(float(np.median(steps)), MIN_PERIOD)
+        alike = np.mean(np.abs(steps - median) < PERIOD_CHANGE / 2 * median) > 0.5
+        return bool(alike) and abs(median / period - 1) > PERIOD_CHANGE
+
+    def _find(self) -> bool:
+        """Fit a line through the last instants, numbered by their median step; False if there is none."""
+        instants = np.array(self._instants)[-PERIOD_INSTANTS:]
+        steps = np.diff(instants)
+        counts = np.append(0, np.cumsum(np.round(steps / max(float(np.median(steps)), MIN_PERIOD))))
+        if np.ptp(instants) < MIN_PERIOD * (PERIOD_INSTANTS - 1) or counts[-1] == 0:
+            return False
+        slope, start = np.polyfit(counts, instants - instants[0], 1)
+        self.period, self._beats, self._known = float(slope), PERIOD_INSTANTS, 0
+        self._grid = max(self._grid, float(instants[0] + start + slope * counts[-1]))
+        return True
+
+    def _follow(self, instant: float, period: float) -> Beat:
+        ahead = (instant - self._grid) / period
+        if ahead < MIN_BEAT_GAP:
+            return Beat(self._grid, 0)
+        count = max(1, int(np.ceil(ahead - SKIP_AFTER)))
+        off = self._bounded(instant - self._grid - count * period)
+        k = min(self._beats, PLL_BEATS)
+        known = min(self._beats + self._known, PLL_BEATS)
+        self._grid += count * period + off * 2 * (2 * k + 1) / ((k + 1) * (k + 2))
+        self.period = period + off / count * 6 / ((known + 1) * (known + 2))
+        self._off += (off * off - self._off) / k
+        self._beats, self.missed = self._beats + 1, self.missed + count - 1
+        return Beat(self._grid, count)
+
+    def _bounded(self, off: float) -> float:
+        """A residual, s, with Huber's bound: a delayed instant does not move the phase."""
+        far = MAX_PULL * self.jitter + 1e-4 if self._beats > PULL_AFTER_BEATS else np.inf
+        return float(np.clip(off, -far, far))
+
+
+@dataclass(frozen=True, slots=True)
+class FrameStamp:
+    """When a frame was exposed."""
+
+    stamp: float  # s, middle of the exposure
+    steady: float  # s, the same without jitter, for pairing
     by: StampedBy
-    lag: float
-    fresh: bool
+    lag: float  # s, from stamp to arrival
+    fresh: bool  # False for a frame of a backlog, whose instant is unknown
 
 
-class Stamping:
-    """Remembers one camera's delays. period: s, None where it is not told. exposure: s, 0 where it is not known."""
+class FrameStamper:
+    """Stamps one camera's frames. period: s, None if unknown."""
 
-    def __init__(self, period: float | None = None, exposure: float = 0.0) -> None:
-        self.exposure = exposure
+    def __init__(self, period: float | None = None) -> None:
+        self.exposure = 0.0  # s, 0: unknown
         self._by: StampedBy = "arrival"
-        self._delays: deque[float] = deque(maxlen=WINDOW)  # s, behind the stream's clock
-        self._late: deque[float] = deque(maxlen=WINDOW)  # s, behind the steady beat
-        self.rhythm = Rhythm(period)
+        self._delays: deque[float] = deque(maxlen=DELAY_WINDOW)  # s, behind the stream's clock
+        self._late: deque[float] = deque(maxlen=DELAY_WINDOW)  # s, behind the steady beat
+        self.pll = PhaseLockedLoop(period)
 
-    def __call__(self, arrival: float, position: float, clocked: bool) -> Stamped:
+    def __call__(self, arrival: float, position: float, clocked: bool) -> FrameStamp:
         """Stamp the frame that arrived at `arrival` (s).
 
-        position: s, as the source tells it (nan: it tells none). clocked: that may be the machine's own clock.
+        position: s, the source's own stamp (nan: none). clocked: whether that may be by the machine's own clock.
         """
         by, instant = self._source(arrival, position, clocked)
         if by != self._by:
-            self._by, self.rhythm = by, Rhythm(self.rhythm.period)
-        beat = self.rhythm(instant)
+            self._by, self.pll = by, PhaseLockedLoop(self.pll.period)
+        beat = self.pll(instant)
         if by == "arrival":
             self._late.append(arrival - beat.steady)
-            instant = min(arrival, beat.steady + sorted(self._late)[len(self._late) // LEAST])
+            instant = min(arrival, beat.steady + sorted(self._late)[len(self._late) // EARLIEST_ONE_IN])
         middle = self.exposure / 2
         fresh = by != "arrival" or beat.count > 0
         steady = instant if by == "arrival" else beat.steady
-        return Stamped(instant - middle, steady - middle, by, arrival - instant + middle, fresh)
+        return FrameStamp(instant - middle, steady - middle, by, arrival - instant + middle, fresh)
 
     def _source(self, arrival: float, position: float, clocked: bool) -> tuple[StampedBy, float]:
-        if clocked and 0 <= arrival - position <= OLDEST:
+        if clocked and 0 <= arrival - position <= MAX_DRIVER_LAG:
             return "driver", position
         if clocked or math.isnan(position):
             return "arrival", arrival
@@ -68,6 +157,6 @@ class Stamping:
         return ("stream", position + min(self._delays)) if self._keeps_time() else ("arrival", arrival)
 
     def _keeps_time(self) -> bool:
-        """Whether the stream's stamps run as the clock does: its least delay is the same now as before."""
-        delays, half = list(self._delays), WINDOW // 2
-        return len(delays) == WINDOW and abs(min(delays[:half]) - min(delays[half:])) <= AGREE
+        """Whether the stream's clock runs as ours: its least delay does not change."""
+        delays, half = list(self._delays), DELAY_WINDOW // 2
+        return len(delays) == DELAY_WINDOW and abs(min(delays[:half]) - min(delays[half:])) <= MAX_DELAY_CHANGE

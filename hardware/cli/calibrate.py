@@ -1,4 +1,4 @@
-"""`stillbed calibrate`: its command line; what does the work is loaded when it is asked for."""
+"""`stillbed calibrate`: its command line. Imports lazily."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from hardware.cli.calibrate_arm import add_calibrate_arm
 from hardware.cli.parser import INTERRUPTED, Commands, add_command, positive
 
 if TYPE_CHECKING:
-    from hardware.calibration.waving_page import WavingPage
+    from hardware.calibration.live import WavingPage
     from hardware.process.clock import Clock
 
 
-FORMATS = {
+RIG_FORMATS = {
     "opencv": "a YAML per camera",
     "ros": "camera_info, a YAML per camera",
     "kalibr": "camchain.yaml",
     "anipose": "aniposelib's and caliscope's TOML, mm",
 }
-FAILED = 1  # exit code of a calibration that is not good enough
+NOT_GOOD_ENOUGH = 1  # exit code of a calibration that is not good enough
 
 
 def add_calibrate(commands: Commands) -> None:
@@ -53,17 +53,16 @@ def _add_board(parts: Commands) -> None:
         "stillbed calibrate board -o board.pdf",
         "stillbed calibrate board -o board.svg --page A3 --square-mm 30 --squares 8x11",
     )
-    part.add_argument(
-        "-o", "--out", type=Path, required=True, metavar="X.pdf", help=".pdf or .svg; board.toml beside it"
-    )
-    part.add_argument("--kind", choices=("charuco", "chessboard"), default="charuco", help="default charuco")
-    part.add_argument("--squares", type=_pair, metavar="CxR", help="columns x rows; default: as many as fit the page")
-    part.add_argument("--square-mm", type=positive, default=25.0, metavar="MM", help="edge of a square; default 25")
-    part.add_argument("--marker", type=float, default=0.75, metavar="SHARE", help="of a square's edge; default 0.75")
-    part.add_argument("--dictionary", default="4X4_50", metavar="NAME", help="of the markers; default 4X4_50")
-    part.add_argument("--inverted", action="store_true", help="exchange black and white")
-    part.add_argument("--page", default="A4", metavar="SIZE", help="A5, A4, A3, A2, letter, or WxH in mm; default A4")
-    part.add_argument("--force", action="store_true", help="overwrite X.pdf and the board.toml beside it")
+    add = part.add_argument
+    add("-o", "--out", type=Path, required=True, metavar="X.pdf", help=".pdf or .svg; board.toml beside it")
+    add("--kind", choices=("charuco", "chessboard"), default="charuco", help="default charuco")
+    add("--squares", type=_pair, metavar="CxR", help="columns x rows; default: as many as fit the page")
+    add("--square-mm", type=positive, default=25.0, metavar="MM", help="edge of a square; default 25")
+    add("--marker", type=float, default=0.75, metavar="SHARE", help="of a square's edge; default 0.75")
+    add("--dictionary", default="4X4_50", metavar="NAME", help="of the markers; default 4X4_50")
+    add("--inverted", action="store_true", help="exchange black and white")
+    add("--page", default="A4", metavar="SIZE", help="A5, A4, A3, A2, letter, or WxH in mm; default A4")
+    add("--force", action="store_true", help="overwrite X.pdf and the board.toml beside it")
     part.set_defaults(run=_board)
 
 
@@ -78,34 +77,29 @@ def _add_cameras(parts: Commands) -> None:
         "stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
         "stillbed calibrate cameras /dev/v4l/by-id/CAMERA_A /dev/v4l/by-id/CAMERA_B --board board.toml -o rig.toml",
     )
-    part.add_argument(
+    add = part.add_argument
+    add(
         "which",
         nargs="+",
         metavar="SESSION_OR_CAMERA",
         help="session folder or .mcap (its rig may lack lenses); or live cameras as `stillbed cameras` names them, "
         "or RIG.toml for all of a rig",
     )
-    part.add_argument(
-        "--seconds", type=float, metavar="S", help="watch live cameras so long at most; default: until enough was seen"
-    )
-    part.add_argument("--no-page", action="store_true", help="with live cameras: without the page in the browser")
-    part.add_argument("--board", type=Path, required=True, metavar="board.toml", help="the board as it was printed")
-    part.add_argument(
-        "-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write; report beside it"
-    )
-    part.add_argument(
-        "--limit-mm", type=positive, default=0.1, metavar="MM", help="predicted error to pass; default 0.1"
-    )
-    part.add_argument(
+    add("--seconds", type=float, metavar="S", help="watch live cameras so long at most; default: until enough was seen")
+    add("--no-page", action="store_true", help="with live cameras: without the page in the browser")
+    add("--board", type=Path, required=True, metavar="board.toml", help="the board as it was printed")
+    add("-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write; report beside it")
+    add("--limit-mm", type=positive, default=0.1, metavar="MM", help="predicted error to pass; default 0.1")
+    add(
         "--distance-mm", type=_distance, metavar="A,B,MM", help="two cameras and how far apart they are, to check scale"
     )
-    part.add_argument(
+    add(
         "--keep-lenses",
         action="store_true",
         help="take the session's lenses, within their lens_sigma; seek places and clocks",
     )
-    part.add_argument("--new-rig", action="store_true", help="do not compare with the session's own rig")
-    part.add_argument("--force", action="store_true", help="overwrite rig.toml and what stands beside it")
+    add("--new-rig", action="store_true", help="do not compare with the session's own rig")
+    add("--force", action="store_true", help="overwrite rig.toml and what stands beside it")
     part.set_defaults(run=_cameras)
 
 
@@ -117,12 +111,11 @@ def _add_import(parts: Commands) -> None:
         "Turn another program's calibration into a rig.toml. Where each camera's images are is to be added to it.",
         "stillbed calibrate import camchain.yaml --format kalibr -o rig.toml",
     )
-    part.add_argument("file", type=Path, metavar="FILE", help="its file, or folder of a file per camera")
-    part.add_argument(
-        "--format", choices=FORMATS, required=True, help="; ".join(f"{k}: {v}" for k, v in FORMATS.items())
-    )
-    part.add_argument("-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write")
-    part.add_argument("--force", action="store_true", help="overwrite the file")
+    add = part.add_argument
+    add("file", type=Path, metavar="FILE", help="its file, or folder of a file per camera")
+    add("--format", choices=RIG_FORMATS, required=True, help="; ".join(f"{k}: {v}" for k, v in RIG_FORMATS.items()))
+    add("-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write")
+    add("--force", action="store_true", help="overwrite the file")
     part.set_defaults(run=_import)
 
 
@@ -134,14 +127,11 @@ def _add_export(parts: Commands) -> None:
         "Write a rig.toml as another program reads it: lenses and places, and what else its format can hold.",
         "stillbed calibrate export rig.toml --format kalibr -o camchain.yaml",
     )
-    part.add_argument("rig", type=Path, metavar="rig.toml", help="a calibrated rig")
-    part.add_argument(
-        "--format", choices=FORMATS, required=True, help="; ".join(f"{k}: {v}" for k, v in FORMATS.items())
-    )
-    part.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="file, or folder, to write")
-    part.add_argument(
-        "--force", action="store_true", help="overwrite the file, or write into a folder that is not empty"
-    )
+    add = part.add_argument
+    add("rig", type=Path, metavar="rig.toml", help="a calibrated rig")
+    add("--format", choices=RIG_FORMATS, required=True, help="; ".join(f"{k}: {v}" for k, v in RIG_FORMATS.items()))
+    add("-o", "--out", type=Path, required=True, metavar="OUT", help="file, or folder, to write")
+    add("--force", action="store_true", help="overwrite the file, or write into a folder that is not empty")
     part.set_defaults(run=_export)
 
 
@@ -162,24 +152,23 @@ def _distance(text: str) -> tuple[str, str, float]:
 
 
 def _board(arguments: argparse.Namespace) -> int:
-    from hardware.calibration.board_print import Print, write_print
+    from hardware.calibration.board_print import PrintOptions, write_print
 
     a = arguments
-    wish = Print(a.kind, a.squares, a.square_mm, a.marker, a.dictionary, a.inverted, a.page)
+    wish = PrintOptions(a.kind, a.squares, a.square_mm, a.marker, a.dictionary, a.inverted, a.page)
     print(write_print(a.out, wish, a.force))
     return 0
 
 
 def _cameras(arguments: argparse.Namespace) -> int:
-    from hardware.calibration.run import Wishes, corners_of, run_calibration, run_live
-    from hardware.out_folder import check_new
+    from hardware.calibration.run import CalibrationOptions, corners_of, run_calibration, run_live
     from hardware.process.clock import WallClock
-    from hardware.process.progress import Progress
+    from hardware.process.progress import Progress, check_new
 
     a, clock = arguments, WallClock()
     check_new(a.out, a.force)
     recorded = _recorded(a.which)
-    wishes = Wishes(a.limit_mm, a.distance_mm, a.keep_lenses, a.new_rig)
+    wishes = CalibrationOptions(a.limit_mm, a.distance_mm, a.keep_lenses, a.new_rig)
     _check_seconds(a.seconds, recorded)
     try:
         with Progress("corners", "frame sets", clock.now) as progress:
@@ -193,12 +182,12 @@ def _cameras(arguments: argparse.Namespace) -> int:
         print(f"\nstillbed: interrupted; {kept}", file=sys.stderr)
         return INTERRUPTED
     print(outcome.text)
-    return 0 if outcome.verdict.passed else FAILED
+    return 0 if outcome.verdict.passed else NOT_GOOD_ENOUGH
 
 
 def _opened_page(clock: Clock) -> WavingPage:
     """The page, and where it is."""
-    from hardware.calibration.waving_page import WavingPage
+    from hardware.calibration.live import WavingPage
 
     page = WavingPage(clock)
     print(f"open {page.address} to see where to hold the board", file=sys.stderr, flush=True)
@@ -220,24 +209,24 @@ def _check_seconds(seconds: float | None, recorded: Path | None) -> None:
 
 
 def _import(arguments: argparse.Namespace) -> int:
-    from hardware.calibration.formats import formats
+    from hardware.calibration.rig_formats import FORMATS
     from hardware.files.rig_file import write_rig
-    from hardware.out_folder import check_new
+    from hardware.process.progress import check_new
 
     check_new(arguments.out, arguments.force)
-    rig = formats()[arguments.format].read(arguments.file)
+    rig = FORMATS[arguments.format].read(arguments.file)
     write_rig(arguments.out, rig, [None] * len(rig))
     print(f"{arguments.out}: {', '.join(c.name for c in rig.cameras)}; where their images are is to be added")
     return 0
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from hardware.calibration.formats import formats
+    from hardware.calibration.rig_formats import FORMATS
     from hardware.files.rig_file import read_rig
-    from hardware.out_folder import check_new
+    from hardware.process.progress import check_new
 
     check_new(arguments.out, arguments.force)
     rig = read_rig(arguments.rig).rig
-    formats()[arguments.format].write(arguments.out, rig)
+    FORMATS[arguments.format].write(arguments.out, rig)
     print(f"{arguments.out}: {', '.join(c.name for c in rig.cameras)}")
     return 0

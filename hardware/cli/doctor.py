@@ -1,23 +1,307 @@
-"""Whether cameras and the arm's line can be seen and opened by this user, and whether what is shipped is whole."""
+"""The checks of `stillbed doctor`: the machine, its libraries, its devices.
+
+Each library is loaded in a process of its own, which may die of it. Device checks are called where the libraries load.
+"""
 
 from __future__ import annotations
 
 import os
+import platform
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from packaging.requirements import Requirement
 
 from estimation.errors import StillbedError
-from hardware.arm.port import serial_ports
-from hardware.cameras.capture import reads_videos
-from hardware.cameras.identity import Device, list_devices
-from hardware.operator.view import Check, Verdict
-from hardware.port_lock import lock_folder
-from perception.wound.network import WoundNetwork, shipped
+from hardware.bench.figures import this_machine
+from hardware.operator.view import Check, CheckVerdict
+from hardware.process.clock import Clock
+from hardware.process.system import NO_PRIORITY
+from hardware.process.ticks import LatenessHistogram, measure_evenness
 
-JOIN = "sudo usermod -aG {group} $USER, then log in anew"
+if TYPE_CHECKING:
+    from hardware.cameras.sources import CameraDevice
+
+FILE_SYSTEM_ROOT = Path("/")
+NO_ANSWER = "nothing was granted"  # of a process that did not come to asking
+MIN_CORES = 2  # one for tracking, one for motion, recorder and page
+MIN_MEMORY_GB = 4.0  # GB: a live run takes under 2, planning a large wound half a one
+# GB: below, nothing can be recorded; below, not for long (a minute of three cameras takes 0.1 to 1)
+MIN_DISK_GB = (1.0, 10.0)
+MIN_SHARED_GB = 0.1  # GB: pictures of three 1280x720 cameras go round between two processes, four sets deep
+CPU_FLAGS = ("avx2", "fma")  # what compiled loops and networks are fast with
+TICK_PERIOD, PROBE_TICKS = 0.02, 50  # s; a second of the ticks that motion is sent by
+MAX_LATE_MS = 2.0  # ms: a tenth of a tick
+PROBE_PIECES = 6000  # of work: two seconds or three, as what disturbs a machine comes every other second
+MAX_SLOW_SHARE = 0.005  # share of the time: once a minute for a third of a second
+PRIORITY_REMEDY = (
+    "as root: echo 'USER - rtprio 20' > /etc/security/limits.d/stillbed.conf, with your name; then log in anew"
+)
+JOIN_GROUP = "sudo usermod -aG {group} $USER, then log in anew"
+LOAD_TIMEOUT = 60.0  # s for all of them on a slow disk
+LOADED_MARK = "loaded"  # the word by which the process tells of each
+LOADER = f"""import importlib, sys
+for name in sys.argv[1:]:
+    importlib.import_module(name)
+    print({LOADED_MARK!r}, name, flush=True)
+"""
+REINSTALL = "make a new environment and `pip install .` there again, with constraints.txt"
+SLOW_REMEDY = "ask again while less runs on this machine"
+SYSTEM_REMEDY = "install the system's package that has this file: `apt-file search` with its name tells which"
+
+
+def machine_checks(folder: Path, clock: Clock, root: Path = FILE_SYSTEM_ROOT) -> list[Check]:
+    """All of this. folder: where sessions would be recorded. root: of the file system."""
+    return [
+        python_check(),
+        processor_check(root),
+        memory_check(root),
+        disk_check(folder),
+        shared_check(root),
+        priority_check(),
+        punctuality_check(clock),
+        evenness_check(clock),
+        loopback_check(),
+    ]
+
+
+def python_check(found: tuple[int, ...] = sys.version_info[:3]) -> Check:
+    """Python, by its version."""
+    text = f"{'.'.join(map(str, found))} on {platform.system()} {platform.machine()}"
+    if found < (3, 11):
+        return Check("python", CheckVerdict.FAIL, text, "install Python 3.11 or newer: make PYTHON=python3.12")
+    if sys.platform != "linux":
+        return Check(
+            "python", CheckVerdict.WARN, text, "live runs are made for Linux; recordings and planning work here"
+        )
+    return Check("python", CheckVerdict.PASS, text)
+
+
+def processor_check(root: Path = FILE_SYSTEM_ROOT) -> Check:
+    """Cores that this process may use, and the instructions that compiled loops are fast with."""
+    machine = this_machine()
+    text = f"{machine.cpu}, {machine.cores} cores"
+    flags = _kernel_values(root / "proc/cpuinfo", "flags")
+    lacking = [name for name in CPU_FLAGS if flags and name not in flags[0].split()]
+    if lacking:
+        return Check(
+            "processor", CheckVerdict.WARN, f"{text}, without {' and '.join(lacking)}", "poses will take longer"
+        )
+    if machine.cores < MIN_CORES:
+        remedy = "track recordings here, print on a machine with two cores"
+        return Check("processor", CheckVerdict.WARN, text, remedy)
+    return Check("processor", CheckVerdict.PASS, text)
+
+
+def memory_check(root: Path = FILE_SYSTEM_ROOT) -> Check:
+    """Memory that programs may still take."""
+    values = _kernel_values(root / "proc/meminfo", "MemAvailable")
+    if not values:
+        return Check("memory", CheckVerdict.WARN, "this system does not tell", f"have {MIN_MEMORY_GB:g} GB free")
+    free = int(values[0].split()[0]) / 1e6
+    if free < MIN_MEMORY_GB:
+        return Check(
+            "memory", CheckVerdict.WARN, f"{free:.1f} GB free", f"close programs until {MIN_MEMORY_GB:g} GB are"
+        )
+    return Check("memory", CheckVerdict.PASS, f"{free:.1f} GB free")
+
+
+def disk_check(folder: Path) -> Check:
+    """Room for recordings."""
+    free, text = _free_gb(folder), f"free in {folder.resolve()}"
+    verdict = (
+        CheckVerdict.FAIL
+        if free < MIN_DISK_GB[0]
+        else CheckVerdict.WARN
+        if free < MIN_DISK_GB[1]
+        else CheckVerdict.PASS
+    )
+    remedy = "" if verdict is CheckVerdict.PASS else f"record where there are {MIN_DISK_GB[1]:g} GB, or make room"
+    return Check("disk", verdict, f"{free:.1f} GB {text}", remedy)
+
+
+def shared_check(root: Path = FILE_SYSTEM_ROOT) -> Check:
+    """Room for the pictures that go from one process to another."""
+    folder = root / "dev/shm"
+    if not folder.is_dir():
+        folder = Path(tempfile.gettempdir())
+    free = _free_gb(folder)
+    if free < MIN_SHARED_GB:
+        remedy = "in a container: --shm-size 1g; elsewhere: mount -o remount,size=1g /dev/shm"
+        return Check("shared memory", CheckVerdict.FAIL, f"{1000 * free:.0f} MB free", remedy)
+    return Check("shared memory", CheckVerdict.PASS, f"{free:.1f} GB free")
+
+
+def priority_check() -> Check:
+    """The priority that the motion would be granted: asked for in another process, so that this one keeps its own."""
+    ask = "from hardware.process.system import ask_for_real_time; print(ask_for_real_time())"
+    done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, timeout=20, check=False)
+    text = done.stdout.strip() or NO_ANSWER
+    if text in (NO_PRIORITY, NO_ANSWER):
+        return Check("priority", CheckVerdict.WARN, text, PRIORITY_REMEDY)
+    return Check("priority", CheckVerdict.PASS, text)
+
+
+def punctuality_check(clock: Clock, ticks: int = PROBE_TICKS) -> Check:
+    """How late this machine wakes a process that asked for a tick."""
+    late = LatenessHistogram()
+    begun = clock.now()
+    for k in range(1, ticks + 1):
+        clock.wait_until(begun + k * TICK_PERIOD)
+        late.add(clock.now() - (begun + k * TICK_PERIOD))
+    half, worst = (1000 * late.percentile(share) for share in (50, 98))
+    text = f"{ticks} ticks of {1000 * TICK_PERIOD:g} ms: {half:.1f} ms late, {worst:.1f} at the worst"
+    if worst > MAX_LATE_MS:
+        return Check("clock", CheckVerdict.WARN, text, "stop other work on this machine; let it not save power")
+    return Check("clock", CheckVerdict.PASS, text)
+
+
+def evenness_check(clock: Clock, pieces: int = PROBE_PIECES) -> Check:
+    """Whether the same work takes the same time."""
+    result = measure_evenness(clock, pieces)
+    if result.slow > MAX_SLOW_SHARE:
+        remedy = "stop other work; where nothing else runs, it is the machine: print with one that shares nothing"
+        return Check("evenness", CheckVerdict.WARN, str(result), remedy)
+    return Check("evenness", CheckVerdict.PASS, str(result))
+
+
+def loopback_check(host: str = "127.0.0.1") -> Check:
+    """Whether the operator's page could be served to this machine's own browser."""
+    try:
+        with socket.create_server((host, 0)):
+            return Check("operator's page", CheckVerdict.PASS, f"{host} takes connections")
+    except OSError as error:
+        return Check(
+            "operator's page", CheckVerdict.FAIL, f"{host}: {error}", "let programs listen on the loopback address"
+        )
+
+
+def _free_gb(folder: Path) -> float:
+    return shutil.disk_usage(folder).free / 1e9
+
+
+def _kernel_values(file: Path, key: str) -> list[str]:
+    """What stands behind `key:` in a file of the kernel's."""
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except OSError:  # not Linux
+        return []
+    return [line.split(":", 1)[1].strip() for line in lines if line.split(":")[0].strip() == key]
+
+
+@dataclass(frozen=True, slots=True)
+class LoadFailure:
+    """Why a module did not load."""
+
+    reason: str
+    slow: bool = False  # it was still loading when the time was up, which says nothing against it
+    shared_object: bool = False  # the dynamic loader complains of a shared object
+
+
+def library_checks(names: list[str] | None = None) -> list[Check]:
+    """A check for each library. names: of distributions; all that stillbed asks for without them."""
+    if names is None:
+        try:
+            names = required_libraries()
+        except PackageNotFoundError:
+            return [Check("stillbed", CheckVerdict.FAIL, "runs from its sources, not installed", "pip install .")]
+    known = modules_of(names)
+    failed = load_failures(list(known.values()))
+    return [_library_check(name, known.get(name, ""), failed) for name in names]
+
+
+def required_libraries() -> list[str]:
+    """The distributions that this machine's stillbed needs, extras apart. PackageNotFoundError: it is not installed."""
+    requirements = [Requirement(line) for line in requires("stillbed") or []]
+    return [
+        requirement.name
+        for requirement in requirements
+        if requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+    ]
+
+
+def modules_of(names: list[str]) -> dict[str, str]:
+    """The module that each installed distribution is imported by: of several the one of its own name, or the first."""
+    by_name: dict[str, list[str]] = {name: [] for name in names}
+    for module, distributions in packages_distributions().items():
+        for name in {distribution.lower() for distribution in distributions} & set(names):
+            by_name[name].append(module)
+    return {
+        name: min(modules, key=lambda m: (m != name, m.startswith("_"))) for name, modules in by_name.items() if modules
+    }
+
+
+def load_failures(modules: list[str], patience: float = LOAD_TIMEOUT) -> dict[str, LoadFailure]:
+    """Why modules did not load, by name. What kills or stops the process that loads it is named; the rest is tried.
+
+    patience: s for all that one process loads.
+    """
+    failures: dict[str, LoadFailure] = {}
+    left = list(modules)
+    while left:
+        loaded, trouble = _load_until_failure(left, patience)
+        left = left[loaded:]
+        if left:
+            failures[left[0]] = trouble
+            left = left[1:]
+    return failures
+
+
+def _load_until_failure(modules: list[str], patience: float) -> tuple[int, LoadFailure]:
+    """How many of the modules a process loaded before it ended, and why it went no further."""
+    command = [sys.executable, "-c", LOADER, *modules]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            text, errors = process.communicate(timeout=patience)
+            complaint = _failure_text(process.returncode, errors)
+            trouble = LoadFailure(complaint, shared_object=".so" in complaint)  # as the dynamic loader names it
+        except subprocess.TimeoutExpired:
+            trouble = _timeout_failure(process.pid, patience)
+            process.kill()
+            text, _ = process.communicate()
+    return sum(line.startswith(LOADED_MARK) for line in text.splitlines()), trouble
+
+
+def _timeout_failure(process: int, patience: float) -> LoadFailure:
+    """Of a process that has not ended: slow where it computes, or waits for processor or disk; else it hangs."""
+    state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+    if state in ("R", "D"):
+        return LoadFailure(f"still loading after {patience:g} s", slow=True)
+    return LoadFailure(f"hangs: not loaded after {patience:g} s, and waits for something")
+
+
+def _failure_text(code: int, complaint: str) -> str:
+    if code < 0:
+        return f"signal {-code} ends the process that loads it: this processor may lack what it was built for"
+    return (complaint.strip().splitlines() or [f"exit code {code}"])[-1]
+
+
+def _library_check(name: str, module: str, failed: dict[str, LoadFailure]) -> Check:
+    try:
+        have = version(name)
+    except PackageNotFoundError:
+        return Check(name, CheckVerdict.FAIL, "not installed", REINSTALL)
+    if module not in failed:
+        return Check(name, CheckVerdict.PASS, have)
+    trouble = failed[module]
+    if trouble.slow:
+        return Check(name, CheckVerdict.WARN, f"{have}: {trouble.reason}", SLOW_REMEDY)
+    remedy = SYSTEM_REMEDY if trouble.shared_object else REINSTALL
+    return Check(name, CheckVerdict.FAIL, f"{have}: {trouble.reason}", remedy)
 
 
 def device_checks() -> list[Check]:
-    """Cameras, arm, lock, videos, network."""
+    """Cameras, arm, lock, videos, network. It imports what needs the libraries: called where these load."""
+    from hardware.arm.port import lock_folder, serial_ports
+    from hardware.cameras.sources import list_devices
+
     return [
         camera_check(list_devices()),
         arm_check(serial_ports()),
@@ -27,51 +311,58 @@ def device_checks() -> list[Check]:
     ]
 
 
-def camera_check(devices: tuple[Device, ...]) -> Check:
+def camera_check(devices: tuple[CameraDevice, ...]) -> Check:
     """What is plugged in, and whether this user may open it."""
     if not devices:
-        return Check("cameras", Verdict.WARN, "none is plugged in", "plug them in; `stillbed cameras` says more")
+        return Check("cameras", CheckVerdict.WARN, "none is plugged in", "plug them in; `stillbed cameras` says more")
     names = ", ".join(device.name or str(device.node) for device in devices)
-    return _opened("cameras", [(str(device.node), names) for device in devices], names, "video")
+    return _access_check("cameras", [(str(device.node), names) for device in devices], names, "video")
 
 
 def arm_check(ports: list[tuple[str, str]]) -> Check:
     """Serial ports, as (device, what calls itself so), and whether this user may open them."""
     if not ports:
         remedy = "plug in the arm's adapter; without one, `stillbed arm --virtual` answers as an arm does"
-        return Check("arm", Verdict.WARN, "no serial port", remedy)
-    return _opened("arm", ports, ", ".join(f"{device} ({name})" for device, name in ports), "dialout")
+        return Check("arm", CheckVerdict.WARN, "no serial port", remedy)
+    return _access_check("arm", ports, ", ".join(f"{device} ({name})" for device, name in ports), "dialout")
 
 
 def lock_check(folder: Path) -> Check:
     """Where a port's lock is kept, so that two programs never write to one arm."""
     if os.access(folder, os.W_OK):
-        return Check("port locks", Verdict.PASS, f"kept in {folder}")
-    return Check("port locks", Verdict.FAIL, f"{folder} cannot be written to", f"let this user write to {folder}")
+        return Check("port locks", CheckVerdict.PASS, f"kept in {folder}")
+    return Check("port locks", CheckVerdict.FAIL, f"{folder} cannot be written to", f"let this user write to {folder}")
 
 
 def video_check() -> Check:
     """Whether recorded videos can be read."""
+    from hardware.cameras.capture import reads_videos
+
     if reads_videos():
-        return Check("videos", Verdict.PASS, "read by FFmpeg")
+        return Check("videos", CheckVerdict.PASS, "read by FFmpeg")
     return Check(
-        "videos", Verdict.WARN, "this OpenCV has no FFmpeg", "pip install --force-reinstall opencv-python-headless"
+        "videos", CheckVerdict.WARN, "this OpenCV has no FFmpeg", "pip install --force-reinstall opencv-python-headless"
     )
 
 
 def network_check() -> Check:
     """Whether the network that finds the wound is there, whole and runs."""
+    from perception.wound.network import WoundNetwork, shipped_model
+
     try:
-        network = WoundNetwork(shipped())
+        network = WoundNetwork(shipped_model())
     except StillbedError as error:
-        return Check("wound network", Verdict.FAIL, str(error), "install stillbed anew, with its data")
-    return Check("wound network", Verdict.PASS, f"{network.size / 1e6:.1f} MB, its hash is right")
+        return Check("wound network", CheckVerdict.FAIL, str(error), "install stillbed anew, with its data")
+    return Check("wound network", CheckVerdict.PASS, f"{network.size / 1e6:.1f} MB, its hash is right")
 
 
-def _opened(name: str, nodes: list[tuple[str, str]], told: str, group: str) -> Check:
+def _access_check(name: str, nodes: list[tuple[str, str]], told: str, group: str) -> Check:
     closed = [node for node, _ in nodes if not os.access(node, os.R_OK | os.W_OK)]
     if closed:
         return Check(
-            name, Verdict.FAIL, f"{', '.join(closed)} may not be opened by this user", JOIN.format(group=group)
+            name,
+            CheckVerdict.FAIL,
+            f"{', '.join(closed)} may not be opened by this user",
+            JOIN_GROUP.format(group=group),
         )
-    return Check(name, Verdict.PASS, told)
+    return Check(name, CheckVerdict.PASS, told)

@@ -1,4 +1,4 @@
-"""The command line: stillbed simulate, track, segment, plan, replay, train, bench and others. Imports lazily."""
+"""The command line `stillbed`: all commands, and `simulate`, `bench` and `doctor` themselves. Imports lazily."""
 
 from __future__ import annotations
 
@@ -10,31 +10,149 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-from estimation.errors import InputError, StillbedError
-from hardware.arm_commands import add_arm
-from hardware.bench.command import add_bench
-from hardware.cameras.command import add_cameras
+from estimation.errors import StillbedError
+from hardware.bench.subjects import SUBJECTS, Subject, Subjects
 from hardware.cli.calibrate import add_calibrate
-from hardware.cli.live import add_init, add_live
-from hardware.cli.parser import INTERRUPTED, WRONG_INPUT, Commands, Parser, add_command, told
-from hardware.cli.plan import add_plan
-from hardware.cli.sessions import add_smooth
-from hardware.comparing.command import add_compare
-from hardware.doctor.command import add_doctor
-from hardware.methods import MAP, METHODS
-from hardware.out_folder import kept, prepare_out
-from hardware.reach_command import add_reach
-from hardware.standard_streams import fill_standard_streams
-from hardware.viewing.command import add_view
-from hardware.wound_commands import add_segment, add_train
+from hardware.cli.live import add_arm, add_cameras, add_init, add_live
+from hardware.cli.parser import INTERRUPTED, WRONG_INPUT, Commands, Parser, add_command, add_fault, error_text
+from hardware.cli.plan import add_plan, add_reach, add_segment, add_train
+from hardware.cli.sessions import add_compare, add_export, add_import, add_replay, add_smooth, add_track, add_view
+from hardware.process.progress import left_files_text
+from hardware.process.system import fill_standard_streams
 from perception.package_data import named_path
 
-if TYPE_CHECKING:
-    from hardware.process.progress import Progress
+BENCH_OUT = Path("out/bench")
+CHECK_FAILED = 1  # exit code where something failed
+LIMITS_MISSED = 1  # a simulation that ran to its end and did not reach its own limits
 
-MISSED = 1  # a simulation that ran to its end and did not reach its own limits
+
+def add_bench(commands: Commands) -> None:
+    """Add the sub-command `bench`; what follows its subject is read once the subject's module is loaded."""
+    command = add_command(
+        commands,
+        "bench",
+        "measure a part, and print each figure beside its target",
+        "Measure a part of stillbed and print each figure beside its target and its reference.",
+        "stillbed bench estimator -o out/estimator",
+        "stillbed bench --quick",
+    )
+    add = command.add_argument
+    add("--list", action="store_true", help="list the subjects and exit")
+    add("--all", action="store_true", help="measure all subjects, each in short; what is there is kept")
+    add("--quick", action="store_true", help="the same of fewer subjects, in two minutes")
+    add("--out", "-o", type=Path, default=BENCH_OUT, help=f"with --all or --quick: folder; default {BENCH_OUT}")
+    add("--against", type=Path, metavar="figures.json", help="with --all or --quick: tell what is worse than there")
+    add("subject", nargs="?", metavar="SUBJECT", help="what to measure; see --list")
+    add("rest", nargs=argparse.REMAINDER, metavar="...", help="its options; see SUBJECT --help")
+    command.set_defaults(run=lambda arguments: run_bench(arguments))
+
+
+def run_bench(arguments: argparse.Namespace, subjects: Subjects = SUBJECTS) -> None:
+    """List the subjects, or measure one or all, print the table and, where a folder was named, save it there."""
+    if arguments.all or arguments.quick:
+        from hardware.bench.whole import run_whole
+
+        run_whole(arguments.out, arguments.quick, arguments.against)
+        return
+    if arguments.list or arguments.subject is None:
+        print(subjects_text(subjects))
+        return
+    name, subject = arguments.subject, _chosen_subject(arguments.subject, subjects)
+    options = subject_parser(name, subject).parse_args(arguments.rest)
+    arguments.out = out = options.out  # told where the run is interrupted
+    _measure_subject(name, subject, options, out)
+
+
+def subjects_text(subjects: Subjects) -> str:
+    """The subjects, a line each."""
+    width = max(map(len, subjects), default=0)
+    return "\n".join(f"{name:<{width}}  {subject.summary}" for name, subject in subjects.items())
+
+
+def _chosen_subject(name: str, subjects: Subjects) -> Subject:
+    from estimation.errors import InputError
+    from hardware.process.checks import one_of_text
+
+    if name not in subjects:
+        raise InputError("command line", "SUBJECT", name, one_of_text(name, list(subjects)))
+    return subjects[name]
+
+
+def subject_parser(name: str, subject: Subject) -> argparse.ArgumentParser:
+    """The options of one subject: where to save, and its own."""
+    parser = Parser(prog=f"stillbed bench {name}", description=subject.summary)
+    parser.add_argument("-o", "--out", type=Path, help="folder for figures.json and figures.csv, new or empty")
+    parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
+    subject.add_options(parser)
+    return parser
+
+
+def _measure_subject(name: str, subject: Subject, options: argparse.Namespace, out: Path | None) -> None:
+    from hardware.bench.figures import save, table_text, this_machine
+    from hardware.process.progress import prepare_out
+
+    if out is not None:
+        prepare_out(out, options.force)
+    machine = this_machine()
+    print(f"{machine.cpu}, {machine.cores} cores, commit {machine.commit or 'unknown'}\n", flush=True)
+    figures = subject.run(options)
+    print(table_text(figures))
+    if out is not None:
+        save(out, name, vars(options), figures, machine)
+
+
+def add_doctor(commands: Commands) -> None:
+    """Add the sub-command `doctor`."""
+    command = add_command(
+        commands,
+        "doctor",
+        "what works on this machine, and what to do about the rest",
+        "Look at the processor, memory, disk, priority, libraries, cameras, serial ports and the shipped\n"
+        "network, and say of each whether a live run can be made with it, and what to do where it cannot. Moves\n"
+        "nothing and writes nothing. Exit code 1 where something fails; a warning does not.",
+        "stillbed doctor",
+    )
+    command.add_argument("--folder", type=Path, default=Path(), metavar="DIR", help="where sessions will be recorded")
+    command.add_argument("--json", action="store_true", help="print JSON")
+    command.set_defaults(run=_run_doctor)
+
+
+def _run_doctor(arguments: argparse.Namespace) -> int:
+    import json
+    from dataclasses import asdict
+
+    from estimation.errors import InputError
+    from hardware.cli.doctor import device_checks, library_checks, machine_checks
+    from hardware.live.checklist import checks_table
+    from hardware.operator.view import CheckVerdict
+    from hardware.process.clock import WallClock
+
+    if not arguments.folder.is_dir():
+        raise InputError("command line", "--folder", arguments.folder, "a folder that exists")
+    libraries = library_checks()
+    machine = machine_checks(arguments.folder, WallClock())
+    broken = any(check.verdict is CheckVerdict.FAIL for check in libraries)
+    parts = {"machine": machine, "libraries": libraries, "devices": [] if broken else device_checks()}
+    checks = [check for part in parts.values() for check in part]
+    if arguments.json:
+        print(json.dumps({name: [asdict(check) for check in part] for name, part in parts.items()}, indent=2))
+    else:
+        print("\n\n".join(f"{name}\n{checks_table(tuple(part))}" for name, part in parts.items() if part))
+        print(f"\n{_verdict_text([check.verdict for check in checks], broken)}")
+    return CHECK_FAILED if any(check.verdict is CheckVerdict.FAIL for check in checks) else 0
+
+
+def _verdict_text(verdicts: list[Any], broken: bool) -> str:
+    failed, warned = (sum(v.value == word for v in verdicts) for word in ("fail", "warn"))
+    if broken:
+        return "libraries are missing; devices were not looked at. Mend these first, then ask again"
+    if failed:
+        return f"{failed} failed: stillbed does not work here until that is mended"
+    if warned:
+        return f"all that stillbed needs works; {warned} to look at before a live run"
+    return "all works; try: make demo, or stillbed init FOLDER"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -49,24 +167,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     out: Path | None = getattr(arguments, "out", None)
     was_there = out is not None and out.exists()
     try:
-        _end_in_order()
+        _interrupt_on_sigterm()
         code = arguments.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # nobody reads on, as after `| head`; the files are written all the same
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (StillbedError, OSError) as error:
-        print(f"stillbed: {told(error)}", file=sys.stderr)
+        print(f"stillbed: {error_text(error)}", file=sys.stderr)
         if out is not None and not was_there:
             with suppress(OSError):
                 out.rmdir()  # made for what was not done; what holds anything stays
         return WRONG_INPUT
     except KeyboardInterrupt:
-        print(f"\nstillbed: interrupted; {kept(getattr(arguments, 'out', None))}", file=sys.stderr)
+        print(f"\nstillbed: interrupted; {left_files_text(getattr(arguments, 'out', None))}", file=sys.stderr)
         return INTERRUPTED
     return code or 0
 
 
-def _end_in_order() -> None:
+def _interrupt_on_sigterm() -> None:
     """What asks this process to end, ends it as Ctrl-C does; outside the main thread that is somebody else's part."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -82,7 +200,7 @@ def parser() -> Parser:
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = top.add_subparsers(metavar="COMMAND", required=True)
     _add_simulate(commands)
-    _add_track(commands)
+    add_track(commands)
     add_smooth(commands)
     add_compare(commands)
     add_view(commands)
@@ -90,13 +208,13 @@ def parser() -> Parser:
     add_plan(commands)
     add_live(commands)
     add_init(commands)
-    _add_replay(commands)
+    add_replay(commands)
     add_calibrate(commands)
     add_reach(commands)
     add_arm(commands)
     add_cameras(commands)
-    _add_import(commands)
-    _add_export(commands)
+    add_import(commands)
+    add_export(commands)
     add_train(commands)
     add_bench(commands)
     add_doctor(commands)
@@ -127,202 +245,26 @@ def _add_simulate(commands: Commands) -> None:
         "report.html. Exit code 0 where the scenario's own limits are met, 1 where they are not.",
         "stillbed simulate data/scenarios/breathing_calm.toml -o out/calm",
     )
-    command.add_argument(
-        "scenario", type=named_path, metavar="SCENARIO.toml", help="what is simulated; see data/scenarios"
-    )
-    command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
-    command.add_argument("--trace", type=Path, metavar="FILE", help="a recorded motion, TUM or CSV, instead of its own")
-    _add_fault(command)
-    command.add_argument("--threads", type=int, default=2, metavar="N", help="threads that render; results do not vary")
-    command.add_argument("--pty", action="store_true", help="send the arm's bytes through a pseudo-terminal")
-    command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
+    add = command.add_argument
+    add("scenario", type=named_path, metavar="SCENARIO.toml", help="what is simulated; see data/scenarios")
+    add("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
+    add("--trace", type=Path, metavar="FILE", help="a recorded motion, TUM or CSV, instead of its own")
+    add_fault(command)
+    add("--threads", type=int, default=2, metavar="N", help="threads that render; results do not vary")
+    add("--pty", action="store_true", help="send the arm's bytes through a pseudo-terminal")
+    add("--force", action="store_true", help="write into a folder that is not empty")
     command.set_defaults(run=_simulate)
-
-
-def _add_fault(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="FAULT",
-        help='what goes wrong, such as "camera0 stuck at 5s for 2s"; may be given more than once; see docs/faults.md',
-    )
-
-
-def _add_track(commands: Commands) -> None:
-    command = add_command(
-        commands,
-        "track",
-        "follow the surface through a session",
-        "Follow the surface through a recorded session, causally: the pose of a frame set uses nothing after it.\n"
-        "Writes, as it goes, poses.csv and poses.tum, and at the end report.html and summary.json.",
-        "stillbed track sessions/monday -o out/monday",
-    )
-    command.add_argument("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
-    command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
-    command.add_argument(
-        "--method", choices=METHODS, default=MAP, help="; ".join(f"{name}: {what}" for name, what in METHODS.items())
-    )
-    command.add_argument("--arm", type=named_path, metavar="ARM.toml", help="what tool hangs on the session's arm")
-    command.add_argument(
-        "--prefilter",
-        choices=("none", "bilateral"),
-        default="none",
-        help="done to each picture first: the thesis's bilateral filter (4.6), 50 ms a picture",
-    )
-    command.add_argument("--wound", action="store_true", help="also segment the wound beside it, into wound.csv")
-    command.add_argument("--record", type=Path, metavar="X.mcap", help="also record images, tracks and poses as MCAP")
-    command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
-    command.set_defaults(run=_track)
-
-
-def _add_replay(commands: Commands) -> None:
-    command = add_command(
-        commands,
-        "replay",
-        "run tracking and motion on a session under a simulated clock",
-        "Run tracking and motion on a recorded session under a simulated clock, as a live run would, without an arm.\n"
-        "Writes commands.csv, frames.bin, the bytes the arm would get, and arm.toml, what was assumed of the arm.\n"
-        "Same input, same bytes. Without --path, the recording of a live run is replayed as it was: from its poses\n"
-        "and ticks planner and guard decide anew, and each frame is compared. Any other recording knows no arm:\n"
-        "without --arm the default one is placed so that the first surface lies under its home.",
-        "stillbed replay sessions/monday --path data/paths/square_10mm.csv -o out/replay",
-    )
-    command.add_argument("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
-    command.add_argument(
-        "--path",
-        type=named_path,
-        metavar="PATH.csv",
-        help="checkpoints on the surface; left out: those of a recorded run",
-    )
-    command.add_argument(
-        "--arm", type=named_path, metavar="ARM.toml", help="the arm's place, limits and dialect of the link"
-    )
-    command.add_argument("--resume", type=Path, metavar="PROGRESS.toml", help="go on where an earlier run stopped")
-    _add_fault(command)
-    command.add_argument("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
-    command.add_argument("--force", action="store_true", help="write into a folder that is not empty")
-    command.set_defaults(run=_replay)
-
-
-def _add_import(commands: Commands) -> None:
-    command = add_command(
-        commands,
-        "import",
-        "turn a session folder into one MCAP file",
-        "Turn a session folder (rig.toml, frames.csv, a video or images per camera) into one MCAP file.",
-        "stillbed import sessions/monday -o monday.mcap",
-    )
-    command.add_argument("folder", type=Path, metavar="FOLDER", help="session folder")
-    command.add_argument("-o", "--out", type=Path, required=True, metavar="X.mcap", help="file to write")
-    command.add_argument("--jpeg-quality", type=int, metavar="Q", help="store images smaller and not exactly, 0 to 100")
-    command.add_argument("--force", action="store_true", help="overwrite the file")
-    command.set_defaults(run=_import)
-
-
-def _add_export(commands: Commands) -> None:
-    command = add_command(
-        commands,
-        "export",
-        "turn an MCAP file into a session folder",
-        "Turn an MCAP file into a session folder: rig.toml, frames.csv and the images of each camera.",
-        "stillbed export monday.mcap -o sessions/monday",
-    )
-    command.add_argument("mcap", type=Path, metavar="X.mcap", help="recording")
-    command.add_argument(
-        "-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder to write, new or empty"
-    )
-    command.set_defaults(run=_export)
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
     from hardware.process.faults import faults_from_texts
-    from hardware.simulator.simulate import Options, run_simulation
+    from hardware.simulator.simulate import SimulationOptions, run_simulation
 
     faults = faults_from_texts("command line", "--fault", arguments.fault)
-    options = Options(arguments.trace, faults, arguments.threads, arguments.pty, arguments.force)
+    options = SimulationOptions(arguments.trace, faults, arguments.threads, arguments.pty, arguments.force)
     outcome = run_simulation(arguments.scenario, arguments.out, options)
     print(outcome.text)
-    return 0 if outcome.met else MISSED
-
-
-def _track(arguments: argparse.Namespace) -> None:
-    from hardware.files.arm_file import read_arm
-    from hardware.offline.track import run_track
-
-    tool = None if arguments.arm is None else read_arm(arguments.arm).tool
-    a = arguments
-    print(run_track(a.session, a.out, a.record, a.force, a.method, tool, a.prefilter, a.wound))
-
-
-def _replay(arguments: argparse.Namespace) -> int | None:
-    from hardware.bookmark_file import read_start
-    from hardware.files.arm_file import read_arm
-    from hardware.files.path_file import read_path
-    from hardware.files.session import damage_told, open_session
-    from hardware.offline.replay import replay_session
-    from hardware.process.faults import faults_from_texts
-
-    faults = faults_from_texts("command line", "--fault", arguments.fault)
-    if arguments.path is None:
-        if faults:
-            raise InputError("command line", "--fault", str(faults[0]), "with --path: what was recorded is over")
-        return _replay_run(arguments)
-    session = open_session(arguments.session)
-    path = read_path(arguments.path)  # what is wrong with it is told before anything is made
-    if arguments.resume is not None:
-        read_start(arguments.resume, path)
-    profile = None if arguments.arm is None else read_arm(arguments.arm)
-    prepare_out(arguments.out, arguments.force)
-    with _progress("replay", "frame sets") as progress:
-        replay_session(session, arguments.path, arguments.out, progress, profile, arguments.resume, faults)
-    rows = (arguments.out / "commands.csv").read_text(encoding="utf-8").splitlines()[1:]
-    moves = sum(row.split(",", 2)[1] == "move" for row in rows)
-    _say(damage_told(session.damage))
-    print(f"{moves} moves and {len(rows) - moves} holds: commands.csv and frames.bin in {arguments.out}")
-    return None
-
-
-def _replay_run(arguments: argparse.Namespace) -> int:
-    from hardware.files.session import damage_told
-    from hardware.live.replayed import write_replay
-
-    count = write_replay(arguments.session, arguments.out, arguments.force)
-    same = "all as they were given" if not count.other else f"{count.other} of them not as they were given"
-    _say(damage_told(count.damage))
-    print(f"{count.frames} frames, {same}: commands.csv and frames.bin in {arguments.out}")
-    return MISSED if count.other else 0
-
-
-def _import(arguments: argparse.Namespace) -> None:
-    from hardware.offline.convert import import_folder
-
-    with _progress("import", "images") as progress:
-        import_folder(arguments.folder, arguments.out, progress, arguments.force, arguments.jpeg_quality)
-    print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB")
-
-
-def _export(arguments: argparse.Namespace) -> None:
-    from hardware.files.session import damage_told
-    from hardware.offline.convert import export_recording
-
-    with _progress("export", "images") as progress:
-        damage = export_recording(arguments.mcap, arguments.out, progress)
-    _say(damage_told(damage))
-    print(f"a session folder is in {arguments.out}")
-
-
-def _say(sentence: str) -> None:
-    """Print a sentence, where there is one."""
-    if sentence:
-        print(sentence)
-
-
-def _progress(what: str, unit: str) -> Progress:
-    from hardware.process.clock import WallClock
-    from hardware.process.progress import Progress
-
-    return Progress(what, unit, WallClock().now)
+    return 0 if outcome.met else LIMITS_MISSED
 
 
 if __name__ == "__main__":

@@ -1,14 +1,18 @@
-"""`stillbed plan`: its command line; what does the work is loaded when it is asked for."""
+"""`stillbed plan`, `reach`, `segment` and `train`: planning and the wound network. Imports lazily."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from hardware.cli.parser import Commands
+from hardware.cli.parser import Commands, add_command, not_negative
 from perception.package_data import named_path
 
-TEXT = """\
+if TYPE_CHECKING:
+    from perception.wound.segmentation import Segmenter
+
+PLAN_TEXT = """\
 Plan the print of a wound. SCAN is a mesh (.ply, .stl, .obj) of the wound with skin around it, or a flat contour
 (.csv with x_mm,y_mm): one layer. The mesh is repaired, the wound found as the depression in the skin, the healthy
 skin interpolated over it, the volume between cut into layers, each filled with beads, and the tool led over them.
@@ -18,106 +22,101 @@ PATH_scan.ply (the scan as repaired), PATH_layers/ (a picture of each layer) and
 three dimensions, without a network). The path is in the scan's frame: a session whose surface.ply is the same scan
 is printed with it as it stands."""
 
-EXAMPLES = """\
-examples:
-  stillbed plan --example forearm -o out/path.csv
-  stillbed plan wound.stl -o out/path.csv --material collagen --pattern contour --bead 0.4
-  stillbed plan wound.ply -o out/path.csv --unit m --layers conformal \\
-      --tissue hypodermis=rest:adipose:37 --tissue dermis=1.5:collagen:20:12 --tissue epidermis=0.3:keratinocytes
-  stillbed plan contour.csv -o out/path.csv --bead 0.8 --pattern zigzag --angle shorter --gcode out/path.gcode"""
+PLAN_EXAMPLES = (
+    "stillbed plan --example forearm -o out/path.csv",
+    "stillbed plan wound.stl -o out/path.csv --material collagen --pattern contour --bead 0.4",
+    "stillbed plan wound.ply -o out/path.csv --unit m --layers conformal \\\n"
+    "      --tissue hypodermis=rest:adipose:37 --tissue dermis=1.5:collagen:20:12 --tissue epidermis=0.3:keratinocytes",
+    "stillbed plan contour.csv -o out/path.csv --bead 0.8 --pattern zigzag --angle shorter --gcode out/path.gcode",
+)
+
+PATH_NOT_REACHABLE = 1  # exit code where a checkpoint cannot be printed
+UNET_METHOD, SHAPE_METHOD = "unet", "shape"
 
 
 def add_plan(commands: Commands) -> None:
     """Add the sub-command `plan`."""
-    command: argparse.ArgumentParser = commands.add_parser(
-        "plan",
-        help="plan the print of a scanned wound: layers, beads, checkpoints",
-        description=TEXT,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    command.add_argument("scan", type=Path, nargs="?", metavar="SCAN", help="mesh of the wound, or contour")
-    command.add_argument("-o", "--out", type=Path, required=True, metavar="PATH.csv", help="path to write")
-    command.add_argument(
-        "--example", choices=("forearm", "chest", "foot"), help="a built-in scan instead of SCAN; also written"
-    )
-    command.add_argument("--gcode", type=Path, metavar="FILE", help="also write the path as plain G-code text")
-    command.add_argument(
+    summary = "plan the print of a scanned wound: layers, beads, checkpoints"
+    command = add_command(commands, "plan", summary, PLAN_TEXT, *PLAN_EXAMPLES)
+    add = command.add_argument
+    add("scan", type=Path, nargs="?", metavar="SCAN", help="mesh of the wound, or contour")
+    add("-o", "--out", type=Path, required=True, metavar="PATH.csv", help="path to write")
+    add("--example", choices=("forearm", "chest", "foot"), help="a built-in scan instead of SCAN; also written")
+    add("--gcode", type=Path, metavar="FILE", help="also write the path as plain G-code text")
+    add(
         "--session", type=Path, metavar="SESSION",
         help="also lay the scan into this session's first pictures, and say how well it fits the wound they show",
     )  # fmt: skip
-    command.add_argument(
+    add(
         "--arm", type=named_path, metavar="ARM.toml",
         help="ask this arm's joints about each checkpoint and write the column `feasible`; without, there is none, and "
         "`stillbed reach` adds it",
     )  # fmt: skip
-    command.add_argument("--no-pictures", action="store_true", help="write neither pictures nor the report")
-    command.add_argument("--force", action="store_true", help="overwrite PATH.csv and what stands beside it")
+    add("--no-pictures", action="store_true", help="write neither pictures nor the report")
+    add("--force", action="store_true", help="overwrite PATH.csv and what stands beside it")
     _add_scan(command)
     _add_layers(command)
     _add_pattern(command)
     _add_way(command)
-    command.set_defaults(run=_plan)
+    command.set_defaults(run=_run_plan)
 
 
 def _add_scan(command: argparse.ArgumentParser) -> None:
-    group = command.add_argument_group("the scan")
-    group.add_argument("--unit", choices=("mm", "cm", "m", "inch"), default="mm", help="of SCAN's numbers; default mm")
-    group.add_argument("--flip", action="store_true", help="turn SCAN over, whose normals point inwards")
-    group.add_argument(
+    add = command.add_argument_group("the scan").add_argument
+    add("--unit", choices=("mm", "cm", "m", "inch"), default="mm", help="of SCAN's numbers; default mm")
+    add("--flip", action="store_true", help="turn SCAN over, whose normals point inwards")
+    add(
         "--outline", type=Path, metavar="CSV",
         help="outline of the wound, x_mm,y_mm[,z_mm] in SCAN's frame, mm; default: found",
     )  # fmt: skip
 
 
 def _add_layers(command: argparse.ArgumentParser) -> None:
-    group = command.add_argument_group("layers")
-    group.add_argument(
+    add = command.add_argument_group("layers").add_argument
+    add(
         "--layers", choices=("skin", "conformal", "horizontal"), default="skin",
         help="parallel to the restored skin; from the bed blending into the skin; flat, as the thesis; default skin",
     )  # fmt: skip
-    group.add_argument(
+    add(
         "--tissue", action="append", default=[], metavar="NAME=THICKNESS:MATERIAL[:TEMPERATURE[:SPEED[:HEIGHT]]]",
         help="bottom up, mm (or 'rest'), degrees C, mm/s, mm of a layer; "
         "default hypodermis=rest, dermis=1.6, epidermis=0.4",
     )  # fmt: skip
-    group.add_argument(
-        "--material", default="1,2,3", metavar="M[,M,M]", help="of all, or of each default tissue; default 1,2,3"
-    )
-    group.add_argument("--layer-height", type=float, metavar="MM", help="about; default: as wide as a bead")
-    group.add_argument(
+    add("--material", default="1,2,3", metavar="M[,M,M]", help="of all, or of each default tissue; default 1,2,3")
+    add("--layer-height", type=float, metavar="MM", help="about; default: as wide as a bead")
+    add(
         "--bump", type=float, metavar="MM",
         help="bumps of the bed that stand over a layer by this at most are gone over, higher ones round; default half "
         "a layer, so that the layer above still has room over them",
     )  # fmt: skip
-    group.add_argument(
+    add(
         "--bump-clearance", type=float, metavar="MM",
         help="left free around bumps that are gone round; default half a bead, room for a needle's outside",
     )  # fmt: skip
-    group.add_argument("--temperature", type=float, default=20.0, metavar="C", help="degrees C; default 20")
+    add("--temperature", type=float, default=20.0, metavar="C", help="degrees C; default 20")
 
 
 def _add_pattern(command: argparse.ArgumentParser) -> None:
-    group = command.add_argument_group("pattern")
-    group.add_argument(
+    add = command.add_argument_group("pattern").add_argument
+    add(
         "--pattern", choices=("zigzag", "raster", "contour", "spiral", "hybrid", "best"), default="contour",
         help="contour: closed lines, nothing left open; zigzag, raster: straight lines, the quickest to plan; hybrid: "
         "rims around a zigzag; spiral: closed lines joined; best: the faster of contour and spiral; default contour",
     )  # fmt: skip
-    group.add_argument(
+    add(
         "--angle", default="fastest", metavar="DEG",
         help="of the lines, or 'shorter' (of 0 and 90) or 'fastest' (of 12), judged on the largest layer; "
         "default fastest",
     )  # fmt: skip
-    group.add_argument("--parallel", action="store_true", help="lines of all layers alike, not every second across")
-    group.add_argument("--bead", type=float, default=0.4, metavar="MM", help="width of a bead; default 0.4")
-    group.add_argument("--overlap-percent", type=float, default=0.0, metavar="P", help="of neighbours; default 0")
-    group.add_argument("--inset", type=float, default=0.0, metavar="MM", help="left free along the rim; default 0")
-    group.add_argument("--rims", type=int, default=1, metavar="N", help="closed lines of hybrid; default 1")
+    add("--parallel", action="store_true", help="lines of all layers alike, not every second across")
+    add("--bead", type=float, default=0.4, metavar="MM", help="width of a bead; default 0.4")
+    add("--overlap-percent", type=float, default=0.0, metavar="P", help="of neighbours; default 0")
+    add("--inset", type=float, default=0.0, metavar="MM", help="left free along the rim; default 0")
+    add("--rims", type=int, default=1, metavar="N", help="closed lines of hybrid; default 1")
 
 
 def _add_way(command: argparse.ArgumentParser) -> None:
-    group = command.add_argument_group("the tool's way")
+    add = command.add_argument_group("the tool's way").add_argument
     for name, default, metavar, text in (
         ("--speed", 20.0, "MM/S", "of printing"),
         ("--travel", 60.0, "MM/S", "between beads"),
@@ -130,34 +129,183 @@ def _add_way(command: argparse.ArgumentParser) -> None:
         ("--turning-deg-mm", 5.0, "DEG/MM", "most it turns on its way"),
         ("--spin-deg", 0.0, "DEG", "about its own axis, free for a round nozzle"),
     ):
-        group.add_argument(name, type=float, default=default, metavar=metavar, help=f"{text}; default {default:g}")
+        add(name, type=float, default=default, metavar=metavar, help=f"{text}; default {default:g}")
 
 
-def _plan(arguments: argparse.Namespace) -> None:
-    from hardware.plan.order import Wishes
-    from hardware.plan.run import Request, run_plan
+def _run_plan(arguments: argparse.Namespace) -> None:
+    from hardware.plan.order import PlanRequest, PlanSettings
+    from hardware.plan.run import run_plan
 
     a = arguments
-    wishes = Wishes(
+    settings = PlanSettings(
         a.material, tuple(a.tissue), a.layers, a.layer_height, a.pattern, a.angle, a.parallel, a.bead,
         a.overlap_percent, a.inset, a.rims, a.speed, a.travel, a.temperature, a.spacing, a.chord, a.lift, a.wait,
         a.sideways, a.tilt_deg, a.turning_deg_mm, a.spin_deg, a.bump, a.bump_clearance,
     )  # fmt: skip
-    print(
-        run_plan(
-            Request(
-                a.out,
-                a.scan,
-                a.example,
-                a.outline,
-                a.unit,
-                a.flip,
-                a.gcode,
-                a.session,
-                not a.no_pictures,
-                a.force,
-                a.arm,
-                wishes,
-            )
-        )
+    source = a.out, a.scan, a.example, a.outline, a.unit, a.flip, a.gcode, a.session
+    print(run_plan(PlanRequest(*source, not a.no_pictures, a.force, a.arm, settings)))
+
+
+def add_reach(commands: Commands) -> None:
+    """Add the sub-command `reach`."""
+    command = add_command(
+        commands,
+        "reach",
+        "check, before printing, that an arm can print a path",
+        "Check each checkpoint of a path against the arm's joints: reach, ranges, speeds, singularities,\n"
+        "on the surface at rest and wherever it moves to. Prints a table; with -o also writes path.csv (the path with\n"
+        "the column `feasible`), reach.csv (joints and distances of each checkpoint) and reach.html (pictures).\n"
+        "Exit code 0 where all can be printed, 1 where not.",
+        "stillbed reach data/paths/wound_raster.csv --arm data/arms/s6h4d.toml --amplitude-mm 10",
     )
+    add = command.add_argument
+    add("path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
+    add("--arm", type=named_path, required=True, metavar="ARM.toml", help="with a table [kinematics]")
+    add(
+        "--surface",
+        type=_six_numbers,
+        metavar="X,Y,Z,A,B,C",
+        help="the surface at rest in the arm's frame, mm and degrees; default: level, under the default arm's home",
+    )
+    add("--amplitude-mm", type=not_negative, default=0.0, metavar="MM", help="of its motion along its normal")
+    add("--turn-deg", type=not_negative, default=0.0, metavar="DEG", help="of its motion about x, y and z")
+    add("--rate-hz", type=not_negative, default=0.25, metavar="HZ", help="of that motion; default 0.25")
+    add("--spin", action="store_true", help="let the tool spin about its own axis where that helps")
+    add("-o", "--out", type=Path, metavar="OUT", help="folder to write to, new or empty")
+    add("--force", action="store_true", help="write into a folder that is not empty")
+    command.set_defaults(run=_run_reach)
+
+
+def _six_numbers(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 6:
+        raise argparse.ArgumentTypeError(f"{text!r}, needed are 6 numbers: X,Y,Z,A,B,C")
+    return values
+
+
+def _run_reach(arguments: argparse.Namespace) -> int:
+    from hardware.offline.reach import ReachQuestion, run_reach
+
+    a = arguments
+    question = ReachQuestion(a.surface, a.amplitude_mm, a.turn_deg, a.rate_hz, a.spin)
+    answer = run_reach(a.path, a.arm, question, a.out, a.force)
+    print(answer.text)
+    return 0 if answer.feasible else PATH_NOT_REACHABLE
+
+
+def add_segment(commands: Commands) -> None:
+    """Add the sub-command `segment`."""
+    command = add_command(
+        commands,
+        "segment",
+        "find the wound in pictures or a video",
+        "Find the wound in pictures, folders of pictures or videos. Writes a PNG mask (0 or 255) of each\n"
+        "picture's own size and name, and wounds.csv: confidence, area, centroid, box and time of each. A picture\n"
+        "without a wound gets an empty mask. Ctrl-C keeps what is done.",
+        "stillbed segment photos/ -o masks --overlay",
+        "stillbed segment ward.mp4 -o masks --method shape",
+    )
+    add = command.add_argument
+    add("inputs", type=Path, nargs="+", metavar="INPUT", help="picture, folder of pictures, or video")
+    add("-o", "--out", type=Path, required=True, metavar="MASKS", help="folder, new or empty")
+    add(
+        "--method",
+        choices=(UNET_METHOD, SHAPE_METHOD),
+        default=UNET_METHOD,
+        help="unet: a trained network; shape: outlines like the scan's",
+    )
+    add("--model", type=Path, metavar="X.onnx", help="another network than the one that comes along")
+    add("--scan", type=Path, metavar="SCAN", help="with --method shape: of the wound, z upwards")
+    add("--overlay", action="store_true", help="also write the pictures with the outlines drawn in")
+    add("--mm-per-px", type=float, metavar="S", help="scale at the wound, for areas in mm^2")
+    add("--threads", type=int, default=2, metavar="N", help="of the network; results do not vary")
+    add("--force", action="store_true", help="write into a folder that is not empty")
+    command.set_defaults(run=_run_segment)
+
+
+def add_train(commands: Commands) -> None:
+    """Add the sub-command `train`."""
+    command = add_command(
+        commands,
+        "train",
+        "train the wound network on labelled pictures",
+        "Train the wound network. Each DATASET holds images/ and labels/, a mask of the same name and\n"
+        "size for each picture. Pictures are grouped by what they show, a part is held out and judged at the end.\n"
+        "Writes X.onnx, X.toml (hash and settings), X.md (model card) and X_curves.png; X.ckpt lets a run\n"
+        "that was broken off go on. Needs the extra [train]: pip install 'stillbed[train]'.",
+        "stillbed train data/fuseg data/medetec -o wound.onnx",
+    )
+    add = command.add_argument
+    add("datasets", type=Path, nargs="+", metavar="DATASET", help="the first is held out in part")
+    add("-o", "--out", type=Path, required=True, metavar="X.onnx", help="file to write")
+    add(
+        "--network",
+        choices=("wound", "thesis", "shape"),
+        default="wound",
+        help="thesis: the U-Net of its 3.3; shape: no network, but what segment --method shape needs, X.toml",
+    )
+    add("--rounds", type=int, metavar="N", help="of 250 steps (thesis: 100); more take longer")
+    add("--rendered", type=int, default=120, metavar="N", help="rendered pictures to add")
+    add("--hold-out", type=int, default=160, metavar="N", help="pictures to judge by, in groups")
+    add("--threads", type=int, default=1, metavar="N", help="of torch")
+    add("--seed", type=int, default=1, metavar="N", help="of the weights and of all that is drawn")
+    add("--force", action="store_true", help="overwrite X.onnx and begin anew")
+    command.set_defaults(run=_run_train)
+
+
+def _run_segment(arguments: argparse.Namespace) -> None:
+    from hardware.offline.segment import SegmentOptions, run_segment
+
+    _check_segment(arguments)
+    how = arguments.scan, arguments.mm_per_px, arguments.threads
+    segmenter = segmenter_by(arguments.method, arguments.model, *how)
+    options = SegmentOptions(arguments.overlay, arguments.mm_per_px, arguments.force)
+    print(run_segment(arguments.inputs, arguments.out, segmenter, options))
+
+
+def _check_segment(arguments: argparse.Namespace) -> None:
+    from estimation.errors import InputError
+
+    if arguments.mm_per_px is not None and not 0 < arguments.mm_per_px < 100:
+        raise InputError("command line", "--mm-per-px", arguments.mm_per_px, "above 0 and below 100")
+    if not 1 <= arguments.threads <= 64:
+        raise InputError("command line", "--threads", arguments.threads, "1 to 64")
+    if arguments.method == SHAPE_METHOD and arguments.model is not None:
+        raise InputError(
+            "command line", "--model", arguments.model, "nothing with --method shape, which has no network"
+        )
+    if arguments.method == UNET_METHOD and arguments.scan is not None:
+        raise InputError("command line", "--scan", arguments.scan, "a scan only with --method shape")
+
+
+def segmenter_by(
+    method: str, model: Path | None = None, scan: Path | None = None, mm_per_px: float | None = None, threads: int = 2
+) -> Segmenter:
+    """A segmenter by the name of its method. model: a network's file, None: the one that comes along. scan: of the
+    wound, for its outline, and for its size where mm_per_px is known."""
+    if method == UNET_METHOD:
+        from perception.wound.network import WoundNetwork, shipped_model
+        from perception.wound.segmentation import NetworkSegmenter
+
+        network = WoundNetwork(shipped_model() if model is None else model, threads)
+        return NetworkSegmenter(network, network.settings)
+    from perception.wound.network import shipped_model
+    from perception.wound.shape_matching import ShapeSegmenter, read_shape_model, scan_outline
+
+    pattern, area = None, None
+    if scan is not None:
+        from hardware.files.mesh_file import read_mesh
+
+        pattern, across = scan_outline(read_mesh(scan).scan)
+        area = None if mm_per_px is None else across / mm_per_px**2
+    return ShapeSegmenter(read_shape_model(shipped_model("shape", ".toml")), pattern, area)
+
+
+def _run_train(arguments: argparse.Namespace) -> None:
+    from hardware.offline.train import run_train
+    from hardware.simulator.scene.ground_truth_views import wound_view
+
+    print(run_train(arguments, wound_view))

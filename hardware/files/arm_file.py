@@ -15,8 +15,22 @@ tool_mm = [[0, 0.5], [12.7, 0.5], [27, 4.8]]  # height above the tip and radius 
 [limits]                                      # as in planning/limits.py; arrays are X Y Z in mm, A B C in degrees
 speed = [150, 150, 150, 120, 120, 120]
 turn = 2.4
-[[no_go]]                                     # optional, see hardware/no_go_table.py
-[kinematics]                                  # optional, see hardware/kinematics_table.py
+[[no_go]]                                     # optional, a zone each, mm, base frame
+name = "below the printing base"
+half_space = [[0, 0, 1], [0, 0, -2]]          # outward normal, a place on the plane
+[[no_go]]
+name = "patient"
+box = [[-300, 50, -100], [300, 150, 40]]      # or: cylinder = [[0, 0, 0], [0, 0, 100]] and radius = 80
+[kinematics]                                  # optional: the arm's joints, and what its axes A B C are
+name = "nominal six-axis desktop arm"
+nominal = true                                # the numbers are made up, not a maker's
+angles = "surface"                            # A B C are the surface's turn (thesis 6.3), or "joints": J4 J5 J6
+dh_mm_deg = [[30, 90, 160, 0], ...]           # six rows a, alpha, d, theta: Rz(joint + theta) Tz(d) Tx(a) Rx(alpha)
+low_deg, high_deg = [...]                     # six joints
+speed_deg_s, acceleration_deg_s2 = [...]
+arm_from_foot = [[...], ...]                  # 4x4, mm, from where the table starts to the arm's frame
+flange_from_nozzle = [[...], ...]             # 4x4, mm
+posture = ["front", "up", "negative"]
 """
 
 from __future__ import annotations
@@ -30,14 +44,133 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile, at_baud
 from hardware.arm.protocol import Dialect
-from hardware.kinematics_table import kinematics_from_table, kinematics_lines
-from hardware.no_go_table import no_go_lines, zones_from_tables
 from hardware.process import checks
-from perception.tool_profile import check_profile
-from planning.kinematics import SimpleArm
-from planning.limits import Limits
+from perception.frames import check_profile
+from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
+from planning.robot.kinematics import AngleMode, JointModel, SimpleArm
 
-KEYS = (
+KINEMATICS_KEYS = ("name", "dh_mm_deg", "low_deg", "high_deg", "speed_deg_s", "acceleration_deg_s2")
+OPTIONAL_KINEMATICS_KEYS = ("nominal", "angles", "arm_from_foot", "flange_from_nozzle", "posture")
+_DH = np.array([1.0, np.deg2rad(1.0), 1.0, np.deg2rad(1.0)])  # of a row, in mm and rad
+_DEG = float(np.deg2rad(1.0))
+
+
+def kinematics_from_table(where: object, table: object) -> tuple[JointModel | None, AngleMode]:
+    """The model in a table, and what A B C are; no model without a table. InputError names the key."""
+    if table is None:
+        return None, AngleMode.SURFACE
+    if not isinstance(table, dict):
+        raise InputError(where, "kinematics", table, "a table [kinematics]")
+    checks.check_keys(where, "kinematics.", table, KINEMATICS_KEYS, OPTIONAL_KINEMATICS_KEYS)
+
+    def numbers(key: str, shape: tuple[int, ...], unit: Array | float = 1.0) -> Array:
+        return np.asarray(checks.numbers(where, f"kinematics.{key}", table[key], shape) * unit)
+
+    def place(key: str) -> Array:
+        return numbers(key, (4, 4)) if key in table else np.eye(4)
+
+    low, high, speed, acceleration = (numbers(key, (6,), _DEG) for key in KINEMATICS_KEYS[2:])
+    nominal = table.get("nominal", True)
+    if not isinstance(nominal, bool):
+        raise InputError(where, "kinematics.nominal", nominal, "true or false")
+    model = JointModel(
+        checks.text(where, "kinematics.name", table["name"]),
+        numbers("dh_mm_deg", (6, 4), _DH),
+        low,
+        high,
+        speed,
+        acceleration,
+        place("arm_from_foot"),
+        place("flange_from_nozzle"),
+        _posture(where, table.get("posture", ["front", "up", "negative"])),
+        nominal,
+    )
+    return model, _angles(where, table.get("angles", AngleMode.SURFACE.value))
+
+
+def kinematics_lines(arm: SimpleArm) -> list[str]:
+    """The table of an arm as lines of TOML; none where it has no model."""
+    if (model := arm.joints) is None:
+        return []
+    degrees = {
+        "low_deg": model.low,
+        "high_deg": model.high,
+        "speed_deg_s": model.speed,
+        "acceleration_deg_s2": model.acceleration,
+    }
+    quoted = model.name.replace("\\", "\\\\").replace('"', '\\"')
+    return [
+        "",
+        "[kinematics]",
+        f'name = "{quoted}"',
+        f"nominal = {str(model.nominal).lower()}",
+        f'angles = "{arm.angles.value}"',
+        f"dh_mm_deg = {checks.toml_numbers(model.dh / _DH)}",
+        *(f"{key} = {checks.toml_numbers(np.rad2deg(value))}" for key, value in degrees.items()),
+        f"arm_from_foot = {checks.toml_numbers(model.arm_from_foot)}",
+        f"flange_from_nozzle = {checks.toml_numbers(model.flange_from_nozzle)}",
+        "posture = [" + ", ".join(f'"{word}"' for word in model.posture) + "]",
+    ]
+
+
+def _posture(where: object, value: object) -> tuple[str, str, str]:
+    if not (isinstance(value, list) and len(value) == 3):
+        raise InputError(where, "kinematics.posture", value, "three words, of shoulder, elbow and wrist")
+    return str(value[0]), str(value[1]), str(value[2])
+
+
+def _angles(where: object, value: object) -> AngleMode:
+    words = [angles.value for angles in AngleMode]
+    if value not in words:
+        raise InputError(where, "kinematics.angles", value, checks.one_of_text(str(value), words))
+    return AngleMode(value)
+
+
+ZONE_KINDS = ("half_space", "box", "cylinder")
+
+
+def zones_from_tables(where: object, value: object) -> tuple[NoGo, ...]:
+    """The zones of `[[no_go]]` tables; InputError names the key."""
+    return tuple(_zone(where, table) for table in checks.tables(where, "no_go", value))
+
+
+def no_go_lines(zones: tuple[NoGo, ...]) -> list[str]:
+    """Tables that give the zones back: one of half-spaces each, with a cylinder where there is one."""
+    lines: list[str] = []
+    for zone in zones:
+        lines += ["", "[[no_go]]", f'name = "{zone.name}"']
+        if zone.radius < float("inf"):
+            lines += [f"cylinder = {checks.toml_numbers(zone.axis)}", f"radius = {checks.toml_number(zone.radius)}"]
+        elif len(zone.offsets) == 1:
+            lines.append(f"half_space = {checks.toml_numbers(_plane(zone))}")
+        else:
+            lines.append(f"box = {checks.toml_numbers(_corners(zone))}")
+    return lines
+
+
+def _zone(where: object, table: checks.Table) -> NoGo:
+    checks.check_keys(where, "no_go.", table, ("name",), (*ZONE_KINDS, "radius"))
+    name = checks.text(where, "no_go.name", table["name"])
+    kinds = [kind for kind in ZONE_KINDS if kind in table]
+    if len(kinds) != 1 or ("radius" in table) != (kinds == ["cylinder"]):
+        raise InputError(where, f"no_go {name!r}", kinds, "half_space, box, or cylinder with radius")
+    first, second = checks.numbers(where, f"no_go.{kinds[0]}", table[kinds[0]], (2, 3), "mm")
+    if kinds == ["cylinder"]:
+        return cylinder(name, first, second, checks.number(where, "no_go.radius", table["radius"]))
+    return half_space(name, first, second) if kinds == ["half_space"] else box(name, first, second)
+
+
+def _plane(zone: NoGo) -> Array:
+    plane: Array = zone.normals.repeat(2, axis=0) * [[1.0], [zone.offsets[0]]]
+    return plane
+
+
+def _corners(zone: NoGo) -> Array:
+    corners: Array = (zone.offsets.reshape(2, 3) * [[1.0], [-1.0]])[::-1]
+    return corners
+
+
+ARM_KEYS = (
     "home_mm_deg",
     "arm_from_base",
     "arm_from_upright",
@@ -54,7 +187,7 @@ KEYS = (
     "no_go",
     "kinematics",
 )
-LIMITS = tuple(f.name for f in fields(Limits) if f.name != "zones")
+LIMIT_KEYS = tuple(f.name for f in fields(MotionLimits) if f.name != "zones")
 _AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
 _ANGLES = ("turn", "surface_turn")  # single numbers in rad
 _SHAPES: dict[str, tuple[int | None, ...]] = {
@@ -63,8 +196,14 @@ _SHAPES: dict[str, tuple[int | None, ...]] = {
     "arm_from_upright": (3, 3),
     "tool_offset_mm": (3,),
 }
-PARTS = {"arm profile": "", "arm": "", "dialect": "", "limits": "limits.", "kinematics": "kinematics."}  # with tables
-NAMED = {  # by what is wrong with them
+PART_PREFIXES = {
+    "arm profile": "",
+    "arm": "",
+    "dialect": "",
+    "limits": "limits.",
+    "kinematics": "kinematics.",
+}  # with tables
+FILE_KEYS = {  # by what is wrong with them
     "home": "home_mm_deg",
     "tool_offset": "tool_offset_mm",
     "tick": "tick_s",
@@ -80,19 +219,26 @@ _TO_RAD = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])
 
 def read_arm(path: str | Path) -> ArmProfile:
     """The profile in an arm file; InputError names the key that makes no sense."""
-    path = Path(path)
-    table = checks.read_toml(path)
-    checks.check_keys(path, "", table, (), KEYS)
+    return _profile(Path(path), checks.read_toml(Path(path)))
+
+
+def arm_from_text(text: str, where: str | Path) -> ArmProfile:
+    """The profile in the text of an arm file; InputError (where) as `read_arm`."""
+    return _profile(Path(where), checks.toml_from_text(where, text))
+
+
+def _profile(path: Path, table: checks.Table) -> ArmProfile:
+    checks.check_keys(path, "", table, (), ARM_KEYS)
     try:
         default = at_baud(ArmProfile(), checks.integer(path, "baud", table.get("baud", ArmProfile().baud), 1))
-        given = {key: checks.numbers(path, key, table[key], shape) for key, shape in _SHAPES.items() if key in table}
+        arrays = {key: checks.numbers(path, key, table[key], shape) for key, shape in _SHAPES.items() if key in table}
         return ArmProfile(
             arm=SimpleArm(
-                given.get("arm_from_base", default.arm.arm_from_base),
-                given.get("arm_from_upright", default.arm.arm_from_upright),
-                given["home_mm_deg"] * _TO_RAD if "home_mm_deg" in given else default.arm.home,
+                arrays.get("arm_from_base", default.arm.arm_from_base),
+                arrays.get("arm_from_upright", default.arm.arm_from_upright),
+                arrays["home_mm_deg"] * _TO_RAD if "home_mm_deg" in arrays else default.arm.home,
                 *kinematics_from_table(path, table.get("kinematics")),
-                tool_offset=given.get("tool_offset_mm", default.arm.tool_offset),
+                tool_offset=arrays.get("tool_offset_mm", default.arm.tool_offset),
             ),
             limits=_limits(path, table.get("limits", {}), table.get("no_go")),
             dialect=_dialect(path, table),
@@ -109,6 +255,11 @@ def read_arm(path: str | Path) -> ArmProfile:
 
 def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
     """Write an arm file that gives the profile back, to rounding of angles."""
+    Path(path).write_text(arm_text(profile, remark), encoding="utf-8")
+
+
+def arm_text(profile: ArmProfile, remark: str = "") -> str:
+    """The text of an arm file, as `write_arm` writes it."""
     arm, dialect, limits = profile.arm, profile.dialect, profile.limits
     lines = [f"# {line}" for line in remark.splitlines()] + [
         f"home_mm_deg = {checks.toml_numbers(arm.home / _TO_RAD)}",
@@ -125,24 +276,24 @@ def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
         f"tool_mm = {checks.toml_numbers(profile.tool)}",
         "",
         "[limits] # X Y Z in mm, A B C in degrees",
-        *(f"{name} = {checks.toml_numbers(getattr(limits, name) / _unit(name))}" for name in LIMITS),
+        *(f"{name} = {checks.toml_numbers(getattr(limits, name) / _unit(name))}" for name in LIMIT_KEYS),
         *no_go_lines(limits.zones),
         *kinematics_lines(arm),
     ]
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return "\n".join(lines) + "\n"
 
 
 def _in_file(path: Path, table: checks.Table, error: InputError) -> InputError:
     """What is wrong with a part of the profile, by its key and value in the file; of a default, its own value."""
-    if error.where not in PARTS:
+    if error.where not in PART_PREFIXES:
         return InputError(path, f"{error.where}: {error.what}", error.got, error.allowed)
-    key = PARTS[error.where] + error.what
-    key = NAMED.get(key, key)
-    found: object = table
+    key = PART_PREFIXES[error.where] + error.what
+    key = FILE_KEYS.get(key, key)
+    value: object = table
     for word in key.split("."):
-        found = found.get(word) if isinstance(found, dict) else None
-    whole = found is None or isinstance(error.got, str)  # one word of a list is what is wrong
-    return InputError(path, key, error.got if whole else found, error.allowed)
+        value = value.get(word) if isinstance(value, dict) else None
+    whole = value is None or isinstance(error.got, str)  # one word of a list is what is wrong
+    return InputError(path, key, error.got if whole else value, error.allowed)
 
 
 def tool_from_value(where: object, key: str, value: object) -> Array:
@@ -157,16 +308,16 @@ def _unit(name: str) -> Array:
     return _TO_RAD if name in _AXES else np.asarray(np.deg2rad(1.0) if name in _ANGLES else 1.0)
 
 
-def _limits(path: Path, table: object, zones: object) -> Limits:
+def _limits(path: Path, table: object, zones: object) -> MotionLimits:
     if not isinstance(table, dict):
         raise InputError(path, "limits", table, "a table [limits]")
-    checks.check_keys(path, "limits.", table, (), LIMITS)
-    given: dict[str, Array | float] = {}
+    checks.check_keys(path, "limits.", table, (), LIMIT_KEYS)
+    limits: dict[str, Array | float] = {}
     for name, value in table.items():
         number = checks.numbers(path, f"limits.{name}", value, (6,) if name in _AXES else ()) * _unit(name)
-        given[name] = number if name in _AXES else float(number)
-    found = () if zones is None else zones_from_tables(path, zones)
-    return Limits(**given, zones=found)  # type: ignore[arg-type]
+        limits[name] = number if name in _AXES else float(number)
+    no_go = () if zones is None else zones_from_tables(path, zones)
+    return MotionLimits(**limits, zones=no_go)  # type: ignore[arg-type]
 
 
 def _dialect(path: Path, table: checks.Table) -> Dialect:

@@ -1,4 +1,8 @@
-"""The small tables of a session folder: frames.csv (stamps), head.csv (the print head), roi.toml (the surface)."""
+"""The tables of a session folder: TUM trajectories, frames.csv, head.csv, roi.toml; and a writer of such folders.
+
+A TUM file has one `stamp x y z qx qy qz qw` a line, s and mm: base_from_surface. frames.csv has the stamp of every
+image, head.csv the print head at each frame set, roi.toml polygons around the surface.
+"""
 
 from __future__ import annotations
 
@@ -7,34 +11,118 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from types import TracebackType
+from typing import TextIO
 
 import numpy as np
 
+from estimation import se3
 from estimation.errors import InputError
+from estimation.pose import Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware.files.session import FrameRef
-from hardware.heads import Heads
+from hardware.files.rig_file import ImageSource, write_rig
+from hardware.files.session import NO_PRINT_HEADS, FrameRef, PrintHeadLog
 from hardware.process import checks
-from hardware.tum import checked_rows, row_from_words
+from hardware.process.checks import error_text
 from perception.frames import Roi
 
-COLUMNS = ("camera", "frame", "stamp_s")
+TUM_HEADER = "# stamp_s x y z qx qy qz qw (mm, base_from_surface)\n"
+TUM_ROW = "8 numbers: stamp x y z qx qy qz qw"
+
+
+def read_tum(path: str | Path, exact: bool) -> Trajectory:
+    """The trajectory in a TUM file (s, mm); InputError names the line that is wrong."""
+    return trajectory_from_rows(read_rows(path), exact)
+
+
+def write_tum(path: str | Path, trajectory: Trajectory) -> None:
+    """Write a trajectory as a TUM file, every number with the digits that give the same float64 back."""
+    write_rows(path, rows_from_trajectory(trajectory))
+
+
+def trajectory_from_rows(rows: Array, exact: bool) -> Trajectory:
+    """Poses from rows (N, 8) of stamp x y z qx qy qz qw, s and mm."""
+    return Trajectory(rows[:, 0], se3.make(se3.rotation_from_quaternion(rows[:, 4:]), rows[:, 1:4]), exact)
+
+
+def rows_from_trajectory(trajectory: Trajectory) -> Array:
+    """Rows (N, 8) of stamp x y z qx qy qz qw, s and mm."""
+    transforms = trajectory.base_from_surface
+    quaternions = se3.quaternion_from_rotation(transforms[:, :3, :3])
+    return np.concatenate([trajectory.stamps[:, None], transforms[:, :3, 3], quaternions], axis=1)
+
+
+def write_rows(path: str | Path, rows: Array) -> None:
+    """Write rows (N, 8) of stamp x y z qx qy qz qw as a TUM file, shortest digits that round-trip."""
+    with open(path, "w", encoding="utf-8") as file:
+        file.write(TUM_HEADER)
+        file.writelines(" ".join(repr(float(v)) for v in row) + "\n" for row in rows)
+
+
+def read_rows(path: str | Path) -> Array:
+    """Rows (N, 8) of a TUM file, N >= 1: finite, stamps rising, quaternions of unit length to 1 %."""
+    path = Path(path)
+    lines = ((f"line {number}", line.replace(",", " ").split()) for number, line in _lines(path))
+    rows = checked_rows(path, ((what, row_from_words(path, what, words)) for what, words in lines))
+    if not len(rows):
+        raise InputError(path, "poses", "none", "at least one line `stamp x y z qx qy qz qw`")
+    return rows
+
+
+def checked_rows(where: object, rows: Iterable[tuple[str, Sequence[float]]]) -> Array:
+    """Rows (N, 8) of stamp x y z qx qy qz qw, N >= 0, each told with its name, such as its line.
+
+    InputError (where, name) unless they are finite, stamps rise and quaternions are of unit length to 1 %.
+    """
+    checked: list[Sequence[float]] = []
+    for what, row in rows:
+        if len(row) != 8:
+            raise InputError(where, what, f"{len(row)} numbers", TUM_ROW)
+        if not all(map(math.isfinite, row)):
+            raise InputError(where, what, " ".join(map(str, row)), "finite numbers")
+        norm = math.hypot(*row[4:])
+        if not 0.99 < norm < 1.01:
+            raise InputError(where, f"{what}: length of qx qy qz qw", norm, "1 +- 0.01 (a unit quaternion)")
+        if checked and row[0] <= checked[-1][0]:
+            raise InputError(where, f"{what}: stamp", row[0], f"later than the one before, {checked[-1][0]} s")
+        checked.append(row)
+    return np.array(checked, float).reshape(-1, 8)
+
+
+def row_from_words(where: object, what: str, words: Sequence[str], allowed: str = TUM_ROW) -> list[float]:
+    """The numbers in words; InputError (where, what, with `allowed`) unless they are numbers."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        raise InputError(where, what, " ".join(words), allowed) from None
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(path, "file", error_text(error), "a readable text file") from error
+    numbered = ((i, line.strip()) for i, line in enumerate(text.splitlines(), 1))
+    return [(i, line) for i, line in numbered if line and not line.startswith("#")]
+
+
+FRAME_COLUMNS = ("camera", "frame", "stamp_s")
 HEAD_COLUMNS = ("stamp_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw", "extruding")
 
 
 def read_frames(path: Path, rig: Rig) -> list[Array]:
     """Stamps (N,), s, of each camera's frames 0..N-1 as its own clock gave them: finite, rising, none left out."""
     names = [c.name for c in rig.cameras]
-    found: list[dict[int, float]] = [{} for _ in names]
-    for line, row in _rows(path, COLUMNS):
+    numbered: list[dict[int, float]] = [{} for _ in names]
+    for line, row in _rows(path, FRAME_COLUMNS):
         camera, frame, stamp = _frame_row(path, line, row, names)
-        if frame in found[camera]:
+        if frame in numbered[camera]:
             raise InputError(path, f"line {line}: camera,frame", f"{names[camera]},{frame}", "each frame once")
-        found[camera][frame] = stamp
-    stamps = [_camera_stamps(path, name, frames) for name, frames in zip(names, found, strict=True)]
+        numbered[camera][frame] = stamp
+    stamps = [_camera_stamps(path, name, frames) for name, frames in zip(names, numbered, strict=True)]
     if not any(len(s) for s in stamps):
-        raise InputError(path, "frames", "none", f"at least one line {','.join(COLUMNS)}")
+        raise InputError(path, "frames", "none", f"at least one line {','.join(FRAME_COLUMNS)}")
     return stamps
 
 
@@ -46,7 +134,7 @@ def _rows(path: Path, columns: Sequence[str]) -> list[tuple[int, dict[str, str |
             reader.fieldnames = header
             rows = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "file", checks.why(error), "a readable CSV file") from error
+        raise InputError(path, "file", checks.error_text(error), "a readable CSV file") from error
     for column in columns:
         if column not in header:
             raise InputError(path, "header", ",".join(header) or "empty", ",".join(columns))
@@ -54,9 +142,9 @@ def _rows(path: Path, columns: Sequence[str]) -> list[tuple[int, dict[str, str |
 
 
 def _frame_row(path: Path, line: int, row: dict[str, str | None], names: Sequence[str]) -> tuple[int, int, float]:
-    name, frame, stamp = ((row[c] or "").strip() for c in COLUMNS)
+    name, frame, stamp = ((row[c] or "").strip() for c in FRAME_COLUMNS)
     if name not in names:
-        raise InputError(path, f"line {line}: camera", name, f"a camera of rig.toml, {checks.meant(name, names)}")
+        raise InputError(path, f"line {line}: camera", name, f"a camera of rig.toml, {checks.one_of_text(name, names)}")
     if not (frame.isascii() and frame.isdigit() and len(frame) < 10):
         raise InputError(path, f"line {line}: frame", frame, "a whole number >= 0")
     try:
@@ -84,7 +172,7 @@ def _camera_stamps(path: Path, name: str, frames: dict[int, float]) -> Array:
 def write_frames(path: Path, rig: Rig, refs: Iterable[FrameRef]) -> None:
     """Write frames.csv, camera by camera, every stamp with the digits that give the same float64 back."""
     with open(path, "w", encoding="utf-8") as file:
-        file.write(",".join(COLUMNS) + "\n")
+        file.write(",".join(FRAME_COLUMNS) + "\n")
         for ref in sorted(refs, key=lambda r: (r.camera, r.number)):
             file.write(frame_line(rig, ref))
 
@@ -94,12 +182,12 @@ def frame_line(rig: Rig, ref: FrameRef) -> str:
     return f"{rig.cameras[ref.camera].name},{ref.number},{ref.camera_stamp!r}\n"
 
 
-def read_heads(path: Path) -> Heads:
+def read_heads(path: Path) -> PrintHeadLog:
     """The print heads of head.csv, base_from_nozzle; none is allowed, as where a run ended before the arm moved."""
-    found = _rows(path, HEAD_COLUMNS)
-    table = [(f"line {line}", [(row[c] or "").strip() for c in HEAD_COLUMNS]) for line, row in found]
+    rows_read = _rows(path, HEAD_COLUMNS)
+    table = [(f"line {line}", [(row[c] or "").strip() for c in HEAD_COLUMNS]) for line, row in rows_read]
     rows = checked_rows(path, ((line, row_from_words(path, line, words[:-1])) for line, words in table))
-    return Heads(rows, np.array([_extruding(path, line, words[-1]) for line, words in table], bool))
+    return PrintHeadLog(rows, np.array([_extruding(path, line, words[-1]) for line, words in table], bool))
 
 
 def _extruding(path: Path, line: str, word: str) -> bool:
@@ -108,7 +196,7 @@ def _extruding(path: Path, line: str, word: str) -> bool:
     return word == "1"
 
 
-def write_heads(path: Path, heads: Heads) -> None:
+def write_heads(path: Path, heads: PrintHeadLog) -> None:
     """Write head.csv, every number with the digits that give the same float64 back."""
     with open(path, "w", encoding="utf-8") as file:
         file.write(",".join(HEAD_COLUMNS) + "\n")
@@ -126,9 +214,9 @@ def read_roi(path: Path, rig: Rig, stamps: Sequence[Array]) -> tuple[Roi, ...]:
     checks.check_keys(path, "", table, ["roi"])
     entries = checks.tables(path, "roi", table["roi"])
     rois = [_roi(path, f"roi[{i}].", entry, rig, stamps) for i, entry in enumerate(entries)]
-    seen = [(r.camera, r.stamp) for r in rois]
-    for i, key in enumerate(seen):
-        if key in seen[:i]:
+    keys = [(r.camera, r.stamp) for r in rois]
+    for i, key in enumerate(keys):
+        if key in keys[:i]:
             got = f"{entries[i]['camera']}, frame {entries[i]['frame']}"
             raise InputError(path, f"roi[{i}]", got, "each frame once")
     return tuple(rois)
@@ -139,7 +227,7 @@ def _roi(path: Path, key: str, entry: checks.Table, rig: Rig, stamps: Sequence[A
     name = checks.text(path, key + "camera", entry["camera"])
     names = [c.name for c in rig.cameras]
     if name not in names:
-        raise InputError(path, key + "camera", name, f"a camera of rig.toml, {checks.meant(name, names)}")
+        raise InputError(path, key + "camera", name, f"a camera of rig.toml, {checks.one_of_text(name, names)}")
     camera = names.index(name)
     frame = checks.integer(path, key + "frame", entry["frame"], 0)
     if frame >= len(stamps[camera]):
@@ -171,3 +259,54 @@ def write_roi(path: Path, rig: Rig, rois: Sequence[Roi], frames: Sequence[int]) 
         polygon = checks.toml_numbers(roi.polygon)
         blocks.append(f"[[roi]]\ncamera = {name}\nframe = {frame}\npolygon = {polygon}\n")
     path.write_text("\n".join(blocks), encoding="utf-8")
+
+
+PICTURE_SUFFIXES = {"png": ".png", "jpeg": ".jpg"}
+
+
+class SessionFolderWriter:
+    """A session folder in the making; readable at every instant, whole once the context ends."""
+
+    def __init__(self, folder: Path, rig: Rig, rois: Sequence[Roi]) -> None:
+        """folder: made if it is not there. rois: where the surface is in the first picture of each camera."""
+        self.folder, self._rig = folder, rig
+        self._counts = [0] * len(rig)
+        self._truth: Trajectory | None = None
+        self._heads: TextIO | None = None  # a session without an arm has no such file
+        for camera in rig.cameras:
+            (folder / camera.name).mkdir(parents=True, exist_ok=True)
+        write_rig(folder / "rig.toml", rig, [ImageSource("images", f"{c.name}/*") for c in rig.cameras])
+        if rois:
+            write_roi(folder / "roi.toml", rig, rois, [0] * len(rois))
+        write_frames(folder / "frames.csv", rig, [])
+        self._frames = (folder / "frames.csv").open("a", encoding="utf-8")
+
+    def picture(self, camera: int, stamp: float, kind: str, data: bytes) -> None:
+        """An encoded picture ("png" or "jpeg") of a camera at `stamp`, s; stamps of a camera rise."""
+        number, name = self._counts[camera], self._rig.cameras[camera].name
+        (self.folder / name / f"{number:06d}{PICTURE_SUFFIXES[kind]}").write_bytes(data)
+        self._frames.write(frame_line(self._rig, FrameRef(camera, number, stamp, stamp)))
+        self._frames.flush()
+        self._counts[camera] += 1
+
+    def head_row(self, row: Array, extruding: bool) -> None:
+        """Where the print head was at a frame set: (8,) stamp x y z qx qy qz qw, s and mm; stamps rise."""
+        if self._heads is None:
+            write_heads(self.folder / "head.csv", NO_PRINT_HEADS)
+            self._heads = (self.folder / "head.csv").open("a", encoding="utf-8")
+        self._heads.write(head_line(row, extruding))
+        self._heads.flush()
+
+    def truth(self, trajectory: Trajectory) -> None:
+        """The exact poses, written when the folder is closed."""
+        self._truth = trajectory
+
+    def __enter__(self) -> SessionFolderWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._frames.close()
+        if self._heads is not None:
+            self._heads.close()
+        if self._truth is not None:
+            write_tum(self.folder / "truth.tum", self._truth)

@@ -4,14 +4,24 @@
 
 Position and angles (Rz(gamma) Ry(beta) Rx(alpha)) are those of the nozzle in the surface frame; 0 0 0 is upright.
 `layer` (0) and `extrude` (1) may be left out, `speed_mm_min` may stand for `speed_mm_s`, any further column is kept.
+
+Beside them: a path as plain G-code; contours of wounds as CSV, x_mm,y_mm or x_mm,y_mm,z_mm; and progress.toml, how far
+a print is, which outlives the run:
+
+    path = "3f0c..."      # fingerprint of the path's places, speeds, materials, temperatures, layers and extrusion
+    fraction = 12.35      # place on it, counted in checkpoints
+    printed = 12          # the last checkpoint that is done, for people
 """
 
 from __future__ import annotations
 
 import csv
 import difflib
+import io
 import math
+import os
 from collections.abc import Sequence
+from math import floor
 from pathlib import Path as File
 
 import numpy as np
@@ -19,68 +29,80 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.se3 import Array
 from hardware.process import checks
 from planning.path import Path, check_path
+from planning.progress import PrintProgress, ProgressMark, fingerprint, progress_mark, resume_fraction
 
-POSE = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
-SPEEDS = {"speed_mm_s": 1.0, "speed_mm_min": 1 / 60}  # column: mm/s of its unit
-REST = ("material", "temperature_c")
-OPTIONAL = ("layer", "extrude")
-HEADER = (*POSE, "speed_mm_s", *REST, *OPTIONAL)
-STEMS = {name.split("_")[0]: name for name in ("temperature_c", *POSE)}  # x, alpha: they need units
-STEMS["speed"] = " or ".join(SPEEDS)
-SMALLEST = 0.1  # mm, corner to corner: less than any wound, and as much as a tenth of a metre has in metres
-Words = dict[str, list[str]]
+POSE_COLUMNS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
+SPEED_COLUMNS = {"speed_mm_s": 1.0, "speed_mm_min": 1 / 60}  # column: mm/s of its unit
+PRINT_COLUMNS = ("material", "temperature_c")
+OPTIONAL_COLUMNS = ("layer", "extrude")
+PATH_HEADER = (*POSE_COLUMNS, "speed_mm_s", *PRINT_COLUMNS, *OPTIONAL_COLUMNS)
+COLUMN_STEMS = {name.split("_")[0]: name for name in ("temperature_c", *POSE_COLUMNS)}  # x, alpha: they need units
+COLUMN_STEMS["speed"] = " or ".join(SPEED_COLUMNS)
+MIN_PATH_SPAN = 0.1  # mm, corner to corner: less than any wound, and as much as a tenth of a metre has in metres
+ColumnWords = dict[str, list[str]]
 
 
 def read_path(file: str | File) -> Path:
     """The path in a CSV file; InputError names line and column of whatever cannot be printed."""
-    file = File(file)
-    lines, words = _columns(file)
-    speed_column = next(name for name in SPEEDS if name in words)
-    numbers = {name: _numbers(file, lines, name, words[name]) for name in (*POSE, speed_column, "temperature_c")}
-    pose = np.stack([numbers[name] for name in POSE], axis=1)
+    return _path_from_rows(File(file), checks.read_csv(File(file)))
+
+
+def path_from_text(text: str, where: str | File) -> Path:
+    """The path in the text of a path file; InputError (where) as `read_path`."""
+    return _path_from_rows(File(where), checks.read_csv(File(where), text=text))
+
+
+def _path_from_rows(file: File, rows: list[checks.CsvRow]) -> Path:
+    lines, words = _columns(file, rows)
+    speed_column = next(name for name in SPEED_COLUMNS if name in words)
+    numbers = {
+        name: _numbers(file, lines, name, words[name]) for name in (*POSE_COLUMNS, speed_column, "temperature_c")
+    }
+    pose = np.stack([numbers[name] for name in POSE_COLUMNS], axis=1)
     path = Path(
         surface_from_nozzle=se3.make(se3.rotation_from_euler(np.deg2rad(pose[:, 3:])), pose[:, :3]),
-        speed=numbers[speed_column] * SPEEDS[speed_column],
+        speed=numbers[speed_column] * SPEED_COLUMNS[speed_column],
         material=_material(file, lines, words["material"]),
         temperature=numbers["temperature_c"],
         layer=_whole(file, lines, "layer", words.get("layer", ["0"] * len(lines)), None),
         extrude=_whole(file, lines, "extrude", words.get("extrude", ["1"] * len(lines)), (0, 1)) == 1,
-        extra={name: np.array(words[name]) for name in words if name not in (*HEADER, *SPEEDS)},
+        extra={name: np.array(words[name]) for name in words if name not in (*PATH_HEADER, *SPEED_COLUMNS)},
     )
-    try:
-        check_path(path, file, lines)
-    except InputError as error:
-        line, _, value = error.what.rpartition(": ")
-        if (column := {"speed": speed_column, "temperature": "temperature_c"}.get(value)) is None:
-            raise
-        word = words[column][lines.index(int(line.removeprefix("line ")))]
-        raise InputError(file, f"{line}: {column}", word, error.allowed) from None
+    named = {"speed": speed_column, "temperature": "temperature_c"}
+    check_path(path, file, lines, {value: (column, words[column]) for value, column in named.items()})
     span = float(np.linalg.norm(np.ptp(pose[:, :3], axis=0)))
-    if span < SMALLEST:
-        allowed = f"{SMALLEST:g} mm or more from corner to corner: are they in metres?"
+    if span < MIN_PATH_SPAN:
+        allowed = f"{MIN_PATH_SPAN:g} mm or more from corner to corner: are they in metres?"
         raise InputError(file, "positions", f"{span:.3g} mm from corner to corner", allowed)
     return path
 
 
 def write_path(file: str | File, path: Path) -> None:
     """Write a path, every number with the digits that give the same float64 back (angles: to rounding)."""
+    File(file).write_text(path_text(path), encoding="utf-8", newline="")
+
+
+def path_text(path: Path) -> str:
+    """The text of a path file, as `write_path` writes it."""
     angles_deg = np.rad2deg(se3.euler_from_rotation(path.surface_from_nozzle[:, :3, :3])) + 0.0  # no -0
     numbers = np.column_stack([path.surface_from_nozzle[:, :3, 3], angles_deg, path.speed])
-    with open(file, "w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*HEADER, *path.extra])
-        for i, row in enumerate(numbers):
-            rest = [path.material[i], repr(float(path.temperature[i])), path.layer[i], int(path.extrude[i])]
-            writer.writerow([*(repr(float(v)) for v in row), *rest, *(column[i] for column in path.extra.values())])
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow([*PATH_HEADER, *path.extra])
+    for i, row in enumerate(numbers):
+        rest = [path.material[i], repr(float(path.temperature[i])), path.layer[i], int(path.extrude[i])]
+        writer.writerow([*(repr(float(v)) for v in row), *rest, *(column[i] for column in path.extra.values())])
+    return stream.getvalue()
 
 
-def _columns(file: File) -> tuple[list[int], Words]:
+def _columns(file: File, rows: list[checks.CsvRow]) -> tuple[list[int], ColumnWords]:
     """Line numbers of the checkpoints, and the words of each column."""
-    rows = [(n, [word.strip() for word in row]) for n, row in checks.read_csv(file) if any(map(str.strip, row))]
+    rows = _stripped(rows)
     if not rows:
-        raise InputError(file, "file", "empty", f"a header {','.join(HEADER)} and 2 checkpoints or more")
+        raise InputError(file, "file", "empty", f"a header {','.join(PATH_HEADER)} and 2 checkpoints or more")
     (_, header), body = rows[0], rows[1:]
     _check_header(file, header)
     for line, row in body:
@@ -91,23 +113,28 @@ def _columns(file: File) -> tuple[list[int], Words]:
     return [line for line, _ in body], {name: [row[i] for _, row in body] for i, name in enumerate(header)}
 
 
+def _stripped(rows: list[checks.CsvRow]) -> list[checks.CsvRow]:
+    """The rows that are not empty, without blanks around their words."""
+    return [(line, [word.strip() for word in row]) for line, row in rows if any(map(str.strip, row))]
+
+
 def _check_header(file: File, header: Sequence[str]) -> None:
     if len(header) == 1 and ";" in header[0]:
         raise InputError(file, "header", header[0], "names with commas between them, not semicolons")
     for i, name in enumerate(header):
         if not name or name in header[:i]:
             raise InputError(file, f"header, column {i + 1}", name, "a name, and each once")
-        if name in (*HEADER, *SPEEDS):
+        if name in (*PATH_HEADER, *SPEED_COLUMNS):
             continue
-        if (stem := name.split("_")[0]) in STEMS:
-            raise InputError(file, f"header, column {i + 1}", name, f"{STEMS[stem]}, in this unit")
-        if difflib.get_close_matches(name, HEADER, 1):
-            raise InputError(file, f"header, column {i + 1}", name, checks.meant(name, HEADER))
-    for name in (*POSE, *REST):
+        if (stem := name.split("_")[0]) in COLUMN_STEMS:
+            raise InputError(file, f"header, column {i + 1}", name, f"{COLUMN_STEMS[stem]}, in this unit")
+        if difflib.get_close_matches(name, PATH_HEADER, 1):
+            raise InputError(file, f"header, column {i + 1}", name, checks.one_of_text(name, PATH_HEADER))
+    for name in (*POSE_COLUMNS, *PRINT_COLUMNS):
         if name not in header:
-            raise InputError(file, "header", f"no {name}", ",".join(HEADER))
-    if sum(name in header for name in SPEEDS) != 1:
-        raise InputError(file, "header", ",".join(header), f"one of {', '.join(SPEEDS)}")
+            raise InputError(file, "header", f"no {name}", ",".join(PATH_HEADER))
+    if sum(name in header for name in SPEED_COLUMNS) != 1:
+        raise InputError(file, "header", ",".join(header), f"one of {', '.join(SPEED_COLUMNS)}")
 
 
 def _numbers(file: File, lines: Sequence[int], name: str, words: Sequence[str]) -> NDArray[np.float64]:
@@ -142,3 +169,130 @@ def _material(file: File, lines: Sequence[int], words: Sequence[str]) -> NDArray
     if all(word.isascii() and word.isdecimal() and len(word) < 19 and str(int(word)) == word for word in words):
         return np.array([int(word) for word in words], np.int64)
     return np.array(words)
+
+
+GCODE_HEADER = """; stillbed: {count} checkpoints, {layers} layers, {length:.1f} mm
+; X Y Z mm and A B C degrees: the nozzle in the frame of the scan, R = Rz(C) Ry(B) Rx(A); F mm/min
+; E mm^3 laid so far; T and M104 are told where they change; a surface that moves needs stillbed, not this file
+G21 ; mm
+G90 ; places are absolute
+M82 ; so is E
+G92 E0
+"""
+
+
+def gcode_text(path: Path) -> str:
+    """The path as G-code: G0 where nothing is laid, G1 where ink flows, G4 for waits, a comment for each layer."""
+    places = path.surface_from_nozzle[:, :3, 3]
+    angles = np.rad2deg(se3.euler_from_rotation(path.surface_from_nozzle[:, :3, :3])) + 0.0
+    columns = {name: path.extra[name].astype(float) for name in ("volume_mm3", "wait_s") if name in path.extra}
+    laid = np.cumsum(columns.get("volume_mm3", np.zeros(len(path))))
+    wait = columns.get("wait_s", np.zeros(len(path)))
+    length = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+    lines = [GCODE_HEADER.format(count=len(path), layers=len(np.unique(path.layer)), length=length)]
+    names = list(dict.fromkeys(path.material.tolist()))
+    for i in range(len(path)):
+        lines += _changes(path, i, names)
+        (x, y, z), (a, b, c) = places[i], angles[i]
+        if wait[i] > 0:
+            lines.append(f"G4 P{1000 * wait[i]:.0f}\n")
+        end = f" E{laid[i]:.4f}\n" if path.extrude[i] else "\n"
+        way = f"G{int(path.extrude[i])} X{x:.3f} Y{y:.3f} Z{z:.3f} A{a:.3f} B{b:.3f} C{c:.3f}"
+        lines.append(f"{way} F{60 * path.speed[i]:.0f}{end}")
+    return "".join([*lines, "M2\n"])
+
+
+def _changes(path: Path, i: int, names: list[object]) -> list[str]:
+    """What begins at checkpoint i: a layer, a material, a temperature."""
+    first, before = i == 0, max(i - 1, 0)
+    lines = []
+    if first or path.layer[i] != path.layer[before]:
+        lines.append(f"; layer {path.layer[i]}\n")
+    if first or path.material[i] != path.material[before]:
+        lines.append(f"T{names.index(path.material[i])} ; material {path.material[i]}\n")
+    if first or path.temperature[i] != path.temperature[before]:
+        lines.append(f"M104 S{path.temperature[i]:g} ; degrees C\n")
+    return lines
+
+
+CONTOUR_COLUMNS = ("x_mm", "y_mm", "z_mm")
+
+
+def read_contour(file: str | File) -> Array:
+    """Points (N, 2) or (N, 3), mm, in order around a contour, the first not repeated at the end; N >= 3."""
+    file = File(file)
+    rows = _stripped(checks.read_csv(file))
+    allowed = "x_mm,y_mm or x_mm,y_mm,z_mm"
+    if not rows:
+        raise InputError(file, "file", "empty", f"a header {allowed} and 3 points or more")
+    (_, header), body = rows[0], rows[1:]
+    if tuple(header) not in (CONTOUR_COLUMNS[:2], CONTOUR_COLUMNS):
+        raise InputError(file, "header", ",".join(header), allowed)
+    points = np.array([_point(file, line, row, len(header)) for line, row in body]).reshape(-1, len(header))
+    keep = np.ones(len(points), bool)
+    keep[1:] = np.abs(np.diff(points, axis=0)).max(axis=1, initial=0.0) > 0
+    points = points[keep]
+    if len(points) > 1 and np.array_equal(points[0], points[-1]):
+        points = points[:-1]
+    if len(points) < 3:
+        raise InputError(file, "points", len(points), "3 or more, each at another place")
+    return points
+
+
+def _point(file: File, line: int, row: list[str], count: int) -> list[float]:
+    if len(row) != count:
+        raise InputError(file, f"line {line}", f"{len(row)} values", f"{count}, as in the header")
+    try:
+        point = [float(word) for word in row]
+    except ValueError:
+        raise InputError(file, f"line {line}", ",".join(row), "numbers, mm") from None
+    if not all(map(math.isfinite, point)):
+        raise InputError(file, f"line {line}", ",".join(row), "finite numbers, mm")
+    return point
+
+
+KEYS = ("path", "fraction", "printed")
+
+
+class ProgressFile:
+    """Keeps the file up to date, tick by tick; whatever ends the run, the file there is whole."""
+
+    def __init__(self, file: File, path: Path) -> None:
+        self._file, self._path = file, fingerprint(path)
+        self._fraction = -1.0
+
+    def write(self, progress: PrintProgress) -> None:
+        """Write how far the print is, if it went on since the last time."""
+        if progress.fraction != self._fraction:
+            self._fraction = progress.fraction
+            _replace(self._file, ProgressMark(self._path, progress.fraction), progress.printed)
+
+
+def write_progress_durably(file: File, fingerprint: str, fraction: float) -> None:
+    """Write how far a print is, so that it outlives a power cut as well: this waits for the disk."""
+    _replace(file, ProgressMark(fingerprint, fraction), floor(fraction), sure=True)
+
+
+def write_progress(file: File, path: Path, progress: PrintProgress) -> None:
+    """Write how far a print of `path` is."""
+    _replace(file, progress_mark(path, progress), progress.printed)
+
+
+def read_progress(file: File, path: Path) -> float:
+    """Where a print of `path` goes on, counted in checkpoints; InputError if the file is of another path or wrong."""
+    table = checks.read_toml(file)
+    checks.check_keys(file, "", table, KEYS)
+    mark = ProgressMark(checks.text(file, "path", table["path"]), checks.number(file, "fraction", table["fraction"]))
+    return resume_fraction(path, mark, file)
+
+
+def _replace(file: File, mark: ProgressMark, printed: int, sure: bool = False) -> None:
+    """Write beside the file and rename: there is always one that can be read. sure: it is on the disk on return."""
+    text = f'path = "{mark.path}"\nfraction = {checks.toml_number(mark.fraction)}\nprinted = {printed}\n'
+    beside = file.with_name(file.name + ".new")
+    with beside.open("w", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        if sure:
+            os.fsync(stream.fileno())
+    beside.replace(file)

@@ -1,18 +1,21 @@
-"""poses.tum and poses.csv: what a tracking run leaves behind, written line by line and read back.
+"""poses.tum, poses.csv and wound.csv: what a tracking run leaves behind, written line by line and read back.
 
 `poses.tum` holds the measured poses only, as evo reads them: `stamp x y z qx qy qz qw`, s and mm. `poses.csv` holds one
-line per frame set: stamp, frames given, pose, upper triangle of the covariance, twist, whether it moves, state, tracks
-per camera, the cameras' clocks, milliseconds per stage, reason. Every line is flushed, so a killed run leaves whole
-lines.
+line per frame set: stamp, images given, pose, upper triangle of the covariance, twist, motion, state, tracks per
+camera, the cameras' clocks, milliseconds per stage, reason. Every line is flushed, so a killed run leaves whole lines.
+`wound.csv` holds what each camera saw of the wound, at the segmentation's own pace.
 """
 
 from __future__ import annotations
 
 import csv
+from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,52 +23,50 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
+from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.process import checks
+from perception.frames import FrameSet
 from perception.tracking.step import StepReport
 
-TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
+if TYPE_CHECKING:
+    from perception.tracking.wound_step import WoundEstimate
+    from perception.wound.segmentation import Segmenter
+
+TANGENT_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 _UPPER = np.triu_indices(6)
 _POSE = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
-_COVARIANCE = tuple(f"cov_{TANGENT[i]}_{TANGENT[j]}" for i, j in zip(*_UPPER, strict=True))
+_COVARIANCE = tuple(f"cov_{TANGENT_NAMES[i]}_{TANGENT_NAMES[j]}" for i, j in zip(*_UPPER, strict=True))
 _TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_mm_s", "vy_mm_s", "vz_mm_s")
 _MOTION = ("moving", "onset_s", "moved_mm", "turned_deg")
 _DEFORMATION = ("deformation_mm", "deformation_sigma_mm")
-_HEAD = ("stamp_s", "frames", *_POSE, *_COVARIANCE, *_TWIST, *_MOTION, *_DEFORMATION, "state", "cameras")
+_POSE_TABLE_COLUMNS = ("stamp_s", "frames", *_POSE, *_COVARIANCE, *_TWIST, *_MOTION, *_DEFORMATION, "state", "cameras")
 _STATES = tuple(state.value for state in TrackState)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseTable:
-    """A run as parallel arrays, one row per frame set.
+    """A run as parallel arrays, one row per frame set; N frame sets, C cameras, S stages."""
 
-    stamps: (N,) s. frames: (N,) images given. base_from_surface: (N, 4, 4) mm. covariance: (N, 6, 6) and twist:
-    (N, 6) as in SurfacePose. moving: (N,), onset: (N,) s, NaN before the first, moved: (N,) mm and turned: (N,) rad, as
-    in SurfaceMotion. deformation, deformation_sigma: (N,) mm, 0 where there is no warp. states: N of TrackState. used:
-    (N, C) tracks that carry the pose, per camera. offsets, offset_sigmas: (N, C) s, as in StepReport.
-    seconds: (N, S + 1) per stage and in all. reasons: N sentences. cameras: C names. stages: S + 1 names, the last
-    "total".
-    """
-
-    stamps: Array
-    frames: NDArray[np.int64]
-    base_from_surface: Array
-    covariance: Array
-    twist: Array
-    moving: NDArray[np.bool_]
-    onset: Array
-    moved: Array
-    turned: Array
-    deformation: Array
-    deformation_sigma: Array
-    states: tuple[TrackState, ...]
-    used: NDArray[np.int64]
-    offsets: Array
-    offset_sigmas: Array
-    seconds: Array
-    reasons: tuple[str, ...]
-    cameras: tuple[str, ...]
-    stages: tuple[str, ...]
+    stamps: Array  # (N,) s
+    frames: NDArray[np.int64]  # (N,) images given
+    base_from_surface: Array  # (N, 4, 4) mm
+    covariance: Array  # (N, 6, 6), as in SurfacePose
+    twist: Array  # (N, 6), as in SurfacePose
+    moving: NDArray[np.bool_]  # (N,), as in SurfaceMotion like the next three
+    onset: Array  # (N,) s, NaN before the first
+    moved: Array  # (N,) mm
+    turned: Array  # (N,) rad
+    deformation: Array  # (N,) mm, 0 where there is no warp
+    deformation_sigma: Array  # (N,) mm, 0 where there is no warp
+    states: tuple[TrackState, ...]  # N
+    used: NDArray[np.int64]  # (N, C) tracks that carry the pose
+    offsets: Array  # (N, C) s, as in StepReport
+    offset_sigmas: Array  # (N, C) s
+    seconds: Array  # (N, S + 1), of each stage and in all
+    reasons: tuple[str, ...]  # N
+    cameras: tuple[str, ...]  # C names
+    stages: tuple[str, ...]  # S + 1 names, the last one "total"
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -89,7 +90,7 @@ class PoseWriter:
         self._csv = csv.writer(self._csv_file, lineterminator="\n")
         self._csv.writerow(
             [
-                *_HEAD,
+                *_POSE_TABLE_COLUMNS,
                 *_names("tracks_", cameras),
                 *_clock_names(cameras),
                 *(f"ms_{s}" for s in (*stages, "total")),
@@ -160,8 +161,8 @@ def read_poses(path: Path) -> PoseTable:
     """
     rows = [row for _, row in checks.read_csv(path, "a poses.csv of stillbed track")]
     head = rows[0] if rows else []
-    if tuple(head[: len(_HEAD)]) != _HEAD or head[-1:] != ["reason"]:
-        raise InputError(path, "header", ",".join(head[:4]), f"{','.join(_HEAD[:4])}, ...")
+    if tuple(head[: len(_POSE_TABLE_COLUMNS)]) != _POSE_TABLE_COLUMNS or head[-1:] != ["reason"]:
+        raise InputError(path, "header", ",".join(head[:4]), f"{','.join(_POSE_TABLE_COLUMNS[:4])}, ...")
     body = rows[1:]
     if body and len(body[-1]) != len(head):
         body = body[:-1]
@@ -171,7 +172,7 @@ def read_poses(path: Path) -> PoseTable:
 def _table(path: Path, head: list[str], body: list[list[str]]) -> PoseTable:
     cameras = tuple(name.removeprefix("tracks_") for name in head if name.startswith("tracks_"))
     stages = tuple(name.removeprefix("ms_") for name in head if name.startswith("ms_"))
-    learned = head[len(_HEAD) + len(cameras) : len(head) - 1 - len(stages)]
+    learned = head[len(_POSE_TABLE_COLUMNS) + len(cameras) : len(head) - 1 - len(stages)]
     if learned not in ([], _clock_names(cameras)):
         raise InputError(path, "header", ",".join(learned), ",".join(_clock_names(cameras)))
     state_column = head.index("state")
@@ -225,3 +226,56 @@ def _numbers(path: Path, head: list[str], cells: list[list[str]]) -> Array:
             except ValueError:
                 raise InputError(path, f"line {i + 2}: {names[j]}", cell, "a number") from None
     return out
+
+
+WOUND_FILE_NAME = "wound.csv"
+WOUND_COLUMNS = (
+    "stamp_s", "camera", "wound", "confidence", "missed", "area_px", "area_mm2", "centroid_x_px", "centroid_y_px",
+    "roi_x0_px", "roi_y0_px", "roi_x1_px", "roi_y1_px",
+)  # fmt: skip
+
+
+class WoundFile:
+    """Segments beside a run, in one thread, and writes what it finds; a sink of `hardware.offline.track.follow`."""
+
+    def __init__(self, folder: Path, rig: Rig, segmenter: Segmenter) -> None:
+        from perception.tracking.wound_step import SEGMENTATION_DELAY_SETS, AsyncSegmentation  # loads onnxruntime
+
+        self._rig, self._thread = rig, ThreadPoolExecutor(1)
+        self._beside = AsyncSegmentation(rig, segmenter, self._thread)
+        self._poses: deque[SurfacePose] = deque(maxlen=SEGMENTATION_DELAY_SETS + 1)
+        self._stream = (folder / WOUND_FILE_NAME).open("w", newline="", encoding="utf-8")
+        self._table = csv.writer(self._stream, lineterminator="\n")
+        self._table.writerow(WOUND_COLUMNS)
+
+    def write(self, frames: FrameSet, pose: SurfacePose, report: StepReport) -> None:
+        """One frame set and its pose; rows of earlier pictures where a look at them is done."""
+        self._poses.append(pose)
+        due = self._beside(frames)
+        if due is None:
+            return
+        stamp, sights = due
+        measured = [p for p in self._poses if p.stamp == stamp and p.state.measured]
+        for camera, sight in sights.items():
+            self._table.writerow(self._row(stamp, camera, sight, measured[0] if measured else None))
+        self._stream.flush()
+
+    def _row(self, stamp: float, camera: int, sight: WoundEstimate, pose: SurfacePose | None) -> list[str | int]:
+        from perception.wound.segmentation import area_on_plane
+
+        area = np.nan
+        if pose is not None and sight.box is not None:
+            area = area_on_plane(sight.mask, self._rig.cameras[camera], pose.base_from_surface)
+        visible = sight.box is not None
+        middle = [f"{value:.2f}" for value in sight.centroid] if visible else ["", ""]
+        return [
+            f"{stamp:.6f}", self._rig.cameras[camera].name, int(visible), f"{sight.confidence:.4f}", sight.missed,
+            int(sight.mask.sum()), f"{area:.2f}" if np.isfinite(area) else "", *middle, *sight.roi,
+        ]  # fmt: skip
+
+    def __enter__(self) -> WoundFile:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._thread.shutdown(cancel_futures=True)
+        self._stream.close()

@@ -1,4 +1,4 @@
-"""rig.toml: the calibrated cameras of a session and where each one's images are."""
+"""rig.toml: the calibrated cameras of a session and where each one's images are. board.toml: the printed board."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from hardware.process import checks
 from hardware.process.checks import Table
+from perception.boards.board import BOARD_KINDS, DICTIONARIES, Board
 
 CAMERA_KEYS = ("name", "size", "matrix", "distortion", "base_from_camera")
-SIGMA_KEY = "lens_sigma"  # one standard deviation of fx fy cx cy k1 k2 p1 p2 k3, where a calibration told it
+SIGMA_KEY = "lens_sigma"  # standard deviations of fx fy cx cy k1 k2 p1 p2 k3, where a calibration gave them
 RECORDED_KEYS = ("video", "images")  # where a recorded session's images are
 LIVE_KEYS = (
     "source",
@@ -31,33 +32,27 @@ LIVE_KEYS = (
 PINHOLE = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px"
 ROTATION_TOLERANCE = 1e-3  # four digits written by hand pass (and are made orthonormal); a wrong matrix does not
 EXACT_ROTATION = 1e-12  # below, the matrix is kept bit by bit, so that a rig written by us comes back the same
-NEAREST_RIG = 10.0  # mm: two lenses cannot stand closer, but a rig of up to 10 m given in metres does
-WIDEST_RIG = 1e5  # mm: 100 m
-SHORTEST_FOCAL = 0.1  # of the image's longer side: 157 degrees; a focal length in mm instead of px is far below
+MIN_RIG_SPAN = 10.0  # mm: two lenses cannot stand closer, but a rig of up to 10 m given in metres does
+MAX_RIG_SPAN = 1e5  # mm: 100 m
+MIN_FOCAL_SHARE = 0.1  # of the image's longer side: 157 degrees; a focal length in mm instead of px is far below
 
 
 @dataclass(frozen=True, slots=True)
 class ImageSource:
-    """Where one camera's images are. kind: "video" (a file), "images" (a glob) or "source" (live).
+    """Where one camera's images are."""
 
-    pattern: relative to the folder; a live source as its key has it.
-    """
-
-    kind: str
-    pattern: str
+    kind: str  # "video" (a file), "images" (a glob) or "source" (live)
+    pattern: str  # relative to the folder; a live source as its key has it
 
 
 @dataclass(frozen=True, slots=True)
 class RigFile:
-    """What rig.toml says. sources: one per camera, None where none is named. surface: the scan's file, if named.
-
-    lens_sigma: per camera one standard deviation (9,) of fx fy cx cy k1 k2 p1 p2 k3, None where it is not told.
-    """
+    """What rig.toml says."""
 
     rig: Rig
-    sources: tuple[ImageSource | None, ...]
-    surface: str | None
-    lens_sigma: tuple[Array | None, ...]
+    sources: tuple[ImageSource | None, ...]  # of each camera
+    surface: str | None  # the scan's file
+    lens_sigma: tuple[Array | None, ...]  # (9,) of each camera, standard deviations of fx fy cx cy k1 k2 p1 p2 k3
 
 
 def read_rig(path: str | Path) -> RigFile:
@@ -73,7 +68,7 @@ def read_rig(path: str | Path) -> RigFile:
 
 
 def read_uncalibrated(path: Path) -> RigFile:
-    """A rig.toml that says of each camera only `name`, `size` and where its images are; the rest is a stand-in."""
+    """A rig.toml with only `name`, `size` and images of each camera; lens and place are placeholders."""
     table = checks.read_toml(path)
     checks.check_keys(path, "", table, ["camera"], ["surface"])
     entries = checks.tables(path, "camera", table.get("camera"))
@@ -83,13 +78,13 @@ def read_uncalibrated(path: Path) -> RigFile:
         f, middle = float(size.max()), (size - 1) / 2
         entry["matrix"] = [[f, 0.0, float(middle[0])], [0.0, f, float(middle[1])], [0.0, 0.0, 1.0]]
         entry["distortion"] = [0.0] * 5
-        entry["base_from_camera"] = se3.make(np.eye(3), [NEAREST_RIG * number, 0.0, 0.0]).tolist()
+        entry["base_from_camera"] = se3.make(np.eye(3), [MIN_RIG_SPAN * number, 0.0, 0.0]).tolist()
     rig = rig_from_table(path, table, ("video", "images"))
     return RigFile(rig, tuple(_source(path, entry) for entry in entries), None, (None,) * len(rig))
 
 
 def is_calibrated(path: Path) -> bool:
-    """Whether every camera of a rig.toml has a lens and a place."""
+    """Whether a camera of a rig.toml has a lens or a place."""
     table = checks.read_toml(path)
     entries = checks.tables(path, "camera", table.get("camera"))
     return any("matrix" in entry or "base_from_camera" in entry for entry in entries)
@@ -124,10 +119,7 @@ def table_from_rig(rig: Rig) -> Table:
 
 
 def write_rig(
-    path: str | Path,
-    rig: Rig,
-    sources: Sequence[ImageSource | None],
-    lens_sigma: Sequence[Array | None] | None = None,
+    path: str | Path, rig: Rig, sources: Sequence[ImageSource | None], lens_sigma: Sequence[Array | None] | None = None
 ) -> None:
     """Write a rig.toml that `read_rig` reads back to the same rig, bit by bit. lens_sigma: (9,) per camera, or None."""
     sigmas = [None] * len(rig) if lens_sigma is None else lens_sigma
@@ -194,9 +186,9 @@ def _check_matrix(where: object, key: str, matrix: Array, longer_side: float) ->
     for name, focal in (("fx", matrix[0, 0]), ("fy", matrix[1, 1])):
         if focal <= 0:
             raise InputError(where, f"{key} {name}", focal, "a focal length > 0 px")
-        if focal < SHORTEST_FOCAL * longer_side:
-            least = SHORTEST_FOCAL * longer_side
-            allowed = f">= {least:g} px, {SHORTEST_FOCAL} of the image's longer side (px, not mm)"
+        if focal < MIN_FOCAL_SHARE * longer_side:
+            least = MIN_FOCAL_SHARE * longer_side
+            allowed = f">= {least:g} px, {MIN_FOCAL_SHARE} of the image's longer side (px, not mm)"
             raise InputError(where, f"{key} {name}", focal, allowed)
     if matrix[0, 1] or matrix[1, 0] or (matrix[2] != [0, 0, 1]).any():
         raise InputError(where, key, matrix.tolist(), PINHOLE)
@@ -213,18 +205,87 @@ def _rigid(where: object, key: str, matrix: Array) -> Array:
 
 
 def _check_scale(where: object, cameras: Sequence[Camera]) -> None:
-    """Refuse a rig in metres: no two lenses can stand within 10 mm of each other, and here all of them do.
+    """Refuse a rig in metres, in which all lenses seem to stand within 10 mm of each other; no two can.
 
-    One camera alone has no baseline, so its unit cannot be told; nor is one near pair among others refused.
+    One camera alone has no baseline, so its unit cannot be told. One near pair among others is not refused.
     """
     centres = np.stack([c.base_from_camera[:3, 3] for c in cameras])
-    if (farthest := float(np.abs(centres).max())) > WIDEST_RIG:  # what is larger by far has no square
-        allowed = f"at most {WIDEST_RIG:g} mm along each axis (lengths are in mm)"
+    if (farthest := float(np.abs(centres).max())) > MAX_RIG_SPAN:  # its square may overflow
+        allowed = f"at most {MAX_RIG_SPAN:g} mm along each axis (lengths are in mm)"
         raise InputError(where, "base_from_camera of all cameras", f"up to {farthest:.4g} mm from the base", allowed)
     spread = float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
-    if len(cameras) > 1 and spread < NEAREST_RIG:
-        allowed = f"{NEAREST_RIG:g} mm or more between the outermost cameras (lengths are in mm, not m)"
+    if len(cameras) > 1 and spread < MIN_RIG_SPAN:
+        allowed = f"{MIN_RIG_SPAN:g} mm or more between the outermost cameras (lengths are in mm, not m)"
         raise InputError(where, "base_from_camera of all cameras", f"at most {spread:.4g} mm apart", allowed)
-    if max(spread, float(np.linalg.norm(centres, axis=1).max())) > WIDEST_RIG:
-        allowed = f"at most {WIDEST_RIG:g} mm from the base and from each other (lengths are in mm)"
+    if max(spread, float(np.linalg.norm(centres, axis=1).max())) > MAX_RIG_SPAN:
+        allowed = f"at most {MAX_RIG_SPAN:g} mm from the base and from each other (lengths are in mm)"
         raise InputError(where, "base_from_camera of all cameras", f"{spread:.4g} mm apart", allowed)
+
+
+DEFAULT_BOARD = Board()
+BOARD_KEYS = ("kind", "squares", "square_mm")
+OPTIONAL_BOARD_KEYS = ("marker", "dictionary", "inverted", "legacy")
+MIN_SQUARES, MAX_SQUARES = 3, 60  # squares along an edge
+SQUARE_SIZE_RANGE = (0.5, 500.0)  # mm, a square: from under a microscope to a wall
+MARKER_SHARE_RANGE = (0.3, 0.95)  # of a square: bits large enough to be read, and white around them
+
+
+def read_board(path: str | Path) -> Board:
+    """Read and check a board.toml; InputError names the key that is wrong."""
+    path = Path(path)
+    table = checks.read_toml(path)
+    checks.check_keys(path, "", table, BOARD_KEYS, OPTIONAL_BOARD_KEYS)
+    kind = checks.text(path, "kind", table["kind"])
+    if kind not in BOARD_KINDS:
+        raise InputError(path, "kind", kind, " or ".join(BOARD_KINDS))
+    squares = checks.numbers(path, "squares", table["squares"], (2,), "[columns, rows]")
+    if (squares != squares.round()).any() or (squares < MIN_SQUARES).any() or (squares > MAX_SQUARES).any():
+        raise InputError(
+            path, "squares", table["squares"], f"[columns, rows], whole, {MIN_SQUARES} to {MAX_SQUARES} each"
+        )
+    square = _within(path, "square_mm", table["square_mm"], *SQUARE_SIZE_RANGE)
+    marker = _within(path, "marker", table.get("marker", DEFAULT_BOARD.marker), *MARKER_SHARE_RANGE)
+    dictionary = str(table.get("dictionary", DEFAULT_BOARD.dictionary)).removeprefix("DICT_")
+    if dictionary not in DICTIONARIES:
+        raise InputError(path, "dictionary", dictionary, checks.one_of_text(dictionary, DICTIONARIES))
+    flags = [_flag(path, key, table.get(key, False)) for key in ("inverted", "legacy")]
+    columns, rows = int(squares[0]), int(squares[1])
+    board = Board(kind, (columns, rows), square, marker, dictionary, *flags)
+    _check_whole(path, board)
+    return board
+
+
+def write_board(path: Path, board: Board) -> None:
+    """Write a board.toml that `read_board` reads back to the same board."""
+    lines = [
+        f'kind = "{board.kind}"',
+        f"squares = {list(board.squares)}",
+        f"square_mm = {checks.toml_number(board.square)}",
+    ]
+    if board.kind == "charuco":
+        lines += [f"marker = {checks.toml_number(board.marker)}  # of a square", f'dictionary = "{board.dictionary}"']
+        lines += [f"legacy = {str(board.legacy).lower()}"]
+    lines.append(f"inverted = {str(board.inverted).lower()}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _check_whole(path: Path, board: Board) -> None:
+    holds = int(board.dictionary.split("_")[1])
+    if board.markers() > holds:
+        raise InputError(path, "dictionary", board.dictionary, f"one with {board.markers()} markers or more")
+    if board.kind == "chessboard" and sum(board.squares) % 2 == 0:
+        allowed = "an even and an odd number: only then can the board not be taken upside down"
+        raise InputError(path, "squares", list(board.squares), allowed)
+
+
+def _within(path: Path, key: str, value: object, low: float, high: float) -> float:
+    number = checks.number(path, key, value)
+    if not low <= number <= high:
+        raise InputError(path, key, number, f"{low:g} to {high:g}")
+    return number
+
+
+def _flag(path: Path, key: str, value: object) -> bool:
+    if not isinstance(value, bool):
+        raise InputError(path, key, value, "true or false")
+    return value

@@ -1,4 +1,4 @@
-"""A recorded session: rig, images by stamp, and what is known beside them; one reader for both containers."""
+"""A recorded session: its rig, its images by stamp, and what else was recorded: truth, scan, print head."""
 
 from __future__ import annotations
 
@@ -7,32 +7,67 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
-from estimation.errors import InputError
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import se3
+from estimation.pose import Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.trajectory import Trajectory
-from hardware.heads import NO_HEADS, Heads
-from perception.frames import Frame, FrameSet, Image, Roi
+from perception.frames import Frame, FrameSet, Image, PrintHead, Roi
 from perception.pairing import frame_period, frame_set, pair, pairing_tolerance
 
 SURFACE_SUFFIXES = (".ply", ".stl", ".obj")
+HEAD_STAMP_TOLERANCE = 0.002  # s from a row to its frame set: the rounding of stamps, far below a frame's period
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PrintHeadLog:
+    """Where the print head was at each frame set of a session with an arm, in order of stamp, as stored."""
+
+    rows: Array  # (N, 8) stamp x y z qx qy qz qw of base_from_nozzle, s and mm
+    extruding: NDArray[np.bool_]  # (N,) whether ink flowed
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def at(self, stamp: float) -> PrintHead | None:
+        """The head of the frame set at `stamp`, s; None where there is no row near enough."""
+        if not len(self):
+            return None
+        after = int(np.searchsorted(self.rows[:, 0], stamp))
+        near = min({max(after - 1, 0), min(after, len(self) - 1)}, key=lambda i: abs(float(self.rows[i, 0]) - stamp))
+        if abs(self.rows[near, 0] - stamp) > HEAD_STAMP_TOLERANCE:
+            return None
+        return head_from_row(self.rows[near], bool(self.extruding[near]))
+
+
+NO_PRINT_HEADS = PrintHeadLog(np.empty((0, 8)), np.empty(0, bool))
+
+
+def head_from_row(row: Array | Sequence[float], extruding: bool) -> PrintHead:
+    """The print head in a row (8,) of stamp x y z qx qy qz qw, s and mm."""
+    return PrintHead(se3.make(se3.rotation_from_quaternion(row[4:]), row[1:4]), extruding)
+
+
+def row_from_head(stamp: float, head: PrintHead) -> Array:
+    """The row (8,) of stamp x y z qx qy qz qw, s and mm, that holds a print head."""
+    nozzle = head.base_from_nozzle
+    return np.array([stamp, *nozzle[:3, 3], *se3.quaternion_from_rotation(nozzle[:3, :3])])
 
 
 @dataclass(frozen=True, slots=True)
 class FrameRef:
-    """One image that is stored somewhere. number: its place among its camera's images, from 0.
-
-    camera_stamp: s, on the camera's own clock, as stored. stamp: s, with the camera's clock offset added.
-    """
+    """One stored image."""
 
     camera: int
-    number: int
-    camera_stamp: float
-    stamp: float
+    number: int  # among its camera's images, from 0
+    camera_stamp: float  # s, on the camera's own clock, as stored
+    stamp: float  # s, with the camera's clock offset added
 
 
 class FrameReader(Protocol):
-    """Decodes images; asked for each camera's in rising order."""
+    """Decodes images; each camera's are asked for in rising order."""
 
     def read(self, ref: FrameRef) -> Image:
         """The image; InputError where it is missing, undecodable or not of the camera's size."""
@@ -43,7 +78,7 @@ class FrameReader(Protocol):
         ...
 
     def close(self) -> None:
-        """Give files and decoders back."""
+        """Close files and decoders."""
         ...
 
 
@@ -57,31 +92,25 @@ class FrameStore(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Session:
-    """A recorded session, checked as far as that goes without decoding every image.
-
-    rig: the cameras. roi: where the surface is at the start. surface: the scan's file (mm) or None (of an MCAP a copy
-    that lives as long as the session). truth: base_from_surface or None; `truth.exact` tells truth.tum from
-    reference.tum. sets: what belongs to one instant, in order of stamp. damage: what was lost of the file, "" if
-    nothing; all that is here was read whole. heads: where the print head was, of the sets that had one.
-    """
+    """A recorded session, checked as far as that goes without decoding every image."""
 
     path: Path
     rig: Rig
-    roi: tuple[Roi, ...]
-    surface: Path | None
-    truth: Trajectory | None
-    sets: tuple[tuple[FrameRef, ...], ...]
+    roi: tuple[Roi, ...]  # where the surface is at the start
+    surface: Path | None  # the scan's file, mm; of an MCAP file a copy that lives as long as the session
+    truth: Trajectory | None  # base_from_surface; its `exact` tells truth.tum from reference.tum
+    sets: tuple[tuple[FrameRef, ...], ...]  # the images of one instant each, in order of stamp
     store: FrameStore
-    damage: str = ""
-    heads: Heads = NO_HEADS
+    damage: str = ""  # what was lost of the file, "" if nothing; all that is here was read whole
+    heads: PrintHeadLog = NO_PRINT_HEADS
 
     def __len__(self) -> int:
         return len(self.sets)
 
     def frame_sets(self) -> Iterator[FrameSet]:
-        """The frame sets in order of stamp, each decoded when it is asked for; stamps are on the cameras' common clock.
+        """The frame sets in order of stamp on the cameras' common clock, each decoded when it is asked for.
 
-        InputError where an image turns out to be missing or undecodable; the sets before it have been given out.
+        InputError where an image turns out to be missing or undecodable; the sets before it were yielded.
         """
         reader = self.store.open()
         try:
@@ -92,25 +121,9 @@ class Session:
             reader.close()
 
 
-def damage_told(damage: str) -> str:
+def damage_text(damage: str) -> str:
     """A session's damage as a sentence; "" where there is none."""
     return f"The recording is damaged: {damage}." if damage else ""
-
-
-def open_session(path: str | Path) -> Session:
-    """Open a session folder or an .mcap file; InputError says what is wrong with it."""
-    path = Path(path)
-    if path.is_dir():
-        from hardware.files.session_folder import (
-            open_folder,  # each container's libraries are loaded only for its own files
-        )
-
-        return open_folder(path)
-    if not path.exists():
-        raise InputError(path, "session", "no such file or folder", "a session folder (with rig.toml) or an .mcap file")
-    from hardware.recording.session_reader import open_recording
-
-    return open_recording(path)
 
 
 def common_stamps(rig: Rig, stamps: Sequence[Array]) -> list[Array]:
@@ -119,7 +132,7 @@ def common_stamps(rig: Rig, stamps: Sequence[Array]) -> list[Array]:
 
 
 def frame_refs(rig: Rig, stamps: Sequence[Array]) -> tuple[tuple[FrameRef, ...], ...]:
-    """The sets that images of each camera, stored with the rising stamps (N,), s, of its own clock, belong to."""
+    """The frame sets of images with the rising stamps (N,), s, of each camera's own clock."""
     common = common_stamps(rig, stamps)
     refs = [
         FrameRef(camera, number, float(stamps[camera][number]), float(stamp))

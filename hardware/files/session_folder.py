@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from estimation.errors import InputError
+from estimation.pose import Trajectory
 from estimation.rig import Camera
-from estimation.trajectory import Trajectory
-from hardware.files.folder_tables import read_frames, read_heads, read_roi
+from hardware.files.folder_tables import read_frames, read_heads, read_roi, read_tum
 from hardware.files.images import Video, check_size, count_by_decoding, decode
 from hardware.files.rig_file import ImageSource, RigFile, read_rig
-from hardware.files.session import SURFACE_SUFFIXES, FrameRef, Session, common_stamps, frame_refs
-from hardware.heads import NO_HEADS
+from hardware.files.session import NO_PRINT_HEADS, SURFACE_SUFFIXES, FrameRef, Session, common_stamps, frame_refs
 from hardware.process import checks
-from hardware.tum import read_tum
 from perception.frames import Image
 
 TRUTH_FILES = (("truth.tum", True), ("reference.tum", False))  # the first that is there counts
@@ -106,15 +104,15 @@ def open_folder(folder: Path, rig_file: RigFile | None = None) -> Session:
     roi = folder / "roi.toml"
     rois = read_roi(roi, rig, common_stamps(rig, stamps)) if roi.exists() else ()
     head = folder / "head.csv"
-    heads = read_heads(head) if head.exists() else NO_HEADS
+    heads = read_heads(head) if head.exists() else NO_PRINT_HEADS
     sets, surface = frame_refs(rig, stamps), _surface(folder, rig_file)
     return Session(folder, rig, rois, surface, truth_of(folder), sets, FolderStore(cameras), heads=heads)
 
 
 def truth_of(folder: Path) -> Trajectory | None:
     """The trajectory in truth.tum, else in reference.tum, else None."""
-    found = truth_file(folder)
-    return None if found is None else read_tum(*found)
+    files = truth_file(folder)
+    return None if files is None else read_tum(*files)
 
 
 def truth_file(folder: Path) -> tuple[Path, bool] | None:
@@ -129,11 +127,11 @@ def _files(folder: Path, camera: Camera, source: ImageSource | None) -> CameraFi
     if source.kind == "video":
         return CameraFiles(camera, folder / source.pattern, ())
     try:
-        found = [p for p in folder.glob(source.pattern) if p.is_file() and not p.name.startswith(".")]
+        files = [p for p in folder.glob(source.pattern) if p.is_file() and not p.name.startswith(".")]
     except (ValueError, NotImplementedError):
         where, what = folder / "rig.toml", f"camera {camera.name!r}: images"
         raise InputError(where, what, source.pattern, "a glob relative to the folder, as cam_0/*.png") from None
-    return CameraFiles(camera, None, tuple(sorted(found, key=lambda p: _natural(p.as_posix()))))
+    return CameraFiles(camera, None, tuple(sorted(files, key=lambda p: _natural(p.as_posix()))))
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -171,12 +169,12 @@ def _surface(folder: Path, rig_file: RigFile) -> Path | None:
             raise InputError(folder / "rig.toml", "surface", rig_file.surface, f"a file {', '.join(SURFACE_SUFFIXES)}")
         if not path.is_file():
             raise InputError(folder / "rig.toml", "surface", rig_file.surface, "a file that is there")
-        found = [path]
+        files = [path]
     else:
-        found = [p for s in SURFACE_SUFFIXES if (p := folder / f"surface{s}").exists()]
-    if len(found) > 1:
-        names = ", ".join(p.name for p in found)
+        files = [p for s in SURFACE_SUFFIXES if (p := folder / f"surface{s}").exists()]
+    if len(files) > 1:
+        names = ", ".join(p.name for p in files)
         raise InputError(folder, "surface", names, "one of them (or `surface = ` in rig.toml)")
-    if found and not found[0].stat().st_size:
-        raise InputError(found[0], "file", "empty", "a scan of the surface, mm")
-    return found[0] if found else None
+    if files and not files[0].stat().st_size:
+        raise InputError(files[0], "file", "empty", "a scan of the surface, mm")
+    return files[0] if files else None

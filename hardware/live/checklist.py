@@ -1,18 +1,73 @@
-"""The check before a run: cameras, calibration, arm, path, reach, recording; each passes, or says what to do."""
+"""The check before a run (cameras, calibration, arm, path, reach, recording), and the path placed on the surface."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
-from hardware.arm_status import ArmState
-from hardware.live.laid import Laid
+from estimation import se3
+from estimation.pose import SurfacePose
+from estimation.se3 import Array
+from hardware.arm.device import ArmState
+from hardware.arm.profile import ArmProfile, placed
 from hardware.live.records import LiveMotionReport, RecorderReport, TrackingReport
-from hardware.operator.view import Check, Verdict
-from hardware.process.progress import counted
+from hardware.operator.view import Check, CheckVerdict
+from hardware.process.progress import count_text
+from planning.limits import AXIS_MARGIN, JOINT_MARGIN
 from planning.path import Path
+from planning.robot.kinematics import axes_from_nozzle, joints_from_axes
 
-FRESH = 1.0  # s: pictures older than this do not come any more
-PASS, FAIL, BUSY, WARN = Verdict.PASS, Verdict.FAIL, Verdict.BUSY, Verdict.WARN
+AXIS_LETTERS = "XYZABC"
+MAX_PICTURE_AGE = 1.0  # s: a camera whose pictures are older does not deliver any more
+PASS, FAIL, BUSY, WARN = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.BUSY, CheckVerdict.WARN
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedPath:
+    """A path that could be begun."""
+
+    path: Path  # in the tracker's surface frame
+    profile: ArmProfile  # of the arm, with its place
+    unreachable: str  # why the arm cannot print the path where the surface is now, "" if it can
+
+
+def place_path(path: Path, surface_from_path: Array, pose: SurfacePose, profile: ArmProfile, place: bool) -> PlacedPath:
+    """The path on the surface as it is now. place: put the arm where the surface lies below its home, level."""
+    moved = replace(path, surface_from_nozzle=surface_from_path @ path.surface_from_nozzle)
+    there = placed(profile, pose.base_from_surface) if place else profile
+    return PlacedPath(moved, there, reach_problem(moved, pose, there))
+
+
+def raised_path(path: Path, lift: float) -> Path:
+    """The path for a dry run: each checkpoint `lift` mm farther up along its own axis, nothing extruded."""
+    up = se3.make(np.eye(3), np.array([0.0, 0.0, lift]))
+    return replace(path, surface_from_nozzle=path.surface_from_nozzle @ up, extrude=np.zeros(len(path), bool))
+
+
+def reach_problem(path: Path, pose: SurfacePose, profile: ArmProfile) -> str:
+    """Why the arm cannot reach all checkpoints where the surface is now, with the planner's margins; "" if it can."""
+    limits, arm = profile.limits, profile.arm
+    axes = axes_from_nozzle(arm, pose.base_from_surface @ path.surface_from_nozzle)
+    if reason := _outside(axes, limits.low + AXIS_MARGIN, limits.high - AXIS_MARGIN, AXIS_LETTERS):
+        return reason
+    if (model := arm.jointed) is None:
+        return ""
+    names = [f"J{i + 1}" for i in range(6)]
+    return _outside(joints_from_axes(model, axes), model.low + JOINT_MARGIN, model.high - JOINT_MARGIN, names)
+
+
+def _outside(values: Array, low: Array, high: Array, names: str | list[str]) -> str:
+    """The first of values (N, 6) that is not within low and high (6,), in words."""
+    rows, columns = np.nonzero(~((values >= low) & (values <= high)))
+    if not len(rows):
+        return ""
+    row, column = int(rows[0]), int(columns[0])
+    shown = [values[row, column], low[column], high[column]]
+    turns = column >= 3 or len(names[column]) > 1
+    got, least, most = np.rad2deg(shown) if turns else shown
+    unit = "degrees" if turns else "mm"
+    return f"checkpoint {row}: {names[column]} = {got:.1f}, allowed {least:.1f} to {most:.1f} {unit}"
 
 
 def camera_checks(report: TrackingReport | None, now: float) -> tuple[Check, Check]:
@@ -21,16 +76,15 @@ def camera_checks(report: TrackingReport | None, now: float) -> tuple[Check, Che
         return Check("cameras", BUSY, "the tracker starts"), Check("calibration", BUSY, "the tracker starts")
     calibration = Check("calibration", PASS, f"{len(report.cameras)} cameras, {', '.join(report.cameras)}")
     if report.pose is None:
-        waits = "no pictures yet"
-        return Check("cameras", BUSY, waits, "plug in the cameras, or see who else uses them"), calibration
-    if (age := now - report.pose.stamp) > FRESH:
+        remedy = "plug in the cameras, or see who else uses them"
+        return Check("cameras", BUSY, "no pictures yet", remedy), calibration
+    if (age := now - report.pose.stamp) > MAX_PICTURE_AGE:
         return Check("cameras", FAIL, f"no pictures for {age:.1f} s", "plug in the cameras"), calibration
-    missing = [name for i, name in enumerate(report.cameras) if i not in report.seen]
+    missing = [name for i, name in enumerate(report.cameras) if i not in report.delivering]
     if missing:
-        verdict = WARN if len(report.seen) >= 2 else FAIL
-        return Check(
-            "cameras", verdict, f"without {', '.join(missing)}", "plug it in, or look at its lens"
-        ), calibration
+        verdict = WARN if len(report.delivering) >= 2 else FAIL
+        without = f"without {', '.join(missing)}"
+        return Check("cameras", verdict, without, "plug it in, or look at its lens"), calibration
     return Check("cameras", PASS, f"all {len(report.cameras)} deliver"), calibration
 
 
@@ -52,15 +106,15 @@ def arm_check(report: LiveMotionReport | None, stands_home: bool) -> Check:
 def path_check(path: Path, start: float) -> Check:
     """What is to be printed."""
     begun = f", from checkpoint {start:.2f} on" if start else ""
-    return Check("path", PASS, f"{len(path)} checkpoints, {counted(len(np.unique(path.layer)), 'layer')}{begun}")
+    return Check("path", PASS, f"{len(path)} checkpoints, {count_text(len(np.unique(path.layer)), 'layer')}{begun}")
 
 
-def reach_check(laid: Laid | None) -> Check:
+def reach_check(placed_path: PlacedPath | None) -> Check:
     """Whether the arm reaches the path where the surface is."""
-    if laid is None:
+    if placed_path is None:
         return Check("reach", BUSY, "the surface is not found yet")
-    if laid.unreachable:
-        return Check("reach", FAIL, laid.unreachable, "move the arm or the wound, or plan the path anew")
+    if placed_path.unreachable:
+        return Check("reach", FAIL, placed_path.unreachable, "move the arm or the wound, or plan the path anew")
     return Check("reach", PASS, "every checkpoint is within the arm's range where the surface is now")
 
 
@@ -73,7 +127,7 @@ def recorder_check(report: RecorderReport | None) -> Check:
     return Check("recording", PASS, "it writes")
 
 
-def table(checks: tuple[Check, ...]) -> str:
+def checks_table(checks: tuple[Check, ...]) -> str:
     """The check as a table for a terminal."""
     width = max(len(check.name) for check in checks)
     lines = []

@@ -1,52 +1,84 @@
-"""Frame sets from the process of the cameras to that of the tracker: pixels in shared memory, word of them by a pipe.
+"""Where frame sets come from: live cameras, or a recorded session that another process plays into a ring.
 
-Neither side waits for the other: what is written goes round a few slots, the reader takes the newest whole one and
-counts those that it never saw.
+The ring is shared memory of a few slots, written in turn; a pipe gives notice of each set. Neither side waits for the
+other: the reader takes the newest whole set and counts those that it never took.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
+from estimation.errors import StillbedError
 from estimation.se3 import Array
-from hardware.live.arrived import Arrived, Encoded, SourceEnded
-from perception.frames import Frame, FrameSet, Image, PrintHead
+from hardware.process.clock import WallClock
+from perception.frames import Frame, FrameSet, Image, PrintHead, parallel_map
 from perception.pairing import frame_set
-from perception.side_by_side import side_by_side
 
-SLOTS = 4  # sets: a reader that takes the newest one has 100 ms at 30 fps to copy it, which takes 2
-COLOURS = 3
-STORED = 2  # bytes a pixel that an encoded picture may take: more than any PNG of a camera's picture
+RING_SLOTS = 4  # sets: a reader that takes the newest one has 100 ms at 30 fps to copy it, which takes 2
+COLOUR_CHANNELS = 3
+ENCODED_BYTES_PER_PIXEL = 2  # room for an encoded picture: more than any PNG of a camera's picture takes
+
+Encoded = tuple[str, bytes]  # "png" or "jpeg", and the picture as the camera gave it
+
+
+class SourceEnded(StillbedError):
+    """There will be no more pictures; it says why."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimedFrameSet:
+    """A frame set as it reaches the tracker."""
+
+    frames: FrameSet
+    encoded: Mapping[int, Encoded] = field(default_factory=dict)  # by camera, where the camera gave it so
+    handed: float = 0.0  # s, when the newest of its frames was handed over
+    source: float = float("nan")  # s, its stamp on the clock of a recorded session; NaN of live cameras
+    dropped: int = 0  # sets before it that were not taken
+
+
+class FrameSource(Protocol):
+    """Live cameras, or what stands for them."""
+
+    def take(self, patience: float) -> TimedFrameSet | None:
+        """The newest set, waiting `patience` s for one; None where none came. SourceEnded once there will be none."""
+        ...
+
+    def learn(self, offsets: Array) -> None:
+        """How much later than stamped each camera exposes (C,), s, as it is known by now."""
+        ...
+
+    def close(self) -> None:
+        """Let the cameras go."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
-    """One picture of a set. camera: number in the rig. stamp: s. shape: of its array. kind, size: as encoded."""
+class RingPicture:
+    """One picture of a set in the ring."""
 
-    camera: int
-    stamp: float
-    shape: tuple[int, ...]
-    kind: str
-    size: int
+    camera: int  # number in the rig
+    stamp: float  # s
+    shape: tuple[int, ...]  # of its array
+    kind: str  # as encoded, "" where it is not there so
+    size: int  # bytes as encoded
 
 
 @dataclass(frozen=True, slots=True)
-class Word:
-    """What is said of a set. count: of the sets so far. handed: s, when its pixels were there. source: s, its stamp on
-    the clock of a recorded session, where it is of one. head: where the print head was, where the session knows.
-    """
+class SetNotice:
+    """The notice that a set is in the ring."""
 
-    count: int
-    handed: float
-    source: float
-    parts: tuple[Part, ...]
-    head: PrintHead | None
+    count: int  # of the sets so far
+    handed: float  # s, when its pixels were there
+    source: float  # s, its stamp on the clock of the recorded session
+    pictures: tuple[RingPicture, ...]
+    head: PrintHead | None  # where the session knows it
 
 
 class FrameRing:
@@ -54,21 +86,21 @@ class FrameRing:
 
     def __init__(self, sizes: Sequence[tuple[int, int]]) -> None:
         """sizes: (W, H) px of each camera."""
-        self._pixels = [w * h * COLOURS for w, h in sizes]
-        self._stored = [w * h * STORED for w, h in sizes]
+        self._pixels = [w * h * COLOUR_CHANNELS for w, h in sizes]
+        self._stored = [w * h * ENCODED_BYTES_PER_PIXEL for w, h in sizes]
         self._slot = sum(self._pixels) + sum(self._stored)
-        self._memory: Any = RawArray("B", self._slot * SLOTS)
-        self._counts: Any = RawArray("Q", SLOTS)
+        self._memory: Any = RawArray("B", self._slot * RING_SLOTS)
+        self._counts: Any = RawArray("Q", RING_SLOTS)
         self._wanted: Any = RawArray("B", 1)
         self._count = 0  # of the writer
 
-    def put(self, frames: FrameSet, encoded: dict[int, Encoded], now: Callable[[], float], source: float) -> Word:
-        """Write a set over the oldest one; what is to be told of it. now: asked once the pixels are there, s."""
+    def put(self, frames: FrameSet, encoded: dict[int, Encoded], now: Callable[[], float], source: float) -> SetNotice:
+        """Write a set over the oldest one; the notice to be sent. now: the clock, read once the pixels are there."""
         self._count += 1
-        slot = self._count % SLOTS
+        slot = self._count % RING_SLOTS
         memory = np.frombuffer(self._memory, np.uint8)
         self._counts[slot] = 0
-        parts = []
+        pictures = []
         for frame in frames.frames:
             start = self._start(slot, frame.camera)
             memory[start : start + frame.image.size] = frame.image.reshape(-1)
@@ -77,35 +109,35 @@ class FrameRing:
                 kind, data = "", b""
             start += self._pixels[frame.camera]
             memory[start : start + len(data)] = np.frombuffer(data, np.uint8)
-            parts.append(Part(frame.camera, frame.stamp, frame.image.shape, kind, len(data)))
+            pictures.append(RingPicture(frame.camera, frame.stamp, frame.image.shape, kind, len(data)))
         self._counts[slot] = self._count
-        return Word(self._count, now(), source, tuple(parts), frames.head)
+        return SetNotice(self._count, now(), source, tuple(pictures), frames.head)
 
-    def take(self, word: Word) -> tuple[FrameSet, dict[int, Encoded]] | None:
-        """A copy of a set that was told of; None where it is written over already."""
-        slot = word.count % SLOTS
+    def take(self, notice: SetNotice) -> tuple[FrameSet, dict[int, Encoded]] | None:
+        """A copy of the set of a notice; None where it is written over already."""
+        slot = notice.count % RING_SLOTS
         memory = np.frombuffer(self._memory, np.uint8)
 
-        def copied(part: Part) -> Frame:
-            start = self._start(slot, part.camera)
-            image: Image = memory[start : start + int(np.prod(part.shape))].reshape(part.shape).copy()
-            return Frame(part.camera, part.stamp, image)
+        def copied(picture: RingPicture) -> Frame:
+            start = self._start(slot, picture.camera)
+            image: Image = memory[start : start + int(np.prod(picture.shape))].reshape(picture.shape).copy()
+            return Frame(picture.camera, picture.stamp, image)
 
-        frames, encoded = side_by_side(copied, word.parts), dict[int, Encoded]()
-        for part in word.parts:
-            start = self._start(slot, part.camera) + self._pixels[part.camera]
-            if part.size:
-                encoded[part.camera] = part.kind, memory[start : start + part.size].tobytes()
-        whole = replace(frame_set(frames), head=word.head)
-        return (whole, encoded) if self._counts[slot] == word.count else None
+        frames, encoded = parallel_map(copied, notice.pictures), dict[int, Encoded]()
+        for picture in notice.pictures:
+            start = self._start(slot, picture.camera) + self._pixels[picture.camera]
+            if picture.size:
+                encoded[picture.camera] = picture.kind, memory[start : start + picture.size].tobytes()
+        whole = replace(frame_set(frames), head=notice.head)
+        return (whole, encoded) if self._counts[slot] == notice.count else None
 
     @property
     def wanted(self) -> bool:
-        """Whether somebody has begun to ask for frames."""
+        """Whether the reader has begun to ask for frames."""
         return bool(self._wanted[0])
 
     def want(self) -> None:
-        """Let the other side know that frames are asked for."""
+        """Tell the writer that frames are asked for."""
         self._wanted[0] = 1
 
     def _start(self, slot: int, camera: int) -> int:
@@ -114,33 +146,68 @@ class FrameRing:
 
 
 class RingSource:
-    """The reading end: the newest set each time it is asked."""
+    """The reader of a ring."""
 
-    def __init__(self, ring: FrameRing, words: Connection) -> None:
-        self._ring, self._words, self._last = ring, words, 0
+    def __init__(self, ring: FrameRing, notices: Connection) -> None:
+        self._ring, self._notices, self._last = ring, notices, 0
 
-    def take(self, patience: float) -> Arrived | None:
+    def take(self, patience: float) -> TimedFrameSet | None:
         """The newest set, waiting `patience` s for one; None where none came. SourceEnded once there will be none."""
-        word = None
+        notice = None
         self._ring.want()
         try:
-            if self._words.poll(patience):
-                word = self._words.recv()
-                while self._words.poll():
-                    word = self._words.recv()
+            if self._notices.poll(patience):
+                notice = self._notices.recv()
+                while self._notices.poll():
+                    notice = self._notices.recv()
         except (EOFError, OSError):
-            if word is None:
+            if notice is None:
                 raise SourceEnded("the cameras have ended") from None
-        if isinstance(word, str):
-            raise SourceEnded(word)
-        if word is None or (taken := self._ring.take(word)) is None:
+        if isinstance(notice, str):
+            raise SourceEnded(notice)
+        if notice is None or (taken := self._ring.take(notice)) is None:
             return None
-        dropped, self._last = word.count - self._last - 1, word.count
-        return Arrived(taken[0], taken[1], word.handed, word.source, dropped)
+        dropped, self._last = notice.count - self._last - 1, notice.count
+        return TimedFrameSet(taken[0], taken[1], notice.handed, notice.source, dropped)
 
     def learn(self, offsets: Array) -> None:
         """Sets come paired as they were recorded."""
 
     def close(self) -> None:
-        """Let the other end know that nobody listens."""
-        self._words.close()
+        """Close the pipe, which the writer notices."""
+        self._notices.close()
+
+
+class LiveCameraSource:
+    """The newest frame set of the cameras in a rig.toml. rig: their calibration."""
+
+    def __init__(self, file: Path) -> None:
+        from hardware.cameras.live import LiveCameras
+        from hardware.cameras.sources import read_live_rig
+
+        self.rig, sources = read_live_rig(file)
+        self._clock = WallClock()
+        self._cameras = LiveCameras(self.rig, sources, self._clock)
+        self._cameras.start()
+        self._passed = 0
+
+    def take(self, patience: float) -> TimedFrameSet | None:
+        """The newest set, waiting `patience` s for one; None where none came. SourceEnded once all have ended."""
+        until = self._clock.now() + patience
+        frames = self._cameras.next_set(until)
+        now = self._clock.now()
+        if frames is None:
+            if now < until:  # it did not wait: there is nothing to wait for
+                raise SourceEnded("all have ended")
+            return None
+        passed = self._cameras.health().passed_over
+        dropped, self._passed = passed - self._passed, passed
+        return TimedFrameSet(frames, handed=now, dropped=dropped)
+
+    def learn(self, offsets: Array) -> None:
+        """Pair frames as the cameras really expose: (C,) s later than their sets are stamped."""
+        self._cameras.learn(offsets)
+
+    def close(self) -> None:
+        """Let the cameras go."""
+        self._cameras.close()

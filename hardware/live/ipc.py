@@ -1,33 +1,57 @@
-"""The processes of a run: started, watched, and ended; each in a process group of its own."""
+"""The processes of a live run: a group that starts and ends them, what each runs, and the channels that join them.
+
+Each process is spawned and runs one of the functions `run_*` below, which import what only that process needs.
+"""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from pathlib import Path as File
 from typing import Any
 
-from hardware.held_interrupt import held_interrupt
+import numpy as np
 
-CONTEXT = multiprocessing.get_context("spawn")  # a forked child would have loaded all that its parent has
-LAST_WORDS = 10.0  # s that a process gets to close its files, on a busy machine
+from estimation.errors import StillbedError
+from hardware.live.frame_source import FrameRing
+from hardware.live.prepared import Prepared
+from hardware.live.recorder_process import RecorderSender, record
+from hardware.live.records import LiveMotionReport, PoseHandover, PrintStart, RecorderReport, TrackingReport
+from hardware.live.settings import VIRTUAL_ARM
+from hardware.operator.shared_state import OperatorLink
+from hardware.process.clock import WallClock, WatchedClock
+from hardware.process.faults import Fault
+from hardware.process.shared_latest import SharedLatest, SharedPathPlace
+from hardware.process.system import ask_for_real_time, blocked_sigint, set_up_process
+
+SPAWN = multiprocessing.get_context("spawn")  # a forked child would have loaded all that its parent has
+EXIT_TIMEOUT = 10.0  # s that a process gets to close its files, on a busy machine
+ARM_POLL_PERIOD = 0.02  # s between looks for the virtual arm's device
+ARM_START_TIMEOUT = 60.0  # s in which that device must be there, on a busy machine
+ARM_AFTERLIFE = 2.0  # s that a virtual arm goes on without the run: it has to come to rest by itself
+EXECUTED_STEP = 0.002  # s between rows of what a virtual arm executed
+TROUBLE_BYTES = 4096  # of the text that says what is wrong with the arm
+
+ProcessBody = Callable[..., None]
 
 
 @dataclass(slots=True)
-class Crew:
-    """Processes by name."""
+class ProcessGroup:
+    """The processes of a run by name, each in a process group of its own."""
 
     members: dict[str, BaseProcess] = field(default_factory=dict)
 
     def start(self, name: str, body: Callable[..., None], arguments: tuple[Any, ...]) -> None:
         """Start a process. Ends of pipes among its arguments are its own from now on."""
-        process = CONTEXT.Process(target=body, args=arguments, name=name)
-        with held_interrupt():
+        process = SPAWN.Process(target=body, args=arguments, name=name)
+        with blocked_sigint():
             process.start()
         self.members[name] = process
         for argument in arguments:
@@ -55,7 +79,7 @@ class Crew:
         """What becomes ready once a process ends."""
         return [member.sentinel for member in self.members.values() if member.is_alive()]
 
-    def end(self, name: str, patience: float = LAST_WORDS) -> None:
+    def end(self, name: str, patience: float = EXIT_TIMEOUT) -> None:
         """Wait `patience` s for a process to end, ask it to, and then end it, with all that it has started."""
         member = self.members.get(name)
         if member is None:
@@ -63,7 +87,7 @@ class Crew:
         member.join(0 if not member.is_alive() else patience)
         if member.is_alive():
             member.terminate()
-            member.join(LAST_WORDS)
+            member.join(EXIT_TIMEOUT)
         self.kill(name)
 
     def kill(self, name: str) -> None:
@@ -76,3 +100,162 @@ class Crew:
             member.join()
         with suppress(OSError):
             os.killpg(member.pid, signal.SIGKILL)
+
+
+def run_player(prepared: Prepared, ring: FrameRing, notices: Connection, start: PrintStart) -> None:
+    """Show a recorded session, as cameras would."""
+    from hardware.live.session_player import play
+
+    play(prepared, ring, notices, start)
+
+
+def run_tracker(
+    prepared: Prepared,
+    ring: FrameRing,
+    notices: Connection,
+    poses: SharedLatest[PoseHandover],
+    reports: SharedLatest[TrackingReport],
+    motion: SharedLatest[LiveMotionReport],
+    link: OperatorLink,
+    sender: Connection,
+    lifeline: Connection,
+) -> None:
+    """Track the surface."""
+    from hardware.live.tracking_process import TrackingChannels, track
+
+    track(prepared, TrackingChannels(ring, notices, poses, reports, motion, link, sender, lifeline))
+
+
+def run_motion(
+    prepared: Prepared,
+    url: str,
+    place: SharedPathPlace,
+    poses: SharedLatest[PoseHandover],
+    reports: SharedLatest[LiveMotionReport],
+    orders: Connection,
+    link: OperatorLink,
+    trouble: SharedLatest[str],
+    sender: Connection,
+) -> None:
+    """Plan the motion, and send it to the arm at `url`."""
+    from hardware.live.motion_process import MotionChannels, move
+
+    move(prepared, url, MotionChannels(place, poses, reports, orders, link.requests, trouble, sender))
+
+
+def run_arm(prepared: Prepared, device: File, lifeline: Connection) -> None:
+    """Be a virtual arm at `device` until SIGTERM or the end of the lifeline; then write the motion it executed."""
+    from hardware.simulator.arm.ports import run_virtual_arm
+    from hardware.simulator.arm.settings import ArmSettings, ReplyMode, read_virtual_arm
+
+    set_up_process("arm")
+    settings, faults = ArmSettings(replies=ReplyMode.STREAM), tuple[Fault, ...]()
+    if prepared.virtual is not None:
+        settings, faults = read_virtual_arm(prepared.virtual)
+    if prepared.settings.real_time:
+        ask_for_real_time()  # a real controller shares no core with us
+    clock, stop = WatchedClock(WallClock()), threading.Event()
+    threading.Thread(target=_stop_after, args=(lifeline, stop), daemon=True).start()
+    arm = run_virtual_arm(
+        settings, prepared.task.profile, faults, device, clock=clock, stop=stop, say=lambda text: None
+    )
+    assert clock.begun is not None
+    stamps = np.arange(0.0, arm.now, EXECUTED_STEP)  # (N,) s
+    axes = arm.axes_at(stamps) if len(stamps) else np.zeros((0, 6))  # (N, 6)
+    with prepared.files.executed.open("wb") as file:
+        np.savez(file, stamps=stamps + clock.begun, axes=axes, deepest=arm.deepest, held_up=clock.longest)
+
+
+def _stop_after(lifeline: Connection, stop: threading.Event) -> None:
+    """Set `stop` some time after the other end of the lifeline is gone."""
+    lifeline.poll(None)
+    stop.wait(ARM_AFTERLIFE)
+    stop.set()
+
+
+@dataclass(slots=True)
+class RunChannels:
+    """What joins the supervising process to the others."""
+
+    processes: ProcessGroup
+    url: str  # of the arm's port
+    place: SharedPathPlace
+    tracking: SharedLatest[TrackingReport]
+    motion: SharedLatest[LiveMotionReport]
+    recorder: SharedLatest[RecorderReport]
+    orders: Connection  # to the motion process
+    lifeline: Connection  # nothing is sent: its end tells the tracking process that this one is gone
+    arm_lifeline: Connection  # the same for a virtual arm
+    sender: RecorderSender
+    link: OperatorLink
+    trouble: SharedLatest[str]  # why the arm cannot be used at all
+    start: PrintStart
+
+    def end(self) -> None:
+        """End the processes so that none misses another: motion first, then what feeds the recorder, the arm last."""
+        self.processes.end("motion")
+        self.lifeline.close()
+        self.processes.end("tracking")
+        self.processes.end("feed", 1.0)
+        self.sender.close()
+        self.processes.end("recorder", 30.0)
+        self.processes.end("arm", 0.1)
+
+    def close(self) -> None:
+        """Leave no process behind."""
+        for name in list(self.processes.members):
+            self.processes.kill(name)
+
+
+def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> RunChannels:
+    """Start all processes, or none. folder: for a virtual arm's device. tracker: body of the tracking process."""
+    processes = ProcessGroup()
+    try:
+        return _start_all(processes, prepared, folder, tracker)
+    except BaseException:
+        for name in list(processes.members):
+            processes.kill(name)
+        raise
+
+
+def _start_all(processes: ProcessGroup, prepared: Prepared, folder: File, tracker: ProcessBody) -> RunChannels:
+    url = prepared.settings.arm
+    arm_lifeline = SPAWN.Pipe(duplex=False)
+    if url == VIRTUAL_ARM:
+        url = str(folder / "arm")
+        _start_arm(processes, prepared, File(url), arm_lifeline[0])
+    place, ring = SharedPathPlace(), FrameRing([camera.size for camera in prepared.rig.cameras])
+    poses, tracking, motion = (
+        SharedLatest[PoseHandover](),
+        SharedLatest[TrackingReport](),
+        SharedLatest[LiveMotionReport](),
+    )
+    recorder, link, trouble, start = (
+        SharedLatest[RecorderReport](),
+        OperatorLink(),
+        SharedLatest[str](TROUBLE_BYTES),
+        PrintStart(),
+    )
+    senders = [SPAWN.Pipe(duplex=False) for _ in range(3)]
+    lifeline, notices, orders = (SPAWN.Pipe(duplex=False) for _ in range(3))
+    processes.start("recorder", record, (prepared.settings, [end for end, _ in senders], recorder))
+    processes.start(
+        "motion", run_motion, (prepared, url, place, poses, motion, orders[0], link, trouble, senders[0][1])
+    )
+    if not prepared.live:
+        processes.start("feed", run_player, (prepared, ring, notices[1], start))
+    tracking_ends = motion, link, senders[1][1], lifeline[0]
+    processes.start("tracking", tracker, (prepared, ring, notices[0], poses, tracking, *tracking_ends))
+    ends = orders[1], lifeline[1], arm_lifeline[1], RecorderSender(senders[2][1])
+    return RunChannels(processes, url, place, tracking, motion, recorder, *ends, link, trouble, start)
+
+
+def _start_arm(processes: ProcessGroup, prepared: Prepared, device: File, lifeline: Connection) -> None:
+    """Start a virtual arm, and wait for its device."""
+    processes.start("arm", run_arm, (prepared, device, lifeline))
+    clock = WallClock()
+    until = clock.now() + ARM_START_TIMEOUT
+    while not device.is_symlink():
+        if not processes.alive("arm") or clock.now() > until:
+            raise StillbedError("the virtual arm did not start")
+        clock.wait_until(clock.now() + ARM_POLL_PERIOD)

@@ -1,4 +1,4 @@
-"""The body of the motion process of a live run: arm, MotionLoop, reports, and what is recorded of them.
+"""The motion process of a live run: arm, MotionLoop, reports, and what is recorded of them.
 
 Loads nothing that holds Python's lock for long: no gtsam, cv2 or onnxruntime.
 """
@@ -8,190 +8,295 @@ from __future__ import annotations
 import math
 import signal
 from collections import deque
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
-from pathlib import Path as File
 from types import FrameType
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
+from estimation.se3 import Array
+from hardware.arm.device import ArmEvent
 from hardware.arm.link import Arm
-from hardware.arm.port import Device
-from hardware.arm.profile import ArmProfile
-from hardware.arm_status import ArmEvent
-from hardware.bookmark_file import keep_bookmark
-from hardware.link_settings import LinkSettings
-from hardware.live.histograms import Histograms
-from hardware.live.motion import LiveMotion
-from hardware.live.motion_names import EXPOSURE_TO_WIRE, FRAMES_TO_WIRE, LATE
-from hardware.live.outbox import Outbox
-from hardware.live.place import Place
-from hardware.live.records import Begin, Handed, LiveMotionReport, Pace, Span, WireEntry
-from hardware.live.tap import Tap
-from hardware.motion.loop import MotionLoop, Order, Tick
+from hardware.arm.port import Opener, Port, PortOpener
+from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.files.path_file import write_progress_durably
+from hardware.live.prepared import Prepared
+from hardware.live.recorder_process import RecorderSender
+from hardware.live.records import (
+    EXPOSURE_TO_WIRE_STAGE,
+    FRAMES_TO_WIRE_STAGE,
+    LATE_TICK_STAGE,
+    BeginPrint,
+    LiveMotionReport,
+    PauseOrder,
+    PoseHandover,
+    StageHistograms,
+    StageTiming,
+    WireEntry,
+)
+from hardware.motion.loop import MotionLoop, Order, RecordedTick, Tick
+from hardware.motion.step import MotionStep
 from hardware.operator.shared_state import RequestLine
-from hardware.priority import ask_for_real_time
 from hardware.process.clock import WallClock
-from hardware.process.shared_latest import Newest
-from hardware.process.system import settle
-from hardware.process.ticks import InStep
-from hardware.recorded_tick import RecordedTick
+from hardware.process.shared_latest import SharedLatest, SharedPathPlace
+from hardware.process.system import ask_for_real_time, set_up_process
+from hardware.process.ticks import PoseLockedSchedule
+from planning.command import Command, Hold
+from planning.progress import PrintProgress
 
-EVENTS = 50  # of the last ones that a report holds
-SECOND_BYTE = 1  # of a frame: which instruction it is
-MOVE = ord("1")
+PAUSED_REASON = "paused by the operator"
+WAITING_REASON = "no path was confirmed yet"
+MAX_REPORTED_EVENTS = 50  # the last ones
+INSTRUCTION_BYTE, MOVE_INSTRUCTION = 1, ord("1")  # place in a frame, and what stands there in a move
+
+
+class LiveMotion:
+    """The motion of a live run: holds until a path is begun, then a MotionStep that can be paused, or begun at home.
+
+    last: the last command.
+    asked: whether planner and guard gave it.
+    begun: place, in checkpoints, at which the step was made anew since this was last reset to NaN.
+    """
+
+    last: Command
+
+    def __init__(self, profile: ArmProfile, place: SharedPathPlace) -> None:
+        self._profile, self._place = profile, place
+        self._step: MotionStep | None = None
+        self._order: BeginPrint | None = None
+        self.paused = self.asked = False
+        self.begun = math.nan
+
+    def begin(self, order: BeginPrint) -> None:
+        """Print this path from now on."""
+        self._order = order
+        self._make(order.start)
+
+    def homed(self) -> None:
+        """Begin anew at the same place of the path, as the arm stands at home."""
+        if self._step is not None:
+            self._make(self._step.progress.fraction)
+
+    def recalled(self, place: Array, stands: Array) -> None:
+        """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,) on its way."""
+        if self._step is not None:
+            self._step.recalled(place, stands)
+
+    @property
+    def progress(self) -> PrintProgress | None:
+        """How far the print is; None before a path was begun."""
+        return None if self._step is None else self._step.progress
+
+    def __call__(self, pose: SurfacePose | None, now: float) -> Command:
+        """The command of the tick at `now`, s."""
+        self.asked = self._step is not None
+        if self._step is None:
+            self.last = Hold(now, self._profile.limits.pause, WAITING_REASON)
+            return self.last
+        self._step.paused = self.paused
+        self.last = self._step(pose, now)
+        if self.paused and isinstance(self.last, Hold):
+            self.last = replace(self.last, reason=PAUSED_REASON)
+        self._place.fraction = self._step.progress.fraction
+        return self.last
+
+    def _make(self, start: float) -> None:
+        assert self._order is not None
+        self._step = MotionStep(self._order.path, self._order.profile, start)
+        self._place.fraction = self.begun = start
+
+
+ByteListener = Callable[[bytes, bool], None]  # (bytes, whether they were sent rather than received)
+
+
+class PortLogger:
+    """An Opener whose ports call `listener` with all bytes that pass."""
+
+    def __init__(self, opener: Opener, listener: ByteListener) -> None:
+        self._opener, self._listener = opener, listener
+
+    def __call__(self) -> Port:
+        """Open the device."""
+        return _LoggedPort(self._opener(), self._listener)
+
+
+class _LoggedPort:
+    def __init__(self, port: Port, listener: ByteListener) -> None:
+        self._port, self._listener = port, listener
+
+    def write(self, data: bytes) -> int:
+        """Give out bytes without waiting; how many were taken."""
+        taken = self._port.write(data)
+        if taken:
+            self._listener(data[:taken], True)
+        return taken
+
+    def read(self) -> bytes:
+        """The bytes that have come."""
+        data = self._port.read()
+        if data:
+            self._listener(data, False)
+        return data
+
+    def waiting(self) -> int:
+        """Bytes taken that are not on the wire yet."""
+        return self._port.waiting()
+
+    def close(self) -> None:
+        """Let the device go."""
+        self._port.close()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LiveMotionPlan:
-    """On which arm is printed. url: of its port. bookmark: where the place is kept if whoever conducts the run is gone.
+class MotionChannels:
+    """What joins the motion process to the others."""
 
-    real_time: ask for that priority. cores: to run on, all without any.
+    place: SharedPathPlace
+    poses: SharedLatest[PoseHandover]
+    reports: SharedLatest[LiveMotionReport]
+    orders: Connection
+    requests: RequestLine  # of the operator's page
+    trouble: SharedLatest[str]  # why the arm cannot be used at all
+    recorder: Connection
+
+
+class _OrderReceiver:
+    """Takes the orders: those of a live run are followed here, those of the arm are returned.
+
+    alone: whether the process that gives the orders is gone. fingerprint: of the path that was begun, "" before.
     """
 
-    profile: ArmProfile
-    url: str
-    bookmark: File
-    settings: LinkSettings = field(default_factory=LinkSettings)
-    real_time: bool = True
-    cores: tuple[int, ...] = ()
-
-
-class _Orders:
-    """Takes the orders; those of a live run are followed here, those of the arm are passed on."""
-
-    def __init__(self, connection: Connection, motion: LiveMotion, wishes: RequestLine, rhythm: InStep) -> None:
-        self._connection, self._motion, self._wishes, self._rhythm = connection, motion, wishes, rhythm
-        self._stopped = wishes.last_stop
+    def __init__(self, channels: MotionChannels, motion: LiveMotion, ticks: PoseLockedSchedule) -> None:
+        self._connection, self._requests, self._motion, self._ticks = channels.orders, channels.requests, motion, ticks
+        self._last_stop = channels.requests.last_stop
         self.alone, self.fingerprint = False, ""
         self._ended = False
         signal.signal(signal.SIGTERM, self._end)
 
     def __call__(self) -> list[Order]:
-        taken: list[Order] = []
-        if (stop := self._wishes.last_stop) != self._stopped:  # the page's stop takes no way through the conductor
-            self._stopped = stop
-            taken.append(Order.STOP)
+        orders: list[Order] = []
+        if (stop := self._requests.last_stop) != self._last_stop:  # a stop of the page does not wait for the run's loop
+            self._last_stop = stop
+            orders.append(Order.STOP)
         try:
             while self._connection.poll():
                 order = self._connection.recv()
                 if isinstance(order, Order):
-                    taken.append(order)
+                    orders.append(order)
                 else:
                     self._follow(order)
         except (EOFError, OSError):
             self.alone = True
-        return [*taken, Order.QUIT] if self.alone or self._ended else taken
+        return [*orders, Order.QUIT] if self.alone or self._ended else orders
 
-    def _follow(self, order: Begin | Pace) -> None:
-        if isinstance(order, Begin):
-            self.fingerprint, self._rhythm.tick = order.fingerprint, order.profile.tick
+    def _follow(self, order: BeginPrint | PauseOrder) -> None:
+        if isinstance(order, BeginPrint):
+            self.fingerprint, self._ticks.tick = order.fingerprint, order.profile.tick
             self._motion.begin(order)
         else:
-            self._motion.paused = order is Pace.PAUSE
+            self._motion.paused = order is PauseOrder.PAUSE
 
     def _end(self, number: int, frame: FrameType | None) -> None:
         self._ended = True
 
 
-class _Watch:
-    """Measures the way from frames to the wire, records what passes, reports each tick."""
+class _TickReporter:
+    """Times the way from frames to the wire, records what passes the port, and reports each tick."""
 
     def __init__(
-        self,
-        plan: LiveMotionPlan,
-        poses: Newest[Handed],
-        reports: Newest[LiveMotionReport],
-        outbox: Outbox,
-        rhythm: InStep,
+        self, channels: MotionChannels, sender: RecorderSender, ticks: PoseLockedSchedule, priority: str
     ) -> None:
-        self._poses, self._reports, self._outbox, self._rhythm = poses, reports, outbox, rhythm
-        self._clock = WallClock()
-        self.times = Histograms()
-        self._priority = ask_for_real_time() if plan.real_time else "nothing asked for"
-        self._events: deque[ArmEvent] = deque(maxlen=EVENTS)
-        self._given: Handed | None = None  # the newest pose that was looked at
-        self._first = False  # whether no move made of it went out yet
+        self._poses, self._reports, self._sender, self._ticks = channels.poses, channels.reports, sender, ticks
+        self._clock, self._priority = WallClock(), priority
+        self.times = StageHistograms()
+        self._events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
+        self._handover: PoseHandover | None = None  # the newest
+        self._unsent = False  # whether no move made of that pose went out yet
         self.loop: MotionLoop | None = None
         self.motion: LiveMotion | None = None
 
-    def pose(self) -> SurfacePose | None:
+    def newest_pose(self) -> SurfacePose | None:
         """The newest pose there is."""
-        handed = self._poses.get()
-        if handed is not self._given:
-            self._given, self._first = handed, True
-            if handed is not None:
-                self._rhythm.arrived(handed.put)
-        return None if handed is None else handed.pose
+        handover = self._poses.get()
+        if handover is not self._handover:
+            self._handover, self._unsent = handover, True
+            if handover is not None:
+                self._ticks.arrived(handover.sent)
+        return None if handover is None else handover.pose
 
-    def heard(self, data: bytes, sent: bool) -> None:
-        """Bytes passed the port."""
-        now, frame = self._clock.now(), b"" if self.motion is None else self.motion.frame
-        made = sent and data == frame and frame[SECOND_BYTE] == MOVE  # the arm's own way home is made of no pose
-        if made and self._first and self._given is not None:
-            self._first = False
-            self.times.add(FRAMES_TO_WIRE, now - self._given.handed)
-            self.times.add(EXPOSURE_TO_WIRE, now - self._given.pose.stamp)
-        self._outbox.put(WireEntry(now, data, sent))
+    def bytes_passed(self, data: bytes, sent: bool) -> None:
+        """Record bytes of the port, and time the first move made of a pose."""
+        now, frame = self._clock.now(), b"" if self.loop is None else self.loop.arm.command_frame
+        planned = sent and data == frame and frame[INSTRUCTION_BYTE] == MOVE_INSTRUCTION  # the way home has no pose
+        if planned and self._unsent and self._handover is not None:
+            self._unsent = False
+            self.times.add(FRAMES_TO_WIRE_STAGE, now - self._handover.handed)
+            self.times.add(EXPOSURE_TO_WIRE_STAGE, now - self._handover.pose.stamp)
+        self._sender.put(WireEntry(now, data, sent))
 
-    def told(self, tick: Tick) -> None:
-        """A tick is done."""
+    def report(self, tick: Tick) -> None:
+        """Record and report a tick that is done."""
         loop, motion = self.loop, self.motion
         assert loop is not None and motion is not None
         self._events.extend(loop.arm.events())
         progress, late = motion.progress, loop.lateness
         if progress is not None:
-            stamp = math.nan if self._given is None else self._given.pose.stamp
+            stamp = math.nan if self._handover is None else self._handover.pose.stamp
             asked, begun = motion.asked and motion.last.stamp == tick.stamp, motion.begun
-            motion.begun, frame = math.nan, motion.frame if asked else b""
-            came_to = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
-            self._outbox.put(
-                RecordedTick(tick.stamp, stamp, asked, begun, motion.paused, tick.command, frame, *came_to)
+            motion.begun, frame = math.nan, loop.arm.command_frame if asked else b""
+            reached = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
+            self._sender.put(
+                RecordedTick(tick.stamp, stamp, asked, begun, motion.paused, tick.command, frame, *reached)
             )
-        spans = (*self.times.spans(), Span(LATE, late.count, late.percentile(50), late.percentile(99), late.most))
+        lateness = StageTiming(LATE_TICK_STAGE, late.count, late.percentile(50), late.percentile(99), late.most)
         stops = loop.arm.stops
         self._reports.put(
             LiveMotionReport(
-                *(tick, progress, motion.paused, tuple(self._events), spans, loop.skipped, len(stops)),
-                *(stops[-1] if stops else None, self._outbox.dropped, self._priority),
+                tick=tick,
+                progress=progress,
+                paused=motion.paused,
+                events=tuple(self._events),
+                timings=(*self.times.timings(), lateness),
+                skipped=loop.skipped,
+                stops=len(stops),
+                stop=stops[-1] if stops else None,
+                unrecorded=self._sender.dropped,
+                priority=self._priority,
             )
         )
 
 
-def live_motion_process(
-    plan: LiveMotionPlan,
-    place: Place,
-    poses: Newest[Handed],
-    reports: Newest[LiveMotionReport],
-    orders: Connection,
-    wishes: RequestLine,
-    trouble: Newest[str],
-    record: Connection,
-) -> None:
-    """Follow orders until told to QUIT, or until whoever gives them is gone; then the arm is stopped.
+def move(prepared: Prepared, url: str, channels: MotionChannels) -> None:
+    """The body of the process: follow orders until QUIT, or until the process that gives them is gone.
 
-    trouble: is told why the arm cannot be used at all.
+    Then the arm is stopped; in the second case the place on the path is kept here. url: of the arm's port.
     """
-    settle("motion", plan.cores)
-    clock, device, outbox = WallClock(), Device(plan.url, plan.profile.baud), Outbox(record)
-    rhythm = InStep(plan.profile.tick, plan.settings.ease, clock.now())
-    motion, watch = LiveMotion(plan.profile, place), _Watch(plan, poses, reports, outbox, rhythm)
-    told = _Orders(orders, motion, wishes, rhythm)
+    settings, profile = prepared.settings, prepared.task.profile
+    set_up_process("motion", settings.cores_motion)
+    clock, device, sender = WallClock(), PortOpener(url, profile.baud), RecorderSender(channels.recorder)
+    link_settings = LinkSettings(pause_frame=settings.pause_frame)
+    ticks = PoseLockedSchedule(profile.tick, link_settings.ease, clock.now())
+    motion = LiveMotion(profile, channels.place)
+    priority = ask_for_real_time() if settings.real_time else "nothing asked for"
+    reporter = _TickReporter(channels, sender, ticks, priority)
+    orders = _OrderReceiver(channels, motion, ticks)
     try:
-        arm = Arm(Tap(device, watch.heard), plan.profile, clock.now(), plan.settings)
-        watch.motion = motion
-        loop = watch.loop = MotionLoop(motion, arm, clock, watch.pose, told, watch.told, motion.homed, rhythm)
+        arm = Arm(PortLogger(device, reporter.bytes_passed), profile, clock.now(), link_settings)
+        reporter.motion = motion
+        poses, report = reporter.newest_pose, reporter.report
+        loop = reporter.loop = MotionLoop(motion, arm, clock, poses, orders, report, motion.homed, ticks)
         try:
             loop.run()
         finally:
-            watch.loop = None
+            reporter.loop = None
             arm.close()
     except InputError as error:
-        trouble.put(str(error))
+        channels.trouble.put(str(error))
     finally:
         device.release()
-        if told.alone and told.fingerprint:
-            keep_bookmark(plan.bookmark, told.fingerprint, place.fraction)
-        for entry in watch.times.entries(clock.now()):
-            outbox.put(entry)
-        outbox.close()
+        if orders.alone and orders.fingerprint:
+            write_progress_durably(prepared.files.progress, orders.fingerprint, channels.place.fraction)
+        for entry in reporter.times.entries(clock.now()):
+            sender.put(entry)
+        sender.close()

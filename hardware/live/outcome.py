@@ -1,104 +1,249 @@
-"""What a run came to: its message, exit code, summary.json and report.html."""
+"""What a run came to: counted while it goes, written at its end as message, exit code, summary.json and report.html.
+
+The counts take the same memory however long the run lasts. What reports need is loaded once the arm is at rest.
+"""
 
 from __future__ import annotations
 
 import json
+import re
 import signal
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
+from math import nan
 from typing import Any
 
 import numpy as np
 
-from hardware.live.checklist import table
-from hardware.live.course import Course
+from estimation import se3
+from estimation.se3 import Array
+from hardware.live.checklist import checks_table
 from hardware.live.prepared import Prepared
-from hardware.live.records import Span
-from hardware.live.state_machine import Conductor, Seen
-from hardware.live.tally import Tally
-from hardware.page import area_key, document, figures_table, legend, line_key, row_of_tiles, section, tile
-from hardware.report.page import Plot, spanning, stretches
-from hardware.report.summary import figure, finite, percent
+from hardware.live.records import StageHistograms, StageTiming
+from hardware.live.state_machine import RunReports, RunStateMachine
+from hardware.operator.view import RunStage
+from planning.command import Move
+from planning.progress import PrintPhase
+from planning.robot.kinematics import SimpleArm, nozzle_from_axes
 
-DONE, CUT_SHORT, SIGNALLED = 0, 1, 128
-OVER = "Predicted, the largest of each moment while material left, over the seconds since the approach."
+TIMELINE_BINS = 600  # an even number: two bins become one
+FIRST_BIN_WIDTH = 0.1  # s of a bin at first
+_NUMBER_PATTERN = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+MAX_REASONS = 40  # kinds of holds that are counted apart
+OTHER_REASONS = "other reasons"
+ERROR_BIN, ERROR_BINS = 0.005, 400  # mm of a bin, and how many
+MAX_TICK_GAP = 0.5  # s from tick to tick that is counted: nobody knows what happened in a longer gap
+EXIT_DONE, EXIT_CUT_SHORT, EXIT_SIGNAL = 0, 1, 128
+TIMELINE_CAPTION = "Predicted, the largest of each moment while material left, over the seconds since the approach."
+
+
+class ErrorTimeline:
+    """The predicted error over a run, in bins that become twice as long whenever all are full.
+
+    width: s of each bin.
+    error: (TIMELINE_BINS,) mm, the largest predicted in each while material left, NaN where none did.
+    held: (TIMELINE_BINS,) s for which the nozzle was held.
+    """
+
+    def __init__(self) -> None:
+        self.width = FIRST_BIN_WIDTH
+        self.error = np.full(TIMELINE_BINS, np.nan)
+        self.held = np.zeros(TIMELINE_BINS)
+        self._begun = nan
+        self._last = 0
+
+    @property
+    def stamps(self) -> Array:
+        """(N,) s since the first tick, the middles of the bins so far."""
+        return np.asarray((np.arange(self._last + 1) + 0.5) * self.width, float)
+
+    def add(self, stamp: float, error: float, held: float) -> None:
+        """A tick at `stamp`, s, with its predicted error, mm or NaN, and the s for which it was held."""
+        if np.isnan(self._begun):
+            self._begun = stamp
+        while (stamp - self._begun) / self.width >= TIMELINE_BINS:
+            half = np.full(TIMELINE_BINS // 2, np.nan), np.zeros(TIMELINE_BINS // 2)
+            self.error = np.concatenate([np.fmax(self.error[::2], self.error[1::2]), half[0]])
+            self.held = np.concatenate([self.held[::2] + self.held[1::2], half[1]])
+            self.width *= 2
+        self._last = max(0, int((stamp - self._begun) / self.width))
+        self.error[self._last] = np.fmax(self.error[self._last], error)
+        self.held[self._last] += held
+
+
+@dataclass(slots=True)
+class HoldTotal:
+    """Holds for one reason."""
+
+    count: int = 0
+    seconds: float = 0.0
+
+
+@dataclass(slots=True)
+class RunStatistics:
+    """Sums of a run."""
+
+    stages: dict[str, float] = field(default_factory=dict)  # s in each stage
+    states: dict[str, int] = field(default_factory=dict)  # frame sets in each state of the tracker
+    holds: dict[str, HoldTotal] = field(default_factory=dict)  # by reason, its numbers left out
+    extruding: float = 0.0  # s in which material left
+    due: float = 0.0  # s in which it should have left
+    times: StageHistograms = field(default_factory=StageHistograms)
+    errors: np.ndarray = field(default_factory=lambda: np.zeros(ERROR_BINS, np.int64))  # histogram of predicted errors
+    most_error: float = 0.0  # mm, the largest predicted
+    last_error: float = nan  # mm, the newest predicted
+    timeline: ErrorTimeline = field(default_factory=ErrorTimeline)
+    _updated: float = nan
+    _ticked: float = nan
+    _sets: int = 0
+    _reason: str = ""
+
+    def update(self, now: float, stage: RunStage, reports: RunReports, arm: SimpleArm | None) -> None:
+        """Count the newest reports at `now`, s. arm: where it stands, once that is known."""
+        if not np.isnan(self._updated):
+            self.stages[stage.value] = self.stages.get(stage.value, 0.0) + now - self._updated
+        self._updated = now
+        if (tracking := reports.tracking) is not None and tracking.pose is not None and tracking.sets != self._sets:
+            self._sets = tracking.sets
+            state = tracking.pose.state.value
+            self.states[state] = self.states.get(state, 0) + 1
+        if reports.motion is not None and reports.motion.tick.stamp != self._ticked:
+            self._tick(reports, stage, arm)
+
+    @property
+    def duty(self) -> float:
+        """Share of the time since printing began in which material left; NaN before."""
+        return self.extruding / self.due if self.due > 0 else nan
+
+    def error(self, share: float) -> float:
+        """Predicted error at the nozzle, mm, that `share` percent of the extruding ticks do not exceed; NaN of none."""
+        total = self.errors.sum()
+        if not total:
+            return nan
+        return float((np.searchsorted(np.cumsum(self.errors), share / 100 * total) + 1) * ERROR_BIN)
+
+    def _tick(self, reports: RunReports, stage: RunStage, arm: SimpleArm | None) -> None:
+        assert reports.motion is not None
+        motion, before = reports.motion, self._ticked
+        self._ticked = motion.tick.stamp
+        step = min(self._ticked - before, MAX_TICK_GAP) if not np.isnan(before) else 0.0
+        command, progress = motion.tick.command, motion.progress
+        if progress is None or stage not in (RunStage.APPROACH, RunStage.PRINT, RunStage.PAUSED, RunStage.STOPPED):
+            return
+        reason = _NUMBER_PATTERN.sub("…", command.reason)
+        if reason:
+            self._hold(reason, step)
+        self._reason = reason
+        if progress.place > 0 and progress.phase not in (PrintPhase.LEAVING, PrintPhase.FINISHED):
+            self.due += step
+        error = nan
+        if isinstance(command, Move) and command.extrude:
+            self.extruding += step
+            if arm is not None:
+                error = self._error(reports, command, arm)
+        self.timeline.add(self._ticked, error, step if reason else 0.0)
+
+    def _hold(self, reason: str, step: float) -> None:
+        if reason not in self.holds and len(self.holds) >= MAX_REASONS:
+            reason = OTHER_REASONS
+        held = self.holds.setdefault(reason, HoldTotal())
+        held.count += reason != self._reason
+        held.seconds += step
+
+    def _error(self, reports: RunReports, move: Move, arm: SimpleArm) -> float:
+        """One standard deviation, mm, of the place under the nozzle, where it is to be after this move; NaN of none."""
+        assert reports.tracking is not None
+        if (pose := reports.tracking.pose) is None:
+            return nan
+        then = pose.predict(max(move.stamp, pose.stamp), onwards=False)
+        nozzle = se3.inverse(pose.base_from_surface) @ nozzle_from_axes(arm, move.axes)
+        error = float(then.error_at(nozzle[None, :3, 3])[0])
+        self.errors[min(int(error / ERROR_BIN), ERROR_BINS - 1)] += 1
+        self.most_error, self.last_error = max(self.most_error, error), error
+        return error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
-    """How a run ended. number: of the signal that ended it, 0 without. fraction: place on the path, NaN before any."""
+class RunOutcome:
+    """How a run ended."""
 
     prepared: Prepared
-    conductor: Conductor
-    tally: Tally
-    seen: Seen
-    number: int
-    fraction: float
+    machine: RunStateMachine
+    statistics: RunStatistics
+    reports: RunReports
+    signal: int  # that ended it, 0 without
+    fraction: float  # place on the path, counted in checkpoints, NaN before any
 
     @property
     def code(self) -> int:
         """0 where the path is printed, 128 and the signal's number where one ended it, else 1."""
-        if self.conductor.done:
-            return DONE
-        return SIGNALLED + self.number if self.number else CUT_SHORT
+        if self.machine.done:
+            return EXIT_DONE
+        return EXIT_SIGNAL + self.signal if self.signal else EXIT_CUT_SHORT
 
     @property
     def words(self) -> str:
         """What happened, and how to go on."""
-        total, beside = len(self.prepared.task.path) - 1, self.prepared.beside
-        lines = [self.conductor.ended]
-        if not self.conductor.done:
+        total, files = len(self.prepared.task.path) - 1, self.prepared.files
+        lines = [self.machine.ended]
+        if not self.machine.done:
             place = self.fraction if self.fraction == self.fraction else self.prepared.task.start
             dry = self.prepared.task.lift is not None
             done = "were passed by, none printed" if dry else "are printed"
             lines.append(f"{place:.2f} of {total} checkpoints {done}; the arm is at rest")
             if not dry:
-                again = f"go on with: stillbed live --resume {beside.record}"
+                again = f"go on with: stillbed live --resume {files.record}"
                 lines.append("the path is printed; there is nothing to go on with" if place >= total else again)
-        return "\n".join([*lines, f"report: {beside.report}"])
+        return "\n".join([*lines, f"report: {files.report}"])
 
     def write(self) -> None:
         """Write summary.json and report.html."""
-        summary, beside = self.summary(), self.prepared.beside
-        beside.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-        beside.report.write_text(self._page(summary), encoding="utf-8")
+        summary, files = self.summary(), self.prepared.files
+        files.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        files.report.write_text(self._page(summary), encoding="utf-8")
 
-    def spans(self) -> tuple[Span, ...]:
+    def timings(self) -> tuple[StageTiming, ...]:
         """All stages that were timed."""
-        tracking, motion = self.seen.tracking, self.seen.motion
-        found = () if tracking is None else tracking.spans
-        return (*found, *(() if motion is None else motion.spans), *self.tally.times.spans())
+        tracking, motion = self.reports.tracking, self.reports.motion
+        tracked = () if tracking is None else tracking.timings
+        return (*tracked, *(() if motion is None else motion.timings), *self.statistics.times.timings())
 
     def summary(self) -> dict[str, Any]:
         """The figures as plain values."""
-        tally, seen, task = self.tally, self.seen, self.prepared.task
-        tracking, motion, recorder = seen.tracking, seen.motion, seen.recorder
+        from hardware.report.summary import finite
+
+        statistics, reports, task = self.statistics, self.reports, self.prepared.task
+        tracking, motion, recorder = reports.tracking, reports.motion, reports.recorder
         cleaned: dict[str, Any] = finite(
             {
-                "ended": self.conductor.ended,
-                "done": self.conductor.done,
-                "signal": signal.Signals(self.number).name if self.number else None,
+                "ended": self.machine.ended,
+                "done": self.machine.done,
+                "signal": signal.Signals(self.signal).name if self.signal else None,
                 "notes": list(self.prepared.notes),
                 "checkpoints": len(task.path),
                 "started_at": task.start,
                 "fraction": self.fraction,
-                "duty": tally.duty,
-                "extruding_s": tally.extruding,
-                "predicted_error_mm": {"p50": tally.error(50), "p95": tally.error(95), "max": tally.most_error},
-                "stages_s": tally.stages,
-                "states": tally.states,
+                "duty": statistics.duty,
+                "extruding_s": statistics.extruding,
+                "predicted_error_mm": {
+                    "p50": statistics.error(50),
+                    "p95": statistics.error(95),
+                    "max": statistics.most_error,
+                },
+                "stages_s": statistics.stages,
+                "states": statistics.states,
                 "holds": [
                     {"reason": reason, "count": held.count, "total_s": held.seconds}
-                    for reason, held in sorted(tally.holds.items(), key=lambda item: -item[1].seconds)
+                    for reason, held in sorted(statistics.holds.items(), key=lambda item: -item[1].seconds)
                 ],
                 "latency_ms": {
-                    span.name: {
-                        "count": span.count,
-                        "p50": 1000 * span.median,
-                        "p99": 1000 * span.p99,
-                        "max": 1000 * span.most,
+                    timing.name: {
+                        "count": timing.count,
+                        "p50": 1000 * timing.median,
+                        "p99": 1000 * timing.p99,
+                        "max": 1000 * timing.largest,
                     }
-                    for span in self.spans()
+                    for timing in self.timings()
                 },
                 "frame_sets": 0 if tracking is None else tracking.sets,
                 "frame_sets_dropped": 0 if tracking is None else tracking.dropped,
@@ -111,47 +256,50 @@ class Outcome:
         return cleaned
 
     def _page(self, summary: dict[str, Any]) -> str:
-        error, duty = summary["predicted_error_mm"], self.tally.duty
+        from hardware.report.page import document, figures_table, row_of_tiles, section, tile
+        from hardware.report.summary import figure, percent
+
+        error, duty = summary["predicted_error_mm"], self.statistics.duty
         tiles = [
             tile(f"{self.fraction:.1f}" if self.fraction == self.fraction else "0", "", "checkpoints printed"),
             tile(percent(duty) if duty == duty else "–", "", "of the time material left the nozzle"),
             tile(figure(error["p95"]) if error["p95"] is not None else "–", "mm", "predicted error, 95 %"),
         ]
         rows = [
-            [s.name, str(s.count), *(f"{1000 * value:.1f}" for value in (s.median, s.p99, s.most))]
-            for s in self.spans()
+            [s.name, str(s.count), *(f"{1000 * seconds:.1f}" for seconds in (s.median, s.p99, s.largest))]
+            for s in self.timings()
         ]
-        holds = [[h["reason"], str(h["count"]), f"{h['total_s']:.2f}"] for h in summary["holds"]] or [
-            ["none", "0", "0"]
-        ]
-        stages = [[name, f"{seconds:.1f}"] for name, seconds in self.tally.stages.items()]
-        states = [[name, str(count)] for name, count in self.tally.states.items()]
-        checks = f"<pre>{escape(table(self.conductor.checks))}</pre>" if self.conductor.checks else ""
-        heads = ("stage", "times", "median", "99 %", "largest"), ("reason", "times", "s"), ("stage", "s")
+        holds = [[hold["reason"], str(hold["count"]), f"{hold['total_s']:.2f}"] for hold in summary["holds"]]
+        stages = [[name, f"{seconds:.1f}"] for name, seconds in self.statistics.stages.items()]
+        states = [[name, str(count)] for name, count in self.statistics.states.items()]
+        checks = f"<pre>{escape(checks_table(self.machine.checks))}</pre>" if self.machine.checks else ""
+        timings = figures_table(("stage", "times", "median", "99 %", "largest"), rows)
+        reasons = figures_table(("reason", "times", "s"), holds or [["none", "0", "0"]])
+        timeline = _timeline_plot(self.statistics.timeline, self.prepared.task.profile.limits.pose_error)
         body = [
             row_of_tiles(tiles),
-            section(
-                "Error at the nozzle", OVER, _course(self.tally.course, self.prepared.task.profile.limits.pose_error)
-            ),
-            section("How long each stage took", "Milliseconds.", figures_table(heads[0], rows)),
-            section("Holds", "Why the nozzle stood, and for how long.", figures_table(heads[1], holds)),
-            section("Stages", "Of the run.", figures_table(heads[2], stages)),
+            section("Error at the nozzle", TIMELINE_CAPTION, timeline),
+            section("How long each stage took", "Milliseconds.", timings),
+            section("Holds", "Why the nozzle stood, and for how long.", reasons),
+            section("Stages", "Of the run.", figures_table(("stage", "s"), stages)),
             section("States", "Of the tracked surface.", figures_table(("state", "frame sets"), states)),
             section("Check", "As it was last.", checks),
         ]
-        lead = f"{self.conductor.ended}. {'. '.join(self.prepared.notes)}"
-        return document("live run", self.prepared.beside.record.stem, lead, body, "stillbed")
+        lead = f"{self.machine.ended}. {'. '.join(self.prepared.notes)}"
+        return document("live run", self.prepared.files.record.stem, lead, body, "stillbed")
 
 
-def _course(course: Course, limit: float) -> str:
+def _timeline_plot(timeline: ErrorTimeline, limit: float) -> str:
     """The predicted error over the run, beside its limit, mm."""
-    stamps = course.stamps
-    error, held = course.error[: len(stamps)], course.held[: len(stamps)] > course.width / 2
+    from hardware.report.page import Plot, area_key, legend, line_key, spanning, stretches
+
+    stamps = timeline.stamps
+    error, held = timeline.error[: len(stamps)], timeline.held[: len(stamps)] > timeline.width / 2
     if not np.isfinite(error).any():
         return "<p>Nothing was extruded.</p>"
-    end = len(stamps) * course.width
+    end = len(stamps) * timeline.width
     plot = Plot(900, 220, (0.0, end), spanning([error, np.array([0.0, limit])]), label="predicted error, mm")
-    runs = np.array([(run.start, run.stop) for run in stretches(held)], float).reshape(-1, 2) * course.width
+    runs = np.array([(run.start, run.stop) for run in stretches(held)], float).reshape(-1, 2) * timeline.width
     plot.shade(runs[:, 0], runs[:, 1], "holding")
     plot.level(limit, "limit", "limit")
     plot.line(stamps, error, "estimate")

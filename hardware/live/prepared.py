@@ -1,56 +1,163 @@
-"""What a run needs before its processes start: files read and checked, a scenario rendered, an earlier run taken up."""
+"""What a run has before its processes start: files checked, a scenario rendered, an earlier run taken up.
+
+A run leaves these files beside its recording, run.mcap:
+
+run.session.toml     the settings of the run, with whole paths
+run.progress.toml    how far the print is
+run.surface.toml     where the path lies on the surface, and which recording shows that surface to a run that resumes
+run.executed.npz     of a virtual arm: where it was
+run.report.html, run.summary.json
+"""
 
 from __future__ import annotations
 
 import math
+import multiprocessing
+import re
 import shutil
+import threading
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path as File
 from typing import Any
 
+import numpy as np
+
+from estimation import se3
 from estimation.errors import InputError, StillbedError
 from estimation.rig import Rig
+from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
-from hardware.bookmark_file import read_start
-from hardware.cache_folder import cache_folder, not_written
 from hardware.files.arm_file import read_arm
-from hardware.files.path_file import read_path
+from hardware.files.path_file import read_path, read_progress, write_progress_durably
 from hardware.files.rig_file import read_rig
-from hardware.live.beside import Beside, Found, read_found
-from hardware.live.ipc import CONTEXT
-from hardware.live.page_address import page_settings
-from hardware.live.settings import VIRTUAL, LiveSettings, check_settings, overridden, read_settings
-from hardware.live.state_machine import Task
-from hardware.process.faults import Fault, Part, Runner, check_faults
-from hardware.recording.mcap_file import ChunkOf, parse, walk
+from hardware.live.settings import (
+    VIRTUAL_ARM,
+    LiveSettings,
+    check_settings,
+    override_settings,
+    page_settings,
+    read_settings,
+)
+from hardware.live.state_machine import PrintTask
+from hardware.process import checks
+from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults
+from hardware.process.progress import cache_error, cache_folder
+from hardware.process.shared_latest import SharedPathPlace
+from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from hardware.recording.messages import rig_from_message
 
 RIG_FILE = "rig.toml"
+PROGRESS_PERIOD = 0.05  # s between looks at the place: a tenth of a checkpoint's time, or less
+
+
+@dataclass(frozen=True, slots=True)
+class RunFiles:
+    """Names of the files beside a recording."""
+
+    record: File
+
+    @property
+    def session(self) -> File:
+        """The settings of the run."""
+        return self._named("session.toml")
+
+    @property
+    def progress(self) -> File:
+        """How far the print is."""
+        return self._named("progress.toml")
+
+    @property
+    def surface(self) -> File:
+        """Where the path lies."""
+        return self._named("surface.toml")
+
+    @property
+    def executed(self) -> File:
+        """The motion of a virtual arm."""
+        return self._named("executed.npz")
+
+    @property
+    def report(self) -> File:
+        """The page."""
+        return self._named("report.html")
+
+    @property
+    def summary(self) -> File:
+        """Its figures."""
+        return self._named("summary.json")
+
+    def next(self) -> RunFiles:
+        """The recording of the run that resumes this one: the next name that is free."""
+        named = re.fullmatch(r"(.+)-([0-9]+)", self.record.stem)
+        stem, number = (named[1], int(named[2]) + 1) if named else (self.record.stem, 2)
+        while (file := self.record.with_name(f"{stem}-{number}.mcap")).exists():
+            number += 1
+        return RunFiles(file)
+
+    def _named(self, end: str) -> File:
+        return self.record.with_name(f"{self.record.stem}.{end}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfacePlacement:
+    """Where an earlier run placed its path."""
+
+    map: File  # recording whose first sets show the surface
+    until: float  # s, the last stamp of those sets
+    surface_from_path: Array  # (4, 4) mm
+    arm_from_base: Array  # (4, 4) mm
+
+
+def write_placement(file: File, placement: SurfacePlacement) -> None:
+    """Write beside the file and rename: there is always one that can be read, or none."""
+    lines = [
+        f'map = "{placement.map.resolve()}"',
+        f"until_s = {checks.toml_number(placement.until)}",
+        f"surface_from_path = {checks.toml_numbers(placement.surface_from_path)}",
+        f"arm_from_base = {checks.toml_numbers(placement.arm_from_base)}",
+    ]
+    beside = file.with_name(file.name + ".new")
+    beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    beside.replace(file)
+
+
+def read_placement(file: File) -> SurfacePlacement:
+    """The placement in a file; InputError where it makes no sense."""
+    table = checks.read_toml(file)
+    checks.check_keys(file, "", table, ("map", "until_s", "surface_from_path", "arm_from_base"))
+    poses = [checks.numbers(file, key, table[key], (4, 4)) for key in ("surface_from_path", "arm_from_base")]
+    for key, pose in zip(("surface_from_path", "arm_from_base"), poses, strict=True):
+        if not se3.is_transform(np.asarray(pose)):
+            raise InputError(file, key, pose.tolist(), "a finite 4x4 rigid motion, mm")
+    recording = File(checks.text(file, "map", table["map"]))
+    try:
+        there = recording.exists()
+    except OSError:  # a name that no file can have
+        there = False
+    if not there:
+        raise InputError(file, "map", recording, "the recording that shows the surface")
+    return SurfacePlacement(recording, checks.number(file, "until_s", table["until_s"]), poses[0], poses[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """settings: as used. session: whose pictures are shown (to and fro for ever where `again`), or live cameras.
+    """A run that can be started."""
 
-    virtual: what a virtual arm is like, None for one that answers. found: where an earlier run's path lies, None of a
-    new run. notes: what one should know all the time. faults: what is to go wrong, before a simulated world alone.
-    """
-
-    settings: LiveSettings
-    session: File
+    settings: LiveSettings  # as used
+    session: File  # whose pictures are shown, or the rig file of live cameras
     rig: Rig
-    again: bool
-    virtual: File | None
-    task: Task
-    found: Found | None
-    beside: Beside
-    notes: tuple[str, ...]
-    faults: tuple[Fault, ...] = ()
+    again: bool  # whether the session is shown to and fro for ever; its truth is then exact
+    virtual: File | None  # settings of a virtual arm, None for one that answers and is never at fault
+    task: PrintTask
+    placement: SurfacePlacement | None  # of the run that is resumed, None of a new run
+    files: RunFiles
+    notes: tuple[str, ...]  # that the operator sees all the time
+    faults: tuple[Fault, ...] = ()  # to be injected, before a simulated world alone
 
     @property
     def live(self) -> bool:
-        """Whether cameras are looked through, rather than a recorded session shown."""
+        """Whether live cameras are used, rather than a recorded session shown."""
         return self.session.suffix == ".toml"
 
 
@@ -60,48 +167,48 @@ def prepare(settings: LiveSettings, where: object, force: bool) -> Prepared:
     if settings.page:
         page_settings(settings, where)
     assert settings.record is not None
-    beside = Beside(settings.record)
+    files = RunFiles(settings.record)
     if settings.record.exists() and not force:
         raise InputError(settings.record, "--record", "a file that exists", "a new file, or --force")
     if not settings.record.parent.is_dir():
         raise InputError(settings.record, "--record", "no such folder", "a file in a folder that exists")
-    for file in (beside.progress, beside.surface):
+    for file in (files.progress, files.surface):
         file.unlink(missing_ok=True)
-    return _prepared(settings, beside, None)
+    return _prepared(settings, files, None)
 
 
-def prepare_again(record: File, flags: dict[str, Any]) -> Prepared:
+def prepare_resumed(record: File, flags: dict[str, Any]) -> Prepared:
     """The run that goes on where the one recorded in `record` stopped, with its settings and what `flags` overrides.
 
-    That somebody confirms is asked anew: nobody has looked at this run yet, whoever did without at the one before.
+    Whether it runs unattended is never taken over: nobody has looked at this run yet.
     """
-    beside = Beside(record)
+    files = RunFiles(record)
     if not record.exists():
         raise InputError(record, "--resume", "no such file", "the recording of a run")
-    if not beside.session.exists():
-        raise InputError(record, "--resume", f"no {beside.session.name} beside it", "the recording of a run")
-    settings = overridden(replace(read_settings(beside.session), unattended=False), flags)
-    found = read_found(beside.surface) if beside.surface.exists() else None
-    again = beside.next()
-    settings = check_settings(replace(settings, record=again.record), beside.session)
+    if not files.session.exists():
+        raise InputError(record, "--resume", f"no {files.session.name} beside it", "the recording of a run")
+    settings = override_settings(replace(read_settings(files.session), unattended=False), flags)
+    placement = read_placement(files.surface) if files.surface.exists() else None
+    again = files.next()
+    settings = check_settings(replace(settings, record=again.record), files.session)
     if settings.page:
-        page_settings(settings, beside.session)
-    prepared = _prepared(settings, again, found)
+        page_settings(settings, files.session)
+    prepared = _prepared(settings, again, placement)
     path = prepared.task.path
-    start = read_start(beside.progress, path) if beside.progress.exists() else 0.0
+    start = read_progress(files.progress, path) if files.progress.exists() else 0.0
     if start >= len(path) - 1:
-        raise InputError(beside.progress, "fraction", start, f"below {len(path) - 1}: the path is printed")
-    for earlier, later in ((beside.progress, again.progress), (beside.surface, again.surface)):
+        raise InputError(files.progress, "fraction", start, f"below {len(path) - 1}: the path is printed")
+    for earlier, later in ((files.progress, again.progress), (files.surface, again.surface)):
         if earlier.exists():  # before it comes as far itself, this run is where that one was
             shutil.copyfile(earlier, later)
     profile = prepared.task.profile
-    if found is not None:
-        profile = replace(profile, arm=replace(profile.arm, arm_from_base=found.arm_from_base))
-    task = replace(prepared.task, start=start, profile=profile, place=prepared.task.place and found is None)
+    if placement is not None:
+        profile = replace(profile, arm=replace(profile.arm, arm_from_base=placement.arm_from_base))
+    task = replace(prepared.task, start=start, profile=profile, place=prepared.task.place and placement is None)
     return replace(prepared, task=task)
 
 
-def _prepared(settings: LiveSettings, beside: Beside, found: Found | None) -> Prepared:
+def _prepared(settings: LiveSettings, files: RunFiles, placement: SurfacePlacement | None) -> Prepared:
     notes = [f"dry run, {settings.lift:g} mm above the path"] if settings.dry_run else []
     scenario, session, profile, path = settings.simulated, settings.rig, settings.profile, settings.path
     virtual: File | None = None
@@ -111,28 +218,28 @@ def _prepared(settings: LiveSettings, beside: Beside, found: Found | None) -> Pr
         profile, path = profile or rendered / "arm.toml", path or rendered / "path.csv"
         notes.append("simulated: pictures rendered before, shown in real time; the arm is not in them")
     assert session is not None and path is not None
-    task = Task(
+    task = PrintTask(
         path=read_path(path),
         profile=ArmProfile() if profile is None else read_arm(profile),
         place=profile is None,
-        stands_home=settings.stands_home or settings.arm == VIRTUAL,
+        stands_home=settings.stands_home or settings.arm == VIRTUAL_ARM,
         lift=settings.lift if settings.dry_run else None,
         unattended=settings.unattended,
         patience=settings.patience,
     )
-    rig = rig_of(session)
+    rig = rig_from_session(session)
     again = scenario is not None
-    return Prepared(settings, session, rig, again, virtual, task, found, beside, tuple(notes))
+    return Prepared(settings, session, rig, again, virtual, task, placement, files, tuple(notes))
 
 
-def rig_of(session: File) -> Rig:
+def rig_from_session(session: File) -> Rig:
     """The cameras of a session folder, a recording or a rig file, without a look at its pictures."""
     if session.is_dir():
         return read_rig(session / RIG_FILE).rig
     if session.suffix == ".toml":
         return read_rig(session).rig
     for part in walk(session):
-        if isinstance(part, ChunkOf):
+        if isinstance(part, ChunkMessages):
             for stored in part.messages:
                 if stored.topic == "/rig":
                     return rig_from_message(f"{session} /rig", parse(session, stored))
@@ -141,8 +248,9 @@ def rig_of(session: File) -> Rig:
 
 def _rendered(scenario: File) -> File:
     """The folder of the scenario's pre-rendered session; rendering is done by a process that ends before the run."""
-    answer, theirs = CONTEXT.Pipe(duplex=False)
-    process = CONTEXT.Process(target=_render, args=(scenario, theirs))
+    spawn = multiprocessing.get_context("spawn")
+    answer, theirs = spawn.Pipe(duplex=False)
+    process = spawn.Process(target=_render, args=(scenario, theirs))
     process.start()
     theirs.close()
     try:
@@ -165,19 +273,55 @@ def _render(scenario: File, answer: Connection) -> None:
     except StillbedError as error:
         answer.send(("", str(error)))
     except OSError as error:  # the disk is full
-        answer.send(("", str(not_written(cache, error))))
+        answer.send(("", str(cache_error(cache, error))))
 
 
-def with_faults(prepared: Prepared, faults: tuple[Fault, ...]) -> Prepared:
-    """The run with what is to go wrong in it; InputError unless cameras and arm are simulated."""
-    check_faults(faults, Runner.LIVE, "command line", "--fault", len(prepared.rig))
-    if faults and (prepared.live or prepared.settings.arm != VIRTUAL):
+def add_faults(prepared: Prepared, faults: tuple[Fault, ...]) -> Prepared:
+    """The run with faults to be injected; InputError unless cameras and arm are simulated."""
+    check_faults(faults, FaultRunner.LIVE, "command line", "--fault", len(prepared.rig))
+    if faults and (prepared.live or prepared.settings.arm != VIRTUAL_ARM):
         raise InputError("command line", "--fault", str(faults[0]), "with --simulated and a virtual arm alone")
     for fault in faults:
-        if fault.part is Part.PAGE and not prepared.settings.page:
+        if fault.part is FaultPart.PAGE and not prepared.settings.page:
             raise InputError("command line", "--fault", str(fault), "a run with the operator's page, without --no-page")
-        if fault.part is Part.ARM and math.isfinite(fault.duration):
+        if fault.part is FaultPart.ARM and math.isfinite(fault.duration):
             raise InputError(
                 "command line", "--fault", str(fault), "no duration: a virtual arm is not plugged in again"
             )
     return replace(prepared, faults=faults, notes=(*prepared.notes, *(f"will happen: {fault}" for fault in faults)))
+
+
+class ProgressWriter:
+    """Writes progress.toml in a thread whenever the place has changed, as the disk may take its time.
+
+    failed: the error of the disk, "" if there is none.
+    """
+
+    def __init__(self, file: File, fingerprint: str, place: SharedPathPlace) -> None:
+        """fingerprint: of the path; "" for a dry run, of which no place is kept."""
+        self.failed = ""
+        self._file, self._fingerprint, self._place = file, fingerprint, place
+        self._written = math.nan
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._keep, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Write the last place, and end."""
+        self._closed.set()
+        self._thread.join()
+
+    def _keep(self) -> None:
+        while not self._closed.wait(PROGRESS_PERIOD):
+            self._write()
+        self._write()
+
+    def _write(self) -> None:
+        fraction = self._place.fraction
+        if not self._fingerprint or math.isnan(fraction) or fraction == self._written:
+            return
+        try:
+            write_progress_durably(self._file, self._fingerprint, fraction)
+            self._written, self.failed = fraction, ""
+        except OSError as error:
+            self.failed = f"{self._file}: {error.strerror or error}"

@@ -18,39 +18,35 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.observations import no_observations
-from estimation.pose import SurfacePose, identity_pose
+from estimation.pose import SurfacePose, Trajectory, identity_pose
 from estimation.se3 import Array
-from estimation.trajectory import Trajectory
-from hardware.cache_folder import not_written
 from hardware.files.arm_file import write_arm
+from hardware.files.folder_tables import rows_from_trajectory
 from hardware.files.path_file import read_path, write_path
 from hardware.process.clock import WallClock
-from hardware.process.faults import Part
-from hardware.process.progress import Progress
+from hardware.process.faults import FaultPart
+from hardware.process.progress import Progress, cache_error
 from hardware.recording.recorder import Recorder
 from hardware.recording.schemas import WARNING
+from hardware.simulator.arm.settings import write_virtual_arm
 from hardware.simulator.cameras import Shot
-from hardware.simulator.laying import laid
-from hardware.simulator.nozzle_log import NozzleLog
-from hardware.simulator.scenario import Scenario
-from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.scene_table import scene_from_table
+from hardware.simulator.deposit import NozzleLog
+from hardware.simulator.scenario import Scenario, read_scenario
+from hardware.simulator.scenario_tables import scene_from_table
 from hardware.simulator.simulate import regions
-from hardware.simulator.truth import Truth
-from hardware.simulator.virtual_arm_file import write_virtual_arm
-from hardware.simulator.world import World
-from hardware.tum import rows_from_trajectory
+from hardware.simulator.truth import Truth, drape_path
+from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet, PrintHead
-from perception.tracking.step import StepReport, trusting_report
+from perception.tracking.step import StepReport, report_without_offsets
 from planning.command import Command
-from planning.progress import Progress as Print
+from planning.progress import PrintProgress as Print
 
-VERSION = "4"  # of what the cache holds: another one is rendered anew
-DIGITS = 9  # of a truth's stamp: exposures of one instant are one
+CACHE_VERSION = "4"  # of what the cache holds: another one is rendered anew
+STAMP_DIGITS = 9  # of a truth's stamp: exposures of one instant are one
 
 
 @dataclass(frozen=True, slots=True)
-class Rendered:
+class PrerenderedSession:
     """A pre-rendered session in its cache folder."""
 
     folder: Path
@@ -76,14 +72,14 @@ class Rendered:
         return Path((self.folder / "scenario").read_text(encoding="utf-8"))
 
 
-def cached(file: Path, cache: Path, seconds: float | None = None) -> Rendered:
+def cached(file: Path, cache: Path, seconds: float | None = None) -> PrerenderedSession:
     """Where the session of a scenario lies or will lie; another text of scenario or path is another folder.
 
     seconds: of its beginning, None for all of it.
     """
-    text = file.read_bytes() + _path_bytes(file) + VERSION.encode()
+    text = file.read_bytes() + _path_bytes(file) + CACHE_VERSION.encode()
     text += b"" if seconds is None else f"{seconds:g} s".encode()
-    return Rendered(cache / f"{file.stem}-{hashlib.sha256(text).hexdigest()[:12]}")
+    return PrerenderedSession(cache / f"{file.stem}-{hashlib.sha256(text).hexdigest()[:12]}")
 
 
 def _path_bytes(file: Path) -> bytes:
@@ -97,7 +93,7 @@ def _path_bytes(file: Path) -> bytes:
         return b""
 
 
-def prerender(file: Path, cache: Path, threads: int = 2, seconds: float | None = None) -> Rendered:
+def prerender(file: Path, cache: Path, threads: int = 2, seconds: float | None = None) -> PrerenderedSession:
     """The session of the scenario in `file`, rendered unless it is there; a run cut short leaves nothing in its place.
 
     seconds: only so much of its beginning. InputError for a scenario that makes no sense, or a cache that cannot be
@@ -106,7 +102,7 @@ def prerender(file: Path, cache: Path, threads: int = 2, seconds: float | None =
     scenario = read_scenario(file)
     if seconds is not None:
         scenario = replace(scenario, seconds=min(seconds, scenario.seconds))
-    if others := [fault for fault in scenario.faults if fault.part is not Part.ARM]:
+    if others := [fault for fault in scenario.faults if fault.part is not FaultPart.ARM]:
         raise InputError(file, "faults", str(others[0]), "faults of the arm; a live run takes others as --fault")
     rendered = cached(file, cache, seconds)
     beside = rendered.folder.with_name(f"{rendered.folder.name}.{os.getpid()}")
@@ -115,7 +111,7 @@ def prerender(file: Path, cache: Path, threads: int = 2, seconds: float | None =
             return rendered
         beside.mkdir(parents=True)
     except OSError as error:
-        raise not_written(cache, error) from None
+        raise cache_error(cache, error) from None
     try:
         _render(replace(scenario, nozzle=False, beads=False), beside, threads)
         (beside / "scenario").write_text(str(file.resolve()), encoding="utf-8")
@@ -130,24 +126,26 @@ def _render(scenario: Scenario, out: Path, threads: int) -> None:
     scene = scene_from_table(scenario.file, scenario.scene, scenario.file.parent, scenario.seed)
     path = read_path(scenario.path)
     if scenario.clearance is not None:
-        path = laid(path, scene.shape, scenario.clearance, scenario.path)
+        path = drape_path(path, scene.shape, scenario.clearance, scenario.path)
     truth = Truth(scenario.rest, scenario.motion, scene.deformation, scenario.strain, scene.shape.surface_from_grid)
     write_path(out / "path.csv", path)
     write_virtual_arm(out / "virtual_arm.toml", scenario.arm, scenario.faults)
     write_arm(out / "arm.toml", scenario.profile, "what the motion knew of the arm")
     shutil.copyfile(scenario.file, out / "scenario.toml")
     with (
-        Recorder(out / "session.mcap", scenario.told_rig) as recorder,
+        Recorder(out / "session.mcap", scenario.known_rig) as recorder,
         Progress("pre-render", "frame sets", WallClock().now) as progress,
     ):
         for roi in regions(scenario, scene, truth):
             recorder.write(roi)
-        sink = _Pictures(recorder, truth)
-        World(scenario, scene, path, truth, _Blind(len(scenario.rig)), {}, sink, WallClock(), threads).run(progress)
+        sink = _PictureSink(recorder, truth)
+        SimulatedWorld(
+            scenario, scene, path, truth, _NullTracker(len(scenario.rig)), {}, sink, WallClock(), threads
+        ).run(progress)
         sink.finish()
 
 
-class _Blind:
+class _NullTracker:
     """Sees no surface: nothing is tracked, so nothing is printed."""
 
     def __init__(self, cameras: int) -> None:
@@ -156,14 +154,14 @@ class _Blind:
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
         none = np.zeros(self._cameras, np.int64)
-        self.last = trusting_report(no_observations(frames.stamp), none, np.zeros(0))
+        self.last = report_without_offsets(no_observations(frames.stamp), none, np.zeros(0))
         return identity_pose(frames.stamp, "nobody looks")
 
     def idle(self) -> None:
         """Nothing to do."""
 
 
-class _Pictures:
+class _PictureSink:
     """Records pictures and the truth at their exposures."""
 
     def __init__(self, recorder: Recorder, truth: Truth) -> None:
@@ -177,7 +175,7 @@ class _Pictures:
 
     def finish(self) -> None:
         """Write the truth, now that its instants can be put in order."""
-        stamps = np.unique(np.round(self._exposed, DIGITS))
+        stamps = np.unique(np.round(self._exposed, STAMP_DIGITS))
         trajectory = Trajectory(stamps, self._truth.base_from_surface(stamps), exact=True)
         for row in rows_from_trajectory(trajectory):
             self._recorder.truth_row(row, exact=True)

@@ -1,21 +1,30 @@
-"""The body of the recorder's process: takes what the others give, writes it, and never makes anybody wait."""
+"""The recorder of a live run: the queue by which a process gives it entries, and the process that writes them.
+
+A sender never waits: it queues a bounded number of bytes and counts the entries for which there was no room. All
+processes of a run import this module, so what writes files is imported in the recorder's process alone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import fcntl
+import os
+import pickle
+import struct
+import threading
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import partial
 from multiprocessing.connection import Connection
-from pathlib import Path
 from selectors import EVENT_READ, BaseSelector, DefaultSelector
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimation.errors import StillbedError
-from estimation.heap import keep_pages
+from estimation.pose import Trajectory
 from estimation.rig import Rig
-from estimation.trajectory import Trajectory
-from hardware.heads import row_from_head
-from hardware.live.inbox import Inbox
+from estimation.runtime import retain_freed_pages
 from hardware.live.records import (
     Entry,
     EventEntry,
@@ -29,113 +38,224 @@ from hardware.live.records import (
     UsedEntry,
     WireEntry,
 )
+from hardware.live.settings import LiveSettings
+from hardware.motion.loop import RecordedTick
 from hardware.process.clock import ProcessorClock, WallClock
-from hardware.process.shared_latest import Newest
-from hardware.process.system import settle
-from hardware.recorded_tick import RecordedTick
-from hardware.recording.recorder import Recorder
-from hardware.tum import rows_from_trajectory
+from hardware.process.shared_latest import SharedLatest
+from hardware.process.system import set_up_process
 
-QUIET = 0.2  # s without anything new after which what is there goes to the disk
-GATHER = 0.08  # s that what comes may gather: woken for each entry, this process took twice as long for all of them
-KEPT = 2**25  # bytes of free pages that are kept: some chunks, as glibc allows at most
-NICE = 10  # below all that moves the arm
+if TYPE_CHECKING:
+    from hardware.recording.recorder import Recorder
 
-
-@dataclass(frozen=True, slots=True)
-class RecorderPlan:
-    """Where to write. jpeg_quality: 0 to 100 of pictures that come as arrays, None to keep them exactly."""
-
-    file: Path
-    jpeg_quality: int | None
-    overwrite: bool
-    cores: tuple[int, ...] = ()
+ENTRY_HEAD = struct.Struct("=Q")  # bytes of the pickled entry that follows
+PIPE_BYTES = 2**20  # bytes that a pipe holds: 0.1 s of three cameras' pictures, and as much as anyone may ask for
+CROWDED_SHARE = 0.9  # of that, from which whoever sends may be waiting
+QUEUE_BYTES = 48 * 2**20  # bytes that may wait in a sender: 3 s of pictures as three cameras encode them
+RESERVED_BYTES = 8 * 2**20  # of them kept free of pictures, so that these never push out what is small
+FLUSH_AFTER = 0.2  # s without anything new after which what is there goes to the disk
+GATHER_TIME = 0.08  # s in which entries gather: woken for each, this process took twice as long for all of them
+FREE_PAGES_BYTES = 2**25  # bytes of free pages that are kept: some chunks, as glibc allows at most
+RECORDER_NICENESS = 10  # below all that moves the arm
 
 
-def recorder_process(plan: RecorderPlan, senders: Sequence[Connection], reports: Newest[RecorderReport]) -> None:
-    """Record until all senders have closed their end; a fault of the disk ends it, said in the last report."""
-    settle("recorder", plan.cores, NICE)
-    keep_pages(KEPT)
-    writer = _Writer(plan, reports)
+class RecorderSender:
+    """One process's queue to the recorder. dropped: entries without room, or after the recorder has ended."""
+
+    def __init__(self, connection: Connection) -> None:
+        self.dropped = 0
+        self._connection = connection
+        self._waiting: deque[bytes] = deque()
+        self._size, self._closed, self._gone = 0, False, False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._send, daemon=True)
+        self._thread.start()
+
+    def put(self, entry: Entry) -> None:
+        """Queue an entry."""
+        data = pickle.dumps(entry, pickle.HIGHEST_PROTOCOL)
+        room = QUEUE_BYTES - RESERVED_BYTES if isinstance(entry, SetEntry) else QUEUE_BYTES
+        with self._changed:
+            if self._gone or self._size + len(data) > room:
+                self.dropped += 1
+                return
+            self._waiting.append(data)
+            self._size += len(data)
+            self._changed.notify()
+
+    def close(self, patience: float = 5.0) -> None:
+        """Send what waits, for `patience` s at most, and close the pipe."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join(patience)
+
+    def _send(self) -> None:
+        try:
+            while (data := self._next()) is not None:
+                _write_all(self._connection.fileno(), ENTRY_HEAD.pack(len(data)), data)
+        except (OSError, ValueError):  # nobody is there any more
+            with self._changed:
+                self._gone = True
+                self.dropped += len(self._waiting)
+                self._waiting.clear()
+        finally:
+            self._connection.close()
+
+    def _next(self) -> bytes | None:
+        """The next entry, waited for; None once this is closed and empty."""
+        with self._changed:
+            while not self._waiting:
+                if self._closed:
+                    return None
+                self._changed.wait()
+            data = self._waiting.popleft()
+            self._size -= len(data)
+            return data
+
+
+def _write_all(pipe: int, head: bytes, data: bytes) -> None:
+    left = memoryview(data)[max(os.writev(pipe, [head, data]) - len(head), 0) :]
+    while left:
+        left = left[os.write(pipe, left) :]
+
+
+class RecorderReceiver:
+    """The recorder's end of a sender's pipe.
+
+    ended: whether the sender has closed its end, and all that it sent was returned or was cut short.
+    crowded: whether the pipe was full, as far as can be seen, when it was last read.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self.ended, self.crowded = False, False
+        self._connection = connection
+        self._memory, self._filled = bytearray(2 * PIPE_BYTES), 0
+        with suppress(OSError):  # a smaller pipe takes more turns
+            fcntl.fcntl(connection.fileno(), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+        self._room = fcntl.fcntl(connection.fileno(), fcntl.F_GETPIPE_SZ)
+
+    def fileno(self) -> int:
+        """The pipe, for whoever waits for it."""
+        return self._connection.fileno()
+
+    def take(self) -> Iterator[Entry]:
+        """The entries that have come since the last call; waits where none has."""
+        with memoryview(self._memory) as memory:
+            count = os.readv(self._connection.fileno(), [memory[self._filled :]])
+        self.ended, self.crowded = count == 0, count > CROWDED_SHARE * self._room
+        self._filled += count
+        yield from self._complete_entries()
+
+    def close(self) -> None:
+        """Close the pipe, which the sender notices."""
+        self._connection.close()
+
+    def _complete_entries(self) -> Iterator[Entry]:
+        """The entries that are complete; the part of the next one is moved to the front of the memory."""
+        begin, needed = 0, ENTRY_HEAD.size
+        with memoryview(self._memory) as memory:
+            while begin + ENTRY_HEAD.size <= self._filled:
+                needed = ENTRY_HEAD.size + ENTRY_HEAD.unpack_from(memory, begin)[0]
+                if begin + needed > self._filled:
+                    break
+                yield pickle.loads(memory[begin + ENTRY_HEAD.size : begin + needed])
+                begin += needed
+                needed = ENTRY_HEAD.size
+            memory[: self._filled - begin] = memory[begin : self._filled]
+        self._filled -= begin
+        if needed > len(self._memory):
+            self._memory += bytes(needed)
+
+
+def record(settings: LiveSettings, senders: Sequence[Connection], reports: SharedLatest[RecorderReport]) -> None:
+    """The body of the process: record until all senders have closed their end.
+
+    A fault of the disk ends it, and is named in the last report.
+    """
+    set_up_process("recorder", settings.cores_recorder, RECORDER_NICENESS)
+    retain_freed_pages(FREE_PAGES_BYTES)
+    writer = _EntryWriter(settings, reports)
     try:
-        writer.run([Inbox(sender) for sender in senders])
+        writer.run([RecorderReceiver(sender) for sender in senders])
     except StillbedError as error:
-        writer.tell(str(error))
+        writer.report(str(error))
     finally:
         try:
             writer.close()
         except StillbedError as error:
-            writer.tell(str(error))
+            writer.report(str(error))
 
 
-class _Writer:
-    """Writes entries once the rig is known, and what came before it then."""
+class _EntryWriter:
+    """Writes entries once the rig is known; those that came before it are written then."""
 
-    def __init__(self, plan: RecorderPlan, reports: Newest[RecorderReport]) -> None:
-        self._plan, self._reports = plan, reports
+    def __init__(self, settings: LiveSettings, reports: SharedLatest[RecorderReport]) -> None:
+        from hardware.recording.recorder import Recorder  # before pictures come, as loading it takes a while
+
+        assert settings.record is not None
+        self._file, self._reports, quality = settings.record, reports, settings.jpeg_quality or None
+        self._opened = partial(Recorder, self._file, jpeg_quality=quality, overwrite=True, compress=False)
         self._clock, self._processor = WallClock(), ProcessorClock()
         self._begin = self._clock.now(), self._processor.now()
         self._recorder: Recorder | None = None
         self._early: list[Entry] = []
         self._failed = ""
-        self._said = 0.0
+        self._reported = 0.0
 
-    def run(self, senders: Sequence[Inbox]) -> None:
-        """Take entries until nobody is left to give any."""
-        with DefaultSelector() as left:
+    def run(self, senders: Sequence[RecorderReceiver]) -> None:
+        """Write entries until all senders have ended."""
+        with DefaultSelector() as selector:
             for sender in senders:
-                left.register(sender, EVENT_READ)
+                selector.register(sender, EVENT_READ)
             crowded = False
-            while left.get_map():
-                if not left.select(QUIET) and self._recorder is not None:
+            while selector.get_map():
+                if not selector.select(FLUSH_AFTER) and self._recorder is not None:
                     self._recorder.flush()
                 elif not crowded:
-                    self._clock.wait_until(self._clock.now() + GATHER)
-                crowded = any([self._take(key.fileobj, left) for key, _ in left.select(0)])
-                if self._clock.now() > self._said + QUIET:
-                    self.tell()
+                    self._clock.wait_until(self._clock.now() + GATHER_TIME)
+                crowded = any([self._take(key.fileobj, selector) for key, _ in selector.select(0)])
+                if self._clock.now() > self._reported + FLUSH_AFTER:
+                    self.report()
 
-    def _take(self, sender: object, left: BaseSelector) -> bool:
-        """Write what a sender has given, or know that it gives no more; whether it may be waiting to give more."""
-        assert isinstance(sender, Inbox)
+    def _take(self, sender: object, selector: BaseSelector) -> bool:
+        """Write what has come from a sender; whether it may be waiting to send more."""
+        assert isinstance(sender, RecorderReceiver)
         for entry in sender.take():
-            self.write(entry)
+            self._write(entry)
         if sender.ended:
-            left.unregister(sender)
+            selector.unregister(sender)
         return sender.crowded
 
-    def write(self, entry: Entry) -> None:
-        """Write one entry."""
+    def _write(self, entry: Entry) -> None:
         if isinstance(entry, RigEntry):
             self._open(entry.rig)
         elif self._recorder is None:
             self._early.append(entry)
         else:
-            _write(self._recorder, entry)
+            _write_entry(self._recorder, entry)
 
     def _open(self, rig: Rig) -> None:
-        plan = self._plan
-        self._recorder = Recorder(plan.file, rig, plan.jpeg_quality, plan.overwrite, compress=False)
+        self._recorder = self._opened(rig=rig)
         early, self._early = self._early, []
         for entry in early:
-            _write(self._recorder, entry)
+            _write_entry(self._recorder, entry)
 
-    def tell(self, failed: str = "") -> None:
-        """Say how it fares."""
+    def report(self, failed: str = "") -> None:
+        """Report the state. failed: what ended the recording."""
         now, spent = self._clock.now(), self._processor.now()
-        self._failed, self._said = self._failed or failed, now
+        self._failed, self._reported = self._failed or failed, now
         share = (spent - self._begin[1]) / max(now - self._begin[0], 1e-3)
-        size = self._plan.file.stat().st_size if self._recorder is not None and self._plan.file.exists() else 0
+        size = self._file.stat().st_size if self._recorder is not None and self._file.exists() else 0
         self._reports.put(RecorderReport(now, size, share, self._failed))
 
     def close(self) -> None:
-        """Close the file, and say so."""
+        """Close the file, and report."""
         if self._recorder is not None:
             self._recorder.close()
-        self.tell()
+        self.report()
 
 
-def _write(recorder: Recorder, entry: Entry) -> None:
+def _write_entry(recorder: Recorder, entry: Entry) -> None:
     if isinstance(entry, SetEntry):
         for camera, (kind, data) in entry.encoded.items():
             recorder.encoded_frame(camera, entry.stamps[camera], kind, data)
@@ -151,7 +271,7 @@ def _write(recorder: Recorder, entry: Entry) -> None:
     elif isinstance(entry, EventEntry):
         recorder.event(entry.stamp, entry.text, entry.level, entry.name)
     elif isinstance(entry, LatencyEntry):
-        recorder.latency(entry.stamp, entry.stage, entry.width, entry.counts, entry.most)
+        recorder.latency(entry.stamp, entry.stage, entry.width, entry.counts, entry.largest)
     elif isinstance(entry, UsedEntry):
         recorder.attach(entry.name, entry.text.encode())
     elif isinstance(entry, ScanEntry):
@@ -161,6 +281,9 @@ def _write(recorder: Recorder, entry: Entry) -> None:
 
 
 def _write_pose(recorder: Recorder, entry: PoseEntry) -> None:
+    from hardware.files.folder_tables import rows_from_trajectory
+    from hardware.files.session import row_from_head
+
     stamp = entry.pose.stamp
     if entry.truth is not None:
         known = Trajectory(np.array([stamp]), entry.truth[None], exact=True)

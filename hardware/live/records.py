@@ -1,11 +1,14 @@
-"""What the processes of a live run tell each other, and what they give the recorder."""
+"""What the processes of a live run hand to each other, and what they give to the recorder."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+from math import nan
+from multiprocessing.sharedctypes import RawArray
 from pathlib import Path as File
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,79 +17,72 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.rig import Rig
 from estimation.se3 import Array
+from hardware.arm.device import ArmEvent
 from hardware.arm.profile import ArmProfile
-from hardware.arm_status import ArmEvent
-from hardware.live.arrived import Encoded
-from hardware.motion.loop import Tick
-from hardware.recorded_tick import RecordedTick
+from hardware.live.frame_source import Encoded
+from hardware.motion.loop import RecordedTick, Tick
+from hardware.process.ticks import LATENESS_BIN, LatenessHistogram
 from perception.frames import Frame, PrintHead, Roi
 from planning.path import Path
-from planning.progress import Progress
+from planning.progress import PrintProgress
+
+FRAMES_TO_WIRE_STAGE = "frames handed over to move on the wire"  # as it stands in reports and recordings
+EXPOSURE_TO_WIRE_STAGE = "exposure to move on the wire"
+LATE_TICK_STAGE = "tick late"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Handed:
-    """A pose on its way to the motion. handed: s, when the newest of its frames came; put: s, when the pose left."""
+class PoseHandover:
+    """A pose on its way from the tracking to the motion process."""
 
     pose: SurfacePose
-    handed: float
-    put: float
+    handed: float  # s, when the newest of its frames was handed over
+    sent: float  # s, when the pose left the tracking process
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
-    """A stage's times so far, s: how many, median, 99 % and largest."""
+class StageTiming:
+    """How long a stage of the processing took so far, s."""
 
     name: str
     count: int
     median: float
     p99: float
-    most: float
+    largest: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingReport:
-    """What the tracking process says after each frame set.
+    """The report of the tracking process after each frame set."""
 
-    stamp: s, when it said so. cameras: their names. seen: cameras in the last set. pose: the newest. surface_from_path:
-    (4, 4), where the path lies on the tracker's surface; None until that is known. registered: stamp, s, of the pose
-    that told. sets, dropped: taken, and left out as a newer one was there. interval: s between two sets, NaN until
-    known. unrecorded: sets that found the recorder busy. spans: of its stages. used: tracks by camera. ended: why there
-    will be no more, "" while there are. wrong: whether that was wrong input. truth: (4, 4) mm, base_from_surface at the
-    pose's stamp where the world is simulated. surface: (V, 3) mm, landmarks in the surface frame.
-    """
-
-    stamp: float
-    cameras: tuple[str, ...] = ()
-    seen: tuple[int, ...] = ()
-    pose: SurfacePose | None = None
-    surface_from_path: Array | None = None
-    registered: float = float("nan")
-    sets: int = 0
-    dropped: int = 0
-    interval: float = float("nan")
-    unrecorded: int = 0
-    spans: tuple[Span, ...] = ()
-    used: tuple[int, ...] = ()
-    ended: str = ""
-    wrong: bool = False
-    truth: Array | None = None
-    surface: Array | None = None
+    stamp: float  # s, of the report
+    cameras: tuple[str, ...] = ()  # names
+    delivering: tuple[int, ...] = ()  # numbers of the cameras in the last set
+    pose: SurfacePose | None = None  # the newest
+    surface_from_path: Array | None = None  # (4, 4) mm, in the tracker's surface frame; None until it is known
+    registered: float = nan  # s, stamp of the pose by which the path was placed
+    sets: int = 0  # frame sets tracked
+    dropped: int = 0  # frame sets left out, as a newer one was there
+    interval: float = nan  # s between two sets
+    unrecorded: int = 0  # entries for which the recorder had no room
+    timings: tuple[StageTiming, ...] = ()
+    used: tuple[int, ...] = ()  # tracks, by camera
+    ended: str = ""  # why there will be no more, "" while there are
+    truth: Array | None = None  # (4, 4) mm, true base_from_surface at the pose's stamp, of a simulated world
+    surface: Array | None = None  # (V, 3) mm, landmarks in the surface frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Begin:
-    """The order to print. path: in the tracker's surface frame. profile: of the arm, its place and lag as they are
-    now known. start: counted in checkpoints. fingerprint: of the path as its file has it.
-    """
+class BeginPrint:
+    """The order to print."""
 
-    path: Path
-    profile: ArmProfile
-    start: float
-    fingerprint: str
+    path: Path  # in the tracker's surface frame
+    profile: ArmProfile  # with the arm's place and lag as they are now known
+    start: float  # place on the path, counted in checkpoints
+    fingerprint: str  # of the path as its file has it
 
 
-class Pace(Enum):
+class PauseOrder(Enum):
     """Orders of a live run beside those that the arm follows."""
 
     PAUSE = "pause"
@@ -95,33 +91,28 @@ class Pace(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveMotionReport:
-    """What the motion process says after each tick.
+    """The report of the motion process after each tick."""
 
-    tick: the last one. progress: None before a path was begun. paused: whether it was told to. events: the last ones.
-    late: ticks' lateness; spans: times from frames to the wire. skipped: ticks not made. stops: how many, and the last
-    one's decision and its frame on the wire, s. unrecorded: what found the recorder busy. priority: as granted.
-    """
-
-    tick: Tick
-    progress: Progress | None
-    paused: bool
-    events: tuple[ArmEvent, ...]
-    spans: tuple[Span, ...]
-    skipped: int
-    stops: int
-    stop: tuple[float, float] | None
-    unrecorded: int
-    priority: str
+    tick: Tick  # the last one
+    progress: PrintProgress | None  # None before a path was begun
+    paused: bool  # whether it was ordered to pause
+    events: tuple[ArmEvent, ...]  # the last ones
+    timings: tuple[StageTiming, ...]  # from frames to the wire, and how late ticks were
+    skipped: int  # ticks that were not made
+    stops: int  # how many stops were sent
+    stop: tuple[float, float] | None  # the last one's decision and the end of its frame on the wire, s
+    unrecorded: int  # entries for which the recorder had no room
+    priority: str  # of the process, as granted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecorderReport:
-    """What the recorder says. written: bytes. share: of one core that it takes. failed: why it stopped, "" if not."""
+    """The report of the recorder."""
 
-    stamp: float
-    written: int
-    share: float
-    failed: str
+    stamp: float  # s
+    written: int  # bytes
+    share: float  # of one core that it takes
+    failed: str  # why it stopped, "" while it writes
 
 
 # -- what is recorded
@@ -150,61 +141,102 @@ class RoiEntry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetEntry:
-    """A frame set as the tracker took it. encoded: pictures by camera as the camera gave them; frames: the others."""
+    """A frame set as the tracker took it."""
 
-    stamps: Mapping[int, float]
-    encoded: Mapping[int, Encoded]
-    frames: tuple[Frame, ...] = ()
+    stamps: Mapping[int, float]  # s, by camera
+    encoded: Mapping[int, Encoded]  # pictures as the camera gave them, by camera
+    frames: tuple[Frame, ...] = ()  # the others
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEntry:
-    """A pose, the tracks that it is made of, the head that was kept out, and the true pose (4, 4) where it is known."""
+    """A pose and what it is made of."""
 
     pose: SurfacePose
     observations: Observations
-    head: PrintHead | None = None
-    truth: Array | None = None
+    head: PrintHead | None = None  # that was masked out
+    truth: Array | None = None  # (4, 4) mm, true base_from_surface where it is known
 
 
 @dataclass(frozen=True, slots=True)
 class WireEntry:
-    """Bytes that passed the arm's port at `stamp`, s."""
+    """Bytes that passed the arm's port."""
 
-    stamp: float
+    stamp: float  # s
     data: bytes
-    sent: bool
+    sent: bool  # rather than received
 
 
 @dataclass(frozen=True, slots=True)
 class EventEntry:
-    """Something that a person should be able to read afterwards."""
+    """A line of the recording's log."""
 
-    stamp: float
+    stamp: float  # s
     text: str
-    level: int
-    name: str
+    level: int  # of hardware.recording.schemas
+    name: str  # of whom it comes from
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatencyEntry:
-    """How long a stage took so far: counts (N,) of bins of `width` s, and the largest, s."""
+    """How long a stage took so far."""
 
-    stamp: float
+    stamp: float  # s
     stage: str
-    width: float
-    counts: NDArray[np.int64]
-    most: float
+    width: float  # s of a bin
+    counts: NDArray[np.int64]  # (N,) of each bin
+    largest: float  # s
 
 
 @dataclass(frozen=True, slots=True)
 class UsedEntry:
-    """What the run used, as TOML; kept in the recording."""
+    """A file that the run used, kept in the recording."""
 
     name: str
     text: str
 
 
-Given = RigEntry | ScanEntry | RoiEntry | UsedEntry
-Happened = SetEntry | PoseEntry | RecordedTick | WireEntry | EventEntry | LatencyEntry
-Entry = Given | Happened
+Entry = (
+    RigEntry | ScanEntry | RoiEntry | UsedEntry
+    | SetEntry | PoseEntry | RecordedTick | WireEntry | EventEntry | LatencyEntry
+)  # fmt: skip
+
+
+class StageHistograms:
+    """How long each stage takes, as a histogram each: a run of any length costs the same memory."""
+
+    def __init__(self) -> None:
+        self._stages: dict[str, LatenessHistogram] = {}
+
+    def add(self, stage: str, seconds: float) -> None:
+        """Count one duration, s, of a stage."""
+        self._stages.setdefault(stage, LatenessHistogram()).add(seconds)
+
+    def timings(self) -> tuple[StageTiming, ...]:
+        """The figures of each stage."""
+        return tuple(
+            StageTiming(name, h.count, h.percentile(50), h.percentile(99), h.most) for name, h in self._stages.items()
+        )
+
+    def entries(self, stamp: float) -> list[LatencyEntry]:
+        """The histograms as they are at `stamp`, s, for the recording."""
+        return [
+            LatencyEntry(stamp, name, LATENESS_BIN, np.array(h.counts, np.int64), h.most)
+            for name, h in self._stages.items()
+        ]
+
+
+class PrintStart:
+    """When printing began, where every process of a run can see it. instant: s, NaN before."""
+
+    def __init__(self) -> None:
+        self._memory: Any = RawArray("d", [float("nan")])
+
+    @property
+    def instant(self) -> float:
+        """When printing began, s."""
+        return float(self._memory[0])
+
+    @instant.setter
+    def instant(self, value: float) -> None:
+        self._memory[0] = value

@@ -1,7 +1,7 @@
-"""`stillbed live`: the process that the user started conducts the run; others see, move and write.
+"""`stillbed live`: the process that the user started, which supervises the processes that track, move and record.
 
-It starts them, looks at their reports, keys, signals and the page, asks the conductor what follows, and gives the
-orders. It does nothing that takes long, so that a stop waits for nothing here.
+It starts them, reads their reports, keys, signals and the requests of the page, asks the state machine what follows,
+and sends the orders. It does nothing that takes long, so that a stop never waits here.
 """
 
 from __future__ import annotations
@@ -13,316 +13,311 @@ import socket
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from multiprocessing.connection import wait
 from pathlib import Path as File
 from types import FrameType
-from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
+from hardware.arm.device import ArmState
+from hardware.arm.link import emergency_stop
 from hardware.arm.profile import ArmProfile
-from hardware.arm_status import ArmState
-from hardware.live.beside import Found, write_found
-from hardware.live.bodies import track
-from hardware.live.checklist import table
-from hardware.live.console import HELP, Console
-from hardware.live.halting import halt
-from hardware.live.injected import Injector
-from hardware.live.keeper import Keeper
-from hardware.live.kept import kept_begin
-from hardware.live.laid import Laid
-from hardware.live.lines import Body, started
-from hardware.live.page_address import page_settings
-from hardware.live.prepared import Prepared
-from hardware.live.records import Begin, EventEntry, UsedEntry
-from hardware.live.settings import settings_text
-from hardware.live.state_machine import Conductor, Orders, Seen
-from hardware.live.tally import Tally
-from hardware.live.view import Viewer
-from hardware.live.words import stage_line, status_line
+from hardware.live.checklist import PlacedPath, checks_table
+from hardware.live.fault_injection import FaultInjector
+from hardware.live.ipc import ProcessBody, run_tracker, start_processes
+from hardware.live.outcome import RunOutcome, RunStatistics
+from hardware.live.prepared import Prepared, ProgressWriter, SurfacePlacement, write_placement
+from hardware.live.records import BeginPrint, EventEntry, UsedEntry
+from hardware.live.settings import page_settings, settings_text
+from hardware.live.state_machine import Orders, RunReports, RunStateMachine
+from hardware.live.view import KEYS_HELP, Console, ViewBuilder, stage_line, status_line
 from hardware.motion.loop import Order
 from hardware.operator.process import OperatorPage
-from hardware.operator.scene import scene_from
-from hardware.operator.shared_state import Request, Wish
-from hardware.operator.view import Stage
+from hardware.operator.shared_state import OperatorRequest, scene_from
+from hardware.operator.view import RunStage, Wish
 from hardware.process.clock import WallClock
 from hardware.recording.schemas import INFO, WARNING
+from hardware.recording.session_reader import input_texts, inputs_from_texts
 
-if TYPE_CHECKING:
-    from hardware.live.outcome import Outcome
-
-LOOK = 0.02  # s between looks while nothing happens
-SHOW = 0.15  # s between views for the page
-SAY = 5.0  # s between lines
-AT_REST = 1.0  # s that the arm gets to say that it is at rest
-HUNG = 2.0  # s without a word of the motion process, after which it is ended and the arm stopped for it
-ENDED_BY = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "the terminal was closed"}
+POLL_PERIOD = 0.02  # s between looks while nothing happens
+VIEW_PERIOD = 0.15  # s between views for the page
+STATUS_PERIOD = 5.0  # s between status lines
+REST_TIMEOUT = 1.0  # s in which the arm has to report that it is at rest
+MOTION_HANG_TIMEOUT = 2.0  # s without a report, after which the motion process is ended and the arm stopped for it
+SIGNAL_TEXTS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "the terminal was closed"}
 MOTION, TRACKING, RECORDER = "motion", "tracking", "recorder"
 
 
 class LiveRun:
     """One run from its check to its report."""
 
-    def __init__(self, prepared: Prepared, console: Console, tracker: Body = track) -> None:
-        """tracker: what the tracking process does; given what `hardware.live.bodies.track` is given."""
+    def __init__(self, prepared: Prepared, console: Console, tracker: ProcessBody = run_tracker) -> None:
+        """tracker: body of the tracking process, with the parameters of `hardware.live.ipc.run_tracker`."""
         self._prepared, self._console, self._clock = prepared, console, WallClock()
         self._tracker = tracker
-        self._conductor, self._tally, self._seen = Conductor(prepared.task), Tally(), Seen()
-        self._signal = 0
-        self._viewer, self._viewed = Viewer(prepared), -1e9
+        self._machine, self._statistics, self._reports = RunStateMachine(prepared.task), RunStatistics(), RunReports()
+        self._view_builder, self._view_put = ViewBuilder(prepared), -1e9
         self._page: OperatorPage | None = None
-        self._stopped_at: list[float] = []  # s, decisions whose frame is not on the wire yet
-        self._stops, self._requests = 0, 0
-        self._turn = 0  # that was told last
-        self._said = self._heard = -1e9
-        self._found = prepared.found is not None
-        self._halted = self._missing = False
-        self._laid: Laid | None = None  # as the page shows it
-        self._landmarks = 0  # of the surface that it shows
-        self._used: ArmProfile | None = None  # since the path was begun
+        self._signal = 0  # that asks the run to end
+        self._stops_ordered: list[float] = []  # s, of stops whose frame is not on the wire yet
+        self._stops = 0  # on the wire so far
+        self._key_requests = 0
+        self._turn = 0  # of the state machine, when its stage was last announced
+        self._announced = -1e9  # s
+        self._silence_logged = self._arm_halted = False
+        self._placement_written = prepared.placement is not None
+        self._shown_path: PlacedPath | None = None
+        self._shown_landmarks = 0
+        self._profile: ArmProfile | None = None  # of the arm since the path was begun
 
-    def __call__(self) -> Outcome:
-        """Run to the end; what came of it. Files are whole and all processes have ended on return."""
-        prepared = self._prepared
-        with tempfile.TemporaryDirectory() as folder, _wakened(self) as wake, ExitStack() as stack:
-            lines = self._lines = started(prepared, File(folder), self._tracker)
-            stack.callback(lines.close)
-            prepared.beside.session.write_text(settings_text(prepared.settings), encoding="utf-8")
-            lines.outbox.put(UsedEntry("session.toml", settings_text(prepared.settings)))
-            keeper = Keeper(prepared.beside.progress, prepared.task.fingerprint, lines.place)
-            stack.callback(keeper.close)
+    def __call__(self) -> RunOutcome:
+        """Run to the end. On return all files are complete and all processes have ended."""
+        prepared, files = self._prepared, self._prepared.files
+        with tempfile.TemporaryDirectory() as folder, _signal_wakeup(self) as wake, ExitStack() as stack:
+            channels = self._channels = start_processes(prepared, File(folder), self._tracker)
+            stack.callback(channels.close)
+            files.session.write_text(settings_text(prepared.settings), encoding="utf-8")
+            channels.sender.put(UsedEntry("session.toml", settings_text(prepared.settings)))
+            progress_writer = ProgressWriter(files.progress, prepared.task.fingerprint, channels.place)
+            stack.callback(progress_writer.close)
             self._open_page(stack)
-            page = "" if self._page is None else self._page.address
-            self._injector = Injector(prepared.faults, lines.crew, prepared.beside.record, lines.begun, page)
-            importlib.import_module("scipy.interpolate")  # predicting takes it; now nobody waits for this process
+            address = "" if self._page is None else self._page.address
+            processes = channels.processes
+            self._injector = FaultInjector(prepared.faults, processes, files.record, channels.start, address)
+            importlib.import_module("scipy.interpolate")  # the prediction needs it; now nobody waits for this process
             for note in prepared.notes:
                 self._console.say(note)
-            while not self._conductor.ended:
-                self._look(wake, keeper)
-            self._come_to_rest(wake)
-            self._say_farewell()
+            while not self._machine.ended:
+                self._cycle(wake, progress_writer)
+            self._wait_for_rest(wake)
+            self._close_page()
             self._shut_down()
-        from hardware.live.outcome import Outcome  # loads what reports need, once the arm is at rest
+        fraction = channels.place.fraction
+        return RunOutcome(prepared, self._machine, self._statistics, self._reports, self._signal, fraction)
 
-        return Outcome(prepared, self._conductor, self._tally, self._seen, self._signal, lines.place.fraction)
-
-    def signalled(self, number: int, frame: FrameType | None) -> None:
-        """A signal asks the run to end."""
+    def on_signal(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal that asks the run to end."""
         self._signal = number
 
-    # -- one look
+    # -- one cycle
 
-    def _look(self, wake: socket.socket, keeper: Keeper) -> None:
-        ready = wait([wake, *self._lines.crew.sentinels(), *self._terminal()], LOOK)
+    def _cycle(self, wake: socket.socket, progress_writer: ProgressWriter) -> None:
+        ready = wait([wake, *self._channels.processes.sentinels(), *self._terminal()], POLL_PERIOD)
         if wake in ready:
             wake.recv(64)
-        requests = self._keys(ready) + self._lines.link.requests.take()
-        seen, lines, now = self._seen, self._lines, self._clock.now()
-        seen.tracking, seen.motion, seen.recorder = lines.tracking.get(), lines.motion.get(), lines.recorder.get()
-        self._count_stops(now)
-        conductor = self._conductor
-        for words in self._injector.look(now):
-            self._say(f"on purpose: {words}", WARNING)
-        orders = self._ended(keeper, now) + conductor(now, seen, requests)
-        self._give(orders)
-        self._tally.look(now, conductor.stage, seen, None if conductor.laid is None else conductor.laid.profile.arm)
-        self._viewer.look(seen, self._used)
-        self._note_surface()
-        self._show(now)
-        self._tell(now)
+        requests = self._requests_by_key(ready) + self._channels.link.requests.take()
+        reports, channels, now = self._reports, self._channels, self._clock.now()
+        reports.tracking, reports.motion = channels.tracking.get(), channels.motion.get()
+        reports.recorder = channels.recorder.get()
+        self._time_stops()
+        machine = self._machine
+        for text in self._injector.update(now):
+            self._log(f"on purpose: {text}", WARNING)
+        self._send(self._check_failures(progress_writer, now) + machine(now, reports, requests))
+        arm = None if machine.placed_path is None else machine.placed_path.profile.arm
+        self._statistics.update(now, machine.stage, reports, arm)
+        self._view_builder.update(reports, self._profile)
+        self._show_surface()
+        self._show_view(now)
+        self._announce(now)
 
     def _terminal(self) -> list[int]:
         return [] if self._console.file is None else [self._console.file]
 
-    def _keys(self, ready: Sequence[object]) -> list[Request]:
+    def _requests_by_key(self, ready: Sequence[object]) -> list[OperatorRequest]:
         if self._console.file is None or self._console.file not in ready:
             return []
-        found = []
+        requests = []
         for wish in self._console.wishes():
-            self._requests -= 1  # the page's count upwards
-            found.append(Request(self._requests, wish, self._conductor.turn))
-        return found
+            self._key_requests -= 1  # the numbers of the page go upwards
+            requests.append(OperatorRequest(self._key_requests, wish, self._machine.turn))
+        return requests
 
-    def _ended(self, keeper: Keeper, now: float) -> Orders:
-        """What ends a run from outside the stages: a signal, a process that is gone or hangs, a bookmark not kept."""
-        conductor, crew = self._conductor, self._lines.crew
+    def _check_failures(self, progress_writer: ProgressWriter, now: float) -> Orders:
+        """End the run for a signal, for a process that has ended or hangs, or for progress that cannot be kept."""
+        machine, processes = self._machine, self._channels.processes
         if self._signal:
-            return conductor.end(f"ended: {ENDED_BY[signal.Signals(self._signal)]}", now, Stage.ENDED)
-        for name in crew.dead():
-            if name == MOTION and (trouble := self._lines.trouble.get()):
-                return conductor.end(trouble, now)
+            return machine.end(f"ended: {SIGNAL_TEXTS[signal.Signals(self._signal)]}", now, RunStage.ENDED)
+        for name in processes.dead():
+            if name == MOTION and (trouble := self._channels.trouble.get()):
+                return machine.end(trouble, now)
             if name == MOTION:
-                self._halt()
-            ended = self._lines.tracking.get()
-            if name == TRACKING and ended is not None and ended.ended:
-                continue  # the conductor knows whether pictures are still needed
+                self._halt_arm()
+            tracking = self._channels.tracking.get()
+            if name == TRACKING and tracking is not None and tracking.ended:
+                continue  # the state machine knows whether pictures are still needed
             if name in (MOTION, TRACKING, RECORDER):
-                failed = self._lines.recorder.get()
-                why = f": {failed.failed}" if name == RECORDER and failed is not None and failed.failed else ""
-                return conductor.end(f"the {name} process {crew.ending(name)}{why}", now)
-        if keeper.failed:
-            return conductor.end(f"the place on the path cannot be kept: {keeper.failed}", now)
-        motion = self._seen.motion
-        if motion is not None and now - motion.tick.stamp > HUNG:
-            crew.kill(MOTION)
-            self._halt()
-            return conductor.end(f"the motion process said nothing for {HUNG:g} s and was ended", now)
+                recorder = self._channels.recorder.get()
+                why = f": {recorder.failed}" if name == RECORDER and recorder is not None and recorder.failed else ""
+                return machine.end(f"the {name} process {processes.ending(name)}{why}", now)
+        if progress_writer.failed:
+            return machine.end(f"the place on the path cannot be kept: {progress_writer.failed}", now)
+        motion = self._reports.motion
+        if motion is not None and now - motion.tick.stamp > MOTION_HANG_TIMEOUT:
+            processes.kill(MOTION)
+            self._halt_arm()
+            return machine.end(f"the motion process said nothing for {MOTION_HANG_TIMEOUT:g} s and was ended", now)
         return []
 
-    def _halt(self) -> None:
+    def _halt_arm(self) -> None:
         """Stop the arm in place of the motion process."""
-        if self._halted:
+        if self._arm_halted:
             return
-        self._halted = True
+        self._arm_halted = True
         decided = self._clock.now()
-        sent, reason = halt(self._lines.url, self._prepared.task.profile)
+        sent, reason = emergency_stop(self._channels.url, self._prepared.task.profile)
         if reason:
-            self._say(f"the arm could not be stopped: {reason}; its queue ends within 50 ms", WARNING)
+            self._log(f"the arm could not be stopped: {reason}; its queue ends within 50 ms", WARNING)
         else:
-            self._tally.times.add("motion process gone to stop on the wire", sent - decided)
+            self._statistics.times.add("motion process gone to stop on the wire", sent - decided)
 
-    def _give(self, orders: Orders) -> None:
+    def _send(self, orders: Orders) -> None:
         for order in orders:
             if order is Order.STOP:
-                self._stopped_at.append(self._clock.now())
-            if isinstance(order, Begin):
+                self._stops_ordered.append(self._clock.now())
+            if isinstance(order, BeginPrint):
                 try:
-                    order = self._noted(order)
+                    order = self._record_begin(order)
                 except InputError as error:
                     why = f"{error.what} = {error.got}, allowed {error.allowed}"
-                    self._give(
-                        self._conductor.end(f"what lies on the surface cannot be printed: {why}", self._clock.now())
-                    )
+                    reason = f"what lies on the surface cannot be printed: {why}"
+                    self._send(self._machine.end(reason, self._clock.now()))
                     return
-            with suppress(OSError):  # nobody is there: seen by its end
-                self._lines.orders.send(order)
+            with suppress(OSError):  # the motion process is gone: the next cycle sees that
+                self._channels.orders.send(order)
 
-    def _noted(self, order: Begin) -> Begin:
-        """The order as a recording keeps it, to the last digit, so that a replay of that gives the same bytes."""
-        kept, order = kept_begin(order)
-        for name, text in kept.items():
-            self._lines.outbox.put(UsedEntry(name, text))
+    def _record_begin(self, order: BeginPrint) -> BeginPrint:
+        """The order with what its recorded texts hold, to the last digit: a replay of them gives the same bytes."""
+        texts, order = recorded_begin(order)
+        for name, text in texts.items():
+            self._channels.sender.put(UsedEntry(name, text))
+        self._profile = order.profile
         lag = 1000 * order.profile.lag
-        self._used = order.profile
-        self._say(f"begun at checkpoint {order.start:.2f}, the arm's lag taken as {lag:.0f} ms")
+        self._log(f"begun at checkpoint {order.start:.2f}, the arm's lag taken as {lag:.0f} ms")
         return order
 
-    def _count_stops(self, now: float) -> None:
-        """How long a stop took from the decision to the end of its frame on the wire."""
-        motion = self._seen.motion
+    def _time_stops(self) -> None:
+        """How long a stop took from the order to the end of its frame on the wire."""
+        motion = self._reports.motion
         if motion is None or motion.stop is None or motion.stops == self._stops:
             return
         self._stops = motion.stops
-        if self._stopped_at and motion.stop[1] >= self._stopped_at[0]:
-            self._tally.times.add("stop decided to on the wire", motion.stop[1] - self._stopped_at[0])
-        self._stopped_at.clear()
+        if self._stops_ordered and motion.stop[1] >= self._stops_ordered[0]:
+            self._statistics.times.add("stop decided to on the wire", motion.stop[1] - self._stops_ordered[0])
+        self._stops_ordered.clear()
 
-    # -- what it shows and says
+    # -- page, terminal and log
 
     def _open_page(self, stack: ExitStack) -> None:
         if not self._prepared.settings.page:
             return
-        link = self._lines.link
-        settings = self._prepared.settings
-        self._page = OperatorPage(link, page_settings(settings, self._prepared.beside.session))
+        link = self._channels.link
+        self._page = OperatorPage(link, page_settings(self._prepared.settings, self._prepared.files.session))
         stack.callback(self._page.close)
         self._page.tend(self._clock.now())
         link.scene.put(scene_from(self._prepared.rig))
         self._console.say(f"open {self._page.address} to see and operate the run")
 
-    def _show(self, now: float) -> None:
-        """The page's view, and the page itself: where it died, whoever looked at it sees nothing, so the arm waits."""
-        page, conductor = self._page, self._conductor
-        if page is None or now < self._viewed + SHOW:
+    def _show_view(self, now: float) -> None:
+        """Put a view for the page, and restart the page where it has died: the run pauses, as nobody saw it."""
+        page, machine = self._page, self._machine
+        if page is None or now < self._view_put + VIEW_PERIOD:
             return
-        self._viewed = now
+        self._view_put = now
         if page.process is not None and not page.process.is_alive():
-            self._say("the operator's page has ended, and is started again", WARNING)
-            if Wish.PAUSE in conductor.offers and not self._prepared.task.unattended:
-                self._give(conductor.pause("the operator's page was lost", now))
+            self._log("the operator's page has ended, and is started again", WARNING)
+            if Wish.PAUSE in machine.offers and not self._prepared.task.unattended:
+                self._send(machine.pause("the operator's page was lost", now))
         page.tend(now)
-        self._lines.link.views.put(self._viewer(now, conductor, self._seen, self._tally))
+        self._put_view(now)
 
-    def _note_surface(self) -> None:
-        """Keep where the path lies as soon as that is known, for a run that resumes."""
-        tracking, laid, prepared = self._seen.tracking, self._conductor.laid, self._prepared
+    def _put_view(self, now: float) -> None:
+        self._channels.link.views.put(self._view_builder(now, self._machine, self._reports, self._statistics))
+
+    def _show_surface(self) -> None:
+        """Show path and surface on the page, and write the placement once, for a run that resumes."""
+        tracking, placed, prepared = self._reports.tracking, self._machine.placed_path, self._prepared
         surface = None if tracking is None else tracking.surface
         count = 0 if surface is None else len(surface)
-        if laid is not self._laid or count != self._landmarks:
-            self._laid, self._landmarks = laid, count
-            self._lines.link.scene.put(scene_from(prepared.rig, None if laid is None else laid.path, surface))
-        if self._found or laid is None or tracking is None or tracking.surface_from_path is None:
+        if placed is not self._shown_path or count != self._shown_landmarks:
+            self._shown_path, self._shown_landmarks = placed, count
+            self._channels.link.scene.put(scene_from(prepared.rig, None if placed is None else placed.path, surface))
+        if self._placement_written or placed is None or tracking is None or tracking.surface_from_path is None:
             return
-        self._found = True
-        arm_from_base = laid.profile.arm.arm_from_base
-        found = Found(prepared.beside.record, tracking.registered, tracking.surface_from_path, arm_from_base)
-        write_found(prepared.beside.surface, found)
+        self._placement_written = True
+        placement = SurfacePlacement(
+            map=prepared.files.record,
+            until=tracking.registered,
+            surface_from_path=tracking.surface_from_path,
+            arm_from_base=placed.profile.arm.arm_from_base,
+        )
+        write_placement(prepared.files.surface, placement)
 
-    def _tell(self, now: float) -> None:
-        conductor = self._conductor
-        if conductor.missed and not self._missing:
-            self._lines.outbox.put(EventEntry(now, conductor.missed, WARNING, "run"))
-        self._missing = bool(conductor.missed)
-        if conductor.turn != self._turn:
-            self._turn = conductor.turn
-            if conductor.stage is Stage.PRINT and math.isnan(self._lines.begun.instant):
-                self._lines.begun.instant = now
-            self._say(stage_line(conductor.stage, conductor.reason))
-            if conductor.stage is Stage.FIND:
-                self._console.say(table(conductor.checks))
-            elif conductor.stage in (Stage.CONFIRM, Stage.READY):
-                key = "y: the path is right" if conductor.stage is Stage.CONFIRM else "s: start"
-                self._console.say(f"  {HELP}\n  now: {key}")
-            self._said = now
-        elif now > self._said + SAY:
-            self._said = now
-            self._console.say(status_line(conductor, self._seen))
+    def _announce(self, now: float) -> None:
+        """Log a new stage and a process that has become silent; write a status line now and then."""
+        machine = self._machine
+        if machine.silence and not self._silence_logged:
+            self._channels.sender.put(EventEntry(now, machine.silence, WARNING, "run"))
+        self._silence_logged = bool(machine.silence)
+        if machine.turn != self._turn:
+            self._turn = machine.turn
+            if machine.stage is RunStage.PRINT and math.isnan(self._channels.start.instant):
+                self._channels.start.instant = now
+            self._log(stage_line(machine.stage, machine.reason))
+            if machine.stage is RunStage.FIND:
+                self._console.say(checks_table(machine.checks))
+            elif machine.stage in (RunStage.CONFIRM, RunStage.READY):
+                key = "y: the path is right" if machine.stage is RunStage.CONFIRM else "s: start"
+                self._console.say(f"  {KEYS_HELP}\n  now: {key}")
+            self._announced = now
+        elif now > self._announced + STATUS_PERIOD:
+            self._announced = now
+            self._console.say(status_line(machine, self._reports))
 
-    def _say(self, text: str, level: int = INFO) -> None:
+    def _log(self, text: str, level: int = INFO) -> None:
         self._console.say(text)
-        self._lines.outbox.put(EventEntry(self._clock.now(), text, level, "run"))
+        self._channels.sender.put(EventEntry(self._clock.now(), text, level, "run"))
 
     # -- the end
 
-    def _come_to_rest(self, wake: socket.socket) -> None:
-        """Wait until the arm was told to stop and has nothing under way."""
-        until = self._clock.now() + AT_REST
-        while (now := self._clock.now()) < until and self._lines.crew.alive(MOTION):
-            motion = self._seen.motion = self._lines.motion.get() or self._seen.motion
-            self._count_stops(now)
+    def _wait_for_rest(self, wake: socket.socket) -> None:
+        """Wait until the arm is not armed and has nothing under way."""
+        until = self._clock.now() + REST_TIMEOUT
+        while (now := self._clock.now()) < until and self._channels.processes.alive(MOTION):
+            motion = self._reports.motion = self._channels.motion.get() or self._reports.motion
+            self._time_stops()
             if motion is None:
                 return
             status = motion.tick.status
-            if status.state is not ArmState.ARMED and not status.in_flight > 0 and status.stamp > now - 2 * LOOK:
+            if status.state is not ArmState.ARMED and not status.in_flight > 0 and status.stamp > now - 2 * POLL_PERIOD:
                 return
-            wait([wake, *self._lines.crew.sentinels()], LOOK / 4)
+            wait([wake, *self._channels.processes.sentinels()], POLL_PERIOD / 4)
 
-    def _say_farewell(self) -> None:
-        """Show on the page how the run ended; then it goes, so that nothing looks as if it could be asked."""
-        if self._page is None:
-            return
-        now = self._clock.now()
-        self._lines.link.views.put(self._viewer(now, self._conductor, self._seen, self._tally))
-        self._page.close()
+    def _close_page(self) -> None:
+        """Show how the run ended, then end the page, so that it does not look as if it could be asked anything."""
+        if self._page is not None:
+            self._put_view(self._clock.now())
+            self._page.close()
 
     def _shut_down(self) -> None:
-        lines = self._lines
+        channels, reports = self._channels, self._reports
         self._injector.close()
         with suppress(OSError):
-            lines.orders.send(Order.QUIT)
-        lines.end()
-        self._seen.tracking = lines.tracking.get() or self._seen.tracking
-        self._seen.motion = lines.motion.get() or self._seen.motion
-        self._seen.recorder = lines.recorder.get()
+            channels.orders.send(Order.QUIT)
+        channels.end()
+        reports.tracking = channels.tracking.get() or reports.tracking
+        reports.motion = channels.motion.get() or reports.motion
+        reports.recorder = channels.recorder.get()
 
 
 @contextmanager
-def _wakened(run: LiveRun) -> Iterator[socket.socket]:
-    """Signals that end a run wake up whoever waits on the socket."""
+def _signal_wakeup(run: LiveRun) -> Iterator[socket.socket]:
+    """A socket that becomes readable when a signal asks the run to end."""
     ours, theirs = socket.socketpair()
     for end in (ours, theirs):
         end.setblocking(False)
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = [signal.signal(number, run.signalled) for number in numbers]
+    before = [signal.signal(number, run.on_signal) for number in numbers]
     file = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
     try:
         yield ours
@@ -332,3 +327,10 @@ def _wakened(run: LiveRun) -> Iterator[socket.socket]:
             signal.signal(number, handler)
         ours.close()
         theirs.close()
+
+
+def recorded_begin(order: BeginPrint) -> tuple[dict[str, str], BeginPrint]:
+    """Path and arm of an order as texts for the recording, and the order with what is read of those texts."""
+    texts = input_texts(order.path, order.profile)
+    path, profile = inputs_from_texts(texts, File("kept"))
+    return texts, replace(order, path=path, profile=profile)

@@ -6,135 +6,131 @@ turn, between two instants at which the surface hardly moves, so that the motion
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
-from pathlib import Path
 
 import numpy as np
 
 from estimation.errors import StillbedError
-from estimation.trajectory import Trajectory
+from estimation.pose import Trajectory
 from hardware.files.images import decode
-from hardware.files.session import FrameReader, FrameRef, Session, open_session
-from hardware.frame_faults import FrameFaults
-from hardware.live.arrived import Encoded
-from hardware.live.frame_source import FrameRing
-from hardware.live.injected import Begun
+from hardware.files.session import FrameReader, FrameRef, Session
+from hardware.live.frame_source import Encoded, FrameRing
+from hardware.live.prepared import Prepared
+from hardware.live.records import PrintStart
+from hardware.offline.replay import FrameFaults
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault
-from hardware.process.system import settle
+from hardware.process.system import set_up_process
+from hardware.recording.session_reader import open_session
 from perception.frames import Frame, FrameSet
 from perception.pairing import frame_set
 
-TRANSPORT = 0.025  # s from the middle of an exposure to the picture in the computer, as a scenario has it
-LOOK = 0.02  # s between looks whether anybody wants to see it
-ENDS = 0.25  # share of a session at each end in which a turn is looked for
-EARLY = 1.5  # times what decoding took, before a set is due
-FORGET = 0.9  # of what it took, from set to set
-KEPT = 2**30  # bytes of encoded pictures that are kept for a session shown again and again
+TRANSPORT_DELAY = 0.025  # s from the middle of an exposure to the picture in the computer, as a scenario has it
+WANTED_POLL_PERIOD = 0.02  # s between looks whether the tracker asks for frames
+TURN_SEARCH_SHARE = 0.25  # share of a session at each end in which a turn is looked for
+DECODE_LEAD = 1.5  # of the time that decoding takes: so long before a set is due it is begun
+DECODE_DECAY = 0.9  # of that time, from set to set
+PICTURE_CACHE_BYTES = 2**30  # of encoded pictures, kept where a session is shown again and again
 
 
 @dataclass(frozen=True, slots=True)
-class FeedPlan:
-    """What is shown. session: folder or MCAP. again: whether it never ends. faults: of cameras, from `begun` on."""
+class SetShowing:
+    """One showing of one set."""
 
-    session: Path
-    again: bool
-    faults: tuple[Fault, ...] = ()
-    begun: Begun = field(default_factory=Begun)
-
-
-@dataclass(frozen=True, slots=True)
-class Showing:
-    """One showing of one set. live: s, the stamp it gets, of its first frame. backwards: whether time runs so."""
-
-    index: int
-    live: float
-    backwards: bool
+    index: int  # of the set in the session
+    live: float  # s, the stamp that its first frame gets
+    backwards: bool  # whether the session's time runs backwards
 
 
-def turns(truth: Trajectory, stamps: np.ndarray) -> tuple[int, int]:
+def turning_sets(truth: Trajectory, stamps: np.ndarray) -> tuple[int, int]:
     """First and last set (N stamps, s) between which a session is shown to and fro: where the surface is slowest."""
     count = len(stamps)
     places = np.stack([np.interp(stamps, truth.stamps, truth.base_from_surface[:, i, 3]) for i in range(3)], 1)
     speed = np.linalg.norm(np.gradient(places, stamps, axis=0), axis=1)
-    share = max(int(ENDS * count), 1)
+    share = max(int(TURN_SEARCH_SHARE * count), 1)
     return int(np.argmin(speed[:share])), count - share + int(np.argmin(speed[count - share :]))
 
 
-def schedule(stamps: np.ndarray, begin: float, between: tuple[int, int] | None) -> Iterator[Showing]:
+def schedule(stamps: np.ndarray, begin: float, between: tuple[int, int] | None) -> Iterator[SetShowing]:
     """When each set, of stamps (N,), is shown: once, or to and fro for ever between two of them."""
     if between is None:
-        yield from (Showing(i, begin + float(s - stamps[0]), False) for i, s in enumerate(stamps))
+        yield from (SetShowing(i, begin + float(s - stamps[0]), False) for i, s in enumerate(stamps))
         return
     first, last = between
     live = begin
-    yield Showing(first, live, False)
+    yield SetShowing(first, live, False)
     while True:
         for i in range(first + 1, last + 1):
             live += float(stamps[i] - stamps[i - 1])
-            yield Showing(i, live, False)
+            yield SetShowing(i, live, False)
         for i in range(last - 1, first - 1, -1):
             live += float(stamps[i + 1] - stamps[i])
-            yield Showing(i, live, True)
+            yield SetShowing(i, live, True)
 
 
-def feed_process(plan: FeedPlan, ring: FrameRing, words: Connection) -> None:
-    """Show a session until it is over, or nobody looks any more; the last word says why it ended."""
-    settle("feed")
+def play(prepared: Prepared, ring: FrameRing, notices: Connection, start: PrintStart) -> None:
+    """The body of the process: show the run's session until it is over or the other end is closed.
+
+    The last notice is a text that says why it ended.
+    """
+    set_up_process("feed")
     with suppress(BrokenPipeError, ConnectionError):
         try:
-            session = open_session(plan.session)
-            _show(session, plan, ring, words)
-            words.send(f"{plan.session.name} is over")
+            session = open_session(prepared.session)
+            play_session(session, prepared.again, prepared.faults, ring, notices, start)
+            notices.send(f"{prepared.session.name} is over")
         except StillbedError as error:
-            words.send(str(error))
+            notices.send(str(error))
 
 
-def _show(session: Session, plan: FeedPlan, ring: FrameRing, words: Connection) -> None:
-    clock, pictures = WallClock(), _Pictures(session, plan.again)
-    spoil = FrameFaults(plan.faults, session.rig, "command line")
+def play_session(
+    session: Session, again: bool, faults: Sequence[Fault], ring: FrameRing, notices: Connection, start: PrintStart
+) -> None:
+    """Put the sets of a session into the ring in real time. faults: of cameras, counted from `start`."""
+    clock, pictures = WallClock(), _PictureCache(session, again)
+    spoil = FrameFaults(faults, session.rig, "command line")
     _wait_until_wanted(ring, clock)
     stamps = np.array([np.mean([ref.stamp for ref in refs]) for refs in session.sets])
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    between = turns(session.truth, stamps) if plan.again and session.truth is not None else None
+    between = turning_sets(session.truth, stamps) if again and session.truth is not None else None
     spent = period  # s that decoding a set took
     for showing in schedule(stamps, clock.now(), between):
-        due = showing.live + TRANSPORT
+        due = showing.live + TRANSPORT_DELAY
         if clock.now() > due + period:
             continue  # as a camera whose host is late loses a frame
         refs, anchor = session.sets[showing.index], float(stamps[showing.index])
-        clock.wait_until(due - EARLY * spent)  # not before: while the set before is tracked, cores are wanted there
-        begun = clock.now()
+        clock.wait_until(due - DECODE_LEAD * spent)  # not before: the tracker wants the cores for the set before
+        decoding = clock.now()
         encoded, frames = pictures.decoded(refs)
-        spent = max(clock.now() - begun, FORGET * spent)
-        shown = [replace(f, stamp=_live(f.stamp, anchor, showing)) for f in frames]
+        spent = max(clock.now() - decoding, DECODE_DECAY * spent)
+        shown = [replace(f, stamp=_live_stamp(f.stamp, anchor, showing)) for f in frames]
         head = session.heads.at(anchor)
         whole = FrameSet(frame_set(shown).stamp, tuple(shown), head)
-        seen = spoil(whole, showing.live - plan.begun.instant)
-        same = {frame.camera for frame in seen.frames if frame in whole.frames}
+        spoilt = spoil(whole, showing.live - start.instant)
+        same = {frame.camera for frame in spoilt.frames if frame in whole.frames}
         encoded = {camera: stored for camera, stored in encoded.items() if camera in same}
         clock.wait_until(due)
-        if seen.frames:
-            words.send(ring.put(seen, encoded, clock.now, anchor))
+        if spoilt.frames:
+            notices.send(ring.put(spoilt, encoded, clock.now, anchor))
 
 
 def _wait_until_wanted(ring: FrameRing, clock: WallClock) -> None:
     """A session that is shown once begins when the tracker is ready for it."""
     parent = parent_process()
     while not ring.wanted and (parent is None or parent.is_alive()):
-        clock.wait_until(clock.now() + LOOK)
+        clock.wait_until(clock.now() + WANTED_POLL_PERIOD)
 
 
-def _live(stamp: float, anchor: float, showing: Showing) -> float:
+def _live_stamp(stamp: float, anchor: float, showing: SetShowing) -> float:
     """The stamp, s, of a frame whose set is shown at another instant; backwards, what was earlier is later."""
     return showing.live + (anchor - stamp if showing.backwards else stamp - anchor)
 
 
-class _Pictures:
+class _PictureCache:
     """Reads and decodes pictures; of a session that is shown again and again, keeps them as they were encoded."""
 
     def __init__(self, session: Session, keep: bool) -> None:
@@ -158,7 +154,7 @@ class _Pictures:
         if ref in self._kept:
             return self._kept[ref]
         stored = self._reader.encoded(ref)
-        if self._keep and stored is not None and self._size < KEPT:
+        if self._keep and stored is not None and self._size < PICTURE_CACHE_BYTES:
             self._kept[ref] = stored
             self._size += len(stored[1])
         return stored

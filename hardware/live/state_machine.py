@@ -1,66 +1,89 @@
-"""The stages of a run as an operator knows them: what is asked for and what has happened lead from one to the next.
+"""The stages of a run as an operator knows them: requests and events lead from one to the next.
 
-Nothing here waits, sends or knows the time. Each call is given the newest reports and what was asked for, and answers
-with orders for the motion process.
+Nothing here waits, sends or reads a clock. Each call is given the newest reports and requests, and returns orders for
+the motion process.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from math import inf, isnan, nan
 
-import numpy as np
-
+from hardware.arm.device import ArmState
 from hardware.arm.profile import ArmProfile
-from hardware.arm_status import ArmState
-from hardware.live import checklist
-from hardware.live.laid import Laid, laid_on, lifted
-from hardware.live.records import Begin, LiveMotionReport, Pace, RecorderReport, TrackingReport
-from hardware.live.silence import silence
-from hardware.live.stages import OFFERS, RUNNING
+from hardware.live.checklist import (
+    PlacedPath,
+    arm_check,
+    camera_checks,
+    path_check,
+    place_path,
+    raised_path,
+    reach_check,
+    recorder_check,
+)
+from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RecorderReport, TrackingReport
 from hardware.motion.loop import Order
-from hardware.operator.shared_state import Request, Wish, refusal
-from hardware.operator.view import Answer, Check, Stage, Verdict
+from hardware.operator.shared_state import OperatorRequest
+from hardware.operator.view import (
+    ACTIVE_STAGES,
+    STAGE_OFFERS,
+    Check,
+    CheckVerdict,
+    RequestAnswer,
+    RunStage,
+    Wish,
+    refusal,
+)
 from hardware.process.ticks import tick_in_step
 from planning.path import Path
-from planning.progress import Phase, fingerprint
+from planning.progress import PrintPhase, fingerprint
 
-Orders = list[Order | Pace | Begin]
+SILENT_INTERVALS, SILENCE_SLACK = 2, 0.01  # a process is silent after so many of its intervals, and so many s
+HOMING_TIMEOUT = 60.0  # s: across the whole room at 20 mm/s
+ARMING_TIMEOUT = 5.0  # s until a stopped arm is at rest and can be armed
+RESEND_AFTER = 0.3  # s between orders to an arm that was not ready for the last one
+MAX_SERVO_LAG = 0.3  # s: a lag measured beyond this is no servo's
+SEARCH_TIMEOUT = 180.0  # s in which an unattended run must pass its checks and find the surface
+ARM_BACK_TEXT = "the arm is back: resume, or go home first"
+ARM_UNPLACED_TEXT = "the arm is back and does not say where it stands: move it to its home by hand, then ask for Home"
 
-HOME_PATIENCE, ARM_PATIENCE = 60.0, 5.0  # s: across the whole room at 20 mm/s; until a stopped arm is at rest
-ASK_AGAIN = 0.3  # s between orders to an arm that was not ready for the last one
-LONGEST_LAG = 0.3  # s: a lag measured beyond this is no servo's
-BACK = "the arm is back: resume, or go home first"
-BACK_SOMEWHERE = "the arm is back and does not say where it stands: move it to its home by hand, then ask for Home"
-SOUGHT = 180.0  # s in which all must be found, or nobody looks any longer where nobody watches
+Orders = list[Order | PauseOrder | BeginPrint]
+
+
+def silence_text(name: str, last: float, interval: float, now: float) -> str:
+    """That a process is silent at `now`, s, long before it counts as hung; "" if it is not.
+
+    last: s, of its last report. interval: s from report to report; of NaN nothing can be said. Nothing is done about
+    silence: the arm rests anyhow, its queue being empty or the pose too old. But the operator is to know at once why.
+    """
+    silent = now - last
+    if silent > SILENT_INTERVALS * interval + SILENCE_SLACK:
+        return f"the {name} process has said nothing for {silent:.2f} s"
+    return ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Task:
-    """What is to be printed, and how. path: in its own frame; start: counted in checkpoints, where it goes on.
+class PrintTask:
+    """What is to be printed, and how."""
 
-    place: put the arm where the surface lies below its home. stands_home: the operator says that the arm does.
-    lift: mm, of a dry run; None for a real one. unattended: nobody confirms and nobody resumes: what stops such a run
-    ends it. patience: s, without pictures, after which the arm is stopped.
-    """
-
-    path: Path
+    path: Path  # in its own frame
     profile: ArmProfile
-    start: float = 0.0
-    place: bool = False
-    stands_home: bool = False
-    lift: float | None = None
-    unattended: bool = False
-    patience: float = 10.0
+    start: float = 0.0  # where it goes on, counted in checkpoints
+    place: bool = False  # put the arm where the surface lies below its home
+    stands_home: bool = False  # the operator says that the arm stands at home
+    lift: float | None = None  # mm above the path in a dry run; None for a real one
+    unattended: bool = False  # nobody confirms and nobody resumes: what stops such a run ends it
+    patience: float = 10.0  # s without pictures, after which the arm is stopped
 
     @property
     def fingerprint(self) -> str:
-        """Of the path as its file has it; "" in a dry run, which prints nothing that need not be printed again."""
+        """Of the path as its file has it; "" in a dry run, of which no progress is kept."""
         return fingerprint(self.path) if self.lift is None else ""
 
 
 @dataclass(slots=True)
-class Seen:
+class RunReports:
     """The newest reports."""
 
     tracking: TrackingReport | None = None
@@ -69,264 +92,262 @@ class Seen:
 
 
 @dataclass(slots=True)
-class Conductor:
-    """Where the run is. turn: counts changes. ended: why it is over, "" while it is not. done: the path is printed.
+class RunStateMachine:
+    """The stage of a run, and what is known for the next one."""
 
-    missed: which process says nothing while the arm may move, "" while both speak.
-    """
-
-    task: Task
-    stage: Stage = Stage.CHECK
-    reason: str = ""
-    turn: int = 0
-    ended: str = ""
-    done: bool = False
-    missed: str = ""
-    laid: Laid | None = None
-    answer: Answer | None = None
+    task: PrintTask
+    stage: RunStage = RunStage.CHECK
+    reason: str = ""  # why the stage is what it is
+    turn: int = 0  # counts changes of stage or reason
+    ended: str = ""  # why the run is over, "" while it is not
+    done: bool = False  # the path is printed
+    silence: str = ""  # that a process is silent while the arm may move, "" while both report
+    placed_path: PlacedPath | None = None
+    answer: RequestAnswer | None = None  # to the last request
     checks: tuple[Check, ...] = ()
-    _since: float = field(default=float("nan"))
-    _asked: float = field(default=float("-inf"))
-    _failing: float = field(default=float("inf"))  # s, since when a check has failed
-    _begun: bool = False
-    _told: bool = False  # where it stands: by the operator, who looks at it when it goes home
-    _away: bool = False  # unplugged
-    _answers: bool = False
-    _homed: bool = False
-    _armed: bool = False  # since it was last asked for
-    _after: Stage = Stage.APPROACH  # the stage that homing leads to
+    _since: float = nan  # s, when the stage was entered
+    _ordered: float = -inf  # s, when the last order went to the arm
+    _failing: float = inf  # s, since when a check has failed
+    _begun: bool = False  # whether the order to print was given
+    _home_declared: bool = False  # whether the operator's word that the arm stands at home was passed on
+    _unplugged: bool = False
+    _answers: bool = False  # whether the arm ever answered
+    _homed: bool = False  # whether the arm was armed since it was ordered home
+    _armed: bool = False  # whether it was armed since that was ordered
+    _after_homing: RunStage = RunStage.APPROACH
 
     @property
     def offers(self) -> tuple[Wish, ...]:
-        """What would be followed now."""
-        return OFFERS.get(self.stage, ())
+        """The wishes that would be followed now."""
+        return STAGE_OFFERS.get(self.stage, ())
 
-    def __call__(self, now: float, seen: Seen, requests: Sequence[Request]) -> Orders:
-        """One look at all there is, at `now`, s."""
-        if np.isnan(self._since):
+    def __call__(self, now: float, reports: RunReports, requests: Sequence[OperatorRequest]) -> Orders:
+        """The orders that follow from reports and requests at `now`, s."""
+        if isnan(self._since):
             self._since = now
         orders: Orders = []
         for request in requests:
-            orders += self._asked_for(request, now)
-        self._check(seen, now)
+            orders += self._answer(request, now)
+        task = self.task
+        self.checks = (
+            *camera_checks(reports.tracking, now),
+            arm_check(reports.motion, task.stands_home),
+            path_check(task.path, task.start),
+            reach_check(self.placed_path),
+            recorder_check(reports.recorder),
+        )
         if not self.ended:
-            orders += self._go_on(seen, now)
-        self.missed = self._missed(seen, now) if self.stage in RUNNING else ""
+            orders += self._advance(reports, now)
+        self.silence = self._silent_process(reports, now) if self.stage in ACTIVE_STAGES else ""
         return orders
 
-    def end(self, reason: str, now: float, stage: Stage = Stage.FAILED) -> Orders:
+    def end(self, reason: str, now: float, stage: RunStage = RunStage.FAILED) -> Orders:
         """End the run; the arm is stopped where it may still move. stage: DONE, ENDED or FAILED."""
         if self.ended:
             return []
-        self.ended, self.done = reason, stage is Stage.DONE
-        self._to(stage, reason, now)
+        self.ended, self.done = reason, stage is RunStage.DONE
+        self._enter(stage, reason, now)
         return [] if self.done else [Order.STOP]
 
     def pause(self, reason: str, now: float) -> Orders:
         """Have the nozzle leave the surface and wait above it."""
-        self._to(Stage.PAUSED, reason, now)
-        return [Pace.PAUSE]
+        self._enter(RunStage.PAUSED, reason, now)
+        return [PauseOrder.PAUSE]
 
-    # -- what is asked for
+    # -- requests
 
-    def _asked_for(self, request: Request, now: float) -> Orders:
+    def _answer(self, request: OperatorRequest, now: float) -> Orders:
         why = refusal(request.wish, request.turn, self.offers, self.turn)
-        self.answer = Answer(request.number, request.wish, not why, why)
+        self.answer = RequestAnswer(request.number, request.wish, not why, why)
         return [] if why else self._follow(request.wish, now)
 
     def _follow(self, wish: Wish, now: float) -> Orders:
         if wish is Wish.STOP:
-            if self.stage in RUNNING:
-                self._to(Stage.STOPPED, "by the operator", now)
+            if self.stage in ACTIVE_STAGES:
+                self._enter(RunStage.STOPPED, "by the operator", now)
             return [Order.STOP]
         if wish is Wish.END:
-            return self.end("ended by the operator", now, Stage.ENDED)
+            return self.end("ended by the operator", now, RunStage.ENDED)
         if wish is Wish.CONFIRM:
-            self._to(Stage.READY, "", now)
+            self._enter(RunStage.READY, "", now)
         elif wish is Wish.AGAIN:
-            self.laid = None
-            self._to(Stage.CHECK, "", now)
+            self.placed_path = None
+            self._enter(RunStage.CHECK, "", now)
         elif wish is Wish.START:
-            return self._home(Stage.APPROACH, now)
+            return self._home(RunStage.APPROACH, now)
         elif wish is Wish.PAUSE:
             return self.pause("by the operator", now)
         elif wish is Wish.HOME:
-            return [Pace.PAUSE, *self._home(Stage.STOPPED, now)]
+            return [PauseOrder.PAUSE, *self._home(RunStage.STOPPED, now)]
         elif wish is Wish.RESUME:
-            resting = self.stage is Stage.STOPPED
-            self._to(Stage.APPROACH, "", now)
-            self._asked, self._armed = now, not resting
-            return [Pace.RESUME, *([Order.ARM] if resting else [])]
+            resting = self.stage is RunStage.STOPPED
+            self._enter(RunStage.APPROACH, "", now)
+            self._ordered, self._armed = now, not resting
+            return [PauseOrder.RESUME, *([Order.ARM] if resting else [])]
         return []
 
-    def _home(self, after: Stage, now: float) -> Orders:
-        self._after, self._homed, self._asked = after, False, now
-        self._to(Stage.HOMING, "", now)
-        said, self._told = self.task.stands_home and not self._told, True
-        return [*([Order.AT_HOME] if said else []), Order.HOME]
+    def _home(self, after: RunStage, now: float) -> Orders:
+        self._after_homing, self._homed, self._ordered = after, False, now
+        self._enter(RunStage.HOMING, "", now)
+        declared, self._home_declared = self.task.stands_home and not self._home_declared, True
+        return [*([Order.AT_HOME] if declared else []), Order.HOME]
 
-    # -- what happens
+    # -- events
 
-    def _check(self, seen: Seen, now: float) -> None:
-        task = self.task
-        cameras, calibration = checklist.camera_checks(seen.tracking, now)
-        arm, path = checklist.arm_check(seen.motion, task.stands_home), checklist.path_check(task.path, task.start)
-        reach, recorder = checklist.reach_check(self.laid), checklist.recorder_check(seen.recorder)
-        self.checks = cameras, calibration, arm, path, reach, recorder
-
-    def _missed(self, seen: Seen, now: float) -> str:
-        motion, tracking = seen.motion, seen.tracking
-        silent = "" if motion is None else silence("motion", motion.tick.stamp, self.task.profile.tick, now)
+    def _silent_process(self, reports: RunReports, now: float) -> str:
+        motion, tracking = reports.motion, reports.tracking
+        silent = "" if motion is None else silence_text("motion", motion.tick.stamp, self.task.profile.tick, now)
         if silent or tracking is None or tracking.ended:
             return silent
-        return silence("tracking", tracking.stamp, tracking.interval, now)
+        return silence_text("tracking", tracking.stamp, tracking.interval, now)
 
-    def _go_on(self, seen: Seen, now: float) -> Orders:
-        tracking, motion = seen.tracking, seen.motion
-        if tracking is not None and tracking.ended and not _printed(motion):
+    def _advance(self, reports: RunReports, now: float) -> Orders:
+        tracking, motion = reports.tracking, reports.motion
+        if tracking is not None and tracking.ended and not _path_printed(motion):
             return self.end(f"the cameras: {tracking.ended}", now)
-        if seen.recorder is not None and seen.recorder.failed:
-            return self.end(seen.recorder.failed, now)
-        if self.stage is Stage.CHECK:
-            return self._checking(now)
+        if reports.recorder is not None and reports.recorder.failed:
+            return self.end(reports.recorder.failed, now)
+        if self.stage is RunStage.CHECK:
+            return self._await_checks(now)
         if tracking is None or motion is None:
             return []
-        if self.stage in (Stage.FIND, Stage.CONFIRM, Stage.READY):
-            return self._finding(tracking, now)
+        if self.stage in (RunStage.FIND, RunStage.CONFIRM, RunStage.READY):
+            return self._await_surface(tracking, now)
         self._answers |= motion.tick.status.answers > 0
-        if self.stage in RUNNING:
-            if orders := self._faults(tracking, motion, now):
+        if self.stage in ACTIVE_STAGES:
+            if orders := self._check_faults(tracking, motion, now):
                 return orders
-            if self.stage is Stage.HOMING:
-                return self._homing(tracking, motion, now)
-            return self._printing(tracking, motion, now)
-        if self.stage is Stage.STOPPED and self.task.unattended:
+            if self.stage is RunStage.HOMING:
+                return self._await_home(tracking, motion, now)
+            return self._follow_print(tracking, motion, now)
+        if self.stage is RunStage.STOPPED and self.task.unattended:
             return self.end(f"stopped: {self.reason}", now)
-        self._came_back(motion, now)
+        self._check_replugged(motion, now)
         return []
 
-    def _checking(self, now: float) -> Orders:
-        verdicts = {check.name: check for check in self.checks if check.name != "reach"}
-        waits = [check for check in verdicts.values() if check.verdict in (Verdict.FAIL, Verdict.BUSY)]
+    def _await_checks(self, now: float) -> Orders:
+        waits = [c for c in self.checks if c.name != "reach" and c.verdict in (CheckVerdict.FAIL, CheckVerdict.BUSY)]
         if not waits:
-            self._to(Stage.FIND, "", now)
+            self._enter(RunStage.FIND, "", now)
             return []
-        fails = [check for check in waits if check.verdict is Verdict.FAIL]
-        self._failing = min(self._failing, now) if fails else float("inf")
-        late = now - self._failing > self.task.patience or now - self._since > SOUGHT
+        fails = [check for check in waits if check.verdict is CheckVerdict.FAIL]
+        self._failing = min(self._failing, now) if fails else inf
+        late = now - self._failing > self.task.patience or now - self._since > SEARCH_TIMEOUT
         if self.task.unattended and late:
-            return self.end(f"the check failed: {(fails or waits)[0].name}: {(fails or waits)[0].found}", now)
+            check = (fails or waits)[0]
+            return self.end(f"the check failed: {check.name}: {check.found}", now)
         return []
 
-    def _finding(self, tracking: TrackingReport, now: float) -> Orders:
+    def _await_surface(self, tracking: TrackingReport, now: float) -> Orders:
         task = self.task
-        if self.stage is Stage.FIND:
+        if self.stage is RunStage.FIND:
             if tracking.surface_from_path is None or tracking.pose is None or not tracking.pose.state.measured:
-                if task.unattended and now - self._since > SOUGHT:
+                if task.unattended and now - self._since > SEARCH_TIMEOUT:
                     why = "no pictures" if tracking.pose is None else tracking.pose.reason
                     return self.end(f"the surface was not found: {why}", now)
                 return []
-            self.laid = laid_on(task.path, tracking.surface_from_path, tracking.pose, task.profile, task.place)
-            if self.laid.unreachable:
-                return self.end(f"out of reach: {self.laid.unreachable}", now) if task.unattended else []
-            self._to(Stage.CONFIRM, "", now)
+            placed = place_path(task.path, tracking.surface_from_path, tracking.pose, task.profile, task.place)
+            self.placed_path = placed
+            if placed.unreachable:
+                return self.end(f"out of reach: {placed.unreachable}", now) if task.unattended else []
+            self._enter(RunStage.CONFIRM, "", now)
         if task.unattended:
-            return self._home(Stage.APPROACH, now)
+            return self._home(RunStage.APPROACH, now)
         return []
 
-    def _faults(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
+    def _check_faults(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
         status = motion.tick.status
         if status.state is ArmState.UNPLUGGED:
-            self._away = True
+            self._unplugged = True
             return self._stop(f"the arm is unplugged: {status.reason}: plug it in", now)
         if tracking.pose is not None and not tracking.ended and (age := now - tracking.pose.stamp) > self.task.patience:
             return self._stop(f"no pictures for {age:.1f} s", now)
         if status.state is ArmState.ARMED:
             self._armed = True
-        elif status.state is ArmState.STOPPED and self._armed and self.stage is not Stage.HOMING:
-            self._to(Stage.STOPPED, status.reason, now)
+        elif status.state is ArmState.STOPPED and self._armed and self.stage is not RunStage.HOMING:
+            self._enter(RunStage.STOPPED, status.reason, now)
         return []
 
-    def _homing(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
-        """Home, then the path, then armed: in this order, each once the one before is done."""
+    def _await_home(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
+        """Wait until the arm is home; then begin the path, then arm, or what else homing leads to."""
         status = motion.tick.status
         if status.state is ArmState.ARMED:
             self._homed = True
         elif self._homed and status.state is ArmState.STOPPED:
             return self._stop(status.reason, now)
         if not self._homed or status.state is ArmState.ARMED:
-            if now - self._since > HOME_PATIENCE:
+            if now - self._since > HOMING_TIMEOUT:
                 return self.end(f"the arm did not come home: {motion.tick.answer or status.reason}", now)
-            if not self._homed and now - self._asked > ASK_AGAIN:
-                self._asked = now
+            if not self._homed and now - self._ordered > RESEND_AFTER:
+                self._ordered = now
                 return [Order.HOME]
             return []
-        if self._after is Stage.DONE:
-            return self.end("the path is printed", now, Stage.DONE)
-        self._to(self._after, "at home", now)
-        if self._after is Stage.STOPPED:
+        if self._after_homing is RunStage.DONE:
+            return self.end("the path is printed", now, RunStage.DONE)
+        self._enter(self._after_homing, "at home", now)
+        if self._after_homing is RunStage.STOPPED:
             return []
-        self._asked, self._armed = now, False
-        return [*self._begin(tracking.interval, motion), Pace.RESUME, Order.ARM]
+        self._ordered, self._armed = now, False
+        return [*self._begin(tracking.interval, motion), PauseOrder.RESUME, Order.ARM]
 
     def _begin(self, interval: float, motion: LiveMotionReport) -> Orders:
-        """interval: s between two poses, with which the ticks are to be in step."""
+        """The order to print, once. interval: s between two poses, with which the ticks are to be in step."""
         if self._begun:
             return []
-        assert self.laid is not None
+        assert self.placed_path is not None
         self._begun = True
-        task, laid, status = self.task, self.laid, motion.tick.status
-        path = laid.path if task.lift is None else lifted(laid.path, task.lift)
+        task, profile, status = self.task, self.placed_path.profile, motion.tick.status
+        path = self.placed_path.path if task.lift is None else raised_path(self.placed_path.path, task.lift)
         lag = task.profile.lag
-        if 0 < status.lag < LONGEST_LAG:  # measured from set-point to answer, NaN where it does not answer
+        if 0 < status.lag < MAX_SERVO_LAG:  # measured from set-point to answer, NaN where it does not answer
             lag = status.lag + task.profile.frame_time
-        tick = tick_in_step(laid.profile.tick, interval, max(laid.profile.tick / 2, 2 * laid.profile.frame_time))
-        return [Begin(path, replace(laid.profile, lag=lag, tick=tick), task.start, task.fingerprint)]
+        tick = tick_in_step(profile.tick, interval, max(profile.tick / 2, 2 * profile.frame_time))
+        return [BeginPrint(path, replace(profile, lag=lag, tick=tick), task.start, task.fingerprint)]
 
-    def _printing(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
+    def _follow_print(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
         progress = motion.progress
-        if self.stage is Stage.STOPPED:
+        if self.stage is RunStage.STOPPED:
             return []
         if not self._armed:
             return self._arm_again(motion, now)
-        if progress is None or self.stage is Stage.PAUSED:
+        if progress is None or self.stage is RunStage.PAUSED:
             return []
-        if progress.phase is Phase.FINISHED or tracking.ended:
-            return self._home(Stage.DONE, now)
-        if self.stage is Stage.APPROACH and progress.phase is Phase.PRINTING:
-            self._to(Stage.PRINT, "", now)
+        if progress.phase is PrintPhase.FINISHED or tracking.ended:
+            return self._home(RunStage.DONE, now)
+        if self.stage is RunStage.APPROACH and progress.phase is PrintPhase.PRINTING:
+            self._enter(RunStage.PRINT, "", now)
         return []
 
     def _arm_again(self, motion: LiveMotionReport, now: float) -> Orders:
-        """An arm that still moved when it was to be armed is asked again, for a while."""
-        if now - self._since > ARM_PATIENCE:
-            self._to(Stage.STOPPED, motion.tick.answer or motion.tick.status.reason, now)
+        """Order again, for a while, to arm an arm that still moved."""
+        if now - self._since > ARMING_TIMEOUT:
+            self._enter(RunStage.STOPPED, motion.tick.answer or motion.tick.status.reason, now)
             return []
-        if now - self._asked < ASK_AGAIN:
+        if now - self._ordered < RESEND_AFTER:
             return []
-        self._asked = now
+        self._ordered = now
         return [Order.ARM]
 
     def _stop(self, reason: str, now: float) -> Orders:
-        """The arm stops and waits for the operator."""
-        self._to(Stage.STOPPED, reason, now)
+        """Stop the arm and wait for the operator."""
+        self._enter(RunStage.STOPPED, reason, now)
         return [Order.STOP]
 
-    def _came_back(self, motion: LiveMotionReport, now: float) -> None:
-        """Say so once an arm that was unplugged is there again, and what is then asked of the operator."""
+    def _check_replugged(self, motion: LiveMotionReport, now: float) -> None:
+        """Tell the operator once an arm that was unplugged is there again, and what to do then."""
         status = motion.tick.status
-        if self._away and status.state is not ArmState.UNPLUGGED:
-            self._away = False
-            self._told = self._answers
-            self._to(Stage.STOPPED, BACK if self._answers else BACK_SOMEWHERE, now)
+        if self._unplugged and status.state is not ArmState.UNPLUGGED:
+            self._unplugged = False
+            self._home_declared = self._answers
+            self._enter(RunStage.STOPPED, ARM_BACK_TEXT if self._answers else ARM_UNPLACED_TEXT, now)
 
-    def _to(self, stage: Stage, reason: str, now: float) -> None:
+    def _enter(self, stage: RunStage, reason: str, now: float) -> None:
         if (stage, reason) != (self.stage, self.reason):
             self.turn += 1
         self.stage, self.reason, self._since = stage, reason, now
 
 
-def _printed(motion: LiveMotionReport | None) -> bool:
-    """Whether the last checkpoint is printed: what is left, the way home, needs no pictures."""
+def _path_printed(motion: LiveMotionReport | None) -> bool:
+    """Whether the last checkpoint is printed: the rest, the way home, needs no pictures."""
     progress = None if motion is None else motion.progress
     return progress is not None and progress.fraction >= progress.total - 1

@@ -1,4 +1,4 @@
-"""The body of the tracking process: frame sets in, poses out, and what is recorded and reported of them.
+"""The tracking process of a live run: frame sets in, poses out, and what is recorded and reported of them.
 
 It may stall or die at any instant: the pose that the motion has grows old, and the guard holds the arm.
 """
@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
@@ -18,120 +19,167 @@ import numpy as np
 
 from estimation import se3
 from estimation.errors import InputError, StillbedError
-from estimation.heap import share_pages
-from estimation.pose import SurfacePose, TrackState
-from estimation.rig import Rig
+from estimation.pose import SurfacePose, TrackState, Trajectory
+from estimation.rig import Rig, ideal_pixels, pixels_from_points
+from estimation.runtime import use_one_arena
 from estimation.se3 import Array
-from estimation.trajectory import Trajectory
 from hardware.arm.profile import ArmProfile
-from hardware.commanded import Commanded
-from hardware.files.session import Session, open_session
-from hardware.heads import head_from_row, row_from_head
-from hardware.live.arrived import Arrived, Source
-from hardware.live.frame_source import FrameRing, RingSource
-from hardware.live.histograms import Histograms
-from hardware.live.outbox import Outbox
-from hardware.live.outline import Outline
+from hardware.files.session import Session, head_from_row, row_from_head
+from hardware.live.frame_source import FrameRing, FrameSource, LiveCameraSource, RingSource, TimedFrameSet
+from hardware.live.prepared import Prepared
+from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
-    Handed,
     LiveMotionReport,
     PoseEntry,
+    PoseHandover,
     RigEntry,
     RoiEntry,
     ScanEntry,
     SetEntry,
+    StageHistograms,
     TrackingReport,
 )
-from hardware.live.remembered import remember, true_pose
-from hardware.operator.link import OperatorLink
-from hardware.operator.taker import PictureTaker, Shot
-from hardware.priority import ask_to_go_first, settle_memory
+from hardware.motion.loop import CommandedPose
+from hardware.offline.track import FrameSetStep, tracker
+from hardware.operator.process import CameraShot, Thumbnailer
+from hardware.operator.shared_state import OperatorLink
 from hardware.process.clock import WallClock
-from hardware.process.shared_latest import Newest
-from hardware.process.system import gone, settle
+from hardware.process.shared_latest import SharedLatest
+from hardware.process.system import ask_to_go_first, pipe_closed, set_up_process, settle_memory
 from hardware.process.ticks import own_interval
-from hardware.tracker import tracker
+from hardware.recording.session_reader import open_session, read_poses
 from perception.frames import FrameSet, PrintHead, Roi
+from perception.lens import undistort
 from perception.tracking.step import STAGES
 
-RIG = ".toml"  # of a file that names live cameras
-PATIENCE = 0.1  # s of a wait for frames, after which it looks who else is still there
-WAITED, TRACKED, POSED = "frames wait for the tracker", "tracking", "frames handed over to pose"
-EXPOSED, TIDIED = "exposure to frames handed over", "pose handed over to ready for frames"
-REFRESH, LANDMARKS = 15, 300  # sets between two looks at the map, and how many of its landmarks are shown, about
-INTERVALS = 31  # between sets, from which the cameras' own is told: a second of them
-HISTOGRAMS = 30.0  # s between histograms in the recording
+DEPTH_NEIGHBOURS = 3  # landmarks whose depth a corner of an outline is taken to have
+SETTLING_TIME = 1.0  # s of an earlier run, beyond where its path was placed, that make the map anew
+FRAME_WAIT = 0.1  # s of a wait for frames, after which the lifeline is looked at
+MAP_REFRESH_SETS = 15  # sets between two looks at the map for the page
+SHOWN_LANDMARKS = 300  # landmarks that the page shows, about
+INTERVAL_WINDOW = 31  # intervals between sets from which that of the cameras is estimated: a second of them
+HISTOGRAM_PERIOD = 30.0  # s between histograms in the recording
+EXPOSURE_STAGE, QUEUE_STAGE = "exposure to frames handed over", "frames wait for the tracker"
+TRACKING_STAGE, HANDED_TO_POSE_STAGE = "tracking", "frames handed over to pose"
+AFTER_POSE_STAGE = "pose handed over to ready for frames"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackingPlan:
-    """What is tracked. session: whose pictures come through the ring, or whose rig stands before live cameras.
+class SurfaceOutline:
+    """Each camera's region of interest on the surface, in the surface frame, once it is placed there."""
 
-    truth: whether the path lies in the session's true surface frame rather than the tracker's own. sees_arm: whether
-    the pictures show the arm, as those of live cameras do; profile: of it. earlier: a recording whose first frame sets,
-    up to `until`, s, make the map; surface_from_path: (4, 4) as it was registered on that.
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._corners: dict[int, Array] = {}  # (K, 3) mm, surface frame, by camera
+
+    @property
+    def placed(self) -> bool:
+        """Whether any region is placed."""
+        return bool(self._corners)
+
+    def place(self, rois: Sequence[Roi], points_surface: Array, base_from_surface: Array) -> None:
+        """Put the regions onto a surface of landmarks (V, 3), mm; a region that is a whole picture is no outline."""
+        points_base = se3.transform_points(base_from_surface, points_surface)
+        surface_from_base = se3.inverse(base_from_surface)
+        for roi in rois:
+            camera = self._rig.cameras[roi.camera]
+            inside = ((roi.polygon > 0) & (roi.polygon < np.array(camera.size) - 1)).all(axis=1)
+            if len(points_base) < DEPTH_NEIGHBOURS or not inside.any():
+                continue
+            corners = undistort(camera, roi.polygon)  # (K, 2)
+            pixels, depths = ideal_pixels(camera, points_base)
+            distances = np.linalg.norm(corners[:, None] - pixels[None], axis=2)  # (K, V)
+            nearest = np.argsort(distances, axis=1)[:, :DEPTH_NEIGHBOURS]
+            rays = np.column_stack([corners, np.ones(len(corners))]) @ np.linalg.inv(camera.matrix).T
+            corners_base = se3.transform_points(camera.base_from_camera, rays * depths[nearest].mean(axis=1)[:, None])
+            self._corners[roi.camera] = se3.transform_points(surface_from_base, corners_base)
+
+    def in_pixels(self, camera: int, base_from_surface: Array) -> tuple[Array, ...]:
+        """A camera's outline in its picture, (K, 2) px as the lens images it; none if it is not known."""
+        if camera not in self._corners:
+            return ()
+        points_base = se3.transform_points(base_from_surface, self._corners[camera])
+        pixels, depth = pixels_from_points(self._rig.cameras[camera], points_base)
+        return (pixels,) if (depth > 0).all() else ()
+
+
+def _true_pose(truth: Trajectory, stamp: float) -> Array:
+    """base_from_surface (4, 4) at `stamp`, s, interpolated between the truth's own stamps."""
+    after = int(np.clip(np.searchsorted(truth.stamps, stamp), 1, len(truth) - 1))
+    before, span = after - 1, truth.stamps[after] - truth.stamps[after - 1]
+    share = (stamp - truth.stamps[before]) / span
+    return np.asarray(se3.interpolate(truth.base_from_surface[before], truth.base_from_surface[after], share))
+
+
+def _restore_map(step: FrameSetStep, record: Path, session: Session, until: float, now: float) -> Array:
+    """Give the step the first pictures of an earlier run, so that it maps the same surface; new_from_old (4, 4) mm.
+
+    From pictures that were kept exactly it is the same map; from others its frame may lie elsewhere, by what both runs
+    estimate at the last of them. InputError where the surface is not found in its own pictures.
     """
-
-    session: Path
-    truth: bool
-    sees_arm: bool
-    profile: ArmProfile
-    earlier: Path | None = None
-    until: float = 0.0
-    surface_from_path: Array | None = None
-    cores: tuple[int, ...] = ()
+    poses = {pose.stamp: pose for pose in read_poses(record) if pose.stamp <= until + SETTLING_TIME}
+    sets = takewhile(lambda frames: frames.stamp <= until + SETTLING_TIME, session.frame_sets())
+    shift = now - until - SETTLING_TIME - 1.0  # the stamps end a second ago: the clock may have begun anew since
+    new_from_old: Array | None = None
+    for frames in sets:
+        shifted = tuple(replace(frame, stamp=frame.stamp + shift) for frame in frames.frames)
+        pose, old = step(FrameSet(frames.stamp + shift, shifted, frames.head)), poses.get(frames.stamp)
+        step.idle()
+        if old is not None and old.state is pose.state is TrackState.TRACKING:
+            new_from_old = se3.inverse(pose.base_from_surface) @ old.base_from_surface
+    if new_from_old is None:
+        raise InputError(record, "recording", "no surface", "pictures in which it is found again")
+    return new_from_old
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TrackingLines:
-    """What the tracking process is joined by. Either ring and words, or live cameras, bring frames."""
+class TrackingChannels:
+    """What joins the tracking process to the others."""
 
-    ring: FrameRing
-    words: Connection
-    poses: Newest[Handed]
-    reports: Newest[TrackingReport]
-    motion: Newest[LiveMotionReport]
+    ring: FrameRing  # frames of a session that is shown, with their notices
+    notices: Connection
+    poses: SharedLatest[PoseHandover]  # to the motion
+    reports: SharedLatest[TrackingReport]
+    motion: SharedLatest[LiveMotionReport]
     link: OperatorLink
-    record: Connection
+    recorder: Connection
     lifeline: Connection
 
 
-def tracking_process(plan: TrackingPlan, lines: TrackingLines) -> None:
-    """Track until the frames end, or nobody conducts the run any more; the last report says why."""
-    settle("tracking", plan.cores)
-    share_pages()
+def track(prepared: Prepared, channels: TrackingChannels) -> None:
+    """The body of the process: track until the frames end or the lifeline does; the last report says why."""
+    set_up_process("tracking", prepared.settings.cores_tracking)
+    use_one_arena()
     ask_to_go_first()  # the process of the map, which stands back behind this one, is then an ordinary one
-    signal.signal(signal.SIGTERM, _ended)
-    outbox = Outbox(lines.record)
+    signal.signal(signal.SIGTERM, _terminate)
+    sender = RecorderSender(channels.recorder)
     try:
         with ExitStack() as stack:
-            run = _Tracking(plan, lines, outbox, stack)
+            run = _TrackingLoop(prepared, channels, sender, stack)
             try:
                 run()
-            except (StillbedError, OSError) as error:  # told before anything is put away, as the arm is stopped for it
-                lines.reports.put(replace(run.report, ended=str(error), wrong=isinstance(error, InputError)))
+            except (StillbedError, OSError) as error:  # reported before files are closed: the arm is stopped for it
+                channels.reports.put(replace(run.report, ended=str(error)))
             finally:
                 for entry in run.times.entries(WallClock().now()):
-                    outbox.put(entry)
+                    sender.put(entry)
     except (StillbedError, OSError) as error:
-        nothing = TrackingReport(WallClock().now())
-        lines.reports.put(replace(nothing, ended=str(error), wrong=isinstance(error, InputError)))
-    except _Ended:
+        channels.reports.put(TrackingReport(WallClock().now(), ended=str(error)))
+    except _Terminated:
         pass
     finally:
-        outbox.close()
+        sender.close()
 
 
-class _Ended(BaseException):
-    """Somebody asked this process to end."""
+class _Terminated(BaseException):
+    """SIGTERM has come."""
 
 
-def _ended(number: int, frame: FrameType | None) -> None:
-    raise _Ended
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise _Terminated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Known:
+class _KnownSession:
     """What is known of the cameras and the surface before the first picture."""
 
     rig: Rig
@@ -141,167 +189,167 @@ class _Known:
     session: Session | None = None  # held, as it may have unpacked the scan
 
 
-def _opened(plan: TrackingPlan, lines: TrackingLines) -> tuple[_Known, Source]:
+def _open_source(prepared: Prepared, channels: TrackingChannels) -> tuple[_KnownSession, FrameSource]:
     """The cameras, live or shown, and what is known of them."""
-    if plan.session.suffix == RIG:
-        from hardware.live.camera_source import CameraSource  # loads what only live cameras need
-
-        source = CameraSource(plan.session)
-        return _Known(source.rig), source
-    session = open_session(plan.session)
-    known = _Known(session.rig, session.roi, session.surface, session.truth, session)
-    return known, RingSource(lines.ring, lines.words)
+    if prepared.live:
+        source = LiveCameraSource(prepared.session)
+        return _KnownSession(source.rig), source
+    session = open_session(prepared.session)
+    known = _KnownSession(session.rig, session.roi, session.surface, session.truth, session)
+    return known, RingSource(channels.ring, channels.notices)
 
 
-class _Tracking:
-    """One run of the tracking step. report: the last one that was given."""
+class _TrackingLoop:
+    """Feeds frame sets to the tracking step, and hands on what comes of them. report: the last one."""
 
-    def __init__(self, plan: TrackingPlan, lines: TrackingLines, outbox: Outbox, stack: ExitStack) -> None:
-        self._plan, self._lines, self._outbox = plan, lines, outbox
-        self._clock, self.times = WallClock(), Histograms()
-        self._commanded = _Heads(lines.motion, plan.profile)
-        self._told = -np.inf  # s, when histograms were last recorded
-        known, self._source = _opened(plan, lines)
+    def __init__(
+        self, prepared: Prepared, channels: TrackingChannels, sender: RecorderSender, stack: ExitStack
+    ) -> None:
+        self._prepared, self._channels, self._sender = prepared, channels, sender
+        self._clock, self.times = WallClock(), StageHistograms()
+        profile, placement = prepared.task.profile, prepared.placement
+        self._commanded_head = _CommandedHead(channels.motion, profile)
+        self._histograms_recorded = -np.inf  # s
+        self._known, self._source = _open_source(prepared, channels)
         stack.callback(self._source.close)
-        self._known = known
-        self._pictures = PictureTaker(lines.link.pictures, lines.link.requests)
-        names = tuple(camera.name for camera in known.rig.cameras)
-        self.report = TrackingReport(self._clock.now(), names)
-        self._outline = Outline(known.rig)
-        self._before, self._intervals = np.nan, deque[float](maxlen=INTERVALS)
-        lines.reports.put(self.report)
-        first = None if plan.earlier is None else open_session(plan.earlier)
-        rois = known.roi if first is None else first.roi
-        self._give(known, rois)
-        at_once = tuple(replace(roi, stamp=-np.inf) for roi in rois)
-        follows = tracker(known.rig, at_once, known.surface, self._clock.now, plan.profile.tool)
-        self._step = stack.enter_context(follows)
-        if first is not None and plan.earlier is not None and plan.surface_from_path is not None:
-            moved = remember(self._step, plan.earlier, first, plan.until, self._clock.now())
-            self.report = replace(self.report, surface_from_path=moved @ plan.surface_from_path)
+        rig = self._known.rig
+        self._thumbnailer = Thumbnailer(channels.link.pictures, channels.link.requests)
+        self.report = TrackingReport(self._clock.now(), tuple(camera.name for camera in rig.cameras))
+        self._outline = SurfaceOutline(rig)
+        self._last_stamp, self._intervals = np.nan, deque[float](maxlen=INTERVAL_WINDOW)
+        channels.reports.put(self.report)
+        earlier = None if placement is None else open_session(placement.map)
+        rois = self._known.roi if earlier is None else earlier.roi
+        self._record_known(rois)
+        immediate = tuple(replace(roi, stamp=-np.inf) for roi in rois)
+        step = tracker(rig, immediate, self._known.surface, self._clock.now, profile.tool)
+        self._step = stack.enter_context(step)
+        if placement is not None and earlier is not None:
+            new_from_old = _restore_map(self._step, placement.map, earlier, placement.until, self._clock.now())
+            self.report = replace(self.report, surface_from_path=new_from_old @ placement.surface_from_path)
 
-    def _give(self, known: _Known, rois: Sequence[Roi]) -> None:
-        """Tell the recorder what is known before the first picture."""
-        self._outbox.put(RigEntry(known.rig))
-        if known.surface is not None:
-            self._outbox.put(ScanEntry(known.surface))
+    def _record_known(self, rois: Sequence[Roi]) -> None:
+        """Record what is known before the first picture."""
+        self._sender.put(RigEntry(self._known.rig))
+        if self._known.surface is not None:
+            self._sender.put(ScanEntry(self._known.surface))
         for roi in rois:
-            self._outbox.put(RoiEntry(replace(roi, stamp=self.report.stamp)))
+            self._sender.put(RoiEntry(replace(roi, stamp=self.report.stamp)))
 
     def __call__(self) -> None:
         settle_memory()
-        while not gone(self._lines.lifeline):
-            arrived = self._source.take(PATIENCE)
+        while not pipe_closed(self._channels.lifeline):
+            arrived = self._source.take(FRAME_WAIT)
             if arrived is None:
                 self.report = replace(self.report, stamp=self._clock.now())
-                self._lines.reports.put(self.report)
+                self._channels.reports.put(self.report)
             else:
                 self._track(arrived)
 
-    def _track(self, arrived: Arrived) -> None:
+    def _track(self, arrived: TimedFrameSet) -> None:
         frames = self._with_head(arrived.frames)
         start = self._clock.now()
         pose = self._step(frames)
-        put = self._clock.now()
-        self._lines.poses.put(Handed(pose, arrived.handed, put))
-        self._count(arrived, pose, start, put)
+        sent = self._clock.now()
+        self._channels.poses.put(PoseHandover(pose, arrived.handed, sent))
+        self._count_times(arrived, pose, start, sent)
         self._register(pose, arrived)
         self._report(arrived, pose)
         self._show(frames, pose)
         self._record(arrived, frames, pose)
         self._step.idle()
         self._source.learn(self._step.last.offsets)
-        self.times.add(TIDIED, self._clock.now() - put)
+        self.times.add(AFTER_POSE_STAGE, self._clock.now() - sent)
 
     def _with_head(self, frames: FrameSet) -> FrameSet:
-        """The print head where the pictures show it, rounded as a recording keeps it: a replay sees the same."""
-        head = self._commanded.at(frames.stamp) if self._plan.sees_arm else frames.head
+        """The set with the print head where the pictures show it, rounded as in a recording: a replay sees the same."""
+        head = self._commanded_head.at(frames.stamp) if self._prepared.live else frames.head
         if head is not None:
             head = head_from_row(row_from_head(frames.stamp, head), head.extruding)
         return replace(frames, head=head)
 
-    def _count(self, arrived: Arrived, pose: SurfacePose, start: float, put: float) -> None:
+    def _count_times(self, arrived: TimedFrameSet, pose: SurfacePose, start: float, sent: float) -> None:
         times = self.times
-        times.add(EXPOSED, arrived.handed - pose.stamp)
-        times.add(WAITED, start - arrived.handed)
+        times.add(EXPOSURE_STAGE, arrived.handed - pose.stamp)
+        times.add(QUEUE_STAGE, start - arrived.handed)
         for stage, seconds in zip(STAGES, self._step.last.seconds, strict=False):
             times.add(f"tracking: {stage}", float(seconds))
-        times.add(TRACKED, put - start)
-        times.add(POSED, put - arrived.handed)
+        times.add(TRACKING_STAGE, sent - start)
+        times.add(HANDED_TO_POSE_STAGE, sent - arrived.handed)
 
-    def _register(self, pose: SurfacePose, arrived: Arrived) -> None:
-        """Where the path lies: in the frame that the tracker has laid, or in the true one where that is known."""
+    def _register(self, pose: SurfacePose, arrived: TimedFrameSet) -> None:
+        """Place the path, once: in the tracker's own surface frame, or in the true one of a simulated world."""
         if self.report.surface_from_path is not None or pose.state is not TrackState.TRACKING:
             return
-        known = np.eye(4)
-        if self._plan.truth and self._known.truth is not None:
-            known = se3.inverse(pose.base_from_surface) @ true_pose(self._known.truth, arrived.source)
-        self.report = replace(self.report, surface_from_path=known, registered=pose.stamp)
+        surface_from_path = np.eye(4)
+        if self._prepared.again and self._known.truth is not None:
+            surface_from_path = se3.inverse(pose.base_from_surface) @ _true_pose(self._known.truth, arrived.source)
+        self.report = replace(self.report, surface_from_path=surface_from_path, registered=pose.stamp)
         settle_memory()  # what was compiled since, as nothing moves yet
 
-    def _report(self, arrived: Arrived, pose: SurfacePose) -> None:
-        report, frames = self.report, arrived.frames
+    def _report(self, arrived: TimedFrameSet, pose: SurfacePose) -> None:
+        report = self.report
         self.report = replace(
             report,
             stamp=self._clock.now(),
-            seen=tuple(frame.camera for frame in frames.frames),
+            delivering=tuple(frame.camera for frame in arrived.frames.frames),
             pose=pose,
             sets=report.sets + 1,
             dropped=report.dropped + arrived.dropped,
             interval=self._interval(arrived),
-            unrecorded=self._outbox.dropped,
-            spans=self.times.spans(),
+            unrecorded=self._sender.dropped,
+            timings=self.times.timings(),
             used=tuple(int(n) for n in self._step.last.used),
-            truth=None if self._known.truth is None else true_pose(self._known.truth, arrived.source),
-            surface=self._surface(pose),
+            truth=None if self._known.truth is None else _true_pose(self._known.truth, arrived.source),
+            surface=self._landmarks(pose),
         )
-        self._lines.reports.put(self.report)
+        self._channels.reports.put(self.report)
 
-    def _surface(self, pose: SurfacePose) -> Array | None:
-        """Landmarks for the page, now and then anew, as the map grows."""
-        if self.report.sets % REFRESH or (found := self._step.map) is None:
+    def _landmarks(self, pose: SurfacePose) -> Array | None:
+        """Landmarks (V, 3) for the page, taken anew now and then, as the map grows."""
+        if self.report.sets % MAP_REFRESH_SETS or (surface_map := self._step.map) is None:
             return self.report.surface
-        if not self._outline.laid and pose.state.measured:
-            self._outline.lay(self._step.roi, found.points, pose.base_from_surface)
-        return np.array(found.points[:: max(len(found) // LANDMARKS, 1)])
+        if not self._outline.placed and pose.state.measured:
+            self._outline.place(self._step.roi, surface_map.points, pose.base_from_surface)
+        return np.array(surface_map.points[:: max(len(surface_map) // SHOWN_LANDMARKS, 1)])
 
-    def _interval(self, arrived: Arrived) -> float:
-        """The time between two sets, s, those that nobody took included; NaN before the second."""
+    def _interval(self, arrived: TimedFrameSet) -> float:
+        """The time between two sets, s, those that were dropped included; NaN before the second."""
         stamp = arrived.frames.stamp
-        if not np.isnan(self._before):
-            self._intervals.append((stamp - self._before) / (1 + arrived.dropped))
-        self._before = stamp
+        if not np.isnan(self._last_stamp):
+            self._intervals.append((stamp - self._last_stamp) / (1 + arrived.dropped))
+        self._last_stamp = stamp
         return own_interval(self._intervals)
 
     def _show(self, frames: FrameSet, pose: SurfacePose) -> None:
         """Offer the pictures to the page, where anybody has it open."""
-        if not self._lines.link.requests.windows:
+        if not self._channels.link.requests.windows:
             return
-        seen, names = self._step.last.observations, self.report.cameras
-        there = pose.base_from_surface if pose.state.measured else None
+        observations, names = self._step.last.observations, self.report.cameras
+        base_from_surface = pose.base_from_surface if pose.state.measured else None
         shots = []
         for frame in frames.frames:
-            outline = () if there is None else self._outline.in_pixels(frame.camera, there)
-            tracks = seen.pixels[seen.camera == frame.camera]
-            shots.append(Shot(names[frame.camera], frame.image, outline, tracks))
-        self._pictures.offer(frames.stamp, shots, there)
+            outline = () if base_from_surface is None else self._outline.in_pixels(frame.camera, base_from_surface)
+            tracks = observations.pixels[observations.camera == frame.camera]
+            shots.append(CameraShot(names[frame.camera], frame.image, outline, tracks))
+        self._thumbnailer.offer(frames.stamp, shots, base_from_surface)
 
-    def _record(self, arrived: Arrived, frames: FrameSet, pose: SurfacePose) -> None:
+    def _record(self, arrived: TimedFrameSet, frames: FrameSet, pose: SurfacePose) -> None:
         stamps = {frame.camera: frame.stamp for frame in frames.frames}
-        bare = tuple(frame for frame in frames.frames if frame.camera not in arrived.encoded)
-        self._outbox.put(SetEntry(stamps, arrived.encoded, bare))
-        self._outbox.put(PoseEntry(pose, self._step.last.observations, frames.head, self.report.truth))
-        if (now := self._clock.now()) > self._told + HISTOGRAMS:
-            self._told = now
+        unencoded = tuple(frame for frame in frames.frames if frame.camera not in arrived.encoded)
+        self._sender.put(SetEntry(stamps, arrived.encoded, unencoded))
+        self._sender.put(PoseEntry(pose, self._step.last.observations, frames.head, self.report.truth))
+        if (now := self._clock.now()) > self._histograms_recorded + HISTOGRAM_PERIOD:
+            self._histograms_recorded = now
             for entry in self.times.entries(now):
-                self._outbox.put(entry)
+                self._sender.put(entry)
 
 
-class _Heads:
+class _CommandedHead:
     """Where the print head should be, by the newest commands of the motion process."""
 
-    def __init__(self, reports: Newest[LiveMotionReport], profile: ArmProfile) -> None:
-        self._reports, self._commanded = reports, Commanded(profile)
+    def __init__(self, reports: SharedLatest[LiveMotionReport], profile: ArmProfile) -> None:
+        self._reports, self._commanded = reports, CommandedPose(profile)
         self._last = -np.inf
 
     def at(self, stamp: float) -> PrintHead | None:

@@ -1,131 +1,202 @@
-"""The run as its operator's page shows it, made of the reports a few times a second."""
+"""What a run shows: views for the operator's page, and lines and keys of the terminal."""
 
 from __future__ import annotations
 
+import os
+import sys
+import termios
+import tty
+from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass, field
 from math import nan
+from typing import Any
 
 import numpy as np
 
+from estimation import se3
 from estimation.se3 import Array
+from hardware.arm.device import ArmState
 from hardware.arm.profile import ArmProfile
-from hardware.arm_status import ArmState
-from hardware.live.motion_names import FRAMES_TO_WIRE
+from hardware.live.checklist import MAX_PICTURE_AGE
+from hardware.live.outcome import RunStatistics
 from hardware.live.prepared import Prepared
-from hardware.live.records import LiveMotionReport, TrackingReport
-from hardware.live.stages import QUESTIONS
-from hardware.live.state_machine import Conductor, Seen
-from hardware.live.tally import Tally
-from hardware.live.true_error import TrueError
+from hardware.live.records import FRAMES_TO_WIRE_STAGE, LiveMotionReport, TrackingReport
+from hardware.live.state_machine import RunReports, RunStateMachine
 from hardware.operator.view import (
+    STAGE_QUESTIONS,
     Activity,
     CameraView,
+    CheckVerdict,
     LatencyView,
     MotionView,
     OperatorView,
     ProgressView,
-    Stage,
+    RunStage,
     TrackingView,
-    Verdict,
+    Wish,
     tracking_from_pose,
 )
 from planning.command import Hold, Move
-from planning.kinematics import nozzle_from_axes
-from planning.path import Path, lengths
-from planning.progress import Phase
+from planning.path import Path, way_lengths
+from planning.progress import PrintPhase
+from planning.robot.kinematics import nozzle_from_axes
 
-LATENCY = 0.035  # s from frames to the wire that 99 % are to keep
-FLIGHT = 0.05  # s of motion that may be under way
-FRESH = 1.0  # s without a picture, after which a camera counts as gone
-RATE = 0.9  # share of the last rate that is kept when it is smoothed
-ACTIVITIES = {
-    Phase.ENTERING: Activity.ENTERING,
-    Phase.LEAVING: Activity.LEAVING,
-    Phase.RETREATING: Activity.LEAVING,
+KEPT_COMMANDS = 64  # a second of them
+MAX_COMMAND_GAP = 0.1  # s between two commands that a straight line joins
+MAX_LATENCY = 0.035  # s from frames to the wire that 99 % are to keep
+MAX_IN_FLIGHT = 0.05  # s of motion that may be under way
+RATE_DECAY = 0.9  # share of the last rate that is kept when it is smoothed
+MAX_KEYS_READ = 100  # at once
+PHASE_ACTIVITIES = {
+    PrintPhase.ENTERING: Activity.ENTERING,
+    PrintPhase.LEAVING: Activity.LEAVING,
+    PrintPhase.RETREATING: Activity.LEAVING,
 }
+ACTION_KEYS = dict.fromkeys(" \r\n", Wish.STOP) | {
+    "p": Wish.PAUSE,
+    "r": Wish.RESUME,
+    "h": Wish.HOME,
+    "y": Wish.CONFIRM,
+    "s": Wish.START,
+    "a": Wish.AGAIN,
+    "q": Wish.END,
+}
+KEYS_HELP = (
+    "space or Enter: STOP   p: pause   r: resume   h: home   y: the path is right   s: start   a: again   q: end"
+)
 
 
 @dataclass(slots=True)
-class Viewer:
-    """Makes views; remembers what a rate needs."""
+class NozzleErrorEstimate:
+    """The true error at the nozzle in a simulated world, by dead reckoning while the run goes on.
+
+    The truth comes with a picture, later than the commands for its instant: so the last commands are kept, and looked
+    up once the truth is there.
+    """
+
+    path: Path  # as its file has it, in the true surface frame
+    last: float = nan  # mm, NaN while it is unknown or nothing is printed
+    _commands: deque[tuple[float, Array, float]] = field(default_factory=lambda: deque(maxlen=KEPT_COMMANDS))
+    _ticked: float = nan  # s, stamp of the last tick
+    _compared: float = nan  # s, stamp of the last pose
+
+    def update(
+        self, tracking: TrackingReport | None, motion: LiveMotionReport | None, profile: ArmProfile | None
+    ) -> None:
+        """Take what is new. profile: of the arm since the path was begun; None before."""
+        if profile is None or motion is None or tracking is None or tracking.truth is None or tracking.pose is None:
+            return
+        if motion.tick.stamp != self._ticked:
+            self._ticked = motion.tick.stamp
+            self._keep_command(motion, profile)
+        if tracking.pose.stamp != self._compared:
+            self._compared = tracking.pose.stamp
+            self.last = self._error(tracking.pose.stamp, tracking.truth, profile)
+
+    def _keep_command(self, motion: LiveMotionReport, profile: ArmProfile) -> None:
+        command = motion.tick.command
+        if isinstance(command, Move) and command.extrude and motion.progress is not None:
+            due = command.stamp + profile.tick + profile.lag
+            self._commands.append((due, command.axes, motion.progress.fraction))
+
+    def _error(self, stamp: float, base_from_surface: Array, profile: ArmProfile) -> float:
+        """Distance, mm, from the nozzle to its place at `stamp`, s; NaN where it was not printing then."""
+        after = next((i for i, (due, _, _) in enumerate(self._commands) if due >= stamp), 0)
+        if not after or self._commands[after][0] - self._commands[after - 1][0] > MAX_COMMAND_GAP:
+            return nan
+        (begin, axes, place), (end, next_axes, next_place) = self._commands[after - 1], self._commands[after]
+        share = (stamp - begin) / (end - begin)
+        nozzle = nozzle_from_axes(profile.arm, axes + share * (next_axes - axes))
+        position = (se3.inverse(base_from_surface) @ nozzle)[:3, 3]
+        fraction, points = place + share * (next_place - place), self.path.surface_from_nozzle[:, :3, 3]
+        target = [np.interp(fraction, np.arange(len(points)), points[:, k]) for k in range(3)]
+        return float(np.linalg.norm(position - target))
+
+
+@dataclass(slots=True)
+class ViewBuilder:
+    """Makes the views of a run for its operator's page."""
 
     prepared: Prepared
-    _true: TrueError = field(init=False)
-    _times: Array = field(default_factory=lambda: np.zeros(0))  # (N,) s from each checkpoint to the end
-    _sets: tuple[float, int] = (nan, 0)
-    _rate: float = nan
+    _true_error: NozzleErrorEstimate = field(init=False)
+    _times_left: Array = field(init=False)  # (N,) s from each checkpoint to the end
+    _last_sets: tuple[float, int] = (nan, 0)  # stamp of the last report, s, and its frame sets
+    _rate: float = nan  # frame sets per second, smoothed
 
     def __post_init__(self) -> None:
-        self._true = TrueError(self.prepared.task.path)
+        self._true_error = NozzleErrorEstimate(self.prepared.task.path)
+        self._times_left = _times_left(self.prepared.task.path)
 
-    def look(self, seen: Seen, profile: ArmProfile | None) -> None:
-        """Note what only shows from one look to the next. profile: of the arm, as it is used."""
-        self._true.look(seen.tracking, seen.motion, profile)
+    def update(self, reports: RunReports, profile: ArmProfile | None) -> None:
+        """Take the newest reports. profile: of the arm since the path was begun; None before."""
+        self._true_error.update(reports.tracking, reports.motion, profile)
 
-    def __call__(self, now: float, conductor: Conductor, seen: Seen, tally: Tally) -> OperatorView:
+    def __call__(
+        self, now: float, machine: RunStateMachine, reports: RunReports, statistics: RunStatistics
+    ) -> OperatorView:
         """The view at `now`, s."""
-        motion, tracking = seen.motion, seen.tracking
+        motion, tracking = reports.motion, reports.tracking
         return OperatorView(
             stamp=now,
-            turn=conductor.turn,
-            stage=conductor.stage,
-            question=QUESTIONS.get(conductor.stage, ""),
-            reason=conductor.missed or conductor.reason,
-            offers=conductor.offers,
-            checks=conductor.checks,
+            turn=machine.turn,
+            stage=machine.stage,
+            question=STAGE_QUESTIONS.get(machine.stage, ""),
+            reason=machine.silence or machine.reason,
+            offers=machine.offers,
+            checks=machine.checks,
             tracking=None if tracking is None else _tracking(tracking, now),
-            motion=None if motion is None else self._motion(motion, conductor, tally),
-            progress=None if motion is None else self._progress(motion, tally),
+            motion=None if motion is None else self._motion(motion, machine, statistics),
+            progress=None if motion is None else self._progress(motion, statistics),
             latency=None if motion is None else _latency(motion),
             cameras=() if tracking is None else self._cameras(tracking, now),
-            answer=conductor.answer,
+            answer=machine.answer,
             notes=self.prepared.notes,
             events=() if motion is None else tuple(event.text for event in motion.events),
         )
 
-    def _motion(self, motion: LiveMotionReport, conductor: Conductor, tally: Tally) -> MotionView:
+    def _motion(self, motion: LiveMotionReport, machine: RunStateMachine, statistics: RunStatistics) -> MotionView:
         status, command = motion.tick.status, motion.tick.command
-        laid, profile = conductor.laid, self.prepared.task.profile
-        known = laid is not None and status.axes is not None
+        placed, base_from_nozzle = machine.placed_path, None
+        if placed is not None and status.axes is not None:
+            base_from_nozzle = nozzle_from_axes(placed.profile.arm, status.axes)
         return MotionView(
-            activity=_activity(motion, conductor.stage),
-            reason=conductor.missed or command.reason,
-            error=tally.last_error,
-            limit=profile.limits.pose_error,
-            true_error=self._true.last,
+            activity=_activity(motion, machine.stage),
+            reason=machine.silence or command.reason,
+            error=statistics.last_error,
+            limit=self.prepared.task.profile.limits.pose_error,
+            true_error=self._true_error.last,
             in_flight=status.in_flight,
-            most_in_flight=FLIGHT,
-            base_from_nozzle=nozzle_from_axes(laid.profile.arm, status.axes) if known else None,  # type: ignore[union-attr,arg-type]
+            most_in_flight=MAX_IN_FLIGHT,
+            base_from_nozzle=base_from_nozzle,
             arm=f"{status.state.value}: {status.reason}",
             speed=command.feed if isinstance(command, Move) else 0.0,
         )
 
-    def _progress(self, motion: LiveMotionReport, tally: Tally) -> ProgressView | None:
+    def _progress(self, motion: LiveMotionReport, statistics: RunStatistics) -> ProgressView | None:
         progress, path = motion.progress, self.prepared.task.path
         if progress is None:
             return None
-        if not len(self._times):
-            self._times = _times_left(path)
-        left = float(np.interp(progress.fraction, np.arange(len(path)), self._times))
+        left = float(np.interp(progress.fraction, np.arange(len(path)), self._times_left))
         layers = np.unique(path.layer)
         layer = int(np.searchsorted(layers, path.layer[min(progress.checkpoint, len(path) - 1)])) + 1
         share = progress.place / progress.length if progress.length > 0 else nan
-        return ProgressView(progress.fraction, progress.total - 1, share, left, tally.duty, layer, len(layers))
+        return ProgressView(progress.fraction, progress.total - 1, share, left, statistics.duty, layer, len(layers))
 
     def _cameras(self, tracking: TrackingReport, now: float) -> tuple[CameraView, ...]:
-        stamp, sets = self._sets
+        stamp, sets = self._last_sets
         if tracking.sets > sets and tracking.stamp > stamp:
             rate = (tracking.sets - sets) / (tracking.stamp - stamp)
-            self._rate = rate if np.isnan(self._rate) else RATE * self._rate + (1 - RATE) * rate
+            self._rate = rate if np.isnan(self._rate) else RATE_DECAY * self._rate + (1 - RATE_DECAY) * rate
         if tracking.sets > sets or np.isnan(stamp):
-            self._sets = tracking.stamp, tracking.sets
-        late = tracking.pose is None or now - tracking.pose.stamp > FRESH
+            self._last_sets = tracking.stamp, tracking.sets
+        late = tracking.pose is None or now - tracking.pose.stamp > MAX_PICTURE_AGE
         views = []
         for camera, name in enumerate(tracking.cameras):
-            there = camera in tracking.seen and not late
+            delivers = camera in tracking.delivering and not late
             tracks = tracking.used[camera] if camera < len(tracking.used) else 0
-            verdict, words = (Verdict.PASS, "") if there else (Verdict.FAIL, "no pictures")
-            views.append(CameraView(name, verdict, self._rate if there else 0.0, tracks, words))
+            verdict, words = (CheckVerdict.PASS, "") if delivers else (CheckVerdict.FAIL, "no pictures")
+            views.append(CameraView(name, verdict, self._rate if delivers else 0.0, tracks, words))
         return tuple(views)
 
 
@@ -134,26 +205,92 @@ def _tracking(report: TrackingReport, now: float) -> TrackingView | None:
 
 
 def _latency(motion: LiveMotionReport) -> LatencyView | None:
-    for span in motion.spans:
-        if span.name == FRAMES_TO_WIRE:
-            return LatencyView(span.median, span.p99, LATENCY)
+    for timing in motion.timings:
+        if timing.name == FRAMES_TO_WIRE_STAGE:
+            return LatencyView(timing.median, timing.p99, MAX_LATENCY)
     return None
 
 
-def _activity(motion: LiveMotionReport, stage: Stage) -> Activity:
-    if stage is Stage.HOMING:
+def _activity(motion: LiveMotionReport, stage: RunStage) -> Activity:
+    if stage is RunStage.HOMING:
         return Activity.HOMING
     if motion.tick.status.state is not ArmState.ARMED or motion.progress is None:
         return Activity.RESTING
     command = motion.tick.command
     if isinstance(command, Hold):
         return Activity.HOLDING
-    if motion.progress.phase is Phase.PRINTING:
+    if motion.progress.phase is PrintPhase.PRINTING:
         return Activity.PRINTING if command.extrude else Activity.TRAVELLING
-    return ACTIVITIES.get(motion.progress.phase, Activity.HOLDING)
+    return PHASE_ACTIVITIES.get(motion.progress.phase, Activity.HOLDING)
 
 
 def _times_left(path: Path) -> Array:
     """Seconds (N,) from each checkpoint to the end at the path's own speeds."""
-    each = lengths(path.surface_from_nozzle) / path.speed[1:]
+    each = way_lengths(path.surface_from_nozzle) / path.speed[1:]
     return np.asarray(np.concatenate([np.cumsum(each[::-1])[::-1], [0.0]]))
+
+
+class Console:
+    """Reads single keys of the terminal and writes lines; a terminal that is closed or never was stops nothing.
+
+    file: to wait on, None where there is no terminal.
+    """
+
+    def __init__(self) -> None:
+        self.file: int | None = None
+        self._before: list[Any] | None = None
+
+    def __enter__(self) -> Console:
+        with suppress(OSError, ValueError, termios.error):
+            if sys.stdin is not None and os.isatty(sys.stdin.fileno()):
+                self._before = termios.tcgetattr(sys.stdin.fileno())
+                tty.setcbreak(sys.stdin.fileno())
+                self.file = sys.stdin.fileno()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            with suppress(OSError, ValueError, termios.error):
+                termios.tcsetattr(sys.stdin.fileno(), termios.TCSADRAIN, self._before)
+
+    def wishes(self) -> list[Wish]:
+        """The wishes of the keys that were pressed; a stop stands alone."""
+        assert self.file is not None
+        try:
+            keys = os.read(self.file, MAX_KEYS_READ).decode(errors="replace")
+        except OSError:
+            keys = ""
+        if not keys:  # the terminal is gone
+            self.file = None
+        wishes = [ACTION_KEYS[key] for key in keys if key in ACTION_KEYS]
+        return [Wish.STOP] if Wish.STOP in wishes else wishes
+
+    def say(self, text: str) -> None:
+        """Write a line to standard error."""
+        with suppress(OSError, ValueError):
+            print(text, file=sys.stderr, flush=True)
+
+
+def status_line(machine: RunStateMachine, reports: RunReports) -> str:
+    """The run in one line: stage, place, state of the tracker and why the nozzle stands; in the check, what fails."""
+    if machine.stage is RunStage.CHECK:
+        waits = [c for c in machine.checks if c.verdict in (CheckVerdict.BUSY, CheckVerdict.FAIL) and c.name != "reach"]
+        return "check: " + "; ".join(f"{check.name}: {check.found}" for check in waits)
+    pose = None if reports.tracking is None else reports.tracking.pose
+    state = "no pose" if pose is None else pose.state.value
+    if machine.stage is RunStage.FIND and machine.placed_path is not None:
+        return f"find: out of reach: {machine.placed_path.unreachable}"
+    if reports.motion is None or reports.motion.progress is None:
+        return f"{machine.stage.value}: {state}"
+    progress, command = reports.motion.progress, reports.motion.tick.command
+    held = f", holds: {command.reason}" if command.reason else ""
+    if machine.silence:
+        held = f", {machine.silence}"
+    return f"{machine.stage.value}: {progress.fraction:.1f} of {progress.total - 1} checkpoints, {state}{held}"
+
+
+def stage_line(stage: RunStage, reason: str) -> str:
+    """The stage and its reason; a reason that begins with the stage's name says both."""
+    if not reason or reason.startswith(stage.value):
+        return reason or stage.value
+    return f"{stage.value}: {reason}"

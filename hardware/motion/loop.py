@@ -1,129 +1,133 @@
-"""The clock-driven loop of the motion: the newest pose, MotionStep, the arm, 50 times a second.
+"""The loop of the motion, driven by a clock: 50 times a second the newest pose, the motion's command, the arm.
 
-It runs in a process of its own (motion_process.py), or under a simulated clock. Between ticks it looks at the line and
-at the operator's orders every few milliseconds, so that a stop waits for no tick. A motion is asked only when the arm
-can take its frame: what was decided is sent, and planner, guard and arm agree on where the arm is.
+It runs in a process of its own, or under a simulated clock. Between ticks it polls the line and the operator's orders
+every few milliseconds, so that a stop waits for no tick. The motion is called only when the arm can take a command:
+what is decided is sent, and planner, guard and arm agree on where the arm is.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
+import numpy as np
+
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from hardware.arm.link import Arm
-from hardware.arm_recall import Recalled
-from hardware.arm_status import ArmState, ArmStatus
-from hardware.farewell import farewell
-from hardware.lateness import Lateness
+from hardware.arm.device import BY_OPERATOR, DONE, ArmState, ArmStatus, LinkCode, Reason
+from hardware.arm.jog import RecalledMoves
+from hardware.arm.link import Arm, shut_down
+from hardware.arm.profile import ArmProfile
 from hardware.process.clock import Clock
-from hardware.process.ticks import Rhythm
+from hardware.process.ticks import LatenessHistogram, TickSchedule
+from perception.frames import PrintHead
 from planning.command import Command, Hold, Move
+from planning.progress import PrintPhase
+from planning.robot.kinematics import nozzle_from_axes
 
 
-class Motion(Protocol):
-    """What the loop asks of a MotionStep."""
+class TickMotion(Protocol):
+    """What the loop needs of a motion; `hardware.motion.step` has the usual one."""
 
-    last: Command
-
-    def __call__(self, pose: SurfacePose | None, now: float) -> bytes:
-        """The frame of the tick at `now`, s."""
+    def __call__(self, pose: SurfacePose | None, now: float) -> Command:
+        """The command of the tick at `now`, s."""
         ...
 
     def recalled(self, place: Array, stands: Array) -> None:
-        """The arm was stopped at `place` (6,) on its way and stands at `stands` (6,): all sent beyond is undone."""
+        """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,)."""
         ...
 
 
 class Order(Enum):
     """What an operator may ask of the motion."""
 
-    AT_HOME = "at home"  # the arm stands at home: whoever looks at it says so
-    ARM = "arm"  # let it move; it goes back to where the motion left off, if that is near
-    HOME = "home"  # arm it, go home, disarm it
+    AT_HOME = "at home"  # the arm stands at home, as the operator sees
+    ARM = "arm"  # let the arm move; it first goes back to where the motion left off, if that is near
+    HOME = "home"  # arm, go home, disarm
     DISARM = "disarm"
     STOP = "stop"
     QUIT = "quit"
 
 
+GOING_HOME = Reason("the arm goes home", LinkCode.OWN_MOVE)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Tick:
-    """What one tick did.
+    """What one tick did."""
 
-    stamp: s, for which it was made. frame: the bytes sent, none of a hold by the link. late: s behind its instant.
-    recalled: what the motion was told before it of moves that were called back.
-    """
-
-    stamp: float
+    stamp: float  # s, for which it was made
     command: Command
-    frame: bytes
-    late: float
+    frame: bytes  # sent; b"" where the link held the command back
+    late: float  # s behind its instant
     status: ArmStatus
-    answer: str  # why the last order was not followed, "" if it was
-    recalled: Recalled | None = None
+    answer: Reason  # why the last order was not followed
+    recalled: RecalledMoves | None = None  # moves that were called back before it
+    hold: LinkCode | None = None  # why the link held the command back; None where it did not
 
 
-def nobody(tick: Tick) -> None:
-    """Tell nobody."""
+def ignore_tick(tick: Tick) -> None:
+    """Report to nobody."""
 
 
-def nothing() -> None:
+def do_nothing() -> None:
     """Do nothing."""
 
 
 class MotionLoop:
-    """One motion on one arm. lateness: of its ticks. skipped: ticks that were too late to be made."""
+    """One motion on one arm. lateness: of its ticks. skipped: ticks left out, as their time had passed."""
 
     def __init__(
         self,
-        motion: Motion,
+        motion: TickMotion,
         arm: Arm,
         clock: Clock,
         pose: Callable[[], SurfacePose | None],
         orders: Callable[[], Sequence[Order]],
-        tell: Callable[[Tick], None] = nobody,
-        homed: Callable[[], None] = nothing,
-        rhythm: Rhythm | None = None,
+        report: Callable[[Tick], None] = ignore_tick,
+        homed: Callable[[], None] = do_nothing,
+        schedule: TickSchedule | None = None,
     ) -> None:
-        """pose: the newest there is. orders: those that have come since the last call. tell: is told of each tick.
+        """pose: gives the newest. orders: gives those since the last call. report: called after each tick.
 
-        homed: is told when the arm has gone home, so that the motion begins from there. rhythm: of the ticks; without
+        homed: called when the arm has gone home, so that the motion begins from there. schedule: of the ticks; without
         one they run freely, the profile's tick and the link's ease apart.
         """
         self.motion, self.arm = motion, arm
-        self.lateness = Lateness()
+        self.lateness = LatenessHistogram()
         self.skipped = 0
-        self._clock, self._pose, self._orders, self._tell, self._homed = clock, pose, orders, tell, homed
+        self._clock, self._pose, self._orders, self._report, self._homed = clock, pose, orders, report, homed
         profile, settings = arm.profile, arm.settings
-        self._pause, self._look = profile.limits.pause, settings.poll
-        self._rhythm = Rhythm(profile.tick, settings.ease, clock.now()) if rhythm is None else rhythm
-        self._given: SurfacePose | None = None  # to the last tick
+        self._hold_time, self._poll_period = profile.limits.pause, settings.poll
+        self._schedule = TickSchedule(profile.tick, settings.ease, clock.now()) if schedule is None else schedule
+        self._last_pose: SurfacePose | None = None  # of the last tick
         self._left_off: Array = profile.arm.home  # where planner and guard take the arm to be
         self._homing = False
-        self._answer = ""
+        self._answer = DONE
         self._quit = False
 
     def run(self, until: float = float("inf")) -> None:
-        """Go on until `until`, s, or until an order ends it; whatever ends it, the arm is stopped."""
-        rhythm = self._rhythm
-        rhythm.due = self._clock.now()
+        """Run until `until`, s, or an order to quit; whatever ends it, the arm is stopped."""
+        schedule = self._schedule
+        schedule.due = self._clock.now()
         try:
             while not self._quit and (now := self._clock.now()) < until:
-                self._obey(now)
+                self._follow_orders(now)
                 self.arm.poll(now)
                 pose = self._pose()
-                if now >= rhythm.opens(pose is not self._given):
-                    self._given = pose
-                    self._tick(pose, now, max(now, rhythm.due))
-                    self.skipped += rhythm.made(self._clock.now())
-                self._clock.wait_until(min(rhythm.due, self._clock.now() + self._look))
+                if now >= schedule.opens(pose is not self._last_pose):
+                    self._last_pose = pose
+                    self._tick(pose, now, max(now, schedule.due))
+                    self.skipped += schedule.advance(self._clock.now())
+                self._clock.wait_until(min(schedule.due, self._clock.now() + self._poll_period))
         finally:
-            farewell(self.arm, "the motion has ended", self._clock, self._look)
+            shut_down(self.arm, "the motion has ended", self._clock, self._poll_period)
 
-    def _obey(self, now: float) -> None:
+    def _follow_orders(self, now: float) -> None:
         for order in self._orders():
             self._answer = self._do(order, now)
         if self._homing and (self.arm.state is not ArmState.ARMED or self.arm.arrived(now)):
@@ -133,11 +137,11 @@ class MotionLoop:
                 self._homed()
                 self.arm.disarm(now)
 
-    def _do(self, order: Order, now: float) -> str:
+    def _do(self, order: Order, now: float) -> Reason:
         """Follow an order; why it cannot be followed, or ""."""
         arm = self.arm
         if order is Order.STOP:
-            arm.stop("by the operator", now)
+            arm.stop(BY_OPERATOR, now)
         elif order is Order.DISARM:
             arm.disarm(now)
         elif order is Order.QUIT:
@@ -150,23 +154,73 @@ class MotionLoop:
             if reason := arm.arm(now) or arm.home(now):
                 return reason
             self._homing = True
-        return ""
+        return DONE
 
     def _tick(self, pose: SurfacePose | None, now: float, instant: float) -> None:
-        """Made at `now`, s, for `instant`, s, which is later where its pose came early."""
-        late = max(now - self._rhythm.due, 0.0)
+        """Make at `now`, s, the tick for `instant`, s, which is later where its pose came early."""
+        late = max(now - self._schedule.due, 0.0)
         self.lateness.add(late)
         frame = b""
         if recalled := self.arm.take_up():
             self._left_off = recalled.stands
             self.motion.recalled(recalled.place, recalled.stands)
-        if reason := "the arm goes home" if self._homing else self.arm.hold(now):
-            command: Command = Hold(instant, self._pause, reason)
+        if hold := GOING_HOME if self._homing else self.arm.hold(now):
+            command: Command = Hold(instant, self._hold_time, str(hold))
         else:
-            frame = self.motion(pose, instant)
-            command = self.motion.last
+            command = self.motion(pose, instant)
             if isinstance(command, Move):
                 self._left_off = command.axes
-            if reason := self.arm.send(frame, now):
-                frame, command = b"", Hold(instant, self._pause, reason)
-        self._tell(Tick(instant, command, frame, late, self.arm.status(now), self._answer, recalled))
+            if hold := self.arm.send(command, now):
+                command = Hold(instant, self._hold_time, str(hold))
+            else:
+                frame = self.arm.command_frame
+        self._report(Tick(instant, command, frame, late, self.arm.status(now), self._answer, recalled, hold.code))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedTick:
+    """A tick of a live run's motion as it is recorded: what planner and guard were given, and what they made of it."""
+
+    stamp: float  # s
+    pose_stamp: float  # s, of the pose they were given; NaN: none
+    asked: bool  # whether planner and guard were called
+    begun: float  # place, in checkpoints, at which they were begun anew before the tick; NaN: they were not
+    paused: bool  # whether they were to wait above the surface
+    command: Command  # of the loop
+    frame: bytes  # of planner's and guard's command
+    fraction: float  # place on the path after it, in checkpoints
+    phase: PrintPhase
+    recalled: Array | None = None  # (2, 6) mm and rad: where the arm rested and stands, where moves were called back
+
+
+MAX_COMMANDS = 256  # commands, five seconds of them: frames are never that late
+
+
+class CommandedPose:
+    """The print head by the last commands, for the tracker; the arm is there a tick and its lag after each was sent."""
+
+    def __init__(self, profile: ArmProfile) -> None:
+        self._profile = profile
+        self._stamps: deque[float] = deque(maxlen=MAX_COMMANDS)
+        self._axes: deque[Array] = deque(maxlen=MAX_COMMANDS)
+        self._extruding: deque[bool] = deque(maxlen=MAX_COMMANDS)
+
+    def add(self, command: Command, now: float) -> None:
+        """Enter a command that is sent at `now`, s; a hold leaves the arm where it was."""
+        moves = isinstance(command, Move)
+        if moves or self._axes:
+            self._stamps.append(now + self._profile.tick + self._profile.lag)
+            self._axes.append(command.axes if isinstance(command, Move) else self._axes[-1])
+            self._extruding.append(isinstance(command, Move) and command.extrude)
+
+    def at(self, stamp: float) -> PrintHead | None:
+        """The print head at `stamp`, s; None before the first move, when nobody knows where the arm is."""
+        if not self._stamps or stamp < self._stamps[0]:
+            return None
+        place = min(bisect_left(self._stamps, stamp), len(self._stamps) - 1)
+        before = max(place - 1, 0)
+        ends = self._stamps[before], self._stamps[place]
+        share = min(1.0, (stamp - ends[0]) / (ends[1] - ends[0])) if ends[1] > ends[0] else 1.0
+        axes = self._axes[before] + share * (self._axes[place] - self._axes[before])
+        extruding = self._extruding[place] and stamp <= ends[1]
+        return PrintHead(np.asarray(nozzle_from_axes(self._profile.arm, axes)), extruding)

@@ -1,26 +1,37 @@
-"""MotionStep: the newest surface pose in, the bytes for the arm out; no I/O and no clock of its own.
+"""MotionStep: the newest surface pose in, the arm's next command out; no I/O and no clock of its own.
 
-Planner, guard, protocol, in this order. The motion process imports this module; it must never need gtsam, cv2 or
-onnxruntime: a call of gtsam was measured to stop every other thread for as long as it takes.
+The planner proposes, the guard decides; whoever owns the line to the arm encodes the command. `motion_process` runs a
+MotionStep on a real arm. The motion's processes import this module: it must never need gtsam, cv2 or onnxruntime, as a
+call of gtsam was measured to stop every other thread for as long as it takes.
 """
 
 from __future__ import annotations
 
+import signal
+from collections import deque
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from types import FrameType
+
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from hardware.arm.profile import ArmProfile
-from hardware.arm.protocol import G1, G4, Dialect, encode
+from hardware.arm.device import ArmEvent
+from hardware.arm.link import Arm
+from hardware.arm.port import PortOpener
+from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.motion.loop import MotionLoop, Order, Tick
+from hardware.process.clock import WallClock
+from hardware.process.shared_latest import SharedLatest
+from hardware.process.system import ask_for_real_time
 from planning.command import Command, Hold, Move
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
 from planning.path import Path
-from planning.progress import Progress
+from planning.progress import PrintProgress
 
 
 class MotionStep:
     """One arm printing one path; call it once a tick."""
-
-    last: Command
 
     def __init__(self, path: Path, profile: ArmProfile | None = None, start: float = 0.0) -> None:
         """start: how much of the path is printed already, counted in checkpoints."""
@@ -29,22 +40,22 @@ class MotionStep:
         lag = self.profile.lag
         self._planner, self._guard = Planner(path, *settings, lag, start), Guard(*settings, path.zone, lag)
 
-    def __call__(self, pose: SurfacePose | None, now: float) -> bytes:
-        """One frame for the tick at `now`, s: G1 of a move, G4 of a hold. pose: the newest there is."""
+    def __call__(self, pose: SurfacePose | None, now: float) -> Command:
+        """The command of the tick at `now`, s, as the guard lets it pass. pose: the newest there is."""
         wanted = self._planner(pose, now)
-        self.last = self._guard(wanted, pose, now)
-        if isinstance(wanted, Move) and isinstance(self.last, Hold):
+        command = self._guard(wanted, pose, now)
+        if isinstance(wanted, Move) and isinstance(command, Hold):
             self._planner.refused(self._guard.axes)
-        return bytes_from_command(self.last, self.profile.dialect)
+        return command
 
     def recalled(self, place: Array, stands: Array) -> None:
-        """The arm was stopped at `place` (6,) on its way and stands at `stands` (6,): the path goes on from there."""
+        """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,) on its way."""
         self._planner.recalled(place, stands)
         self._guard.stands(stands)
 
     @property
     def paused(self) -> bool:
-        """Whether the nozzle is to go up from the surface and stand there; it goes on where it left off."""
+        """Whether the nozzle is to retract from the surface and wait there; it then goes on where it left off."""
         return self._planner.paused
 
     @paused.setter
@@ -52,13 +63,99 @@ class MotionStep:
         self._planner.paused = value
 
     @property
-    def progress(self) -> Progress:
-        """Which checkpoint is being printed, and in which phase the print is."""
+    def progress(self) -> PrintProgress:
+        """How far the print is, and in which phase."""
         return self._planner.progress
 
 
-def bytes_from_command(command: Command, dialect: Dialect) -> bytes:
-    """The frame (48 bytes) of a command."""
-    if isinstance(command, Move):
-        return encode(G1(command.axes, command.feed), dialect)
-    return encode(G4(command.duration), dialect)
+MAX_REPORTED_EVENTS = 50
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionPlan:
+    """What is to be printed, and on which arm."""
+
+    path: Path
+    profile: ArmProfile
+    url: str  # of the arm's port, for pyserial
+    settings: LinkSettings = field(default_factory=LinkSettings)
+    real_time: bool = True  # ask for that priority
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionReport:
+    """The state of the motion process after a tick."""
+
+    tick: Tick
+    checkpoint: int
+    total: int  # checkpoints
+    events: tuple[ArmEvent, ...]  # the last ones
+    late: tuple[float, float, float]  # s, median, 99 % and largest lateness of all ticks so far
+    ticks: int
+    skipped: int  # ticks left out
+    stop: tuple[float, float] | None  # s, when the last one was decided and when it was on the wire
+    priority: str  # as the system granted it
+
+
+class _Reporter:
+    def __init__(self, arm: Arm, motion: MotionStep, reports: SharedLatest[MotionReport], real_time: bool) -> None:
+        self._arm, self._motion, self._reports = arm, motion, reports
+        self._priority = ask_for_real_time() if real_time else "nothing asked for"
+        self._events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
+        self.loop: MotionLoop | None = None
+
+    def __call__(self, tick: Tick) -> None:
+        assert self.loop is not None
+        self._events.extend(self._arm.events())
+        progress, late = self._motion.progress, self.loop.lateness
+        self._reports.put(
+            MotionReport(
+                tick,
+                progress.checkpoint,
+                progress.total,
+                tuple(self._events),
+                (late.percentile(50), late.percentile(99), late.most),
+                late.count,
+                self.loop.skipped,
+                self._arm.stops[-1] if self._arm.stops else None,
+                self._priority,
+            )
+        )
+
+
+class _Orders:
+    """The orders received; QUIT where the other end is closed, or at SIGTERM and SIGINT."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._ended = False
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._end)
+
+    def __call__(self) -> list[Order]:
+        orders: list[Order] = []
+        try:
+            while self._connection.poll():
+                orders.append(self._connection.recv())
+        except (EOFError, OSError):
+            self._ended = True
+        return [*orders, Order.QUIT] if self._ended else orders
+
+    def _end(self, number: int, frame: FrameType | None) -> None:
+        self._ended = True
+
+
+def motion_process(
+    plan: MotionPlan, poses: SharedLatest[SurfacePose], reports: SharedLatest[MotionReport], orders: Connection
+) -> None:
+    """Print until an order to quit, or until the process that gives orders is gone; then stop the arm."""
+    clock, device = WallClock(), PortOpener(plan.url, plan.profile.baud)
+    arm, motion = Arm(device, plan.profile, clock.now(), plan.settings), MotionStep(plan.path, plan.profile)
+    reporter = _Reporter(arm, motion, reports, plan.real_time)
+    loop = reporter.loop = MotionLoop(motion, arm, clock, poses.get, _Orders(orders), reporter)
+    try:
+        loop.run()
+    finally:
+        reporter.loop = None  # a cycle would keep the planner's solver alive until the process ends
+        arm.close()
+        device.release()

@@ -1,47 +1,193 @@
-"""report.html of a comparison, and the same in words and figures."""
+"""`stillbed compare`: absolute and relative errors of poses as evo counts them, as text, JSON and page.
+
+The metrics are those of Sturm et al. (IROS 2012) and Zhang and Scaramuzza (IROS 2018). evo itself draws in pandas,
+matplotlib and seaborn; its numbers are a page of arithmetic, and a test holds ours to them. Scale is never fitted:
+lengths here are calibrated mm.
+"""
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from estimation import se3
+from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.comparing.metrics import ALIGNMENTS, CLAIMED, Compared, statistics
-from hardware.page import document, figures_table, legend, line_key, row_of_tiles, section, tile
-from hardware.report.evaluation import NEES_BOUND
-from hardware.report.page import Plot, spanning
-from hardware.report.report import HALF, WIDTH, components
-from hardware.report.summary import figure, percent
+from hardware.offline.trajectory_files import PoseSeries, read_pose_series, read_truth_series
+from hardware.process.progress import prepare_out
+from hardware.report.evaluation import NEES_BOUND, PoseErrors, associate, best_constant, errors_under
+from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, spanning, tile
+from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, components
+from hardware.report.summary import figure, finite, percent
 
-HEAD = ("", "RMSE", "mean", "median", "std", "max")
-STYLES = dict(zip(ALIGNMENTS, ("series c3", "series c1", "series c0", "series c2"), strict=True))
-EXPLAINED = (
+ALIGNMENTS = ("as they stand", "aligned, SE(3)", "one surface frame", "laid at one pose")
+HELD_SIGMA_MM = 1e-3  # mm, one standard deviation in all: less is claimed of no pose that was measured
+UNFITTED_ALIGNMENTS = ALIGNMENTS[0], ALIGNMENTS[3]  # under which covariances mean what they say: nothing is fitted
+RowNumbers = NDArray[np.int64]
+MIN_PAIRS = 3  # pairs: of fewer an alignment would leave nothing
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorStatistics:
+    """The figures that evo gives of errors, in their own unit; NaN where there are none."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+    sse: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativeErrors:
+    """Errors of the change over `delta` poses, (P,) mm and rad. rows: (P,) of the poses at which each change ends."""
+
+    rows: RowNumbers
+    translation: Array
+    rotation: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlignedErrors:
+    """The errors under one alignment."""
+
+    name: str  # of ALIGNMENTS
+    estimated: Array  # (M, 4, 4), aligned
+    reference: Array  # (M, 4, 4)
+    absolute: PoseErrors  # APE and NEES
+    relative: RelativeErrors  # RPE
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrajectoryComparison:
+    """Poses beside others of the same instants."""
+
+    estimated: PoseSeries
+    reference: PoseSeries
+    stamps: Array  # (M,) s, of the estimated ones
+    gap: float  # s, median distance of the stamps that belong together
+    delta: int  # poses between the two of a relative error
+    judged: tuple[AlignedErrors, ...]  # without the SE(3) alignment where positions do not determine it
+
+    def of(self, name: str) -> AlignedErrors | None:
+        """The alignment of that name, None where there is none."""
+        return next((each for each in self.judged if each.name == name), None)
+
+    @property
+    def fitted(self) -> AlignedErrors:
+        """In one surface frame, the one that fits best."""
+        return self.judged[-2]
+
+    @property
+    def laid(self) -> AlignedErrors:
+        """In the surface frame of one pose."""
+        return self.judged[-1]
+
+
+def error_statistics(errors: Array) -> ErrorStatistics:
+    """The figures of errors (M,)."""
+    if not len(errors):
+        return ErrorStatistics(*[float("nan")] * 7)
+    square = errors**2
+    values = np.sqrt(square.mean()), errors.mean(), np.median(errors), errors.std(), errors.min(), errors.max()
+    return ErrorStatistics(*map(float, (*values, square.sum())))
+
+
+def compare(estimated: PoseSeries, reference: PoseSeries, delta: int = 1) -> TrajectoryComparison:
+    """The estimated poses evaluated against the reference, under each alignment.
+
+    "As they stand": evo without options.
+    "Aligned, SE(3)": `evo_ape -a`, the rigid motion of the base that brings the positions nearest (Umeyama 1991); left
+        out where they lie on a line and do not determine it.
+    "One surface frame": the constant between the two runs' own surface frames that brings the poses nearest.
+    "Laid at one pose": that constant by one pose, whose error then is in all others. So are a run's covariances meant,
+        which lays its surface frame by its first pose or, smoothed, holds the pose that did.
+    delta: poses between the two of a relative error; the pairs follow one another, as evo's do.
+    InputError where fewer than MIN_PAIRS poses belong together.
+    """
+    rows, theirs = associate(estimated.trajectory.stamps, reference.trajectory.stamps)
+    rows, theirs = _one_to_one(rows, theirs, estimated.trajectory.stamps, reference.trajectory.stamps)
+    if len(rows) < max(MIN_PAIRS, delta + 1):
+        need = f"{max(MIN_PAIRS, delta + 1)} or more: are both of the same recording, and on one clock?"
+        raise InputError(estimated.name, f"poses at instants of {reference.name}", len(rows), need)
+    ours, target = estimated.trajectory.base_from_surface[rows], reference.trajectory.base_from_surface[theirs]
+    covariance = estimated.covariance[rows]
+    pairs = [(ALIGNMENTS[0], ours, target)]
+    if _rotation_determined(ours[:, :3, 3], target[:, :3, 3]):
+        motion = se3.rigid_from_points(ours[:, :3, 3], target[:, :3, 3])
+        pairs.append((ALIGNMENTS[1], motion @ ours, target))
+    changes = se3.inverse(target) @ ours
+    pairs += [
+        (ALIGNMENTS[2], ours, target @ best_constant(changes)),
+        (ALIGNMENTS[3], ours, target @ changes[_held_row(covariance)]),
+    ]
+    judged = tuple(
+        AlignedErrors(name, a, b, errors_under(np.eye(4), b, a, covariance), relative_errors(a, b, delta))
+        for name, a, b in pairs
+    )
+    gaps = np.abs(estimated.trajectory.stamps[rows] - reference.trajectory.stamps[theirs])
+    return TrajectoryComparison(
+        estimated, reference, estimated.trajectory.stamps[rows], float(np.median(gaps)), delta, judged
+    )
+
+
+def _held_row(covariance: Array) -> int:
+    """The pose that a smoothed run holds, of which next to nothing is claimed (M, 6, 6); the first where none is."""
+    size = np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2)
+    return int(np.argmin(size)) if np.isfinite(size).all() and size.min() < HELD_SIGMA_MM**2 else 0
+
+
+def relative_errors(estimated: Array, reference: Array, delta: int) -> RelativeErrors:
+    """Of poses (M, 4, 4): how far the change from each to the one `delta` later is off, pairs end to end."""
+    ends = np.arange(0, len(estimated), delta, dtype=np.int64)
+    change, expected = (se3.inverse(p[ends[:-1]]) @ p[ends[1:]] for p in (estimated, reference))
+    off = se3.inverse(expected) @ change
+    return RelativeErrors(ends[1:], np.linalg.norm(off[:, :3, 3], axis=-1), se3.angle_of(off[:, :3, :3]))
+
+
+def _one_to_one(
+    rows: RowNumbers, theirs: RowNumbers, stamps: Array, their_stamps: Array
+) -> tuple[RowNumbers, RowNumbers]:
+    """Each of the reference's rows once, with the nearest of those that chose it."""
+    order = np.lexsort((np.abs(stamps[rows] - their_stamps[theirs]), theirs))
+    _, first = np.unique(theirs[order], return_index=True)
+    kept = np.sort(order[first])
+    return rows[kept], theirs[kept]
+
+
+def _rotation_determined(a: Array, b: Array) -> bool:
+    """Whether positions (M, 3) tell a rotation between them: evo's own condition."""
+    sizes = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)) / len(a), compute_uv=False)
+    return bool((sizes > np.finfo(float).eps).sum() >= 2)
+
+
+TABLE_HEAD = ("", "RMSE", "mean", "median", "std", "max")
+ALIGNMENT_STYLES = dict(zip(ALIGNMENTS, ("series c3", "series c1", "series c0", "series c2"), strict=True))
+ALIGNMENT_TEXT = (
     "As they stand: nothing is fitted. Aligned, SE(3): the base of the first is moved until the positions lie nearest "
     "(Umeyama, without scale; evo_ape -a). One surface frame: the two runs' surface frames differ by a constant, the "
     "one that fits best is taken out, or the one that one pose tells."
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Line:
-    """Errors over time, of the alignment `name`. stamps: (M,) s. translation: (M,) mm. rotation: (M,) rad."""
-
-    name: str
-    stamps: Array
-    translation: Array
-    rotation: Array
+Errors = PoseErrors | RelativeErrors
+Line = tuple[str, Array, Errors]  # name of the alignment, stamps (M,) s, errors (M,)
 
 
-def lead(compared: Compared) -> str:
+def comparison_verdict(compared: TrajectoryComparison) -> str:
     """The verdict in words."""
     words = [f"{len(compared.stamps)} of {len(compared.estimated)} poses have one beside them in the reference."]
     if compared.gap > 1e-6:
         words.append(f"Their stamps lie {figure(1000 * compared.gap)} ms apart (median).")
     for judged in compared.judged[:-1]:
-        off = statistics(judged.absolute.translation).rmse, statistics(np.degrees(judged.absolute.rotation)).rmse
+        off = [error_statistics(values).rmse for _, values in _by_unit(judged.absolute)]
         words.append(f"{judged.name.capitalize().replace('se(3)', 'SE(3)')}: {figure(off[0])} mm, {figure(off[1])}°.")
     if compared.of(ALIGNMENTS[1]) is None:
         words.append("The positions lie on a line and determine no SE(3) alignment.")
@@ -51,16 +197,17 @@ def lead(compared: Compared) -> str:
     return " ".join(words)
 
 
-def text(compared: Compared) -> str:
+def comparison_text(compared: TrajectoryComparison) -> str:
     """The verdict and the tables, for a terminal."""
-    lines = [lead(compared), ""]
-    for title, rows in (("APE", _absolute_rows(compared)), (_relative_title(compared), _relative_rows(compared))):
-        lines.append(f"{title:<34}" + "".join(f"{name:>10}" for name in HEAD[1:]))
+    lines = [comparison_verdict(compared), ""]
+    relative = f"RPE over {_poses(compared.delta)}"
+    for title, rows in (("APE", _absolute_rows(compared)), (relative, _relative_rows(compared))):
+        lines.append(f"{title:<34}" + "".join(f"{name:>10}" for name in TABLE_HEAD[1:]))
         lines += [f"  {row[0]:<32}" + "".join(f"{cell:>10}" for cell in row[1:]) for row in rows]
     return "\n".join(lines)
 
 
-def as_dict(compared: Compared) -> dict[str, Any]:
+def comparison_figures(compared: TrajectoryComparison) -> dict[str, Any]:
     """All figures by alignment: mm and degrees."""
     out: dict[str, Any] = {
         "estimated": compared.estimated.name,
@@ -72,33 +219,35 @@ def as_dict(compared: Compared) -> dict[str, Any]:
     }
     for judged in compared.judged:
         out[judged.name] = {
-            "ape": _both(judged.absolute.translation, judged.absolute.rotation),
-            "rpe": _both(judged.relative.translation, judged.relative.rotation),
+            "ape": _statistics(judged.absolute),
+            "rpe": _statistics(judged.relative),
             "nees_over_6": judged.absolute.mean_nees / 6,
             "nees_inside_95": judged.absolute.nees_inside,
         }
     return out
 
 
-def page(compared: Compared) -> str:
+def comparison_page(compared: TrajectoryComparison) -> str:
     """The page as HTML text."""
     body = [_tiles(compared), _trajectory(compared), _absolute(compared), _relative(compared), _consistency(compared)]
     title = f"{_short(compared.estimated.name)} by {_short(compared.reference.name)}"
     footer = "Lengths in mm, time in s from the session's own clock; poses are base_from_surface. Scale is not fitted."
-    return document("stillbed compare", title, lead(compared), [part for part in body if part], footer)
+    return document("stillbed compare", title, comparison_verdict(compared), [part for part in body if part], footer)
 
 
-def _both(translation: Array, rotation: Array) -> dict[str, Any]:
-    return {
-        "translation_mm": asdict(statistics(translation)),
-        "rotation_deg": asdict(statistics(np.degrees(rotation))),
-    }
+def _by_unit(errors: Errors) -> tuple[tuple[str, Array], ...]:
+    return ("mm", errors.translation), ("°", np.degrees(errors.rotation))
 
 
-def _tiles(compared: Compared) -> str:
+def _statistics(errors: Errors) -> dict[str, Any]:
+    names = ("translation_mm", "rotation_deg")
+    return {name: asdict(error_statistics(values)) for name, (_, values) in zip(names, _by_unit(errors), strict=True)}
+
+
+def _tiles(compared: TrajectoryComparison) -> str:
     tiles = [tile(str(len(compared.stamps)), "", "pairs of poses")]
     for judged in compared.judged[:-1]:
-        rmse = statistics(judged.absolute.translation).rmse
+        rmse = error_statistics(judged.absolute.translation).rmse
         tiles.append(tile(figure(1000 * rmse), "µm", f"APE {judged.name}, RMSE"))
     nees = compared.laid.absolute.mean_nees / 6
     if np.isfinite(nees):
@@ -106,73 +255,65 @@ def _tiles(compared: Compared) -> str:
     return row_of_tiles(tiles)
 
 
-def _trajectory(compared: Compared) -> str:
-    judged = compared.fitted
+def _trajectory(compared: TrajectoryComparison) -> str:
+    judged, span = compared.fitted, _span(compared)
     values, expected = (components(poses, judged.reference[0]) for poses in (judged.estimated, judged.reference))
+    names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
     plots = []
     for i in (0, 3, 1, 4, 2, 5):
-        name = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")[i]
-        plot = Plot(HALF, 165, _span(compared), spanning([values[:, i], expected[:, i]], 0.12, 0.5), label=name)
+        scale = spanning([values[:, i], expected[:, i]], 0.12, 0.5)
+        plot = Plot(HALF_CHART_WIDTH, 165, span, scale, label=names[i])
         plot.line(compared.stamps, expected[:, i], "truth")
         plot.line(compared.stamps, values[:, i], "estimate")
         plots.append(plot.svg())
-    keys = legend(
-        [line_key("estimate", _short(compared.estimated.name)), line_key("truth", _short(compared.reference.name))]
-    )
+    sources = ("estimate", compared.estimated), ("truth", compared.reference)
+    keys = legend([line_key(style, _short(series.name)) for style, series in sources])
     words = "The surface's origin in base and its rotation since the first pose, in one surface frame. Time in s."
     return section("Trajectories", words, f'{keys}<div class="two">{"".join(plots)}</div>')
 
 
-def _absolute(compared: Compared) -> str:
-    lines = [Line(j.name, compared.stamps, j.absolute.translation, j.absolute.rotation) for j in compared.judged]
-    table = figures_table(HEAD, _absolute_rows(compared))
-    return section("Absolute pose error (APE)", EXPLAINED, _error_plots(compared, lines) + table)
+def _absolute(compared: TrajectoryComparison) -> str:
+    plots = _error_plots(compared, [(j.name, compared.stamps, j.absolute) for j in compared.judged])
+    table = figures_table(TABLE_HEAD, _absolute_rows(compared))
+    return section("Absolute pose error (APE)", ALIGNMENT_TEXT, plots + table)
 
 
-def _relative(compared: Compared) -> str:
-    last = compared.fitted
-    line = Line(last.name, compared.stamps[last.relative.rows], last.relative.translation, last.relative.rotation)
+def _relative(compared: TrajectoryComparison) -> str:
+    name, errors = compared.fitted.name, compared.fitted.relative
+    plots = _error_plots(compared, [(name, compared.stamps[errors.rows], errors)])
     over = _poses(compared.delta)
     words = f"How far the change over {over} is off; an alignment of the base alone changes none of it."
-    table = figures_table(HEAD, _relative_rows(compared))
-    return section("Relative pose error (RPE)", words, _error_plots(compared, [line]) + table)
+    return section("Relative pose error (RPE)", words, plots + figures_table(TABLE_HEAD, _relative_rows(compared)))
 
 
-def _error_plots(compared: Compared, lines: list[Line]) -> str:
-    keys = legend([line_key(STYLES[line.name], line.name) for line in lines])
-    plots = [
-        _error_plot(compared, lines, [line.translation for line in lines], "distance, mm"),
-        _error_plot(compared, lines, [np.degrees(line.rotation) for line in lines], "angle, °"),
-    ]
-    return keys + "".join(plots)
+def _error_plots(compared: TrajectoryComparison, lines: list[Line]) -> str:
+    plots = [legend([line_key(ALIGNMENT_STYLES[name], name) for name, _, _ in lines])]
+    for unit, label in enumerate(("distance, mm", "angle, °")):
+        values = [_by_unit(errors)[unit][1] for _, _, errors in lines]
+        positive = np.concatenate([v[v > 1e-9] for v in values])
+        high = max(float(positive.max(initial=0.0)) * 1.5, 1e-4)
+        low = max(float(np.percentile(positive, 1)) / 2, high / 1e5) if len(positive) else high / 10
+        plot = Plot(PAGE_CHART_WIDTH, 170, _span(compared), (min(low, high / 10), high), log_y=True, label=label)
+        for (name, stamps, _), errors in zip(lines, values, strict=True):
+            plot.line(stamps, errors, ALIGNMENT_STYLES[name])
+        plots.append(plot.svg())
+    return "".join(plots)
 
 
-def _error_plot(compared: Compared, lines: list[Line], values: list[Array], label: str) -> str:
-    positive = np.concatenate([v[v > 1e-9] for v in values])
-    high = max(float(positive.max(initial=0.0)) * 1.5, 1e-4)
-    low = max(float(np.percentile(positive, 1)) / 2, high / 1e5) if len(positive) else high / 10
-    plot = Plot(WIDTH, 170, _span(compared), (min(low, high / 10), high), log_y=True, label=label)
-    for line, errors in zip(lines, values, strict=True):
-        plot.line(line.stamps, errors, STYLES[line.name])
-    return plot.svg()
-
-
-def _consistency(compared: Compared) -> str:
+def _consistency(compared: TrajectoryComparison) -> str:
     nees = compared.laid.absolute.nees
     shown = np.isfinite(nees) & (nees > 1e-6)  # the first pose's is nothing by definition
     if not shown.any():
         return ""
     high = max(float(nees[shown].max()) * 1.3, 2 * NEES_BOUND)
     low = max(float(np.percentile(nees[shown], 1)) / 2, 1e-2)
-    plot = Plot(WIDTH, 170, _span(compared), (min(low, 1.0), high), log_y=True, label=f"NEES, {compared.laid.name}")
+    label = f"NEES, {compared.laid.name}"
+    plot = Plot(PAGE_CHART_WIDTH, 170, _span(compared), (min(low, 1.0), high), log_y=True, label=label)
     plot.line(compared.stamps[shown], nees[shown], "estimate")
     plot.level(NEES_BOUND, "95 %", "limit")
     plot.level(6.0, "6", "median")
-    claimed = [judged.absolute for judged in compared.judged if judged.name in CLAIMED]
-    rows = [
-        [name, figure(each.mean_nees / 6), percent(each.nees_inside)]
-        for name, each in zip(CLAIMED, claimed, strict=True)
-    ]
+    unfitted = [judged for judged in compared.judged if judged.name in UNFITTED_ALIGNMENTS]
+    rows = [[j.name, figure(j.absolute.mean_nees / 6), percent(j.absolute.nees_inside)] for j in unfitted]
     words = "Squared errors in parts of the covariance that is claimed; six on average where that is honest."
     if not compared.reference.trajectory.exact:
         words += " The reference is no exact truth: its own error counts as well."
@@ -180,28 +321,20 @@ def _consistency(compared: Compared) -> str:
     return section("Consistency (NEES)", words, plot.svg() + table)
 
 
-def _absolute_rows(compared: Compared) -> list[list[str]]:
-    return [
-        row for j in compared.judged for row in _rows(j.name, j.absolute.translation, np.degrees(j.absolute.rotation))
-    ]
+def _absolute_rows(compared: TrajectoryComparison) -> list[list[str]]:
+    return [row for judged in compared.judged for row in _rows(judged.name, judged.absolute)]
 
 
-def _relative_rows(compared: Compared) -> list[list[str]]:
-    return [
-        row for j in compared.judged for row in _rows(j.name, j.relative.translation, np.degrees(j.relative.rotation))
-    ]
+def _relative_rows(compared: TrajectoryComparison) -> list[list[str]]:
+    return [row for judged in compared.judged for row in _rows(judged.name, judged.relative)]
 
 
-def _rows(name: str, translation: Array, rotation: Array) -> list[list[str]]:
+def _rows(name: str, errors: Errors) -> list[list[str]]:
     rows = []
-    for unit, values in (("mm", translation), ("°", rotation)):
-        s = statistics(values)
+    for unit, values in _by_unit(errors):
+        s = error_statistics(values)
         rows.append([f"{name}, {unit}", *(figure(v) for v in (s.rmse, s.mean, s.median, s.std, s.max))])
     return rows
-
-
-def _relative_title(compared: Compared) -> str:
-    return f"RPE over {_poses(compared.delta)}"
 
 
 def _poses(count: int) -> str:
@@ -209,9 +342,27 @@ def _poses(count: int) -> str:
 
 
 def _short(name: str) -> str:
-    """A path's last two parts: whose file it is, and which."""
     return "/".join(Path(name).parts[-2:])
 
 
-def _span(compared: Compared) -> tuple[float, float]:
+def _span(compared: TrajectoryComparison) -> tuple[float, float]:
     return float(compared.stamps[0]), float(compared.stamps[-1])
+
+
+def run_compare(estimated: str, reference: str | None, delta: int, out: Path | None) -> str:
+    """Judge `estimated` by `reference`, without one by the truth beside it; the figures as text."""
+    if delta < 1:
+        raise InputError("command line", "--delta", delta, "1 or more poses")
+    ours = read_pose_series(estimated)
+    theirs = read_truth_series(estimated) if reference is None else read_pose_series(reference)
+    if theirs.name == ours.name:
+        raise InputError(ours.name, "poses", "the very ones they are judged by", "two different trajectories")
+    compared = compare(ours, theirs, delta)
+    report = comparison_text(compared)
+    if out is None:
+        return report
+    prepare_out(out, force=True)
+    figures = json.dumps(finite(comparison_figures(compared)), indent=2)
+    (out / "compare.json").write_text(figures + "\n", encoding="utf-8")
+    (out / "report.html").write_text(comparison_page(compared), encoding="utf-8")
+    return f"{report}\nreport: {out / 'report.html'}"

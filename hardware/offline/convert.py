@@ -1,8 +1,8 @@
-"""Folder to MCAP and back, losing nothing: `stillbed import` and `stillbed export`.
+"""Recordings made of sessions: `stillbed import` and `stillbed export` (folder to MCAP and back), and tracking runs.
 
-Both write beside the place they are asked for and rename at the end, so an interrupted run leaves nothing that looks
-whole. Import stores a video's images as PNG (exact) and pictures as they are; export writes the stored pictures as
-they are, so importing an export gives the same stamps, numbers and pixels again.
+Import and export lose nothing. Both write beside the target and rename at the end, so an interrupted run leaves nothing
+that looks whole. Import stores a video's images as PNG (exact) and pictures as they are; export writes the stored
+pictures as they are, so importing an export gives the same stamps, numbers and pixels again.
 """
 
 from __future__ import annotations
@@ -15,19 +15,29 @@ import shutil
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from types import TracebackType
 
 import numpy as np
 
 from estimation.errors import InputError, StillbedError
+from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.channels import read_truth_rows
-from hardware.files.folder_tables import write_frames, write_heads, write_roi
+from hardware.files.folder_tables import (
+    read_rows,
+    rows_from_trajectory,
+    write_frames,
+    write_heads,
+    write_roi,
+    write_rows,
+)
 from hardware.files.rig_file import ImageSource, write_rig
-from hardware.files.session import FrameRef, Session, open_session
+from hardware.files.session import HEAD_STAMP_TOLERANCE, FrameRef, Session
 from hardware.files.session_folder import TRUTH_FILES, truth_file
 from hardware.recording.recorder import Recorder
-from hardware.tum import read_rows, write_rows
-from perception.frames import Frame, Roi
+from hardware.recording.schemas import INFO, WARNING
+from hardware.recording.session_reader import open_session, read_truth_rows
+from perception.frames import Frame, FrameSet, Roi
+from perception.tracking.step import StepReport
 
 Progress = Callable[[int, int], None]  # images done, images in all
 
@@ -206,3 +216,53 @@ def _frame_at(session: Session, roi: Roi, refs: list[tuple[FrameRef, FrameRef]])
         name = session.rig.cameras[roi.camera].name
         raise InputError(session.path, "/roi", f"a polygon of {name!r}, which has no image", "a camera with an image")
     return own[int(np.argmin([abs(new.stamp - roi.stamp) for new in own]))].number
+
+
+class TrackRecorder:
+    """Writes images, tracks, poses and state changes as they pass, and beside them what the session knows."""
+
+    def __init__(self, path: Path, session: Session, overwrite: bool) -> None:
+        """Create the file at `path`; InputError where it exists and `overwrite` is not set."""
+        self._recorder = Recorder(path, session.rig, overwrite=overwrite)
+        self._truth = np.empty((0, 8)) if session.truth is None else rows_from_trajectory(session.truth)
+        self._exact = session.truth is not None and session.truth.exact
+        self._heads = session.heads
+        self._next_truth, self._next_head = 0, 0
+        self._state: TrackState | None = None
+        if session.surface is not None:
+            self._recorder.surface(session.surface)
+        for roi in session.roi:
+            self._recorder.write(roi)
+
+    def write(self, frames: FrameSet, pose: SurfacePose, report: StepReport) -> None:
+        """One frame set, its pose and tracks, and truth and print heads up to its stamp."""
+        self._write_truth(frames.stamp)
+        self._write_heads(frames.stamp + HEAD_STAMP_TOLERANCE)  # the row of this very frame set included
+        for frame in frames.frames:
+            self._recorder.write(frame)
+        self._recorder.write(report.observations)
+        self._recorder.write(pose)
+        if pose.state is not self._state:
+            level = INFO if pose.state.measured else WARNING
+            self._recorder.event(pose.stamp, f"{pose.state.value}: {pose.reason}", level, "tracking")
+            self._state = pose.state
+
+    def _write_truth(self, until: float) -> None:
+        while self._next_truth < len(self._truth) and self._truth[self._next_truth, 0] <= until:
+            self._recorder.truth_row(self._truth[self._next_truth], self._exact)
+            self._next_truth += 1
+
+    def _write_heads(self, until: float) -> None:
+        """As stored: what a frame set holds of a head has been turned into a matrix."""
+        while self._next_head < len(self._heads) and self._heads.rows[self._next_head, 0] <= until:
+            self._recorder.head_row(self._heads.rows[self._next_head], bool(self._heads.extruding[self._next_head]))
+            self._next_head += 1
+
+    def __enter__(self) -> TrackRecorder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        with self._recorder:
+            if error is None:
+                self._write_truth(np.inf)
+                self._write_heads(np.inf)

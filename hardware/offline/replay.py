@@ -1,6 +1,6 @@
 """`stillbed replay`: tracking and motion in one process under a simulated clock, merged by stamp.
 
-A pose becomes known to the motion a fixed DELAY after its stamp, which stands for transport and processing: never the
+A pose becomes known to the motion POSE_DELAY_S after its stamp, which stands for transport and processing: never the
 time that was measured, so the same input gives the same bytes on every machine.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path as File
 from types import TracebackType
@@ -16,28 +17,81 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
+from estimation.rig import Rig
 from hardware.arm.profile import ArmProfile, placed
-from hardware.bookmark_file import BookmarkFile, read_start
+from hardware.arm.protocol import frame_from_command
 from hardware.files.arm_file import write_arm
-from hardware.files.path_file import read_path
+from hardware.files.path_file import ProgressFile, read_path, read_progress
 from hardware.files.session import Session
 from hardware.motion.step import MotionStep
 from hardware.process.clock import SimClock
-from hardware.process.faults import Fault, Part, Runner, check_faults, struck
-from hardware.process.progress import Report, silent
+from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults, faults_striking
+from hardware.process.progress import ProgressReport, no_progress
+from perception.frames import Frame, FrameSet, Image
 from planning.command import Command, Move
 
-DELAY = 0.05  # s: 20 ms from exposure to decoded image, 15 ms of tracking, 15 ms of spread (30 Hz cameras, USB)
-COLUMNS = (
+
+class FrameFaults:
+    """What cameras deliver of one frame set after the other, in order."""
+
+    def __init__(self, faults: Sequence[Fault], rig: Rig, where: object) -> None:
+        """InputError where cables are exchanged between cameras whose pictures differ in size."""
+        self._faults, self._count = faults_striking(faults, FaultPart.CAMERA), len(rig)
+        self._last: dict[int, Image] = {}  # of each camera, before it stuck
+        for fault in faults_striking(self._faults, FaultPart.CAMERA, FaultKind.SWAP):
+            sizes = [rig.cameras[camera].size for camera in self._pair(fault)]
+            if sizes[0] != sizes[1]:
+                raise InputError(where, "--fault", str(fault), "cameras whose pictures are of one size")
+
+    def __call__(self, frames: FrameSet, instant: float) -> FrameSet:
+        """The set as it comes at `instant`, s; frames may be missing from it."""
+        images = {frame.camera: frame.image for frame in frames.frames}
+        for fault in self._faults:
+            if fault.kind is FaultKind.SWAP and fault.covers(instant):
+                one, other = self._pair(fault)
+                if one in images and other in images:
+                    images[one], images[other] = images[other], images[one]
+        found = [self._one(frame, images[frame.camera], instant) for frame in frames.frames]
+        return replace(frames, frames=tuple(frame for frame in found if frame is not None))
+
+    def _pair(self, fault: Fault) -> tuple[int, int]:
+        return fault.number, (fault.number + 1) % self._count
+
+    def _one(self, frame: Frame, image: Image, instant: float) -> Frame | None:
+        kinds = {fault.kind for fault in self._faults if fault.number == frame.camera and fault.covers(instant)}
+        if FaultKind.OFF in kinds:
+            return None
+        if FaultKind.STUCK in kinds:
+            return replace(frame, image=self._last.setdefault(frame.camera, image))
+        self._last[frame.camera] = image
+        if FaultKind.BLACK in kinds:
+            image = np.zeros_like(image)
+        elif FaultKind.FLASH in kinds:
+            image = np.full_like(image, 255)
+        return frame if image is frame.image else replace(frame, image=image)
+
+
+def tracked_sets(sets: Iterable[FrameSet], faults: Sequence[Fault], rig: Rig, where: object) -> Iterator[FrameSet]:
+    """The sets of a recording that a tracking with faults gets to see; instants count from the first set's stamp."""
+    spoil, idle, start = FrameFaults(faults, rig, where), faults_striking(faults, FaultPart.TRACKING), None
+    for frames in sets:
+        start = frames.stamp if start is None else start
+        spoilt = spoil(frames, frames.stamp - start)
+        if spoilt.frames and not any(fault.covers(frames.stamp - start) for fault in idle):
+            yield spoilt
+
+
+POSE_DELAY_S = 0.05  # s: 20 ms from exposure to decoded image, 15 ms of tracking, 15 ms of spread (30 Hz cameras, USB)
+COMMAND_COLUMNS = (
     *("stamp_s", "kind", "x_mm", "y_mm", "z_mm", "a_deg", "b_deg", "c_deg"),
     *("feed_mm_min", "checkpoint", "extrude", "hold_ms", "reason"),
 )
 
 
 def replay(
-    poses: Iterable[SurfacePose], motion: MotionStep, delay: float = DELAY, hangs: Sequence[Fault] = ()
-) -> Iterator[tuple[float, Command, bytes]]:
-    """Every tick's instant (s), command and frame, from the first pose's stamp until the last pose is known.
+    poses: Iterable[SurfacePose], motion: MotionStep, delay: float = POSE_DELAY_S, hangs: Sequence[Fault] = ()
+) -> Iterator[tuple[float, Command]]:
+    """Every tick's instant (s) and command, from the first pose's stamp until the last pose is known.
 
     poses: in order of stamp, asked for only when they are due. delay: s, from a pose's stamp until the motion knows it.
     hangs: when no tick is made, s from the first.
@@ -54,8 +108,7 @@ def replay(
             ahead = after
         now = clock.now()
         if not any(fault.covers(now - start) for fault in hangs):
-            frame = motion(pose, now)
-            yield now, motion.last, frame
+            yield now, motion(pose, now)
         if ahead is None:
             return
         tick += 1
@@ -77,7 +130,7 @@ class CommandWriter:
         self._table = (folder / "commands.csv").open("w", newline="", encoding="utf-8")
         self._frames = (folder / "frames.bin").open("wb")
         self._csv = csv.writer(self._table, lineterminator="\n")
-        self._csv.writerow(COLUMNS)
+        self._csv.writerow(COMMAND_COLUMNS)
 
     def write(self, command: Command, frame: bytes) -> None:
         """One tick; on the disk, as far as this process can see to it, when it returns."""
@@ -110,23 +163,23 @@ def replay_session(
     session: Session,
     path: File,
     out: File,
-    progress: Report = silent,
+    progress: ProgressReport = no_progress,
     profile: ArmProfile | None = None,
     resume: File | None = None,
     faults: Sequence[Fault] = (),
-) -> None:
+) -> tuple[int, int]:
     """Replay a session with the path at `path` (CSV) into `out`: commands.csv, frames.bin, arm.toml, progress.toml.
 
     A recording knows no arm. Without a profile the default arm is placed so that the first measured surface lies on its
     bench, level and below home; arm.toml says where that is. What was written before an error stays readable.
     resume: progress.toml of an earlier run, to go on where that stopped. faults: of cameras, tracking and motion.
+    Returns how many moves and how many holds were written.
     """
-    from hardware.frame_faults import tracked_sets
-    from hardware.tracker import tracker  # loads cv2: the motion must not
+    from hardware.offline.track import tracker  # loads cv2: the motion must not
 
-    check_faults(faults, Runner.REPLAY, "command line", "--fault", len(session.rig))
+    check_faults(faults, FaultRunner.REPLAY, "command line", "--fault", len(session.rig))
     checkpoints = read_path(path)
-    start = 0.0 if resume is None else read_start(resume, checkpoints)
+    start = 0.0 if resume is None else read_progress(resume, checkpoints)
     tool = None if profile is None else profile.tool
     with tracker(session.rig, session.roi, session.surface, tool=tool) as step, CommandWriter(out) as writer:
 
@@ -140,11 +193,16 @@ def replay_session(
         poses: Iterable[SurfacePose] = track()
         if profile is None:
             poses, profile = placed_by(poses)
-        write_arm(out / "arm.toml", profile, f"what this replay assumed; poses were known {DELAY} s after their stamps")
-        motion, keeper = MotionStep(checkpoints, profile, start), BookmarkFile(out / "progress.toml", checkpoints)
-        for _, command, frame in replay(poses, motion, hangs=struck(faults, Part.MOTION)):
-            writer.write(command, frame)
+        write_arm(
+            out / "arm.toml", profile, f"what this replay assumed; poses were known {POSE_DELAY_S} s after their stamps"
+        )
+        motion, keeper = MotionStep(checkpoints, profile, start), ProgressFile(out / "progress.toml", checkpoints)
+        moves = ticks = 0
+        for _, command in replay(poses, motion, hangs=faults_striking(faults, FaultPart.MOTION)):
+            writer.write(command, frame_from_command(command, profile.dialect))
+            moves, ticks = moves + isinstance(command, Move), ticks + 1
             keeper.write(motion.progress)
+    return moves, ticks - moves
 
 
 def placed_by(poses: Iterable[SurfacePose]) -> tuple[Iterator[SurfacePose], ArmProfile]:

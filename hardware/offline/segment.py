@@ -12,27 +12,24 @@ import numpy as np
 
 from estimation.errors import InputError
 from hardware.files.images import Video, decode, encode
-from hardware.out_folder import prepare_out
 from hardware.process.clock import WallClock
-from hardware.process.progress import Progress
+from hardware.process.progress import Progress, prepare_out
 from perception.frames import Image
-from perception.overlay import overlaid
-from perception.wound.segmentation import Segmentation, Segmenter, centroid
-from perception.wound_region import box_of
+from perception.wound.segmentation import Segmentation, Segmenter, box_of, centroid, draw_overlay
 
-PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
-TABLE = "wounds.csv"
-OVERLAYS = "overlays"  # folder of the pictures with outlines
+PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
+WOUND_TABLE = "wounds.csv"
+OVERLAY_FOLDER = "overlays"  # folder of the pictures with outlines
 OVERLAY_QUALITY = 90  # JPEG: they are for the eye
-HEAD = (
+WOUND_COLUMNS = (
     "name", "wound", "confidence", "threshold", "area_px", "area_mm2", "centroid_x_px", "centroid_y_px",
     "x0_px", "y0_px", "x1_px", "y1_px", "ms",
 )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Options:
+class SegmentOptions:
     """How it is written. overlay: pictures with outlines as well. mm_per_px: of the wound's plane, None: unknown.
     force: into a folder that is not empty."""
 
@@ -41,51 +38,51 @@ class Options:
     force: bool = False
 
 
-def run_segment(inputs: Sequence[Path], out: Path, segmenter: Segmenter, options: Options) -> str:
+def run_segment(inputs: Sequence[Path], out: Path, segmenter: Segmenter, options: SegmentOptions) -> str:
     """Segment pictures, folders of pictures and videos into the folder `out`; what it came to, in words.
 
     A mask lies there as NAME.png (a video's as NAME_000000.png and so on), 0 or 255, of the picture's own size. A file
     that cannot be read is told at the end, by InputError; all others have been written.
     """
-    files = listed(inputs)
+    files = input_files(inputs)
     prepare_out(out, options.force)
     if options.overlay:
-        (out / OVERLAYS).mkdir(exist_ok=True)
+        (out / OVERLAY_FOLDER).mkdir(exist_ok=True)
     clock, faults = WallClock(), list[InputError]()
     times, found = list[float](), 0
-    with (out / TABLE).open("w", newline="", encoding="utf-8") as stream:
+    with (out / WOUND_TABLE).open("w", newline="", encoding="utf-8") as stream:
         table = csv.writer(stream, lineterminator="\n")
-        table.writerow(HEAD)
+        table.writerow(WOUND_COLUMNS)
         with Progress("segment", "pictures", clock.now) as progress:
-            total = sum(expected(file) for file in files)
-            for name, image in pictures(files, faults):
+            total = sum(expected_count(file) for file in files)
+            for name, image in read_pictures(files, faults):
                 start = clock.now()
                 seen = segmenter(image)
                 times.append(1000 * (clock.now() - start))
                 found += seen.found
                 _write(out, name, image, seen, options)
-                table.writerow(row(name, seen, options.mm_per_px, times[-1]))
+                table.writerow(table_row(name, seen, options.mm_per_px, times[-1]))
                 stream.flush()
                 progress(len(times), max(total, len(times)))
-    _tell(faults, len(times))
+    _raise_faults(faults, len(times))
     median, late = np.percentile(times, [50, 99])
     took = f"{median:.1f} ms each (median), {late:.1f} ms (p99)"
-    return f"{found} of {len(times)} pictures show a wound; {took}\nmasks and {TABLE} are in {out}"
+    return f"{found} of {len(times)} pictures show a wound; {took}\nmasks and {WOUND_TABLE} are in {out}"
 
 
-def listed(inputs: Sequence[Path]) -> list[Path]:
+def input_files(inputs: Sequence[Path]) -> list[Path]:
     """The files that inputs name, folders opened; InputError: none, unknown kind, two that would share a mask."""
     files = list[Path]()
     for path in inputs:
         if path.is_dir():
-            inside = [f for f in sorted(path.iterdir()) if f.suffix.lower() in PICTURES]
+            inside = [f for f in sorted(path.iterdir()) if f.suffix.lower() in PICTURE_SUFFIXES]
             if not inside:
-                raise InputError(path, "pictures", "none", f"one at least, ending in {', '.join(PICTURES)}")
+                raise InputError(path, "pictures", "none", f"one at least, ending in {', '.join(PICTURE_SUFFIXES)}")
             files += inside
         elif not path.is_file():
             raise InputError(path, "input", "no such file or folder", "a picture, a folder of pictures or a video")
-        elif path.suffix.lower() not in PICTURES + VIDEOS:
-            raise InputError(path, "kind", path.suffix or "no suffix", ", ".join(PICTURES + VIDEOS))
+        elif path.suffix.lower() not in PICTURE_SUFFIXES + VIDEO_SUFFIXES:
+            raise InputError(path, "kind", path.suffix or "no suffix", ", ".join(PICTURE_SUFFIXES + VIDEO_SUFFIXES))
         else:
             files.append(path)
     first: dict[str, Path] = {}
@@ -97,24 +94,24 @@ def listed(inputs: Sequence[Path]) -> list[Path]:
     return files
 
 
-def expected(file: Path) -> int:
+def expected_count(file: Path) -> int:
     """How many pictures a file holds, as far as it tells."""
-    if file.suffix.lower() in PICTURES:
+    if file.suffix.lower() in PICTURE_SUFFIXES:
         return 1
     try:
         video = Video(file)
     except InputError:
         return 0
-    count = video.told_count()
+    count = video.reported_count()
     video.close()
     return count
 
 
-def pictures(files: Sequence[Path], faults: list[InputError]) -> Iterator[tuple[str, Image]]:
+def read_pictures(files: Sequence[Path], faults: list[InputError]) -> Iterator[tuple[str, Image]]:
     """Name of the mask and picture (H, W) or (H, W, 3) BGR, one after another; what cannot be read goes to `faults`."""
     for file in files:
         try:
-            if file.suffix.lower() in PICTURES:
+            if file.suffix.lower() in PICTURE_SUFFIXES:
                 yield file.stem, decode(file.read_bytes(), file, "picture")
             else:
                 yield from _frames(file)
@@ -124,7 +121,7 @@ def pictures(files: Sequence[Path], faults: list[InputError]) -> Iterator[tuple[
 
 def _frames(file: Path) -> Iterator[tuple[str, Image]]:
     video = Video(file)
-    told = video.told_count()
+    told = video.reported_count()
     try:
         while (image := video.read()) is not None:
             yield f"{file.stem}_{video.next - 1:06d}", image
@@ -136,7 +133,7 @@ def _frames(file: Path) -> Iterator[tuple[str, Image]]:
         video.close()
 
 
-def row(name: str, seen: Segmentation, mm_per_px: float | None, ms: float) -> list[Any]:
+def table_row(name: str, seen: Segmentation, mm_per_px: float | None, ms: float) -> list[Any]:
     """One line of the table; what is not known is empty."""
     area, box = int(seen.mask.sum()), box_of(seen.mask)
     middle = [f"{value:.2f}" for value in centroid(seen.mask)] if seen.found else ["", ""]
@@ -146,13 +143,13 @@ def row(name: str, seen: Segmentation, mm_per_px: float | None, ms: float) -> li
     ]  # fmt: skip
 
 
-def _write(out: Path, name: str, image: Image, seen: Segmentation, options: Options) -> None:
+def _write(out: Path, name: str, image: Image, seen: Segmentation, options: SegmentOptions) -> None:
     (out / f"{name}.png").write_bytes(encode(seen.mask.astype(np.uint8) * np.uint8(255))[1])
     if options.overlay:
-        (out / OVERLAYS / f"{name}.jpg").write_bytes(encode(overlaid(image, seen), OVERLAY_QUALITY)[1])
+        (out / OVERLAY_FOLDER / f"{name}.jpg").write_bytes(encode(draw_overlay(image, seen), OVERLAY_QUALITY)[1])
 
 
-def _tell(faults: list[InputError], done: int) -> None:
+def _raise_faults(faults: list[InputError], done: int) -> None:
     if len(faults) == 1 or (faults and not done):
         raise faults[0]
     if faults:

@@ -1,74 +1,227 @@
-"""report.html of a smoothed session: one page, in one file that needs no network."""
+"""report.html of a smoothed session: against the live run and the truth, its spectrum, and loops of other delays."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.batch.smoothed import Smoothed
+from estimation.pose import Trajectory
 from estimation.se3 import Array
-from hardware.page import document, figures_table, legend, line_key, row_of_tiles, section, tile
-from hardware.report.evaluation import spread
-from hardware.report.page import Plot, spanning
-from hardware.report.report import HALF, WIDTH, components, deviations
+from hardware.offline.smooth_tracks import SessionTracks
+from hardware.report.evaluation import PoseErrors, associate, best_constant, errors_under, spread
+from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, spanning, tile
+from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, components, deviations
 from hardware.report.summary import figure
-from hardware.smoothing.judged import DELAYS, Judged
-from hardware.smoothing.rhythms import Rhythms
 
-PARTS = 4  # of the recording, whose residuals stand side by side: what a camera drifts by shows there
-HIGHEST = 5.0  # Hz, of the spectrum shown
+BREATHING_BAND_HZ = (0.1, 0.7)  # Hz: 6 to 42 breaths a minute
+PULSE_BAND_HZ = (0.75, 3.0)  # Hz: 45 to 180 beats a minute
+MIN_CYCLES = 4  # of a rhythm that a recording must hold for it to be named
+MIN_SPECTRUM_S = 10.0  # s: of a shorter recording nothing is said
+MIN_PEAK_POWER_RATIO = 8.0  # times the band's own median power: a peak that stands out
+HARMONIC_TOLERANCE = 0.08  # parts: a peak so near to a multiple of the breathing is the breathing's
 
 
-def lead(result: Smoothed, judged: Judged) -> str:
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionSpectrum:
+    """hertz: (F,), amplitude: (F,) mm, of the motion along `direction` (3,) in base. breathing, pulse: Hz, nan where no
+    peak stands out.
+    """
+
+    hertz: Array
+    amplitude: Array
+    direction: Array
+    breathing: float
+    pulse: float
+
+
+def motion_spectrum(smoothed: Smoothed, rate: float = 30.0) -> MotionSpectrum:
+    """The spectrum (Hann window) of the origin's position, resampled at `rate` Hz."""
+    first, last = smoothed.stamps[[0, -1]]
+    times = np.arange(first, last, 1 / rate)
+    positions = smoothed.at(times).base_from_surface[:, :3, 3]
+    centred = positions - positions.mean(0)
+    direction = np.linalg.eigh(centred.T @ centred)[1][:, -1]
+    along = centred @ direction
+    along = along - np.polyval(np.polyfit(times - first, along, 1), times - first)
+    window = np.hanning(len(along))
+    hertz = np.asarray(np.fft.rfftfreq(len(along), 1 / rate), float)
+    amplitude = np.asarray(2 * np.abs(np.fft.rfft(along * window)) / max(window.sum(), 1e-9), float)
+    breathing = _peak(hertz, amplitude, BREATHING_BAND_HZ, last - first)
+    pulse = _peak(hertz, amplitude, PULSE_BAND_HZ, last - first, breathing)
+    return MotionSpectrum(hertz, amplitude, direction, breathing, pulse)
+
+
+def _peak(
+    hertz: Array, amplitude: Array, band: tuple[float, float], seconds: float, apart_from: float = float("nan")
+) -> float:
+    """The clearest peak of a band, Hz, or nan; not a multiple of `apart_from`."""
+    inside = (hertz >= max(band[0], MIN_CYCLES / seconds)) & (hertz <= band[1])
+    if np.isfinite(apart_from):
+        times = hertz / apart_from
+        inside &= np.abs(times - np.round(times)) > HARMONIC_TOLERANCE * np.maximum(1.0, times / 4)
+    peaks = np.zeros(len(hertz), bool)
+    peaks[1:-1] = (amplitude[1:-1] > amplitude[:-2]) & (amplitude[1:-1] >= amplitude[2:])
+    found = np.flatnonzero(inside & peaks)
+    if not len(found) or seconds < MIN_SPECTRUM_S:
+        return float("nan")
+    best = found[amplitude[found].argmax()]
+    usual = np.median(amplitude[(hertz >= band[0]) & (hertz <= band[1])] ** 2)
+    clear = amplitude[best] ** 2 > MIN_PEAK_POWER_RATIO * usual
+    return float(hertz[best]) if clear else float("nan")
+
+
+LOOP_DELAYS_S = (0.02, 0.033, 0.05, 0.1, 0.15, 0.2, 0.3)  # s, from exposure to the nozzle's arrival
+LOOP_RATE_HZ = 60.0  # Hz, of the instants that a loop is asked at
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveErrors:
+    """The live run's measured poses, after the constant between the surface frames that fits best."""
+
+    rows: NDArray[np.int64]  # (M,) of the smoothed poses
+    poses: Array  # (M, 4, 4)
+    apart: Array  # (M, 6) right perturbations of the smoothed poses, rad and mm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothEvaluation:
+    """A smoothed session beside its live run and its truth."""
+
+    live: LiveErrors | None  # None without measured poses
+    errors: tuple[PoseErrors, PoseErrors | None] | None  # smoothed and live, against truth or reference
+    exact: bool  # whether that is a truth
+    late: Array  # (D, 4) mm, see `delay_errors`
+    spectrum: MotionSpectrum
+
+    @property
+    def live_rms(self) -> float:
+        """RMS distance, mm, of live from smoothed poses; nan without."""
+        return float("nan") if self.live is None else float(np.sqrt((self.live.apart[:, 3:] ** 2).sum(1).mean()))
+
+
+def evaluate_smoothed(smoothed: Smoothed, tracks: SessionTracks, truth: Trajectory | None) -> SmoothEvaluation:
+    """Errors, spectrum and delays of a smoothed session."""
+    live = _live_errors(smoothed, tracks)
+    errors = None if truth is None else _reference_errors(smoothed, live, truth)
+    return SmoothEvaluation(
+        live, errors, truth is not None and truth.exact, delay_errors(smoothed), motion_spectrum(smoothed)
+    )
+
+
+def _live_errors(smoothed: Smoothed, tracks: SessionTracks) -> LiveErrors | None:
+    start = tracks.start
+    if start is None:
+        return None
+    theirs, rows = associate(start.stamps, smoothed.stamps)
+    if not len(rows):
+        return None
+    poses, ours = start.base_from_surface[theirs], smoothed.states.poses[rows]
+    constant = best_constant(se3.inverse(ours) @ poses)
+    laid = poses @ se3.inverse(constant)
+    return LiveErrors(rows, laid, se3.log(se3.inverse(ours) @ laid))
+
+
+def _reference_errors(
+    smoothed: Smoothed, live: LiveErrors | None, truth: Trajectory
+) -> tuple[PoseErrors, PoseErrors | None] | None:
+    rows, true_rows = associate(smoothed.stamps, truth.stamps)
+    if not len(rows):
+        return None
+    ours = _under(smoothed.states.poses[rows], truth.base_from_surface[true_rows], smoothed.covariance[rows, :6, :6])
+    if live is None:
+        return ours, None
+    mine, of_truth = associate(smoothed.stamps[live.rows], truth.stamps)
+    unknown = np.full((len(mine), 6, 6), np.nan)
+    return ours, _under(live.poses[mine], truth.base_from_surface[of_truth], unknown) if len(mine) else None
+
+
+def _under(poses: Array, truth: Array, covariance: Array) -> PoseErrors:
+    return errors_under(best_constant(se3.inverse(truth) @ poses), truth, poses, covariance)
+
+
+def delay_errors(smoothed: Smoothed) -> Array:
+    """(D, 4) mm for each of LOOP_DELAYS_S: RMS and 95 % of the nozzle's error where the last pose is held, and where it
+    is extrapolated by its twist. The nozzle stands over the middle of the map, and the pose is known exactly."""
+    middle = np.median(smoothed.map.points, axis=0)
+    first, last = smoothed.stamps[[0, -1]]
+    out = np.full((len(LOOP_DELAYS_S), 4), np.nan)
+    times = np.arange(first, last, 1 / LOOP_RATE_HZ)
+    now = smoothed.at(times)
+    for i, delay in enumerate(LOOP_DELAYS_S):
+        kept = times + delay <= last
+        if not kept.any():
+            continue
+        then = smoothed.at(times[kept] + delay).base_from_surface
+        held = now.base_from_surface[kept]
+        carried = held @ se3.exp(now.twist[kept] * delay)
+        true = se3.transform_points(then, middle[None])[:, 0]
+        for j, guess in enumerate((held, carried)):
+            off = np.linalg.norm(se3.transform_points(guess, middle[None])[:, 0] - true, axis=1)
+            out[i, 2 * j : 2 * j + 2] = np.sqrt(np.mean(off**2)), np.percentile(off, 95)
+    return out
+
+
+RESIDUAL_PARTS = 4  # of the recording, whose residuals stand side by side: what a camera drifts by shows there
+MAX_SPECTRUM_HZ = 5.0  # Hz, of the spectrum shown
+
+
+def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
     """The verdict in words."""
     sigma = float(np.median(np.sqrt(np.trace(result.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)))
     words = [
         f"{len(result)} poses and {len(result.map)} landmarks over {result.stamps[-1] - result.stamps[0]:.1f} s; "
         f"an axis of a position is known to {figure(sigma)} mm (median, one sigma)."
     ]
-    if judged.live is not None:
-        words.append(f"The live run stood {figure(judged.live_rms)} mm off (RMS).")
-    if judged.errors is not None:
-        ours, live = (None if e is None else figure(spread(e.translation).rmse) for e in judged.errors)
+    if evaluation.live is not None:
+        words.append(f"The live run stood {figure(evaluation.live_rms)} mm off (RMS).")
+    if evaluation.errors is not None:
+        ours, live = (None if e is None else figure(spread(e.translation).rmse) for e in evaluation.errors)
         beside = "" if live is None else f", live {live} mm"
-        words.append(f"Against the {_other(judged)}: {ours} mm{beside} (RMS, aligned).")
-    for name, rate in (("Breathing", judged.rhythms.breathing), ("Pulse", judged.rhythms.pulse)):
+        words.append(f"Against the {_other(evaluation)}: {ours} mm{beside} (RMS, aligned).")
+    for name, rate in (("Breathing", evaluation.spectrum.breathing), ("Pulse", evaluation.spectrum.pulse)):
         if np.isfinite(rate):
             words.append(f"{name}: {60 * rate:.1f} a minute.")
     return " ".join(words)
 
 
-def page(title: str, words: str, result: Smoothed, judged: Judged) -> str:
+def smooth_page(title: str, words: str, result: Smoothed, evaluation: SmoothEvaluation) -> str:
     """The page as HTML text. words: the verdict."""
-    body = [_tiles(result, judged), _trajectory(result, judged), _live(result, judged), _errors(judged)]
-    body += [_residuals(result), _spectrum(judged.rhythms), _what_if(judged), _cameras(result)]
+    body = [_tiles(result, evaluation), _trajectory(result, evaluation), _live(result, evaluation), _errors(evaluation)]
+    body += [_residuals(result), _spectrum(evaluation.spectrum), _what_if(evaluation), _cameras(result)]
     footer = "Lengths in mm, time in s from the session's own clock; poses are base_from_surface."
     return document("stillbed smooth", title, words, [part for part in body if part], footer)
 
 
-def _other(judged: Judged) -> str:
-    return "exact truth" if judged.exact else "measured reference"
+def _other(evaluation: SmoothEvaluation) -> str:
+    return "exact truth" if evaluation.exact else "measured reference"
 
 
-def _tiles(result: Smoothed, judged: Judged) -> str:
+def _tiles(result: Smoothed, evaluation: SmoothEvaluation) -> str:
     sigma = np.sqrt(np.trace(result.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)
     tiles = [tile(figure(1000 * float(np.median(sigma))), "µm", "one sigma of an axis, median")]
-    if judged.live is not None:
-        tiles.append(tile(figure(1000 * judged.live_rms), "µm", "live against smoothed, RMS"))
-    for name, rate in (("breaths a minute", judged.rhythms.breathing), ("beats a minute", judged.rhythms.pulse)):
+    if evaluation.live is not None:
+        tiles.append(tile(figure(1000 * evaluation.live_rms), "µm", "live against smoothed, RMS"))
+    for name, rate in (
+        ("breaths a minute", evaluation.spectrum.breathing),
+        ("beats a minute", evaluation.spectrum.pulse),
+    ):
         if np.isfinite(rate):
             tiles.append(tile(f"{60 * rate:.1f}", "", name))
     return row_of_tiles(tiles)
 
 
-def _trajectory(result: Smoothed, judged: Judged) -> str:
+def _trajectory(result: Smoothed, evaluation: SmoothEvaluation) -> str:
     values = components(result.states.poses, result.states.poses[0])
     sigma = 2 * deviations(result.states.poses, result.covariance[:, :6, :6])
     span = float(result.stamps[0]), float(result.stamps[-1])
     names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
     plots = []
     for i in (0, 3, 1, 4, 2, 5):
-        plot = Plot(HALF, 165, span, spanning([values[:, i]], 0.12, 0.5), label=names[i])
+        plot = Plot(HALF_CHART_WIDTH, 165, span, spanning([values[:, i]], 0.12, 0.5), label=names[i])
         plot.band(result.stamps, values[:, i] - sigma[:, i], values[:, i] + sigma[:, i], "spread")
         plot.line(result.stamps, values[:, i], "estimate")
         plots.append(plot.svg())
@@ -77,16 +230,16 @@ def _trajectory(result: Smoothed, judged: Judged) -> str:
     return section("Trajectory", text, f'{keys}<div class="two">{"".join(plots)}</div>')
 
 
-def _live(result: Smoothed, judged: Judged) -> str:
-    if judged.live is None:
+def _live(result: Smoothed, evaluation: SmoothEvaluation) -> str:
+    if evaluation.live is None:
         return ""
-    apart = judged.live.apart
-    stamps, span = result.stamps[judged.live.rows], (float(result.stamps[0]), float(result.stamps[-1]))
+    apart = evaluation.live.apart
+    stamps, span = result.stamps[evaluation.live.rows], (float(result.stamps[0]), float(result.stamps[-1]))
     distance = np.linalg.norm(apart[:, 3:], axis=1)
     turn = np.degrees(np.linalg.norm(apart[:, :3], axis=1))
     plots, rows = [], []
     for values, name, unit in ((1000 * distance, "distance, µm", "µm"), (turn, "angle, °", "°")):
-        plot = Plot(WIDTH, 150, span, (0.0, max(float(values.max()) * 1.08, 1e-3)), label=name)
+        plot = Plot(PAGE_CHART_WIDTH, 150, span, (0.0, max(float(values.max()) * 1.08, 1e-3)), label=name)
         plot.line(stamps, values, "estimate")
         plots.append(plot.svg())
         s = spread(values)
@@ -96,32 +249,32 @@ def _live(result: Smoothed, judged: Judged) -> str:
     return section("Live against smoothed", text, "".join(plots) + table)
 
 
-def _errors(judged: Judged) -> str:
-    if judged.errors is None:
+def _errors(evaluation: SmoothEvaluation) -> str:
+    if evaluation.errors is None:
         return ""
     rows = []
-    for name, errors in zip(("smoothed", "live"), judged.errors, strict=True):
+    for name, errors in zip(("smoothed", "live"), evaluation.errors, strict=True):
         if errors is not None:
             for unit, values in (("mm", errors.translation), ("°", np.degrees(errors.rotation))):
                 s = spread(values)
                 rows.append([f"{name}, {unit}", *(figure(v) for v in (s.median, s.rmse, s.p95, s.max))])
-    text = f"Against the {_other(judged)}, aligned: the best constant over the run."
+    text = f"Against the {_other(evaluation)}, aligned: the best constant over the run."
     return section("Errors", text, figures_table(["", "median", "RMSE", "95 %", "max"], rows))
 
 
 def _residuals(result: Smoothed) -> str:
     rms, span = result.fitted.rms, (float(result.stamps[0]), float(result.stamps[-1]))
     top = float(np.nanpercentile(rms, 99.5)) * 1.15 if np.isfinite(rms).any() else 1.0
-    plot = Plot(WIDTH, 170, span, (0.0, max(top, 0.05)), label="residual, px RMS")
+    plot = Plot(PAGE_CHART_WIDTH, 170, span, (0.0, max(top, 0.05)), label="residual, px RMS")
     keys, rows = [], []
-    parts = np.array_split(np.arange(len(result)), PARTS)
+    parts = np.array_split(np.arange(len(result)), RESIDUAL_PARTS)
     used, seen = result.fitted.used.sum(0), result.fitted.seen.sum(0)
     for i, camera in enumerate(result.rig.cameras):
         plot.line(result.stamps, rms[:, i], f"series c{i % 5}")
         keys.append(line_key(f"series c{i % 5}", camera.name))
         shares = [_mean(rms[part, i]) for part in parts]
         rows.append([camera.name, *(figure(v) for v in shares), f"{100 * used[i] / max(seen[i], 1):.1f} %"])
-    head = ["camera, px RMS", *(f"quarter {k + 1}" for k in range(PARTS)), "tracks that agree"]
+    head = ["camera, px RMS", *(f"quarter {k + 1}" for k in range(RESIDUAL_PARTS)), "tracks that agree"]
     text = "What is left of the pixels of the tracks that agree, camera by camera."
     return section("Residuals", text, legend(keys) + plot.svg() + figures_table(head, rows))
 
@@ -131,14 +284,14 @@ def _mean(values: Array) -> float:
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
-def _spectrum(found: Rhythms) -> str:
-    shown = (found.hertz > 0) & (found.hertz <= HIGHEST)
+def _spectrum(found: MotionSpectrum) -> str:
+    shown = (found.hertz > 0) & (found.hertz <= MAX_SPECTRUM_HZ)
     if shown.sum() < 2:
         return ""
     amplitude = np.maximum(found.amplitude[shown], 1e-6)
     high = float(amplitude.max()) * 1.5
     span = 0.0, float(found.hertz[shown][-1])
-    plot = Plot(WIDTH, 190, span, (max(high / 1e4, 1e-5), high), log_y=True, label="amplitude, mm")
+    plot = Plot(PAGE_CHART_WIDTH, 190, span, (max(high / 1e4, 1e-5), high), log_y=True, label="amplitude, mm")
     plot.line(found.hertz[shown], amplitude, "estimate")
     for name, rate in (("breathing", found.breathing), ("pulse", found.pulse)):
         if np.isfinite(rate):
@@ -148,10 +301,10 @@ def _spectrum(found: Rhythms) -> str:
     return section("Spectrum", text, plot.svg())
 
 
-def _what_if(judged: Judged) -> str:
+def _what_if(evaluation: SmoothEvaluation) -> str:
     rows = [
         [f"{1000 * delay:.0f} ms", *(figure(1000 * v) for v in row)]
-        for delay, row in zip(DELAYS, judged.late, strict=True)
+        for delay, row in zip(LOOP_DELAYS_S, evaluation.late, strict=True)
     ]
     head = ["delay", "held, µm RMS", "95 %", "carried on, µm RMS", "95 %"]
     text = (

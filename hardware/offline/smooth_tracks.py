@@ -1,8 +1,13 @@
-"""A session's tracks with what its images show besides, once map and motion are known; made once and kept."""
+"""The tracks that a session is smoothed by: recorded ones, or the tracker's on its images; and reobserved landmarks.
+
+Tracks that took long to make are kept as a recording beside the results, with the hash of what they were made of.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TextIO
@@ -12,26 +17,123 @@ import numpy as np
 from estimation.batch.smoothed import Smoothed
 from estimation.errors import InputError
 from estimation.observations import Observations
+from estimation.pose import SurfacePose, Trajectory
+from estimation.rig import Rig
 from hardware.files.session import Session
+from hardware.offline.track import tracker
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress
-from hardware.smoothing.kept import keeping, made_of, part_of
-from hardware.smoothing.tracks import Tracks, read_tracks
-from perception.known_motion import KnownMotion
+from hardware.recording.mcap_file import AttachedFile, ChunkMessages, walk
+from hardware.recording.recorder import Recorder
+from hardware.recording.session_reader import read_observations, read_poses
 from perception.pairing import mean_stamp
-from perception.tracking.reobservation import References, Relinker, joined
+from perception.tracking.reobservation import KnownMotion, ReferencePictures, Reobserver, joined_observations
 
-RELINKED = "relinked.mcap"
-NEAR = 1e-6  # s
+SOURCE_ATTACHMENT = "made_of.txt"  # attached to the recording, before all else in it
+
+
+def source_hash(path: Path) -> str:
+    """What `track_writer` was told that the recording is made of; "" where there is none, or none of its own."""
+    try:
+        for part in walk(path):
+            if isinstance(part, AttachedFile) and part.name == SOURCE_ATTACHMENT:
+                return part.data.decode()
+            if isinstance(part, ChunkMessages):
+                break
+    except InputError:  # it is made anew
+        pass
+    return ""
+
+
+def part_path(target: Path) -> Path:
+    """What is there of it while it is made, and where that was interrupted."""
+    return target.with_suffix(".part.mcap")
+
+
+@contextmanager
+def track_writer(target: Path, rig: Rig, contents: str) -> Iterator[Recorder]:
+    """A recorder for what is made of `contents`, a hash; the file has its name once it is whole."""
+    part = part_path(target)
+    with Recorder(part, rig, overwrite=True) as recorder:
+        recorder.attach(SOURCE_ATTACHMENT, contents.encode())
+        yield recorder
+    os.replace(part, target)
+
+
+TRACKS_FILE = "tracks.mcap"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Relinked:
+class SessionTracks:
+    """What a causal run left. observations: of each frame set, in order of stamp. poses: its own, in order of stamp."""
+
+    observations: tuple[Observations, ...]
+    poses: tuple[SurfacePose, ...]
+
+    @property
+    def start(self) -> Trajectory | None:
+        """The poses that were measured; None where there are none."""
+        measured = [pose for pose in self.poses if pose.state.measured]
+        if not measured:
+            return None
+        stamps = np.array([pose.stamp for pose in measured])
+        return Trajectory(stamps, np.stack([pose.base_from_surface for pose in measured]), exact=False)
+
+
+def tracks_of(session: Session, out: Path, contents: str, stream: TextIO | None = None) -> SessionTracks:
+    """The session's tracks. Where it has none, its images are tracked first, into tracks.mcap in the folder `out`.
+
+    contents: the session's hash; tracks.mcap of another one is made anew. stream: where progress is said, stderr
+    without.
+    """
+    if session.path.is_file():
+        recorded = read_tracks(session.path)
+        if any(map(len, recorded.observations)):
+            return recorded
+    kept = out / TRACKS_FILE
+    if source_hash(kept) != contents:
+        _track(session, kept, contents, stream)
+    found = read_tracks(kept)
+    if not any(map(len, found.observations)):
+        raise InputError(session.path, "tracks", "none in its images", "a surface that the tracker finds")
+    return found
+
+
+def read_tracks(path: Path) -> SessionTracks:
+    """By stamp, each once: a run that was interrupted while it wrote may have stored a stretch twice."""
+    observations = {seen.stamp: seen for seen in read_observations(path)}
+    poses = {pose.stamp: pose for pose in read_poses(path) if np.isfinite(pose.base_from_surface).all()}
+    return SessionTracks(
+        tuple(observations[stamp] for stamp in sorted(observations)), tuple(poses[stamp] for stamp in sorted(poses))
+    )
+
+
+def _track(session: Session, target: Path, contents: str, stream: TextIO | None) -> None:
+    clock = WallClock()
+    with (
+        tracker(session.rig, session.roi, session.surface, clock.now) as step,
+        track_writer(target, session.rig, contents) as recorder,
+        Progress("track", "frame sets", clock.now, stream) as progress,
+    ):
+        for done, frames in enumerate(session.frame_sets(), 1):
+            pose = step(frames)
+            recorder.write(step.last.observations)
+            recorder.write(pose)
+            step.idle()
+            progress(done, len(session))
+
+
+RELINKED_FILE = "relinked.mcap"
+STAMP_TOLERANCE_S = 1e-6  # s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReobservedTracks:
     """tracks: of the session, with what was found. looks: how many that are, early: of landmarks before they were first
     seen; sets: frame sets that had none before. trouble: why not all images were searched, "" if they were.
     """
 
-    tracks: Tracks
+    tracks: SessionTracks
     looks: int = 0
     early: int = 0
     sets: int = 0
@@ -52,27 +154,27 @@ class Relinked:
         return {"looks_found": self.looks, "looks_before_joining": self.early, "frame_sets_found": self.sets}
 
 
-def relinked(
-    session: Session, tracks: Tracks, smoothed: Smoothed, out: Path, contents: str, stream: TextIO | None = None
-) -> Relinked:
+def reobserve(
+    session: Session, tracks: SessionTracks, smoothed: Smoothed, out: Path, contents: str, stream: TextIO | None = None
+) -> ReobservedTracks:
     """The session's tracks, and looks at its landmarks wherever its images show one and the tracks do not say so.
 
     What is found is kept in relinked.mcap in the folder `out`. smoothed: of these tracks. contents: hash of the session
     and of how it was smoothed; a file made of others is made anew. stream: where progress is said, stderr without.
     """
-    kept = out / RELINKED
-    if made_of(kept) == contents:
+    kept = out / RELINKED_FILE
+    if source_hash(kept) == contents:
         return with_looks(tracks, read_tracks(kept).observations)
     try:
-        with keeping(kept, session.rig, contents) as recorder:
+        with track_writer(kept, session.rig, contents) as recorder:
             for seen in _searched(session, tracks, smoothed, stream):
                 recorder.write(seen)
     except InputError as damage:  # the tracks do not need the images
-        return replace(with_looks(tracks, read_tracks(part_of(kept)).observations), trouble=str(damage))
+        return replace(with_looks(tracks, read_tracks(part_path(kept)).observations), trouble=str(damage))
     return with_looks(tracks, read_tracks(kept).observations)
 
 
-def with_looks(tracks: Tracks, found: Iterable[Observations]) -> Relinked:
+def with_looks(tracks: SessionTracks, found: Iterable[Observations]) -> ReobservedTracks:
     """The tracks with what was found besides, in order of stamp."""
     whole = {seen.stamp: seen for seen in tracks.observations}
     first: dict[int, float] = {}
@@ -82,19 +184,21 @@ def with_looks(tracks: Tracks, found: Iterable[Observations]) -> Relinked:
     looks = early = sets = 0
     for seen in found:
         before = whole.get(seen.stamp)
-        whole[seen.stamp] = seen if before is None else joined(before, seen)
+        whole[seen.stamp] = seen if before is None else joined_observations(before, seen)
         looks += len(seen)
         early += sum(seen.stamp < first[track] for track in seen.track.tolist())
         sets += before is None or not len(before)
     observations = tuple(whole[stamp] for stamp in sorted(whole))
-    return Relinked(replace(tracks, observations=observations), looks, early, sets)
+    return ReobservedTracks(replace(tracks, observations=observations), looks, early, sets)
 
 
-def _searched(session: Session, tracks: Tracks, smoothed: Smoothed, stream: TextIO | None) -> Iterable[Observations]:
+def _searched(
+    session: Session, tracks: SessionTracks, smoothed: Smoothed, stream: TextIO | None
+) -> Iterable[Observations]:
     motion = KnownMotion(session.rig, smoothed, tracks.observations)
-    references = References(motion)
+    references = ReferencePictures(motion)
     stamps = np.array([mean_stamp(refs) for refs in session.sets])
-    wanted = np.abs(stamps[:, None] - references.stamps).min(1, initial=np.inf) < NEAR
+    wanted = np.abs(stamps[:, None] - references.stamps).min(1, initial=np.inf) < STAMP_TOLERANCE_S
     some = replace(session, sets=tuple(refs for refs, mine in zip(session.sets, wanted, strict=True) if mine))
     total = len(some) + len(session)
     with Progress("relink", "frame sets", WallClock().now, stream) as progress:
@@ -104,10 +208,10 @@ def _searched(session: Session, tracks: Tracks, smoothed: Smoothed, stream: Text
         found = references.matcher()
         if found is None:
             return
-        relinker, looks = Relinker(motion, *found), list[Observations]()
+        relinker, looks = Reobserver(motion, *found), list[Observations]()
         try:
             for done, frames in enumerate(session.frame_sets(), 1 + len(some)):
                 looks += relinker(frames)
                 progress(done, total)
         finally:
-            yield from map(relinker.told, looks)
+            yield from map(relinker.as_tracks, looks)

@@ -1,58 +1,187 @@
-"""`stillbed track`: the tracking step over a recorded session, its poses written as they come, and the report."""
+"""The trackers that can be chosen by name, and `stillbed track`: one of them over a recorded session.
+
+The command line needs the names alone, so GTSAM, OpenCV and onnxruntime are imported where they are used.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-
-from estimation.pose import SurfacePose
-from estimation.se3 import Array
-from hardware.files.pose_file import PoseWriter, read_poses
-from hardware.files.session import Session, open_session
-from hardware.methods import MAP, step_by
-from hardware.out_folder import prepare_out
-from hardware.process.clock import WallClock
-from hardware.process.progress import Progress, Report
-from hardware.report.evaluation import evaluate
-from hardware.report.report import write_report
-from hardware.report.summary import summary_text, write_summary
-from hardware.track_recorder import TrackRecorder
-from perception.frames import FrameSet
-from perception.tracking.step import STAGES, StepReport
+from hardware.process.progress import Progress, ProgressReport, prepare_out
+from hardware.process.system import blocked_sigint, exit_with_parent
 
 if TYPE_CHECKING:
-    from hardware.wound_file import WoundFile
+    from estimation.pose import SurfacePose
+    from estimation.rig import Rig
+    from estimation.se3 import Array
+    from hardware.files.pose_file import PoseWriter
+    from hardware.files.session import Session
+    from perception.frames import FrameSet, Roi
+    from perception.tracking.step import StepReport, TrackingStep
+    from perception.tracking.wound_step import WoundTrackingStep
+    from perception.wound.segmentation import NetworkSegmenter
+
+    PoseSink = Callable[[FrameSet, SurfacePose, StepReport], None]  # what else is done with each pose
+
+MAP_PROCESS_NICE = 10  # by which the process of the map stands back
+MAP_METHOD, THESIS_METHOD, THESIS_FLOW_METHOD = "map", "thesis", "thesis-flow"
+TRACKING_METHODS = {
+    MAP_METHOD: "the pose from all cameras against a map of the surface",
+    THESIS_METHOD: "the thesis's estimator: SIFT and FLANN, median displacement, an axis a camera",
+    THESIS_FLOW_METHOD: "the same with Shi-Tomasi corners and optical flow",
+}
 
 
-class Step(Protocol):
-    """What is driven: perception.tracking.step.TrackingStep, or anything that answers like it."""
+class FrameSetStep(Protocol):
+    """A tracker as it is driven: TrackingStep, or anything that answers like it."""
 
     last: StepReport
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
         """The pose at `frames.stamp`."""
-        ...
 
     def idle(self) -> None:
         """Work that no pose waits for."""
-        ...
 
 
-Sink = Callable[[FrameSet, SurfacePose, StepReport], None]  # what else is done with each pose, e.g. recording it
+@contextmanager
+def step_by(
+    method: str,
+    rig: Rig,
+    roi: Sequence[Roi],
+    surface: Path | None = None,
+    now: Callable[[], float] = lambda: 0.0,
+    tool: Array | None = None,
+    prefilter: str = "none",
+) -> Iterator[FrameSetStep]:
+    """The tracker of a method, a key of TRACKING_METHODS, for these cameras.
+
+    roi, surface, now, tool, prefilter: as `tracker` takes them. The thesis's methods make no use of scan and tool, and
+    always apply the bilateral filter.
+    """
+    if method == MAP_METHOD:
+        with tracker(rig, roi, surface, now, tool, prefilter) as step:
+            yield step
+        return
+    from perception.thesis.features import Corners, KeyPoints
+    from perception.thesis.step import ThesisStep
+
+    with ThreadPoolExecutor(len(rig)) as threads:
+        yield ThesisStep(rig, roi, now, threads, KeyPoints if method == THESIS_METHOD else Corners)
+
+
+@contextmanager
+def tracker(
+    rig: Rig,
+    roi: Sequence[Roi],
+    surface: Path | None = None,
+    now: Callable[[], float] = lambda: 0.0,
+    tool: Array | None = None,
+    prefilter: str = "none",
+) -> Iterator[TrackingStep | WoundTrackingStep]:
+    """TrackingStep for these cameras; the map is refined in a process of its own, as GTSAM holds the interpreter.
+
+    roi: where the surface is at the start; without one the wound is looked for first, by the network that comes along,
+    and where it sees none the whole pictures are the surface. surface: the scan's file, mm; InputError where it cannot
+    be read. now: s, only to say how long the stages take. tool: (K, 2) mm, profile of what hangs on the arm, as
+    `ArmProfile.tool`. prefilter: a key of perception.lens.PREFILTERS.
+    """
+    from hardware.files.mesh_file import read_mesh
+    from perception.lens import PREFILTERS
+    from perception.matching.masks import Tool
+    from perception.tracking.step import TrackingStep
+    from perception.tracking.wound_step import WoundTrackingStep
+
+    scan = None if surface is None else read_mesh(surface).scan
+    with ProcessPoolExecutor(1, get_context("spawn"), _settle) as executor:
+        with blocked_sigint():
+            first = executor.submit(int)
+        first.result()  # started before the first frame set, not beside it
+
+        def make_step(regions: Sequence[Roi]) -> TrackingStep:
+            held = None if tool is None else Tool(tool)
+            return TrackingStep(rig, regions, now, executor, scan, held, PREFILTERS[prefilter])
+
+        if roi:
+            yield make_step(roi)
+            return
+        segmenter = _network_segmenter()
+        with ThreadPoolExecutor(1) as thread:
+            yield WoundTrackingStep(rig, make_step, segmenter, thread)
+
+
+def _settle() -> None:
+    """Ctrl-C is for the parent, which then ends this process in good order; frames go before the map."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    exit_with_parent()
+    os.nice(MAP_PROCESS_NICE)
+
+
+def _network_segmenter() -> NetworkSegmenter:
+    from perception.wound.network import WoundNetwork, shipped_model
+    from perception.wound.segmentation import NetworkSegmenter
+
+    network = WoundNetwork(shipped_model(), threads=1)  # the other core is the tracker's
+    return NetworkSegmenter(network, network.settings)
+
+
+def run_track(
+    path: Path,
+    out: Path,
+    record: Path | None = None,
+    force: bool = False,
+    method: str = MAP_METHOD,
+    tool: Array | None = None,
+    prefilter: str = "none",
+    wound: bool = False,
+) -> str:
+    """Track the session at `path` into the folder `out`; returns the summary as text.
+
+    method, tool, prefilter: as `step_by` takes them. wound: whether the wound is segmented beside it, into wound.csv.
+    Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of all frame sets until then.
+    """
+    from hardware.files.pose_file import PoseWriter, WoundFile
+    from hardware.offline.convert import TrackRecorder
+    from hardware.process.clock import WallClock
+    from hardware.recording.session_reader import open_session
+    from perception.tracking.step import STAGES
+
+    session = open_session(path)
+    prepare_out(out, force)
+    clock = WallClock()
+    cameras = [camera.name for camera in session.rig.cameras]
+    complete = False
+    with ExitStack() as stack:
+        follows = step_by(method, session.rig, session.roi, session.surface, clock.now, tool, prefilter)
+        step = stack.enter_context(follows)
+        sinks = [] if record is None else [stack.enter_context(TrackRecorder(record, session, force)).write]
+        if wound:
+            sinks.append(stack.enter_context(WoundFile(out, session.rig, _network_segmenter())).write)
+        writer = stack.enter_context(PoseWriter(out, cameras, STAGES))
+        progress = stack.enter_context(Progress("track", "frame sets", clock.now))
+        try:
+            follow(session.frame_sets(), step, writer, clock.now, progress, len(session), sinks)
+            complete = True
+        finally:
+            text = _write_report(out, session, complete, method)
+    return f"{text}\nreport: {out / 'report.html'}"
 
 
 def follow(
     frame_sets: Iterable[FrameSet],
-    step: Step,
+    step: FrameSetStep,
     writer: PoseWriter,
     now: Callable[[], float],
-    progress: Report,
+    progress: ProgressReport,
     total: int,
-    sinks: Sequence[Sink] = (),
+    sinks: Sequence[PoseSink] = (),
 ) -> int:
     """Drive `step` over the frame sets, each pose written before the next is asked for; how many there were.
 
@@ -72,61 +201,16 @@ def follow(
     return done
 
 
-def finish(out: Path, session: Session, complete: bool, method: str = MAP) -> str:
-    """Judge what poses.csv in `out` holds; writes report.html and summary.json there and returns the summary as text.
+def _write_report(out: Path, session: Session, complete: bool, method: str) -> str:
+    """Evaluate the poses.csv in `out`; report.html and summary.json there, the summary as text."""
+    from hardware.files.pose_file import read_poses
+    from hardware.report.evaluation import evaluate
+    from hardware.report.report import write_report
+    from hardware.report.summary import summary_text, write_summary
 
-    complete: whether the session was run to its end. method: by which it was tracked.
-    """
-    since = min((roi.stamp for roi in session.roi), default=-np.inf)
+    since = min((roi.stamp for roi in session.roi), default=float("-inf"))
     table = read_poses(out / "poses.csv")
     result = evaluate(table, session.truth, session.path.name, since, complete, session.damage, method)
     write_summary(out / "summary.json", result)
     write_report(out / "report.html", result)
     return summary_text(result)
-
-
-def _wound_file(out: Path, session: Session) -> WoundFile:
-    from hardware.wound_file import WoundFile  # loads onnxruntime
-    from perception.wound.network import WoundNetwork, shipped
-    from perception.wound.segmentation import NetworkSegmenter
-
-    network = WoundNetwork(shipped(), threads=1)  # the other core is the tracker's
-    return WoundFile(out, session.rig, NetworkSegmenter(network, network.settings))
-
-
-def run_track(
-    path: Path,
-    out: Path,
-    record: Path | None = None,
-    force: bool = False,
-    method: str = MAP,
-    tool: Array | None = None,
-    prefilter: str = "none",
-    wound: bool = False,
-) -> str:
-    """Track the session at `path` into the folder `out`; returns the summary as text.
-
-    method: a key of METHODS. tool: (K, 2) mm, profile of what hangs on the session's arm, as `ArmProfile.tool`; None
-    for the usual one. prefilter: a key of perception.prefilter.PREFILTERS. wound: whether the wound is segmented
-    beside it, into wound.csv. Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of
-    all frame sets until then.
-    """
-    session = open_session(path)
-    prepare_out(out, force)
-    clock = WallClock()
-    cameras = [camera.name for camera in session.rig.cameras]
-    complete = False
-    with ExitStack() as stack:
-        follows = step_by(method, session.rig, session.roi, session.surface, clock.now, tool, prefilter)
-        step = stack.enter_context(follows)
-        sinks = [] if record is None else [stack.enter_context(TrackRecorder(record, session, force)).write]
-        if wound:
-            sinks.append(stack.enter_context(_wound_file(out, session)).write)
-        writer = stack.enter_context(PoseWriter(out, cameras, STAGES))
-        progress = stack.enter_context(Progress("track", "frame sets", clock.now))
-        try:
-            follow(session.frame_sets(), step, writer, clock.now, progress, len(session), sinks)
-            complete = True
-        finally:
-            text = finish(out, session, complete, method)
-    return f"{text}\nreport: {out / 'report.html'}"

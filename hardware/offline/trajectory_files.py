@@ -1,36 +1,54 @@
-"""The files of a smoothed session."""
+"""Poses out of any file or folder that stillbed writes, and the files of a smoothed session.
+
+A recording is never written to: it is copied with the smoothed poses beside the rest. Of a damaged recording the copy
+holds what can be read.
+"""
 
 from __future__ import annotations
 
 import csv
+import json
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
+from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from estimation.batch.smoothed import Instants, Smoothed
-from estimation.errors import InputError
+from estimation.errors import InputError, StillbedError
+from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.rig import Rig, distort, ideal_pixels
 from estimation.se3 import Array, quaternion_from_rotation, transform_points
-from hardware.files.pose_file import TANGENT
+from hardware.files.folder_tables import checked_rows, read_tum, row_from_words, trajectory_from_rows
+from hardware.files.pose_file import TANGENT_NAMES
+from hardware.files.pose_file import read_poses as read_pose_table
 from hardware.files.session import Session
+from hardware.process import checks
 from hardware.process.checks import read_csv
-from hardware.tum import checked_rows, row_from_words, trajectory_from_rows
+from hardware.recording.mcap_file import Damage, record_groups
+from hardware.recording.messages import message_from_pose
+from hardware.recording.schemas import POSE
+from hardware.recording.session_reader import open_session, read_poses, read_smoothed
 from perception.frames import Image
 
-COLUMNS = ("stamp_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
-TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_mm_s", "vy_mm_s", "vz_mm_s")
-UPPER = np.triu_indices(6)
-GREY = np.array([150, 150, 150])
+POSE_COLUMNS = ("stamp_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
+TWIST_COLUMNS = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_mm_s", "vy_mm_s", "vz_mm_s")
+UPPER_TRIANGLE = np.triu_indices(6)
+UNKNOWN_COLOUR = np.array([150, 150, 150])
 
 
 def write_instants(path: Path, instants: Instants) -> None:
     """smoothed.csv: pose, twist, and the upper triangles of both covariances, a line for each instant."""
-    pairs = [f"{TANGENT[i]}_{TANGENT[j]}" for i, j in zip(*UPPER, strict=True)]
-    head = [*COLUMNS, *TWIST, *(f"cov_{pair}" for pair in pairs), *(f"twist_cov_{pair}" for pair in pairs)]
+    pairs = [f"{TANGENT_NAMES[i]}_{TANGENT_NAMES[j]}" for i, j in zip(*UPPER_TRIANGLE, strict=True)]
+    head = [*POSE_COLUMNS, *TWIST_COLUMNS, *(f"cov_{pair}" for pair in pairs), *(f"twist_cov_{pair}" for pair in pairs)]
     poses = instants.base_from_surface
     numbers = np.concatenate([poses[:, :3, 3], quaternion_from_rotation(poses[:, :3, :3]), instants.twist], axis=1)
-    spreads = [c[:, UPPER[0], UPPER[1]] for c in (instants.covariance, instants.twist_covariance)]
+    spreads = [c[:, UPPER_TRIANGLE[0], UPPER_TRIANGLE[1]] for c in (instants.covariance, instants.twist_covariance)]
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(head)
@@ -41,8 +59,8 @@ def write_instants(path: Path, instants: Instants) -> None:
 
 def read_instants(path: Path) -> tuple[Array, Array, Array]:
     """Stamps (N,), poses (N, 4, 4), covariances (N, 6, 6) of a smoothed.csv; InputError names what is wrong."""
-    rows, count = read_csv(path), len(COLUMNS)
-    width = count + len(TWIST)
+    rows, count = read_csv(path), len(POSE_COLUMNS)
+    width = count + len(TWIST_COLUMNS)
     lines = [(f"line {number}", words) for number, words in rows[1:] if words]
     for what, words in lines:
         if len(words) != len(rows[0][1]):
@@ -52,8 +70,10 @@ def read_instants(path: Path) -> tuple[Array, Array, Array]:
         raise InputError(path, "poses", "none", "at least one line")
     covariance = np.empty((len(lines), 6, 6))
     for k, (what, words) in enumerate(lines):
-        claims = row_from_words(path, f"{what}: covariance", words[width : width + len(UPPER[0])], "21 numbers")
-        covariance[k][UPPER] = covariance[k].T[UPPER] = claims
+        claims = row_from_words(
+            path, f"{what}: covariance", words[width : width + len(UPPER_TRIANGLE[0])], "21 numbers"
+        )
+        covariance[k][UPPER_TRIANGLE] = covariance[k].T[UPPER_TRIANGLE] = claims
     trajectory = trajectory_from_rows(places, exact=False)
     return trajectory.stamps, trajectory.base_from_surface, covariance
 
@@ -78,7 +98,7 @@ def write_map(path: Path, smoothed: Smoothed, session: Session) -> None:
 
 def _colours(smoothed: Smoothed, session: Session) -> NDArray[np.int64]:
     """(L, 3) red green blue, 0 to 255."""
-    out = np.tile(GREY, (len(smoothed.map), 1))
+    out = np.tile(UNKNOWN_COLOUR, (len(smoothed.map), 1))
     for frames in session.frame_sets():
         k = int(np.abs(smoothed.stamps - frames.stamp).argmin())
         if abs(smoothed.stamps[k] - frames.stamp) > 0.05:
@@ -98,3 +118,191 @@ def _lay(colours: NDArray[np.int64], image: Image, rig: Rig, camera: int, points
     x, y = at[inside].astype(np.int64).T
     shown = image[y, x]
     colours[inside] = shown[:, None] if shown.ndim == 1 else shown[:, ::-1]
+
+
+FOLDER_FILES = ("smoothed.mcap", "smoothed.csv", "poses.csv", "truth.tum", "reference.tum")  # the first that is there
+POSE_CHANNELS = ("smoothed", "pose", "truth")  # of a recording; the first that holds something
+POSE_READERS: dict[str, Callable[[Path], Iterator[SurfacePose]]] = {"smoothed": read_smoothed, "pose": read_poses}
+POSE_SOURCES = f"a TUM or CSV file, an .mcap file, or a folder with one of {', '.join(FOLDER_FILES)}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseSeries:
+    """A trajectory. name: where it is from. covariance: (N, 6, 6) of right perturbations, NaN where nothing is told."""
+
+    name: str
+    trajectory: Trajectory
+    covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.trajectory)
+
+
+def read_pose_series(text: str) -> PoseSeries:
+    """The trajectory that a word of the command line names; InputError says what is wrong.
+
+    A path; of an .mcap file also PATH:CHANNEL, with one of CHANNELS.
+    """
+    path, channel = _path_and_channel(text)
+    if path.is_dir():
+        inside = [path / name for name in FOLDER_FILES if (path / name).exists()]
+        if not inside:
+            raise InputError(path, "poses", "none", POSE_SOURCES)
+        path = inside[0]
+    if not path.exists():
+        raise InputError(path, "file", "no such file or folder", POSE_SOURCES)
+    if path.suffix == ".mcap":
+        return _of_recording(path, (channel,) if channel else POSE_CHANNELS)
+    if path.suffix == ".csv":
+        return _of_csv(path)
+    return _without_covariance(path, read_tum(path, exact=path.name == "truth.tum"))
+
+
+def read_truth_series(text: str) -> PoseSeries:
+    """The truth or reference that lies in the session that a word of the command line names."""
+    path, _ = _path_and_channel(text)
+    if path.is_dir():
+        for name in ("smoothed.mcap", "truth.tum", "reference.tum"):
+            if (path / name).exists():
+                return (
+                    read_truth_series(str(path / name))
+                    if name.endswith(".mcap")
+                    else read_pose_series(str(path / name))
+                )
+    elif path.suffix == ".mcap":
+        return _of_recording(path, ("truth",))
+    raise InputError(path, "truth", "none", "a session with its truth or reference; else name what it is compared with")
+
+
+def _path_and_channel(text: str) -> tuple[Path, str]:
+    before, colon, channel = text.rpartition(":")
+    if not colon or not before.endswith(".mcap") or Path(text).exists():
+        return Path(text), ""
+    if channel not in POSE_CHANNELS:
+        raise InputError(before, "channel", channel, ", ".join(POSE_CHANNELS))
+    return Path(before), channel
+
+
+def _without_covariance(path: Path, trajectory: Trajectory) -> PoseSeries:
+    return PoseSeries(str(path), trajectory, np.full((len(trajectory), 6, 6), np.nan))
+
+
+def _of_csv(path: Path) -> PoseSeries:
+    """A poses.csv, a smoothed.csv, or rows of `stamp,x,y,z,qx,qy,qz,qw`."""
+    head = checks.read_csv(path)[:1]
+    words = head[0][1] if head else []
+    if words[: len(POSE_COLUMNS)] == list(POSE_COLUMNS):
+        stamps, poses, covariance = read_instants(path)
+        return PoseSeries(str(path), Trajectory(stamps, poses, exact=False), covariance)
+    if words[:1] == ["stamp_s"]:
+        table = read_pose_table(path)
+        rows = table.measured
+        trajectory = Trajectory(table.stamps[rows], table.base_from_surface[rows], exact=False)
+        return _nonempty(path, PoseSeries(str(path), trajectory, table.covariance[rows]))
+    return _without_covariance(path, read_tum(path, exact=False))
+
+
+def _of_recording(path: Path, channels: tuple[str, ...]) -> PoseSeries:
+    for channel in channels:
+        found = _truth_of(path) if channel == "truth" else _poses_of(path, POSE_READERS[channel])
+        if len(found):
+            return PoseSeries(f"{path}:{channel}", found.trajectory, found.covariance)
+    raise InputError(path, "poses", "none", " or ".join(f"something in /{channel}" for channel in channels))
+
+
+def _poses_of(path: Path, read: Callable[[Path], Iterator[SurfacePose]]) -> PoseSeries:
+    """Measured poses in order of stamp, each once."""
+    found: dict[float, SurfacePose] = {}
+    for pose in read(path):
+        if np.isfinite(pose.base_from_surface).all() and pose.state.measured:
+            found[pose.stamp] = pose
+    poses = [found[stamp] for stamp in sorted(found)]
+    placed = np.array([pose.base_from_surface for pose in poses]).reshape(-1, 4, 4)
+    spread = np.array([pose.covariance for pose in poses]).reshape(-1, 6, 6)
+    return PoseSeries(str(path), Trajectory(np.array([pose.stamp for pose in poses]), placed, exact=False), spread)
+
+
+def _truth_of(path: Path) -> PoseSeries:
+    truth = open_session(path).truth
+    return _without_covariance(
+        path, Trajectory(np.zeros(0), np.zeros((0, 4, 4)), exact=False) if truth is None else truth
+    )
+
+
+def _nonempty(path: Path, posed: PoseSeries) -> PoseSeries:
+    if not len(posed):
+        raise InputError(path, "poses", "none that was measured", "one or more")
+    return posed
+
+
+SMOOTHED_TOPIC = "/smoothed"
+
+
+def write_copy(source: Path, target: Path, smoothed: Smoothed) -> None:
+    """Copy the .mcap file `source` to `target` with the channel /smoothed; StillbedError where it cannot be copied."""
+    part = target.with_suffix(".part.mcap")
+    try:
+        with part.open("wb") as written:
+            writer = Writer(written)
+            writer.start(profile="", library="stillbed")
+            copying = _RecordCopier(writer)
+            for piece in record_groups(source):
+                for record in () if isinstance(piece, Damage) else piece.records:
+                    copying.write(record)
+            _add(writer, smoothed, copying.epoch)
+            writer.finish()  # type: ignore[no-untyped-call]
+        os.replace(part, target)
+    except McapError as error:
+        raise StillbedError(f"{source}: cannot be copied: {error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+class _RecordCopier:
+    """Writes the records of one file into another, where channels have other numbers. epoch: s, as metadata said."""
+
+    def __init__(self, writer: Writer) -> None:
+        self.epoch = 0
+        self._writer = writer
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._kept: dict[int, int] = {}  # number of a channel that has messages: its number in the copy
+
+    def write(self, record: McapRecord) -> None:
+        """Write a record, or keep what later ones need of it."""
+        if isinstance(record, Metadata):
+            self._writer.add_metadata(record.name, record.metadata)
+            epoch = record.metadata.get("epoch_s", "")
+            self.epoch = int(epoch) if epoch.isdecimal() else self.epoch
+        elif isinstance(record, Attachment):
+            a = record
+            self._writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
+        elif isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._channels[record.id] = record
+        elif isinstance(record, Message) and self._channels[record.channel_id].topic != SMOOTHED_TOPIC:
+            number, m = self._number(record.channel_id), record
+            self._writer.add_message(number, m.log_time, m.data, m.publish_time, m.sequence)
+
+    def _number(self, channel: int) -> int:
+        if channel not in self._kept:
+            of, schema = self._channels[channel], self._schemas.get(self._channels[channel].schema_id)
+            number = 0 if schema is None else self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._kept[channel] = self._writer.register_channel(of.topic, of.message_encoding, number)
+        return self._kept[channel]
+
+
+def _add(writer: Writer, smoothed: Smoothed, epoch: int) -> None:
+    kept = writer.register_schema(f"{POSE['title']}", "jsonschema", json.dumps(POSE).encode())
+    channel = writer.register_channel(SMOOTHED_TOPIC, "json", kept)
+    used = smoothed.fitted.used.sum(1)
+    at = smoothed.instants
+    for k, stamp in enumerate(smoothed.stamps):
+        state = TrackState.TRACKING if used[k] else TrackState.COASTING
+        pose = SurfacePose(
+            float(stamp), at.base_from_surface[k], at.covariance[k], at.twist[k], state, at.twist_covariance[k]
+        )
+        data = json.dumps(message_from_pose(pose), allow_nan=False, separators=(",", ":")).encode()
+        log_time = round(float(stamp) * 1e9) + epoch * 1_000_000_000
+        writer.add_message(channel, log_time, data, log_time)

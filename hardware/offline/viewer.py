@@ -1,39 +1,55 @@
-"""A recorded session to be looked at: at each of its frame sets the pictures and all that is known beside them."""
+"""`stillbed view`: a recorded session as a page; at each frame set the pictures and all that is known beside them.
+
+Behind the same access control as the operator's page: this machine only, a token in the address, nothing from outside.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import socket
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from threading import Lock
 
 import numpy as np
+from aiohttp import web
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.errors import InputError
+from estimation.errors import InputError, StillbedError
+from estimation.mapping.triangulation import triangulated_map
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.triangulated import triangulated
-from hardware.channels import read_commands, read_observations, read_poses, read_smoothed
-from hardware.comparing.posed import Posed, read_posed
 from hardware.files.images import small_jpeg
 from hardware.files.path_file import read_path
-from hardware.files.session import FrameReader, Session, open_session
-from hardware.live.kept import used_in
-from hardware.operator.pictures import CameraPicture, Pictures
-from hardware.operator.scene import Scene, scene_from
-from hardware.operator.taker import QUALITY, WIDTH
+from hardware.files.session import FrameReader, Session
+from hardware.offline.trajectory_files import PoseSeries, read_pose_series
+from hardware.operator.broadcast import pictures_bytes, scene_text, text
+from hardware.operator.process import THUMBNAIL_QUALITY, THUMBNAIL_WIDTH
+from hardware.operator.server import CONTENT_TYPES, page_files
+from hardware.operator.settings import AccessControl, OperatorSettings, check_settings, response_headers
+from hardware.operator.shared_state import CameraPicture, PagePictures, PageScene, scene_from
 from hardware.operator.view import Activity, MotionView, TrackingView, tracking_from_pose
+from hardware.recording.session_reader import (
+    open_session,
+    read_commands,
+    read_observations,
+    read_poses,
+    read_smoothed,
+    used_inputs,
+)
 from hardware.report.evaluation import associate
 from perception.frames import Frame, FrameSet
 from perception.pairing import frame_set
 from planning.command import Move
 from planning.path import Path as Toolpath
 
-FEWEST = 12  # tracks that make a surface worth showing
-LOOKED_AT = 60  # frame sets among which the one that shows most of the surface is sought
+MIN_SURFACE_TRACKS = 12  # tracks that make a surface worth showing
+MAX_SURFACE_SETS = 60  # frame sets among which the one that shows most of the surface is sought
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +68,7 @@ class Playback:
     tracks: tuple[Observations | None, ...]
     fraction: Array
     off: Array
-    scene: Scene
+    scene: PageScene
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -105,7 +121,7 @@ def _stamps(session: Session) -> Array:
 def _poses(session: Session, named: str | None) -> tuple[list[SurfacePose], str]:
     """The poses to show and where they are from: those asked for, else smoothed, live or true ones."""
     if named is not None:
-        posed = read_posed(named)
+        posed = read_pose_series(named)
         return _as_poses(posed), posed.name
     if session.path.is_file():
         for name, read in (("smoothed", read_smoothed), ("live", read_poses)):
@@ -116,10 +132,10 @@ def _poses(session: Session, named: str | None) -> tuple[list[SurfacePose], str]
     if truth is None:
         return [], ""
     unknown = np.full((len(truth), 6, 6), np.nan)
-    return _as_poses(Posed("truth", truth, unknown)), "truth" if truth.exact else "reference"
+    return _as_poses(PoseSeries("truth", truth, unknown)), "truth" if truth.exact else "reference"
 
 
-def _as_poses(posed: Posed) -> list[SurfacePose]:
+def _as_poses(posed: PoseSeries) -> list[SurfacePose]:
     rows = zip(posed.trajectory.stamps, posed.trajectory.base_from_surface, posed.covariance, strict=True)
     return [SurfacePose(float(t), pose, spread, np.zeros(6), TrackState.TRACKING) for t, pose, spread in rows]
 
@@ -144,14 +160,14 @@ def _tracks(session: Session, stamps: Array) -> tuple[Observations | None, ...]:
 
 def _surface(rig: Rig, poses: tuple[SurfacePose | None, ...], tracks: tuple[Observations | None, ...]) -> Array | None:
     """Landmarks (V, 3) mm in the surface frame, by the rays of the frame set that shows most; None without."""
-    both = [k for k, pose in enumerate(poses) if pose is not None and tracks[k] is not None][:LOOKED_AT]
+    both = [k for k, pose in enumerate(poses) if pose is not None and tracks[k] is not None][:MAX_SURFACE_SETS]
     sizes = {k: len(seen) for k in both if (seen := tracks[k]) is not None}
     k = max(sizes, key=lambda each: sizes[each], default=None)
-    if k is None or sizes[k] < FEWEST:
+    if k is None or sizes[k] < MIN_SURFACE_TRACKS:
         return None
     pose, seen = poses[k], tracks[k]
     assert pose is not None and seen is not None
-    laid = triangulated(rig, seen)
+    laid = triangulated_map(rig, seen)
     return se3.transform_points(se3.inverse(pose.base_from_surface) @ laid.base_from_surface, laid.map.points)
 
 
@@ -170,11 +186,10 @@ def _off(stamps: Array, poses: tuple[SurfacePose | None, ...], session: Session)
 
 
 def _toolpath(session: Session) -> Toolpath | None:
-    """The path that a live run recorded; None where it has none."""
     if not session.path.is_file():
         return None
     try:
-        return used_in(session.path)[0]
+        return used_inputs(session.path)[0]
     except InputError:
         return None
 
@@ -192,7 +207,7 @@ def _fraction(session: Session, stamps: Array) -> Array:
     return out
 
 
-class PictureBook:
+class PictureReader:
     """The pictures of a session by frame set, in any order; one page is made at a time, from any thread."""
 
     def __init__(self, playback: Playback) -> None:
@@ -200,17 +215,22 @@ class PictureBook:
         self._reader: FrameReader | None = None
         self._next = 0
 
-    def __call__(self, k: int) -> Pictures:
+    def __call__(self, k: int) -> PagePictures:
         """The pictures of frame set k; InputError where one cannot be read."""
         with self._lock:
             frames = self._read(k)
         pose, seen = self._playback.poses[k], self._playback.tracks[k]
         cameras = self._playback.session.rig.cameras
         pictures = tuple(
-            CameraPicture(cameras[f.camera].name, small_jpeg(f.image, WIDTH, QUALITY), (), _pixels(seen, f.camera))
+            CameraPicture(
+                cameras[f.camera].name,
+                small_jpeg(f.image, THUMBNAIL_WIDTH, THUMBNAIL_QUALITY),
+                (),
+                _pixels(seen, f.camera),
+            )
             for f in frames.frames
         )
-        return Pictures(frames.stamp, pictures, None if pose is None else pose.base_from_surface)
+        return PagePictures(frames.stamp, pictures, None if pose is None else pose.base_from_surface)
 
     def _read(self, k: int) -> FrameSet:
         """Readers go forward only: going back, a new one is begun."""
@@ -234,3 +254,126 @@ class PictureBook:
 
 def _pixels(seen: Observations | None, camera: int) -> NDArray[np.float64]:
     return np.zeros((0, 2)) if seen is None else seen.pixels[seen.camera == camera]
+
+
+# of the operator's page
+OPERATOR_FILES = ("camera.js", "lens.js", "panes.js", "scene.js", "words.js", "page.css", "icon.svg")
+STATUS_UNREADABLE = 422  # an answer that says why, to a question that was understood
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class ViewServer:
+    """One session's viewer."""
+
+    def __init__(self, playback: Playback, settings: OperatorSettings, port: int) -> None:
+        self._playback, self._book = playback, PictureReader(playback)
+        self._gate, self._headers = (
+            AccessControl(settings, port),
+            {**response_headers(settings, port), "Server": "stillbed"},
+        )
+        own = {each.name: each.read_bytes() for each in (files("hardware.offline") / "viewer_page").iterdir()}
+        self._files = {**{name: page_files()[name] for name in OPERATOR_FILES}, **own}
+        self._session = session_text(playback)
+
+    def application(self) -> web.Application:
+        """Everything behind the gate."""
+        made = web.Application(middlewares=[self._guard])
+        made.add_routes(
+            [
+                web.get("/{token}/session", self._whole),
+                web.get("/{token}/at/{k:[0-9]{1,9}}", self._instant),
+                web.get("/{token}/pictures/{k:[0-9]{1,9}}", self._pictures),
+                web.get("/{token}/{name:[a-z_.]*}", self._file),
+            ]
+        )
+        return made
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        token = request.path.partition("/")[2].partition("/")[0]
+        if reason := self._gate.refusal(token, request.headers, request.method != "GET"):
+            return web.Response(status=403, text=f"refused: {reason}\n", headers=self._headers)
+        try:
+            return await handler(request)
+        except web.HTTPException as error:
+            return web.Response(status=error.status, text=f"{error.reason}\n", headers=self._headers)
+        except StillbedError as error:
+            return web.Response(status=STATUS_UNREADABLE, text=str(error), headers=self._headers)
+
+    async def _file(self, request: web.Request) -> web.StreamResponse:
+        name = request.match_info["name"] or "view.html"
+        if name not in self._files:
+            raise web.HTTPNotFound
+        kind = CONTENT_TYPES[name.rsplit(".", 1)[1]]
+        return web.Response(body=self._files[name], content_type=kind, charset="utf-8", headers=self._headers)
+
+    async def _whole(self, _: web.Request) -> web.StreamResponse:
+        return web.Response(text=self._session, content_type="application/json", headers=self._headers)
+
+    async def _instant(self, request: web.Request) -> web.StreamResponse:
+        said = instant_text(self._playback, self._number(request))
+        return web.Response(text=said, content_type="application/json", headers=self._headers)
+
+    async def _pictures(self, request: web.Request) -> web.StreamResponse:
+        k = self._number(request)
+        body = await asyncio.to_thread(lambda: pictures_bytes(self._book(k)))
+        return web.Response(body=body, content_type="application/octet-stream", headers=self._headers)
+
+    def _number(self, request: web.Request) -> int:
+        k = int(request.match_info["k"])
+        if k >= len(self._playback):
+            raise web.HTTPNotFound
+        return k
+
+
+def session_text(playback: Playback) -> str:
+    """What does not change with time: the scene, and where the surface is all along."""
+    truth = playback.session.truth
+    whole = text(
+        title=playback.session.path.name,
+        source=playback.source,
+        damage=playback.session.damage,
+        truth="" if truth is None else "truth" if truth.exact else "reference",
+        stamps=np.round(playback.stamps - playback.stamps[0], 4),
+        first=float(playback.stamps[0]),
+        places=[None if np.isnan(place[0]) else np.round(place, 4) for place in playback.places],
+        states=["" if pose is None else pose.state for pose in playback.poses],
+        off=playback.off,
+    )
+    return f'{whole[:-1]},"scene":{scene_text(playback.scene)}}}'
+
+
+def instant_text(playback: Playback, k: int) -> str:
+    """What is known at frame set k."""
+    return text(
+        k=k,
+        tracking=playback.tracking(k),
+        motion=playback.motion(k),
+        fraction=playback.fraction[k],
+        off=playback.off[k],
+    )
+
+
+async def serve(playback: Playback, settings: OperatorSettings, listener: socket.socket) -> None:
+    """Serve until cancelled."""
+    server = ViewServer(playback, settings, listener.getsockname()[1])
+    runner = web.AppRunner(server.application(), access_log=None, shutdown_timeout=0.5)
+    await runner.setup()
+    try:
+        await web.SockSite(runner, listener).start()
+        await asyncio.Event().wait()
+    finally:
+        await runner.cleanup()
+
+
+def run_view(session: Path, poses: str | None, toolpath: Path | None, port: int) -> None:
+    """Say where the page is, and serve it until interrupted; InputError where the session cannot be opened."""
+    settings = check_settings(OperatorSettings(port=port))
+    playback = open_playback(session, poses, toolpath)
+    with socket.create_server((settings.host, settings.port)) as listener:
+        port = listener.getsockname()[1]
+        seconds = playback.stamps[-1] - playback.stamps[0]
+        print(f"{len(playback)} frame sets over {seconds:.1f} s, poses: {playback.source or 'none'}")
+        print(f"open http://{settings.host}:{port}/{settings.token}/ in a browser; Ctrl-C ends", flush=True)
+        asyncio.run(serve(playback, settings, listener))

@@ -1,21 +1,31 @@
-"""What a window is sent: JSON of the records, and the pictures as they are behind a head that says whose they are."""
+"""The messages of the page: what all windows are sent, encoded once for all of them, and what a window sends.
+
+A window is sent JSON of the records, and pictures behind a head that says whose they are. What it sends is parsed
+strictly, and limited in its rate.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import struct
-from dataclasses import fields, is_dataclass
+from collections import deque
+from dataclasses import dataclass, fields, is_dataclass
+from math import nan
 from typing import Any
 
 import numpy as np
 
-from hardware.operator.pictures import Pictures
-from hardware.operator.scene import Scene
+from hardware.operator.shared_state import OperatorLink, PagePictures, PageScene
+from hardware.operator.view import Activity, MotionView, OperatorView, WavingView, Wish
 
-_SIZE = struct.Struct("<I")
-DIGITS = 7  # significant ones: 0.1 um of a metre, as much as a screen could ever show
-PIXEL = 1  # decimals of pixels
+_HEAD_SIZE = struct.Struct("<I")
+JSON_DIGITS = 7  # significant ones: 0.1 um of a metre, more than a screen shows
+PIXEL_DECIMALS = 1
+TIMELINE_SECONDS = 60.0  # of the error over time: a few breaths, and what led to the present hold
+TIMELINE_ROWS = 1200  # of it: at 20 views per second, which is more than are taken
+MAX_BROWSER_INTEGER = 2**53 - 1  # up to which a browser's numbers count
 
 
 def text(**parts: Any) -> str:
@@ -41,11 +51,11 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(each) for each in value]
     if isinstance(value, float):
-        return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
+        return float(f"{value:.{JSON_DIGITS}g}") if math.isfinite(value) else None
     return value.value if hasattr(value, "value") else value
 
 
-def scene_text(scene: Scene) -> str:
+def scene_text(scene: PageScene) -> str:
     """The scene, its coordinates in rows one after the other."""
     return text(
         kind="scene",
@@ -58,7 +68,7 @@ def scene_text(scene: Scene) -> str:
     )
 
 
-def pictures_bytes(pictures: Pictures) -> bytes:
+def pictures_bytes(pictures: PagePictures) -> bytes:
     """Length of the head (4 bytes, little-endian), the head as JSON, each camera's JPEGs: the whole, the near one."""
     head = text(
         stamp=pictures.stamp,
@@ -69,10 +79,116 @@ def pictures_bytes(pictures: Pictures) -> bytes:
                 "size": len(each.jpeg),
                 "near": len(each.near),
                 "crop": each.crop,
-                "outline": [np.round(polygon, PIXEL).ravel() for polygon in each.outline],
-                "tracks": np.round(each.tracks, PIXEL).ravel(),
+                "outline": [np.round(polygon, PIXEL_DECIMALS).ravel() for polygon in each.outline],
+                "tracks": np.round(each.tracks, PIXEL_DECIMALS).ravel(),
             }
             for each in pictures.pictures
         ],
     ).encode()
-    return b"".join([_SIZE.pack(len(head)), head, *(each.jpeg + each.near for each in pictures.pictures)])
+    return b"".join([_HEAD_SIZE.pack(len(head)), head, *(each.jpeg + each.near for each in pictures.pictures)])
+
+
+class Broadcast:
+    """The newest of everything that the run has put out, encoded once for all windows.
+
+    view: None before the first. gone: whether the run has ended. refused: requests that were turned away.
+    """
+
+    def __init__(self, link: OperatorLink) -> None:
+        self._link = link
+        self._scene: PageScene | None = None
+        self._pictures: PagePictures | None = None
+        self._since = nan
+        self._timeline: deque[tuple[float, float, float, float, bool]] = deque(maxlen=TIMELINE_ROWS)
+        self.view: OperatorView | WavingView | None = None
+        self.gone, self.refused = False, 0
+        self.view_text, self.scene_text, self.pictures_bytes = "null", "", b""
+        self.news = asyncio.Event()  # set, and replaced, when there is something new
+
+    def update(self, now: float, watched: bool) -> None:
+        """Take what is new at `now`, s; pictures only where they are watched."""
+        view = self._link.views.get()
+        new = view is not None and (self.view is None or view.stamp > self.view.stamp)
+        if view is not None and new:
+            self.view, self.view_text, self._since = view, text_of(view), now
+            self._add_to_timeline(view.stamp, view.motion if isinstance(view, OperatorView) else None)
+        if (scene := self._link.scene.get()) is not self._scene and scene is not None:
+            self._scene, self.scene_text, new = scene, scene_text(scene), True
+        if watched and (pictures := self._link.pictures.get()) is not self._pictures and pictures is not None:
+            self._pictures, self.pictures_bytes, new = pictures, pictures_bytes(pictures), True
+        if new:
+            self.wake()
+
+    def wake(self) -> None:
+        """Wake all windows."""
+        self.news.set()
+        self.news = asyncio.Event()
+
+    def age(self, now: float) -> float:
+        """For how long, s, the newest view has been the newest; NaN before the first."""
+        return now - self._since
+
+    def timeline_text(self) -> str:
+        """The error over the last minute, for a window that has just been opened."""
+        return text(kind="course", rows=list(self._timeline))
+
+    def _add_to_timeline(self, stamp: float, motion: MotionView | None) -> None:
+        if motion is None:
+            return
+        held = motion.activity is Activity.HOLDING
+        self._timeline.append((stamp, motion.error, motion.true_error, motion.limit, held))
+        while stamp - self._timeline[0][0] > TIMELINE_SECONDS:
+            self._timeline.popleft()
+
+
+@dataclass(frozen=True, slots=True)
+class RequestMessage:
+    """A wish that a window sends."""
+
+    wish: Wish
+    turn: int  # of the view it was asked under
+    tag: int  # the window's own number for it
+
+
+@dataclass(frozen=True, slots=True)
+class ShownMessage:
+    """The window has shown the bundle of this number."""
+
+    bundle: int
+
+
+def parse_message(text: str) -> RequestMessage | ShownMessage | None:
+    """The message in a text; None where it makes no sense."""
+    try:
+        message = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(message, dict):
+        return None
+    if message.keys() == {"shown"}:
+        return ShownMessage(message["shown"]) if _is_count(message["shown"]) else None
+    if message.keys() != {"ask", "turn", "tag"} or not (_is_count(message["turn"]) and _is_count(message["tag"])):
+        return None
+    known = isinstance(message["ask"], str) and message["ask"] in Wish.__members__.values()
+    return RequestMessage(Wish(message["ask"]), message["turn"], message["tag"]) if known else None
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and 0 <= value <= MAX_BROWSER_INTEGER
+
+
+class RateLimiter:
+    """A token bucket: `rate` a second, and as many at once as a second's worth and ten."""
+
+    def __init__(self, rate: float, now: float) -> None:
+        self._rate, self._most = rate, rate + 10
+        self._left, self._then = self._most, now
+
+    def take(self, now: float) -> bool:
+        """Whether one more is allowed at `now`, s."""
+        self._left = min(self._most, self._left + self._rate * (now - self._then))
+        self._then = now
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True

@@ -1,142 +1,232 @@
 """The operator's page with nothing behind it but a made-up run: `python -m hardware.operator.demo`.
 
-To learn the page by, and to look at it. Nothing moves, whatever is pressed.
+To learn the page by. Nothing moves, whatever is pressed: three painted cameras look at a wound that breathes.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import nan
 
 import numpy as np
 
+from estimation import se3
 from estimation.pose import TrackState
-from hardware.operator.demo_world import Painter, demo_path, demo_rig, demo_scene, nozzle_at, surface_at
-from hardware.operator.link import OperatorLink
-from hardware.operator.process import OperatorPage
+from estimation.rig import Camera, Rig, ideal_pixels
+from estimation.se3 import Array
+from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
 from hardware.operator.settings import OperatorSettings
-from hardware.operator.shared_state import Request, Wish, refusal
-from hardware.operator.taker import PictureTaker
+from hardware.operator.shared_state import OperatorLink, OperatorRequest, PageScene, scene_from
 from hardware.operator.view import (
+    ACTIVE_STAGES,
+    STAGE_OFFERS,
     Activity,
-    Answer,
     CameraView,
     Check,
+    CheckVerdict,
     LatencyView,
     MotionView,
     OperatorView,
     ProgressView,
-    Stage,
+    RequestAnswer,
+    RunStage,
     TrackingView,
-    Verdict,
+    Wish,
+    refusal,
 )
 from hardware.process.clock import Clock, WallClock
+from perception.frames import Image
+from planning.path import Path
 
-PERIOD = 0.1  # s between two views
-SPEED = 9.0  # checkpoints/s
-HELD = 0.62  # mm: of error while it holds
-OFFERS: dict[Stage, tuple[Wish, ...]] = {
-    Stage.CHECK: (Wish.AGAIN,),
-    Stage.FIND: (),
-    Stage.CONFIRM: (Wish.CONFIRM, Wish.AGAIN),
-    Stage.READY: (Wish.START, Wish.AGAIN, Wish.HOME, Wish.END),
-    Stage.APPROACH: (Wish.PAUSE,),
-    Stage.PRINT: (Wish.PAUSE,),
-    Stage.PAUSED: (Wish.RESUME, Wish.HOME),
-    Stage.STOPPED: (Wish.RESUME, Wish.HOME, Wish.END),
-    Stage.HOMING: (),
-    Stage.DONE: (Wish.HOME, Wish.END),
-    Stage.FAILED: (Wish.AGAIN, Wish.HOME, Wish.END),
+DEMO_IMAGE_SIZE = (640, 360)  # px
+BREATH_PERIOD = 4.0  # s
+WOUND_HALF_AXES = np.array([21.0, 14.0])  # mm, half axes
+SKIN_COLOUR, WOUND_COLOUR = np.array([150.0, 178.0, 216.0]), np.array([52.0, 44.0, 150.0])  # BGR
+DEMO_CHECKPOINTS = 700  # checkpoints
+
+
+def demo_rig() -> Rig:
+    """Three cameras around the wound, half a metre away and above it."""
+    return Rig(tuple(_camera(f"camera{k}", turn) for k, turn in enumerate((-1.2, 0.0, 1.2))))
+
+
+def demo_path() -> Path:
+    """A spiral over the wound, in two layers, upright."""
+    share = np.linspace(0.0, 1.0, DEMO_CHECKPOINTS)
+    angle, radius = 2 * np.pi * 18 * (share % 0.5), 1 - 1.9 * (share % 0.5)
+    poses = np.tile(np.eye(4), (DEMO_CHECKPOINTS, 1, 1))
+    poses[:, 0, 3] = WOUND_HALF_AXES[0] * radius * np.cos(angle)
+    poses[:, 1, 3] = WOUND_HALF_AXES[1] * radius * np.sin(angle)
+    poses[:, 2, 3] = surface_height(poses[:, 0, 3], poses[:, 1, 3]) + 0.3 + 0.3 * (share >= 0.5)
+    layer = (share >= 0.5).astype(np.int64)
+    extrude = np.r_[False, np.diff(layer) == 0]
+    return Path(
+        poses,
+        np.full(DEMO_CHECKPOINTS, 6.0),
+        np.zeros(DEMO_CHECKPOINTS, np.int64),
+        np.full(DEMO_CHECKPOINTS, 37.0),
+        layer,
+        extrude,
+    )
+
+
+def surface_height(x: Array, y: Array) -> Array:
+    """Height, mm, of the surface over places in mm."""
+    return np.asarray(-(x**2 + 1.6 * y**2) / 400)
+
+
+def demo_scene(side: int = 24) -> PageScene:
+    """Cameras, path and surface."""
+    x, y = np.meshgrid(np.linspace(-45, 45, side), np.linspace(-32, 32, side))
+    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    halves = [[corner, corner + 1, corner + side], [corner + 1, corner + side + 1, corner + side]]
+    triangles = np.concatenate([np.stack(half, axis=1) for half in halves])
+    return scene_from(
+        demo_rig(), demo_path(), np.column_stack([x.ravel(), y.ravel(), surface_height(x, y).ravel()]), triangles
+    )
+
+
+def surface_at(now: float) -> Array:
+    """base_from_surface (4, 4) mm: it breathes."""
+    breath = np.sin(2 * np.pi * now / BREATH_PERIOD)
+    pose = se3.exp(np.array([0.05 * breath, 0.03 * breath, 0.1, 0.0, 0.0, 0.0]))
+    pose[:3, 3] = [4.0 * breath, 1.5 * breath, 20.0 + 5.0 * breath]
+    return np.asarray(pose)
+
+
+def nozzle_at(base_from_surface: Array, path: Path, fraction: float, lift: float = 0.0) -> Array:
+    """base_from_nozzle (4, 4) mm at a place on the path counted in checkpoints, `lift` mm above it."""
+    i = int(np.clip(fraction, 0, len(path) - 2))
+    share = np.clip(fraction - i, 0.0, 1.0)
+    pose = path.surface_from_nozzle[i].copy()
+    pose[:3, 3] += share * (path.surface_from_nozzle[i + 1, :3, 3] - pose[:3, 3]) + [0, 0, lift]
+    return np.asarray(base_from_surface @ pose)
+
+
+class Painter:
+    """Paints what a camera sees of the surface, as if it were flat."""
+
+    def __init__(self, rig: Rig, rng: np.random.Generator) -> None:
+        self._rig = rig
+        self._grain = rng.normal(0.0, 9.0, (DEMO_IMAGE_SIZE[1], DEMO_IMAGE_SIZE[0], 1))
+        turn = np.linspace(0.0, 2 * np.pi, 48)
+        self._edge = np.column_stack([WOUND_HALF_AXES[0] * np.cos(turn), WOUND_HALF_AXES[1] * np.sin(turn), 0 * turn])
+        self._edge[:, 2] = surface_height(self._edge[:, 0], self._edge[:, 1])
+        self._marks = rng.uniform([-40, -28, 0], [40, 28, 0], (60, 3))
+        self._marks[:, 2] = surface_height(self._marks[:, 0], self._marks[:, 1])
+
+    def shots(self, base_from_surface: Array) -> list[CameraShot]:
+        """The pictures of all cameras, with outline and tracks."""
+        return [self._shot(camera, base_from_surface) for camera in self._rig.cameras]
+
+    def _shot(self, camera: Camera, base_from_surface: Array) -> CameraShot:
+        edge, marks = (
+            ideal_pixels(camera, se3.transform_points(base_from_surface, points))[0]
+            for points in (self._edge, self._marks)
+        )
+        return CameraShot(camera.name, self._image(camera, base_from_surface), (edge,), marks)
+
+    def _image(self, camera: Camera, base_from_surface: Array) -> Image:
+        surface_from_camera = se3.inverse(base_from_surface) @ camera.base_from_camera
+        u, v = np.meshgrid(np.arange(DEMO_IMAGE_SIZE[0]), np.arange(DEMO_IMAGE_SIZE[1]))
+        rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(camera.matrix).T @ surface_from_camera[:3, :3].T
+        far = -surface_from_camera[2, 3] / rays[..., 2]
+        x, y = (surface_from_camera[k, 3] + far * rays[..., k] for k in range(2))
+        inside = np.clip(6 * (1 - np.hypot(x / WOUND_HALF_AXES[0], y / WOUND_HALF_AXES[1])), 0, 1)[..., None]
+        shade = 1 - 0.1 * np.clip(np.hypot(x, y) / 60, 0, 2)[..., None]
+        painted = (SKIN_COLOUR + inside * (WOUND_COLOUR - SKIN_COLOUR)) * shade + self._grain
+        return np.asarray(np.clip(painted, 0, 255), np.uint8)
+
+
+def _camera(name: str, turn: float) -> Camera:
+    place = np.array([320 * np.sin(turn), -320 * np.cos(turn), 330.0])
+    ahead = np.array([0.0, 0.0, 20.0]) - place
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([right, np.cross(ahead, right), ahead])
+    pose[:3, 3] = place
+    matrix = np.array([[2900.0, 0, 319.5], [0, 2900.0, 179.5], [0, 0, 1.0]])
+    return Camera(name, DEMO_IMAGE_SIZE, matrix, np.zeros(5), pose)
+
+
+DEMO_VIEW_PERIOD = 0.1  # s between two views
+DEMO_SPEED = 9.0  # checkpoints/s
+DEMO_HOLD_ERROR = 0.62  # mm: of error while it holds
+NEXT_STAGES = {
+    Wish.CONFIRM: RunStage.READY,
+    Wish.AGAIN: RunStage.FIND,
+    Wish.START: RunStage.APPROACH,
+    Wish.PAUSE: RunStage.PAUSED,
+    Wish.RESUME: RunStage.APPROACH,
+    Wish.STOP: RunStage.STOPPED,
+    Wish.HOME: RunStage.HOMING,
+    Wish.END: RunStage.ENDED,
 }
-LEADS = {
-    Wish.CONFIRM: Stage.READY,
-    Wish.AGAIN: Stage.FIND,
-    Wish.START: Stage.APPROACH,
-    Wish.PAUSE: Stage.PAUSED,
-    Wish.RESUME: Stage.APPROACH,
-    Wish.STOP: Stage.STOPPED,
-    Wish.HOME: Stage.HOMING,
-    Wish.END: Stage.DONE,
+TIMED_STAGES = {  # stages that end by themselves: after how many s, and what follows
+    RunStage.CHECK: (6.0, RunStage.FIND),
+    RunStage.FIND: (4.0, RunStage.CONFIRM),
+    RunStage.APPROACH: (2.5, RunStage.PRINT),
+    RunStage.HOMING: (3.0, RunStage.READY),
 }
-AFTER = {  # stages that end by themselves: after how many s, and what follows
-    Stage.CHECK: (6.0, Stage.FIND),
-    Stage.FIND: (4.0, Stage.CONFIRM),
-    Stage.APPROACH: (2.5, Stage.PRINT),
-    Stage.HOMING: (3.0, Stage.READY),
-}
-WHY = {
-    Stage.STOPPED: "stopped by the operator",
-    Stage.PAUSED: "paused by the operator",
-    Stage.FAILED: "camera1 has sent no picture for 2 s: check its cable, then look again",
-}
-ARMED = (Stage.APPROACH, Stage.PRINT, Stage.PAUSED, Stage.HOMING)
+STAGE_REASONS = {RunStage.STOPPED: "stopped by the operator", RunStage.PAUSED: "paused by the operator"}
 
 
 class DemoRun:
-    """Goes through the stages of a run as a real one would, and obeys as a real one would. taken: all requests."""
+    """Goes through the stages of a run and follows requests as a live run does. fraction: where printing begins."""
 
-    def __init__(self, stage: Stage = Stage.CHECK, fraction: float = 0.0, now: float = 0.0) -> None:
-        self._stage, self._since, self._then, self._fraction = stage, now, now, fraction
+    def __init__(self, fraction: float, now: float) -> None:
+        self.stage, self._turn, self._since, self._then, self._fraction = RunStage.CHECK, 1, now, now, fraction
         self._path = demo_path()
-        self._answer: Answer | None = None
-        self.turn = 1
-        self.taken: list[Request] = []
+        self._answer: RequestAnswer | None = None
 
-    @property
-    def stage(self) -> Stage:
-        """Where it is."""
-        return self._stage
+    def _enter(self, stage: RunStage, now: float) -> None:
+        self.stage, self._since, self._turn = stage, now, self._turn + 1
 
-    def go(self, stage: Stage, now: float) -> None:
-        """Enter a stage at `now`, s."""
-        self._stage, self._since, self.turn = stage, now, self.turn + 1
-
-    def obey(self, request: Request, now: float) -> None:
+    def follow(self, request: OperatorRequest, now: float) -> None:
         """Follow a request, or refuse it."""
-        self.taken.append(request)
-        why = refusal(request.wish, request.turn, OFFERS[self._stage], self.turn)
-        self._answer = Answer(request.number, request.wish, not why, why)
+        why = refusal(request.wish, request.turn, STAGE_OFFERS.get(self.stage, ()), self._turn)
+        self._answer = RequestAnswer(request.number, request.wish, not why, why)
         if not why:
-            again = request.wish is Wish.AGAIN and self._stage is Stage.CHECK
-            self.go(Stage.CHECK if again else LEADS[request.wish], now)
+            self._enter(NEXT_STAGES[request.wish], now)
 
     def step(self, now: float) -> OperatorView:
         """The run at `now`, s."""
-        after, follows = AFTER.get(self._stage, (float("inf"), self._stage))
+        after, follows = TIMED_STAGES.get(self.stage, (float("inf"), self.stage))
         if now - self._since > after:
-            self.go(follows, now)
-        if self._stage is Stage.PRINT and not _held(now):
-            self._fraction = min(self._fraction + SPEED * (now - self._then), len(self._path) - 1)
+            self._enter(follows, now)
+        if self.stage is RunStage.PRINT and not _held(now):
+            self._fraction = min(self._fraction + DEMO_SPEED * (now - self._then), len(self._path) - 1)
             if self._fraction == len(self._path) - 1:
-                self.go(Stage.DONE, now)
+                self._enter(RunStage.DONE, now)
         self._then = now
         return self._view(now)
 
     def _view(self, now: float) -> OperatorView:
-        stage = self._stage
-        known = stage not in (Stage.CHECK, Stage.FIND)
+        stage = self.stage
+        known = stage not in (RunStage.CHECK, RunStage.FIND)
         return OperatorView(
             stamp=now,
-            turn=self.turn,
+            turn=self._turn,
             stage=stage,
-            reason=WHY.get(stage, ""),
-            offers=OFFERS[stage],
-            checks=_checks(now - self._since) if stage is Stage.CHECK else (),
+            reason=STAGE_REASONS.get(stage, ""),
+            offers=STAGE_OFFERS.get(stage, ()),
+            checks=_checks(now - self._since) if stage is RunStage.CHECK else (),
             tracking=_tracking(stage, now),
             motion=self._motion(now) if known else None,
             progress=self._progress() if known else None,
             latency=LatencyView(0.0142, 0.0271 + 0.002 * np.sin(now), 0.035) if known else None,
-            cameras=_cameras(stage),
+            cameras=tuple(CameraView(f"camera{k}", CheckVerdict.PASS, 29.9, 61 - 7 * k) for k in range(3)),
             answer=self._answer,
             notes=("demonstration",),
         )
 
     def _motion(self, now: float) -> MotionView:
-        moves = self._stage in (Stage.PRINT, Stage.APPROACH)
-        held = self._stage is Stage.PRINT and _held(now)
-        error = HELD if held else 0.17 + 0.06 * np.sin(2.1 * now) + 0.03 * np.sin(7 * now)
-        lift = {Stage.PRINT: 0.0, Stage.APPROACH: max(12 - 5 * (now - self._since), 0.0)}.get(self._stage, 25.0)
-        activity = Activity.ENTERING if self._stage is Stage.APPROACH else Activity.PRINTING
+        moves = self.stage in (RunStage.PRINT, RunStage.APPROACH)
+        held = self.stage is RunStage.PRINT and _held(now)
+        error = DEMO_HOLD_ERROR if held else 0.17 + 0.06 * np.sin(2.1 * now) + 0.03 * np.sin(7 * now)
+        lift = {RunStage.PRINT: 0.0, RunStage.APPROACH: max(12 - 5 * (now - self._since), 0.0)}.get(self.stage, 25.0)
+        activity = Activity.ENTERING if self.stage is RunStage.APPROACH else Activity.PRINTING
         activity = Activity.HOLDING if held else activity if moves else Activity.RESTING
         return MotionView(
             activity=activity,
@@ -147,67 +237,63 @@ class DemoRun:
             in_flight=0.031 if moves else 0.0,
             most_in_flight=0.05,
             base_from_nozzle=nozzle_at(surface_at(now), self._path, self._fraction, lift),
-            arm="armed" if self._stage in ARMED else "disarmed",
+            arm="armed" if self.stage in ACTIVE_STAGES else "disarmed",
         )
 
     def _progress(self) -> ProgressView:
         total = len(self._path)
         share = self._fraction / (total - 1)
         layer = int(self._path.layer[int(self._fraction)]) + 1
-        return ProgressView(self._fraction, total, share, (1 - share) * total / SPEED, 0.87, layer, 2)
+        return ProgressView(self._fraction, total, share, (1 - share) * total / DEMO_SPEED, 0.87, layer, 2)
 
 
 def _held(now: float) -> bool:
     return now % 12 > 9.5
 
 
-def _tracking(stage: Stage, now: float) -> TrackingView:
+def _tracking(stage: RunStage, now: float) -> TrackingView:
     pose = surface_at(now)
     spread = np.diag([0.0025, 0.0016, 0.006]) * (1.5 + np.sin(now))
-    if stage in (Stage.CHECK, Stage.FIND):
+    if stage in (RunStage.CHECK, RunStage.FIND):
         return TrackingView(TrackState.INITIALISING, "no map of the surface yet", nan, nan, pose, spread * nan)
-    state, why = TrackState.TRACKING, "three cameras agree on 182 tracks"
-    if stage is Stage.FAILED:
-        state, why = TrackState.LOST, "no picture for 2.0 s"
-    return TrackingView(state, why, 0.018, float(np.sqrt(spread.max())), pose, spread, 182)
-
-
-def _cameras(stage: Stage) -> tuple[CameraView, ...]:
-    fine = tuple(CameraView(f"camera{k}", Verdict.PASS, 29.9, 61 - 7 * k) for k in range(3))
-    if stage is not Stage.FAILED:
-        return fine
-    return fine[0], replace(fine[1], verdict=Verdict.FAIL, words="no picture for 2 s"), fine[2]
+    return TrackingView(
+        TrackState.TRACKING, "three cameras agree on 182 tracks", 0.018, float(np.sqrt(spread.max())), pose, spread, 182
+    )
 
 
 def _checks(age: float) -> tuple[Check, ...]:
     rows = (
-        Check("Cameras", Verdict.PASS, "3 cameras at 30 Hz, 1280 x 720"),
-        Check("Calibration", Verdict.PASS, "0.31 px on what is seen now"),
-        Check("Arm", Verdict.PASS, "answers, 9.6 ms behind"),
-        Check("Path", Verdict.PASS, "700 checkpoints, 2 layers, 1.9 ml"),
+        Check("Cameras", CheckVerdict.PASS, "3 cameras at 30 Hz, 1280 x 720"),
+        Check("Calibration", CheckVerdict.PASS, "0.31 px on what is seen now"),
+        Check("Arm", CheckVerdict.PASS, "answers, 9.6 ms behind"),
+        Check("Path", CheckVerdict.PASS, "700 checkpoints, 2 layers, 1.9 ml"),
         Check(
-            "Reach", Verdict.WARN, "4 mm from the edge of joint 5", "Move the bed 20 mm nearer to the arm if you can."
+            "Reach",
+            CheckVerdict.WARN,
+            "4 mm from the edge of joint 5",
+            "Move the bed 20 mm nearer to the arm if you can.",
         ),
-        Check("Disk", Verdict.PASS, "212 GB free, enough for 31 h"),
+        Check("Disk", CheckVerdict.PASS, "212 GB free, enough for 31 h"),
     )
     done = int(age)
-    return tuple(row if k < done else Check(row.name, Verdict.BUSY) for k, row in enumerate(rows))
+    return tuple(row if k < done else Check(row.name, CheckVerdict.BUSY) for k, row in enumerate(rows))
 
 
-def run(link: OperatorLink, page: OperatorPage, stage: Stage, clock: Clock) -> None:
+def run(link: OperatorLink, page: OperatorPage, clock: Clock) -> None:
     """Go on until interrupted."""
-    made, painter = DemoRun(stage, 260.0, clock.now()), Painter(demo_rig(), np.random.default_rng(1))
-    taker = PictureTaker(link.pictures, link.requests)
+    made_up, painter = DemoRun(260.0, clock.now()), Painter(demo_rig(), np.random.default_rng(1))
+    thumbnailer = Thumbnailer(link.pictures, link.requests)
     link.scene.put(demo_scene())
     while True:
         now = clock.now()
         page.tend(now)
         for request in link.requests.take():
-            made.obey(request, now)
-        link.views.put(made.step(now))
+            made_up.follow(request, now)
+        link.views.put(made_up.step(now))
         if link.requests.windows:
-            taker.offer(now, painter.shots(surface_at(now)), surface_at(now) if made.stage is not Stage.CHECK else None)
-        clock.wait_until(now + PERIOD)
+            pose = surface_at(now)
+            thumbnailer.offer(now, painter.shots(pose), None if made_up.stage is RunStage.CHECK else pose)
+        clock.wait_until(now + DEMO_VIEW_PERIOD)
 
 
 def main() -> None:
@@ -216,7 +302,7 @@ def main() -> None:
     page = OperatorPage(link, OperatorSettings())
     try:
         print(page.address, flush=True)
-        run(link, page, Stage.CHECK, clock)
+        run(link, page, clock)
     except KeyboardInterrupt:
         page.close()
 

@@ -1,4 +1,8 @@
-"""The page's process: seen from the run, and its body."""
+"""The run's side of its operator's page: the process that serves it, and the thumbnails that are offered to it.
+
+Offering a frame set costs a comparison or two. Thumbnails are made a few times a second while a window is open, in a
+thread of their own with OpenCV's calls outside of Python's lock; sets that come meanwhile are dropped.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +12,39 @@ import multiprocessing
 import os
 import signal
 import socket
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
+from threading import Condition, Thread
 
-from hardware.operator.gate import hosts
-from hardware.operator.link import OperatorLink
-from hardware.operator.settings import Limits, OperatorSettings, check_settings
+import numpy as np
 
-NICENESS = 5  # below the loops, above what may wait for minutes
-AGAIN = 1.0  # s between two starts of a page that died
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.operator.settings import OperatorSettings, WindowLimits, allowed_hosts, check_settings
+from hardware.operator.shared_state import CameraPicture, OperatorLink, PagePictures, RequestLine
+from hardware.process.clock import Clock, WallClock
+from hardware.process.shared_latest import SharedLatest
+from perception.frames import Image
+
+PAGE_NICENESS = 5  # below the loops, above what may wait for minutes
+RESTART_AFTER = 1.0  # s between two starts of a page that died
+THUMBNAIL_WIDTH = 640  # px: three side by side fill a screen
+THUMBNAIL_QUALITY = 75  # 35 kB each; the path's edges are drawn by the browser and do not suffer
+CROP_WIDTH = 480  # px, of the part around the wound: seldom more than the camera has there
+CROP_MARGIN = 1.4  # of that part around outline and tracks: breathing stays inside
+MIN_CROP_POINTS = 8  # points that say where the wound is
+THUMBNAIL_PERIOD = 0.2  # s: breathing looks smooth, and 3 % of a core is not missed
+
+Crop = tuple[int, int, int, int]  # x, y, width, height px
 
 
 class OperatorPage:
-    """The page as the run sees it: started, looked after, ended. address: holds from the beginning, however often the
-    process is started again, as the port stays with the run.
-    """
+    """The page's process, which is started again whenever it has died: the port stays with the run."""
 
-    def __init__(self, link: OperatorLink, settings: OperatorSettings, limits: Limits | None = None) -> None:
+    def __init__(self, link: OperatorLink, settings: OperatorSettings, limits: WindowLimits | None = None) -> None:
         """Binds the port; OSError where it is taken, InputError where the settings would let others in."""
-        self._link, self._settings, self._limits = link, check_settings(settings), limits or Limits()
+        self._link, self._settings, self._limits = link, check_settings(settings), limits or WindowLimits()
         family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
         self._listener = socket.create_server((settings.host, settings.port), family=family, backlog=32)
         self._process: BaseProcess | None = None
@@ -34,11 +53,11 @@ class OperatorPage:
 
     @property
     def address(self) -> str:
-        """What is to be opened in a browser; whoever has it can operate the run."""
+        """To be opened in a browser, from the beginning on; whoever has it can operate the run."""
         port = self._listener.getsockname()[1]
         names = [*self._settings.names, self._settings.host]
         own = f"[{names[0]}]" if ":" in names[0] else names[0]
-        assert f"{own}:{port}" in hosts(self._settings, port)
+        assert f"{own}:{port}" in allowed_hosts(self._settings, port)
         return f"{self._settings.scheme}://{own}:{port}/{self._settings.token}/"
 
     @property
@@ -48,7 +67,7 @@ class OperatorPage:
 
     def tend(self, now: float) -> bool:
         """Start the process if it does not run, at most once a second; whether it was started. now: s."""
-        if (self._process is not None and self._process.is_alive()) or now - self._started < AGAIN:
+        if (self._process is not None and self._process.is_alive()) or now - self._started < RESTART_AFTER:
             return False
         self.restarts += self._process is not None
         self._started = now
@@ -70,18 +89,18 @@ class OperatorPage:
 
 
 def operator_process(
-    link: OperatorLink, settings: OperatorSettings, listener: socket.socket, limits: Limits | None = None
+    link: OperatorLink, settings: OperatorSettings, listener: socket.socket, limits: WindowLimits | None = None
 ) -> None:
-    """Serve the page until told to end (SIGTERM) or until the run is gone; Ctrl-C is the run's business."""
+    """The body of the process: serve the page until SIGTERM or until the run is gone. Ctrl-C is for the run alone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(NICENESS)
+    os.nice(PAGE_NICENESS)
     for name in ("aiohttp", "asyncio"):  # what strangers send is theirs: it is counted, and not written on the terminal
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    asyncio.run(_until_the_end(link, settings, listener, limits or Limits()))
+    asyncio.run(_serve_until_end(link, settings, listener, limits or WindowLimits()))
 
 
-async def _until_the_end(
-    link: OperatorLink, settings: OperatorSettings, listener: socket.socket, limits: Limits
+async def _serve_until_end(
+    link: OperatorLink, settings: OperatorSettings, listener: socket.socket, limits: WindowLimits
 ) -> None:
     from hardware.operator.server import serve  # aiohttp is for this process alone
 
@@ -89,10 +108,115 @@ async def _until_the_end(
     loop.add_signal_handler(signal.SIGTERM, ended.set)
     parent = multiprocessing.parent_process()
     if parent is not None:
-        loop.add_reader(parent.sentinel, _parent_gone, loop, parent.sentinel, ended)
+        loop.add_reader(parent.sentinel, _on_parent_exit, loop, parent.sentinel, ended)
     await serve(link, settings, listener, ended, limits)
 
 
-def _parent_gone(loop: asyncio.AbstractEventLoop, sentinel: int, ended: asyncio.Event) -> None:
+def _on_parent_exit(loop: asyncio.AbstractEventLoop, sentinel: int, ended: asyncio.Event) -> None:
     loop.remove_reader(sentinel)
     ended.set()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraShot:
+    """One camera's picture as it is offered; outline and tracks as in CameraPicture."""
+
+    camera: str
+    image: Image  # (H, W) or (H, W, 3) BGR, which must not change any more
+    outline: tuple[Array, ...] = ()
+    tracks: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+
+class Thumbnailer:
+    """A thread that makes thumbnails. made: instants whose pictures were put out; dropped: those too large."""
+
+    def __init__(
+        self, pictures: SharedLatest[PagePictures], requests: RequestLine, clock: Clock | None = None, near: bool = True
+    ) -> None:
+        """near: whether the part around outline and tracks is shown as well."""
+        self._pictures, self._requests, self._clock, self._near = pictures, requests, clock or WallClock(), near
+        self._due = float("-inf")
+        self._crops: dict[str, Crop] = {}
+        self._waiting: tuple[float, Sequence[CameraShot], Array | None] | None = None
+        self._changed, self._ended = Condition(), False
+        self.made = self.dropped = 0
+        self._thread = Thread(target=self._work, name="live pictures", daemon=True)
+        self._thread.start()
+
+    def offer(self, stamp: float, shots: Sequence[CameraShot], base_from_surface: Array | None = None) -> bool:
+        """Whether the shots of one instant (s) will be shown; never waits. base_from_surface: (4, 4) mm then."""
+        now = self._clock.now()
+        if now < self._due or not self._requests.windows:
+            return False
+        if not self._changed.acquire(blocking=False):
+            return False
+        try:
+            if self._waiting is not None:
+                return False
+            self._due = now + THUMBNAIL_PERIOD
+            self._waiting = stamp, shots, base_from_surface
+            self._changed.notify()
+        finally:
+            self._changed.release()
+        return True
+
+    def close(self) -> None:
+        """End the thread."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._ended or self._waiting is not None)
+                if self._ended or self._waiting is None:
+                    return
+                stamp, shots, pose = self._waiting
+            self._put(PagePictures(stamp, tuple(map(self._picture, shots)), pose))
+            with self._changed:
+                self._waiting = None
+
+    def _put(self, pictures: PagePictures) -> None:
+        try:
+            self._pictures.put(pictures)
+            self.made += 1
+        except InputError:  # larger than their place: the next ones may be smaller
+            self.dropped += 1
+
+    def _picture(self, shot: CameraShot) -> CameraPicture:
+        from hardware.files.images import small_jpeg  # OpenCV is for the process that has the images
+
+        crop = crop_around(shot, self._crops.get(shot.camera)) if self._near else None
+        whole, near = small_jpeg(shot.image, THUMBNAIL_WIDTH, THUMBNAIL_QUALITY), b""
+        if crop is not None:
+            self._crops[shot.camera] = crop
+            x, y, width, height = crop
+            near = small_jpeg(shot.image[y : y + height, x : x + width], CROP_WIDTH, THUMBNAIL_QUALITY)
+        return CameraPicture(shot.camera, whole, shot.outline, shot.tracks, near, crop)
+
+
+def crop_around(shot: CameraShot, present: Crop | None) -> Crop | None:
+    """The part of an image around outline and tracks, of its own proportions; None where that is all of it.
+
+    present: what was shown before; it stays while all is in it and not much less would do, so that the view rests.
+    """
+    points = np.concatenate([*shot.outline, shot.tracks])
+    if len(points) < MIN_CROP_POINTS:
+        return present
+    low, high = np.percentile(points, [2, 98], axis=0)  # single tracks may lie anywhere
+    height, width = shot.image.shape[:2]
+    wanted = CROP_MARGIN * max(high[0] - low[0], (high[1] - low[1]) * width / height, width / 8)
+    if present is not None and wanted > present[2] / 2 and _holds(present, low, high):
+        return present
+    if wanted >= width:
+        return None
+    size = np.array([round(wanted), round(wanted * height / width)])
+    corner = np.clip(np.round((low + high - size) / 2), 0, [width, height] - size).astype(int)
+    return int(corner[0]), int(corner[1]), int(size[0]), int(size[1])
+
+
+def _holds(crop: Crop, low: Array, high: Array) -> bool:
+    corner, size = np.array(crop[:2]), np.array(crop[2:])
+    return bool((low >= corner).all() and (high <= corner + size).all())

@@ -1,76 +1,185 @@
-"""The page over HTTP: its few files, its web sockets, and a stop for windows that have no socket (owns aiohttp)."""
+"""The page over HTTP: its few files, its web sockets, and a stop for windows that have no socket (owns aiohttp).
+
+A window is sent the newest whenever it has confirmed what it was sent before. Receiving never waits for sending, so
+that a window which shows nothing any more can still stop the run.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import ssl
+from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from importlib.resources import files
 from socket import socket as Listener
 
-from aiohttp import web
+from aiohttp import WSCloseCode, WSMsgType, web
 
-from hardware.operator.board import Board
-from hardware.operator.broadcast import text
-from hardware.operator.gate import Gate, answer_headers
-from hardware.operator.link import OperatorLink
-from hardware.operator.settings import Limits, OperatorSettings
-from hardware.operator.shared_state import Wish
-from hardware.operator.window import Window
+from hardware.operator.broadcast import Broadcast, RateLimiter, RequestMessage, ShownMessage, parse_message, text
+from hardware.operator.settings import AccessControl, OperatorSettings, WindowLimits, response_headers
+from hardware.operator.shared_state import OperatorLink, RequestLine
+from hardware.operator.view import CALMING_WISHES, Wish, refusal
 from hardware.process.clock import WallClock
 
-LOOK = 0.04  # s: how soon what the run puts out is seen
-STRANGERS = 32  # connections that are no windows: a browser keeps six
-FULL = 1013  # close code: try again later
-KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+STATUS_PULSE = 0.25  # s: so often a window is sent how old everything is, even if nothing is new
+LINK_POLL_PERIOD = 0.04  # s: how soon what the run puts out is noticed
+SHUTDOWN_DELAY = 0.2  # s in which the windows show that the run is gone
+MAX_DROPPED_MESSAGES = 400  # messages beyond what is allowed, after which a window is closed
+MAX_OTHER_CONNECTIONS = 32  # connections that are no windows: a browser keeps six
+CONTENT_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
-class OperatorServer:
-    """One run's page."""
+class WindowSession:
+    """Serves one web socket until either side ends it."""
 
-    def __init__(self, link: OperatorLink, settings: OperatorSettings, port: int, limits: Limits) -> None:
+    def __init__(
+        self, socket: web.WebSocketResponse, newest: Broadcast, requests: RequestLine, limits: WindowLimits
+    ) -> None:
+        self._socket, self._newest, self._requests, self._limits = socket, newest, requests, limits
+        self._clock = WallClock()
+        now = self._clock.now()
+        self._messages, self._asks = RateLimiter(limits.messages, now), RateLimiter(limits.asks, now)
+        self._replies: deque[str] = deque(maxlen=16)
+        self._bundle, self._shown = 0, asyncio.Event()
+        self.malformed = self.dropped = 0
+
+    async def run(self) -> None:
+        """Send and receive."""
+        sending = asyncio.create_task(self._send())
+        try:
+            await self._receive()
+        finally:
+            sending.cancel()
+
+    async def _receive(self) -> None:
+        async for message in self._socket:
+            parsed = parse_message(message.data) if message.type is WSMsgType.TEXT else None
+            if isinstance(parsed, RequestMessage) and parsed.wish is Wish.STOP:
+                self._ask(parsed)
+            elif not self._messages.take(self._clock.now()):
+                self.dropped += 1
+            elif isinstance(parsed, RequestMessage):
+                self._ask(parsed)
+            elif isinstance(parsed, ShownMessage):
+                if parsed.bundle == self._bundle:
+                    self._shown.set()
+            else:
+                self.malformed += 1
+            if self.malformed > self._limits.malformed or self.dropped > MAX_DROPPED_MESSAGES:
+                await self._close(b"too many messages, or none that make sense")
+
+    def _ask(self, ask: RequestMessage) -> None:
+        number, words = None, self._refusal(ask)
+        if not words and (number := self._requests.ask(ask.wish, ask.turn)) is None:
+            words = "the run has not yet taken what was asked before"
+        self._replies.append(text(kind="asked", tag=ask.tag, wish=ask.wish, number=number, words=words))
+        self._newest.wake()
+
+    def _refusal(self, ask: RequestMessage) -> str:
+        """Why a request is not even handed on, "" if it is; the run decides again, by newer knowledge."""
+        if ask.wish is Wish.STOP:
+            return ""
+        now, view = self._clock.now(), self._newest.view
+        if not self._asks.take(now):
+            return "that was too fast: ask again"
+        if view is None or self._newest.age(now) > self._limits.stale:
+            return "" if ask.wish in CALMING_WISHES else "nothing is heard from the run"
+        return refusal(ask.wish, ask.turn, view.offers, view.turn)
+
+    async def _send(self) -> None:
+        try:
+            await self._send_all()
+        except (TimeoutError, ConnectionError, asyncio.IncompleteReadError):
+            await self._close(b"nothing was shown for too long")
+
+    async def _send_all(self) -> None:
+        newest, scene, pictures = self._newest, "", b""
+        await self._put(newest.timeline_text())
+        while True:
+            news = newest.news
+            self._bundle, self._shown = self._bundle + 1, asyncio.Event()
+            if newest.scene_text is not scene:
+                scene = newest.scene_text
+                await self._put(scene)
+            if newest.pictures_bytes is not pictures:
+                pictures = newest.pictures_bytes
+                await self._put(pictures)
+            while self._replies:
+                await self._put(self._replies.popleft())
+            await self._put(self._status())
+            await asyncio.wait_for(self._shown.wait(), self._limits.patience)
+            if not self._replies:
+                await _within(news, STATUS_PULSE)
+
+    def _status(self) -> str:
+        age = self._newest.age(self._clock.now())
+        kind, stale = "gone" if self._newest.gone else "view", self._limits.stale
+        head = text(kind=kind, bundle=self._bundle, age=age, stale=stale, refused=self._newest.refused)
+        return f'{head[:-1]},"view":{self._newest.view_text}}}'
+
+    async def _put(self, message: str | bytes) -> None:
+        if message:
+            sent = self._socket.send_str(message) if isinstance(message, str) else self._socket.send_bytes(message)
+            await asyncio.wait_for(sent, self._limits.patience)
+
+    async def _close(self, why: bytes) -> None:
+        closing = self._socket.close(code=WSCloseCode.POLICY_VIOLATION, message=why)
+        await asyncio.wait_for(closing, self._limits.patience)
+
+
+async def _within(news: asyncio.Event, seconds: float) -> None:
+    try:
+        await asyncio.wait_for(news.wait(), seconds)
+    except TimeoutError:
+        return
+
+
+class OperatorServer:
+    """The page of one run."""
+
+    def __init__(self, link: OperatorLink, settings: OperatorSettings, port: int, limits: WindowLimits) -> None:
         self._link, self._settings, self._limits, self._clock = link, settings, limits, WallClock()
-        self._gate, self._headers = Gate(settings, port), answer_headers(settings, port)
-        self._windows: dict[Window, asyncio.BaseTransport | None] = {}
+        self._access, self._headers = AccessControl(settings, port), response_headers(settings, port)
+        self._windows: dict[WindowSession, asyncio.BaseTransport | None] = {}
         self._files = page_files()
-        self.board = Board(link)
+        self.broadcast = Broadcast(link)
 
     def application(self) -> web.Application:
-        """Everything behind the gate."""
-        made = web.Application(middlewares=[self._guard], client_max_size=self._limits.message)
-        made.add_routes(
+        """The routes, all behind the check of requests."""
+        application = web.Application(middlewares=[self._guard], client_max_size=self._limits.message)
+        application.add_routes(
             [
                 web.get("/{token}/socket", self._socket),
                 web.post("/{token}/stop", self._stop),
                 web.get("/{token}/{name:[a-z_.]*}", self._file),
             ]
         )
-        return made
+        return application
 
-    async def look(self, connections: Callable[[], Sequence[web.RequestHandler]]) -> None:
-        """Keep the board up to date for ever, and connections few. connections: all there are, the oldest first."""
+    async def update(self, connections: Callable[[], Sequence[web.RequestHandler]]) -> None:
+        """Take what the run puts out, for ever, and keep connections few. connections: all, the oldest first."""
         while True:
             self._link.requests.windows = len(self._windows)
-            self.board.refused = sum(self._gate.refused.values())
-            self.board.look(self._clock.now(), bool(self._windows))
+            self.broadcast.refused = sum(self._access.refused.values())
+            self.broadcast.update(self._clock.now(), bool(self._windows))
             own = set(self._windows.values())
-            for handler in [each for each in connections() if each.transport not in own][:-STRANGERS]:
+            for handler in [each for each in connections() if each.transport not in own][:-MAX_OTHER_CONNECTIONS]:
                 handler.force_close()
-            await asyncio.sleep(LOOK)
+            await asyncio.sleep(LINK_POLL_PERIOD)
 
-    def last_look(self) -> None:
-        """Show what the run said last, and that it is gone."""
-        self.board.look(self._clock.now(), False)
+    def last_update(self) -> None:
+        """Show the run's last view, and that it is gone."""
+        self.broadcast.update(self._clock.now(), False)
         self._link.requests.windows = 0
-        self.board.gone = True
+        self.broadcast.gone = True
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         changes = request.method != "GET" or "Upgrade" in request.headers
         token = request.path.partition("/")[2].partition("/")[0]
-        if reason := self._gate.refusal(token, request.headers, changes):
+        if reason := self._access.refusal(token, request.headers, changes):
             return web.Response(status=403, text=f"refused: {reason}\n", headers=self._own_headers())
         try:
             answer = await handler(request)
@@ -85,7 +194,7 @@ class OperatorServer:
         name = request.match_info["name"] or self._settings.page
         if name not in self._files:
             raise web.HTTPNotFound
-        kind = KINDS[name.rsplit(".", 1)[1]]
+        kind = CONTENT_TYPES[name.rsplit(".", 1)[1]]
         return web.Response(body=self._files[name], content_type=kind, charset="utf-8", headers=self._own_headers())
 
     async def _stop(self, request: web.Request) -> web.StreamResponse:
@@ -98,9 +207,9 @@ class OperatorServer:
         await socket.prepare(request)
         if len(self._windows) >= self._limits.windows:
             await socket.send_str(text(kind="full", windows=len(self._windows)))
-            await socket.close(code=FULL, message=b"too many windows")
+            await socket.close(code=WSCloseCode.TRY_AGAIN_LATER, message=b"too many windows")
             return socket
-        window = Window(socket, self.board, self._link.requests, self._limits, self._clock)
+        window = WindowSession(socket, self.broadcast, self._link.requests, self._limits)
         self._windows[window] = request.transport
         try:
             await window.run()
@@ -115,34 +224,31 @@ def page_files() -> dict[str, bytes]:
 
 
 async def serve(
-    link: OperatorLink, settings: OperatorSettings, listener: Listener, ended: asyncio.Event, limits: Limits
+    link: OperatorLink, settings: OperatorSettings, listener: Listener, ended: asyncio.Event, limits: WindowLimits
 ) -> None:
-    """Serve until `ended` is set; windows are told then."""
+    """Serve until `ended` is set; then the windows show that the run is gone."""
     server = OperatorServer(link, settings, listener.getsockname()[1], limits)
     runner = web.AppRunner(server.application(), access_log=None, keepalive_timeout=10.0, shutdown_timeout=0.5)
     await runner.setup()
-    await web.SockSite(runner, listener, ssl_context=_encryption(settings)).start()
+    await web.SockSite(runner, listener, ssl_context=_ssl_context(settings)).start()
     assert runner.server is not None
     handlers = runner.server
-    looking = asyncio.create_task(server.look(lambda: handlers.connections))
+    updating = asyncio.create_task(server.update(lambda: handlers.connections))
     done = asyncio.create_task(ended.wait())
-    await asyncio.wait({looking, done}, return_when=asyncio.FIRST_COMPLETED)
-    server.last_look()
-    server.board.tell()
-    await asyncio.sleep(FAREWELL)
+    await asyncio.wait({updating, done}, return_when=asyncio.FIRST_COMPLETED)
+    server.last_update()
+    server.broadcast.wake()
+    await asyncio.sleep(SHUTDOWN_DELAY)
     await runner.cleanup()
-    if looking.done():
-        looking.result()  # what ended it
-    looking.cancel()
+    if updating.done():
+        updating.result()  # what ended it
+    updating.cancel()
 
 
-FAREWELL = 0.2  # s for the windows to be told
-
-
-def _encryption(settings: OperatorSettings) -> ssl.SSLContext | None:
+def _ssl_context(settings: OperatorSettings) -> ssl.SSLContext | None:
     if settings.certificate is None:
         return None
-    made = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    made.minimum_version = ssl.TLSVersion.TLSv1_2
-    made.load_cert_chain(settings.certificate, settings.key)
-    return made
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.load_cert_chain(settings.certificate, settings.key)
+    return context

@@ -1,13 +1,21 @@
-"""Where the page is served, to whom, and how much of it: checked before anything listens."""
+"""Where the page is served and to whom: settings, limits, and the check of each request.
+
+A request is let in if it knows the token, names this machine as Host, and comes from the page itself.
+"""
 
 from __future__ import annotations
 
+import hmac
 import secrets
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from ipaddress import ip_address
 from pathlib import Path
 
 from estimation.errors import InputError
+
+OWN_SITES = ("same-origin", "none")  # Sec-Fetch-Site of a request by the page itself, or by the address bar
+_TOKEN_LETTERS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_")
 
 
 def new_token() -> str:
@@ -17,20 +25,16 @@ def new_token() -> str:
 
 @dataclass(frozen=True, slots=True)
 class OperatorSettings:
-    """host: address that is listened on; port: 0 for whichever is free. token: what every request must know.
+    """Where and to whom the page is served."""
 
-    elsewhere: serve other machines as well; then `certificate` and `key` (PEM files) are needed, and `names` are those
-    by which browsers call this machine, as the certificate has them. page: which of the pages is served.
-    """
-
-    host: str = "127.0.0.1"
-    port: int = 0
-    token: str = field(default_factory=new_token, repr=False)
-    elsewhere: bool = False
-    certificate: Path | None = None
-    key: Path | None = None
-    names: tuple[str, ...] = ()
-    page: str = "index.html"
+    host: str = "127.0.0.1"  # address that is listened on
+    port: int = 0  # 0: any that is free
+    token: str = field(default_factory=new_token, repr=False)  # that every request must know
+    elsewhere: bool = False  # serve other machines as well, with certificate and key
+    certificate: Path | None = None  # PEM file
+    key: Path | None = None  # PEM file
+    names: tuple[str, ...] = ()  # by which browsers call this machine, as the certificate has them
+    page: str = "index.html"  # which of the pages is served
 
     @property
     def scheme(self) -> str:
@@ -39,7 +43,7 @@ class OperatorSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class WindowLimits:
     """What windows may ask for. Far above what hands and screens do, far below what would be felt."""
 
     windows: int = 8  # at once: an operator's, a colleague's, and those that a browser has not closed yet
@@ -60,7 +64,7 @@ def check_settings(settings: OperatorSettings) -> OperatorSettings:
         raise InputError(where, "host", settings.host, "an IP address, such as 127.0.0.1") from None
     if not 0 <= settings.port <= 65535:
         raise InputError(where, "port", settings.port, "0 to 65535, 0 for whichever is free")
-    if len(settings.token) < 16 or not set(settings.token) <= _ADDRESS_LETTERS:
+    if len(settings.token) < 16 or not set(settings.token) <= _TOKEN_LETTERS:
         raise InputError(where, "token", "(not shown)", "16 or more letters, digits, - or _")
     if not loopback and not settings.elsewhere:
         raise InputError(where, "host", settings.host, "127.0.0.1 or ::1, unless other machines are allowed in")
@@ -72,4 +76,57 @@ def check_settings(settings: OperatorSettings) -> OperatorSettings:
     return settings
 
 
-_ADDRESS_LETTERS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_")
+class AccessControl:
+    """Checks each request. refused: how many were turned away, by reason."""
+
+    def __init__(self, settings: OperatorSettings, port: int) -> None:
+        self._token = settings.token.encode()
+        self._hosts = allowed_hosts(settings, port)
+        self._origins = {f"{settings.scheme}://{host}" for host in self._hosts}
+        self.refused: dict[str, int] = {}
+
+    def refusal(self, token: str, headers: Mapping[str, str], changes: bool) -> str:
+        """Why a request is turned away, "" if it is let in.
+
+        changes: whether it could ask something of the run: a web socket, or anything but GET. Another Host comes from a
+        page whose name was made to point here (DNS rebinding); another Origin from a page in the same browser.
+        """
+        reason = ""
+        if headers.get("Host", "") not in self._hosts:
+            reason = "host"
+        elif (origin := headers.get("Origin")) not in self._origins and (changes or origin is not None):
+            reason = "origin"
+        elif headers.get("Sec-Fetch-Site", "none") not in OWN_SITES:
+            reason = "site"
+        elif not hmac.compare_digest(token.encode("utf-8", "replace"), self._token):
+            reason = "token"
+        if reason:
+            self.refused[reason] = self.refused.get(reason, 0) + 1
+        return reason
+
+
+def allowed_hosts(settings: OperatorSettings, port: int) -> frozenset[str]:
+    """The values of Host that are let in."""
+    own = f"[{settings.host}]" if ":" in settings.host else settings.host
+    names = {own, *settings.names} | (set() if settings.elsewhere else {"localhost"})
+    return frozenset(f"{name}:{port}" for name in names)
+
+
+def response_headers(settings: OperatorSettings, port: int) -> dict[str, str]:
+    """Headers of every response: nothing from outside, no frames, nothing cached, nothing sent to others."""
+    sockets = " ".join(
+        f"{settings.scheme.replace('http', 'ws')}://{host}" for host in sorted(allowed_hosts(settings, port))
+    )
+    policy = (
+        f"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self' {sockets}; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+    return {
+        "Content-Security-Policy": policy,
+        "X-Content-Type-Options": "nosniff",
+        "X-Frame-Options": "DENY",
+        "Referrer-Policy": "no-referrer",
+        "Cross-Origin-Opener-Policy": "same-origin",
+        "Cross-Origin-Resource-Policy": "same-origin",
+        "Cache-Control": "no-store",
+    }

@@ -1,128 +1,201 @@
-"""What an operator asks of the run, and the line in shared memory by which it comes.
+"""What a run and its operator's page share in memory: the newest view, pictures and scene, and a line of requests.
 
-Neither side ever waits: a full line refuses what comes, what leads towards rest has places that nothing else takes, and
-a stop has one of its own that cannot be full. A page that is killed in the middle of a word leaves nothing behind that
-the run would stumble over.
+Neither side ever waits: a full line refuses what comes, wishes that lead towards rest have places that nothing else
+takes, and a stop has one of its own that cannot be full. A page that is killed while it writes leaves nothing behind
+that the run would stumble over. Path and nozzle are drawn by the browser, which knows the cameras from the scene: a
+picture carries only the pose of its instant.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection
 from ctypes import c_uint64
-from dataclasses import dataclass
-from enum import StrEnum
+from dataclasses import dataclass, field
 from multiprocessing.sharedctypes import RawArray
 from typing import Any
 from zlib import crc32
 
+import numpy as np
+from numpy.typing import NDArray
 
-class Wish(StrEnum):
-    """What can be asked for. A STOP is always followed; the others where the run offers them."""
+from estimation.rig import Camera, Rig
+from estimation.se3 import Array
+from hardware.operator.view import CALMING_WISHES, OperatorView, WavingView, Wish
+from hardware.process.shared_latest import SharedLatest
+from planning.path import Path
 
-    CONFIRM = "confirm"  # what is shown over the pictures is right
-    AGAIN = "again"  # do this stage anew: check, or look for the wound
-    START = "start"  # let the arm move: approach, then print
-    PAUSE = "pause"  # hold above the surface, ready to go on
-    RESUME = "resume"  # go on printing where it left off
-    STOP = "stop"  # come to rest now
-    HOME = "home"  # move the arm to its home
-    END = "end"  # end the run, and write its report
-
-
-ALWAYS = frozenset({Wish.STOP, Wish.PAUSE, Wish.END})  # lead towards rest: right whatever the asking window showed
-
-SLOTS = 16  # requests that wait; the run takes them every few ms and a hand gives a few in a second
-OTHERS = 8  # of them for what does not lead towards rest: a flood of such requests leaves room for a pause
+REQUEST_SLOTS = 16  # requests that wait; the run takes them every few ms and a hand gives a few in a second
+OTHER_REQUEST_SLOTS = 8  # of them for what does not lead towards rest: a flood of such requests leaves room for a pause
+PICTURES_CAPACITY = 1 << 20  # bytes: three pictures of 640 px, and near ones, take 250 kB with all that lies over them
+MAX_PATH_POINTS, MAX_TRIANGLES = 4000, 1500  # what a browser without a graphics card draws ten times a second
+SCENE_CAPACITY = 1 << 21  # bytes: ten times what these limits allow
 _RECORD = struct.Struct("=QQBI")  # number, turn, wish, check sum
 _LAST, _STOP, _WRITTEN, _TAKEN, _WINDOWS = range(5)  # last number given, last stop, records written and taken, windows
 _WISHES = tuple(Wish)
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
-    """One wish. number: counts up over all windows. turn: that of the view which the operator saw when asking."""
+class OperatorRequest:
+    """A wish of an operator."""
 
-    number: int
+    number: int  # counts up over all windows
     wish: Wish
-    turn: int
-
-
-def refusal(wish: Wish, turn: int, offers: Collection[Wish], present: int) -> str:
-    """Why a wish cannot be followed, "" if it can.
-
-    turn: of the view it was asked under; present: of the newest view, which `offers` wishes. A window that shows an
-    older turn may stop, pause or end, and nothing else: it cannot let a run go on that another window has stopped.
-    """
-    if wish is Wish.STOP:
-        return ""
-    if wish not in ALWAYS and turn != present:
-        return "the run has changed since this was shown: look again, then ask again"
-    return "" if wish in offers else f"{wish} cannot be done at this stage"
+    turn: int  # of the view that the operator saw when asking
 
 
 class RequestLine:
-    """Handed to the page's process when that is started: the page asks, the run takes. One of each."""
+    """The line of requests in shared memory: one page asks, one run takes."""
 
     def __init__(self) -> None:
         self._counts: Any = RawArray(c_uint64, 5)  # each is written whole, or not at all
-        self._records: Any = RawArray("B", SLOTS * _RECORD.size)
+        self._records: Any = RawArray("B", REQUEST_SLOTS * _RECORD.size)
         self._stops_seen = 0
 
     def ask(self, wish: Wish, turn: int) -> int | None:
-        """Number of the request; None where the line is full: for ALWAYS later than for others, for a stop never."""
+        """Number of the request; None where the line is full: for CALMING_WISHES later, for a stop never."""
         number = int(self._counts[_LAST]) + 1
         if wish is Wish.STOP:
             self._counts[_LAST] = number
             self._counts[_STOP] = number
             return number
         written = self._counts[_WRITTEN]
-        if written - self._counts[_TAKEN] >= (SLOTS if wish in ALWAYS else OTHERS):
+        if written - self._counts[_TAKEN] >= (REQUEST_SLOTS if wish in CALMING_WISHES else OTHER_REQUEST_SLOTS):
             return None
         body = (number, turn, _WISHES.index(wish))
-        _RECORD.pack_into(self._records, _place(written), *body, _check(*body))
+        _RECORD.pack_into(self._records, _slot_offset(written), *body, _check_sum(*body))
         self._counts[_LAST] = number
         self._counts[_WRITTEN] = written + 1
         return number
 
-    def take(self) -> list[Request]:
-        """What was asked for since the last call, in order; a stop stands alone, as what came with it is void."""
+    def take(self) -> list[OperatorRequest]:
+        """The requests since the last call, in order; a stop stands alone, as what came with it is void."""
         waiting = list(self._waiting())
         stop = self._counts[_STOP]
         if stop != self._stops_seen:
             self._stops_seen = stop
-            return [Request(stop, Wish.STOP, 0)]
+            return [OperatorRequest(stop, Wish.STOP, 0)]
         return waiting
 
     @property
     def last_stop(self) -> int:
-        """Number of the last stop asked for, 0 before the first; any process that holds the line may watch it."""
+        """Number of the last stop, 0 before the first; any process that holds the line may watch it."""
         return int(self._counts[_STOP])
 
     @property
     def windows(self) -> int:
-        """How many windows show the page; pictures for nobody need not be made."""
+        """How many windows show the page; without any, no pictures need be made."""
         return int(self._counts[_WINDOWS])
 
     @windows.setter
     def windows(self, count: int) -> None:
         self._counts[_WINDOWS] = count
 
-    def _waiting(self) -> list[Request]:
-        taken, written, found = self._counts[_TAKEN], self._counts[_WRITTEN], []
+    def _waiting(self) -> list[OperatorRequest]:
+        taken, written, requests = self._counts[_TAKEN], self._counts[_WRITTEN], []
         while taken < written:
-            number, turn, index, check = _RECORD.unpack_from(self._records, _place(taken))
-            if check != _check(number, turn, index):
+            number, turn, index, check = _RECORD.unpack_from(self._records, _slot_offset(taken))
+            if check != _check_sum(number, turn, index):
                 break  # the count was seen before the record: the next look finds it whole
-            found.append(Request(number, _WISHES[index], turn))
+            requests.append(OperatorRequest(number, _WISHES[index], turn))
             taken += 1
         self._counts[_TAKEN] = taken
-        return found
+        return requests
 
 
-def _place(count: int) -> int:
-    return (count % SLOTS) * _RECORD.size
+def _slot_offset(count: int) -> int:
+    return (count % REQUEST_SLOTS) * _RECORD.size
 
 
-def _check(number: int, turn: int, index: int) -> int:
+def _check_sum(number: int, turn: int, index: int) -> int:
     return crc32(struct.pack("=QQB", number, turn, index))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPicture:
+    """One camera's picture; all pixels count in the camera's own size."""
+
+    camera: str
+    jpeg: bytes  # of any size
+    outline: tuple[Array, ...] = ()  # of the wound, polygons (K, 2) px of the image as it is
+    tracks: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) px, undistorted as in Observations
+    near: bytes = b""  # JPEG of the part `crop` around outline and tracks, b"" without any
+    crop: tuple[int, int, int, int] | None = None  # x, y, width, height px
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PagePictures:
+    """The pictures of one instant."""
+
+    stamp: float  # s
+    pictures: tuple[CameraPicture, ...]
+    base_from_surface: Array | None = None  # (4, 4) mm at that instant, None while it is unknown
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PageScene:
+    """What stands still in the view: cameras, and path and surface in the surface frame. Sent when it changes."""
+
+    cameras: tuple[Camera, ...]
+    path: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (K, 3) mm, places in order
+    checkpoint: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (K,) their numbers
+    extrude: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))  # (K,) whether on the way to each
+    surface: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (V, 3) mm
+    triangles: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))  # (T, 3), or none known
+
+
+def scene_from(
+    rig: Rig, path: Path | None = None, surface: Array | None = None, triangles: NDArray[np.int64] | None = None
+) -> PageScene:
+    """The scene, thinned to what a browser draws with ease. surface: (V, 3) mm, triangles: (T, 3), surface frame."""
+    empty = PageScene(rig.cameras)
+    kept = empty.checkpoint if path is None else _drawn_checkpoints(path)
+    points = empty.surface if surface is None else np.asarray(surface, float)
+    corners = empty.triangles if triangles is None else np.asarray(triangles, np.int64)
+    if len(corners) > MAX_TRIANGLES:
+        points, corners = _coarser_mesh(points, corners)
+    elif not len(corners) and len(points) > MAX_TRIANGLES:
+        points = points[np.linspace(0, len(points) - 1, MAX_TRIANGLES).astype(np.int64)]
+    if path is None:
+        return PageScene(rig.cameras, surface=points, triangles=corners)
+    return PageScene(rig.cameras, path.surface_from_nozzle[kept, :3, 3], kept, path.extrude[kept], points, corners)
+
+
+def _drawn_checkpoints(path: Path) -> NDArray[np.int64]:
+    """Numbers of the checkpoints that are drawn: all, or evenly thinned ones and each where extrusion changes."""
+    count = len(path)
+    even = np.linspace(0, count - 1, min(count, MAX_PATH_POINTS)).astype(np.int64)
+    if count <= MAX_PATH_POINTS:
+        return even
+    changes = np.flatnonzero(np.diff(path.extrude.astype(np.int8)))
+    ends = np.concatenate([changes, changes + 1])
+    return np.unique(np.concatenate([even, ends[: MAX_PATH_POINTS // 2]]))
+
+
+def _coarser_mesh(points: Array, triangles: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    """The surface with the corners in each cell of a cube grid drawn together; as fine as MAX_TRIANGLES allow."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    cell = float((high - low).max()) / np.sqrt(MAX_TRIANGLES)
+    while True:
+        _, group = np.unique(np.floor((points - low) / cell).astype(np.int64), axis=0, return_inverse=True)
+        group = group.reshape(-1)
+        joined = group[triangles]
+        whole = (joined != np.roll(joined, 1, axis=1)).all(axis=1)
+        kept = np.unique(np.sort(joined[whole], axis=1), axis=0)
+        if len(kept) <= MAX_TRIANGLES:
+            break
+        cell *= 1.2
+    middles = np.stack([np.bincount(group, points[:, k]) for k in range(3)], axis=1) / np.bincount(group)[:, None]
+    return middles, kept
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OperatorLink:
+    """All that joins a run and its page, handed to each process that takes part when it is started.
+
+    Of `views`, `pictures` and `scene` each has one process that puts; the page gets.
+    """
+
+    views: SharedLatest[OperatorView | WavingView] = field(default_factory=SharedLatest)
+    pictures: SharedLatest[PagePictures] = field(default_factory=lambda: SharedLatest(PICTURES_CAPACITY))
+    scene: SharedLatest[PageScene] = field(default_factory=lambda: SharedLatest(SCENE_CAPACITY))
+    requests: RequestLine = field(default_factory=RequestLine)

@@ -1,21 +1,21 @@
-"""What the run shows its operator, a few times a second: one record, made of what the run knows anyway.
+"""What a run or a calibration shows its operator a few times a second, what it offers, and which wishes it follows.
 
-Everything but stamp, turn and stage may be missing: a part that does not exist yet is None, a figure that nobody knows
-is NaN.
+Everything but stamp, turn and stage may be missing: a part that does not exist yet is None, an unknown figure is NaN.
+The fields of the records go to the page under their names.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from enum import StrEnum
 from math import nan
 
 from estimation.pose import SurfacePose, TrackState, position_sigma
 from estimation.se3 import Array
-from hardware.operator.shared_state import Wish
 
 
-class Stage(StrEnum):
+class RunStage(StrEnum):
     """Where a run is, as an operator knows it."""
 
     CHECK = "check"  # cameras, calibration, arm, path, reach
@@ -32,7 +32,66 @@ class Stage(StrEnum):
     FAILED = "failed"  # the run cannot go on; the arm is at rest
 
 
-class Verdict(StrEnum):
+class Wish(StrEnum):
+    """What can be asked for. A STOP is always followed; the others where the run offers them."""
+
+    CONFIRM = "confirm"  # what is shown over the pictures is right
+    AGAIN = "again"  # do this stage anew: check, or look for the wound
+    START = "start"  # let the arm move: approach, then print
+    PAUSE = "pause"  # hold above the surface, ready to go on
+    RESUME = "resume"  # go on printing where it left off
+    STOP = "stop"  # come to rest now
+    HOME = "home"  # move the arm to its home
+    END = "end"  # end the run, and write its report
+
+
+CALMING_WISHES = frozenset(
+    {Wish.STOP, Wish.PAUSE, Wish.END}
+)  # lead towards rest: right whatever the asking window showed
+
+
+ACTIVE_STAGES = (RunStage.APPROACH, RunStage.PRINT, RunStage.HOMING, RunStage.PAUSED)  # the arm may move, or is armed
+STAGE_OFFERS = {
+    RunStage.CHECK: (Wish.END,),
+    RunStage.FIND: (Wish.END,),
+    RunStage.CONFIRM: (Wish.CONFIRM, Wish.AGAIN, Wish.END),
+    RunStage.READY: (Wish.START, Wish.AGAIN, Wish.END),
+    RunStage.APPROACH: (Wish.PAUSE, Wish.HOME, Wish.END),
+    RunStage.PRINT: (Wish.PAUSE, Wish.HOME, Wish.END),
+    RunStage.PAUSED: (Wish.RESUME, Wish.HOME, Wish.END),
+    RunStage.STOPPED: (Wish.RESUME, Wish.HOME, Wish.END),
+    RunStage.HOMING: (Wish.END,),
+}
+STAGE_QUESTIONS = {
+    RunStage.CHECK: "Checking cameras, arm, path and recording",
+    RunStage.FIND: "Looking for the wound and laying the path on it",
+    RunStage.CONFIRM: "Does the path lie where it should be printed?",
+    RunStage.READY: "Is nobody within the arm's reach? Then it may start",
+    RunStage.APPROACH: "The nozzle goes to where printing begins",
+    RunStage.PRINT: "Printing",
+    RunStage.PAUSED: "Paused: resume, go home, or end",
+    RunStage.STOPPED: "Stopped: resume, go home, or end",
+    RunStage.HOMING: "The arm goes home",
+    RunStage.DONE: "The path is printed",
+    RunStage.ENDED: "The run was ended; what is left can be resumed",
+    RunStage.FAILED: "The run cannot go on; what is left can be resumed",
+}
+
+
+def refusal(wish: Wish, turn: int, offers: Collection[Wish], present: int) -> str:
+    """Why a wish cannot be followed, "" if it can.
+
+    turn: of the view it was asked under; present: of the newest view, which `offers` wishes. A window that shows an
+    older turn may stop, pause or end, and nothing else: it cannot let a run go on that another window has stopped.
+    """
+    if wish is Wish.STOP:
+        return ""
+    if wish not in CALMING_WISHES and turn != present:
+        return "the run has changed since this was shown: look again, then ask again"
+    return "" if wish in offers else f"{wish} cannot be done at this stage"
+
+
+class CheckVerdict(StrEnum):
     """What a check found, or how something fares."""
 
     PASS = "pass"
@@ -58,7 +117,7 @@ class Check:
     """One line of the check table. found: in words; remedy: what to do, "" where nothing is to be done."""
 
     name: str
-    verdict: Verdict
+    verdict: CheckVerdict
     found: str = ""
     remedy: str = ""
 
@@ -134,14 +193,14 @@ class CameraView:
     """How one camera fares. rate: pictures per second that arrive. tracks: in use. words: what is wrong, or ""."""
 
     name: str
-    verdict: Verdict
+    verdict: CheckVerdict
     rate: float = nan
     tracks: int = 0
     words: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class RequestAnswer:
     """What became of a request. number: its own. words: why it was not followed, or what it led to."""
 
     number: int
@@ -163,7 +222,7 @@ class OperatorView:
 
     stamp: float
     turn: int
-    stage: Stage
+    stage: RunStage
     question: str = ""
     reason: str = ""
     offers: tuple[Wish, ...] = ()
@@ -173,7 +232,7 @@ class OperatorView:
     progress: ProgressView | None = None
     latency: LatencyView | None = None
     cameras: tuple[CameraView, ...] = ()
-    answer: Answer | None = None
+    answer: RequestAnswer | None = None
     notes: tuple[str, ...] = ()
     events: tuple[str, ...] = ()
 
@@ -182,3 +241,48 @@ def tracking_from_pose(pose: SurfacePose, now: float, tracks: int = 0) -> Tracki
     """The estimate as it is shown at `now`, s. tracks: in use."""
     sigma, place = position_sigma(pose.covariance), pose.covariance[3:, 3:]
     return TrackingView(pose.state, pose.reason, now - pose.stamp, sigma, pose.base_from_surface, place, tracks)
+
+
+class WavingStage(StrEnum):
+    """Where a calibration is."""
+
+    WAVE = "wave"  # the board is looked for
+    SOLVE = "solve"  # enough was seen: lenses and places are computed
+    PASSED = "passed"
+    FAILED = "failed"  # not good enough, or not to be calibrated from this
+    STOPPED = "stopped"  # the corners are kept
+
+
+@dataclass(frozen=True, slots=True)
+class WavingCamera:
+    """What one camera has seen of the board.
+
+    size: (W, H) px of its picture. corners: in the newest one. parts: of the picture, row by row, 0 to 1 of the
+    corners that each should have. tilts: 0 to 1 of the views that should be tilted so: left, right, top, bottom
+    nearer. depth: 0 to 1 of how much nearer than the far views the near ones should be.
+    """
+
+    name: str
+    size: tuple[int, int]
+    corners: int
+    parts: tuple[tuple[float, ...], ...]
+    tilts: tuple[float, ...]
+    depth: float
+
+
+@dataclass(frozen=True, slots=True)
+class WavingView:
+    """The calibration now. stamp: s. hints: what to do next, the most needed first. together: 0 to 1 of the frame sets
+    in which two cameras should have seen the board. looked: frame sets looked at. words: what came of it.
+    """
+
+    stamp: float
+    turn: int
+    stage: WavingStage
+    hints: tuple[str, ...] = ()
+    cameras: tuple[WavingCamera, ...] = ()
+    together: float = 0.0
+    looked: int = 0
+    words: tuple[str, ...] = ()
+    offers: tuple[Wish, ...] = ()
+    answer: RequestAnswer | None = None

@@ -1,34 +1,55 @@
-"""What a plan is asked for on the command line, read and checked: tissues, pattern, the tool's way."""
+"""The plan that the command line asks for, read and checked: settings, tissues, pattern, and the wound of a scan."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Literal, cast, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation.errors import InputError
-from planning.fill.pattern import Kind, Pattern
-from planning.layers.bumps import Passing
-from planning.layers.checkpoints import Way
-from planning.layers.plan import Order
-from planning.layers.slicing import Mode
-from planning.layers.tissue import Tissue
-from planning.layers.tool import ToolLimits
-from planning.path import COLDEST, FASTEST, HOTTEST
+from estimation.se3 import Array
+from hardware.files.mesh_file import in_mm, read_raw_mesh
+from hardware.files.path_file import read_contour
+from planning.fill import PatternKind
+from planning.fill.bead import Pattern
+from planning.layers.bumps import BumpPassing
+from planning.layers.checkpoints import CheckpointSettings, ToolLimits
+from planning.layers.plan import PlanOrder, flat_wound
+from planning.layers.repair import Repairs, repair_mesh
+from planning.layers.slicing import LayerMode, Tissue
+from planning.layers.wound import WoundVolume, find_wound
+from planning.path import MAX_SPEED, MAX_TEMPERATURE, MIN_TEMPERATURE
 
-Settled = Literal["shorter", "fastest"]
-WHERE = "command line"
-SKIN = (("hypodermis", None), ("dermis", 1.6), ("epidermis", 0.4))  # mm, bottom up; the epidermis, in truth 0.1 mm,
-# is one layer of the default bead
-TISSUE = "NAME=THICKNESS:MATERIAL[:TEMPERATURE[:SPEED[:LAYER_HEIGHT]]], mm (or rest), degrees C, mm/s, mm"
+Index = NDArray[np.int64]
+AngleChoice = Literal["shorter", "fastest"]
+COMMAND_LINE = "command line"
+# mm, bottom up; the epidermis, in truth 0.1 mm, is one layer of the default bead
+DEFAULT_TISSUES = (("hypodermis", None), ("dermis", 1.6), ("epidermis", 0.4))
+TISSUE_SYNTAX = "NAME=THICKNESS:MATERIAL[:TEMPERATURE[:SPEED[:LAYER_HEIGHT]]], mm (or rest), degrees C, mm/s, mm"
+GRID_PER_BEAD = 0.6  # of a bead between nodes of the wound's grid: finer changes no layer's area by a thousandth
+MIN_GRID_STEP, MAX_GRID_STEP = 0.1, 0.5  # mm
+EXAMPLE_STEP = 0.75  # mm between the vertices of an example scan, as of a handheld scanner
+EXAMPLE_SIZE, EXAMPLE_DEPTH, EXAMPLE_SEED = (42.0, 31.0), 3.5, 1  # mm
+DEFAULT_TEXTS = {
+    "tissues": "hypodermis=rest, dermis=1.6, epidermis=0.4", "layer_height": "as wide as a bead",
+    "bump": "half a layer", "bump_clearance": "half a bead",
+}  # fmt: skip
+SETTING_RANGES = (
+    ("bead", 0.01, 20), ("inset", 0, 100), ("rims", 0, 100),
+    ("layer_height", 0.02, 20), ("overlap_percent", 0, 90), ("speed", 0.1, MAX_SPEED), ("travel", 0.1, MAX_SPEED),
+    ("temperature", MIN_TEMPERATURE, MAX_TEMPERATURE), ("spacing", 0.05, 50), ("chord", 0.001, 1), ("lift", 0, 50),
+    ("wait", 0, 3600), ("sideways", 1, 100_000), ("tilt_deg", 0, 60), ("turning_deg_mm", 0.01, 90),
+    ("spin_deg", -360, 360), ("bump", 0, 20), ("bump_clearance", 0, 20),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
-class Wishes:
+class PlanSettings:
     """The command line's own words: lengths mm, speeds mm/s, angles degrees. angle: degrees, shorter or fastest."""
 
     material: str = "1,2,3"
@@ -63,7 +84,7 @@ class Wishes:
     def _text(self, name: str) -> str:
         value = getattr(self, name)
         if value is None or value == ():
-            return UNSAID[name]
+            return DEFAULT_TEXTS[name]
         if isinstance(value, bool):
             return "yes" if value else "no"
         return (
@@ -71,90 +92,105 @@ class Wishes:
         )
 
 
-def order_of(wishes: Wishes, flat: bool) -> Order:
+@dataclass(frozen=True, slots=True)
+class PlanRequest:
+    """What is to be planned and written."""
+
+    out: Path
+    scan: Path | None = None  # mesh or contour
+    example: str | None = None  # a built-in body instead of a scan
+    outline: Path | None = None  # of the wound on the scan
+    unit: str = "mm"  # of the scan's numbers
+    flip: bool = False  # the scan is inside out
+    gcode: Path | None = None
+    session: Path | None = None  # in whose pictures the scan is to be registered
+    pictures: bool = True
+    force: bool = False
+    arm: Path | None = None  # whose reach of each checkpoint is written
+    settings: PlanSettings = field(default_factory=PlanSettings)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlanSubject:
+    """The wound to be planned."""
+
+    name: str
+    wound: WoundVolume
+    repairs: Repairs | None  # of its scan; None for a contour
+    example: tuple[Array, Index] | None = None  # vertices and triangles of a built-in scan, written beside the path
+
+
+def order_of(settings: PlanSettings, flat: bool) -> PlanOrder:
     """What is to be planned. flat: one layer of one tissue."""
-    w = wishes
-    for name, low, high in RANGES:
+    w = settings
+    for name, low, high in SETTING_RANGES:
         value = getattr(w, name)
         if value is not None and not low <= value <= high:
-            raise InputError(WHERE, "--" + name.replace("_", "-"), value, f"{low:g} to {high:g}")
+            raise InputError(COMMAND_LINE, "--" + name.replace("_", "-"), value, f"{low:g} to {high:g}")
     pattern = Pattern(
-        kind=cast(Kind, w.pattern), width=w.bead, overlap=w.overlap_percent / 100, inset=w.inset, angle=_angle(w.angle),
-        rims=w.rims,
+        kind=cast(PatternKind, w.pattern), width=w.bead, overlap=w.overlap_percent / 100, inset=w.inset,
+        angle=_angle(w.angle), rims=w.rims,
     )  # fmt: skip
     tool = ToolLimits(*(math.radians(v) for v in (w.tilt_deg, w.turning_deg_mm, w.spin_deg)))
-    way = Way(w.spacing, w.chord, w.sideways, travel=w.travel, lift=w.lift, wait=w.wait, tool=tool)
-    mode: Mode = "skin" if flat else cast(Mode, w.layers)
-    return Order(_tissues(w, flat), pattern, mode, way, not w.parallel, Passing(w.bump, w.bump_clearance))
+    way = CheckpointSettings(w.spacing, w.chord, w.sideways, travel=w.travel, lift=w.lift, wait=w.wait, tool=tool)
+    mode: LayerMode = "skin" if flat else cast(LayerMode, w.layers)
+    return PlanOrder(_tissues(w, flat), pattern, mode, way, not w.parallel, BumpPassing(w.bump, w.bump_clearance))
 
 
-UNSAID = {
-    "tissues": "hypodermis=rest, dermis=1.6, epidermis=0.4", "layer_height": "as wide as a bead",
-    "bump": "half a layer", "bump_clearance": "half a bead",
-}  # fmt: skip
-RANGES = (
-    ("bead", 0.01, 20), ("inset", 0, 100), ("rims", 0, 100),
-    ("layer_height", 0.02, 20), ("overlap_percent", 0, 90), ("speed", 0.1, FASTEST), ("travel", 0.1, FASTEST),
-    ("temperature", COLDEST, HOTTEST), ("spacing", 0.05, 50), ("chord", 0.001, 1), ("lift", 0, 50), ("wait", 0, 3600),
-    ("sideways", 1, 100_000), ("tilt_deg", 0, 60), ("turning_deg_mm", 0.01, 90), ("spin_deg", -360, 360),
-    ("bump", 0, 20), ("bump_clearance", 0, 20),
-)  # fmt: skip
-
-
-def _angle(text: str) -> float | Settled:
-    if text in get_args(Settled):
-        return cast(Settled, text)
+def _angle(text: str) -> float | AngleChoice:
+    if text in get_args(AngleChoice):
+        return cast(AngleChoice, text)
     try:
         return float(np.deg2rad(float(text)))
     except ValueError:
-        raise InputError(WHERE, "--angle", text, "degrees, shorter or fastest") from None
+        raise InputError(COMMAND_LINE, "--angle", text, "degrees, shorter or fastest") from None
 
 
-def _tissues(wishes: Wishes, flat: bool) -> tuple[Tissue, ...]:
-    height = wishes.layer_height if wishes.layer_height is not None else wishes.bead
-    if wishes.tissues:
-        found = tuple(_tissue(text, wishes, height) for text in wishes.tissues)
+def _tissues(settings: PlanSettings, flat: bool) -> tuple[Tissue, ...]:
+    height = settings.layer_height if settings.layer_height is not None else settings.bead
+    if settings.tissues:
+        result = tuple(_tissue(text, settings, height) for text in settings.tissues)
     else:
-        names = _materials(wishes.material)
-        found = tuple(
-            Tissue(name, thickness, names[min(i, len(names) - 1)], wishes.temperature, wishes.speed, height)
-            for i, (name, thickness) in enumerate(SKIN)
+        names = _materials(settings.material)
+        result = tuple(
+            Tissue(name, thickness, names[min(i, len(names) - 1)], settings.temperature, settings.speed, height)
+            for i, (name, thickness) in enumerate(DEFAULT_TISSUES)
         )
-    if len({t.name for t in found}) < len(found):
-        raise InputError(WHERE, "--tissue", ", ".join(t.name for t in found), "each name once")
-    if sum(t.thickness is None for t in found) > 1:
-        raise InputError(WHERE, "--tissue", ", ".join(wishes.tissues), "at most one that takes the rest")
-    if flat and len(wishes.tissues) > 1:
-        raise InputError(WHERE, "--tissue", ", ".join(wishes.tissues), "one: a contour is one layer")
+    if len({t.name for t in result}) < len(result):
+        raise InputError(COMMAND_LINE, "--tissue", ", ".join(t.name for t in result), "each name once")
+    if sum(t.thickness is None for t in result) > 1:
+        raise InputError(COMMAND_LINE, "--tissue", ", ".join(settings.tissues), "at most one that takes the rest")
+    if flat and len(settings.tissues) > 1:
+        raise InputError(COMMAND_LINE, "--tissue", ", ".join(settings.tissues), "one: a contour is one layer")
     if flat:
-        first = found[0]
-        name = first.name if wishes.tissues else "layer"
+        first = result[0]
+        name = first.name if settings.tissues else "layer"
         return (Tissue(name, None, first.material, first.temperature, first.speed, first.height),)
-    return found
+    return result
 
 
 def _materials(text: str) -> Sequence[str]:
     names = [name.strip() for name in text.split(",")]
-    if not all(_fine(name) for name in names) or len(names) not in (1, len(SKIN)):
+    if not all(_is_material_name(name) for name in names) or len(names) not in (1, len(DEFAULT_TISSUES)):
         raise InputError(
-            WHERE, "--material", text, "one name, or three with commas between: hypodermis, dermis, epidermis"
+            COMMAND_LINE, "--material", text, "one name, or three with commas between: hypodermis, dermis, epidermis"
         )
     return names
 
 
-def _fine(name: str) -> bool:
+def _is_material_name(name: str) -> bool:
     return bool(name) and name.isprintable() and not any(c in name for c in ',"\n')
 
 
-def _tissue(text: str, wishes: Wishes, height: float) -> Tissue:
+def _tissue(text: str, settings: PlanSettings, height: float) -> Tissue:
     name, _, rest = text.partition("=")
     words = [word.strip() for word in rest.split(":")]
-    if not _fine(name.strip()) or not 2 <= len(words) <= 5 or not _fine(words[1]):
-        raise InputError(WHERE, "--tissue", text, TISSUE)
+    if not _is_material_name(name.strip()) or not 2 <= len(words) <= 5 or not _is_material_name(words[1]):
+        raise InputError(COMMAND_LINE, "--tissue", text, TISSUE_SYNTAX)
     thickness = None if words[0] == "rest" else _number(text, words[0], 0.02, 100)
-    limits = ((COLDEST, HOTTEST), (0.1, FASTEST), (0.02, 20.0))
+    limits = ((MIN_TEMPERATURE, MAX_TEMPERATURE), (0.1, MAX_SPEED), (0.02, 20.0))
     numbers = [_number(text, word, *limit) for word, limit in zip(words[2:], limits, strict=False)]
-    values = numbers + [wishes.temperature, wishes.speed, height][len(numbers) :]
+    values = numbers + [settings.temperature, settings.speed, height][len(numbers) :]
     return Tissue(name.strip(), thickness, words[1], *values)
 
 
@@ -164,17 +200,64 @@ def _number(text: str, word: str, low: float, high: float) -> float:
     except ValueError:
         value = math.nan
     if not low <= value <= high:
-        raise InputError(WHERE, f"--tissue {text}: {word}", word, f"{low:g} to {high:g}; {TISSUE}")
+        raise InputError(COMMAND_LINE, f"--tissue {text}: {word}", word, f"{low:g} to {high:g}; {TISSUE_SYNTAX}")
     return value
 
 
 def check_out(out: Path, gcode: Path | None, force: bool) -> None:
     """Make the folder of the file that is written; InputError where it stands there already and `force` is not set."""
     if out.suffix.lower() != ".csv":
-        raise InputError(WHERE, "--out", out, "a file that ends in .csv")
+        raise InputError(COMMAND_LINE, "--out", out, "a file that ends in .csv")
     for file in (out, *([gcode] if gcode else [])):
         if file.is_dir() or (file.exists() and not force):
             raise InputError(
                 file, "--out", "a folder" if file.is_dir() else "a file that exists", "a new one, or --force"
             )
         file.parent.mkdir(parents=True, exist_ok=True)
+
+
+def subject_of(request: PlanRequest, flat: bool) -> PlanSubject:
+    """The wound that is to be planned, read and found. flat: the scan is a contour."""
+    step = float(np.clip(GRID_PER_BEAD * request.settings.bead, MIN_GRID_STEP, MAX_GRID_STEP))
+    if request.example is not None and request.scan is not None:
+        raise InputError("command line", "SCAN", request.scan, "none beside --example")
+    if request.example is not None:
+        vertices, triangles = example_scan(request.example)
+        result = planned_scan(vertices, triangles, step, f"{request.example} (example)")
+        return replace(result, example=(vertices, triangles))
+    if request.scan is None:
+        raise InputError("command line", "SCAN", "none", "a mesh, a contour, or --example forearm, chest or foot")
+    if flat:
+        height = request.settings.layer_height or request.settings.bead
+        contour = read_contour(request.scan)
+        if contour.shape[1] != 2:
+            raise InputError(request.scan, "header", "x_mm,y_mm,z_mm", "x_mm,y_mm: a flat contour")
+        return PlanSubject(request.scan.name, flat_wound(contour, height, request.scan), None)
+    raw = read_raw_mesh(request.scan)
+    vertices = in_mm(raw.vertices, raw.triangles, request.unit, request.scan)
+    scan, repairs = repair_mesh(vertices, raw.triangles, request.scan, request.flip)
+    outline = None if request.outline is None else _outline(request.outline, scan.vertices)
+    return PlanSubject(request.scan.name, find_wound(scan, step, request.scan, outline, request.flip), repairs)
+
+
+def planned_scan(vertices: Array, triangles: Index, step: float, where: object, flip: bool = False) -> PlanSubject:
+    """The wound in a mesh, vertices (V, 3) mm, triangles (T, 3), that may be damaged."""
+    scan, repairs = repair_mesh(vertices, triangles, where, flip)
+    return PlanSubject(str(where), find_wound(scan, step, where, flipped=flip), repairs)
+
+
+def _outline(file: Path, vertices: Array) -> Array:
+    """An outline (N, 3), mm; without z it is laid on the scan as seen along the scan's z."""
+    points = read_contour(file)
+    if points.shape[1] == 3:
+        return points
+    near = [int(np.argmin(np.sum((vertices[:, :2] - point) ** 2, axis=1))) for point in points]
+    return np.column_stack([points, vertices[near, 2]])
+
+
+def example_scan(kind: str) -> tuple[Array, Index]:
+    """A scan of a built-in body with a wound: vertices (V, 3) mm and triangles (T, 3)."""
+    from hardware.simulator.scene.shape import Wound as Carved
+    from hardware.simulator.scene.shape import body
+
+    return body(kind, Carved(EXAMPLE_SIZE, EXAMPLE_DEPTH), EXAMPLE_SEED).mesh(EXAMPLE_STEP)

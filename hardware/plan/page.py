@@ -1,30 +1,48 @@
-"""The report of a plan: one page without a network, with a view to turn, the figures, and each layer's picture."""
+"""The report of a plan: one page that needs no network, with a 3D view, the figures, and an SVG of each layer."""
 
 from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from estimation.se3 import Array
-from hardware.page import document, figures_table, row_of_tiles, section, tile
-from hardware.plan.layer_picture import len_text
-from hardware.process.progress import counted, duration
-from planning.layers.figures import LayerFigures, Total, seconds_to
-from planning.layers.grid import at
-from planning.layers.plan import Plan
-from planning.layers.tool import rotations
+from hardware.process.progress import count_text, duration_text
+from hardware.report.page import document, figures_table, round_step, row_of_tiles, section, tile
+from planning.fill.bead import Bead
+from planning.layers.checkpoints import tool_rotations
+from planning.layers.grid import interpolate
+from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, seconds_to
 
-PAINTS = ((0.16, 0.52, 0.72), (0.87, 0.56, 0.2), (0.33, 0.66, 0.45), (0.55, 0.42, 0.75), (0.8, 0.36, 0.26))  # tissues
-SHEET = 120  # nodes along the longer side of the surfaces in the view
-STYLE = """
+PICTURE_WIDTH, PICTURE_MARGIN, HEAD_HEIGHT, FOOT_HEIGHT = 940.0, 24.0, 34.0, 34.0  # px
+MAX_DRAWING_HEIGHT = 900.0  # px of the drawing
+WIDTH_STEP = 0.02  # mm: widths nearer than this are drawn alike
+PICTURE_STYLE = """
+text { font: 13px "Inter", "Segoe UI", "DejaVu Sans", system-ui, sans-serif; fill: #1c2430; }
+.soft { fill: #5d6875; } .page { fill: #fbfaf7; }
+.region { fill: #f1e4dc; stroke: #b98d78; stroke-width: 1; vector-effect: non-scaling-stroke; }
+.bead { fill: none; stroke: #2a6f97; opacity: .55; stroke-linecap: round; stroke-linejoin: round; }
+.core { fill: none; stroke: #174a68; stroke-width: .7; vector-effect: non-scaling-stroke; stroke-linejoin: round; }
+.travel { fill: none; stroke: #e06c00; stroke-width: 1.8; vector-effect: non-scaling-stroke; stroke-dasharray: 4 3; }
+.around { fill: #8a5a3c; stroke: #5b3822; stroke-width: 1; vector-effect: non-scaling-stroke; }
+.over { fill: none; stroke: #5b3822; stroke-width: 1.8; vector-effect: non-scaling-stroke; stroke-dasharray: 2 2; }
+.gap { fill: #d3232f; } .start { fill: #2f9e5b; stroke: #fff; stroke-width: 1.5; }
+.end { fill: #1c2430; stroke: #fff; stroke-width: 1.5; } .bar { stroke: #1c2430; stroke-width: 2; fill: none; }
+"""
+
+# tissues
+TISSUE_COLOURS = ((0.16, 0.52, 0.72), (0.87, 0.56, 0.2), (0.33, 0.66, 0.45), (0.55, 0.42, 0.75), (0.8, 0.36, 0.26))
+SURFACE_NODES = 120  # nodes along the longer side of the surfaces in the view
+PAGE_STYLE = """
 #plan-canvas { width: 100%; height: 560px; display: block; touch-action: none; cursor: grab; border-radius: 8px;
   background: linear-gradient(#eef2f5, #d9e0e6); }
 @media (prefers-color-scheme: dark) { #plan-canvas { background: linear-gradient(#2a323b, #171c22); } }
@@ -38,7 +56,7 @@ STYLE = """
 .sideways { overflow-x: auto; }
 .sideways td { white-space: nowrap; padding: 5px 7px; } .sideways th { padding: 4px 7px; }
 """
-CONTROLS = """<canvas id="plan-canvas" role="img" aria-label="the beads in three dimensions"></canvas>
+VIEW_CONTROLS = """<canvas id="plan-canvas" role="img" aria-label="the beads in three dimensions"></canvas>
 <div class="plan-bar"><input id="plan-at" type="range" min="0" value="0" aria-label="printed up to">
 <button id="plan-step" type="button">next layer</button><button id="plan-top" type="button">from above</button></div>
 <div class="plan-bar"><label><input id="plan-alone" type="checkbox"> this layer alone</label>
@@ -46,7 +64,7 @@ CONTROLS = """<canvas id="plan-canvas" role="img" aria-label="the beads in three
 <label><input id="plan-bed" type="checkbox" checked> wound bed</label>
 <label><input id="plan-skin" type="checkbox"> restored skin</label>
 <label><input id="plan-tool" type="checkbox" checked> tool</label></div><div id="plan-words"></div>"""
-CHOOSER = """<div class="plan-bar"><input id="layer-at" type="range" min="1" max="{count}" value="{count}"
+LAYER_CHOOSER = """<div class="plan-bar"><input id="layer-at" type="range" min="1" max="{count}" value="{count}"
  aria-label="layer"><span id="layer-words"></span></div>{pictures}
 <script>(function () {{
   const pictures = document.querySelectorAll(".layer-picture"), at = document.getElementById("layer-at");
@@ -57,10 +75,112 @@ CHOOSER = """<div class="plan-bar"><input id="layer-at" type="range" min="1" max
   }}
   at.addEventListener("input", show); show();
 }})();</script>"""
+LAYER_TEXT = (
+    "Covered and twice are shares of the layer's area, each bead taken as wide as it is meant to be; open is what no "
+    "bead reaches, and over half a bead and over a bead the parts of that into which a disc so wide would fit."
+)
+
+
+def layer_svg(layer: PlannedLayer, figures: LayerFigures, bounds: tuple[float, float, float, float]) -> str:
+    """The picture of a layer. bounds: of what all pictures of a plan show, mm in the chart, low x, low y, high x, y."""
+    low_x, low_y, high_x, high_y = bounds
+    scale = min(
+        (PICTURE_WIDTH - 2 * PICTURE_MARGIN) / max(high_x - low_x, 1e-3), MAX_DRAWING_HEIGHT / max(high_y - low_y, 1e-3)
+    )
+    height = HEAD_HEIGHT + (high_y - low_y) * scale + FOOT_HEIGHT + PICTURE_MARGIN
+    left = (PICTURE_WIDTH - (high_x - low_x) * scale) / 2
+    turn = f"matrix({scale:.5f} 0 0 {-scale:.5f} {left - low_x * scale:.3f} {HEAD_HEIGHT + high_y * scale:.3f})"
+    drawn = [
+        f'<path class="region" fill-rule="evenodd" d="{_areas(layer.region)}"/>',
+        *_beads(layer.beads),
+        f'<path class="gap" fill-rule="evenodd" d="{_areas(figures.coverage.gaps)}"/>',
+        *_bumps(layer),
+        f'<path class="travel" d="{_travels(layer.beads)}"/>',
+    ]
+    ends = np.array([layer.beads[0].points[0], layer.beads[-1].points[-1]])
+    ends = ends * [scale, -scale] + [left - low_x * scale, HEAD_HEIGHT + high_y * scale]
+    title = f"Layer {figures.number + 1}: {figures.tissue}, material {figures.material}"
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {PICTURE_WIDTH:g} {height:.0f}" role="img" '
+        f'aria-label="{escape(title)}"><style>{PICTURE_STYLE}</style><rect class="page" width="100%" height="100%"/>'
+        f'<g transform="{turn}">{"".join(drawn)}</g>'
+        f'<rect class="end" x="{ends[1, 0] - 5:.1f}" y="{ends[1, 1] - 5:.1f}" width="10" height="10"/>'
+        f'<circle class="start" cx="{ends[0, 0]:.1f}" cy="{ends[0, 1]:.1f}" r="6.5"/>'
+        f"{_captions(title, layer, figures, scale, height)}</svg>"
+    )
+
+
+def bounds_of(layers: Iterable[PlannedLayer]) -> tuple[float, float, float, float]:
+    """Low and high corner, mm, of all layers' regions."""
+    boxes = np.array([layer.region.bounds for layer in layers if not layer.region.is_empty])
+    low_x, low_y = boxes[:, :2].min(axis=0)
+    high_x, high_y = boxes[:, 2:].max(axis=0)
+    return float(low_x), float(low_y), float(high_x), float(high_y)
+
+
+def _captions(title: str, layer: PlannedLayer, figures: LayerFigures, scale: float, height: float) -> str:
+    facts = (
+        f"{figures.coverage.covered:.2%} covered, {figures.coverage.double:.2%} twice, {figures.gap:.2f} mm² open · "
+        f"{len_text(figures.printed)} of bead in {figures.beads} runs, {len_text(figures.travelled)} of travel"
+    )
+    bar = round_step(60 / scale)
+    at = height - 16
+    keys = f"{bar:g} mm · beads at their true width · red: open · dashed: travel · green: start · black: end"
+    keys += "" if layer.around.is_empty else " · brown: bump, gone round"
+    keys += "" if layer.over.is_empty else " · dotted: bump, gone over"
+    return (
+        f'<text x="{PICTURE_MARGIN}" y="21" font-weight="600">{escape(title)}</text>'
+        f'<text class="soft" x="{PICTURE_WIDTH - PICTURE_MARGIN}" y="21" text-anchor="end">{escape(facts)}</text>'
+        f'<path class="bar" d="M{PICTURE_MARGIN} {at - 4:.1f}v4h{bar * scale:.1f}v-4"/>'
+        f'<text class="soft" x="{PICTURE_MARGIN + bar * scale + 10:.1f}" y="{at:.1f}">{escape(keys)}</text>'
+    )
+
+
+def len_text(millimetres: float) -> str:
+    """A length as people say it: 31.4 mm, 2.71 m."""
+    return f"{millimetres:.1f} mm" if millimetres < 1000 else f"{millimetres / 1000:.2f} m"
+
+
+def _areas(shape: shapely.Geometry) -> str:
+    rings = shapely.get_rings(shapely.get_parts(shape))
+    return "".join(_line(shapely.get_coordinates(ring)) + "Z" for ring in rings)
+
+
+def _line(points: Array) -> str:
+    return "M" + "L".join(f"{x:.3f} {y:.3f}" for x, y in points.tolist())
+
+
+def _bumps(layer: PlannedLayer) -> list[str]:
+    """Bumps that are gone round, as areas, and those that are gone over, as outlines on the beads."""
+    shapes = {"around": layer.around, "over": layer.over}
+    return [
+        f'<path class="{name}" fill-rule="evenodd" d="{_areas(shape)}"/>'
+        for name, shape in shapes.items()
+        if not shape.is_empty
+    ]
+
+
+def _travels(beads: tuple[Bead, ...]) -> str:
+    return "".join(_line(np.stack([a.points[-1], b.points[0]])) for a, b in pairwise(beads))
+
+
+def _beads(beads: tuple[Bead, ...]) -> list[str]:
+    """Each bead as strokes of nearly even width, and its middle line."""
+    runs, middles = [], []
+    for bead in beads:
+        middles.append(_line(bead.points))
+        wide = np.rint((bead.width[:-1] + bead.width[1:]) / 2 / WIDTH_STEP).astype(int)
+        cuts = np.r_[0, np.flatnonzero(np.diff(wide)) + 1, len(wide)]
+        strokes = [
+            f'<path stroke-width="{bead.width[a : b + 1].mean():.3f}" d="{_line(bead.points[a : b + 1])}"/>'
+            for a, b in pairwise(cuts.tolist())
+        ]
+        runs.append(f'<g class="bead">{"".join(strokes)}</g>')  # as one, so that only other beads show through it
+    return [*runs, f'<path class="core" d="{"".join(middles)}"/>']
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Story:
+class ReportText:
     """What the report tells beside the plan's figures.
 
     title: what was planned. findings: of the wound, as (what, value). repairs: of the scan, as (what, count). order:
@@ -74,9 +194,11 @@ class Story:
     notes: Sequence[str]
 
 
-def page_text(plan: Plan, layers: Sequence[LayerFigures], total: Total, story: Story, pictures: Sequence[str]) -> str:
+def page_text(
+    plan: Plan, layers: Sequence[LayerFigures], total: PlanTotal, story: ReportText, pictures: Sequence[str]
+) -> str:
     """The whole page."""
-    body = [f"<style>{STYLE}</style>", row_of_tiles(_tiles(layers, total))]
+    body = [f"<style>{PAGE_STYLE}</style>", row_of_tiles(_tiles(layers, total))]
     if story.notes:
         notes = "".join(f'<div class="plan-note">{escape(note)}</div>' for note in story.notes)
         body.append(f"<section><h2>Look at this before printing</h2>{notes}</section>")
@@ -84,16 +206,16 @@ def page_text(plan: Plan, layers: Sequence[LayerFigures], total: Total, story: S
         section(
             "The beads",
             "Drag to turn, shift and drag to move, wheel to come nearer. The slider prints as far as it is moved.",
-            f'{CONTROLS}<script type="application/json" id="plan-data">{_data(plan)}</script><script>'
+            f'{VIEW_CONTROLS}<script type="application/json" id="plan-data">{_data(plan)}</script><script>'
             f"{(files('hardware.plan') / 'view.js').read_text(encoding='utf-8')}</script>",
         )
     )
-    body.append(section("Layers", LAYER_WORDS, f'<div class="sideways">{_layer_table(layers, total)}</div>'))
-    shown = "".join(f'<div class="layer-picture">{picture}</div>' for picture in pictures)
+    body.append(section("Layers", LAYER_TEXT, f'<div class="sideways">{_layer_table(layers, total)}</div>'))
+    shown_pictures = "".join(f'<div class="layer-picture">{picture}</div>' for picture in pictures)
     if pictures:
         unrolled = "" if plan.order.mode == "horizontal" else " They are unrolled to the lengths on the skin."
         words = f"Seen from outside, the scan's x to the right.{unrolled}"
-        body.append(section("Each layer", words, CHOOSER.format(count=len(pictures), pictures=shown)))
+        body.append(section("Each layer", words, LAYER_CHOOSER.format(count=len(pictures), pictures=shown_pictures)))
     body.append(section("The wound", "As found in the scan.", figures_table(("", "value"), story.findings)))
     if story.repairs:
         rows = [(what, str(count)) for what, count in story.repairs]
@@ -103,21 +225,16 @@ def page_text(plan: Plan, layers: Sequence[LayerFigures], total: Total, story: S
     return document("plan", story.title, lead, body, "mm, s, degrees; 1 mm³ is 1 µl")
 
 
-LAYER_WORDS = (
-    "Covered and twice are shares of the layer's area, each bead taken as wide as it is meant to be; open is what no "
-    "bead reaches, and over half a bead and over a bead the parts of that into which a disc so wide would fit."
-)
-
-
-def _lead(layers: Sequence[LayerFigures], total: Total) -> str:
+def _lead(layers: Sequence[LayerFigures], total: PlanTotal) -> str:
     inks = ", ".join(f"{volume / 1000:.2f} ml of {material_text(name)}" for name, volume in total.volume)
     return (
-        f"{counted(len(layers), 'layer')}, {len_text(total.printed)} of bead, {duration(total.seconds)} to print: "
-        f"{inks}. {total.covered:.2%} of the layers' area is covered, {total.double:.2%} twice."
+        f"{count_text(len(layers), 'layer')}, {len_text(total.printed)} of bead, "
+        f"{duration_text(total.seconds)} to print: {inks}. "
+        f"{total.covered:.2%} of the layers' area is covered, {total.double:.2%} twice."
     )
 
 
-def _tiles(layers: Sequence[LayerFigures], total: Total) -> list[str]:
+def _tiles(layers: Sequence[LayerFigures], total: PlanTotal) -> list[str]:
     return [
         tile(f"{100 * total.covered:.2f}", "%", "covered"),
         tile(f"{100 * total.double:.2f}", "%", "laid twice"),
@@ -143,7 +260,7 @@ def material_text(name: str) -> str:
     return f"material {name}" if name.isdecimal() else name
 
 
-def _layer_table(layers: Sequence[LayerFigures], total: Total) -> str:
+def _layer_table(layers: Sequence[LayerFigures], total: PlanTotal) -> str:
     head = (
         "layer", "tissue", "material", "area mm²", "covered", "twice", "beside", "open mm²", "over half a bead",
         "over a bead", "runs", "bead", "travel", "time", "ink µl",
@@ -171,7 +288,7 @@ def _data(plan: Plan) -> str:
     """The checkpoints and surfaces for the view, as JSON."""
     points = plan.points
     names = list(dict.fromkeys(layer.slab.tissue.name for layer in plan.stack.layers))
-    up = rotations(points.tilt, 0.0)[:, :, 2]
+    up = tool_rotations(points.tilt, 0.0)[:, :, 2]
     data: dict[str, Any] = {
         "tip": _base64(points.tip, "<f4"),
         "normal": _base64(np.rint(127 * up), "i1"),
@@ -181,8 +298,8 @@ def _data(plan: Plan) -> str:
         "seconds": _base64(seconds_to(points), "<f4"),
         "layers": len(plan.stack.layers),
         "names": [layer.slab.tissue.name for layer in plan.stack.layers],
-        "paints": PAINTS,
-        "paint_of": [names.index(layer.slab.tissue.name) % len(PAINTS) for layer in plan.stack.layers],
+        "paints": TISSUE_COLOURS,
+        "paint_of": [names.index(layer.slab.tissue.name) % len(TISSUE_COLOURS) for layer in plan.stack.layers],
         "low": points.tip.min(axis=0).tolist(),
         "high": points.tip.max(axis=0).tolist(),
         "bed": _sheet(plan, plan.wound.bed),
@@ -200,10 +317,10 @@ def _sheet(plan: Plan, heights: Array) -> dict[str, Any]:
     grid = plan.wound.grid
     low, high = np.array(plan.wound.outline.bounds).reshape(2, 2) + [[-12.0], [12.0]]
     low, high = np.maximum(low, grid.origin), np.minimum(high, [grid.x[-1], grid.y[-1]])
-    step = float((high - low).max()) / SHEET
+    step = float((high - low).max()) / SURFACE_NODES
     columns, rows = (int(n) for n in (high - low) / step + 1)
     x, y = np.meshgrid(low[0] + step * np.arange(columns), low[1] + step * np.arange(rows))
-    values = at(grid, heights, np.column_stack([x.ravel(), y.ravel()]))
+    values = interpolate(grid, heights, np.column_stack([x.ravel(), y.ravel()]))
     return {
         "x": float(low[0]), "y": float(low[1]), "step": step, "columns": columns, "rows": rows,
         "heights": _base64(values, "<f4"),

@@ -1,4 +1,8 @@
-"""`stillbed plan`: a scan or a contour in; path, G-code, pictures, report and figures out."""
+"""`stillbed plan`: a scan or a contour in; path, G-code, pictures, report and figures out.
+
+With a session, the scan is also registered in its first pictures, point to plane as in tracking. The result is checked
+in the thesis's own way (5.2): the centroid of the segmented wound beside that of the planned outline, in each camera.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,9 @@ import csv
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,145 +20,69 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.contour_file import read_contour
-from hardware.files.mesh_file import read_raw_mesh
-from hardware.files.path_file import write_path
-from hardware.gcode_file import gcode_text
+from hardware.files.path_file import gcode_text, write_path
+from hardware.files.ply_file import write_ply
 from hardware.offline.reach import with_feasible
-from hardware.plan.findings import NOT_ASKED, bump_facts, bumps_text, bumpy, findings_rows, notes_of
-from hardware.plan.layer_picture import bounds_of, layer_svg, len_text
-from hardware.plan.order import Wishes, check_out, order_of
-from hardware.plan.page import Story, material_text, page_text
-from hardware.ply_file import write_ply
+from hardware.plan.order import PlanRequest, PlanSubject, check_out, order_of, subject_of
+from hardware.plan.page import ReportText, bounds_of, layer_svg, len_text, material_text, page_text
 from hardware.process.clock import WallClock
-from hardware.process.progress import Progress, counted, duration
-from hardware.scan_units import in_mm
-from planning.layers.figures import LayerFigures, Total, figures_of, total_of
-from planning.layers.flat_wound import flat_wound
-from planning.layers.plan import Plan, make_plan
-from planning.layers.repair import Repairs, repaired
-from planning.layers.wound import Wound, wound_in
+from hardware.process.progress import Progress, count_text, duration_text
+from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, figures_of, make_plan, total_of
+from planning.layers.wound import WoundVolume
 from planning.path import check_path
 
+if TYPE_CHECKING:
+    from estimation.pose import SurfacePose
+    from estimation.rig import Camera
+    from perception.frames import FrameSet
+
 Index = NDArray[np.int64]
-GRID = 0.6  # of a bead between nodes of the wound's grid: finer changes no layer's area by a thousandth
-FINEST, COARSEST = 0.1, 0.5  # mm
-EXAMPLE_STEP = 0.75  # mm between the vertices of an example scan, as of a handheld scanner
-EXAMPLE_SIZE, EXAMPLE_DEPTH, EXAMPLE_SEED = (42.0, 31.0), 3.5, 1  # mm
+# off the normal: a bead is then pushed aside by a fifth of its width, as the tip is no point
+MAX_TILT_OFF_NORMAL_DEG = 35.0
+NO_ARM_GIVEN = "no arm was asked, so there is no column feasible; --arm ARM.toml asks one, stillbed reach one later"
+MAX_FRAME_SETS = 12  # frame sets that are tried: the first map, its confirmation, the averaging, and some that fail
+MAX_MIDDLE_DISTANCE = 3.0  # mm between the two middles: a wound seen aslant by a network is drawn to about a millimetre
 LAYER_COLUMNS = (
     "layer", "tissue", "material", "area_mm2", "covered", "double", "over", "gap_mm2", "gap_over_half_a_bead_mm2",
     "gap_over_a_bead_mm2", "runs", "checkpoints", "printed_mm", "travelled_mm", "time_s", "volume_mm3",
 )  # fmt: skip
-REPAIRED_STEP = 0.5  # mm between the vertices of the repaired scan that is written
+REPAIRED_SCAN_STEP = 0.5  # mm between the vertices of the repaired scan that is written
 
 
-@dataclass(frozen=True, slots=True)
-class Request:
-    """What is to be planned and written. scan: mesh or contour; example: a built-in body instead.
-
-    outline: of the wound on the scan. unit: of the scan's numbers. flip: it was scanned inside out. session: in whose
-    pictures the scan is to be found. arm: whose joints are asked about each checkpoint.
-    """
-
-    out: Path
-    scan: Path | None = None
-    example: str | None = None
-    outline: Path | None = None
-    unit: str = "mm"
-    flip: bool = False
-    gcode: Path | None = None
-    session: Path | None = None
-    pictures: bool = True
-    force: bool = False
-    arm: Path | None = None
-    wishes: Wishes = field(default_factory=Wishes)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Subject:
-    """The wound to be planned, and what was done to its scan; None where there is none.
-
-    example: a built-in scan, as vertices and triangles, to be written beside the path.
-    """
-
-    name: str
-    wound: Wound
-    repairs: Repairs | None
-    example: tuple[Array, Index] | None = None
-
-
-def run_plan(request: Request) -> str:
+def run_plan(request: PlanRequest) -> str:
     """Plan and write; what it came to, in words. The path is whole before anything beside it is begun."""
+    from hardware.recording.session_reader import open_session
+
     flat = request.scan is not None and request.scan.suffix.lower() == ".csv"
-    order = order_of(request.wishes, flat)
+    order = order_of(request.settings, flat)
     if request.session is not None:
-        _check_session(request.session, flat)
+        if flat:
+            allowed = "nothing with a contour: it has no shape to be found by"
+            raise InputError("command line", "--session", request.session, allowed)
+        open_session(request.session)  # what is wrong with it is reported before anything is written
     check_out(request.out, request.gcode, request.force)
-    subject = _subject(request, flat)
+    subject = subject_of(request, flat)
     with _progress("plan", "layers") as progress:
         plan = make_plan(subject.wound, order, subject.name, progress)
-    path, arm = (plan.path, NOT_ASKED) if request.arm is None else with_feasible(plan.path, request.arm)
+    path, arm = (plan.path, NO_ARM_GIVEN) if request.arm is None else with_feasible(plan.path, request.arm)
     check_path(path)
-    _whole(request.out, lambda file: write_path(file, path))
+    _write_atomically(request.out, lambda file: write_path(file, path))
     if request.gcode is not None:
-        _whole(request.gcode, lambda file: file.write_text(gcode_text(plan.path), encoding="utf-8"))
+        _write_atomically(request.gcode, lambda file: file.write_text(gcode_text(plan.path), encoding="utf-8"))
     with _progress("measure", "layers") as progress:
         layers = figures_of(plan, progress)
     total = total_of(layers)
     written = [request.out.name, *_tables(request, plan, subject, layers, total, arm)]
     if request.pictures:
         written += _pictures(request, plan, subject, layers, total, arm)
-    placed = [] if request.session is None else _placed(request.session, request.out, plan)
-    return "\n".join([_told(plan, subject, total, request.out, written), arm, *placed])
+    placed = []
+    if request.session is not None:
+        scan = request.out.with_name(f"{request.out.stem}_scan.ply")
+        placed = scan_placement(request.session, scan, plan.wound.rim).lines()
+    return "\n".join([_summary_text(plan, subject, total, request.out, written), arm, *placed])
 
 
-def planned_scan(vertices: Array, triangles: Index, step: float, where: object, flip: bool = False) -> Subject:
-    """The wound in a mesh, vertices (V, 3) mm, triangles (T, 3), that may be damaged."""
-    scan, repairs = repaired(vertices, triangles, where, flip)
-    return Subject(str(where), wound_in(scan, step, where, flipped=flip), repairs)
-
-
-def _subject(request: Request, flat: bool) -> Subject:
-    step = float(np.clip(GRID * request.wishes.bead, FINEST, COARSEST))
-    if request.example is not None and request.scan is not None:
-        raise InputError("command line", "SCAN", request.scan, "none beside --example")
-    if request.example is not None:
-        vertices, triangles = example_scan(request.example)
-        found = planned_scan(vertices, triangles, step, f"{request.example} (example)")
-        return replace(found, example=(vertices, triangles))
-    if request.scan is None:
-        raise InputError("command line", "SCAN", "none", "a mesh, a contour, or --example forearm, chest or foot")
-    if flat:
-        height = request.wishes.layer_height or request.wishes.bead
-        contour = read_contour(request.scan)
-        if contour.shape[1] != 2:
-            raise InputError(request.scan, "header", "x_mm,y_mm,z_mm", "x_mm,y_mm: a flat contour")
-        return Subject(request.scan.name, flat_wound(contour, height, request.scan), None)
-    raw = read_raw_mesh(request.scan)
-    vertices = in_mm(raw.vertices, raw.triangles, request.unit, request.scan)
-    scan, repairs = repaired(vertices, raw.triangles, request.scan, request.flip)
-    outline = None if request.outline is None else _outline(request.outline, scan.vertices)
-    return Subject(request.scan.name, wound_in(scan, step, request.scan, outline, request.flip), repairs)
-
-
-def _outline(file: Path, vertices: Array) -> Array:
-    """An outline (N, 3), mm; without z it is laid on the scan as seen along the scan's z."""
-    points = read_contour(file)
-    if points.shape[1] == 3:
-        return points
-    near = [int(np.argmin(np.sum((vertices[:, :2] - point) ** 2, axis=1))) for point in points]
-    return np.column_stack([points, vertices[near, 2]])
-
-
-def example_scan(kind: str) -> tuple[Array, Index]:
-    """A scan of a built-in body with a wound: vertices (V, 3) mm and triangles (T, 3)."""
-    from hardware.simulator.bodies import Wound as Carved
-    from hardware.simulator.bodies import body
-
-    return body(kind, Carved(EXAMPLE_SIZE, EXAMPLE_DEPTH), EXAMPLE_SEED).mesh(EXAMPLE_STEP)
-
-
-def _whole(file: Path, write: Callable[[Path], object]) -> None:
+def _write_atomically(file: Path, write: Callable[[Path], object]) -> None:
     """Write a file under another name first: whoever sees it sees all of it."""
     part = file.with_name(file.name + ".part")
     try:
@@ -164,28 +93,28 @@ def _whole(file: Path, write: Callable[[Path], object]) -> None:
 
 
 def _tables(
-    request: Request, plan: Plan, subject: Subject, layers: Sequence[LayerFigures], total: Total, arm: str
+    request: PlanRequest, plan: Plan, subject: PlanSubject, layers: Sequence[LayerFigures], total: PlanTotal, arm: str
 ) -> list[str]:  # fmt: skip
     """Write the coverage of each layer, the summary, the scan as it was repaired, and an example's; their names."""
     stem = request.out.with_suffix("")
     table, summary = stem.with_name(stem.name + "_layers.csv"), stem.with_suffix(".json")
-    _whole(table, lambda file: _write_layers(file, layers))
+    _write_atomically(table, lambda file: _write_layers(file, layers))
     facts = {
         "checkpoints": len(plan.path), "mode": plan.order.mode, "missing_tissues": plan.stack.missing,
         "wound": asdict(plan.wound.findings), "total": asdict(total),
-        "repairs": None if subject.repairs is None else asdict(subject.repairs), "settings": asdict(request.wishes),
+        "repairs": None if subject.repairs is None else asdict(subject.repairs), "settings": asdict(request.settings),
         "bumps": bump_facts(plan), "feasible": arm,
         "surface_from_plane": plan.wound.surface_from_plane.tolist(),
     }  # fmt: skip
-    _whole(summary, lambda file: file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8"))
+    _write_atomically(summary, lambda file: file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8"))
     if subject.repairs is None:
         return [table.name, summary.name]
     mesh = stem.with_name(stem.name + "_scan.ply")
-    _whole(mesh, lambda file: write_ply(file, *_surface(plan.wound)))
+    _write_atomically(mesh, lambda file: write_ply(file, *_surface(plan.wound)))
     if subject.example is None:
         return [table.name, summary.name, mesh.name]
     example, built_in = stem.with_name(stem.name + "_example.ply"), subject.example
-    _whole(example, lambda file: write_ply(file, *built_in))
+    _write_atomically(example, lambda file: write_ply(file, *built_in))
     return [table.name, summary.name, mesh.name, example.name]
 
 
@@ -203,9 +132,9 @@ def _write_layers(file: Path, layers: Sequence[LayerFigures]) -> None:
             )
 
 
-def _surface(wound: Wound) -> tuple[Array, Index]:
+def _surface(wound: WoundVolume) -> tuple[Array, Index]:
     """The scan around the wound as it was used, its holes closed: vertices (V, 3) mm, scan frame, triangles (T, 3)."""
-    every = max(1, round(REPAIRED_STEP / wound.grid.step))
+    every = max(1, round(REPAIRED_SCAN_STEP / wound.grid.step))
     nodes = np.dstack([wound.grid.nodes, wound.bed])[::every, ::every]
     number = np.arange(nodes.shape[0] * nodes.shape[1]).reshape(nodes.shape[:2])
     a, b, c, d = (m.ravel() for m in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
@@ -214,7 +143,7 @@ def _surface(wound: Wound) -> tuple[Array, Index]:
 
 
 def _pictures(
-    request: Request, plan: Plan, subject: Subject, layers: Sequence[LayerFigures], total: Total, arm: str
+    request: PlanRequest, plan: Plan, subject: PlanSubject, layers: Sequence[LayerFigures], total: PlanTotal, arm: str
 ) -> list[str]:  # fmt: skip
     """Write a picture of each layer and the report; their names."""
     stem = request.out.with_suffix("")
@@ -230,23 +159,25 @@ def _pictures(
             progress(i + 1, len(layers))
     repairs = [] if subject.repairs is None else subject.repairs.rows()
     findings = [*findings_rows(plan), ("what an arm can print", arm)]
-    story = Story(subject.name, findings, repairs, request.wishes.rows(), notes_of(plan))
-    _whole(report, lambda file: file.write_text(page_text(plan, layers, total, story, drawn), encoding="utf-8"))
+    story = ReportText(subject.name, findings, repairs, request.settings.rows(), notes_of(plan))
+    _write_atomically(
+        report, lambda file: file.write_text(page_text(plan, layers, total, story, drawn), encoding="utf-8")
+    )
     return [f"{folder.name}/ ({len(drawn)} pictures)", report.name]
 
 
-def _told(plan: Plan, subject: Subject, total: Total, out: Path, written: Sequence[str]) -> str:
+def _summary_text(plan: Plan, subject: PlanSubject, total: PlanTotal, out: Path, written: Sequence[str]) -> str:
     f = plan.wound.findings
     lines = [
         f"wound: {f.area:.0f} mm^2, up to {f.depth:.2f} mm deep, {f.volume:.0f} mm^3"
         + ("" if f.given else f"; outline found where the scan is {f.level:.2f} mm deep"),
-        f"path: {counted(sum(bool(layer.beads) for layer in plan.layers), 'layer')}, {len(plan.path)} checkpoints, "
-        f"{len_text(total.printed)} of bead, {len_text(total.travelled)} of travel, {duration(total.seconds)}",
+        f"path: {count_text(sum(bool(layer.beads) for layer in plan.layers), 'layer')}, {len(plan.path)} checkpoints, "
+        f"{len_text(total.printed)} of bead, {len_text(total.travelled)} of travel, {duration_text(total.seconds)}",
         f"coverage: {total.covered:.2%} covered, {total.double:.2%} twice, {total.over:.2%} beside, "
         f"{total.gap:.2f} mm^2 open",
         "ink: " + ", ".join(f"{volume / 1000:.3f} ml of {material_text(name)}" for name, volume in total.volume),
     ]
-    lines += [f"bumps: {bumps_text(plan)}"] if bumpy(plan) else []
+    lines += [f"bumps: {bumps_text(plan)}"] if layers_with_bumps(plan) else []
     done = [] if subject.repairs is None else [f"{what} ({n})" for what, n in subject.repairs.rows()[2:] if n]
     if done:
         lines.append("scan: " + ", ".join(done))
@@ -254,21 +185,187 @@ def _told(plan: Plan, subject: Subject, total: Total, out: Path, written: Sequen
     return "\n".join([*lines, f"in {out.parent}: {', '.join(written)}"])
 
 
-def _check_session(session: Path, flat: bool) -> None:
-    from hardware.files.session import open_session
-
-    if flat:
-        raise InputError("command line", "--session", session, "nothing with a contour: it has no shape to be found by")
-    open_session(session)  # what is wrong with it is told before anything is written
-
-
-def _placed(session: Path, out: Path, plan: Plan) -> list[str]:
-    """Where the scan lies in a session's pictures, in words."""
-    from hardware.plan.placing import placing_in
-
-    ring = plan.wound.rim
-    return placing_in(session, out.with_name(f"{out.stem}_scan.ply"), ring).lines()
-
-
 def _progress(what: str, unit: str) -> Progress:
     return Progress(what, unit, WallClock().now)
+
+
+def findings_rows(plan: Plan) -> list[tuple[str, str]]:
+    """What the wound is like, in words."""
+    f = plan.wound.findings
+    low_tilt, high_tilt = (np.rad2deg(t.departure) for t in (plan.ground.low, plan.ground.high))
+    rows = [
+        ("outline", "given" if f.given else f"found: where the scan is {f.level:.2f} mm deep"),
+        ("area over which it is open", f"{f.area:.1f} mm²"),
+        ("greatest depth under the restored skin", f"{f.depth:.2f} mm"),
+        ("volume up to the restored skin", f"{f.volume:.0f} mm³"),
+        ("volume of the beads", f"{plan.points.volume.sum():.0f} mm³"),
+    ]
+    rows += [("bumps of the bed", bumps_text(plan))] if layers_with_bumps(plan) else []
+    if not f.noise and not f.scatter:
+        return rows
+    return rows + [
+        ("noise of the scan", f"{f.noise:.3f} mm, smoothed over {f.smoothing:.2f} mm"),
+        ("skin around off the restored surface", f"{f.scatter:.3f} mm"),
+        ("guessed in holes of the scan", f"{f.closed:.1f} mm²"),
+        ("hidden under overhangs", f"{f.hidden:.1f} mm²"),
+        ("tool off the normal, at worst, first and last layer", f"{low_tilt:.1f}°, {high_tilt:.1f}°"),
+    ]
+
+
+def notes_of(plan: Plan) -> list[str]:
+    """What somebody should look at before printing."""
+    notes = list(plan.wound.findings.notes)
+    if plan.stack.missing:
+        notes.append(f"not printed, as the wound is not deep enough: {', '.join(plan.stack.missing)}")
+    off_deg = max(np.rad2deg(t.departure) for t in (plan.ground.low, plan.ground.high))
+    if off_deg > MAX_TILT_OFF_NORMAL_DEG:
+        notes.append(
+            f"the tool stands up to {off_deg:.0f} degrees off the normal, as its limits ask for: on the steepest walls"
+        )
+    empty = sum(not layer.beads for layer in plan.layers)
+    if empty:
+        notes.append(f"{empty} of {len(plan.layers)} layers have no room for a bead and are left out")
+    return notes
+
+
+def layers_with_bumps(plan: Plan) -> list[PlannedLayer]:
+    """The layers over which something of the bed stands."""
+    return [p for p in plan.layers if not (p.over.is_empty and p.around.is_empty)]
+
+
+def bump_facts(plan: Plan) -> dict[str, Any]:
+    """How bumps were to be passed, and what was met in which layer (counted from 1). mm, mm2."""
+    passing, width = plan.order.passing, plan.order.pattern.width
+    met = [
+        {
+            "layer": p.layer.number + 1, "limit_mm": passing.limit(p.layer.height), "over": len(p.over.geoms),
+            "over_mm2": p.over.area, "around": len(p.around.geoms), "around_mm2": p.around.area,
+            "highest_mm": p.layer.bumps.highest,
+        }
+        for p in layers_with_bumps(plan)
+    ]  # fmt: skip
+    return {"clearance_mm": passing.clear(width), "layers": met}
+
+
+def bumps_text(plan: Plan) -> str:
+    """Bumps in words: how many layers go over some, and round some."""
+    over = [p.layer.number + 1 for p in plan.layers if not p.over.is_empty]
+    around = [p.layer.number + 1 for p in plan.layers if not p.around.is_empty]
+    parts = []
+    if over:
+        parts.append(f"gone over in {_layers_text(over)}")
+    if around:
+        clear = plan.order.passing.clear(plan.order.pattern.width)
+        highest = max(p.layer.bumps.highest for p in plan.layers if not p.around.is_empty)
+        parts.append(
+            f"gone round with {clear:.2f} mm between in {_layers_text(around)}, up to {highest:.2f} mm over it"
+        )
+    return "; ".join(parts)
+
+
+def _layers_text(numbers: list[int]) -> str:
+    """Layers as people name them: layer 3, layers 2 to 5, layers 1, 4, 6."""
+    if len(numbers) == 1:
+        return f"layer {numbers[0]}"
+    if len(numbers) > 2 and numbers[-1] - numbers[0] + 1 == len(numbers):
+        return f"layers {numbers[0]} to {numbers[-1]}"
+    return "layers " + ", ".join(str(n) for n in numbers)
+
+
+@dataclass(frozen=True, slots=True)
+class WoundSighting:
+    """The wound that one camera shows, beside the planned one."""
+
+    camera: str
+    off: float  # mm between the two middles, across the camera's view; NaN where it shows no wound
+    share: float  # of the two outlines' areas, the smaller over the larger
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanPlacement:
+    """Where a scan lies in a session."""
+
+    base_from_scan: Array | None  # (4, 4) mm; None where it was not registered
+    verdict: str  # for a person
+    sights: tuple[WoundSighting, ...]
+
+    def lines(self) -> list[str]:
+        """What it says, for a person."""
+        lines = [f"placed: {self.verdict}"]
+        for sight in self.sights:
+            if not np.isfinite(sight.off):
+                lines.append(f"placed: {sight.camera} shows no wound")
+                continue
+            doubt = f", more than {MAX_MIDDLE_DISTANCE:g} mm: is it the same wound?"
+            far = doubt if sight.off > MAX_MIDDLE_DISTANCE else ""
+            lines.append(
+                f"placed: in {sight.camera} the wound's middle is {sight.off:.2f} mm from the plan's{far}; "
+                f"their areas are as {sight.share:.2f} to 1"
+            )
+        return lines
+
+
+def scan_placement(session_path: Path, scan_file: Path, outline: Array) -> ScanPlacement:
+    """Where a scan lies in a session's first pictures. outline: (N, 3) mm, of the planned wound, scan frame."""
+    from hardware.offline.track import tracker  # loads gtsam and cv2, which a plan alone does not need
+    from hardware.recording.session_reader import open_session
+
+    session = open_session(session_path)
+    pose, frames = None, None
+    with tracker(session.rig, session.roi, scan_file) as step:
+        for number, frames in enumerate(session.frame_sets()):
+            pose = step(frames)
+            step.idle()
+            if pose.state.measured or number + 1 == MAX_FRAME_SETS:
+                break
+    if pose is None or frames is None:
+        return ScanPlacement(None, "the session holds no frame set", ())
+    if not pose.state.measured:
+        return ScanPlacement(None, f"not placed: {pose.reason or pose.state.value}", ())
+    return ScanPlacement(pose.base_from_surface, _verdict(pose), _sights(session.rig.cameras, frames, pose, outline))
+
+
+def _verdict(pose: SurfacePose) -> str:
+    sigma = np.sqrt(np.diag(pose.covariance))
+    good = f"good to {np.linalg.norm(sigma[3:]):.3f} mm and {np.rad2deg(np.linalg.norm(sigma[:3])):.2f} degrees"
+    return f"{pose.state.value}, {good}" + (f"; {pose.reason}" if pose.reason else "")
+
+
+def _sights(
+    cameras: Sequence[Camera], frames: FrameSet, pose: SurfacePose, outline: Array
+) -> tuple[WoundSighting, ...]:
+    from perception.wound.network import WoundNetwork, shipped_model
+    from perception.wound.segmentation import NetworkSegmenter  # loads onnxruntime
+
+    network = WoundNetwork(shipped_model(), threads=1)
+    segmenter = NetworkSegmenter(network, network.settings)
+    sightings = []
+    for frame in frames.frames:
+        mask = segmenter(frame.image).mask
+        sightings.append(_sight(cameras[frame.camera], mask, pose.base_from_surface, outline))
+    return tuple(sightings)
+
+
+def _sight(
+    camera: Camera, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], pose: Array, outline: Array
+) -> WoundSighting:
+    from perception.lens import undistort
+    from perception.wound.segmentation import centroid
+
+    if not mask.any():
+        return WoundSighting(camera.name, float("nan"), float("nan"))
+    points_camera = se3.transform_points(se3.inverse(camera.base_from_camera) @ pose, outline)
+    pixels = points_camera[:, :2] / points_camera[:, 2:] * camera.matrix[[0, 1], [0, 1]] + camera.matrix[:2, 2]
+    area, middle = _middle(pixels)
+    off = np.linalg.norm(undistort(camera, centroid(mask)[None])[0] - middle)
+    scale = float(points_camera[:, 2].mean()) / float(camera.matrix[0, 0])  # mm per px
+    areas = sorted([area, float(mask.sum())])
+    return WoundSighting(camera.name, float(off) * scale, areas[0] / max(areas[1], 1e-9))
+
+
+def _middle(ring: Array) -> tuple[float, Array]:
+    """Area and middle (2,) of what a ring (N, 2) encloses."""
+    (x, y), (u, v) = ring.T, np.roll(ring, -1, axis=0).T
+    cross = x * v - u * y
+    area = float(cross.sum()) / 2
+    return abs(area), np.array([(x + u) @ cross, (y + v) @ cross]) / (6 * area)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import difflib
+import io
 import json
 import tomllib
 from collections.abc import Collection, Iterable
@@ -16,6 +17,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 
 Table = dict[str, Any]
+CsvRow = tuple[int, list[str]]  # line number and words
 
 
 def read_toml(path: Path) -> Table:
@@ -23,16 +25,21 @@ def read_toml(path: Path) -> Table:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, "file", why(error), "a readable UTF-8 text file") from error
+        raise InputError(path, "file", error_text(error), "a readable UTF-8 text file") from error
+    return toml_from_text(path, text)
+
+
+def toml_from_text(where: object, text: str) -> Table:
+    """The table in the text of a TOML file; InputError where it is empty or not TOML."""
     if not text.strip():
-        raise InputError(path, "file", "empty", "TOML")
+        raise InputError(where, "file", "empty", "TOML")
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # too long a number, and brackets in brackets, are no syntax errors
-        raise InputError(path, "syntax", error, "valid TOML") from error
+        raise InputError(where, "syntax", error, "valid TOML") from error
 
 
-def why(error: Exception) -> str:
+def error_text(error: Exception) -> str:
     """Why a file cannot be read, in words without the file's name."""
     if isinstance(error, UnicodeDecodeError):
         return f"not text: byte {error.start} is {error.object[error.start]:#04x}"
@@ -44,20 +51,22 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(path, "file", why(error), "a readable file") from error
+        raise InputError(path, "file", error_text(error), "a readable file") from error
 
 
-def read_csv(path: Path, allowed: str = "a readable CSV file") -> list[tuple[int, list[str]]]:
-    """The rows of a CSV file, each with its line number; blanks before a word do not count, empty lines do.
+def read_csv(path: Path, allowed: str = "a readable CSV file", text: str | None = None) -> list[CsvRow]:
+    """The rows of a CSV file with their line numbers; blanks before a word do not count, empty lines do.
 
-    InputError, with `allowed`, where it is missing, not text or not CSV.
+    text: what the file holds, where it need not be opened. InputError, with `allowed`, where it is missing, not text or
+    not CSV.
     """
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
+        opened = path.open(newline="", encoding="utf-8-sig") if text is None else io.StringIO(text, newline="")
+        with opened as stream:
             reader = csv.reader(stream, skipinitialspace=True)
             return [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "file", why(error), allowed) from error
+        raise InputError(path, "file", error_text(error), allowed) from error
 
 
 def check_keys(where: object, prefix: str, table: Table, required: Iterable[str], optional: Iterable[str] = ()) -> None:
@@ -65,13 +74,13 @@ def check_keys(where: object, prefix: str, table: Table, required: Iterable[str]
     known = [*required, *optional]
     for key in table:
         if key not in known:
-            raise InputError(where, prefix + key, "unknown key", meant(key, known))
+            raise InputError(where, prefix + key, "unknown key", one_of_text(key, known))
     for key in required:
         if key not in table:
             raise InputError(where, prefix + key, "missing", f"this key ({', '.join(required)} are required)")
 
 
-def meant(word: str, known: Collection[str]) -> str:
+def one_of_text(word: str, known: Collection[str]) -> str:
     """The allowed words, the nearest one first by name if there is a near one."""
     near = difflib.get_close_matches(word, known, 1)
     hint = f"; did you mean {near[0]!r}?" if near else ""

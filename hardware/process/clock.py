@@ -64,7 +64,7 @@ class SimClock:
         self._now = max(self._now, instant)
 
 
-class RememberingClock:
+class WatchedClock:
     """A clock that remembers. begun: its first instant, s, None before. longest: s that nobody looked at it."""
 
     def __init__(self, clock: Clock) -> None:

@@ -1,20 +1,24 @@
-"""Progress of long work on stderr: one updating line on a terminal, a line every few seconds otherwise."""
+"""What a command shows and where it writes: progress on stderr, its output folder, and the cache."""
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import TextIO
 
-Report = Callable[[int, int], None]  # (done, total); a total of 0 is not known
+from estimation.errors import InputError
+
+ProgressReport = Callable[[int, int], None]  # (done, total); a total of 0 is not known
 
 
-def silent(done: int, total: int) -> None:
-    """Report nothing."""
+def no_progress(done: int, total: int) -> None:
+    """Show nothing."""
 
 
 class Progress:
-    """Says how far `what` is, at what rate, and how long the rest will take; call it with (done, total)."""
+    """Shows how far `what` is, at what rate, and how long the rest will take; call it with (done, total)."""
 
     def __init__(self, what: str, unit: str, now: Callable[[], float], stream: TextIO | None = None) -> None:
         self._what, self._unit, self._now = what, unit, now
@@ -22,17 +26,19 @@ class Progress:
         self._tty = self._stream.isatty()
         self._every = 0.1 if self._tty else 5.0  # s between lines
         self._start = now()
-        self._said = self._start
-        self.note = ""  # said behind the figures
+        self._reported = self._start
+        self.note = ""  # behind the figures
         self._open = False  # whether an unfinished line stands on the terminal
 
     def __call__(self, done: int, total: int) -> None:
-        """Say it, unless something was said a moment ago and the work is not done."""
+        """Report, unless the last report was a moment ago and the work is not done."""
         now = self._now()
-        if now - self._said < self._every and done != total:
+        if now - self._reported < self._every and done != total:
             return
-        self._said = now
-        text = line(self._what, self._unit, done, total, now - self._start) + (f"; {self.note}" if self.note else "")
+        self._reported = now
+        text = progress_line(self._what, self._unit, done, total, now - self._start) + (
+            f"; {self.note}" if self.note else ""
+        )
         if self._tty:
             self._stream.write(f"\r\x1b[K{text}")
         else:
@@ -54,23 +60,23 @@ class Progress:
             self._open = False
 
 
-def line(what: str, unit: str, done: int, total: int, elapsed: float) -> str:
+def progress_line(what: str, unit: str, done: int, total: int, elapsed: float) -> str:
     """One line: `done` of `total` after `elapsed` s."""
     rate = done / elapsed if elapsed > 0 else 0.0
     text = f"{what}: {done}" + (f" of {total}" if total else "") + f" {unit}"
     if rate > 0:
         text += f", {rate:.1f}/s"
         if total > done:
-            text += f", {duration((total - done) / rate)} left"
+            text += f", {duration_text((total - done) / rate)} left"
     return text
 
 
-def counted(count: int, noun: str) -> str:
-    """So many of what is counted: 1 layer, 2 layers."""
+def count_text(count: int, noun: str) -> str:
+    """A count with its noun: 1 layer, 2 layers."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def duration(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Seconds as a person says them: 8 s, 3 min 20 s, 1 h 5 min."""
     whole = round(seconds)
     if whole < 60:
@@ -79,3 +85,52 @@ def duration(seconds: float) -> str:
     if minutes < 60:
         return f"{minutes} min {rest} s"
     return f"{minutes // 60} h {minutes % 60} min"
+
+
+MAX_NAMED_FILES = 20  # files of an interrupted command that are named; more are counted
+
+
+def prepare_out(out: Path, force: bool) -> None:
+    """Make the folder `out`; raises InputError where it is a file, or holds something and `force` is not set."""
+    if out.exists() and not out.is_dir():
+        raise InputError(out, "--out", "a file", "a folder, new or empty")
+    check_new(out, force)
+    out.mkdir(parents=True, exist_ok=True)
+
+
+def check_new(out: Path, force: bool) -> None:
+    """InputError where `out` is a file, or a folder that holds something, and `force` is not set."""
+    if out.is_dir() and any(out.iterdir()) and not force:
+        raise InputError(out, "--out", "a folder that is not empty", "a new or empty one, or --force")
+    if out.exists() and not out.is_dir() and not force:
+        raise InputError(out, "--out", "a file that exists", "a new one, or --force")
+
+
+def left_files_text(out: Path | None) -> str:
+    """What an interrupted command left behind, for a person. out: None where it writes nothing."""
+    if out is None:
+        return "nothing was to be written"
+    if out.is_dir():
+        names = sorted(file.name for file in out.iterdir())
+        if len(names) > MAX_NAMED_FILES:
+            return f"kept in {out}: {len(names)} files"
+        return f"kept in {out}: {', '.join(names)}" if names else f"nothing was written to {out}"
+    if out.suffix == ".csv" and out.exists():
+        return f"kept {out}, whole, and what stands beside it"
+    if out.suffix == ".mcap" and out.exists():
+        return f"kept {out}, readable up to its last whole chunk"
+    return f"kept {out}" if out.exists() else "nothing was written"
+
+
+def cache_folder() -> Path:
+    """Where it is, as the XDG rules have it; it may not be there yet."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stillbed"
+
+
+def cache_error(folder: Path, error: OSError) -> InputError:
+    """The error about a cache that could not be written."""
+    from hardware.process.checks import (
+        error_text,  # loads numpy, which a command line that only shows its help does not need
+    )
+
+    return InputError(folder, "cache", error_text(error), "one that can be written: set XDG_CACHE_HOME")

@@ -1,7 +1,7 @@
-"""The newest of what one process tells another: neither waits for the other, and what came before is gone.
+"""Shared memory between processes: the latest value of a stream, and the place on the path.
 
-Two slots in shared memory take turns: one can be read while the other is written. A reader that is overtaken in the
-middle sees it by the count and the check sum, and reads the newer one.
+Neither side waits. Two slots take turns: one can be read while the other is written. A reader that is overtaken sees it
+by the count and the checksum, and reads the newer one.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from estimation.errors import InputError
 
 Value = TypeVar("Value")
 
-CAPACITY = 1 << 20  # bytes: fifty times a pose with its forecast and its warp
-TRIES = 8  # by then the writer would have come twice within each reading, some of them microseconds
+DEFAULT_CAPACITY = 1 << 20  # bytes: fifty times a pose with its forecast and its warp
+MAX_READ_TRIES = 8  # by then the writer would have come twice within each reading, some of them microseconds
 _COUNT = struct.Struct("=Q")
-_HEAD = struct.Struct("=QII")  # count, size, check sum
+_SLOT_HEAD = struct.Struct("=QII")  # count, size, check sum
 
 
-class Newest(Generic[Value]):
+class SharedLatest(Generic[Value]):
     """Handed to another process when that is started; one puts, the other gets."""
 
-    def __init__(self, capacity: int = CAPACITY) -> None:
+    def __init__(self, capacity: int = DEFAULT_CAPACITY) -> None:
         self._capacity = capacity
-        self._memory: Any = RawArray("B", _COUNT.size + 2 * (_HEAD.size + capacity))
+        self._memory: Any = RawArray("B", _COUNT.size + 2 * (_SLOT_HEAD.size + capacity))
         self._seen, self._value = 0, None
 
     def put(self, value: Value) -> None:
@@ -38,24 +38,44 @@ class Newest(Generic[Value]):
         memory = memoryview(self._memory).cast("B")
         count = _COUNT.unpack_from(memory)[0] + 1
         start = self._start(count)
-        memory[start + _HEAD.size : start + _HEAD.size + len(data)] = data
-        _HEAD.pack_into(memory, start, count, len(data), crc32(data))
+        memory[start + _SLOT_HEAD.size : start + _SLOT_HEAD.size + len(data)] = data
+        _SLOT_HEAD.pack_into(memory, start, count, len(data), crc32(data))
         _COUNT.pack_into(memory, 0, count)
 
     def get(self) -> Value | None:
         """The newest value, the very object of the last call if there is no newer one; None before the first."""
         memory = memoryview(self._memory).cast("B")
-        for _ in range(TRIES):
+        for _ in range(MAX_READ_TRIES):
             count = _COUNT.unpack_from(memory)[0]
             if count == self._seen:
                 break
             start = self._start(count)
-            written, size, check = _HEAD.unpack_from(memory, start)
-            data = bytes(memory[start + _HEAD.size : start + _HEAD.size + min(size, self._capacity)])
+            written, size, check = _SLOT_HEAD.unpack_from(memory, start)
+            data = bytes(memory[start + _SLOT_HEAD.size : start + _SLOT_HEAD.size + min(size, self._capacity)])
             if written == count and crc32(data) == check:
                 self._seen, self._value = count, pickle.loads(data)
                 break
         return self._value
 
     def _start(self, count: int) -> int:
-        return _COUNT.size + (count % 2) * (_HEAD.size + self._capacity)
+        return _COUNT.size + (count % 2) * (_SLOT_HEAD.size + self._capacity)
+
+
+class SharedPathPlace:
+    """How far the print is, in shared memory: outlives the process that prints.
+
+    It is written before the command goes to the arm, so what it does not hold was not printed. fraction: counted in
+    checkpoints, NaN before a path was begun.
+    """
+
+    def __init__(self) -> None:
+        self._memory: Any = RawArray("d", [float("nan")])
+
+    @property
+    def fraction(self) -> float:
+        """The place, counted in checkpoints."""
+        return float(self._memory[0])
+
+    @fraction.setter
+    def fraction(self, value: float) -> None:
+        self._memory[0] = value

@@ -1,12 +1,14 @@
-"""When the ticks of a motion are due: evenly, or in step with the poses that they are made of.
+"""When the ticks of a motion are due, how late they come, and how evenly the machine works.
 
-Cameras give a pose each 33 ms; ticks that run freely beside them leave each pose lying for half a tick on average. In
-step, the pose comes shortly before the tick that is made of it, and a tick may be made as soon as its pose is there:
-planner and guard still get the instant at which it was due, so that the arm's motion stays even.
+Cameras give a pose each 33 ms. Ticks that run freely beside them leave each pose waiting for half a tick on average.
+Locked to the poses, a tick comes shortly after its pose, and may come as soon as the pose is there; planner and guard
+still get the instant at which it was due, so the arm's motion stays even. The arm does a tick's move in `tick`. The
+time between two ticks may be a little longer, never shorter, as the arm's queue would fill up. So a locked tick is one
+per cent shorter than its share of the time between two poses (`tick_in_step`): phase is gained and lost within that.
 
-The arm does a tick's move in `tick`; the time between two ticks may be a little longer, never shorter, as the arm's
-queue would fill up. So a tick that is to be in step has to be a hundredth shorter than its share of the time between
-two poses (`tick_in_step`): phase is gained and lost within that.
+A machine that shares its memory with others, as a virtual one does, may for some tens of milliseconds take ten times as
+long for the same work, with nothing else running on it. Neither load nor priority shows that, and no priority helps:
+`measure_evenness` times the same small work again and again.
 """
 
 from __future__ import annotations
@@ -14,16 +16,22 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from statistics import median
 
-MARGIN = 0.01  # share of a tick by which it is shorter: 10 ms of phase are gained in a second
-EASE = 0.001, 0.03  # least and greatest share by which the time between two ticks is longer than one
-GAIN = 0.05  # share of the phase that is made good in a tick
-MEMORY = 0.1  # share of a new arrival in the mean phase: ten arrivals, a third of a second
-STEADY = 0.5  # length of the mean phase from which arrivals count as regular: half a tick of spread gives 0.6
-LEAD = 0.25  # share of a tick by which a pose is to come before its tick: what tracking takes longer now and then
-LONGEST = 5.0  # mean intervals between two poses, beyond which it is a new beginning
-EARLY = 0.5  # share of a tick by which a tick may be made before it is due, where its pose is there
+import numpy as np
+
+from estimation.se3 import Array
+from hardware.process.clock import Clock
+
+TICK_SHORTENING = 0.01  # share of a tick by which it is shorter: 10 ms of phase are gained in a second
+EASE_RANGE = 0.001, 0.03  # least and greatest share by which the time between two ticks is longer than one
+PHASE_GAIN = 0.05  # share of the phase that is made good in a tick
+PHASE_MEMORY = 0.1  # share of a new arrival in the mean phase: ten arrivals, a third of a second
+MIN_PHASE_LENGTH = 0.5  # length of the mean phase from which arrivals count as regular: half a tick of spread gives 0.6
+TARGET_LEAD = 0.25  # share of a tick by which a pose is to come before its tick, as tracking sometimes takes longer
+MAX_GAP_INTERVALS = 5.0  # mean intervals between two poses, beyond which it is a new beginning
+MAX_EARLY_SHARE = 0.5  # share of a tick by which a tick may be made before it is due, where its pose is there
 
 
 def tick_in_step(longest: float, interval: float, shortest: float) -> float:
@@ -33,7 +41,7 @@ def tick_in_step(longest: float, interval: float, shortest: float) -> float:
     """
     if not interval > 0:
         return longest
-    share = interval * (1 - MARGIN)
+    share = interval * (1 - TICK_SHORTENING)
     tick = share / math.ceil(share / longest) if share > longest else share * math.floor(longest / share)
     return tick if tick >= shortest else longest
 
@@ -49,7 +57,7 @@ def own_interval(between: Sequence[float]) -> float:
     return median(each / max(round(each / least), 1) for each in between) if least > 0 else math.nan
 
 
-class Rhythm:
+class TickSchedule:
     """The instants of ticks of `tick` s that run freely, a share of `ease` apart beyond that. due: s, the next one."""
 
     def __init__(self, tick: float, ease: float, now: float) -> None:
@@ -60,7 +68,7 @@ class Rhythm:
         """When the next tick may be made, s. fresh: whether a pose is there of which none was made."""
         return self.due
 
-    def made(self, now: float) -> int:
+    def advance(self, now: float) -> int:
         """The tick that was due is made, and it is `now`, s; how many are left out, as their time has passed."""
         period = self._period()
         missed = max(int((now - self.due) / period) - 1, 0)
@@ -71,7 +79,7 @@ class Rhythm:
         return self.tick * (1 + self._ease)
 
 
-class InStep(Rhythm):
+class PoseLockedSchedule(TickSchedule):
     """The instants of ticks that follow the arrival of poses where these come regularly, and run freely where not."""
 
     def __init__(self, tick: float, ease: float, now: float) -> None:
@@ -81,28 +89,98 @@ class InStep(Rhythm):
 
     def opens(self, fresh: bool) -> float:
         """When the next tick may be made: when it is due, or somewhat before where no newer pose will come for it."""
-        return self.due - (EARLY * self.tick if fresh and self._last + self._interval > self.due else 0.0)
+        return self.due - (MAX_EARLY_SHARE * self.tick if fresh and self._last + self._interval > self.due else 0.0)
 
     def arrived(self, at: float) -> None:
         """A pose has come at `at`, s."""
-        if at - self._last < LONGEST * self._interval:
-            self._interval += MEMORY * (at - self._last - self._interval)
+        if at - self._last < MAX_GAP_INTERVALS * self._interval:
+            self._interval += PHASE_MEMORY * (at - self._last - self._interval)
         elif math.isfinite(self._last):
             self._interval = at - self._last
         self._last = at
         phase = cmath.exp(2j * math.pi * (self.due - at) / self.tick)
-        self._mean += MEMORY * (phase - self._mean)
+        self._mean += PHASE_MEMORY * (phase - self._mean)
 
     @property
     def lead(self) -> float:
         """By how much poses come before their tick, s, from 0 to a tick; NaN where they come irregularly."""
-        if abs(self._mean) < STEADY:
+        if abs(self._mean) < MIN_PHASE_LENGTH:
             return math.nan
         return self.tick * ((cmath.phase(self._mean) / (2 * math.pi)) % 1.0)
 
     def _period(self) -> float:
         if math.isnan(lead := self.lead):
             return super()._period()
-        ahead = (LEAD - lead / self.tick + 0.5) % 1.0 - 0.5  # share of a tick by which ticks come too soon
-        low, high = EASE
-        return self.tick * (1 + min(max(MARGIN + GAIN * ahead, low), high))
+        ahead = (TARGET_LEAD - lead / self.tick + 0.5) % 1.0 - 0.5  # share of a tick by which ticks come too soon
+        low, high = EASE_RANGE
+        return self.tick * (1 + min(max(TICK_SHORTENING + PHASE_GAIN * ahead, low), high))
+
+
+LATENESS_BIN = 1e-4  # s
+_BINS = 1000  # a tenth of a second; what is later counts as that
+
+
+class LatenessHistogram:
+    """Counts of lateness. most: s, the largest."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(_BINS, np.int64)
+        self.count, self.most = 0, 0.0
+
+    def add(self, late: float) -> None:
+        """One tick was `late` s behind its instant."""
+        self._counts[min(int(max(late, 0.0) / LATENESS_BIN), _BINS - 1)] += 1
+        self.count += 1
+        self.most = max(self.most, late)
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """How many there were in each bin of BIN s; the last one holds all that were later."""
+        return tuple(self._counts.tolist())
+
+    def percentile(self, share: float) -> float:
+        """Lateness, s, that `share` percent of the ticks do not exceed, rounded up to a bin; NaN of none."""
+        if not self.count:
+            return math.nan
+        wanted = max(share / 100 * self.count, 1.0)
+        return (int(np.searchsorted(np.cumsum(self._counts), wanted)) + 1) * LATENESS_BIN
+
+
+PROBE_CALLS = 20  # of each kind in a piece of work: a quarter of a millisecond, a fraction of a tick of the motion
+SLOW_RATIO = 3.0  # times the usual
+
+
+@dataclass(frozen=True, slots=True)
+class Evenness:
+    """usual, largest: s that a piece of work took. slow: share of the time in pieces that took over SLOW usual ones."""
+
+    usual: float
+    largest: float
+    slow: float
+
+    def __str__(self) -> str:
+        """In words."""
+        usual, largest = 1000 * self.usual, 1000 * self.largest
+        return f"{usual:.2f} ms of work took {largest:.0f} ms at the worst; {self.slow:.1%} of the time work was slow"
+
+
+def measure_evenness(clock: Clock, pieces: int) -> Evenness:
+    """Do so many pieces of work, one after the other. The process should have nothing else to do."""
+    rng = np.random.default_rng(0)
+    small, many = rng.random((6, 6)) + 6 * np.eye(6), rng.random((50, 4, 4))
+    spent = np.empty(pieces)
+    for k in range(pieces):
+        begun = clock.now()
+        for _ in range(PROBE_CALLS):
+            np.linalg.inv(small)
+            many @ many
+            np.concatenate([small, small])
+        spent[k] = clock.now() - begun
+    return evenness_from_times(spent)
+
+
+def evenness_from_times(spent: Array) -> Evenness:
+    """Of pieces that took spent (N,), s."""
+    usual, whole = float(np.median(spent)), float(spent.sum())
+    slow = float(spent[spent > SLOW_RATIO * usual].sum())
+    return Evenness(usual, float(spent.max()), slow / whole if whole > 0 else 0.0)

@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from estimation import se3
-from estimation.forecast import Forecast
 from estimation.observations import Observations
-from estimation.pose import SurfaceMotion, SurfacePose, TrackState
+from estimation.pose import Forecast, MotionState, SurfacePose, TrackState
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
-from estimation.warp import Warp
+from estimation.surface_map import Warp
 from hardware.files.rig_file import rig_from_table, table_from_rig
-from hardware.recorded_tick import RecordedTick
+from hardware.motion.loop import RecordedTick
 from hardware.recording.schemas import camera_frame
 from perception.frames import Roi
 from planning.command import Hold, Move
@@ -141,21 +140,21 @@ def pose_from_message(message: Message) -> SurfacePose:
         stamp=message["stamp"],
         state=TrackState(message["state"]),
         reason=message["reason"],
-        motion=_motion_from_message(message["motion"]) if "motion" in message else SurfaceMotion(),
+        motion=_motion_from_message(message["motion"]) if "motion" in message else MotionState(),
         warp=_warp_from_message(message["warp"]) if "warp" in message else None,
         forecast=_forecast_from_message(message["forecast"]) if "forecast" in message else None,
         **arrays,
     )
 
 
-def _message_from_motion(motion: SurfaceMotion) -> Message:
+def _message_from_motion(motion: MotionState) -> Message:
     onset = _flat(np.array([motion.onset]))
     return {"moving": motion.moving, "onset": onset, "moved": motion.moved, "turned": motion.turned}
 
 
-def _motion_from_message(message: Message) -> SurfaceMotion:
+def _motion_from_message(message: Message) -> MotionState:
     onset = float(_array(message["onset"], (1,))[0])
-    return SurfaceMotion(message["moving"], onset, message["moved"], message["turned"])
+    return MotionState(message["moving"], onset, message["moved"], message["turned"])
 
 
 def _message_from_forecast(forecast: Forecast | None) -> Message:

@@ -1,4 +1,4 @@
-"""Recorder: writes everything that passes a seam into one MCAP file that stays readable if the run is killed."""
+"""Recorder: writes a run's records into one MCAP file, which stays readable if the run is killed."""
 
 from __future__ import annotations
 
@@ -12,51 +12,48 @@ from typing import TypeVar
 
 import numpy as np
 import orjson
-from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from estimation.errors import InputError, StillbedError
 from estimation.observations import Observations
-from estimation.pose import SurfacePose
+from estimation.pose import SurfacePose, Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.trajectory import Trajectory
-from hardware.compressed_image import ENCODING, NAME, SCHEMA, SCHEMA_ENCODING, pack
-from hardware.files.images import check_size, encode
-from hardware.files.session import SURFACE_SUFFIXES
-from hardware.mcap_index import pack_index
-from hardware.process.checks import read_bytes
-from hardware.recorded_tick import RecordedTick
-from hardware.recording import messages
-from hardware.recording.messages import SURFACE_FRAME, Message
-from hardware.recording.schemas import (
-    CALIBRATION,
-    INFO,
-    TOPICS,
-    Schema,
-    calibration_topic,
-    camera_frame,
-    image_topic,
+from hardware.files.folder_tables import rows_from_trajectory
+from hardware.files.images import (
+    IMAGE_ENCODING,
+    IMAGE_SCHEMA,
+    IMAGE_SCHEMA_ENCODING,
+    IMAGE_SCHEMA_NAME,
+    check_size,
+    encode,
+    pack_image,
 )
-from hardware.tum import rows_from_trajectory
+from hardware.files.session import SURFACE_SUFFIXES
+from hardware.motion.loop import RecordedTick
+from hardware.process.checks import read_bytes
+from hardware.recording import messages
+from hardware.recording.mcap_file import McapWriter
+from hardware.recording.messages import SURFACE_FRAME, Message
+from hardware.recording.schemas import CALIBRATION, INFO, TOPICS, Schema, calibration_topic, camera_frame, image_topic
 from perception.frames import Frame, Roi
 from planning.command import Command, Move
 
-CHUNK_SECONDS = 0.5  # s of stamps: what a killed run may lose; half of the second that is promised
-CHUNK_BYTES = 4 * 2**20  # a chunk is unpacked whole, so its size bounds the reader's memory
-EPOCH = 1_000_000_000  # s added to log times of a run whose stamps do not count from 1970: MCAP has none below zero
-WALL_CLOCK = 1e8  # s: a first stamp above is taken for seconds since 1970
-LAST_LOG_TIME = 2**63 - 1  # ns
+MAX_CHUNK_SECONDS = 0.5  # s of stamps, which a killed run may lose: half of the second that is promised
+MAX_CHUNK_BYTES = 4 * 2**20  # a chunk is unpacked whole, so its size bounds the reader's memory
+LOG_EPOCH = 1_000_000_000  # s added to log times where stamps do not count from 1970: MCAP has none below zero
+MIN_WALL_CLOCK_STAMP = 1e8  # s: a first stamp above it counts from 1970
+MAX_LOG_TIME = 2**63 - 1  # ns
 
 T = TypeVar("T")
 
 
 class Recorder:
-    """Writes a recording; a context manager. Stamps (s) may start anywhere, also below zero.
+    """Writes a recording; a context manager. Stamps, s, may start anywhere, also below zero.
 
-    A chunk is closed and given to the system before its stamps span more than half a second, so a run killed at any
-    instant keeps all but the last half second (a power cut may take more). A disk that is full or gone is a
-    StillbedError; what was written before stays readable, and later writes are refused with the same words.
+    A chunk is closed and handed to the system before its stamps span more than half a second: a run that is killed at
+    any instant loses no more than that (a power cut may take more). A disk that is full or gone is a StillbedError;
+    what was written before stays readable, and later writes raise the same error.
     """
 
     def __init__(
@@ -84,16 +81,12 @@ class Recorder:
         try:
             self._file = open(self.path, "wb" if overwrite else "xb")  # noqa: SIM115  (closed in `close`)
         except FileExistsError:
-            raise InputError(
-                self.path, "recording", "a file that exists", "a new file, or leave to overwrite"
-            ) from None
+            allowed = "a new file, or leave to overwrite"
+            raise InputError(self.path, "recording", "a file that exists", allowed) from None
         except OSError as error:
             raise StillbedError(f"{self.path}: cannot write: {error}") from error
-        self._writer = Writer(
-            self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD if compress else CompressionType.NONE
-        )
-        pack_index(self._writer)
-        self._guarded(lambda: self._writer.start(profile="", library="stillbed"))
+        self._writer = McapWriter(self._file, MAX_CHUNK_BYTES, compress)
+        self._guarded(lambda: self._writer.start("stillbed"))
 
     def __enter__(self) -> Recorder:
         return self
@@ -108,7 +101,7 @@ class Recorder:
                 raise
 
     def write(self, record: Frame | Observations | SurfacePose | Command | Roi | RecordedTick) -> None:
-        """Write any record that carries its own stamp to its channel."""
+        """Write a record to its channel at its own stamp."""
         if isinstance(record, Frame):
             self.frame(record)
         elif isinstance(record, Observations):
@@ -137,7 +130,7 @@ class Recorder:
         own = stamp - self.rig.cameras[camera].clock_offset if camera_stamp is None else camera_stamp
         name, number = self.rig.cameras[camera].name, self._numbers[camera]
         self._check_rising(f"stamp of camera {name!r}", stamp)
-        image = pack(kind, data, camera_frame(name), self._log_time(stamp))
+        image = pack_image(kind, data, camera_frame(name), self._log_time(stamp))
         self._add(image_topic(name), None, stamp, image, number)
         entry = {"stamp": stamp, "camera_stamp": own, "camera": int(camera), "number": number}
         self._message("/frames", stamp, entry)  # after the image: where this can be read, the image can
@@ -164,7 +157,7 @@ class Recorder:
             raise InputError(path, "surface", path.name, f"a file {', '.join(SURFACE_SUFFIXES)}")
         data = read_bytes(path)
         name = f"surface{path.suffix.lower()}"
-        self._guarded(lambda: self._writer.add_attachment(0, 0, name, "model/" + path.suffix.lower()[1:], data))
+        self._guarded(lambda: self._writer.add_attachment(name, "model/" + path.suffix.lower()[1:], data))
 
     def sent(self, stamp: float, data: bytes) -> None:
         """Write bytes that went to the arm at `stamp`, s."""
@@ -175,7 +168,7 @@ class Recorder:
         self._message("/arm/received", stamp, messages.message_from_bytes(stamp, data))
 
     def event(self, stamp: float, text: str, level: int = INFO, name: str = "stillbed") -> None:
-        """Write something that happened at `stamp`, s, in words."""
+        """Write an event at `stamp`, s."""
         log_time = self._log_time(stamp)
         self._message("/events", stamp, messages.message_from_event(stamp, level, text, name, log_time))
 
@@ -186,7 +179,7 @@ class Recorder:
 
     def attach(self, name: str, data: bytes) -> None:
         """Keep a file of the run in the recording, as text."""
-        self._guarded(lambda: self._writer.add_attachment(0, 0, name, "text/plain", data))
+        self._guarded(lambda: self._writer.add_attachment(name, "text/plain", data))
 
     def flush(self) -> None:
         """Close the open chunk and hand everything to the system."""
@@ -194,7 +187,7 @@ class Recorder:
         self._chunk_start = math.nan
 
     def close(self) -> None:
-        """Write the index and close the file; of a recorder that failed, keep what reached the disk. Twice is once."""
+        """Write the index and close the file; after a failure keep what reached the disk. Twice is once."""
         if self._closed:
             return
         self._closed = True
@@ -202,10 +195,10 @@ class Recorder:
             if not self._failed:
                 if self._epoch is None:
                     self._begin(0.0)
-                self._guarded(lambda: self._writer.finish())  # type: ignore[no-untyped-call]
+                self._guarded(self._writer.finish)
                 self._guarded(self._file.flush)
         finally:
-            with contextlib.suppress(OSError):  # said already: the same bytes could not be written a moment ago
+            with contextlib.suppress(OSError):  # was raised already, for the same bytes
                 self._file.close()
 
     def _pose(self, pose: SurfacePose) -> None:
@@ -217,7 +210,7 @@ class Recorder:
             )
 
     def _check_rising(self, stream: str, stamp: float) -> None:
-        """Refuse at the time of writing what the reader would have to refuse of the whole file."""
+        """Refuse a stamp now for which the reader would refuse the whole file."""
         last = self._last.get(stream, -math.inf)
         if not stamp > last:
             raise InputError(self.path, stream, stamp, f"later than the one before, {last} s")
@@ -231,13 +224,13 @@ class Recorder:
             self._begin(stamp)
         assert self._epoch is not None
         log_time = round(stamp * 1e9) + self._epoch * 1_000_000_000
-        if not 0 <= log_time <= LAST_LOG_TIME:
-            raise InputError(self.path, "stamp", stamp, f"-{self._epoch} .. {LAST_LOG_TIME / 1e9 - self._epoch:.0f} s")
+        if not 0 <= log_time <= MAX_LOG_TIME:
+            raise InputError(self.path, "stamp", stamp, f"-{self._epoch} .. {MAX_LOG_TIME / 1e9 - self._epoch:.0f} s")
         return log_time
 
     def _begin(self, stamp: float) -> None:
-        """Write the rig at the first stamp, so that viewers do not see a recording that starts in 1970."""
-        self._epoch = 0 if stamp > WALL_CLOCK else EPOCH
+        """Write the rig at the first stamp: at 0 s viewers would see a recording that starts in 1970."""
+        self._epoch = 0 if stamp > MIN_WALL_CLOCK_STAMP else LOG_EPOCH
         epoch = {"epoch_s": str(self._epoch), "units": "mm, s, rad, px"}
         self._guarded(lambda: self._writer.add_metadata("stillbed", epoch))
         self._message("/rig", stamp, messages.message_from_rig(self.rig))
@@ -254,16 +247,16 @@ class Recorder:
     def _add(self, topic: str, schema: Schema | None, stamp: float, data: bytes, sequence: int = 0) -> None:
         """Write the bytes of a message; schema: None for an image."""
         log_time = self._log_time(stamp)
-        if abs(stamp - self._chunk_start) >= CHUNK_SECONDS:
+        if abs(stamp - self._chunk_start) >= MAX_CHUNK_SECONDS:
             self.flush()
         if math.isnan(self._chunk_start):
             self._chunk_start = stamp
         channel = self._channel(topic, schema)
-        self._guarded(lambda: self._writer.add_message(channel, log_time, data, log_time, sequence))
+        self._guarded(lambda: self._writer.add_message(channel, log_time, data, sequence))
 
     def _text(self, topic: str, message: Message) -> bytes:
         data = orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY)
-        if b"null" in data:  # what stands there for a number that is not finite, unless it is a word
+        if b"null" in data:  # orjson's word for a number that is not finite; it may be part of a text
             try:
                 json.dumps(message, allow_nan=False)
             except ValueError:
@@ -273,7 +266,12 @@ class Recorder:
     def _channel(self, topic: str, schema: Schema | None) -> int:
         if topic not in self._channels:
             if schema is None:
-                name, kind, encoding, text = NAME, SCHEMA_ENCODING, ENCODING, SCHEMA.encode()
+                name, kind, encoding, text = (
+                    IMAGE_SCHEMA_NAME,
+                    IMAGE_SCHEMA_ENCODING,
+                    IMAGE_ENCODING,
+                    IMAGE_SCHEMA.encode(),
+                )
             else:
                 name, kind, encoding, text = schema["title"], "jsonschema", "json", orjson.dumps(schema)
             if name not in self._schemas:
@@ -283,7 +281,7 @@ class Recorder:
         return self._channels[topic]
 
     def _guarded(self, action: Callable[[], T]) -> T:
-        """Run one write of the library; a fault of the disk becomes a StillbedError, now and from then on."""
+        """Run one write; a fault of the disk becomes a StillbedError, now and at every later write."""
         if self._failed:
             raise StillbedError(self._failed)
         try:

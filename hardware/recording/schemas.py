@@ -1,4 +1,4 @@
-"""The published schemas of a recording: every channel's messages but the images' (compressed_image.py), as JSON Schema.
+"""The published schemas of a recording: the messages of every channel but the images', as JSON Schema.
 
 Foxglove's well-known messages where one fits (foxglove.*: field names and meanings are theirs, lengths in metres),
 our own otherwise (stillbed.*: mm, s, rad, px). The float64 `stamp` of our own messages is exact; the file's
@@ -33,12 +33,14 @@ def _array(items: Schema, count: int | None = None, about: str = "") -> Schema:
     return {"type": "array", "items": items, **length, **({"description": about} if about else {})}
 
 
-def _numbers(count: int, about: str) -> Schema:
-    return _array(NUMBER, count, about)
-
-
 def _perhaps(about: str) -> Schema:
     return _array(NUMBER, None, f"{about}; empty: not finite")
+
+
+def _part(about: str = "", **properties: Schema) -> Schema:
+    """An object inside a message, all of it required."""
+    description = {"description": about} if about else {}
+    return {"type": "object", **description, "properties": properties, "required": list(properties)}
 
 
 def _object(title: str, about: str, **properties: Schema) -> Schema:
@@ -57,20 +59,16 @@ def _about(schema: Schema, words: str) -> Schema:
 
 
 STAMP = _about(NUMBER, "s, exact")
-XYZ = {"type": "object", "properties": {"x": NUMBER, "y": NUMBER, "z": NUMBER}, "required": ["x", "y", "z"]}
-QUATERNION = {
-    "type": "object",
-    "properties": {"x": NUMBER, "y": NUMBER, "z": NUMBER, "w": NUMBER},
-    "required": ["x", "y", "z", "w"],
-}
+XYZ = _part(x=NUMBER, y=NUMBER, z=NUMBER)
+QUATERNION = _part(x=NUMBER, y=NUMBER, z=NUMBER, w=NUMBER)
 CAMERA = {
     "type": "object",
     "properties": {
         "name": TEXT,
         "size": _array(WHOLE, 2, "[width, height], px"),
-        "matrix": _numbers(9, "3x3, px"),
+        "matrix": _array(NUMBER, 9, "3x3, px"),
         "distortion": _array(NUMBER, 5, "k1 k2 p1 p2 k3"),
-        "base_from_camera": _numbers(16, "4x4, mm"),
+        "base_from_camera": _array(NUMBER, 16, "4x4, mm"),
         "clock_offset_s": _about(NUMBER, "s, to be added to the camera's stamps"),
     },
     "required": ["name", "size", "matrix", "distortion", "base_from_camera"],
@@ -150,27 +148,19 @@ OBSERVATIONS = _object(
     pixels=_perhaps("x y of each track, undistorted px"),
     sigma=_perhaps("px, one standard deviation per axis"),
 )
-MOTION: Schema = {
-    "type": "object",
-    "description": "Whether the surface moves",
-    "properties": {
-        "moving": FLAG,
-        "onset": _array(NUMBER, None, "s, start of the last movement; empty: before the first pose"),
-        "moved": _about(NUMBER, "mm since it was last at rest"),
-        "turned": _about(NUMBER, "rad since it was last at rest"),
-    },
-    "required": ["moving", "onset", "moved", "turned"],
-}
-FORECAST: Schema = {
-    "type": "object",
-    "description": "where the surface is expected after the stamp; empty: by its twist",
-    "properties": {
-        "horizons": _perhaps("s after the stamp, H of them"),
-        "increments": _perhaps("Hx6, tangent at the pose"),
-        "covariances": _perhaps("Hx6x6, rad, mm"),
-    },
-    "required": ["horizons", "increments", "covariances"],
-}
+MOTION = _part(
+    "Whether the surface moves",
+    moving=FLAG,
+    onset=_array(NUMBER, None, "s, start of the last movement; empty: before the first pose"),
+    moved=_about(NUMBER, "mm since it was last at rest"),
+    turned=_about(NUMBER, "rad since it was last at rest"),
+)
+FORECAST = _part(
+    "where the surface is expected after the stamp; empty: by its twist",
+    horizons=_perhaps("s after the stamp, H of them"),
+    increments=_perhaps("Hx6, tangent at the pose"),
+    covariances=_perhaps("Hx6x6, rad, mm"),
+)
 WARP: Schema = {
     "type": "object",
     "description": "Departure from a rigid body: Gaussian bells about K points, surface frame; K = 0: none",

@@ -1,4 +1,7 @@
-"""Reading an MCAP recording back as a session; a damaged one up to its damage."""
+"""Recordings read back: as a session, one channel at a time, and the path and arm that a run used.
+
+A damaged file is read up to its damage. Sessions of both containers, folder and MCAP file, are opened here.
+"""
 
 from __future__ import annotations
 
@@ -6,37 +9,44 @@ import shutil
 import tempfile
 import weakref
 from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 
 from estimation.errors import InputError
+from estimation.observations import Observations
+from estimation.pose import SurfacePose, Trajectory
 from estimation.rig import Rig
-from estimation.trajectory import Trajectory
-from hardware import compressed_image
-from hardware.files.folder_tables import check_polygon
+from estimation.se3 import Array
+from hardware.arm.profile import ArmProfile
+from hardware.files import images as compressed_image
+from hardware.files.arm_file import arm_from_text, arm_text
+from hardware.files.folder_tables import check_polygon, checked_rows, trajectory_from_rows
 from hardware.files.images import check_size, decode
-from hardware.files.session import SURFACE_SUFFIXES, FrameRef, Session, pair_refs
-from hardware.heads import Heads
+from hardware.files.path_file import path_from_text, path_text
+from hardware.files.session import SURFACE_SUFFIXES, FrameRef, PrintHeadLog, Session, head_from_row, pair_refs
+from hardware.files.session_folder import open_folder
 from hardware.recording import messages
-from hardware.recording.mcap_file import Attached, Damage, Stored, chunk_messages, parse, walk
+from hardware.recording.mcap_file import AttachedFile, ChunkMessages, Damage, StoredMessage, chunk_messages, parse, walk
 from hardware.recording.messages import Message
 from hardware.recording.schemas import image_topic
-from hardware.tum import checked_rows, trajectory_from_rows
-from perception.frames import Image, Roi
+from perception.frames import Image, PrintHead, Roi
+from planning.command import Command
+from planning.path import Path as PrintPath
 
 CACHED_CHUNKS = 4  # frames of one instant lie in neighbouring chunks
 
 SURFACE_NAMES = tuple(f"surface{suffix}" for suffix in SURFACE_SUFFIXES)  # an attachment with a path in it is none
 
 # of an image's topic and number: offset of its chunk, place in it, how it is encoded
-Places = dict[tuple[str, int], tuple[int, int, str]]
+ImagePlaces = dict[tuple[str, int], tuple[int, int, str]]
 
 
 @dataclass(slots=True)
-class Contents:
+class RecordingContents:
     """What a walk through a recording found: everything but the images, and the chunk each image is in.
 
     A run that is interrupted while it writes may store a chunk twice: what is told twice counts once.
@@ -48,9 +58,19 @@ class Contents:
     exact: bool = False
     heads: set[tuple[tuple[float, ...], bool]] = field(default_factory=set)
     frames: dict[tuple[int, int], FrameRef] = field(default_factory=dict)
-    places: Places = field(default_factory=dict)
-    surface: Attached | None = None
+    places: ImagePlaces = field(default_factory=dict)
+    surface: AttachedFile | None = None
     damage: str = ""
+
+
+def open_session(path: str | Path) -> Session:
+    """Open a session folder or an .mcap file; InputError says what is wrong with it."""
+    path = Path(path)
+    if path.is_dir():
+        return open_folder(path)
+    if not path.exists():
+        raise InputError(path, "session", "no such file or folder", "a session folder (with rig.toml) or an .mcap file")
+    return open_recording(path)
 
 
 def open_recording(path: Path) -> Session:
@@ -72,12 +92,12 @@ def open_recording(path: Path) -> Session:
     return Session(path, rig, rois, surface, truth, pair_refs(frames, stamps, len(rig)), store, contents.damage, heads)
 
 
-def _contents(path: Path) -> Contents:
-    contents = Contents()
+def _contents(path: Path) -> RecordingContents:
+    contents = RecordingContents()
     for part in walk(path):
         if isinstance(part, Damage):
             contents.damage = part.text
-        elif isinstance(part, Attached):
+        elif isinstance(part, AttachedFile):
             if part.name in SURFACE_NAMES:
                 contents.surface = part
         else:
@@ -86,7 +106,7 @@ def _contents(path: Path) -> Contents:
     return contents
 
 
-def _take(path: Path, contents: Contents, place: tuple[int, int], stored: Stored) -> None:
+def _take(path: Path, contents: RecordingContents, place: tuple[int, int], stored: StoredMessage) -> None:
     if stored.topic.endswith("/image"):
         contents.places[stored.topic, stored.sequence] = *place, stored.encoding
     elif stored.topic in ("/rig", "/roi", "/truth", "/head", "/frames"):
@@ -97,7 +117,7 @@ def _take(path: Path, contents: Contents, place: tuple[int, int], stored: Stored
             raise InputError(path, stored.topic, repr(error), "a message of its schema") from error
 
 
-def _take_message(path: Path, contents: Contents, topic: str, message: Message) -> None:
+def _take_message(path: Path, contents: RecordingContents, topic: str, message: Message) -> None:
     if topic == "/rig":
         contents.rig = messages.rig_from_message(f"{path} /rig", message)
     elif topic == "/roi":
@@ -116,7 +136,7 @@ def _take_message(path: Path, contents: Contents, topic: str, message: Message) 
         contents.frames[camera, number] = FrameRef(camera, number, own, common)
 
 
-def _check_frames(path: Path, contents: Contents, rig: Rig) -> None:
+def _check_frames(path: Path, contents: RecordingContents, rig: Rig) -> None:
     if not contents.frames:
         raise InputError(path, "/frames", contents.damage or "no message", "at least one image")
     for ref in contents.frames.values():
@@ -131,7 +151,7 @@ def _check_frames(path: Path, contents: Contents, rig: Rig) -> None:
             )
 
 
-def _checked_rois(path: Path, contents: Contents, rig: Rig) -> tuple[Roi, ...]:
+def _checked_rois(path: Path, contents: RecordingContents, rig: Rig) -> tuple[Roi, ...]:
     for i, roi in enumerate(contents.rois.values()):
         if not 0 <= roi.camera < len(rig) or not np.isfinite(roi.stamp):
             got = f"camera {roi.camera} at {roi.stamp} s"
@@ -148,20 +168,20 @@ def _check_first_images(store: RecordingStore, frames: list[FrameRef]) -> None:
     reader.close()
 
 
-def _truth(path: Path, contents: Contents) -> Trajectory | None:
+def _truth(path: Path, contents: RecordingContents) -> Trajectory | None:
     if not contents.truth:
         return None
     rows = checked_rows(path, ((f"/truth[{i}]", row) for i, row in enumerate(sorted(contents.truth))))
     return trajectory_from_rows(rows, contents.exact)
 
 
-def _heads(path: Path, contents: Contents) -> Heads:
-    found = sorted(contents.heads)
-    rows = checked_rows(path, ((f"/head[{i}]", row) for i, (row, _) in enumerate(found)))
-    return Heads(rows, np.array([extruding for _, extruding in found], bool))
+def _heads(path: Path, contents: RecordingContents) -> PrintHeadLog:
+    heads = sorted(contents.heads)
+    rows = checked_rows(path, ((f"/head[{i}]", row) for i, (row, _) in enumerate(heads)))
+    return PrintHeadLog(rows, np.array([extruding for _, extruding in heads], bool))
 
 
-def _unpacked_surface(surface: Attached | None, store: RecordingStore) -> Path | None:
+def _unpacked_surface(surface: AttachedFile | None, store: RecordingStore) -> Path | None:
     """A copy of the scan beside the session, since mesh readers want a file; it goes when the session goes."""
     if surface is None:
         return None
@@ -175,7 +195,7 @@ def _unpacked_surface(surface: Attached | None, store: RecordingStore) -> Path |
 class RecordingStore:
     """Where the images of a recording are: the offset of the chunk that holds each."""
 
-    def __init__(self, path: Path, rig: Rig, places: Places) -> None:
+    def __init__(self, path: Path, rig: Rig, places: ImagePlaces) -> None:
         self.path, self.rig, self.places = path, rig, places
 
     def open(self) -> RecordingReader:
@@ -205,9 +225,9 @@ class RecordingReader:
         offset, index, encoding = self._store.places[topic, ref.number]
         data = self._chunk(offset)[index]
         try:
-            if encoding == compressed_image.ENCODING:
-                return compressed_image.unpack(data)
-            message = parse(self._store.path, Stored(topic, ref.number, data))  # as recordings once held them
+            if encoding == compressed_image.IMAGE_ENCODING:
+                return compressed_image.unpack_image(data)
+            message = parse(self._store.path, StoredMessage(topic, ref.number, data))  # as recordings once held them
             return message["format"], messages.bytes_from_message(message)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(self._store.path, topic, repr(error), "an encoded image") from error
@@ -222,3 +242,94 @@ class RecordingReader:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+T = TypeVar("T")
+
+
+def read_poses(path: str | Path) -> Iterator[SurfacePose]:
+    """Estimated poses."""
+    return _read(path, {"/pose": messages.pose_from_message})
+
+
+def read_smoothed(path: str | Path) -> Iterator[SurfacePose]:
+    """Poses as `stillbed smooth` added them."""
+    return _read(path, {"/smoothed": messages.pose_from_message})
+
+
+def read_observations(path: str | Path) -> Iterator[Observations]:
+    """Observations."""
+    return _read(path, {"/observations": messages.observations_from_message})
+
+
+def read_commands(path: str | Path) -> Iterator[Command]:
+    """Moves and holds as they were decided."""
+    return _read(path, {"/move": messages.move_from_message, "/hold": messages.hold_from_message})
+
+
+def read_sent(path: str | Path) -> Iterator[tuple[float, bytes]]:
+    """Stamps (s) and bytes of what went to the arm."""
+    return _read(path, {"/arm/sent": _stamped_bytes})
+
+
+def read_received(path: str | Path) -> Iterator[tuple[float, bytes]]:
+    """Stamps (s) and bytes of what came from the arm."""
+    return _read(path, {"/arm/received": _stamped_bytes})
+
+
+def read_events(path: str | Path) -> Iterator[tuple[float, int, str]]:
+    """Stamp (s), level and words of every event."""
+    return _read(path, {"/events": lambda m: (m["stamp"], m["level"], m["message"])})
+
+
+def read_truth_rows(path: str | Path) -> Array:
+    """Truth or reference as stored, rows (N, 8) of stamp x y z qx qy qz qw, s and mm, in order of stamp."""
+    return np.array(sorted(_read(path, {"/truth": messages.row_from_message})), float).reshape(-1, 8)
+
+
+def read_heads(path: str | Path) -> Iterator[tuple[float, PrintHead]]:
+    """Stamps (s) of frame sets, and the print head at each."""
+    return _read(path, {"/head": _stamped_head})
+
+
+def _stamped_head(message: Message) -> tuple[float, PrintHead]:
+    row = messages.row_from_message(message)
+    return row[0], head_from_row(row, message["extruding"])
+
+
+def _stamped_bytes(message: Message) -> tuple[float, bytes]:
+    return message["stamp"], messages.bytes_from_message(message)
+
+
+def _read(path: str | Path, decoders: dict[str, Callable[[Message], T]]) -> Iterator[T]:
+    path = Path(path)
+    for part in walk(path):
+        for stored in part.messages if isinstance(part, ChunkMessages) else ():
+            if stored.topic in decoders:
+                message = parse(path, stored)
+                try:
+                    yield decoders[stored.topic](message)
+                except (KeyError, TypeError, ValueError, OverflowError) as error:
+                    raise InputError(path, stored.topic, repr(error), "a message of its schema") from error
+
+
+PATH_ATTACHMENT, ARM_ATTACHMENT = "path.csv", "arm.toml"
+
+
+def input_texts(path: PrintPath, profile: ArmProfile) -> dict[str, str]:
+    """Path and arm as the texts that a recording keeps."""
+    return {PATH_ATTACHMENT: path_text(path), ARM_ATTACHMENT: arm_text(profile, "as a live run used it")}
+
+
+def used_inputs(record: Path) -> tuple[PrintPath, ArmProfile]:
+    """Path and arm that a recorded run used; InputError where it did not begin to print."""
+    attached = (part for part in walk(record) if isinstance(part, AttachedFile))
+    return inputs_from_texts({part.name: part.data.decode("utf-8", "replace") for part in attached}, record)
+
+
+def inputs_from_texts(texts: Mapping[str, str], record: Path) -> tuple[PrintPath, ArmProfile]:
+    """Path and arm of the texts of a recording; InputError where they are not there."""
+    if PATH_ATTACHMENT not in texts or ARM_ATTACHMENT not in texts:
+        raise InputError(record, "recording", "no path", "the recording of a run that began to print")
+    path = path_from_text(texts[PATH_ATTACHMENT], record / PATH_ATTACHMENT)
+    return path, arm_from_text(texts[ARM_ATTACHMENT], record / ARM_ATTACHMENT)

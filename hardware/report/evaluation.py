@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.pose import TrackState
+from estimation.pose import TrackState, Trajectory
 from estimation.se3 import Array
-from estimation.trajectory import Trajectory
 from hardware.files.pose_file import PoseTable
 
-OFF_MM = 10.0  # a pose further off than this while the state says TRACKING is a lie, not an error
+MAX_TRACKING_ERROR_MM = 10.0  # a pose further off than this while the state says TRACKING is a lie, not an error
 NEES_BOUND = 12.592  # chi-square of 6 degrees of freedom, 95 %
 
 
@@ -35,7 +34,7 @@ class Spread:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Errors:
+class PoseErrors:
     """Errors of the measured poses that have a true one beside them, under one constant surface transform.
 
     truth_surface_from_estimated_surface: (4, 4). translation: (M,) mm, of the estimated surface's origin in base.
@@ -66,13 +65,13 @@ class Comparison:
     """A run beside a truth. rows: (M,) of the run; expected: (M, 4, 4) the truth's poses there; both error kinds.
 
     exact: whether the truth is one (NEES means something) or a measured reference. off: measured rows in state TRACKING
-    whose start error passes OFF_MM. stamp_gap: s, median distance of the associated stamps.
+    whose start error passes MAX_TRACKING_ERROR_MM. stamp_gap: s, median distance of the associated stamps.
     """
 
     rows: NDArray[np.int64]
     expected: Array
-    start: Errors
-    aligned: Errors
+    start: PoseErrors
+    aligned: PoseErrors
     exact: bool
     off: NDArray[np.int64]
     stamp_gap: float
@@ -123,7 +122,7 @@ def compare(table: PoseTable, truth: Trajectory) -> Comparison | None:
         start=start,
         aligned=aligned,
         exact=truth.exact,
-        off=rows[tracking & (start.translation > OFF_MM)],
+        off=rows[tracking & (start.translation > MAX_TRACKING_ERROR_MM)],
         stamp_gap=float(np.median(np.abs(table.stamps[rows] - truth.stamps[true_rows]))),
     )
 
@@ -137,7 +136,7 @@ def best_constant(changes: Array) -> Array:
     return se3.orthonormalise(changes.mean(axis=0))
 
 
-def errors_under(constant: Array, expected: Array, estimate: Array, covariance: Array) -> Errors:
+def errors_under(constant: Array, expected: Array, estimate: Array, covariance: Array) -> PoseErrors:
     """Errors of `estimate` (M, 4, 4) against `expected @ constant`, with covariance (M, 6, 6) of the estimate."""
     target = expected @ constant
     difference = se3.log(se3.inverse(estimate) @ target)  # (M, 6) right perturbation of the estimate
@@ -145,7 +144,7 @@ def errors_under(constant: Array, expected: Array, estimate: Array, covariance: 
     nees = np.full(len(estimate), np.nan)
     information = np.linalg.pinv(covariance[usable], hermitian=True)
     nees[usable] = np.einsum("ni,nij,nj->n", difference[usable], information, difference[usable])
-    return Errors(
+    return PoseErrors(
         truth_surface_from_estimated_surface=constant,
         translation=np.linalg.norm(estimate[:, :3, 3] - target[:, :3, 3], axis=-1),
         rotation=np.linalg.norm(difference[:, :3], axis=-1),
@@ -198,7 +197,7 @@ class Evaluation:
 
     title: the session's name. comparison: None without truth or reference. shares: per state, of the frame sets from
     `since` (s) on. complete: whether the session was run to its end. damage: what was lost of its file, "" if nothing.
-    method: how it was tracked, a key of hardware.methods.METHODS or "truth", "" where that is not known.
+    method: how it was tracked, a key of hardware.offline.track.TRACKING_METHODS or "truth", "" where that is not known.
     """
 
     title: str

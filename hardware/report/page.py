@@ -1,4 +1,4 @@
-"""Charts as plain SVG text: scales, and a plot that collects lines, bands, dots and bars. No script, no network."""
+"""What all reports share: one HTML page that needs no network, and charts as plain SVG text without a script."""
 
 from __future__ import annotations
 
@@ -6,14 +6,74 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from importlib.resources import files
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation.se3 import Array
 
-MOST_POINTS = 3000  # a line is thinned to its extremes beyond: no screen shows more
-APART = 2.0  # px between the points of a curve that is drawn
+
+def document(kind: str, title: str, lead: str, body: Sequence[str], footer: str) -> str:
+    """The whole page. kind: of report; lead: the verdict in words; body: parts as HTML; the rest is plain text."""
+    style = (files("hardware.report") / "report.css").read_text(encoding="utf-8")
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(f"{title} · {kind}")}</title>'
+        f'<meta name="viewport" content="width=device-width"><style>\n{style}</style></head><body><main>\n'
+        f'<header><div class="kind">{escape(kind)}</div><h1>{escape(title)}</h1>'
+        f'<p class="lead">{escape(lead)}</p></header>\n'
+        f"{chr(10).join(body)}\n<footer>{escape(footer)}</footer></main></body></html>\n"
+    )
+
+
+def tile(value: str, unit: str, caption: str) -> str:
+    """One figure, large."""
+    return f'<div class="tile"><b>{escape(value)}<small>{escape(unit)}</small></b><span>{escape(caption)}</span></div>'
+
+
+def row_of_tiles(tiles: Sequence[str]) -> str:
+    """Tiles side by side."""
+    return f'<div class="tiles">{"".join(tiles)}</div>'
+
+
+def section(title: str, explanation: str, body: str) -> str:
+    """A titled card; `body` is HTML."""
+    return f"<section><h2>{escape(title)}</h2><p>{escape(explanation)}</p>{body}</section>"
+
+
+def figures_table(head: Sequence[str], rows: Sequence[Sequence[str]], last_total: bool = False) -> str:
+    """A table of plain text; last_total: whether its last row stands out."""
+    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
+    lines = []
+    for i, row in enumerate(rows):
+        style = ' class="total"' if last_total and i == len(rows) - 1 else ""
+        lines.append(f"<tr{style}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
+    return f"<table><thead><tr>{top}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+
+
+def line_key(style: str, words: str) -> str:
+    """An entry of a legend: a line in a CSS class, and what it is."""
+    return f'<span><svg viewBox="0 0 18 10"><path class="{style}" d="M0 5H18"/></svg>{escape(words)}</span>'
+
+
+def dot_key(style: str, words: str) -> str:
+    """An entry of a legend: a dot in a CSS class, and what it is."""
+    return f'<span><svg viewBox="0 0 18 10"><circle class="{style}" cx="9" cy="5" r="4"/></svg>{escape(words)}</span>'
+
+
+def area_key(style: str, words: str) -> str:
+    """An entry of a legend: a patch in a CSS class, and what it is."""
+    patch = f'<svg viewBox="0 0 18 10"><rect class="{style}" width="18" height="10" rx="2"/></svg>'
+    return f"<span>{patch}{escape(words)}</span>"
+
+
+def legend(keys: Sequence[str]) -> str:
+    """The entries of a legend in a row."""
+    return f'<div class="legend">{"".join(keys)}</div>'
+
+
+MAX_LINE_POINTS = 3000  # a line is thinned to its extremes beyond: no screen shows more
+CURVE_SPACING = 2.0  # px between the points of a curve that is drawn
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +127,7 @@ def spanning(values: Sequence[Array], margin: float = 0.06, least: float = 1e-3)
     return low - pad, high + pad
 
 
-def thinned(y: Array, most: int = MOST_POINTS) -> NDArray[np.int64]:
+def thinned(y: Array, most: int = MAX_LINE_POINTS) -> NDArray[np.int64]:
     """Rows (M,) of y (N,) that keep the look of a line: all, or the extremes of each of most / 2 stretches."""
     if len(y) <= most:
         return np.arange(len(y))
@@ -138,7 +198,7 @@ class Plot:
         """A curve through (N,) finite points that may turn back in x, of each APART px along it one point."""
         across, down = self.x(x), self.y(y)
         along = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(across), np.diff(down)))])
-        rows = np.append(np.unique(along // APART, return_index=True)[1], len(x) - 1)
+        rows = np.append(np.unique(along // CURVE_SPACING, return_index=True)[1], len(x) - 1)
         self._parts.append(f'<path class="{style}" d="M{"L".join(self._points(x[rows], y[rows]))}"/>')
 
     def band(self, x: Array, low: Array, high: Array, style: str) -> None:

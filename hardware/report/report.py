@@ -1,29 +1,35 @@
-"""report.html: one run on one page, in one file that needs no network."""
+"""report.html of `stillbed track`: one run on one page, in one file that needs no network."""
 
 from __future__ import annotations
 
-import json
 import math
-import sys
 from html import escape
 from pathlib import Path
 
 import numpy as np
 
 from estimation import se3
-from estimation.errors import InputError, StillbedError
 from estimation.pose import TrackState
 from estimation.se3 import Array
-from hardware.clock_section import clock_section
-from hardware.motion_section import motion_section
-from hardware.page import area_key, document, figures_table, legend, line_key, row_of_tiles, section, tile
-from hardware.report.evaluation import NEES_BOUND, OFF_MM, Comparison, Evaluation, spread
-from hardware.report.page import Plot, ribbon, spanning
-from hardware.report.summary import figure, measured_share, percent, text_of, verdict
+from hardware.report.evaluation import MAX_TRACKING_ERROR_MM, NEES_BOUND, Comparison, Evaluation, spread
+from hardware.report.page import (
+    Plot,
+    area_key,
+    document,
+    figures_table,
+    legend,
+    line_key,
+    ribbon,
+    row_of_tiles,
+    section,
+    spanning,
+    tile,
+)
+from hardware.report.summary import clocks_learned, figure, measured_share, percent, verdict
 
-WIDTH = 1030  # px of a chart across the page
-HALF = 480  # px of one of two
-MOST_EVENTS = 40  # rows of the table of state changes
+PAGE_CHART_WIDTH = 1030  # px of a chart across the page
+HALF_CHART_WIDTH = 480  # px of one of two
+MAX_EVENT_ROWS = 40  # rows of the table of state changes
 
 
 def write_report(path: Path, result: Evaluation) -> None:
@@ -41,10 +47,8 @@ def page(result: Evaluation) -> str:
 
 def sections(result: Evaluation) -> list[str]:
     """The parts of the page that follow its tiles, as HTML."""
-    span = _followed(result)
-    parts = [_states(result), _trajectory(result), motion_section(result.table, span, WIDTH), _errors(result)]
-    parts += [_tracks(result), clock_section(result.table, span, WIDTH), _latency(result)]
-    return [part for part in parts if part]
+    parts = _states, _trajectory, _motion, _errors, _tracks, _clocks, _latency
+    return [html for part in parts if (html := part(result))]
 
 
 def _tiles(result: Evaluation) -> str:
@@ -81,7 +85,7 @@ def _states(result: Evaluation) -> str:
     edges = np.append(table.stamps, last)
     names = [state.value for state in table.states]
     titles = [f"{s:.2f} s: {n}. {why}" for s, n, why in zip(table.stamps, names, table.reasons, strict=True)]
-    strip = ribbon(edges, names, titles, _span(table.stamps), WIDTH)
+    strip = ribbon(edges, names, titles, _span(table.stamps), PAGE_CHART_WIDTH)
     keys = [area_key(name, f"{name} {percent(share)}") for name, share in result.shares.items() if share > 0]
     text = "TRACKING and DEGRADED are measured, COASTING is predicted, LOST is of no use."
     if math.isfinite(result.since):
@@ -96,9 +100,9 @@ def _events(result: Evaluation) -> str:
     rows = "".join(
         f"<tr><td>{table.stamps[i]:.2f} s</td><td class=words>{table.states[i].value}</td>"
         f"<td class=words>{escape(table.reasons[i])}</td></tr>"
-        for i in changes[:MOST_EVENTS]
+        for i in changes[:MAX_EVENT_ROWS]
     )
-    more = len(changes) - MOST_EVENTS
+    more = len(changes) - MAX_EVENT_ROWS
     rest = f"<p>and {more} more, all in poses.csv</p>" if more > 0 else ""
     return f"<details><summary>{len(changes)} states in a row, and why</summary><table>{rows}</table>{rest}</details>"
 
@@ -141,7 +145,7 @@ def _trajectory(result: Evaluation) -> str:
     plots = []
     for i, name in enumerate(names):
         seen = [values[:, i]] if truth is None else [values[:, i], truth[:, i]]
-        plot = Plot(HALF, 165, _followed(result), spanning(seen, 0.12, 0.5), label=name)
+        plot = Plot(HALF_CHART_WIDTH, 165, _followed(result), spanning(seen, 0.12, 0.5), label=name)
         plot.band(table.stamps, values[:, i] - sigma[:, i], values[:, i] + sigma[:, i], "spread")
         if truth is not None:
             plot.line(table.stamps, truth[:, i], "truth")
@@ -156,15 +160,38 @@ def _trajectory(result: Evaluation) -> str:
     return section("Trajectory", text, body)
 
 
+def _motion(result: Evaluation) -> str:
+    """How far the surface was from its last place of rest, and where its movements began; "" without poses."""
+    table = result.table
+    if not len(table):
+        return ""
+    moved = np.where(table.measured, table.moved, np.nan)
+    label = "away from the last place of rest, mm"
+    plot = Plot(PAGE_CHART_WIDTH, 150, _followed(result), spanning([moved], 0.1, 0.3), label=label)
+    plot.line(table.stamps, moved, "estimate")
+    onsets = np.unique(table.onset[np.isfinite(table.onset)])
+    if len(onsets):
+        plot.dots(onsets, np.zeros(len(onsets)), "off", 3)
+    share = float(np.mean(table.moving[table.measured])) if table.measured.any() else float("nan")
+    still = "was never at rest" if share == 1 else f"moved in {100 * share:.0f} % of the measured frame sets"
+    began = {0: "no movement was seen to begin", 1: "one movement was seen to begin"}
+    text = (
+        f"The surface {still}; {began.get(len(onsets), f'{len(onsets)} movements were seen to begin')}. A movement is "
+        "0.3 mm or 0.1°, and a dot marks the first pose of each."
+    )
+    keys = [line_key("estimate", "middle of the surface since it was last at rest")]
+    return section("Motion", text, legend(keys) + plot.svg())
+
+
 def _errors(result: Evaluation) -> str:
     comparison = result.comparison
     if comparison is None:
-        return section(
-            "Errors", "The session has neither truth.tum nor reference.tum, or no measured pose beside it.", ""
-        )
+        missing = "The session has neither truth.tum nor reference.tum, or no measured pose beside it."
+        return section("Errors", missing, "")
+    translation, rotation = comparison.start.translation, np.degrees(comparison.start.rotation)
     plots = [
-        _error_plot(result, comparison, comparison.start.translation, "distance from the start on, mm", OFF_MM),
-        _error_plot(result, comparison, np.degrees(comparison.start.rotation), "angle from the start on, °"),
+        _error_plot(result, comparison, translation, "distance from the start on, mm", MAX_TRACKING_ERROR_MM),
+        _error_plot(result, comparison, rotation, "angle from the start on, °"),
     ]
     text = (
         f"Against the {'exact truth' if comparison.exact else 'measured reference, whose own error is part of this'}, "
@@ -179,7 +206,7 @@ def _error_plot(result: Evaluation, comparison: Comparison, errors: Array, label
     positive = errors[errors > 1e-9]
     high = max(float(positive.max()) * 1.5, 1e-2) if len(positive) else 1.0
     low = max(float(np.percentile(positive, 2)) / 2, high / 1e5) if len(positive) else 0.1
-    plot = Plot(WIDTH, 170, _followed(result), (min(low, high / 10), high), log_y=True, label=label)
+    plot = Plot(PAGE_CHART_WIDTH, 170, _followed(result), (min(low, high / 10), high), log_y=True, label=label)
     stamps, over_time = result.table.stamps, np.full(len(result.table), np.nan)
     over_time[comparison.rows] = errors
     plot.line(stamps, over_time, "estimate")
@@ -201,10 +228,11 @@ def _error_table(comparison: Comparison) -> str:
 
 def _consistency(comparison: Comparison) -> str:
     start, aligned = comparison.start, comparison.aligned
+    inside = percent(aligned.nees_inside) if math.isfinite(aligned.nees_inside) else "–"
     text = (
         f"NEES / 6: {figure(start.mean_nees / 6)} from the start, with the first pose's own error in all poses, "
         f"and {figure(aligned.mean_nees / 6)} aligned. "
-        f"{_percent_or_dash(aligned.nees_inside)} of the aligned poses have a NEES under {NEES_BOUND:.1f}, "
+        f"{inside} of the aligned poses have a NEES under {NEES_BOUND:.1f}, "
         "where 95 % should be. "
     )
     if not comparison.exact:
@@ -212,15 +240,11 @@ def _consistency(comparison: Comparison) -> str:
     return f'<p class="note">{escape(text)}</p>'
 
 
-def _percent_or_dash(share: float) -> str:
-    return percent(share) if math.isfinite(share) else "–"
-
-
 def _tracks(result: Evaluation) -> str:
     table = result.table
     if not len(table):
         return ""
-    plot = Plot(WIDTH, 170, _followed(result), (0.0, max(float(table.used.max(initial=0)) * 1.08, 1.0)))
+    plot = Plot(PAGE_CHART_WIDTH, 170, _followed(result), (0.0, max(float(table.used.max(initial=0)) * 1.08, 1.0)))
     keys = []
     counted = ~table.is_state(TrackState.INITIALISING)
     for i, name in enumerate(table.cameras):
@@ -229,6 +253,28 @@ def _tracks(result: Evaluation) -> str:
         keys.append(line_key(f"series c{i % 5}", f"{name}, median {middle:.0f}"))
     text = "Tracks that carry the pose, per camera."
     return section("Tracks", text, legend(keys) + plot.svg())
+
+
+def _clocks(result: Evaluation) -> str:
+    """How much later than stamped each camera exposes, as it was learned; "" where it was not."""
+    table = result.table
+    if not clocks_learned(table):
+        return ""
+    shown = np.where(table.is_state(TrackState.INITIALISING), np.nan, 1.0)
+    offsets, sigmas = 1000 * table.offsets * shown[:, None], 1000 * table.offset_sigmas
+    limits, keys = spanning([offsets], 0.15, 2.0), []
+    plot = Plot(PAGE_CHART_WIDTH, 150, _followed(result), limits, label="later than stamped, ms")
+    for i, name in enumerate(table.cameras):
+        plot.line(table.stamps, offsets[:, i], f"series c{i % 5}")
+        at_end = f"{1000 * table.offsets[-1, i]:+.1f} ± {sigmas[-1, i]:.1f} ms"
+        keys.append(line_key(f"series c{i % 5}", f"{name}, at the end {at_end}"))
+    text = (
+        "How much later than stamped each camera exposes, against the mean of all, and one standard deviation. It "
+        "shows where the surface moves, and is corrected once it is clearly there."
+    )
+    if not np.nan_to_num(offsets).any():
+        return section("Clocks", f"{text} Here chance explains what was seen, and nothing was corrected.", legend(keys))
+    return section("Clocks", f"{text} Until then a line stays at zero.", legend(keys) + plot.svg())
 
 
 def _latency(result: Evaluation) -> str:
@@ -246,32 +292,9 @@ def _latency(result: Evaluation) -> str:
     figures = figures_table(["stage, ms", "median", "95 %", "99 %", "max"], rows, last_total=True)
     high = max(float(np.percentile(late.total, 99.5)) * 1.25, 1.0)
     counts, edges = np.histogram(np.minimum(late.total, high * (1 - 1e-9)), bins=40, range=(0, high))
-    plot = Plot(
-        HALF,
-        210,
-        (0, high),
-        (0, max(float(counts.max()) * 1.1, 1.0)),
-    )
+    plot = Plot(HALF_CHART_WIDTH, 210, (0, high), (0, max(float(counts.max()) * 1.1, 1.0)))
     plot.bars(edges, counts.astype(float), "bar")
     plot.mark(float(late.p50[-1]), "median", "median")
     plot.mark(float(late.p99[-1]), "99 %", "median")
     caption = '<div class="caption">frame sets by their total, ms</div>'
     return section("Latency", text, f'<div class="two"><div>{figures}</div><div>{caption}{plot.svg()}</div></div>')
-
-
-def main(arguments: list[str]) -> int:
-    """`python -m hardware.report.report OUT`: say again what the run in the folder OUT came to."""
-    path = Path(arguments[0]) / "summary.json"
-    try:
-        print(text_of(json.loads(path.read_text(encoding="utf-8"))))
-        print(f"report: {path.with_name('report.html')}")
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(path, "file", str(error), "the summary.json of stillbed track") from None
-    return 0
-
-
-if __name__ == "__main__":
-    try:
-        sys.exit(main(sys.argv[1:]))
-    except StillbedError as error:
-        sys.exit(f"stillbed: {error}")

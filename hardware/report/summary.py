@@ -12,8 +12,8 @@ import numpy as np
 
 from estimation.pose import TrackState
 from hardware.files.pose_file import PoseTable
-from hardware.files.session import damage_told
-from hardware.report.evaluation import OFF_MM, Comparison, Errors, Evaluation, Spread, spread
+from hardware.files.session import damage_text
+from hardware.report.evaluation import MAX_TRACKING_ERROR_MM, Comparison, Evaluation, PoseErrors, Spread, spread
 
 
 def measured_share(result: Evaluation) -> float:
@@ -29,7 +29,7 @@ def verdict(result: Evaluation) -> list[str]:
     if not result.complete:
         sentences.insert(0, "This run was cut short; what follows is about the part that was done.")
     if result.damage:
-        sentences.insert(0, damage_told(result.damage))
+        sentences.insert(0, damage_text(result.damage))
     if result.comparison is not None:
         sentences += _judgement(result.comparison)
     if len(result.latency.total):
@@ -60,7 +60,7 @@ def _judgement(comparison: Comparison) -> list[str]:
     against = "exact truth" if comparison.exact else "measured reference"
     sentences = [f"Against the {against} it was off by {figure(error.median)} mm and {figure(turn)}° (median)."]
     many = {0: "No pose was", 1: "One pose was"}.get(len(comparison.off), f"{len(comparison.off)} poses were")
-    return [*sentences, f"{many} off by more than {OFF_MM:.0f} mm while the state said TRACKING."]
+    return [*sentences, f"{many} off by more than {MAX_TRACKING_ERROR_MM:.0f} mm while the state said TRACKING."]
 
 
 def percent(share: float) -> str:
@@ -116,7 +116,7 @@ def _comparison_dict(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def _errors_dict(errors: Errors) -> dict[str, Any]:
+def _errors_dict(errors: PoseErrors) -> dict[str, Any]:
     return {
         "translation_mm": spread_dict(spread(errors.translation)),
         "rotation_deg": spread_dict(spread(np.degrees(errors.rotation))),

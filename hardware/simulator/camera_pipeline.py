@@ -2,73 +2,208 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import Protocol
 
+import cv2
 import numpy as np
 
+from estimation import se3
 from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
-from hardware.files.images import decode
-from hardware.offline.track import Step
+from estimation.rig import Camera, pixels_from_points
+from estimation.se3 import Array
+from hardware.files.images import decode, encode
+from hardware.offline.track import FrameSetStep
 from hardware.process.clock import Clock
-from hardware.process.faults import Part, struck
-from hardware.rates import Rates
+from hardware.process.faults import Fault, FaultPart, WorkRates, fault_rng, faults_striking
 from hardware.recording.schemas import WARNING
-from hardware.simulator.agenda import ARRIVAL, EXPOSURE, KNOWN, Agenda
-from hardware.simulator.cameras import Fate, Shot, SimulatedCameras
-from hardware.simulator.instant import Instant
-from hardware.simulator.pictures import Pictures
+from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, TrueCameras, garble
 from hardware.simulator.scenario import Scenario
-from perception.frames import Frame, FrameSet, PrintHead
+from hardware.simulator.scene.appearance import Sensor
+from hardware.simulator.scene.render import render
+from hardware.simulator.scene.scene import Scene, WorldState
+from perception.frames import Frame, FrameSet, Image, PrintHead
 from perception.pairing import Pairing
 from perception.tracking.step import StepReport
+
+Action = Callable[[float], None]  # of the instant, s
+ARRIVAL_EVENT, POSE_EVENT, TICK_EVENT, EXPOSURE_EVENT = range(4)  # what goes first of what falls on one instant
+
+
+class EventQueue:
+    """A queue of actions by instant; what falls on one instant goes by rank, then in the order in which it came."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[float, int, int, Action]] = []
+        self._count = 0
+
+    def at(self, instant: float, rank: int, action: Action) -> None:
+        """Do `action` at `instant`, s."""
+        heapq.heappush(self._heap, (instant, rank, self._count, action))
+        self._count += 1
+
+    def run(self, until: Callable[[], float]) -> Iterator[float]:
+        """Do everything due before `until()`, s, in order; gives each instant after what happened at it."""
+        while self._heap and self._heap[0][0] < until():
+            instant, _, _, action = heapq.heappop(self._heap)
+            action(instant)
+            yield instant
+
+
+WOUND_EXTENT = np.array([[x, y, 0.0] for x in (-26.0, 26.0) for y in (-19.0, 19.0)])  # mm, round a usual wound
+COVER_SCALE = 1.35  # a cover that lies over all of the wound is larger than it by this
+
+
+def draw_cover(image: Image, box: tuple[Array, Array], aside: float, rng: np.random.Generator) -> Image:
+    """A blotchy, skin-toned cover over a box (low, high px); aside: by which part of its width it is drawn away."""
+    low, high = box
+    angle = rng.uniform(0, 2 * np.pi)
+    half = COVER_SCALE * (high - low) / 2
+    away = np.array([np.cos(angle), np.sin(angle)]) * (half + (high - low) / 2) * min(aside, 1.0)
+    middle = (low + high) / 2 + away * 1.45  # wholly beside the box at one, whatever the angle
+    if aside >= 1.0:
+        return image
+    h, w = image.shape
+    small = rng.normal(150, 28, (14, 18)).astype(np.float32)
+    size = tuple(np.maximum(np.round(2 * half), 8).astype(int).tolist())
+    cloth = cv2.resize(small, size, interpolation=cv2.INTER_CUBIC) + rng.normal(0, 6, size[::-1])
+    corner = np.round(middle - half).astype(int)
+    x0, y0 = np.clip(corner, 0, (w, h))
+    x1, y1 = np.clip(corner + size, 0, (w, h))
+    out = image.copy()
+    if x1 > x0 and y1 > y0:
+        part = cloth[y0 - corner[1] : y1 - corner[1], x0 - corner[0] : x1 - corner[0]]
+        out[y0:y1, x0:x1] = np.clip(part, 0, 255).astype(np.uint8)
+    return out
+
+
+def cover_wound(image: Image, camera: Camera, base_from_surface: Array, fault: Fault) -> Image:
+    """An image (H, W, 3) of a camera with a cover over the wound; base_from_surface: (4, 4) mm then."""
+    pixels, _ = pixels_from_points(camera, se3.transform_points(base_from_surface, WOUND_EXTENT))
+    box = pixels.min(0), pixels.max(0)
+    return np.stack([draw_cover(image[..., k], box, 0.0, fault_rng(fault)) for k in range(image.shape[2])], -1)
+
+
+def draw_glare(image: Image, box: tuple[Array, Array], share: float, rng: np.random.Generator) -> Image:
+    """Soft saturated spots over about `share` of a box (low, high px)."""
+    low, high = box
+    light = np.zeros(image.shape, np.float32)
+    for _ in range(3):
+        centre = low + rng.uniform(0.1, 0.9, 2) * (high - low)
+        radius = (high - low) * np.sqrt(share / 3 / np.pi) * rng.uniform(0.8, 1.2)
+        middle, axes = (tuple(np.round(v).astype(int).tolist()) for v in (centre, radius))
+        cv2.ellipse(light, middle, axes, 0, 0, 360, 400.0, -1)
+    soft = cv2.GaussianBlur(light, (0, 0), 3.0)
+    return np.asarray(np.clip(image + soft, 0, 255), np.uint8)
+
+
+NOISE_STREAM, DAMAGE_STREAM = 5, 6  # streams of random numbers of one picture
+
+
+class PictureRenderer:
+    """Renders and encodes what was exposed.
+
+    Exposed pictures wait until one of them is asked for; then all that wait are rendered, one of each camera at a time,
+    with the printed material as it was at the first of them (`lay`): what was laid while pictures travel is missing.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        lenses: TrueCameras,
+        sensor: Sensor,
+        jpeg_quality: int | None,
+        seed: int,
+        threads: int = 2,
+        lay: Callable[[float], None] = lambda until: None,
+    ) -> None:
+        """lenses: the true cameras. lay: brings the scene's printed material up to an instant, s."""
+        self._scene, self._lenses, self._sensor, self._quality = scene, lenses, sensor, jpeg_quality
+        self._seed, self._threads, self._lay = seed, threads, lay
+        self._waiting: list[tuple[Shot, WorldState]] = []  # exposed and not yet rendered
+        self._done: dict[tuple[int, int], tuple[str, bytes]] = {}
+
+    def expose(self, shot: Shot, instant: WorldState) -> None:
+        """Remember the world as this shot meets it."""
+        self._waiting.append((shot, instant))
+
+    def take(self, shot: Shot) -> tuple[str, bytes]:
+        """Format and bytes of a picture that was exposed; each once."""
+        key = shot.camera, shot.number
+        if key not in self._done:
+            self._develop()
+        return self._done.pop(key)
+
+    def _develop(self) -> None:
+        self._lay(min(instant.stamp for _, instant in self._waiting))
+        while self._waiting:
+            batch = {pair[0].camera: pair for pair in reversed(self._waiting)}  # the first of each camera
+            self._waiting = [pair for pair in self._waiting if pair is not batch[pair[0].camera]]
+            self._render(*zip(*batch.values(), strict=True))
+
+    def _render(self, shots: Sequence[Shot], instants: Sequence[WorldState]) -> None:
+        cameras = [self._lenses(shot) for shot in shots]
+        rngs = [self._rng(NOISE_STREAM, shot.camera, shot.picture) for shot in shots]
+        images = render(self._scene, cameras, instants, self._sensor, rngs, self._threads)
+        for i, (shot, camera, instant) in enumerate(zip(shots, cameras, instants, strict=True)):
+            if shot.covered is not None:
+                images[i] = cover_wound(images[i], camera, instant.base_from_surface, shot.covered)
+        with ThreadPoolExecutor(self._threads) as pool:
+            encoded = list(pool.map(lambda image: encode(image, self._quality), images))
+        for shot, (kind, data) in zip(shots, encoded, strict=True):
+            if shot.fate is Fate.GARBLED:
+                data = garble(data, self._rng(DAMAGE_STREAM, shot.camera, shot.number))
+            self._done[shot.camera, shot.number] = kind, data
+
+    def _rng(self, stream: int, camera: int, number: int) -> np.random.Generator:
+        """A picture's own random numbers: they depend on nothing but its camera and number."""
+        return np.random.default_rng([self._seed, stream, camera, number])
+
 
 NO_IMAGE = np.zeros((0, 0), np.uint8)  # of a frame that nobody looks at
 
 Exposures = dict[tuple[int, float], Shot]  # by camera and stamp, s
 
 
-class Watcher(Protocol):
-    """What is told of everything that is seen."""
+class PipelineSink(Protocol):
+    """Receives pictures, print head and poses as they come."""
 
     def picture(self, shot: Shot, kind: str, data: bytes) -> None:
         """A picture that can be decoded has arrived, as encoded by its camera."""
-        ...
 
     def head(self, stamp: float, head: PrintHead) -> None:
         """Where the print head was at the stamp of a frame set, s, which may yet find the tracker busy."""
-        ...
 
     def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
         """A pose was made of a frame set in `spent` s of real time."""
-        ...
 
     def event(self, stamp: float, text: str, level: int = WARNING) -> None:
         """Something that a person should know."""
-        ...
 
 
-Known = Callable[[SurfacePose, FrameSet, Observations], None]  # a pose has reached the motion
+OnPose = Callable[[SurfacePose, FrameSet, Observations], None]  # a pose has reached the motion
 
 
-class Sight:
+class CameraPipeline:
     """The cameras and the tracker of one run. tracked, skipped: frame sets, and those the tracker had no time for."""
 
     def __init__(
         self,
         scenario: Scenario,
-        agenda: Agenda,
-        step: Step,
+        events: EventQueue,
+        step: FrameSetStep,
         exposures: Exposures,
-        sink: Watcher,
+        sink: PipelineSink,
         clock: Clock,
-        known: Known,
-        pictures: Pictures | None = None,
-        instant: Callable[[Shot, float], Instant] | None = None,
+        on_pose: OnPose,
+        pictures: PictureRenderer | None = None,
+        instant: Callable[[Shot, float], WorldState] | None = None,
         head: Callable[[float], PrintHead | None] = lambda stamp: None,
     ) -> None:
         """exposures: filled with the shot of each picture, for a step that may know. clock: measures tracking times.
@@ -77,17 +212,17 @@ class Sight:
         the print head was at a stamp, s.
         """
         self.tracked, self.skipped = 0, 0
-        self._scenario, self._agenda, self._step, self._exposed = scenario, agenda, step, exposures
-        self._sink, self._clock, self._known = sink, clock, known
+        self._scenario, self._events, self._step, self._exposures = scenario, events, step, exposures
+        self._sink, self._clock, self._on_pose = sink, clock, on_pose
         self._pictures, self._instant, self._head = pictures, instant, head
         self._cameras = SimulatedCameras(scenario.cameras, scenario.seed, scenario.faults)
         self._pairer = Pairing(len(scenario.rig), scenario.cameras.period)
-        self._rates = Rates(struck(scenario.faults, Part.TRACKING))
+        self._rates = WorkRates(faults_striking(scenario.faults, FaultPart.TRACKING))
         self._busy = False  # the tracker
         self._waiting: FrameSet | None = None  # the newest that came meanwhile
 
     def begin(self) -> None:
-        """Put the first exposure of each camera on the agenda."""
+        """Put the first exposure of each camera into the queue."""
         for camera in range(len(self._scenario.rig)):
             self._next_shot(self._cameras.shots(camera, self._scenario.seconds))
 
@@ -95,17 +230,17 @@ class Sight:
         shot = next(shots, None)
         if shot is not None:
             due = self._cameras.due(shot.camera, shot.number)
-            self._agenda.at(due, EXPOSURE, partial(self._expose, shot, shots))
+            self._events.at(due, EXPOSURE_EVENT, partial(self._expose, shot, shots))
 
     def _expose(self, shot: Shot, shots: Iterator[Shot], now: float) -> None:
         """Half of a camera's exposure is over: from here on the world may change, the picture may not."""
         self._next_shot(shots)
         if shot.fate is Fate.DROPPED:
             return
-        self._exposed[shot.camera, shot.stamp] = shot
+        self._exposures[shot.camera, shot.stamp] = shot
         if self._pictures is not None and self._instant is not None:
             self._pictures.expose(shot, self._instant(shot, now))
-        self._agenda.at(shot.arrival, ARRIVAL, partial(self._arrive, shot))
+        self._events.at(shot.arrival, ARRIVAL_EVENT, partial(self._arrive, shot))
 
     def _arrive(self, shot: Shot, now: float) -> None:
         frame = Frame(shot.camera, shot.stamp, NO_IMAGE)
@@ -118,14 +253,13 @@ class Sight:
                 return
             self._sink.picture(shot, kind, data)
             frame = replace(frame, image=image)
-        self._formed(self._pairer.add(frame, now), now)
-        self._agenda.at(now + self._pairer.patience, ARRIVAL, self._overdue)
+        self._take_sets(self._pairer.add(frame, now), now)
+        self._events.at(now + self._pairer.patience, ARRIVAL_EVENT, self._overdue)
 
     def _overdue(self, now: float) -> None:
-        self._formed(self._pairer.due(now), now)
+        self._take_sets(self._pairer.due(now), now)
 
-    def _formed(self, sets: Sequence[FrameSet], now: float) -> None:
-        """New frame sets: the tracker takes the newest when it is free."""
+    def _take_sets(self, sets: Sequence[FrameSet], now: float) -> None:
         for frames in sets:
             if self._waiting is not None:
                 self.skipped += 1
@@ -151,11 +285,11 @@ class Sight:
         self._sink.pose(frames, pose, self._step.last, spent)
         processing = self._scenario.tracking.processing
         known = self._rates.done(now, spent if processing is None else processing)
-        self._agenda.at(known, KNOWN, partial(self._know, pose, frames, self._step.last.observations))
+        self._events.at(known, POSE_EVENT, partial(self._deliver, pose, frames, self._step.last.observations))
         self._step.idle()
 
-    def _know(self, pose: SurfacePose, frames: FrameSet, seen: Observations, now: float) -> None:
+    def _deliver(self, pose: SurfacePose, frames: FrameSet, observations: Observations, now: float) -> None:
         self._busy = False
-        self._known(pose, frames, seen)
+        self._on_pose(pose, frames, observations)
         if self._waiting is not None:
             self._track(now)

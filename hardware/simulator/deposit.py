@@ -1,63 +1,143 @@
-"""Where the material went: beads laid and beads planned, seen from above the surface, layer by layer.
+"""The planned path, the log of the nozzle's true motion, and the material: beads deposited and planned, layer by layer.
 
 A straight bead is 1 thick over its whole width and 0 beside it, so thickness is in units of the nominal bead. The
 nozzle lays it as a disc whose density 1 / (pi sqrt(r^2 - d^2)) has that very profile in every direction (its chords all
-weigh 1), so that neither a corner nor a trembling nozzle needs a direction of its own. Plan and deposit are laid in the
-same way. Lengths count as seen from above: on a slope, where both get thicker, neither does here.
+weigh 1), so that neither a corner nor a trembling nozzle needs a direction of its own. Plan and deposit are drawn in
+the same way. Lengths count as seen from above: on a slope, where both get thicker, neither does here.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
 from estimation.se3 import Array
-from hardware.simulator.nozzle_log import NozzleLog, row_step
-from hardware.simulator.planned_line import PlannedLine
+from planning.path import MIN_SPACING, Path, way_lengths
 
-CELL = 0.1  # mm
-LEAST_CELLS = 4  # across a bead: fewer do not hold its profile, so cells shrink with thin beads
-FAR = 20.0  # mm beyond the planned path where the map ends; what is laid further out is laid there
-FINE = 5  # samples for each cell that a bead crosses
-HALF = 0.5  # of a bead's thickness too much or too little: a gap or an overlap
-_PARTS = 32  # of a cell, each way, over which the disc's density is summed
+DISTANCES_AT_ONCE = 2_000_000  # distances held at once
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedLine:
+    """The K - 1 straight pieces between K checkpoints; a piece has the number of the checkpoint before it."""
+
+    knots: Array  # (K,) mm along the path, as NozzleLog.place counts them (turns count too)
+    points: Array  # (K, 3) mm, surface frame
+    printed: NDArray[np.bool_]  # (K-1,) whether material leaves on it
+    layer: NDArray[np.int64]  # (K-1,)
+
+    @property
+    def end(self) -> float:
+        """The place of the last checkpoint, mm."""
+        return float(self.knots[-1])
+
+    def piece(self, place: Array) -> NDArray[np.int64]:
+        """Piece (N,) on which each place (N,), mm, lies; a checkpoint belongs to the piece that leads to it."""
+        return np.clip(np.searchsorted(self.knots, place, "left") - 1, 0, len(self.knots) - 2)
+
+    def direction(self) -> Array:
+        """Unit vector (K-1, 3) of each piece; a turn on the spot has that of the piece before it, or the next one's."""
+        step = np.diff(self.points, axis=0)
+        length = np.linalg.norm(step, axis=1)
+        moving = np.flatnonzero(length >= MIN_SPACING)
+        if not len(moving):
+            return np.tile([1.0, 0.0, 0.0], (len(step), 1))  # nowhere to go: any direction serves
+        nearest = moving[np.maximum(np.searchsorted(moving, np.arange(len(step)), "right") - 1, 0)]
+        return np.asarray(step[nearest] / length[nearest, None])
+
+    def distance(self, points: Array) -> Array:
+        """Distance (N,), mm, of points (N, 3) in the surface frame from what is printed; NaN where nothing is."""
+        if not self.printed.any():
+            return np.full(len(points), np.nan)
+        size = max(1, DISTANCES_AT_ONCE // int(self.printed.sum()))
+        parts = [self._distance(points[i : i + size]) for i in range(0, len(points), size)]
+        return np.concatenate(parts) if parts else np.empty(0)
+
+    def _distance(self, points: Array) -> Array:
+        start = self.points[:-1][self.printed]
+        step = self.points[1:][self.printed] - start
+        square = np.sum(step**2, axis=1)
+        reached = points @ step.T - np.sum(start * step, axis=1)  # (N, P)
+        share = np.clip(reached / np.where(square > 0, square, 1.0), 0.0, 1.0)
+        # |point - start - share * step|^2 less |point|^2, which does not say which piece is nearest
+        far = np.sum(start**2, axis=1) - 2 * points @ start.T - 2 * share * reached + share**2 * square
+        nearest = np.argmin(far, axis=1)
+        foot = start[nearest] + share[np.arange(len(points)), nearest][:, None] * step[nearest]
+        return np.asarray(np.linalg.norm(points - foot, axis=1))
+
+
+def planned_line(path: Path) -> PlannedLine:
+    """The pieces of a path: whether, how fast and in which layer is printed is said by the checkpoint they lead to."""
+    poses = path.surface_from_nozzle
+    knots = np.concatenate([[0.0], np.cumsum(way_lengths(poses))])
+    return PlannedLine(knots, poses[:, :3, 3], path.extrude[1:], path.layer[1:])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NozzleLog:
+    """The true motion of the nozzle, a row a millisecond, N rows; NaN where no checkpoint was due yet."""
+
+    stamps: Array  # (N,) s
+    base_from_surface: Array  # (N, 4, 4) mm
+    base_from_nozzle: Array  # (N, 4, 4) mm, executed by the arm
+    base_from_target: Array  # (N, 4, 4) mm, the checkpoint on the true surface that was due
+    place: Array  # (N,) mm along the path of that checkpoint
+    checkpoint: NDArray[np.int64]  # (N,) its number, -1 for none
+    extrude: NDArray[np.bool_]  # (N,) whether material leaves the nozzle
+    reason: NDArray[np.str_]  # (N,) why the arm holds, "" while it moves
+    surface_from_tip: Array  # (N, 3) mm, the tip in the surface frame, deformation taken back
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+def row_step(log: NozzleLog) -> float:
+    """How long a row lasts, s; 0 where there are not two."""
+    return float(np.median(np.diff(log.stamps))) if len(log) > 1 else 0.0
+
+
+def join_logs(logs: Sequence[NozzleLog]) -> NozzleLog:
+    """One log of several that follow each other."""
+    columns = (np.concatenate([getattr(log, f.name) for log in logs]) for f in fields(NozzleLog))
+    return NozzleLog(*columns)
+
+
+MAP_CELL = 0.1  # mm
+MIN_CELLS_PER_BEAD = 4  # across a bead: fewer do not hold its profile, so cells shrink with thin beads
+MAP_REACH = 20.0  # mm beyond the planned path where the map ends; what is laid further out is laid there
+SAMPLES_PER_CELL = 5  # samples for each cell that a bead crosses
+HALF_BEAD = 0.5  # of a bead's thickness too much or too little: a gap or an overlap
+_DISC_SUBCELLS = 32  # of a cell, each way, over which the disc's density is summed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepositMap:
-    """Thickness of material, in nominal beads, on cells of the surface's x and y.
+    """Thickness of material, in nominal beads, on cells of the surface's x and y."""
 
-    low: (2,) mm, x and y of the outer corner of the first cell. cell: mm. layers: (L,) numbers, rising. planned,
-    deposited: (L, H, W), rows along y, columns along x.
-    """
-
-    low: Array
-    cell: float
-    layers: NDArray[np.int64]
-    planned: Array
-    deposited: Array
+    low: Array  # (2,) mm, x and y of the outer corner of the first cell
+    cell: float  # mm
+    layers: NDArray[np.int64]  # (L,) numbers, rising
+    planned: Array  # (L, H, W), rows along y, columns along x
+    deposited: Array  # (L, H, W)
 
 
 @dataclass(frozen=True, slots=True)
 class DepositFigures:
-    """How the deposit compares with the plan: sums over the layers, each layer with its own plan; NaN without a plan.
+    """How the deposit compares with the plan: sums over the layers, each with its own plan; NaN without a plan.
 
-    area: mm^2, planned, a cell counting by its thickness up to 1. coverage: share of it that got its material; a bead
-    half as thick covers half. outside: area beyond the plan that got material, as a share of the planned. gaps,
-    overlap: share of the planned cells (at least HALF thick in the plan) that lack HALF a bead of a single one, or have
-    1.5 times what was planned, or HALF a bead more where that is less than one. material: all that was laid, as a share
-    of all that was planned.
+    Gaps and overlaps are shares of the planned cells, those at least HALF_BEAD thick in the plan.
     """
 
-    area: float
-    coverage: float
-    gaps: float
-    overlap: float
-    outside: float
-    material: float
+    area: float  # mm^2, planned, a cell counting by its thickness up to 1
+    coverage: float  # share of the area that got its material; a bead half as thick covers half
+    gaps: float  # cells that lack HALF_BEAD of a single bead
+    overlap: float  # cells with 1.5 times the plan, or HALF_BEAD more where the plan is below one
+    outside: float  # area beyond the plan that got material, as a share of the planned
+    material: float  # all that was deposited, as a share of all that was planned
 
 
 def deposit_map(log: NozzleLog, line: PlannedLine, bead: float) -> DepositMap:
@@ -66,9 +146,9 @@ def deposit_map(log: NozzleLog, line: PlannedLine, bead: float) -> DepositMap:
     Between two extruding rows material leaves in proportion to the way that the path goes on meanwhile, and falls on
     the straight line between the nozzle's two tips; it belongs to the layer of the path's piece.
     """
-    cell = min(CELL, bead / LEAST_CELLS)
-    planned, laid = _planned(line, cell), _laid(log, line, cell)
-    everything = np.concatenate([line.points[:, :2], laid.places])
+    cell = min(MAP_CELL, bead / MIN_CELLS_PER_BEAD)
+    planned, deposited = _planned_drops(line, cell), _deposited_drops(log, line, cell)
+    everything = np.concatenate([line.points[:, :2], deposited.places])
     margin = bead / 2 + 3 * cell  # of these, 2 for the bead's blurred edge
     low = everything.min(axis=0) - margin
     columns, rows = np.ceil((everything.max(axis=0) + margin - low) / cell).astype(int)
@@ -80,15 +160,15 @@ def deposit_map(log: NozzleLog, line: PlannedLine, bead: float) -> DepositMap:
         each = [_spread(places, drops.material * (drops.layer == n), (rows, columns), disc) for n in layers]
         return np.array(each).reshape(len(layers), rows, columns)
 
-    return DepositMap(low, cell, layers, thickness(planned), thickness(laid))
+    return DepositMap(low, cell, layers, thickness(planned), thickness(deposited))
 
 
-def deposit_figures(found: DepositMap) -> DepositFigures:
+def deposit_figures(thickness: DepositMap) -> DepositFigures:
     """The figures of a map."""
-    planned, deposited = found.planned, found.deposited
-    square = found.cell**2
+    planned, deposited = thickness.planned, thickness.deposited
+    square = thickness.cell**2
     wanted, got = np.minimum(planned, 1.0), np.minimum(deposited, 1.0)
-    area, cells = float(wanted.sum()) * square, int((planned >= HALF).sum())
+    area, cells = float(wanted.sum()) * square, int((planned >= HALF_BEAD).sum())
     if not cells:
         return DepositFigures(area, *[float("nan")] * 5)
     lacking, double = gaps_and_overlaps(planned, deposited)
@@ -104,9 +184,9 @@ def deposit_figures(found: DepositMap) -> DepositFigures:
 
 def gaps_and_overlaps(planned: Array, deposited: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which cells (...) are gaps and which overlap, as DepositFigures counts them, of thicknesses (...)."""
-    there = planned >= HALF
-    gaps = there & (deposited <= np.minimum(planned, 1.0) - HALF)
-    return gaps, there & (deposited > np.maximum(1.5 * planned, planned + HALF))
+    there = planned >= HALF_BEAD
+    gaps = there & (deposited <= np.minimum(planned, 1.0) - HALF_BEAD)
+    return gaps, there & (deposited > np.maximum(1.5 * planned, planned + HALF_BEAD))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,20 +198,20 @@ class _Drops:
     layer: NDArray[np.int64]
 
 
-def _planned(line: PlannedLine, cell: float) -> _Drops:
+def _planned_drops(line: PlannedLine, cell: float) -> _Drops:
     start, end = line.points[:-1, :2][line.printed], line.points[1:, :2][line.printed]
     return _drops(start, end, np.linalg.norm(end - start, axis=1), line.layer[line.printed], cell)
 
 
-def _laid(log: NozzleLog, line: PlannedLine, cell: float) -> _Drops:
-    seen = np.linalg.norm(np.diff(line.points[:, :2], axis=0), axis=1)
-    way = np.interp(log.place, line.knots, np.concatenate([[0.0], np.cumsum(seen)]))  # NaN stays NaN
+def _deposited_drops(log: NozzleLog, line: PlannedLine, cell: float) -> _Drops:
+    from_above = np.linalg.norm(np.diff(line.points[:, :2], axis=0), axis=1)
+    way = np.interp(log.place, line.knots, np.concatenate([[0.0], np.cumsum(from_above)]))  # NaN stays NaN
     steady = np.diff(log.stamps) < 1.5 * row_step(log)
     on = log.extrude[:-1] & log.extrude[1:] & steady & (np.diff(way) > 0)
     on &= np.isfinite(log.surface_from_tip[:-1, 0]) & np.isfinite(log.surface_from_tip[1:, 0])
     start, end = log.surface_from_tip[:-1, :2][on], log.surface_from_tip[1:, :2][on]
     middle = (log.place[:-1] + np.diff(log.place) / 2)[on]
-    low, high = line.points[:, :2].min(axis=0) - FAR, line.points[:, :2].max(axis=0) + FAR
+    low, high = line.points[:, :2].min(axis=0) - MAP_REACH, line.points[:, :2].max(axis=0) + MAP_REACH
     start, end = np.clip(start, low, high), np.clip(end, low, high)
     return _drops(start, end, np.diff(way)[on], line.layer[line.piece(middle)], cell)
 
@@ -139,7 +219,7 @@ def _laid(log: NozzleLog, line: PlannedLine, cell: float) -> _Drops:
 def _drops(start: Array, end: Array, material: Array, layer: NDArray[np.int64], cell: float) -> _Drops:
     """Ways from start to end (M, 2), mm, each with its material (M,), as drops spread evenly along them."""
     length = np.linalg.norm(end - start, axis=1)
-    count = np.maximum(np.ceil(length * FINE / cell), 1).astype(int)
+    count = np.maximum(np.ceil(length * SAMPLES_PER_CELL / cell), 1).astype(int)
     way = np.repeat(np.arange(len(start)), count)
     first = np.concatenate([[0], np.cumsum(count)[:-1]]).astype(int) if len(count) else count
     share = (np.arange(len(way)) - first[way] + 0.5) / count[way]
@@ -157,15 +237,15 @@ def _spread(places: Array, material: Array, shape: tuple[int, int], disc: Array)
         for y in (0, 1):
             weight = material * np.abs(1 - x - part[:, 0]) * np.abs(1 - y - part[:, 1])
             dots += np.bincount((corner[:, 1] + y) * shape[1] + corner[:, 0] + x, weight, len(dots))
-    laid = fftconvolve(dots.reshape(shape), disc, mode="same")
-    return np.asarray(np.where(laid > 1e-9, laid, 0.0))  # the transform leaves 1e-16 everywhere
+    thickness = fftconvolve(dots.reshape(shape), disc, mode="same")
+    return np.asarray(np.where(thickness > 1e-9, thickness, 0.0))  # the transform leaves 1e-16 everywhere
 
 
 def _disc(width: float) -> Array:
     """Weights (M, M), M odd, of a disc `width` cells wide: what 1 cell of bead gives to each cell around it."""
     reach = int(np.ceil(width / 2))
-    fine = (np.arange((2 * reach + 1) * _PARTS) + 0.5) / _PARTS - reach - 0.5
+    fine = (np.arange((2 * reach + 1) * _DISC_SUBCELLS) + 0.5) / _DISC_SUBCELLS - reach - 0.5
     inside = (width / 2) ** 2 - fine[:, None] ** 2 - fine[None] ** 2
     density = np.where(inside > 0, 1 / np.sqrt(np.where(inside > 0, inside, 1.0)), 0.0)
-    weights = density.reshape(2 * reach + 1, _PARTS, 2 * reach + 1, _PARTS).sum(axis=(1, 3))
+    weights = density.reshape(2 * reach + 1, _DISC_SUBCELLS, 2 * reach + 1, _DISC_SUBCELLS).sum(axis=(1, 3))
     return np.asarray(width * weights / weights.sum())

@@ -26,56 +26,65 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from estimation.synthetic.draws import WIDEST, BreathingSpec, draw_breathing, draw_noise, draw_pulse, draw_walk
-from estimation.synthetic.motions import FRAMES_PER_S, Driven, Motion, Part, shaking_amplitude
-from estimation.synthetic.waveforms import Corners, Levels, Sine, Steps, Waveform, Zigzag
+from estimation.synthetic.movements import (
+    FRAMES_PER_S,
+    MAX_DRAW_SIGMAS,
+    BreathingSpec,
+    ComposedMotion,
+    MotionPart,
+    WaveformMotion,
+    draw_breathing,
+    draw_noise,
+    draw_pulse,
+    draw_walk,
+    shaking_amplitude,
+)
+from estimation.synthetic.waveforms import Levels, RoundedCorners, Sine, StepWave, Waveform, Zigzag
 from hardware.process.checks import Table
-from hardware.simulator.scenario_tables import Keys
-from hardware.simulator.trace_file import read_trace
-from hardware.simulator.traces import traced
+from hardware.simulator.scenario_tables import TableReader
+from hardware.simulator.trace_file import played_trace, read_trace
 
 MOTION_STREAM = 21  # of the scenario's seed: no other draw of the simulator shares it
-OUTWARD = (0.0, 0.0, 1.0)  # the surface's normal
-UNIT_MM = 100.0  # the thesis's cube has an edge of 1 unit, 282 px: at 400 mm before 1109 px of focal length, 102 mm
-WIDEST_SPREAD = 0.9 / WIDEST  # no breath and no beat may come out with no length
+SURFACE_NORMAL = (0.0, 0.0, 1.0)  # the surface's normal
+THESIS_UNIT_MM = 100.0  # edge of the thesis's cube: 282 px at 400 mm before 1109 px of focal length are 102 mm
+MAX_SPREAD = 0.9 / MAX_DRAW_SIGMAS  # no breath and no beat may come out with no length
 
-Random = np.random.Generator
+Generator = np.random.Generator
 
 
-def motion_from_tables(where: object, tables: list[Table], folder: Path, seed: int) -> Motion:
+def motion_from_tables(where: object, tables: list[Table], folder: Path, seed: int) -> ComposedMotion:
     """The motion that `[[motion]]` tables describe, none for a surface at rest.
 
     folder: what a trace's file is relative to. seed: >= 0; part i draws from it and i alone. InputError names the key.
     """
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         raise InputError(where, "motion", tables, "[[motion]] tables")
-    return Motion(tuple(_part(where, i, table, folder, seed) for i, table in enumerate(tables)))
+    return ComposedMotion(tuple(_part(where, i, table, folder, seed) for i, table in enumerate(tables)))
 
 
-def waveform_from_table(where: object, key: str, table: Table, rng: Random) -> Waveform:
+def waveform_from_table(where: object, key: str, table: Table, rng: Generator) -> Waveform:
     """A waveform alone, of height 1: a table `key` of kind breathing, pulse, sine or steps, without amplitude."""
     if not isinstance(table, dict):
         raise InputError(where, key, table, f"a table [{key}]")
-    keys = Keys(where, f"{key}.", table)
-    wave = WAVES[keys.word("kind", list(WAVES))](keys, rng)
+    keys = TableReader(where, f"{key}.", table)
+    wave = WAVE_KINDS[keys.word("kind", list(WAVE_KINDS))](keys, rng)
     keys.done()
     return wave
 
 
-def _part(where: object, number: int, table: Table, folder: Path, seed: int) -> Part:
-    keys = Keys(where, f"motion[{number}].", table)
-    kind = keys.word("kind", [*WAVES, *PARTS])
+def _part(where: object, number: int, table: Table, folder: Path, seed: int) -> MotionPart:
+    keys = TableReader(where, f"motion[{number}].", table)
+    kind = keys.word("kind", [*WAVE_KINDS, *PART_KINDS])
     rng = np.random.default_rng([seed, MOTION_STREAM, number])
     pivot = keys.vector("pivot_mm", (0.0, 0.0, 0.0))
-    part = _driven(keys, kind, rng, pivot) if kind in WAVES else PARTS[kind](keys, rng, pivot, folder)
+    part = _driven(keys, kind, rng, pivot) if kind in WAVE_KINDS else PART_KINDS[kind](keys, rng, pivot, folder)
     keys.done()
     return part
 
 
-def _driven(keys: Keys, kind: str, rng: Random, pivot: Array) -> Driven:
-    """One waveform along one direction."""
-    wave = WAVES[kind](keys, rng)
-    direction, turn = keys.axis("direction", OUTWARD), np.deg2rad(keys.vector("turn_deg", (0.0, 0.0, 0.0)))
+def _driven(keys: TableReader, kind: str, rng: Generator, pivot: Array) -> WaveformMotion:
+    wave = WAVE_KINDS[kind](keys, rng)
+    direction, turn = keys.axis("direction", SURFACE_NORMAL), np.deg2rad(keys.vector("turn_deg", (0.0, 0.0, 0.0)))
     name = "height_mm" if kind == "steps" else "amplitude_mm"
     if kind == "sine" and keys.has("mm_per_frame"):
         if keys.has(name):
@@ -84,10 +93,10 @@ def _driven(keys: Keys, kind: str, rng: Random, pivot: Array) -> Driven:
         amplitude = shaking_amplitude(keys.number("mm_per_frame"), keys.number("rate_hz"), fps)
     else:
         amplitude = keys.number(name, 0.0 if turn.any() else None)
-    return Driven((wave,), np.concatenate([turn, amplitude * direction])[None], pivot)
+    return WaveformMotion((wave,), np.concatenate([turn, amplitude * direction])[None], pivot)
 
 
-def _breathing(keys: Keys, rng: Random) -> Waveform:
+def _breathing(keys: TableReader, rng: Generator) -> Waveform:
     usual = BreathingSpec()
     if keys.has("rate_hz") and keys.has("period_s"):
         raise InputError(keys.where, keys.prefix + "rate_hz", keys.table["rate_hz"], "one of rate_hz, period_s")
@@ -96,8 +105,8 @@ def _breathing(keys: Keys, rng: Random) -> Waveform:
         period=keys.number("period_s", 1 / rate, 0.2, 50),
         inspiration=keys.number("inspiration", usual.inspiration, 0.1, 0.9),
         exponent=keys.number("exponent", usual.exponent, 2, 20),
-        period_spread=keys.number("period_spread", usual.period_spread, 0, WIDEST_SPREAD),
-        depth_spread=keys.number("depth_spread", usual.depth_spread, 0, WIDEST_SPREAD),
+        period_spread=keys.number("period_spread", usual.period_spread, 0, MAX_SPREAD),
+        depth_spread=keys.number("depth_spread", usual.depth_spread, 0, MAX_SPREAD),
         sighs_per_min=keys.number("sighs_per_min", usual.sighs_per_min, 0, 10),
         sigh_factor=keys.number("sigh_factor", usual.sigh_factor, 1, 5),
         pauses_per_min=keys.number("pauses_per_min", usual.pauses_per_min, 0, 10),
@@ -106,40 +115,40 @@ def _breathing(keys: Keys, rng: Random) -> Waveform:
     return draw_breathing(spec, rng)
 
 
-def _pulse(keys: Keys, rng: Random) -> Waveform:
+def _pulse(keys: TableReader, rng: Generator) -> Waveform:
     rate = keys.number("rate_hz", 1.15, 0.2, 5)
-    spreads = [keys.number(name, 0.05, 0, WIDEST_SPREAD) for name in ("rate_spread", "depth_spread")]
+    spreads = [keys.number(name, 0.05, 0, MAX_SPREAD) for name in ("rate_spread", "depth_spread")]
     return draw_pulse(rate, spreads[0], spreads[1], rng)
 
 
-def _sine(keys: Keys, rng: Random) -> Waveform:
+def _sine(keys: TableReader, rng: Generator) -> Waveform:
     return Sine(keys.number("rate_hz", None, 0, 50, open=True), math.radians(keys.number("phase_deg", 0.0)))
 
 
-def _steps(keys: Keys, rng: Random) -> Waveform:
+def _steps(keys: TableReader, rng: Generator) -> Waveform:
     every = keys.number("every_s", 2.0, 1e-3)
     rise = keys.number("rise_s", min(0.05, every), 1e-3, every)
     first = keys.number("start_s", every, 0)
-    return Steps(first, every, rise, keys.word("pattern", ["turns", "stairs"], "turns") == "stairs")
+    return StepWave(first, every, rise, keys.word("pattern", ["turns", "stairs"], "turns") == "stairs")
 
 
-def _tremor(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
+def _tremor(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
     return _noise(keys, rng, pivot, (8.0, 12.0), 0.0)
 
 
-def _hand(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
+def _hand(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
     return _noise(keys, rng, pivot, (0.2, 3.0), 1.0)
 
 
-def _noise(keys: Keys, rng: Random, pivot: Array, band: tuple[float, float], tilt: float) -> Driven:
+def _noise(keys: TableReader, rng: Generator, pivot: Array, band: tuple[float, float], tilt: float) -> WaveformMotion:
     """Six noises of their own; tilt: 1 for one speed at every frequency, as of a hand, counted from its start."""
     low, high = keys.band("band_hz", band)
     rms = _six(keys, "rms_mm", "rms_deg", 0.0)
     waves = tuple(draw_noise(low, high, tilt, rng) for _ in range(6))
-    return Driven(waves, np.diag(rms), pivot, from_start=tilt > 0)
+    return WaveformMotion(waves, np.diag(rms), pivot, from_start=tilt > 0)
 
 
-def _six(keys: Keys, shift: str, turn: str, low: float = -math.inf) -> Array:
+def _six(keys: TableReader, shift: str, turn: str, low: float = -math.inf) -> Array:
     """Rotation and shift (6,), rad and mm, of two keys; one of them must be there."""
     if not keys.has(shift) and not keys.has(turn):
         raise InputError(keys.where, keys.prefix + shift, "missing", f"{shift} or {turn}, 3 numbers")
@@ -147,19 +156,18 @@ def _six(keys: Keys, shift: str, turn: str, low: float = -math.inf) -> Array:
     return np.concatenate([np.deg2rad(keys.vector(turn, zero, low)), keys.vector(shift, zero, low)])
 
 
-def _drift(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
+def _drift(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
     speed = np.concatenate([np.deg2rad(keys.vector("speed_deg_s", (0, 0, 0))), keys.vector("speed_mm_s", (0, 0, 0))])
     walk = np.concatenate([np.deg2rad(keys.vector("walk_deg", (0, 0, 0), 0)), keys.vector("walk_mm", (0, 0, 0), 0)])
     if not speed.any() and not walk.any():
-        raise InputError(
-            keys.where, keys.prefix + "speed_mm_s", "missing", "speed_mm_s, speed_deg_s, walk_mm or walk_deg"
-        )
-    steady = Corners(np.zeros(1), np.ones(1), 1.0)  # from rest, at full speed after half a second
+        allowed = "speed_mm_s, speed_deg_s, walk_mm or walk_deg"
+        raise InputError(keys.where, keys.prefix + "speed_mm_s", "missing", allowed)
+    steady = RoundedCorners(np.zeros(1), np.ones(1), 1.0)  # from rest, at full speed after half a second
     waves: list[Waveform] = [steady, *(draw_walk(rng) for _ in range(6))]
-    return Driven(tuple(waves), np.concatenate([speed[None], np.diag(walk)]), pivot)
+    return WaveformMotion(tuple(waves), np.concatenate([speed[None], np.diag(walk)]), pivot)
 
 
-def _ramp(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
+def _ramp(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
     speed = _six(keys, "speed_mm_s", "speed_deg_s")
     rounding = keys.number("round_s", 0.2, 1e-3)
     start = keys.number("start_s", 0.0)
@@ -173,55 +181,48 @@ def _ramp(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
         times, bends = [start, end, 2 * end - start], [1.0, -2.0, 1.0]
     else:
         times, bends = [start, end], [1.0, -1.0]
-    return Driven((Corners(np.array(times), np.array(bends), rounding),), speed[None], pivot)
+    return WaveformMotion((RoundedCorners(np.array(times), np.array(bends), rounding),), speed[None], pivot)
 
 
-def _constant(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
+def _constant_speed(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
     """The thesis's cube (4.6): constant speed in all six degrees of freedom, 0.3 of both.
 
     Its unit is the cube's edge; the rotation's is not said, rad/s are taken. It ran on for ever; here it comes back.
     """
-    unit, speed = keys.number("unit_mm", UNIT_MM, 0, open=True), keys.number("speed_units_s", 0.3)
+    unit, speed = keys.number("unit_mm", THESIS_UNIT_MM, 0, open=True), keys.number("speed_units_s", 0.3)
     turn = math.radians(keys.number("turn_deg_s", math.degrees(0.3)))
     along, about = (keys.vector(name, (1.0, 1.0, 1.0)) for name in ("direction", "axis"))
     travel = keys.number("travel_s", 1.0, 1e-3)
     rounding = keys.number("round_s", min(0.2, travel), 1e-3, 2 * travel)
-    return Driven((Zigzag(travel, rounding),), np.concatenate([turn * about, unit * speed * along])[None], pivot)
+    reach = np.concatenate([turn * about, unit * speed * along])[None]
+    return WaveformMotion((Zigzag(travel, rounding),), reach, pivot)
 
 
-def _turn(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Driven:
+def _turn(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
     """To each angle and back, with a rest before each change; the thesis's wrist (4.6) turned by 25 and -16 degrees."""
     angles = keys.list_of_numbers("angles_deg", (25.0, -16.0))
-    axis = keys.axis("axis", OUTWARD)
+    axis = keys.axis("axis", SURFACE_NORMAL)
     duration, hold = keys.number("duration_s", 1.0, 1e-2), keys.number("hold_s", 1.0, 0)
     start = keys.number("start_s", hold, 0)
     starts = start + (duration + hold) * np.arange(2.0 * len(angles))
     steps = np.stack([angles, -angles], axis=1).ravel()
     period = float(starts[-1] + duration) if keys.flag("repeat", True) else math.inf
-    return Driven((Levels(starts, steps, duration, period),), np.deg2rad(np.append(axis, np.zeros(3)))[None], pivot)
+    reach = np.deg2rad(np.append(axis, np.zeros(3)))[None]
+    return WaveformMotion((Levels(starts, steps, duration, period),), reach, pivot)
 
 
-def _trace(keys: Keys, rng: Random, pivot: Array, folder: Path) -> Part:
+def _trace(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> MotionPart:
     unit = keys.word("unit", ["mm", "m"]) if keys.has("unit") else None
     rate = keys.number("rate_hz", None, 0, open=True) if keys.has("rate_hz") else None
     trace = read_trace(folder / keys.text("file"), unit, rate, keys.number("start_s", 0.0, 0))
     smooth = keys.number("smooth_s", None, 0) if keys.has("smooth_s") else None
     back = keys.word("loop", ["back", "hold"], "back") == "back"
-    return traced(trace, keys.number("scale", 1.0), keys.flag("rotation", True), smooth, back, pivot)
+    return played_trace(trace, keys.number("scale", 1.0), keys.flag("rotation", True), smooth, back, pivot)
 
 
-WAVES: dict[str, Callable[[Keys, Random], Waveform]] = {
-    "breathing": _breathing,
-    "pulse": _pulse,
-    "sine": _sine,
-    "steps": _steps,
-}
-PARTS: dict[str, Callable[[Keys, Random, Array, Path], Part]] = {
-    "tremor": _tremor,
-    "hand": _hand,
-    "drift": _drift,
-    "ramp": _ramp,
-    "constant": _constant,
-    "turn": _turn,
-    "trace": _trace,
-}
+WAVE_KINDS: dict[str, Callable[[TableReader, Generator], Waveform]] = dict(
+    breathing=_breathing, pulse=_pulse, sine=_sine, steps=_steps
+)
+PART_KINDS: dict[str, Callable[[TableReader, Generator, Array, Path], MotionPart]] = dict(
+    tremor=_tremor, hand=_hand, drift=_drift, ramp=_ramp, constant=_constant_speed, turn=_turn, trace=_trace
+)

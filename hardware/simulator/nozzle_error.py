@@ -1,10 +1,11 @@
-"""The error at the nozzle: how far it is from where it should be on the moving surface, and what that comes to.
+"""The error at the nozzle: how far it is from where it should be on the moving surface, how late, and why the arm held.
 
-Everything is told of the extruding rows: where no material leaves, being elsewhere is no error.
+Everything counts the extruding rows alone: where no material leaves, being elsewhere is no error.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,30 +13,160 @@ from numpy.typing import NDArray
 
 from estimation.se3 import Array
 from hardware.report.evaluation import Spread, spread
-from hardware.simulator.hold_reasons import Holds, HoldSpan, hold_spans, holds_of
-from hardware.simulator.lag import Lag, lag_of
-from hardware.simulator.nozzle_log import NozzleLog, row_step
-from hardware.simulator.planned_line import PlannedLine
+from hardware.report.page import stretches
+from hardware.simulator.deposit import NozzleLog, PlannedLine, row_step
 
-NEAR = 0.5  # mm: what a thin bead forgives
-ARRIVED = 0.01  # mm from the end of the path at which it counts as finished
+_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")  # but not the 2 of a camera called cam2
+_ANY = "…"
+
+
+@dataclass(frozen=True, slots=True)
+class HoldGroup:
+    """Holds of one kind."""
+
+    reason: str  # what their reasons share, "…" for a number that differs among them
+    count: int  # how many
+    seconds: float  # s in all
+    longest: float  # s
+    first: float  # s, the instant at which the first began
+
+
+@dataclass(frozen=True, slots=True)
+class HoldSpan:
+    """One hold: from `start` to `end`, s, and the reason that it began with."""
+
+    start: float
+    end: float
+    reason: str
+
+
+def hold_spans(stamps: Array, reason: NDArray[np.str_], step: float) -> list[HoldSpan]:
+    """The holds in rows `stamps` (N,) s with `reason` (N,), "" where the arm moves; a row lasts `step` s.
+
+    A reason that goes on with other numbers is the same hold; another one begins another.
+    """
+    if not len(reason):
+        return []
+    words, index = np.unique(reason, return_inverse=True)
+    kinds = {kind: i for i, kind in enumerate(dict.fromkeys(_without_numbers(str(word)) for word in words))}
+    kind = np.array([kinds[_without_numbers(str(word))] for word in words])[index]
+    changed = (np.diff(kind) != 0) | (np.diff(stamps) > 1.5 * step)
+    starts = np.concatenate([[0], np.flatnonzero(changed) + 1])
+    ends = np.append(starts[1:], len(reason)) - 1
+    return [
+        HoldSpan(float(stamps[a]), float(stamps[b]) + step, str(reason[a]))
+        for a, b in zip(starts, ends, strict=True)
+        if reason[a]
+    ]
+
+
+def group_holds(spans: list[HoldSpan]) -> tuple[HoldGroup, ...]:
+    """Holds by kind, those that took longest in all first."""
+    groups: dict[str, list[HoldSpan]] = {}
+    for span in spans:
+        groups.setdefault(_without_numbers(span.reason), []).append(span)
+    kinds = [_hold_group(group) for group in groups.values()]
+    return tuple(sorted(kinds, key=lambda holds: (-holds.seconds, holds.first)))
+
+
+def _hold_group(group: list[HoldSpan]) -> HoldGroup:
+    lasted = [span.end - span.start for span in group]
+    reason = _common_reason([span.reason for span in group])
+    return HoldGroup(reason, len(group), float(sum(lasted)), max(lasted), group[0].start)
+
+
+def _without_numbers(reason: str) -> str:
+    return _NUMBER.sub(_ANY, reason)
+
+
+def _common_reason(reasons: list[str]) -> str:
+    columns = zip(*(_NUMBER.findall(reason) for reason in reasons), strict=True)
+    numbers = iter([column[0] if len(set(column)) == 1 else _ANY for column in columns])
+    return _NUMBER.sub(lambda _: next(numbers), reasons[0])
+
+
+MAX_LAG = 0.25  # s, the largest shift tried; a loop later than this follows nothing that breathes
+COARSE_STEP = 0.01  # s between the shifts first tried
+MIN_TARGET_SPEED = 1.0  # mm/s, root mean square: slower, 10 um of noise already are 10 ms of lag
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NozzleErrors:
-    """The error in each of N rows of a log; NaN where no target was due.
+class NozzleLag:
+    """How late the nozzle is."""
 
-    vector: (N, 3) mm, nozzle less target, in the surface frame. split: (N, 3) mm, the same along the path (ahead is
-    positive), across it (to the left) and along the target's axis (back into the tool), which is the surface's normal
-    as far as the path says so. angle: (N,) rad between the nozzle's axis and the target's. path: (N,) mm from the tip
-    to the nearest place that is printed, whenever that is due, and known without a target too; NaN where the path
-    prints nothing.
+    seconds: float  # behind the target, below 0 ahead of it, NaN where unknown
+    shifts: Array  # (M,) s that were tried
+    distance: Array  # (M,) mm, RMS between the nozzle and the target so shifted
+
+
+def nozzle_lag(log: NozzleLog) -> NozzleLag:
+    """The shift tau that minimises the mean of |nozzle(t) - target(t - tau)|^2 over the extruding rows, in base.
+
+    This is their cross-correlation in least squares: the two differ by what does not depend on tau. It is searched for
+    by whole rows and refined by a parabola through the best three. Only rows count that have a target for SEARCH on
+    either side, without a gap in the stamps, so each shift is judged by the same rows. Nothing is fitted but tau: on a
+    surface at rest and a straight path an offset along the path is a lag, as no one can tell the two apart. NaN where
+    no row counts, the target moves slower than MIN_TARGET_SPEED, or the best shift is at the end of the search.
     """
+    if len(log) < 3:
+        return _unknown_lag()
+    step = row_step(log)
+    most, stride = round(MAX_LAG / step), max(1, round(COARSE_STEP / step))
+    rows = _rows(log, step, most)
+    nozzle, target = log.base_from_nozzle[:, :3, 3], log.base_from_target[:, :3, 3]
+    if not len(rows) or _speed(target, rows, step) < MIN_TARGET_SPEED:
+        return _unknown_lag()
+    tried = np.arange(-most, most + 1, stride)
+    squares = _squares(nozzle, target, rows, tried)
+    best = int(tried[np.argmin(squares)])
+    near = np.arange(max(best - stride, -most), min(best + stride, most) + 1)
+    around = _squares(nozzle, target, rows, near)
+    i = int(np.argmin(around))
+    shifts, distance = np.asarray(tried * step), np.asarray(np.sqrt(squares))
+    if not 0 < i < len(near) - 1:
+        return NozzleLag(float("nan"), shifts, distance)
+    before, at, after = around[i - 1 : i + 2]
+    bend = before - 2 * at + after
+    part = 0.5 * (before - after) / bend if bend > 0 else 0.0
+    return NozzleLag(float((near[i] + part) * step), shifts, distance)
 
-    vector: Array
-    split: Array
-    angle: Array
-    path: Array
+
+def _unknown_lag() -> NozzleLag:
+    return NozzleLag(float("nan"), np.empty(0), np.empty(0))
+
+
+def _rows(log: NozzleLog, step: float, most: int) -> NDArray[np.int64]:
+    known = np.isfinite(log.base_from_target[:, 0, 3])
+    gaps = np.flatnonzero(np.abs(np.diff(log.stamps) - step) > 0.5 * step) + 1
+    inside = np.zeros(len(log), bool)
+    for first, last in zip([0, *gaps], [*gaps, len(log)], strict=True):
+        for part in stretches(known[first:last]):
+            inside[first + part.start + most : max(first + part.stop - most, 0)] = True
+    return np.flatnonzero(inside & log.extrude)
+
+
+def _speed(target: Array, rows: NDArray[np.int64], step: float) -> float:
+    velocity = (target[rows + 1] - target[rows - 1]) / (2 * step)
+    return float(np.sqrt(np.mean(np.sum(velocity**2, axis=1))))
+
+
+def _squares(nozzle: Array, target: Array, rows: NDArray[np.int64], shifts: NDArray[np.int64]) -> Array:
+    there = nozzle[rows]
+    return np.array([np.mean(np.sum((there - target[rows - shift]) ** 2, axis=1)) for shift in shifts])
+
+
+NEAR_ERROR = 0.5  # mm: what a thin bead forgives
+END_TOLERANCE = 0.01  # mm from the end of the path at which it counts as finished
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RowErrors:
+    """The error in each of N rows of a log; NaN where no target was due."""
+
+    vector: Array  # (N, 3) mm, nozzle less target, in the surface frame
+    split: Array  # (N, 3) mm, along the path (ahead), across it (left), along the target's axis (into the tool)
+    angle: Array  # (N,) rad between the nozzle's axis and the target's
+    path: Array  # (N,) mm to the nearest printed place, with or without a target; NaN where none is printed
 
     @property
     def distance(self) -> Array:
@@ -43,7 +174,7 @@ class NozzleErrors:
         return np.asarray(np.linalg.norm(self.vector, axis=1))
 
 
-def nozzle_errors(log: NozzleLog, line: PlannedLine) -> NozzleErrors:
+def nozzle_errors(log: NozzleLog, line: PlannedLine) -> RowErrors:
     """The error in every row, each from nothing but its own row."""
     base_from_surface = log.base_from_surface[:, :3, :3]
     difference = log.base_from_nozzle[:, :3, 3] - log.base_from_target[:, :3, 3]
@@ -54,18 +185,15 @@ def nozzle_errors(log: NozzleLog, line: PlannedLine) -> NozzleErrors:
     along = _unit(direction - np.sum(direction * normal, axis=1, keepdims=True) * normal)
     across = np.cross(normal, along)
     split = np.einsum("nij,nj->ni", np.stack([along, across, normal], axis=1), difference)
-    return NozzleErrors(
-        vector, split, _between(log.base_from_nozzle[:, :3, 2], normal), line.distance(log.surface_from_tip)
-    )
+    angle = _between(log.base_from_nozzle[:, :3, 2], normal)
+    return RowErrors(vector, split, angle, line.distance(log.surface_from_tip))
 
 
 def _turned(base_from_surface: Array, vectors: Array) -> Array:
-    """Vectors (N, 3) in base as seen in the surface frame."""
     return np.asarray(np.einsum("nji,nj->ni", base_from_surface, vectors))
 
 
 def _unit(vectors: Array) -> Array:
-    """Vectors (N, 3) at length 1; a vector of no length stays."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors / np.where(length > 1e-9, length, 1.0))
 
@@ -77,42 +205,36 @@ def _between(a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NozzleFigures:
-    """What a run came to. Spreads are of lengths in mm and of the angle in rad, over the extruding rows with a target.
+    """The figures of a run. Spreads are over the extruding rows with a target, parts of the error without sign.
 
-    position: the error's length. along, across, normal: of its parts, without sign. path: the distance from the
-    printed line. offset: (3,) mm, mean error in the surface frame. near: share of the extruding time with an error
-    under NEAR. extruding: s. untold: s of it without a target, and so in no spread.
-
-    printing: s from the first extruding row until the path is finished, planned travel left out. The path is finished
-    in the last row that extrudes or has a place more than ARRIVED short of the end; if no row comes that near to the
-    end, in the last row of the log. Travel are the rows whose place lies on a piece that does not print; a row without
-    a place has the last known one. duty: extruding rows among those of `printing`; NaN where nothing was due to print,
-    0 where nothing was extruded of what was. finished: whether the path was. holds: until then, by kind; spans: each.
+    The path is finished in the last row that extrudes or has a place more than END_TOLERANCE short of the end; if no
+    row comes that near to the end, in the last row of the log. Travel are the rows whose place lies on a piece that
+    does not print; a row without a place has the last known one.
     """
 
-    position: Spread
-    along: Spread
-    across: Spread
-    normal: Spread
-    angle: Spread
-    path: Spread
-    offset: Array
-    near: float
-    extruding: float
-    untold: float
-    printing: float
-    duty: float
-    finished: bool
-    lag: Lag
-    holds: tuple[Holds, ...]
-    spans: tuple[HoldSpan, ...]
+    position: Spread  # mm, length of the error
+    along: Spread  # mm
+    across: Spread  # mm
+    normal: Spread  # mm
+    angle: Spread  # rad
+    path: Spread  # mm from the printed line
+    offset: Array  # (3,) mm, mean error in the surface frame
+    near: float  # share of the extruding time with an error under NEAR_ERROR
+    extruding: float  # s
+    untold: float  # s of it without a target, and so in no spread
+    printing: float  # s from the first extruding row until the path is finished, without planned travel
+    duty: float  # extruding share of `printing`; NaN where nothing was due, 0 where nothing was extruded
+    finished: bool  # whether the path was
+    lag: NozzleLag
+    holds: tuple[HoldGroup, ...]  # until then, by kind
+    spans: tuple[HoldSpan, ...]  # each of them
 
 
-def nozzle_figures(log: NozzleLog, line: PlannedLine, errors: NozzleErrors) -> NozzleFigures:
+def nozzle_figures(log: NozzleLog, line: PlannedLine, errors: RowErrors) -> NozzleFigures:
     """The figures of a log and its errors."""
     step = row_step(log)
-    told = log.extrude & np.isfinite(errors.distance)
-    distance, split = errors.distance[told], np.abs(errors.split[told])
+    with_target = log.extrude & np.isfinite(errors.distance)
+    distance, split = errors.distance[with_target], np.abs(errors.split[with_target])
     printing, end, finished = _printing(log, line)
     extruding, extruded = int(log.extrude.sum()), int((log.extrude & printing).sum())
     spans = hold_spans(log.stamps[:end], log.reason[:end], step)
@@ -121,17 +243,17 @@ def nozzle_figures(log: NozzleLog, line: PlannedLine, errors: NozzleErrors) -> N
         along=spread(split[:, 0]),
         across=spread(split[:, 1]),
         normal=spread(split[:, 2]),
-        angle=spread(errors.angle[told]),
-        path=spread(errors.path[told & np.isfinite(errors.path)]),
-        offset=errors.vector[told].mean(axis=0) if told.any() else np.full(3, np.nan),
-        near=float(np.sum(distance < NEAR) / extruding) if extruding else float("nan"),
+        angle=spread(errors.angle[with_target]),
+        path=spread(errors.path[with_target & np.isfinite(errors.path)]),
+        offset=errors.vector[with_target].mean(axis=0) if with_target.any() else np.full(3, np.nan),
+        near=float(np.sum(distance < NEAR_ERROR) / extruding) if extruding else float("nan"),
         extruding=extruding * step,
-        untold=float(extruding - told.sum()) * step,
+        untold=float(extruding - with_target.sum()) * step,
         printing=float(printing.sum()) * step,
         duty=_duty(extruded, int(printing.sum()), len(log), line),
         finished=finished,
-        lag=lag_of(log),
-        holds=holds_of(spans),
+        lag=nozzle_lag(log),
+        holds=group_holds(spans),
         spans=tuple(spans),
     )
 
@@ -145,7 +267,7 @@ def _duty(extruded: int, printing: int, rows: int, line: PlannedLine) -> float:
 def _printing(log: NozzleLog, line: PlannedLine) -> tuple[NDArray[np.bool_], int, bool]:
     """(N,) rows in which material was due; the row after the last before the end of the path; if it was finished."""
     known = np.isfinite(log.place)
-    short = known & (log.place < line.end - ARRIVED)
+    short = known & (log.place < line.end - END_TOLERANCE)
     finished = bool((known & ~short).any())
     going = np.flatnonzero(short | log.extrude)
     end = int(going[-1]) + 1 if finished and len(going) else len(log)

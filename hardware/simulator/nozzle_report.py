@@ -1,42 +1,172 @@
-"""report.html of a simulated print: the error at the nozzle on one page, in one file that needs no network."""
+"""report.html of a simulated print: errors, holds, deposit and the way of the nozzle, in one file without a network."""
 
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterable
+from dataclasses import dataclass
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation.se3 import Array
-from hardware.page import area_key, document, figures_table, legend, line_key, row_of_tiles, section, tile
-from hardware.report.page import Plot, stretches, thinned
-from hardware.report.report import HALF, WIDTH, sections
+from hardware.report.page import (
+    Plot,
+    area_key,
+    document,
+    figures_table,
+    legend,
+    line_key,
+    round_step,
+    row_of_tiles,
+    section,
+    stretches,
+    thinned,
+    tile,
+)
+from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, sections
 from hardware.report.summary import figure
-from hardware.simulator.lag import Lag
-from hardware.simulator.nozzle_error import NEAR
-from hardware.simulator.nozzle_log import row_step
-from hardware.simulator.nozzle_run import NozzleResult
+from hardware.simulator.deposit import HALF_BEAD, DepositMap, gaps_and_overlaps, row_step
+from hardware.simulator.nozzle_error import NEAR_ERROR, NozzleLag
 from hardware.simulator.nozzle_summary import (
-    HEADS,
-    PARTS,
+    SPREAD_HEADS,
+    SPREAD_PARTS,
+    NozzleResult,
     allowed_in_words,
     nozzle_verdict,
     reached_in_words,
     rows_of_errors,
     share,
 )
-from hardware.simulator.print_picture import KINDS, bead_picture, view_of, way_keys, way_picture
 
-KIND = "stillbed simulate"
-FOOTER = (
+PAGE_KIND = "stillbed simulate"
+PAGE_FOOTER = (
     "Lengths in mm, time in s of the simulation's own clock. The error is the nozzle's tip less the place on the true "
     "surface that was due at that instant, both known exactly; nothing in the loop sees either."
 )
-MOST_LAYERS = 6  # bead maps shown
-MOST_ROWS = 12_000  # of a log drawn as one line
-MOST_SHADES = 1500  # stretches shaded in a chart: finer ones cannot be told apart
-WIDE = 2.2  # width over height of the print from which its pictures stand one below the other
+_MARKS = {True: '<span class="met">✓ met</span>', False: '<span class="missed">✗ missed</span>'}
+MAX_LAYERS = 6  # bead maps shown
+MAX_LINE_POINTS = 12_000  # of a log drawn as one line
+MAX_SHADED_SPANS = 1500  # stretches shaded in a chart: finer ones cannot be told apart
+WIDE_ASPECT = 2.2  # width over height of the print from which its pictures stand one below the other
+CELL_KINDS = ("as planned", "missing", "double", "outside")  # of cells, in this order; report.css has them as classes
+CELL_COLOURS = (0x5C, 0x97, 0xBD), (0xD0, 0x56, 0x3E), (0xE3, 0xA5, 0x3C), (0x84, 0x66, 0xB8)  # red, green, blue
+MIN_PICTURE_PX = 1000  # px across a picture's longer side, at least: cells are drawn with smooth edges
+ERROR_STEPS = (0.1, 0.25, 0.5, 1.0)  # mm: the error's colours change here
+MAX_WAY_PIECES = 4000  # of the way drawn: more are no longer seen
+SCALE_HEIGHT_PX = 34  # px below a picture for its scale
+MIN_PICTURE_HEIGHT = 40.0  # px, the least height of a picture
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TopView:
+    """A window onto the surface from above, y up. low, high: (2,) mm, its corners. width: px."""
+
+    low: Array
+    high: Array
+    width: float
+
+    @property
+    def scale(self) -> float:
+        """px per mm."""
+        return float(self.width / (self.high[0] - self.low[0]))
+
+    @property
+    def height(self) -> float:
+        """px."""
+        return max(float(self.scale * (self.high[1] - self.low[1])), MIN_PICTURE_HEIGHT)
+
+    def pixels(self, points: Array) -> Array:
+        """(N, 2) px of points (N, 2) or (N, 3) in the surface frame, mm; x right, y down."""
+        return np.stack([points[:, 0] - self.low[0], self.high[1] - points[:, 1]], axis=1) * self.scale
+
+    def svg(self, body: str, name: str) -> str:
+        """The picture with its scale below."""
+        length = round_step((self.high[0] - self.low[0]) / 6)
+        bar = f'<path class="scale" d="M2 {self.height + 10:.1f}v6h{length * self.scale:.1f}v-6"/>'
+        bar += f'<text x="2" y="{self.height + 29:.1f}">{length:g} mm</text>'
+        box = f'viewBox="0 0 {self.width:g} {self.height + SCALE_HEIGHT_PX:.1f}"'
+        return f'<svg class="plot" {box} role="img" aria-label="{escape(name)}">{body}{bar}</svg>'
+
+
+def whole_map_view(deposit: DepositMap, width: float) -> TopView:
+    """The whole map."""
+    shape = np.array(deposit.planned.shape[:0:-1])  # (W, H)
+    return TopView(deposit.low, deposit.low + deposit.cell * shape, width)
+
+
+def bead_picture(result: NozzleResult, layer: int, width: float) -> str:
+    """One layer's beads, planned and laid, by CELL_KINDS, with the planned path. layer: its index in the map."""
+    deposit, line = result.deposit, result.line
+    view = whole_map_view(deposit, width)
+    planned, deposited = deposit.planned[layer], deposit.deposited[layer]
+    times = max(1, -(-MIN_PICTURE_PX // max(planned.shape)))
+    size = (planned.shape[1] * times, planned.shape[0] * times)
+    planned, deposited = (cv2.resize(m, size, interpolation=cv2.INTER_LINEAR) for m in (planned, deposited))
+    encoded = base64.b64encode(_png(cell_kinds(planned, deposited), np.maximum(planned, deposited))).decode()
+    box = f'width="{view.width:g}" height="{view.scale * (view.high[1] - view.low[1]):.1f}"'
+    image = f'<image {box} preserveAspectRatio="none" href="data:image/png;base64,{encoded}"/>'
+    plan = view.pixels(line.points)
+    pieces = np.flatnonzero(line.printed & (line.layer == deposit.layers[layer]))
+    seams = "".join(_polyline("seam", plan[i : i + 2]) for i in pieces)
+    return view.svg(image + seams, f"beads of layer {deposit.layers[layer]}")
+
+
+def cell_kinds(planned: Array, deposited: Array) -> NDArray[np.uint8]:
+    """Index in CELL_KINDS (H, W) of each cell, by the bounds of DepositFigures; empty cells count as 0."""
+    kind = np.zeros(planned.shape, np.uint8)
+    for number, cells in enumerate(gaps_and_overlaps(planned, deposited), 1):
+        kind[cells] = number
+    kind[(planned < HALF_BEAD) & (deposited >= HALF_BEAD)] = 3
+    return kind
+
+
+def _png(kind: NDArray[np.uint8], thickness: Array) -> bytes:
+    """A PNG (H, W) that is coloured by kind and clear where nothing is; the first row of the map is at its bottom."""
+    picture = np.empty((*kind.shape, 4), np.uint8)
+    picture[..., :3] = np.array(CELL_COLOURS, np.uint8)[kind][..., ::-1]
+    picture[..., 3] = np.round(255 * np.clip(4 * thickness - 1.5, 0, 1)).astype(np.uint8)  # half a bead is its edge
+    done, data = cv2.imencode(".png", picture[::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    assert done
+    return data.tobytes()
+
+
+def way_picture(result: NozzleResult, width: float) -> str:
+    """The planned path, dashed, and the way of the tip while it printed, coloured by the error."""
+    view = whole_map_view(result.deposit, width)
+    plan = view.pixels(result.line.points)
+    lines = [_polyline("plan", plan[i : i + 2]) for i in np.flatnonzero(result.line.printed)]
+    log, distance = result.run.log, result.errors.distance
+    tip = view.pixels(log.surface_from_tip)
+    stride = max(1, int(np.ceil(log.extrude.sum() / MAX_WAY_PIECES)))
+    for part in stretches(log.extrude & np.isfinite(tip[:, 0])):
+        rows = np.append(np.arange(part.start, part.stop - 1, stride), part.stop - 1)
+        worst = np.fmax.reduceat(distance, rows)[:-1] if len(rows) > 1 else np.empty(0)
+        colour = np.searchsorted(ERROR_STEPS, np.nan_to_num(worst, nan=np.inf))
+        for piece in _equal_runs(colour):
+            lines.append(_polyline(f"e{colour[piece.start]}", tip[rows[piece.start : piece.stop + 1]]))
+    return view.svg("".join(lines), "the way of the nozzle by its error")
+
+
+def way_legend() -> list[tuple[str, str]]:
+    """Class and words of each colour in `way_picture`."""
+    lows = ("", *(f"{step:g}" for step in ERROR_STEPS))
+    between = (f"{a} to {b:g} mm" for a, b in zip(lows[1:], ERROR_STEPS[1:], strict=False))
+    words = [f"under {ERROR_STEPS[0]:g} mm", *between, f"over {ERROR_STEPS[-1]:g} mm"]
+    return [(f"e{i}", text) for i, text in enumerate(words)]
+
+
+def _equal_runs(values: NDArray[np.int64]) -> list[slice]:
+    edges = np.append(np.flatnonzero(np.diff(values, prepend=-1)), len(values))
+    return [slice(int(a), int(b)) for a, b in pairwise(edges)]
+
+
+def _polyline(style: str, points: Array) -> str:
+    return f'<path class="{style}" d="M{"L".join(f"{x:.1f} {y:.1f}" for x, y in points)}"/>'
 
 
 def write_nozzle_report(path: Path, result: NozzleResult) -> None:
@@ -49,9 +179,9 @@ def nozzle_page(result: NozzleResult) -> str:
     parts = [_badge(result), _tiles(result), _figures(result)]
     if len(result.run.log):
         parts += [_over_time(result), _parts(result), _spread(result), _pictures(result)]
-    parts += [_holds(result), _seen(result), _tracking(result), _files(result)]
+    parts += [_holds(result), _camera_pictures(result), _tracking(result), _files(result)]
     lead = " ".join(nozzle_verdict(result))
-    return document(KIND, result.run.title or "a print", lead, [part for part in parts if part], FOOTER)
+    return document(PAGE_KIND, result.run.title or "a print", lead, [part for part in parts if part], PAGE_FOOTER)
 
 
 def _badge(result: NozzleResult) -> str:
@@ -64,56 +194,45 @@ def _badge(result: NozzleResult) -> str:
 
 def _tiles(result: NozzleResult) -> str:
     f = result.figures.nozzle
-    return row_of_tiles(
-        [
-            tile(figure(f.position.p95), "mm", "error, 95 % of the time"),
-            tile(figure(f.position.max), "mm", "error, at most"),
-            tile(share(f.duty).removesuffix(" %"), "%", "duty: printed of the time it had"),
-            tile(figure(np.degrees(f.angle.p95)), "°", "angle, 95 % of the time"),
-            tile(figure(1000 * f.lag.seconds), "ms", "lag"),
-            tile(share(result.figures.deposit.coverage).removesuffix(" %"), "%", "of the planned area covered"),
-        ]
+    tiles = (
+        (figure(f.position.p95), "mm", "error, 95 % of the time"),
+        (figure(f.position.max), "mm", "error, at most"),
+        (share(f.duty).removesuffix(" %"), "%", "duty: printed of the time it had"),
+        (figure(np.degrees(f.angle.p95)), "°", "angle, 95 % of the time"),
+        (figure(1000 * f.lag.seconds), "ms", "lag"),
+        (share(result.figures.deposit.coverage).removesuffix(" %"), "%", "of the planned area covered"),
     )
-
-
-# -- figures
+    return row_of_tiles([tile(*each) for each in tiles])
 
 
 def _figures(result: NozzleResult) -> str:
     rows = [
-        [name, *(figure(getattr(spread, part) * scale) for part in PARTS)]
+        [name, *(figure(getattr(spread, part) * scale) for part in SPREAD_PARTS)]
         for name, _, spread, scale in rows_of_errors(result)
     ]
     offset = ", ".join(figure(v) for v in result.figures.nozzle.offset)
     f = result.figures.nozzle
-    more = (
-        f"Within {NEAR:g} mm for {share(f.near)} of the {f.extruding:.2f} s it printed, of {f.printing:.2f} s it had; "
-        f"mean error {offset} mm along x, y and z of the surface."
-    )
-    errors = figures_table(["", *HEADS], rows) + f'<p class="note">{escape(more)}</p>'
+    time = f"of the {f.extruding:.2f} s it printed, of {f.printing:.2f} s it had"
+    within = f"Within {NEAR_ERROR:g} mm for {share(f.near)} {time}"
+    more = f"{within}; mean error {offset} mm along x, y and z of the surface."
+    errors = figures_table(["", *SPREAD_HEADS], rows) + f'<p class="note">{escape(more)}</p>'
     text = "Over the milliseconds in which material left the nozzle; parts of the error are without their sign."
-    if not result.verdicts:
-        return section("Error while printing", text, errors)
-    return section("Limits", "What the scenario asks of a run.", _limits(result)) + section(
-        "Error while printing", text, errors
-    )
+    limits = section("Limits", "What the scenario asks of a run.", _limits(result)) if result.verdicts else ""
+    return limits + section("Error while printing", text, errors)
 
 
 def _limits(result: NozzleResult) -> str:
-    rows = "".join(
-        f"<tr><td>{escape(v.bound.words)}</td><td>{escape(reached_in_words(v))}</td>"
-        f"<td>{escape(allowed_in_words(v))}</td><td>{_mark(v.met)}</td></tr>"
+    rows = [
+        (escape(v.bound.words), escape(reached_in_words(v)), escape(allowed_in_words(v)), _MARKS[v.met])
         for v in result.verdicts
-    )
-    head = "<tr><th></th><th>reached</th><th>allowed</th><th></th></tr>"
-    return f"<table><thead>{head}</thead><tbody>{rows}</tbody></table>"
+    ]
+    return _table(("", "reached", "allowed", ""), rows)
 
 
-def _mark(met: bool) -> str:
-    return f'<span class="{"met" if met else "missed"}">{"✓ met" if met else "✗ missed"}</span>'
-
-
-# -- over time
+def _table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    head = "".join(f"<th>{cell}</th>" for cell in columns)
+    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def _span(stamps: Array) -> tuple[float, float]:
@@ -122,41 +241,38 @@ def _span(stamps: Array) -> tuple[float, float]:
 
 
 def _shades(result: NozzleResult, plot: Plot) -> None:
-    """Shade the extruding stretches, and the holds with their reasons."""
     log = result.run.log
     step = row_step(log)
     parts = stretches(log.extrude)
     start = np.array([log.stamps[part.start] for part in parts])
     end = np.array([log.stamps[part.stop - 1] + step for part in parts])
-    kept = _longest(end - start)
-    plot.shade(start[kept], end[kept], "extruding")
+    longest = _longest(end - start)
+    plot.shade(start[longest], end[longest], "extruding")
     spans = result.figures.nozzle.spans
     start, end = np.array([s.start for s in spans]), np.array([s.end for s in spans])
-    kept = _longest(end - start)
-    titles = [f"{spans[i].start:.3f} s, for {spans[i].end - spans[i].start:.3f} s: {spans[i].reason}" for i in kept]
-    plot.shade(start[kept], end[kept], "holding", titles)
+    longest = _longest(end - start)
+    titles = [f"{spans[i].start:.3f} s, for {spans[i].end - spans[i].start:.3f} s: {spans[i].reason}" for i in longest]
+    plot.shade(start[longest], end[longest], "holding", titles)
 
 
 def _longest(lengths: Array) -> Array:
-    """Indices of the MOST_SHADES longest, in their order."""
-    return np.sort(np.argsort(-lengths, kind="stable")[:MOST_SHADES])
+    return np.sort(np.argsort(-lengths, kind="stable")[:MAX_SHADED_SPANS])
 
 
-def _line(plot: Plot, stamps: Array, values: Array, style: str) -> None:
-    """A line through (N,) rows, however many stretches it is broken into."""
-    rows = thinned(values, MOST_ROWS)
+def _draw_line(plot: Plot, stamps: Array, values: Array, style: str) -> None:
+    rows = thinned(values, MAX_LINE_POINTS)
     plot.line(stamps[rows], values[rows], style)
 
 
 def _over_time(result: NozzleResult) -> str:
     log, distance = result.run.log, result.errors.distance
     top = result.figures.nozzle.position.max
-    top = max(1.12 * top, 1.2 * NEAR) if np.isfinite(top) else 2 * NEAR
-    plot = Plot(WIDTH, 260, _span(log.stamps), (0.0, top), label="error, mm")
+    top = max(1.12 * top, 1.2 * NEAR_ERROR) if np.isfinite(top) else 2 * NEAR_ERROR
+    plot = Plot(PAGE_CHART_WIDTH, 260, _span(log.stamps), (0.0, top), label="error, mm")
     _shades(result, plot)
-    _line(plot, log.stamps, np.where(log.extrude, np.nan, distance), "aside")
-    plot.level(NEAR, f"{NEAR:g} mm", "limit")
-    _line(plot, log.stamps, np.where(log.extrude, distance, np.nan), "estimate")
+    _draw_line(plot, log.stamps, np.where(log.extrude, np.nan, distance), "aside")
+    plot.level(NEAR_ERROR, f"{NEAR_ERROR:g} mm", "limit")
+    _draw_line(plot, log.stamps, np.where(log.extrude, distance, np.nan), "estimate")
     keys = [
         line_key("estimate", "error while printing"),
         line_key("aside", "while not printing, where a place was due"),
@@ -171,21 +287,18 @@ def _parts(result: NozzleResult) -> str:
     log, errors = result.run.log, result.errors
     printed = np.where(log.extrude, 1.0, np.nan)
     values = [*(errors.split.T * printed), np.degrees(errors.angle) * printed]
-    told = np.abs(errors.split[log.extrude])
-    most = max(float(np.nanmax(told)), 0.05) * 1.1 if np.isfinite(told).any() else 1.0
+    split = np.abs(errors.split[log.extrude])
+    most = max(float(np.nanmax(split)), 0.05) * 1.1 if np.isfinite(split).any() else 1.0
     angles = values[3][np.isfinite(values[3])]
     names = ("along the path, mm", "across the path, mm", "along the normal, mm", "angle, °")
     plots = []
     for i, (name, value) in enumerate(zip(names, values, strict=True)):
         y = (-most, most) if i < 3 else (0.0, max(float(angles.max(initial=0)) * 1.1, 0.05))
-        plot = Plot(WIDTH, 156 if i == 3 else 140, _span(log.stamps), y, label=name, x_ticks=i == 3)
-        _line(plot, log.stamps, value, f"series c{i}")
+        plot = Plot(PAGE_CHART_WIDTH, 156 if i == 3 else 140, _span(log.stamps), y, label=name, x_ticks=i == 3)
+        _draw_line(plot, log.stamps, value, f"series c{i}")
         plots.append(plot.svg())
     text = "Ahead, to the left and out of the surface are positive; the angle is that to the axis of the target."
     return section("Parts of the error", text, "".join(plots))
-
-
-# -- spread and lag
 
 
 def _spread(result: NozzleResult) -> str:
@@ -194,10 +307,10 @@ def _spread(result: NozzleResult) -> str:
     distance = distance[np.isfinite(distance)]
     if not len(distance):
         return ""
-    high = max(float(distance.max()) * 1.02, 1.1 * NEAR)
+    high = max(float(distance.max()) * 1.02, 1.1 * NEAR_ERROR)
     counts, edges = np.histogram(distance, bins=48, range=(0, high))
     percents = 100 * counts / len(distance)
-    bars = Plot(HALF, 230, (0, high), (0, float(percents.max()) * 1.15), label="")
+    bars = Plot(HALF_CHART_WIDTH, 230, (0, high), (0, float(percents.max()) * 1.15), label="")
     bars.bars(edges, percents, "bar")
     bars.mark(f.position.median, "median", "median")
     bars.mark(f.position.p95, "95 %", "median")
@@ -210,35 +323,32 @@ def _spread(result: NozzleResult) -> str:
     return section("Spread and lag", text, f'<div class="two">{drawn}</div>')
 
 
-def _lag(lag: Lag) -> str:
+def _lag(lag: NozzleLag) -> str:
     if not len(lag.shifts):
         return '<div class="caption">The target moved too little, or not long enough, to tell a lag.</div>'
     milliseconds = 1000 * lag.shifts
     top = float(lag.distance.max()) * 1.1
-    plot = Plot(HALF, 230, (float(milliseconds[0]), float(milliseconds[-1])), (0.0, max(top, 0.01)))
+    plot = Plot(HALF_CHART_WIDTH, 230, (float(milliseconds[0]), float(milliseconds[-1])), (0.0, max(top, 0.01)))
     plot.line(milliseconds, lag.distance, "estimate")
     if np.isfinite(lag.seconds):
         plot.mark(1000 * lag.seconds, f"{figure(1000 * lag.seconds)} ms", "limit")
     return f'<div class="caption">distance in mm, by shift in ms</div>{plot.svg()}'
 
 
-# -- from above
-
-
 def _pictures(result: NozzleResult) -> str:
     deposit, f = result.deposit, result.figures.deposit
     if not len(deposit.layers):
         return ""
-    view = view_of(deposit, 1.0)
-    wide = float((view.high - view.low)[0] / (view.high - view.low)[1]) > WIDE
-    width = WIDTH if wide else HALF
+    view = whole_map_view(deposit, 1.0)
+    wide = float((view.high - view.low)[0] / (view.high - view.low)[1]) > WIDE_ASPECT
+    width = PAGE_CHART_WIDTH if wide else HALF_CHART_WIDTH
     maps = "".join(
         (f'<div class="caption">layer {number}</div>' if len(deposit.layers) > 1 else "")
         + bead_picture(result, i, width)
-        for i, number in enumerate(deposit.layers[:MOST_LAYERS])
+        for i, number in enumerate(deposit.layers[:MAX_LAYERS])
     )
-    kinds = legend([area_key(kind.replace(" ", "-"), kind) for kind in KINDS])
-    colours = legend([line_key("plan", "planned"), *(line_key(style, words) for style, words in way_keys())])
+    kinds = legend([area_key(kind.replace(" ", "-"), kind) for kind in CELL_KINDS])
+    colours = legend([line_key("plan", "planned"), *(line_key(style, words) for style, words in way_legend())])
     both = f"<div>{maps}{kinds}</div><div>{way_picture(result, width)}{colours}</div>"
     text = (
         f"The surface from above, x to the right. Beads are {result.run.bead:g} mm wide, {f.area:.0f} mm² are planned: "
@@ -246,29 +356,21 @@ def _pictures(result: NozzleResult) -> str:
         f"{share(f.overlap)} overlap (1.5 times the plan or more), and an area of {share(f.outside)} lies outside. "
         "Beside it, the way of the tip while it printed, coloured by the error."
     )
-    more = len(deposit.layers) - MOST_LAYERS
+    more = len(deposit.layers) - MAX_LAYERS
     rest = f'<p class="note">and {more} more layers</p>' if more > 0 else ""
     return section("Deposited and planned", text, (both if wide else f'<div class="two">{both}</div>') + rest)
-
-
-# -- the rest
 
 
 def _holds(result: NozzleResult) -> str:
     holds = result.figures.nozzle.holds
     if not holds:
         return section("Holds", "The arm never held.", "")
-    rows = "".join(
-        f"<tr><td>{escape(h.reason)}</td><td>{h.count}</td><td>{h.seconds:.3f}</td><td>{h.longest:.3f}</td>"
-        f"<td>{h.first:.3f}</td></tr>"
-        for h in holds
-    )
-    head = "".join(f"<th>{cell}</th>" for cell in ("reason", "times", "in all, s", "longest, s", "first at, s"))
+    rows = [(escape(h.reason), str(h.count), *(f"{v:.3f}" for v in (h.seconds, h.longest, h.first))) for h in holds]
     text = "Why the arm stood still until the path was finished; … stands for a number that was not always the same."
-    return section("Holds", text, f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>")
+    return section("Holds", text, _table(("reason", "times", "in all, s", "longest, s", "first at, s"), rows))
 
 
-def _seen(result: NozzleResult) -> str:
+def _camera_pictures(result: NozzleResult) -> str:
     if not result.run.pictures:
         return ""
     figures = "".join(

@@ -1,20 +1,179 @@
-"""A simulated print in words, as plain values for summary.json, and as a table for the terminal."""
+"""The result of a simulated print: its limits and whether they were met, its summary as text, JSON and table.
+
+A scenario's table [limits] has keys of BOUNDS, all optional. Those without a unit are shares from 0 to 1.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from hardware.report.evaluation import Spread
+from estimation.errors import InputError
+from hardware.process import checks
+from hardware.report.evaluation import Evaluation, Spread, spread
 from hardware.report.summary import figure, finite, percent, spread_dict
-from hardware.simulator.nozzle_error import NEAR
-from hardware.simulator.nozzle_run import NozzleResult
-from hardware.simulator.run_limits import Verdict
+from hardware.simulator.deposit import (
+    DepositFigures,
+    DepositMap,
+    NozzleLog,
+    PlannedLine,
+    deposit_figures,
+    deposit_map,
+    planned_line,
+)
+from hardware.simulator.nozzle_error import NEAR_ERROR, NozzleFigures, RowErrors, nozzle_errors, nozzle_figures
+from planning.path import Path
 
-PARTS = ("median", "rmse", "p95", "p99", "max")
-HEADS = ("median", "RMS", "95 %", "99 %", "max")
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunFigures:
+    """All that can be bounded. tracking: errors of the estimated surface, mm, from the start; None where not known."""
+
+    nozzle: NozzleFigures
+    deposit: DepositFigures
+    tracking: Spread | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bound:
+    """A figure that a scenario may bound."""
+
+    words: str  # what it is
+    unit: str  # "" for a share
+    least: bool  # whether the bound must be reached; else it must not be passed
+    of: Callable[[RunFigures], float]  # the figure in that unit
+
+
+def _tracking(part: str) -> Callable[[RunFigures], float]:
+    return lambda f: math.nan if f.tracking is None else float(getattr(f.tracking, part))
+
+
+def _longest_hold(figures: RunFigures) -> float:
+    return max((holds.longest for holds in figures.nozzle.holds), default=0.0)
+
+
+BOUNDS = {  # key in [limits]: with its unit
+    "rms_mm": Bound("position error, RMS", "mm", False, lambda f: f.nozzle.position.rmse),
+    "median_mm": Bound("position error, median", "mm", False, lambda f: f.nozzle.position.median),
+    "p95_mm": Bound("position error, 95 %", "mm", False, lambda f: f.nozzle.position.p95),
+    "p99_mm": Bound("position error, 99 %", "mm", False, lambda f: f.nozzle.position.p99),
+    "max_mm": Bound("position error, largest", "mm", False, lambda f: f.nozzle.position.max),
+    "normal_p95_mm": Bound("error along the normal, 95 %", "mm", False, lambda f: f.nozzle.normal.p95),
+    "path_p95_mm": Bound("distance from the path, 95 %", "mm", False, lambda f: f.nozzle.path.p95),
+    "path_max_mm": Bound("distance from the path, largest", "mm", False, lambda f: f.nozzle.path.max),
+    "angle_p95_deg": Bound("angle, 95 %", "°", False, lambda f: math.degrees(f.nozzle.angle.p95)),
+    "angle_max_deg": Bound("angle, largest", "°", False, lambda f: math.degrees(f.nozzle.angle.max)),
+    "near": Bound("extruding time within 0.5 mm", "", True, lambda f: f.nozzle.near),
+    "duty": Bound("duty", "", True, lambda f: f.nozzle.duty),
+    "hold_s": Bound("longest hold", "s", False, _longest_hold),
+    "lag_ms": Bound("lag", "ms", False, lambda f: 1000 * abs(f.nozzle.lag.seconds)),
+    "coverage": Bound("coverage", "", True, lambda f: f.deposit.coverage),
+    "gaps": Bound("gaps", "", False, lambda f: f.deposit.gaps),
+    "overlap": Bound("overlap", "", False, lambda f: f.deposit.overlap),
+    "outside": Bound("material outside", "", False, lambda f: f.deposit.outside),
+    "tracking_rms_mm": Bound("tracking error, RMS", "mm", False, _tracking("rmse")),
+    "tracking_p95_mm": Bound("tracking error, 95 %", "mm", False, _tracking("p95")),
+    "tracking_max_mm": Bound("tracking error, largest", "mm", False, _tracking("max")),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RunLimits:
+    """The bounds of one scenario. names: keys of BOUNDS, in the file's order. allowed: one each, in the key's unit."""
+
+    names: tuple[str, ...] = ()
+    allowed: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class LimitVerdict:
+    """One limit and what came of it. name: key of BOUNDS. reached, allowed: in its unit. A NaN never meets a limit."""
+
+    name: str
+    reached: float
+    allowed: float
+    met: bool
+
+    @property
+    def bound(self) -> Bound:
+        """What is bounded, and how."""
+        return BOUNDS[self.name]
+
+
+def limits_from_table(where: object, table: checks.Table) -> RunLimits:
+    """The limits in a table [limits] of the file `where`; InputError names the key that makes no sense."""
+    checks.check_keys(where, "limits.", table, (), BOUNDS)
+    allowed = []
+    for name, value in table.items():
+        number = checks.number(where, f"limits.{name}", value)
+        most = math.inf if BOUNDS[name].unit else 1.0
+        if not 0 <= number <= most:
+            allowed_range = "0 to 1" if most == 1 else f"0 {BOUNDS[name].unit} or more"
+            raise InputError(where, f"limits.{name}", value, allowed_range)
+        allowed.append(number)
+    return RunLimits(tuple(table), tuple(allowed))
+
+
+def check_limits(limits: RunLimits, figures: RunFigures) -> list[LimitVerdict]:
+    """A verdict for each limit, in the order in which they were given."""
+    verdicts = []
+    for name, allowed in zip(limits.names, limits.allowed, strict=True):
+        bound = BOUNDS[name]
+        reached = bound.of(figures)
+        verdicts.append(LimitVerdict(name, reached, allowed, reached >= allowed if bound.least else reached <= allowed))
+    return verdicts
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NozzleRun:
+    """One simulated print."""
+
+    title: str
+    log: NozzleLog
+    path: Path  # in the true surface frame
+    bead: float  # width, mm
+    limits: RunLimits = field(default_factory=RunLimits)
+    tracking: Evaluation | None = None  # of the surface, where known
+    complete: bool = True  # whether it ran to its end
+    pictures: tuple[tuple[str, bytes], ...] = ()  # of the cameras: name, and bytes of a JPEG or PNG
+    files: tuple[tuple[str, str], ...] = ()  # beside the page: relative name, and what it holds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NozzleResult:
+    """A run with its errors row by row, its figures, the map of its deposit, and a verdict for each limit."""
+
+    run: NozzleRun
+    line: PlannedLine
+    errors: RowErrors
+    figures: RunFigures
+    deposit: DepositMap
+    verdicts: tuple[LimitVerdict, ...]
+
+    @property
+    def met(self) -> bool:
+        """Whether the run was complete, printed something, and that only where a target was, and met all its limits."""
+        printed = self.figures.nozzle.extruding > 0 and self.figures.nozzle.untold == 0
+        return self.run.complete and printed and all(verdict.met for verdict in self.verdicts)
+
+
+def evaluate_run(run: NozzleRun) -> NozzleResult:
+    """What a run came to."""
+    line = planned_line(run.path)
+    errors = nozzle_errors(run.log, line)
+    deposit = deposit_map(run.log, line, run.bead)
+    comparison = None if run.tracking is None else run.tracking.comparison
+    tracking = None if comparison is None else spread(comparison.start.translation)
+    figures = RunFigures(nozzle_figures(run.log, line, errors), deposit_figures(deposit), tracking)
+    return NozzleResult(run, line, errors, figures, deposit, tuple(check_limits(run.limits, figures)))
+
+
+SPREAD_PARTS = ("median", "rmse", "p95", "p99", "max")
+SPREAD_HEADS = ("median", "RMS", "95 %", "99 %", "max")
 
 
 def rows_of_errors(result: NozzleResult) -> list[tuple[str, str, Spread, float]]:
@@ -63,12 +222,12 @@ def share(value: float) -> str:
     return percent(value) if math.isfinite(value) else "–"
 
 
-def reached_in_words(verdict: Verdict) -> str:
+def reached_in_words(verdict: LimitVerdict) -> str:
     """What was reached, with its unit."""
     return with_unit(verdict.reached, verdict.bound.unit)
 
 
-def allowed_in_words(verdict: Verdict) -> str:
+def allowed_in_words(verdict: LimitVerdict) -> str:
     """The bound, with its unit and its side."""
     number = percent(verdict.allowed) if not verdict.bound.unit else f"{verdict.allowed:g} {verdict.bound.unit}"
     return f"{'at least' if verdict.bound.least else 'at most'} {number}"
@@ -92,7 +251,7 @@ def nozzle_dict(result: NozzleResult) -> dict[str, Any]:
         ],
         "errors": {key: _scaled(spread, scale) for _, key, spread, scale in rows_of_errors(result)},
         "offset_mm": f.offset.tolist(),
-        "near_mm": NEAR,
+        "near_mm": NEAR_ERROR,
         "near": f.near,
         "extruding_s": f.extruding,
         "extruding_without_target_s": f.untold,
@@ -126,10 +285,10 @@ def _scaled(spread: Spread, scale: float) -> dict[str, float]:
 
 def nozzle_text(summary: dict[str, Any]) -> str:
     """The verdict and the tables, for a terminal, from a summary as `nozzle_dict` gives it."""
-    lines = [*summary["verdict"], "", f"{'error while printing':<26}" + "".join(f"{head:>9}" for head in HEADS)]
+    lines = [*summary["verdict"], "", f"{'error while printing':<26}" + "".join(f"{head:>9}" for head in SPREAD_HEADS)]
     for key, figures in summary["errors"].items():
         name, _, unit = key.rpartition("_")
-        lines.append(f"{f'{name}, {unit}':<26}" + "".join(f"{_number(figures[part]):>9}" for part in PARTS))
+        lines.append(f"{f'{name}, {unit}':<26}" + "".join(f"{_number(figures[part]):>9}" for part in SPREAD_PARTS))
     deposit = summary["deposit"]
     lag = summary["lag_ms"]
     parts = [("duty", summary["duty"]), *((name, deposit[name]) for name in ("coverage", "gaps", "overlap", "outside"))]

@@ -5,7 +5,7 @@ tracking/                  poses.csv, poses.tum and their report, as `stillbed t
 commands.csv, frames.bin   what the motion decided, and the bytes that went to the arm
 nozzle.csv                 where the nozzle was and should have been, every millisecond
 arm.toml, scenario.toml    what was assumed of the arm, and what was simulated
-watch.html, report.html    what the cameras see while it runs, and what came of it
+watch.html, report.html    what the cameras see while it runs, on a page that reloads itself; and the result
 """
 
 from __future__ import annotations
@@ -13,50 +13,186 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from html import escape
 from pathlib import Path
 from types import TracebackType
 
+import cv2
 import numpy as np
 
 from estimation import se3
-from estimation.pose import SurfacePose, TrackState
+from estimation.pose import SurfacePose, TrackState, Trajectory
+from estimation.rig import Rig, pixels_from_points
 from estimation.se3 import Array
-from estimation.trajectory import Trajectory
 from hardware.files.arm_file import write_arm
+from hardware.files.folder_tables import SessionFolderWriter, rows_from_trajectory
 from hardware.files.pose_file import PoseWriter
-from hardware.heads import row_from_head
+from hardware.files.session import row_from_head
 from hardware.offline.replay import CommandWriter
 from hardware.recording.recorder import Recorder
 from hardware.recording.schemas import INFO, WARNING
-from hardware.session_folder import SessionFolder
 from hardware.simulator.cameras import JITTER_LIMIT, Shot
-from hardware.simulator.nozzle_file import NozzleWriter
-from hardware.simulator.nozzle_log import NozzleLog
-from hardware.simulator.planned_line import PlannedLine
+from hardware.simulator.deposit import NozzleLog, PlannedLine
+from hardware.simulator.nozzle_error import RowErrors, nozzle_errors
 from hardware.simulator.scenario import Scenario
-from hardware.simulator.watch import Watch
-from hardware.tum import rows_from_trajectory
-from perception.frames import FrameSet, PrintHead, Roi
+from perception.frames import FrameSet, Image, PrintHead, Roi
 from perception.tracking.step import STAGES, StepReport
 from planning.command import Command, Move
-from planning.progress import Progress
+from planning.progress import PrintProgress
 
-DIGITS = 9  # of a stamp: a row and an exposure of one instant are one
-PATIENCE = 0.5  # s beyond the transport until a picture has surely arrived; truth is written in order of stamp
+WATCH_INTERVAL = 0.5  # s of the run between two pictures
+MAIN_TILE, SIDE_TILE = (960, 540), (480, 270)  # px: the first camera's picture, and the others'
+WATCH_JPEG_QUALITY = 85
+CLOSE_UP_PX = 400  # px of the picture that fill a tile's width once the line's place is known
+LINE_BGR = (255, 200, 90)  # BGR
+STATE_BGR = {  # as the report's states
+    TrackState.INITIALISING: (160, 160, 160),
+    TrackState.TRACKING: (90, 190, 70),
+    TrackState.DEGRADED: (40, 170, 240),
+    TrackState.COASTING: (50, 110, 240),
+    TrackState.LOST: (60, 60, 220),
+}
+WATCH_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>{refresh}
+<style>body{{margin:0;padding:1.2rem;background:#14171a;color:#e6e9ec;font:16px/1.5 system-ui,sans-serif}}
+h1{{font-size:1.15rem;font-weight:600;margin:0 0 .6rem}}img{{max-width:100%;border-radius:8px;display:block}}
+dl{{display:flex;flex-wrap:wrap;gap:.3rem 2rem;margin:.9rem 0}}dt{{color:#9aa4ad;font-size:.8rem}}dd{{margin:0}}
+a{{color:#7fc4ff}}</style><h1>{title}</h1><img src="watch.jpg?{number}" alt="what the cameras see">
+<dl>{facts}</dl>{foot}</html>
+"""
 
-FILES = (
+
+class WatchPage:
+    """Writes watch.jpg and watch.html into a folder, at most every WATCH_INTERVAL s of the run."""
+
+    def __init__(self, folder: Path, rig: Rig, title: str) -> None:
+        self._folder, self._rig, self._title = folder, rig, title
+        self._number, self._next = 0, -np.inf
+        self._facts: list[tuple[str, str]] = []
+
+    @property
+    def page(self) -> Path:
+        """Where the page is."""
+        return self._folder / "watch.html"
+
+    def show(self, frames: FrameSet, pose: SurfacePose, line: Array | None, facts: Sequence[tuple[str, str]]) -> None:
+        """The newest frames, pose and printed line (N, 3), mm, surface frame of the pose; facts: name and value."""
+        if pose.stamp < self._next:
+            return
+        self._next = pose.stamp + WATCH_INTERVAL
+        self._number += 1
+        self._facts = [("state", pose.state.value + (f": {pose.reason}" if pose.reason else "")), *facts]
+        picture = self._montage(frames, pose, line)
+        cv2.imwrite(str(self._folder / "watch.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, WATCH_JPEG_QUALITY])
+        self._write('<meta http-equiv="refresh" content="1">', "<p>This page renews itself while the run goes on.</p>")
+
+    def finish(self, verdict: str) -> None:
+        """The run is over: the page stands still and leads to the report."""
+        self._write("", f'<p>{escape(verdict)} <a href="report.html">The report</a></p>')
+
+    def _write(self, refresh: str, foot: str) -> None:
+        facts = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in self._facts)
+        title = escape(self._title)
+        text = WATCH_PAGE.format(title=title, refresh=refresh, number=self._number, facts=facts, foot=foot)
+        self.page.write_text(text, encoding="utf-8")
+
+    def _montage(self, frames: FrameSet, pose: SurfacePose, line: Array | None) -> Image:
+        others = max(len(self._rig) - 1, 1)
+        height = max(MAIN_TILE[1], others * SIDE_TILE[1])
+        canvas = np.full((height, MAIN_TILE[0] + SIDE_TILE[0], 3), 24, np.uint8)
+        for camera in range(len(self._rig)):
+            (w, h), x, y = (MAIN_TILE, 0, 0) if camera == 0 else (SIDE_TILE, MAIN_TILE[0], (camera - 1) * SIDE_TILE[1])
+            tile = canvas[y : y + h, x : x + w]
+            images = [f.image for f in frames.frames if f.camera == camera]
+            if images:
+                self._draw(tile, images[0], camera, pose, line)
+            self._label(tile, self._rig.cameras[camera].name if images else "no picture")
+        cv2.rectangle(canvas, (0, 0), (canvas.shape[1] - 1, height - 1), STATE_BGR[pose.state], 6)
+        return canvas
+
+    def _draw(self, tile: Image, image: Image, camera: int, pose: SurfacePose, line: Array | None) -> None:
+        """The picture on its tile, brought close to the line where the pose says that it lies, and the line on it."""
+        width, (h, w) = image.shape[1], tile.shape[:2]
+        pixels = self._pixels(camera, pose, line)
+        zoom, corner = w / width, np.zeros(2)
+        if pixels is not None:
+            zoom, corner = w / CLOSE_UP_PX, pixels.mean(0) - [CLOSE_UP_PX / 2, CLOSE_UP_PX * h / w / 2]
+        move = np.array([[zoom, 0, -zoom * corner[0]], [0, zoom, -zoom * corner[1]]])
+        colour = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+        cv2.warpAffine(colour, move, (w, h), dst=tile, flags=cv2.INTER_LINEAR)
+        if pixels is not None:
+            corners = [np.rint(16 * zoom * (pixels - corner)).astype(np.int32).reshape(-1, 1, 2)]
+            cv2.polylines(tile, corners, False, LINE_BGR, 1, cv2.LINE_AA, 4)
+
+    def _pixels(self, camera: int, pose: SurfacePose, line: Array | None) -> Array | None:
+        if line is None or not pose.state.measured:
+            return None
+        points = se3.transform_points(pose.base_from_surface, line)
+        pixels, depth = pixels_from_points(self._rig.cameras[camera], points)
+        return pixels if (depth > 1).all() else None
+
+    def _label(self, tile: Image, text: str) -> None:
+        for colour, width in (((20, 20, 20), 4), ((240, 240, 240), 1)):
+            cv2.putText(tile, text, (16, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, width, cv2.LINE_AA)
+
+
+_NOZZLE = ("x_mm", "y_mm", "z_mm")
+_TARGET = ("target_x_mm", "target_y_mm", "target_z_mm")
+_ERROR = ("error_mm", "error_x_mm", "error_y_mm", "error_z_mm", "angle_deg", "path_error_mm")
+NOZZLE_HEADER = ("stamp_s", "extrude", *_NOZZLE, *_TARGET, *_ERROR, "place_mm", "checkpoint", "reason")
+_ROW = "%.6f,%d" + ",%.6f" * 13 + ",%d,"
+
+
+class NozzleWriter:
+    """Writes nozzle.csv, some rows at a time; closes it as a context manager."""
+
+    def __init__(self, file: Path, line: PlannedLine) -> None:
+        self._file = file.open("w", newline="", encoding="utf-8")
+        self._file.write(",".join(NOZZLE_HEADER) + "\n")
+        self._line = line
+
+    def write(self, log: NozzleLog) -> None:
+        """The rows that came since the last call."""
+        rows = _numbers(log, nozzle_errors(log, self._line)).tolist()
+        reasons = {word: _quoted(word) for word in np.unique(log.reason).tolist()}
+        for row, word in zip(rows, log.reason.tolist(), strict=True):
+            self._file.write((_ROW % tuple(row)).replace("nan", "") + reasons[word])
+        self._file.flush()
+
+    def __enter__(self) -> NozzleWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._file.close()
+
+
+def _numbers(log: NozzleLog, errors: RowErrors) -> Array:
+    nozzle, target = log.base_from_nozzle[:, :3, 3], log.base_from_target[:, :3, 3]
+    error = [errors.distance, errors.vector, np.degrees(errors.angle), errors.path]
+    return np.column_stack([log.stamps, log.extrude, nozzle, target, *error, log.place, log.checkpoint])
+
+
+def _quoted(word: str) -> str:
+    """A last cell and its end of line, as csv.writer writes them; a line break becomes a blank."""
+    text = " ".join(word.split("\n"))
+    return ('"' + text.replace('"', '""') + '"' if any(c in text for c in ',"\r') else text) + "\n"
+
+
+STAMP_DIGITS = 9  # of a stamp: a row and an exposure of one instant are one
+TRUTH_DELAY = 0.5  # s beyond the transport until a picture has surely arrived; truth is written in order of stamp
+
+RUN_FILES = (
     *("session.mcap", "commands.csv", "frames.bin", "nozzle.csv", "arm.toml", "scenario.toml"),
     *("watch.html", "watch.jpg", "report.html", "summary.json"),
 )
 
-TruthAt = Callable[[Array], Array]  # times (N,), s -> base_from_surface (N, 4, 4)
+PosesAt = Callable[[Array], Array]  # times (N,), s -> base_from_surface (N, 4, 4)
 
 
-def clear(out: Path) -> None:
+def clear_run(out: Path) -> None:
     """Remove from the folder `out` what an earlier run left there: of two runs no session could be made."""
     for name in ("session", "tracking"):
         shutil.rmtree(out / name, ignore_errors=True)
-    for name in FILES:
+    for name in RUN_FILES:
         (out / name).unlink(missing_ok=True)
 
 
@@ -64,13 +200,13 @@ class RunFolder:
     """Writes a run; a context manager that leaves all files readable however it ends."""
 
     def __init__(
-        self, out: Path, scenario: Scenario, line: PlannedLine, rois: Sequence[Roi], truth: TruthAt, scan: Path | None
+        self, out: Path, scenario: Scenario, line: PlannedLine, rois: Sequence[Roi], truth: PosesAt, scan: Path | None
     ) -> None:
         """out: a folder that is there. line: the planned line. scan: the scan's file in out/session, if any."""
         self.out, self._truth, self._line, self._seconds = out, truth, line, scenario.seconds
         self.logs: list[NozzleLog] = []
         self.pictures: dict[int, bytes] = {}  # per camera, the newest, if there is one the newest of the printing
-        self.watch = Watch(out, scenario.told_rig, scenario.title)
+        self.watch = WatchPage(out, scenario.known_rig, scenario.title)
         self._shown: Array | None = None  # (N, 3) the line in the tracker's own surface frame
         self._doing, self._printing, self._printed = "waiting for a surface to follow", False, False
         self._state: TrackState | None = None
@@ -80,30 +216,26 @@ class RunFolder:
         self._until = -np.inf  # s, the last of them
         self._headed = -np.inf  # s, the last frame set whose print head was written
         cameras = scenario.cameras
-        self._latest = cameras.transport + JITTER_LIMIT * cameras.transport_jitter + PATIENCE
+        self._latest = cameras.transport + JITTER_LIMIT * cameras.transport_jitter + TRUTH_DELAY
         shutil.copyfile(scenario.file, out / "scenario.toml")
         write_arm(out / "arm.toml", scenario.profile, "what the motion knew of the arm")
         (out / "tracking").mkdir(exist_ok=True)
         with ExitStack() as opening:  # what is open is closed if the next cannot be opened
-            names = [camera.name for camera in scenario.told_rig.cameras]
+            names = [camera.name for camera in scenario.known_rig.cameras]
             self._poses = opening.enter_context(PoseWriter(out / "tracking", names, STAGES))
             self._commands = opening.enter_context(CommandWriter(out))
             self._nozzle = opening.enter_context(NozzleWriter(out / "nozzle.csv", line))
-            self._session: tuple[SessionFolder, Recorder] | None = None
+            self._session: tuple[SessionFolderWriter, Recorder] | None = None
             if scenario.tracking.pictures:
                 self._session = (
-                    opening.enter_context(SessionFolder(out / "session", scenario.told_rig, rois)),
-                    opening.enter_context(Recorder(out / "session.mcap", scenario.told_rig, overwrite=True)),
+                    opening.enter_context(SessionFolderWriter(out / "session", scenario.known_rig, rois)),
+                    opening.enter_context(Recorder(out / "session.mcap", scenario.known_rig, overwrite=True)),
                 )
-                self._record_start(rois, scan)
+                if scan is not None:
+                    self._session[1].surface(scan)
+                for roi in rois:
+                    self._session[1].write(roi)
             self._files = opening.pop_all()
-
-    def _record_start(self, rois: Sequence[Roi], scan: Path | None) -> None:
-        assert self._session is not None
-        if scan is not None:
-            self._session[1].surface(scan)
-        for roi in rois:
-            self._session[1].write(roi)
 
     def picture(self, shot: Shot, kind: str, data: bytes) -> None:
         """A picture has arrived, as encoded by its camera."""
@@ -140,7 +272,7 @@ class RunFolder:
         """The path was registered: truth_surface_from_estimated_surface (4, 4)."""
         self._shown = se3.transform_points(se3.inverse(truth_from_estimate), self._line.points)
 
-    def command(self, command: Command, progress: Progress, frame: bytes, received: bytes) -> None:
+    def command(self, command: Command, progress: PrintProgress, frame: bytes, received: bytes) -> None:
         """A command was sent, how far the print is by it, and what came from the arm since the last."""
         self._commands.write(command, frame)
         if self._session is not None:
@@ -170,7 +302,6 @@ class RunFolder:
             self._session[1].event(stamp, text, level, "simulation")
 
     def _error(self) -> str:
-        """The mean error of the last rows while they were printed, in words."""
         log = self.logs[-1] if self.logs else None
         if log is None or not log.extrude.any():
             return "not printing"
@@ -181,7 +312,7 @@ class RunFolder:
         """Truth in the middle of each exposure and at each row, in order, up to `until`, s."""
         if self._session is None or not self._pending:
             return
-        stamps: Array = np.unique(np.round(np.concatenate(self._pending), DIGITS))
+        stamps: Array = np.unique(np.round(np.concatenate(self._pending), STAMP_DIGITS))
         self._pending = [stamps[stamps > until]]
         due = stamps[(stamps <= until) & (stamps > self._until)]
         if len(due):

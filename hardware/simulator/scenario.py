@@ -1,76 +1,260 @@
-"""A scenario: one simulated print, everything that is true of it and everything the loop is told."""
+"""Scenario files: a simulated print as TOML, in mm, degrees, s and px; every key says its unit.
+
+title = "..."                    # what the scenario is; a comment above it says what it proves
+seconds = 20.0
+seed = 1
+path = "../paths/x.csv"          # checkpoints in the surface frame; files are relative to this one
+clearance_mm = 0.4               # lays the path onto the true surface at this height; left out: the path as it is
+bead_mm = 1.0
+faults = ["arm stall 600ms at 5s"]   # what goes wrong, as hardware/process/faults.py names it
+[scene]                          # the body or a scan, the wound, its wetness
+[[motion]]                       # composed in order; without any the surface is still
+[strain]                         # a waveform: the amount of [scene.deformation] over time
+[rig]                            # file, or angles_deg, distance_mm, focal_px, size, distortion
+[cameras]                        # rate, exposure, way to the computer, clock offsets, lost and damaged frames
+[sensor]                         # noise, vignetting, jpeg_quality (0 for lossless pictures)
+[tracking]                       # by = "pictures", "thesis", "thesis-flow", "tracks" (the estimator, from tracks that
+                                 # nobody has rendered) or "truth"; processing_s = 0.02 or "measured";
+                                 # register = "texture" or "scan"
+[arm]                            # file, assumed_lag_s, wire_baud, tool_mm (as in an arm file), and the virtual
+                                 # controller: servo, dead time, replies
+[planted]                        # rig_offset_mm, arm_offset_mm: errors of calibration that nothing in the loop knows of
+[limits]                         # what the run must reach, for the exit code
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
+from estimation import se3
+from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.synthetic.motions import Motion
-from hardware.arm.profile import ArmProfile
-from hardware.methods import MAP
+from estimation.synthetic.movements import ComposedMotion
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
+from hardware.arm.profile import BITS_PER_BYTE, MAX_LAG, ArmProfile, placed
+from hardware.arm.protocol import FRAME_LENGTH
+from hardware.files.arm_file import read_arm, tool_from_value
+from hardware.files.rig_file import read_rig
+from hardware.offline.track import MAP_METHOD, THESIS_FLOW_METHOD, THESIS_METHOD
+from hardware.process import checks
 from hardware.process.checks import Table
-from hardware.process.faults import Fault
-from hardware.simulator.arm.settings import ArmSettings
-from hardware.simulator.camera_settings import CameraSettings
-from hardware.simulator.run_limits import RunLimits
-from hardware.simulator.sensor import Sensor
-from planning.kinematics import SimpleArm
+from hardware.process.faults import Fault, FaultRunner, check_faults, faults_from_texts
+from hardware.simulator.arm.settings import ArmSettings, arm_settings_from_table
+from hardware.simulator.cameras import CameraSettings, camera_settings_from_table
+from hardware.simulator.motion_table import motion_from_tables, waveform_from_table
+from hardware.simulator.nozzle_summary import RunLimits, limits_from_table
+from hardware.simulator.scenario_tables import sensor_from_table
+from hardware.simulator.scene.appearance import Sensor
+from planning.robot.kinematics import SimpleArm
 
 
 @dataclass(frozen=True, slots=True)
-class Tracking:
-    """How poses are made. pictures: by a tracking step from rendered pictures, else exact ones at their instants.
+class TrackingSettings:
+    """How poses are made."""
 
-    tracks: without pictures, by the estimator from tracks that nobody has rendered, instead of exact ones.
-    processing: s that a frame set takes, None for the time that was measured (then no two runs are alike).
-    scan: whether the tracker has the scan and registers to it; else the path is registered by the skin's texture.
-    method: of the tracking step, a key of METHODS.
-    """
-
-    pictures: bool = True
-    tracks: bool = False
-    processing: float | None = 0.02  # 15 ms of tracking and 5 ms of decoding, measured on two cores
-    scan: bool = False
-    method: str = MAP
+    pictures: bool = True  # by a tracking step from rendered pictures; else exact ones at their instants
+    tracks: bool = False  # without pictures: by the estimator from tracks that nobody has rendered
+    processing: float | None = 0.02  # s a frame set, None: as measured; 15 ms of tracking, 5 ms of decoding
+    scan: bool = False  # register to the scan; else the path is registered by the skin's texture
+    method: str = MAP_METHOD  # of the tracking step, a key of METHODS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scenario:
-    """One simulated print, as data/scenarios holds them.
+    """One simulated print: everything that is true of it and everything the loop knows."""
 
-    file: where it was read. path: the file of the checkpoints; clearance: mm above the true surface at which they are
-    laid, None for a path as it is; bead: width, mm. scene: the table from which the scene is built when it is needed.
-    rest: (4, 4) base_from_surface without motion. strain: amount of the deformation over time, None for none.
-    rig: the cameras as they are, told_rig: as the tracker knows them. arm: the virtual controller. true_arm: where the
-    arm stands. baud: bits/s of its line. profile: what the motion knows of it. limits: what the run must reach.
-    nozzle, beads: whether the pictures show the nozzle, and what it has printed.
-    """
-
-    file: Path
+    file: Path  # where it was read
     title: str
     seconds: float
     seed: int
-    path: Path
-    clearance: float | None
-    bead: float
-    scene: Table
-    motion: Motion
-    strain: Callable[[Array], Array] | None
-    rest: Array
-    rig: Rig
-    told_rig: Rig
+    path: Path  # file of the checkpoints
+    clearance: float | None  # mm above the true surface, None for a path as it is
+    bead: float  # width, mm
+    scene: Table  # from which the scene is built when it is needed
+    motion: ComposedMotion
+    strain: Callable[[Array], Array] | None  # amount of the deformation over time, None for none
+    rest: Array  # (4, 4) base_from_surface without motion
+    rig: Rig  # the cameras as they are
+    known_rig: Rig  # as the tracker knows them
     cameras: CameraSettings
     sensor: Sensor
     jpeg_quality: int | None
-    tracking: Tracking
-    arm: ArmSettings
+    tracking: TrackingSettings
+    arm: ArmSettings  # the virtual controller
     faults: tuple[Fault, ...]
-    true_arm: SimpleArm
-    baud: float
-    profile: ArmProfile
-    limits: RunLimits
-    nozzle: bool
-    beads: bool
+    true_arm: SimpleArm  # where the arm stands
+    baud: float  # bits/s of its line
+    profile: ArmProfile  # what the motion knows of the arm
+    limits: RunLimits  # what the run must reach
+    nozzle: bool  # whether pictures show it
+    beads: bool  # whether pictures show what was printed
+
+
+REQUIRED_KEYS = ("title", "seconds", "path")
+SCENARIO_TABLES = ("scene", "strain", "rig", "cameras", "sensor", "tracking", "arm", "planted", "limits")
+OPTIONAL_KEYS = ("seed", "clearance_mm", "bead_mm", "faults", "motion", *SCENARIO_TABLES)
+MAX_CAMERAS = 8
+WITHOUT_PICTURES = ("truth", "tracks")  # ways of tracking that need no pictures
+PICTURE_SIDES = 64, 4096  # px of a picture
+MAX_SECONDS = 3600.0  # s: an hour of pictures is 300,000 of them
+STRAIN_STREAM = 11  # of random numbers, so that motions and strain do not share theirs
+
+
+def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
+    """Read and check a scenario; InputError names the key that is wrong.
+
+    trace: a recorded motion, as a [[motion]] of kind "trace" takes it, instead of the scenario's own.
+    """
+    path = Path(path)
+    table = checks.read_toml(path)
+    checks.check_keys(path, "", table, REQUIRED_KEYS, OPTIONAL_KEYS)
+    if trace is not None:
+        table["motion"] = [{"kind": "trace", "file": str(trace.resolve())}]
+    parts = {name: _table(path, table, name) for name in SCENARIO_TABLES}
+    seed = checks.integer(path, "seed", table.get("seed", 1), 0)
+    rig = _rig(path, parts["rig"])
+    arm, profile, baud = _arm(path, parts["arm"])
+    rig_offset, arm_offset = _planted(path, parts["planted"])
+    quality = checks.integer(path, "sensor.jpeg_quality", parts["sensor"].pop("jpeg_quality", 90), 0)
+    if quality > 100:
+        raise InputError(path, "sensor.jpeg_quality", quality, "1 to 100, or 0 for lossless pictures")
+    known = replace(profile.arm, arm_from_base=profile.arm.arm_from_base @ se3.make(np.eye(3), arm_offset))
+    return Scenario(
+        file=path,
+        title=checks.text(path, "title", table["title"]),
+        seconds=_within(path, "seconds", table["seconds"], 0.1, MAX_SECONDS, "s"),
+        seed=seed,
+        path=path.parent / checks.text(path, "path", table["path"]),
+        clearance=None
+        if "clearance_mm" not in table
+        else _within(path, "clearance_mm", table["clearance_mm"], 0, 50, "mm"),
+        bead=_within(path, "bead_mm", table.get("bead_mm", 1.0), 0.05, 20.0, "mm"),
+        nozzle=_switch(path, "scene.nozzle", parts["scene"].pop("nozzle", True)),
+        beads=_switch(path, "scene.beads", parts["scene"].pop("beads", True)),
+        scene=parts["scene"],
+        motion=motion_from_tables(path, table.get("motion", []), path.parent, seed),
+        strain=waveform_from_table(path, "strain", parts["strain"], np.random.default_rng([seed, STRAIN_STREAM]))
+        if parts["strain"]
+        else None,
+        rest=BASE_FROM_REST,
+        rig=rig,
+        known_rig=_shifted(rig, rig_offset),
+        cameras=camera_settings_from_table(path, parts["cameras"], [camera.name for camera in rig.cameras]),
+        sensor=sensor_from_table(path, parts["sensor"]),
+        jpeg_quality=quality or None,
+        tracking=_tracking(path, parts["tracking"]),
+        arm=arm,
+        faults=_faults(path, table.get("faults", []), len(rig)),
+        true_arm=profile.arm,
+        baud=baud,
+        profile=replace(profile, arm=known),
+        limits=limits_from_table(path, parts["limits"]),
+    )
+
+
+def _table(path: Path, table: Table, name: str) -> Table:
+    part = table.get(name, {})
+    if not isinstance(part, dict):
+        raise InputError(path, name, part, f"a table [{name}]")
+    return dict(part)
+
+
+def _within(path: Path, key: str, value: object, low: float, high: float, unit: str) -> float:
+    number = checks.number(path, key, value)
+    if not low <= number <= high:
+        raise InputError(path, key, number, f"{low:g} to {high:g} {unit}")
+    return number
+
+
+def _rig(path: Path, table: Table) -> Rig:
+    if "file" in table:
+        checks.check_keys(path, "rig.", table, ("file",))
+        return read_rig(path.parent / checks.text(path, "rig.file", table["file"])).rig
+    checks.check_keys(path, "rig.", table, (), ("angles_deg", "distance_mm", "focal_px", "size", "distortion"))
+    given: dict[str, object] = {}
+    if "angles_deg" in table:
+        angles = checks.numbers(path, "rig.angles_deg", table["angles_deg"], (None,), "degrees")
+        if not 1 <= len(angles) <= MAX_CAMERAS:
+            raise InputError(path, "rig.angles_deg", table["angles_deg"], f"1 to {MAX_CAMERAS} angles")
+        given["angles_deg"] = tuple(angles)
+    if "distance_mm" in table:
+        given["distance"] = _within(path, "rig.distance_mm", table["distance_mm"], 100, 2000, "mm")
+    if "focal_px" in table:
+        given["focal"] = _within(path, "rig.focal_px", table["focal_px"], 100, 10_000, "px")
+    if "size" in table:
+        size = checks.numbers(path, "rig.size", table["size"], (2,), "[width, height] in px")
+        if (size != np.rint(size)).any() or size.min() < PICTURE_SIDES[0] or size.max() > PICTURE_SIDES[1]:
+            raise InputError(path, "rig.size", table["size"], f"whole px, {PICTURE_SIDES[0]} to {PICTURE_SIDES[1]}")
+        given["size"] = (int(size[0]), int(size[1]))
+    if "distortion" in table:
+        given["distortion"] = tuple(checks.numbers(path, "rig.distortion", table["distortion"], (5,), "k1 k2 p1 p2 k3"))
+    return arc_rig(**given)  # type: ignore[arg-type]
+
+
+def _shifted(rig: Rig, offset: Array) -> Rig:
+    shift = se3.make(np.eye(3), offset)
+    return Rig(tuple(replace(c, base_from_camera=shift @ c.base_from_camera) for c in rig.cameras))
+
+
+def _planted(path: Path, table: Table) -> tuple[Array, Array]:
+    keys = ("rig_offset_mm", "arm_offset_mm")
+    checks.check_keys(path, "planted.", table, (), keys)
+    rig, arm = (checks.numbers(path, f"planted.{key}", table.get(key, [0, 0, 0]), (3,), "mm") for key in keys)
+    return rig, arm
+
+
+def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:
+    """The virtual controller, what the motion knows of it (all of its lag, unless told), and its line's baud."""
+    file, assumed, baud, tool = (table.pop(key, None) for key in ("file", "assumed_lag_s", "wire_baud", "tool_mm"))
+    settings = arm_settings_from_table(path, table)
+    profile = ArmProfile() if file is None else read_arm(path.parent / checks.text(path, "arm.file", file))
+    profile = placed(profile, BASE_FROM_REST)
+    if baud is None:
+        baud = profile.baud
+    elif not isinstance(baud, (int, float)) or isinstance(baud, bool) or not baud >= profile.baud:
+        allowed = f"{profile.baud} bits/s, the arm's own, or more; inf for no delay"
+        raise InputError(path, "arm.wire_baud", baud, allowed)
+    lag = settings.dead_time + settings.servo_lag + FRAME_LENGTH * BITS_PER_BYTE / baud
+    if assumed is not None:
+        lag = _within(path, "arm.assumed_lag_s", assumed, 0, MAX_LAG, "s")
+    elif lag > MAX_LAG:
+        raise InputError(path, "arm.dead_time_s + servo_lag_s", lag, f"at most {MAX_LAG:g} s, or assumed_lag_s")
+    if tool is not None:
+        profile = replace(profile, tool=tool_from_value(path, "arm.tool_mm", tool))
+    return settings, replace(profile, lag=lag), float(baud)
+
+
+def _tracking(path: Path, table: Table) -> TrackingSettings:
+    checks.check_keys(path, "tracking.", table, (), ("by", "processing_s", "register"))
+    methods = ("pictures", THESIS_METHOD, THESIS_FLOW_METHOD, *WITHOUT_PICTURES)
+    by = _one_of(path, "tracking.by", table.get("by", "pictures"), methods)
+    register = _one_of(path, "tracking.register", table.get("register", "texture"), ("texture", "scan"))
+    spent = table.get("processing_s", TrackingSettings().processing)
+    measured = spent == "measured"
+    processing = None if measured else _within(path, "tracking.processing_s", spent, 0, 10, 's, or "measured"')
+    method = MAP_METHOD if by in ("pictures", *WITHOUT_PICTURES) else by
+    return TrackingSettings(by not in WITHOUT_PICTURES, by == "tracks", processing, register == "scan", method)
+
+
+def _switch(path: Path, key: str, value: object) -> bool:
+    if not isinstance(value, bool):
+        raise InputError(path, key, value, "true or false")
+    return value
+
+
+def _one_of(path: Path, key: str, value: object, allowed: tuple[str, ...]) -> str:
+    word = checks.text(path, key, value)
+    if word not in allowed:
+        raise InputError(path, key, word, checks.one_of_text(word, allowed))
+    return word
+
+
+def _faults(path: Path, value: object, cameras: int) -> tuple[Fault, ...]:
+    faults = faults_from_texts(path, "faults", value)
+    check_faults(faults, FaultRunner.SIMULATE, path, "faults", cameras)
+    return faults

@@ -1,21 +1,62 @@
-"""One table of a scenario, read key by key: each with its default and range, and what nobody asked for refused."""
+"""The tables of a scenario file, read key by key; and the scene and the sensor that two of them describe, in mm and px.
+
+[scene]
+body = "forearm"          # or "chest", "foot"; or scan = "file.ply", mm, whose own frame then is the surface frame
+wound = true
+wound_size_mm = [42, 31]
+wound_depth_mm = 2.4      # of a body's wound; on a scan it is only painted
+tone = 0.2                # of the skin, 0 fair to 1 dark
+wetness = 0.6             # 0 dry to 1 dripping
+hair = 0.5
+drape = true
+texel_mm = 0.1
+nozzle = true             # whether pictures show it
+beads = true              # and what it has printed
+[scene.deformation]       # at amount 1, which a scenario's [strain] varies
+stretch = [0.01, 0.005]   # a share of each length, along x and y
+bulge_mm = 1.0
+radius_mm = 40.0
+[sensor]
+jpeg_quality = 90         # 0: lossless pictures
+noise = 1.5               # grey levels, one sigma
+vignetting = 0.8          # 1: the cos^4 law
+blur_px = 0.45            # of lens and colour filter, one sigma
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from estimation.synthetic.world import BASE_FROM_REST
+from hardware.files.mesh_file import read_mesh
 from hardware.process import checks
 from hardware.process.checks import Table
+from hardware.simulator.scene.appearance import MAX_BLUR, MAX_NOISE, MAX_VIGNETTING, Appearance, Sensor
+from hardware.simulator.scene.scene import Scene
+from hardware.simulator.scene.shape import (
+    BODIES,
+    BULGE_RADIUS_RANGE,
+    DRAPE_MARGIN,
+    MAX_BULGE,
+    STRETCH_RANGE,
+    Deformation,
+    Shape,
+    Wound,
+    body,
+    shape_from_scan,
+    with_wound,
+)
 
 
 @dataclass(slots=True)
-class Keys:
+class TableReader:
     """Takes values out of a table. where: the file. prefix: in front of each key in an error ("motion[0].").
 
     A key without a default must be there. `done` is called last: it refuses every key that was not asked for.
@@ -109,7 +150,7 @@ class Keys:
             return default
         value = self.table[key]
         if not isinstance(value, str) or value not in allowed:
-            raise self.wrong(key, checks.meant(str(value), allowed))
+            raise self.wrong(key, checks.one_of_text(str(value), allowed))
         return value
 
     def text(self, key: str) -> str:
@@ -141,3 +182,101 @@ def _range(low: float, high: float, open: bool) -> str:
     if math.isinf(low):
         return f"<= {high:g}"
     return f"{low:g} {'<' if open else '<='} it <= {high:g}"
+
+
+TEXEL_RANGE = (0.05, 1.0)  # mm
+WOUND_SIZE_RANGE = (5.0, 80.0)  # mm across
+WOUND_DEPTH_RANGE = (0.0, 8.0)  # mm
+MIN_DRAPE_OPENING = 20.0  # mm, the least that a drape leaves open
+MAX_SCAN_SIZE = 400.0  # mm: a texture of 0.1 mm and rays for nodes 0.25 mm apart end there
+# taken out by whoever reads the scenario
+SCENARIO_ONLY_KEYS = {"scene": ("nozzle", "beads"), "sensor": ("jpeg_quality",)}
+
+
+def scene_from_table(
+    where: object, table: Table, folder: Path, seed: int, base_from_rest: Array = BASE_FROM_REST
+) -> Scene:
+    """The scene that a [scene] table describes; files are relative to `folder`. InputError names the key."""
+    return Scene(*bare_scene(where, table, folder, seed), seed, base_from_rest)
+
+
+def bare_scene(where: object, table: Table, folder: Path, seed: int) -> tuple[Shape, Appearance, Deformation]:
+    """Shape, look and deformation of the scene, for those who need no pictures: painting it takes seconds."""
+    keys = _reader(where, "scene", table)
+    look, wound, deformation = _appearance(keys), _wound(keys), _deformation(keys)
+    kind = keys.word("body", tuple(BODIES), "forearm")
+    scan = keys.text("scan") if keys.has("scan") else None
+    keys.done()
+    if scan is None:
+        shape = body(kind, wound, seed)
+    elif keys.has("body"):
+        raise InputError(where, "scene", "body and scan", "one of the two")
+    else:
+        shape = _scanned(folder / scan, wound, seed)
+        if look.drape and min(shape.size) < 2 * DRAPE_MARGIN + MIN_DRAPE_OPENING:
+            size = f"{shape.size[0]:.1f} x {shape.size[1]:.1f} mm"
+            allowed = f"false for a scan of {size}: a drape needs {DRAPE_MARGIN:g} a side"
+            raise InputError(where, "scene.drape", True, allowed)
+    return shape, look, deformation
+
+
+def sensor_from_table(where: object, table: Table) -> Sensor:
+    """The sensor that a [sensor] table describes; InputError names the key."""
+    keys, usual = _reader(where, "sensor", table), Sensor()
+    sensor = Sensor(
+        noise=keys.number("noise", usual.noise, 0, MAX_NOISE),
+        vignetting=keys.number("vignetting", usual.vignetting, 0, MAX_VIGNETTING),
+        blur=keys.number("blur_px", usual.blur, 0, MAX_BLUR),
+    )
+    keys.done()
+    return sensor
+
+
+def _reader(where: object, name: str, table: Table) -> TableReader:
+    return TableReader(where, f"{name}.", table, list(SCENARIO_ONLY_KEYS[name]))
+
+
+def _appearance(keys: TableReader) -> Appearance:
+    usual = Appearance()
+    return Appearance(
+        texel=keys.number("texel_mm", usual.texel, *TEXEL_RANGE),
+        tone=keys.number("tone", usual.tone, 0, 1),
+        wetness=keys.number("wetness", usual.wetness, 0, 1),
+        hair=keys.number("hair", usual.hair, 0, 4),
+        drape=keys.flag("drape", usual.drape),
+    )
+
+
+def _wound(keys: TableReader) -> Wound | None:
+    usual = Wound()
+    size = keys.pair("wound_size_mm", usual.size, *WOUND_SIZE_RANGE)
+    depth = keys.number("wound_depth_mm", usual.depth, *WOUND_DEPTH_RANGE)
+    return Wound(size, depth) if keys.flag("wound", True) else None
+
+
+def _deformation(scene: TableReader) -> Deformation:
+    if not scene.has("deformation"):
+        return Deformation()
+    table, usual = scene.table["deformation"], Deformation()
+    if not isinstance(table, dict):
+        raise scene.wrong("deformation", "a table [scene.deformation]")
+    keys = TableReader(scene.where, f"{scene.prefix}deformation.", table)
+    deformation = Deformation(
+        stretch=keys.pair("stretch", usual.stretch, *STRETCH_RANGE),
+        bulge=keys.number("bulge_mm", usual.bulge, -MAX_BULGE, MAX_BULGE),
+        radius=keys.number("radius_mm", usual.radius, *BULGE_RADIUS_RANGE),
+    )
+    keys.done()
+    return deformation
+
+
+def _scanned(path: Path, wound: Wound | None, seed: int) -> Shape:
+    scan = read_mesh(path).scan
+    longest = float(np.ptp(scan.vertices, axis=0).max())
+    if longest > MAX_SCAN_SIZE:
+        raise InputError(path, "size of the scan", f"{longest:.4g} mm", f"at most {MAX_SCAN_SIZE:g} mm in a scene")
+    try:
+        shape = shape_from_scan(scan.vertices, scan.triangles)
+    except InputError as error:
+        raise InputError(path, error.what, error.got, error.allowed) from None
+    return shape if wound is None else with_wound(shape, wound, seed)

@@ -1,57 +1,177 @@
-"""`stillbed simulate`: a scenario from its file to the report, and whether its own limits were met."""
+"""`stillbed simulate`: a scenario from its file to the report, and whether its own limits were met.
+
+Besides the tracking step of a live run there are two trackers that look at no pictures: one that is told the truth, and
+one whose landmarks on the true surface are seen as pictures would show them. The latter leaves out detection, and with
+it nearly all of the time that a simulated second takes; its estimator is that of a live run.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
-from estimation.trajectory import Trajectory
+from estimation.forecast.predictor import Predictor
+from estimation.mapping.triangulation import TriangulatedMap
+from estimation.observations import Observations, no_observations
+from estimation.pose import SurfacePose, TrackState, Trajectory, identity_pose
+from estimation.rig import Rig
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap
+from estimation.synthetic.follow import Follower
+from estimation.synthetic.world import project_landmarks, undistorting
 from hardware.files.path_file import read_path
+from hardware.files.ply_file import write_ply
 from hardware.files.pose_file import read_poses
-from hardware.methods import MAP, step_by
-from hardware.offline.track import Step
-from hardware.out_folder import prepare_out
-from hardware.ply_file import write_ply
+from hardware.offline.track import MAP_METHOD, FrameSetStep, step_by
 from hardware.process.clock import WallClock
-from hardware.process.faults import Fault, Kind, Part, Runner, check_faults
-from hardware.process.progress import Progress
+from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults
+from hardware.process.progress import Progress, prepare_out
 from hardware.report.evaluation import Evaluation, evaluate
 from hardware.report.report import write_report
 from hardware.report.summary import write_summary
+from hardware.simulator.arm.ports import PtyLink
 from hardware.simulator.camera_pipeline import Exposures
-from hardware.simulator.cameras import Fate, SimulatedCameras
-from hardware.simulator.laying import laid
-from hardware.simulator.nozzle_log import joined
+from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, TrueCameras
+from hardware.simulator.deposit import join_logs, planned_line
 from hardware.simulator.nozzle_report import write_nozzle_report
-from hardware.simulator.nozzle_run import NozzleRun, judge
-from hardware.simulator.nozzle_summary import nozzle_dict, nozzle_text
-from hardware.simulator.perfect import PerfectTracker
-from hardware.simulator.planned_line import planned_line
-from hardware.simulator.pty_link import PtyLink
-from hardware.simulator.run_folder import RunFolder, clear
-from hardware.simulator.scenario import Scenario
-from hardware.simulator.scenario_file import read_scenario
-from hardware.simulator.scene.scene import STILL, Scene, rois
+from hardware.simulator.nozzle_summary import NozzleRun, evaluate_run, nozzle_dict, nozzle_text
+from hardware.simulator.run_folder import RunFolder, clear_run
+from hardware.simulator.scenario import Scenario, read_scenario
+from hardware.simulator.scenario_tables import scene_from_table
+from hardware.simulator.scene.scene import UNDEFORMED, Scene, rois
 from hardware.simulator.scene.shape import Shape
-from hardware.simulator.scene_table import scene_from_table
-from hardware.simulator.struck_surface import folded, struck_motion
-from hardware.simulator.track_tracker import TrackTracker
-from hardware.simulator.truth import Truth
-from hardware.simulator.world import World
-from perception.frames import Roi
+from hardware.simulator.truth import Truth, disturbed_motion, drape_path, fold_deformation
+from hardware.simulator.world import SimulatedWorld
+from perception.frames import FrameSet, Roi
+from perception.tracking.step import STAGES, StepReport, report_without_offsets
 from planning.path import Path as Checkpoints
 
-SEEN = (Kind.GARBLE, Kind.SWAP, Kind.BUMP, Kind.BLACK, Kind.FLASH, Kind.COVER)  # faults that pictures show
-SCAN_STEP = 1.0  # mm between the vertices of a scan, as handheld scanners give them
-FILES = (
+LANDMARK_COUNT, LANDMARK_AREA = 90, (56.0, 42.0)  # landmarks, and mm of the surface round the wound that they lie in
+DETECTED_SHARE = 0.85  # of landmarks, in a picture
+DAMAGED_SHARE = 0.5  # of those, in a damaged picture
+TRACK_SIGMA = 0.3  # px, of a track
+STRAY_SHARE, STRAY_PX = 0.02, 30.0  # share of tracks that lie anywhere within so many px
+USABLE_GAINS = 0.2, 4.0  # of a picture that shows anything
+MIN_INITIAL_TRACKS = 30  # tracks to begin with
+
+
+class LandmarkTracker:
+    """Answers like TrackingStep, without looking at pictures."""
+
+    last: StepReport
+
+    def __init__(
+        self, true: Rig, known: Rig, truth: Truth, shape: Shape, taken: Callable[[int, float], Shot], seed: int
+    ) -> None:
+        """taken: the shot of a camera's frame with a stamp, s."""
+        rng = np.random.default_rng([seed, 81])
+        places = rng.uniform(-0.5, 0.5, (LANDMARK_COUNT, 2)) * np.minimum(LANDMARK_AREA, shape.size)
+        self._points, self._normals = shape.points(places), shape.normals(places)
+        self._lenses, self._known_rig, self._truth, self._taken = (
+            TrueCameras(undistorting(true).cameras),
+            known,
+            truth,
+            taken,
+        )
+        self._rng, self._cameras = np.random.default_rng([seed, 82]), len(true)
+        self._follower: Follower | None = None
+
+    def __call__(self, frames: FrameSet) -> SurfacePose:
+        """The pose at `frames.stamp`."""
+        seen = self._observe(frames)
+        pose = self._pose(seen)
+        used = np.bincount(seen.camera, minlength=self._cameras)
+        self.last = report_without_offsets(seen, used, np.zeros(len(STAGES)))
+        return pose
+
+    def idle(self) -> None:
+        """There is nothing else to do."""
+
+    def _pose(self, observations: Observations) -> SurfacePose:
+        if self._follower is not None:
+            return self._follower(observations)
+        if len(observations) < MIN_INITIAL_TRACKS:
+            return identity_pose(observations.stamp, f"{len(observations)} tracks found, {MIN_INITIAL_TRACKS} needed")
+        known = SurfaceMap(self._points, self._normals, np.zeros((3 * LANDMARK_COUNT, 3 * LANDMARK_COUNT)))
+        place = self._truth.base_from_surface(np.array([observations.stamp]))[0]
+        start = TriangulatedMap(known, place, np.arange(LANDMARK_COUNT))
+        self._follower = Follower(self._known_rig, observations, start, refine=False)
+        assert self._follower.estimator.pose is not None
+        return self._follower.estimator.pose
+
+    def _observe(self, frames: FrameSet) -> Observations:
+        views = [self._look(frame.camera, self._taken(frame.camera, frame.stamp)) for frame in frames.frames]
+        if not any(len(track) for _, track, _ in views):
+            return no_observations(frames.stamp)
+        camera = np.concatenate([np.full(len(track), c) for c, track, _ in views])
+        track, pixels = np.concatenate([t for _, t, _ in views]), np.concatenate([p for _, _, p in views])
+        return Observations(frames.stamp, camera, track, pixels, np.full(len(track), TRACK_SIGMA))
+
+    def _look(self, camera: int, shot: Shot) -> tuple[int, NDArray[np.int64], Array]:
+        rng, instant = self._rng, np.array([shot.exposed])
+        chance = rng.random(LANDMARK_COUNT)
+        other = shot.lens not in (None, camera) or shot.covered is not None  # nothing there looks as it did before
+        blind = other or shot.fate is Fate.DUPLICATED or not USABLE_GAINS[0] <= shot.gain <= USABLE_GAINS[1]
+        amount = np.broadcast_to(self._truth.amount(instant), LANDMARK_COUNT)
+        points = self._points + self._truth.displacement(self._points, amount) if amount.any() else self._points
+        pose = self._truth.base_from_surface(instant)
+        pixels, inside = project_landmarks(Rig((self._lenses(shot),)), points, pose, self._normals)
+        noisy = pixels[0] + TRACK_SIGMA * rng.standard_normal((LANDMARK_COUNT, 2))
+        stray = rng.random(LANDMARK_COUNT) < STRAY_SHARE
+        noisy[stray] += rng.uniform(-STRAY_PX, STRAY_PX, (int(stray.sum()), 2))
+        share = 0.0 if blind else DETECTED_SHARE * (DAMAGED_SHARE if shot.fate is Fate.GARBLED else 1.0)
+        track = np.flatnonzero(inside[0] & (chance < share)).astype(np.int64)
+        return camera, track, noisy[track]
+
+
+EXACT_COVARIANCE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: exact, but no matrix without an inverse
+
+
+class OracleTracker:
+    """Answers like TrackingStep, without looking at pictures."""
+
+    last: StepReport
+
+    def __init__(self, truth: Truth, offset: Array, exposed: Callable[[int, float], float], cameras: int) -> None:
+        """offset: (4, 4) known_base_from_base, what a wrong rig makes of every pose.
+
+        exposed: the true instant, s, of a camera's frame with a stamp, s: clocks that are wrong stay wrong.
+        """
+        self._predictor = Predictor()
+        self._truth, self._offset, self._exposed, self._cameras = truth, offset, exposed, cameras
+
+    def __call__(self, frames: FrameSet) -> SurfacePose:
+        """The pose at the mean of the true exposures, under the stamp that the cameras tell."""
+        instant = np.array([np.mean([self._exposed(f.camera, f.stamp) for f in frames.frames])])
+        pose, twist = self._truth.base_from_surface(instant)[0], self._truth.twist(instant)[0]
+        nothing, none = no_observations(frames.stamp), np.zeros(self._cameras, np.int64)
+        self.last = report_without_offsets(nothing, none, np.zeros(len(STAGES)))
+        seen = SurfacePose(frames.stamp, self._offset @ pose, EXACT_COVARIANCE, twist, TrackState.TRACKING)
+        return replace(seen, forecast=self._predictor.add(seen))
+
+    def idle(self) -> None:
+        """There is nothing else to do."""
+
+
+PICTURE_FAULTS = (
+    FaultKind.GARBLE,
+    FaultKind.SWAP,
+    FaultKind.BUMP,
+    FaultKind.BLACK,
+    FaultKind.FLASH,
+    FaultKind.COVER,
+)  # faults that pictures show
+SCAN_MESH_STEP = 1.0  # mm between the vertices of a scan, as handheld scanners give them
+FILE_NOTES = (
     ("nozzle.csv", "where the nozzle was and should have been, every millisecond"),
     ("tracking/report.html", "the tracking alone: estimate against truth, states, latency"),
     ("tracking/poses.csv", "every pose with its covariance"),
@@ -62,49 +182,45 @@ FILES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
-    """How to run a scenario.
+class SimulationOptions:
+    """How to run a scenario."""
 
-    trace: a recorded motion instead of the scenario's own. faults: besides the scenario's own. threads: that render.
-    pty: whether the arm's bytes pass a pseudo-terminal. force: whether to write into a folder that is not empty.
-    """
-
-    trace: Path | None = None
-    faults: tuple[Fault, ...] = ()
-    threads: int = 2
-    pty: bool = False
-    force: bool = False
+    trace: Path | None = None  # a recorded motion instead of the scenario's own
+    faults: tuple[Fault, ...] = ()  # besides the scenario's own
+    threads: int = 2  # that render
+    pty: bool = False  # send the arm's bytes through a pseudo-terminal
+    force: bool = False  # write into a folder that is not empty
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class SimulationResult:
     """What a run came to. text: for a terminal. met: whether it ran to its end and met its scenario's limits."""
 
     text: str
     met: bool
 
 
-def run_simulation(file: Path, out: Path, options: Options | None = None) -> Outcome:
+def run_simulation(file: Path, out: Path, options: SimulationOptions | None = None) -> SimulationResult:
     """Run the scenario in `file` into the folder `out`.
 
     Whatever ends the run early leaves all files of what was simulated until then, report included. InputError for a
     scenario, path or scan that makes no sense.
     """
-    options = options or Options()
+    options = options or SimulationOptions()
     if options.threads < 1:
         raise InputError("command line", "--threads", options.threads, ">= 1")
     scenario = read_scenario(file, options.trace)
-    check_faults(options.faults, Runner.SIMULATE, "command line", "--fault", len(scenario.rig))
+    check_faults(options.faults, FaultRunner.SIMULATE, "command line", "--fault", len(scenario.rig))
     scenario = replace(scenario, faults=(*scenario.faults, *options.faults))
     path = read_path(scenario.path)
     scene = scene_from_table(scenario.file, scenario.scene, scenario.file.parent, scenario.seed)
     _check_pairs(scenario, scene)
     if scenario.clearance is not None:
-        path = laid(path, scene.shape, scenario.clearance, scenario.path)
+        path = drape_path(path, scene.shape, scenario.clearance, scenario.path)
     if file.resolve().parent == out.resolve():
         raise InputError(out, "--out", "the folder that holds the scenario", "another one: files there are replaced")
     prepare_out(out, options.force)
-    clear(out)
+    clear_run(out)
     truth = true_surface(scenario, scene)
     around, scan = regions(scenario, scene, truth), _scan(scenario, scene, out)
     folder = RunFolder(out, scenario, planned_line(path), around, truth.base_from_surface, scan)
@@ -116,42 +232,42 @@ def run_simulation(file: Path, out: Path, options: Options | None = None) -> Out
             line = stack.enter_context(PtyLink()).transfer if options.pty else bytes
             progress = stack.enter_context(Progress("simulate", "frame sets", WallClock().now))
             print(f"watch: {folder.watch.page.resolve().as_uri()}", file=sys.stderr)
-            world = World(scenario, scene, path, truth, step, exposures, folder, WallClock(), options.threads, line)
+            loop = step, exposures, folder, WallClock(), options.threads, line
+            world = SimulatedWorld(scenario, scene, path, truth, *loop)
             try:
                 world.run(progress)
             finally:
-                skipped = world.skipped
+                skipped = world.pipeline.skipped
         complete = True
     finally:
-        outcome = _finish(scenario, path, truth, folder, around, complete, skipped)
+        outcome = _write_results(scenario, path, truth, folder, around, complete, skipped)
     return outcome
 
 
 def true_surface(scenario: Scenario, scene: Scene) -> Truth:
     """The truth of a scenario's surface, its faults included; the scene is told how it folds."""
     strain = scenario.strain
-    if (fold := folded(scenario.file, scene.deformation, scenario.faults)) is not None:
+    if (fold := fold_deformation(scenario.file, scene.deformation, scenario.faults)) is not None:
         scene.deformation, strain = fold
-    motion = struck_motion(scenario.motion, scenario.faults)
+    motion = disturbed_motion(scenario.motion, scenario.faults)
     return Truth(scenario.rest, motion, scene.deformation, strain, scene.shape.surface_from_grid)
 
 
 def _check_pairs(scenario: Scenario, scene: Scene) -> None:
-    """InputError for what was read and would have no effect."""
-    if (scenario.strain is None) != (scene.deformation == STILL):
+    if (scenario.strain is None) != (scene.deformation == UNDEFORMED):
         allowed = "both (how much over time, and of what) or neither"
         raise InputError(scenario.file, "strain, scene.deformation", "one of the two", allowed)
-    if scenario.tracking.scan and not (scenario.tracking.pictures and scenario.tracking.method == MAP):
+    if scenario.tracking.scan and not (scenario.tracking.pictures and scenario.tracking.method == MAP_METHOD):
         allowed = 'with by = "pictures": nothing else registers to a scan'
         raise InputError(scenario.file, "tracking.register", "scan", allowed)
     if not (scenario.tracking.pictures or scenario.tracking.tracks):
         for fault in scenario.faults:
-            if fault.kind in SEEN and fault.part in (Part.CAMERA, Part.SURFACE):
+            if fault.kind in PICTURE_FAULTS and fault.part in (FaultPart.CAMERA, FaultPart.SURFACE):
                 allowed = 'with tracking.by = "pictures" or "tracks": who knows the truth does not look'
                 raise InputError(scenario.file, "faults", str(fault), allowed)
 
 
-def _finish(
+def _write_results(
     scenario: Scenario,
     path: Checkpoints,
     truth: Truth,
@@ -159,36 +275,35 @@ def _finish(
     regions: Sequence[Roi],
     complete: bool,
     skipped: int,
-) -> Outcome:
+) -> SimulationResult:
     """Judge what was simulated; writes both reports and summaries. skipped: frame sets that found the tracker busy."""
     out = folder.out
     if not folder.logs:
-        return Outcome("nothing was simulated", False)
+        return SimulationResult("nothing was simulated", False)
     tracking = _tracking_report(scenario, truth, out / "tracking", regions, complete)
     run = NozzleRun(
         title=scenario.title,
-        log=joined(folder.logs),
+        log=join_logs(folder.logs),
         path=path,
         bead=scenario.bead,
         limits=scenario.limits,
         tracking=tracking,
         complete=complete,
         pictures=tuple((scenario.rig.cameras[c].name, data) for c, data in sorted(folder.pictures.items())),
-        files=FILES if scenario.tracking.pictures else tuple(f for f in FILES if f[0] != "session"),
+        files=FILE_NOTES if scenario.tracking.pictures else tuple(f for f in FILE_NOTES if f[0] != "session"),
     )
-    result = judge(run)
+    result = evaluate_run(run)
     summary = nozzle_dict(result) | {"frame_sets_skipped": skipped, "faults": [str(f) for f in scenario.faults]}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     write_nozzle_report(out / "report.html", result)
     folder.watch.finish(summary["verdict"][0])
     busy = f"{skipped} frame sets found the tracker busy and were left out\n" if skipped else ""
-    return Outcome(f"{nozzle_text(summary)}\n{busy}report: {out / 'report.html'}", result.met)
+    return SimulationResult(f"{nozzle_text(summary)}\n{busy}report: {out / 'report.html'}", result.met)
 
 
 def _tracking_report(
     scenario: Scenario, truth: Truth, folder: Path, regions: Sequence[Roi], complete: bool
 ) -> Evaluation:
-    """Judge the poses against the truth at their very stamps, as `stillbed track` would."""
     table = read_poses(folder / "poses.csv")
     exact = Trajectory(table.stamps, truth.base_from_surface(table.stamps), exact=True) if len(table) else None
     since = min((roi.stamp for roi in regions), default=-np.inf)
@@ -203,38 +318,36 @@ def _tracking_report(
 def regions(scenario: Scenario, scene: Scene, truth: Truth) -> tuple[Roi, ...]:
     """What an operator would draw around the wound in each camera's first picture."""
     start = SimulatedCameras(scenario.cameras, scenario.seed, scenario.faults)
-    found: list[Roi] = []
+    polygons: list[Roi] = []
     for camera in range(len(scenario.rig)):
         shot = next((s for s in start.shots(camera, scenario.seconds) if s.fate is not Fate.DROPPED), None)
         if shot is not None:
             pose = truth.base_from_surface(np.array([shot.exposed]))[0]
-            found += [r for r in rois(scene, scenario.rig, pose, shot.stamp) if r.camera == camera]
-    return tuple(found)
+            polygons += [r for r in rois(scene, scenario.rig, pose, shot.stamp) if r.camera == camera]
+    return tuple(polygons)
 
 
 def _scan(scenario: Scenario, scene: Scene, out: Path) -> Path | None:
-    """The scan's file where the scenario has the tracker register to one."""
     if not (scenario.tracking.pictures and scenario.tracking.scan):
         return None
     (out / "session").mkdir(exist_ok=True)
-    write_ply(out / "session" / "surface.ply", *scene.shape.mesh(SCAN_STEP))
+    write_ply(out / "session" / "surface.ply", *scene.shape.mesh(SCAN_MESH_STEP))
     return out / "session" / "surface.ply"
 
 
 @contextmanager
 def _tracking(
     scenario: Scenario, truth: Truth, shape: Shape, regions: Sequence[Roi], scan: Path | None, exposures: Exposures
-) -> Iterator[Step]:
-    """The tracking step of the scenario: that of a live run, its estimator alone, or one that knows the truth."""
+) -> Iterator[FrameSetStep]:
     if scenario.tracking.pictures:
-        method, rig, tool = scenario.tracking.method, scenario.told_rig, scenario.profile.tool
+        method, rig, tool = scenario.tracking.method, scenario.known_rig, scenario.profile.tool
         with step_by(method, rig, regions, scan, WallClock().now, tool) as step:
             yield step
         return
     if scenario.tracking.tracks:
-        rigs = scenario.rig, scenario.told_rig
-        yield TrackTracker(*rigs, truth, shape, lambda camera, stamp: exposures[camera, stamp], scenario.seed)
+        rigs = scenario.rig, scenario.known_rig
+        yield LandmarkTracker(*rigs, truth, shape, lambda camera, stamp: exposures[camera, stamp], scenario.seed)
         return
-    told, true = scenario.told_rig.cameras[0], scenario.rig.cameras[0]
-    offset = told.base_from_camera @ se3.inverse(true.base_from_camera)
-    yield PerfectTracker(truth, offset, lambda camera, stamp: exposures[camera, stamp].exposed, len(scenario.rig))
+    known, true = scenario.known_rig.cameras[0], scenario.rig.cameras[0]
+    offset = known.base_from_camera @ se3.inverse(true.base_from_camera)
+    yield OracleTracker(truth, offset, lambda camera, stamp: exposures[camera, stamp].exposed, len(scenario.rig))

@@ -1,8 +1,9 @@
-"""Recorded motions from files: TUM, and CSV whose header names its columns and their units.
+"""Recorded motions from files, TUM or CSV, played as parts of a simulated one: there and back, or held at the end.
 
-A CSV has a time (`t_s`, `stamp_s`, or `frame` beside a rate), a place (`tx_mm ty_mm tz_mm`, `x_mm ...`, or either
-in `m`) and, if it turns, a rotation vector (`rx_deg ry_deg rz_deg` or `rx_rad ...`) or a quaternion (`qx qy qz qw`).
-Further columns are left alone, unless they are one of these in a unit that is not known.
+The header of a CSV names its columns and their units: a time (`t_s`, `stamp_s`, or `frame` beside a rate), a place
+(`tx_mm ty_mm tz_mm`, `x_mm ...`, or either in `m`) and, if it turns, a rotation vector (`rx_deg ry_deg rz_deg` or
+`rx_rad ...`) or a quaternion (`qx qy qz qw`). Other columns are ignored, unless they are one of these in an unknown
+unit.
 """
 
 from __future__ import annotations
@@ -12,32 +13,37 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import butter, filtfilt
 
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
+from estimation.synthetic.waveforms import corner, corner_rate, folded, folded_rate
+from hardware.files.folder_tables import read_rows
 from hardware.process import checks
-from hardware.tum import read_rows
 
-MM = {"mm": 1.0, "m": 1000.0}
-PLACES = [(stem + "_" + unit, scale) for stem in ("t{}", "{}") for unit, scale in MM.items()]
-TURNS = [("r{}_deg", math.pi / 180), ("r{}_rad", 1.0)]
-QUATERNION = ["qx", "qy", "qz", "qw"]
-TIMES = ["t_s", "stamp_s", "frame"]
-KNOWN = [*TIMES, *(n.format(a) for n, _ in [*PLACES, *TURNS] for a in "xyz"), *QUATERNION]
-STEMS = {name.rsplit("_", 1)[0]: name for name in reversed(KNOWN) if "_" in name}  # tx: tx_mm, for a tx_cm
-LONGEST_GAP = 1.0  # s without a sample: a spline across more would be invention
-LEAST, LEAST_STATED = 1.0, 0.05  # mm that a trace spans; less are metres taken for mm (stated: less than any noise)
-MOST = 2000.0  # mm; more are mm taken for metres
+MM_PER_UNIT = {"mm": 1.0, "m": 1000.0}
+PLACE_COLUMNS = [(stem + "_" + unit, scale) for stem in ("t{}", "{}") for unit, scale in MM_PER_UNIT.items()]
+TURN_COLUMNS = [("r{}_deg", math.pi / 180), ("r{}_rad", 1.0)]
+QUATERNION_COLUMNS = ["qx", "qy", "qz", "qw"]
+TIME_COLUMNS = ["t_s", "stamp_s", "frame"]
+_AXIS_COLUMNS = [name.format(axis) for name, _ in [*PLACE_COLUMNS, *TURN_COLUMNS] for axis in "xyz"]
+KNOWN_COLUMNS = [*TIME_COLUMNS, *_AXIS_COLUMNS, *QUATERNION_COLUMNS]
+COLUMN_STEMS = {name.rsplit("_", 1)[0]: name for name in reversed(KNOWN_COLUMNS) if "_" in name}  # tx: tx_mm
+MAX_TRACE_GAP = 1.0  # s without a sample: a spline across more would be invention
+MIN_SPAN = 1.0  # mm that a trace spans; less are metres taken for mm
+MIN_SPAN_STATED = 0.05  # mm, where the unit is stated: less than any noise
+MAX_SPAN = 2000.0  # mm; more are mm taken for metres
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
-    """A recorded motion. stamps: (N,) s, from 0. poses: (N, 4, 4) mm, relative to the first. where: its file."""
+    """A recorded motion."""
 
-    where: Path
-    stamps: Array
-    poses: Array
+    where: Path  # its file
+    stamps: Array  # (N,) s, from 0
+    poses: Array  # (N, 4, 4) mm, relative to the first
 
 
 def read_trace(path: Path, unit: str | None = None, rate_hz: float | None = None, start_s: float = 0.0) -> Trace:
@@ -57,9 +63,9 @@ def read_trace(path: Path, unit: str | None = None, rate_hz: float | None = None
             raise InputError(path, "rate_hz", rate_hz, "none: only a CSV with a column `frame` needs it")
         rows = read_rows(path)
         stamps = rows[:, 0]
-        poses = se3.make(se3.rotation_from_quaternion(rows[:, 4:]), rows[:, 1:4] * MM[unit or "mm"])
+        poses = se3.make(se3.rotation_from_quaternion(rows[:, 4:]), rows[:, 1:4] * MM_PER_UNIT[unit or "mm"])
     stated = unit is not None or path.suffix.lower() == ".csv"
-    _check(path, stamps, poses[:, :3, 3], LEAST_STATED if stated else LEAST)
+    _check(path, stamps, poses[:, :3, 3], MIN_SPAN_STATED if stated else MIN_SPAN)
     return _from_start(path, stamps - stamps[0], poses, start_s)
 
 
@@ -77,31 +83,29 @@ def _check(path: Path, stamps: Array, places: Array, least: float) -> None:
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0))
         raise InputError(path, f"stamp of pose {k + 2}", stamps[k + 1], f"later than the one before, {stamps[k]} s")
-    if steps.max() > LONGEST_GAP:
-        k = int(np.argmax(steps > LONGEST_GAP))
-        raise InputError(
-            path, f"gap after {stamps[k]:.10g} s", f"{steps[k]:g} s", f"at most {LONGEST_GAP:g} s (stamps in s)"
-        )
+    if steps.max() > MAX_TRACE_GAP:
+        k = int(np.argmax(steps > MAX_TRACE_GAP))
+        allowed = f"at most {MAX_TRACE_GAP:g} s (stamps in s)"
+        raise InputError(path, f"gap after {stamps[k]:.10g} s", f"{steps[k]:g} s", allowed)
     span = float(np.ptp(places, axis=0).max())
     if 0 < span < least:
-        raise InputError(
-            path, "places span", f"{span:g} mm", f'{least:g} mm or more; if they are metres: unit = "m", columns tx_m'
-        )
-    if span > MOST:
-        raise InputError(path, "places span", f"{span:g} mm", f"at most {MOST:g} mm; are they mm, not metres?")
+        allowed = f'{least:g} mm or more; if they are metres: unit = "m", columns tx_m'
+        raise InputError(path, "places span", f"{span:g} mm", allowed)
+    if span > MAX_SPAN:
+        raise InputError(path, "places span", f"{span:g} mm", f"at most {MAX_SPAN:g} mm; are they mm, not metres?")
 
 
 def _from_csv(path: Path, rate_hz: float | None) -> tuple[Array, Array]:
     columns = _columns(path)
     _check_units(path, columns)
-    time = next((name for name in TIMES if name in columns), None)
+    time = next((name for name in TIME_COLUMNS if name in columns), None)
     if time is None:
-        raise InputError(path, "header", ",".join(columns)[:80], f"a column {', '.join(TIMES)}")
+        raise InputError(path, "header", ",".join(columns)[:80], f"a column {', '.join(TIME_COLUMNS)}")
     if (time == "frame") != (rate_hz is not None):
         allowed = "the rate of the column `frame`" if time == "frame" else f"none: there is a column {time}"
         raise InputError(path, "rate_hz", "missing" if rate_hz is None else rate_hz, allowed)
     stamps = columns[time] / (rate_hz or 1.0)
-    places = _triple(columns, PLACES)
+    places = _triple(columns, PLACE_COLUMNS)
     if places is None:
         raise InputError(path, "header", ",".join(columns)[:80], "columns tx_mm, ty_mm, tz_mm")
     return stamps, se3.make(_rotations(path, columns, len(stamps)), places)
@@ -109,10 +113,9 @@ def _from_csv(path: Path, rate_hz: float | None) -> tuple[Array, Array]:
 
 def _check_units(path: Path, columns: dict[str, Array]) -> None:
     for name in columns:
-        if name not in KNOWN and (stem := name.rsplit("_", 1)[0].lower()) in STEMS:
-            raise InputError(
-                path, "header", name, f"{STEMS[stem]}, or that column in another unit: {checks.meant(name, KNOWN)}"
-            )
+        if name not in KNOWN_COLUMNS and (stem := name.rsplit("_", 1)[0].lower()) in COLUMN_STEMS:
+            others = checks.one_of_text(name, KNOWN_COLUMNS)
+            raise InputError(path, "header", name, f"{COLUMN_STEMS[stem]}, or that column in another unit: {others}")
 
 
 def _triple(columns: dict[str, Array], kinds: list[tuple[str, float]]) -> Array | None:
@@ -123,16 +126,16 @@ def _triple(columns: dict[str, Array], kinds: list[tuple[str, float]]) -> Array 
 
 
 def _rotations(path: Path, columns: dict[str, Array], count: int) -> Array:
-    turns = _triple(columns, TURNS)
+    turns = _triple(columns, TURN_COLUMNS)
     if turns is not None:
         return se3.exp_rotation(turns)
-    if all(name in columns for name in QUATERNION):
-        quaternions = np.stack([columns[name] for name in QUATERNION], axis=1)
+    if all(name in columns for name in QUATERNION_COLUMNS):
+        quaternions = np.stack([columns[name] for name in QUATERNION_COLUMNS], axis=1)
         lengths = np.linalg.norm(quaternions, axis=1)
         if np.abs(lengths - 1).max() > 0.01:
             raise InputError(path, "length of qx qy qz qw", lengths[np.argmax(np.abs(lengths - 1))], "1 +- 0.01")
         return se3.rotation_from_quaternion(quaternions)
-    halves = [name for name in columns if name in KNOWN and name[0] in "rq"]
+    halves = [name for name in columns if name in KNOWN_COLUMNS and name[0] in "rq"]
     if halves:
         raise InputError(path, "header", ",".join(halves), "all three of rx_deg, ry_deg, rz_deg, all four of qx to qw")
     return np.broadcast_to(np.eye(3), (count, 3, 3))
@@ -147,7 +150,7 @@ def _columns(path: Path) -> dict[str, Array]:
     for n, row in rows[1:]:
         if len(row) != len(header):
             raise InputError(path, f"line {n}", f"{len(row)} values", f"{len(header)}, as in the header")
-    numbers = {name: _column(path, rows[1:], i, name) for i, name in enumerate(header) if name in KNOWN}
+    numbers = {name: _column(path, rows[1:], i, name) for i, name in enumerate(header) if name in KNOWN_COLUMNS}
     return {name: numbers.get(name, np.empty(0)) for name in header}
 
 
@@ -161,3 +164,84 @@ def _column(path: Path, rows: list[tuple[int, list[str]]], index: int, name: str
         if not math.isfinite(values[-1]):
             raise InputError(path, f"line {n}: {name}", row[index], "a finite number")
     return np.array(values)
+
+
+SMOOTH_STEPS = 5  # of the trace's own: periods below are taken away, on the 10 Hz chests 0.03-0.1 mm, their noise
+MAX_TURN = math.radians(150)  # from the first pose: rotation vectors are interpolated, which end at 180
+STOP_DURATION = 0.5  # s in which the play turns round or comes to its end
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlayedTrace:
+    """A trace as a part of a motion."""
+
+    spline: CubicSpline  # s -> (N, 6) rotation vector and shift, rad and mm
+    duration: float  # s
+    back: bool  # played there and back for ever; else it stops at the end
+    pivot: Array  # (3,) mm
+
+    def coordinates(self, times: Array) -> Array:
+        """Rotation vector and shift (N, 6), rad and mm."""
+        return np.asarray(self.spline(self._place(times)))
+
+    def rates(self, times: Array) -> Array:
+        """Their derivatives (N, 6)."""
+        return np.asarray(self.spline(self._place(times), 1) * self._speed(times)[:, None])
+
+    def _place(self, times: Array) -> Array:
+        """Where in the trace, s: at 0 s at its beginning and at its own speed, before that slowly out of rest."""
+        start, end = times + STOP_DURATION / 2, times - self.duration + STOP_DURATION / 2
+        first = corner(start, STOP_DURATION) - STOP_DURATION / 2 - corner(end, STOP_DURATION)
+        return np.where(self._again(times), folded(times, self.duration, STOP_DURATION), first)
+
+    def _speed(self, times: Array) -> Array:
+        start, end = times + STOP_DURATION / 2, times - self.duration + STOP_DURATION / 2
+        first = corner_rate(start, STOP_DURATION) - corner_rate(end, STOP_DURATION)
+        return np.where(self._again(times), folded_rate(times, self.duration, STOP_DURATION), first)
+
+    def _again(self, times: Array) -> Array:
+        return np.asarray(self.back & (times > self.duration / 2))
+
+
+def played_trace(
+    trace: Trace, scale: float, rotation: bool, smooth: float | None, back: bool, pivot: Array
+) -> PlayedTrace:
+    """A trace as a part: its shifts and rotations times `scale`, without the rotations where `rotation` is false.
+
+    smooth: s, the period at which the low-pass keeps half (Butterworth of second order, forward and back, so without
+    delay): of 0.1 mm noise at 10 Hz an interpolating spline would make speeds of mm/s that no chest had. None takes
+    SMOOTH_STEPS of the trace's own steps, 0 nothing.
+    """
+    step, zero = float(np.median(np.diff(trace.stamps))), np.zeros((len(trace.stamps), 3))
+    smooth = SMOOTH_STEPS * step if smooth is None else smooth
+    coordinates = np.concatenate([_rotation_vectors(trace) if rotation else zero, trace.poses[:, :3, 3]], axis=1)
+    duration = float(trace.stamps[-1])
+    if duration < 2 * STOP_DURATION:
+        raise InputError(trace.where, "duration", f"{duration:g} s", f"{2 * STOP_DURATION:g} s or more")
+    stamps = trace.stamps
+    if smooth > 0:
+        if smooth < 2.5 * step:
+            allowed = f"0, or at least 2.5 steps of the trace, {2.5 * step:g} s"
+            raise InputError(trace.where, "smooth_s", smooth, allowed)
+        stamps, coordinates = _smoothed(stamps, coordinates, step, smooth)
+    coordinates = coordinates - coordinates[0]  # the filter moves the first sample too
+    return PlayedTrace(CubicSpline(stamps, scale * coordinates), duration, back, pivot)
+
+
+def _rotation_vectors(trace: Trace) -> Array:
+    vectors = se3.log_rotation(trace.poses[:, :3, :3])
+    widest = float(np.linalg.norm(vectors, axis=1).max())
+    if widest > MAX_TURN:
+        got = f"{math.degrees(widest):.0f} degrees from the pose at its start"
+        raise InputError(trace.where, "rotation", got, f"at most {math.degrees(MAX_TURN):.0f}; or rotation = false")
+    return vectors
+
+
+def _smoothed(stamps: Array, coordinates: Array, step: float, smooth: float) -> tuple[Array, Array]:
+    """Resampled to even steps and low-passed: stamps (M,) and coordinates (M, 6)."""
+    count = max(8, round(stamps[-1] / step) + 1)
+    even = np.linspace(0.0, stamps[-1], count)
+    values = CubicSpline(stamps, coordinates)(even)
+    # of two passes each keeps 1 / sqrt(2) of the amplitude at its corner frequency
+    b, a = butter(2, 1 / smooth, fs=(count - 1) / stamps[-1])
+    return even, np.asarray(filtfilt(b, a, values, axis=0, padlen=min(count - 1, 3 * round(smooth / step) + 6)))

@@ -1,30 +1,37 @@
-"""What is true of the surface at any instant: where it is, how it moves, and where a checkpoint on it lies."""
+"""The true motion of the surface, its faults, paths laid onto it, and the log that compares commands with execution."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.simulator.deformation import Deformation
+from hardware.process.faults import Fault, FaultKind, FaultPart, fault_rng, faults_striking
+from hardware.simulator.deposit import NozzleLog, planned_line
+from hardware.simulator.scene.shape import Deformation, Shape
+from planning.command import Command, Move
+from planning.path import Path
+from planning.progress import PrintPhase, PrintProgress
+from planning.robot.kinematics import SimpleArm, nozzle_from_axes
 
-STEP = 0.01  # mm over which the deformation's gradient is taken: it is smooth over centimetres
+GRADIENT_STEP = 0.01  # mm over which the deformation's gradient is taken: it is smooth over centimetres
 
 
-class MotionOf(Protocol):
-    """A motion about the rest pose: estimation.synthetic.motions.Motion, or anything that answers like it."""
+class TrueMotion(Protocol):
+    """A motion about the rest pose: estimation.synthetic.movements.ComposedMotion, or anything that answers like it."""
 
     def __call__(self, times: Array) -> Array:
         """rest_from_surface (N, 4, 4) at times (N,), s."""
-        ...
 
     def twist(self, times: Array) -> Array:
         """Body twist (N, 6) at times (N,), rad/s and mm/s."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +42,7 @@ class Truth:
     """
 
     rest: Array
-    motion: MotionOf
+    motion: TrueMotion
     deformation: Deformation = field(default_factory=Deformation)
     strain: Callable[[Array], Array] | None = None
     surface_from_grid: Array = field(default_factory=lambda: np.eye(4))
@@ -82,8 +89,224 @@ class Truth:
         return np.asarray(moved @ self.surface_from_grid[:3, :3].T)
 
     def _turn(self, points: Array, amount: Array) -> Array:
-        """Rotations (N, 3, 3) of the material at points (N, 3)."""
-        ahead = [self.displacement(points + STEP / 2 * axis, amount) for axis in np.eye(3)]
-        behind = [self.displacement(points - STEP / 2 * axis, amount) for axis in np.eye(3)]
-        gradient = np.eye(3) + (np.stack(ahead, -1) - np.stack(behind, -1)) / STEP
+        ahead = [self.displacement(points + GRADIENT_STEP / 2 * axis, amount) for axis in np.eye(3)]
+        behind = [self.displacement(points - GRADIENT_STEP / 2 * axis, amount) for axis in np.eye(3)]
+        gradient = np.eye(3) + (np.stack(ahead, -1) - np.stack(behind, -1)) / GRADIENT_STEP
         return se3.nearest_rotation(gradient)
+
+
+FOLD_SIGMA = 8.0  # mm, one sigma of a fold: narrower than a wound, wider than a bead
+
+
+def fault_pulse(fault: Fault, times: Array) -> tuple[Array, Array]:
+    """A rise from 0 to 1 and back without a corner while a fault lasts, and its rate, 1/s; both (N,) at times (N,)."""
+    phase = np.clip((times - fault.start) / fault.duration, 0.0, 1.0) * np.pi
+    return np.sin(phase) ** 2, np.sin(2 * phase) * np.pi / fault.duration
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DisturbedMotion:
+    """A motion with faults of kind FAST on top: along a straight line, at their amount at most."""
+
+    motion: TrueMotion
+    faults: Sequence[Fault]
+
+    def __call__(self, times: Array) -> Array:
+        """rest_from_surface (N, 4, 4) at times (N,), s."""
+        return np.asarray(se3.make(np.eye(3), self._way(times)[0]) @ self.motion(times))
+
+    def twist(self, times: Array) -> Array:
+        """Body twist (N, 6) at times (N,), rad/s and mm/s."""
+        turned = np.swapaxes(self.motion(times)[:, :3, :3], -1, -2)
+        twist = self.motion.twist(times).copy()
+        twist[:, 3:] += (turned @ self._way(times)[1][..., None])[..., 0]
+        return np.asarray(twist)
+
+    def _way(self, times: Array) -> tuple[Array, Array]:
+        place, speed = np.zeros((len(times), 3)), np.zeros((len(times), 3))
+        for fault in self.faults:
+            risen, rate = fault_pulse(fault, times)
+            direction = fault_rng(fault).normal(size=3)
+            reach = fault.amount * fault.duration / np.pi * direction / np.linalg.norm(direction)
+            place += risen[:, None] * reach
+            speed += rate[:, None] * reach
+        return place, speed
+
+
+def disturbed_motion(motion: TrueMotion, faults: Sequence[Fault]) -> TrueMotion:
+    """The motion with all that makes it run away."""
+    fast = faults_striking(faults, FaultPart.SURFACE, FaultKind.FAST)
+    return DisturbedMotion(motion, fast) if fast else motion
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoldAmount:
+    """How high folds stand: an amount over time, as a scenario's [strain] is."""
+
+    faults: Sequence[Fault]
+
+    def __call__(self, times: Array) -> Array:
+        """mm (N,) at times (N,), s."""
+        return np.asarray(sum(fault.amount * fault_pulse(fault, times)[0] for fault in self.faults))
+
+
+def fold_deformation(
+    where: object, deformation: Deformation, faults: Sequence[Fault]
+) -> tuple[Deformation, FoldAmount] | None:
+    """The deformation of folds and its amount over time; None without any.
+
+    InputError where the surface is deformed already: there is one deformation at a time.
+    """
+    folds = faults_striking(faults, FaultPart.SURFACE, FaultKind.FOLD)
+    if not folds:
+        return None
+    if deformation != Deformation():
+        raise InputError(where, "faults", str(folds[0]), "a scenario without [scene.deformation]")
+    return Deformation(bulge=1.0, radius=FOLD_SIGMA), FoldAmount(folds)
+
+
+RowIndex = NDArray[np.int64]
+
+ROW_STEP = 0.001  # s between rows
+
+
+class TruthLog:
+    """Remembers commands and gives the rows of a NozzleLog.
+
+    A command of the tick at `now` says where the nozzle shall be one tick and the arm's known lag later. Between two
+    such instants the place on the path runs evenly. Whatever else delays the arm is error.
+    """
+
+    def __init__(self, path: Path, arm: SimpleArm, truth: Truth, tick: float, lag: float) -> None:
+        """path: in the true surface frame. arm: where it truly stands. tick, lag: s, as the motion knows them."""
+        self._path, self._arm, self._truth, self._tick, self._lag = path, arm, truth, tick, lag
+        self._places = planned_line(path).knots  # (N,) mm along the path of each checkpoint
+        self._due: list[float] = []  # s, rising: when each command is to be fulfilled
+        self._fraction: list[float] = []  # checkpoints, at `due`; NaN before printing began
+        self._extrude: list[bool] = []
+        self._reason: list[str] = []
+
+    def write(self, command: Command, progress: PrintProgress) -> None:
+        """The command of one tick, and how far the print is by it."""
+        begun = progress.place > 0 or progress.phase is PrintPhase.PRINTING
+        self._due.append(command.stamp + self._tick + self._lag)
+        self._fraction.append(progress.fraction if begun else np.nan)
+        self._extrude.append(isinstance(command, Move) and command.extrude)
+        self._reason.append(command.reason)
+
+    @property
+    def known_until(self) -> float:
+        """The last instant, s, for which something was commanded; minus infinity before any."""
+        return self._due[-1] if self._due else -np.inf
+
+    def extruding(self, times: Array) -> NDArray[np.bool_]:
+        """Whether material leaves (N,) at times (N,), s."""
+        return np.array([self._extrude[i] if 0 <= i < len(self._due) else False for i in self._rows(times)], bool)
+
+    def rows(self, times: Array, executed: Callable[[Array], Array]) -> NozzleLog:
+        """The log at times (N,), s; executed: machine axes (N, 6) at times (N,)."""
+        index = self._rows(times)
+        known = (index >= 0) & (index < len(self._due))
+        fraction = self._fractions(times, index, known)
+        target = np.full((len(times), 4, 4), np.nan)
+        there = np.isfinite(fraction)
+        target[there] = self._truth.checkpoints(times[there], self._between(fraction[there]))
+        nozzle = nozzle_from_axes(self._arm, executed(times))
+        place = np.interp(fraction, np.arange(len(self._places)), self._places)
+        filled = np.where(there, fraction, 0.0)
+        reasons = [self._reason[i] if ok else "no surface is followed yet" for i, ok in zip(index, known, strict=True)]
+        return NozzleLog(
+            stamps=times,
+            base_from_surface=self._truth.base_from_surface(times),
+            base_from_nozzle=nozzle,
+            base_from_target=target,
+            place=np.where(there, place, np.nan),
+            checkpoint=np.where(there, np.minimum(np.ceil(filled), len(self._places) - 1), -1).astype(np.int64),
+            extrude=self.extruding(times),
+            reason=np.array(reasons, dtype=np.str_),
+            surface_from_tip=self._truth.material(times, nozzle[:, :3, 3]),
+        )
+
+    def _rows(self, times: Array) -> RowIndex:
+        """Per instant (N,) the command that is being fulfilled, -1 before the first."""
+        first = self._due[0] - self._tick if self._due else np.inf
+        return np.array([-1 if t <= first else bisect_left(self._due, t) for t in times.tolist()], np.int64)
+
+    def _fractions(self, times: Array, index: RowIndex, known: NDArray[np.bool_]) -> Array:
+        """Fractional checkpoint (N,) due at times (N,), NaN where there is none."""
+        out = np.full(len(times), np.nan)
+        for row, i in enumerate(index.tolist()):
+            if known[row]:
+                end = self._fraction[i]
+                start = self._fraction[i - 1] if i > 0 and np.isfinite(self._fraction[i - 1]) else end
+                share = 1.0 - (self._due[i] - times[row]) / self._tick
+                out[row] = start + min(max(share, 0.0), 1.0) * (end - start)
+        return out
+
+    def _between(self, fraction: Array) -> Array:
+        """surface_from_nozzle (N, 4, 4) at fractional checkpoints (N,): straight and evenly from one to the next."""
+        poses = self._path.surface_from_nozzle
+        i = np.minimum(fraction.astype(int), len(poses) - 2)
+        share = (fraction - i)[:, None]
+        places = poses[i, :3, 3] + share * (poses[i + 1, :3, 3] - poses[i, :3, 3])
+        turn = se3.log_rotation(np.swapaxes(poses[i, :3, :3], -1, -2) @ poses[i + 1, :3, :3])
+        return se3.make(poses[i, :3, :3] @ se3.exp_rotation(share * turn), places)
+
+
+def row_instants(start: float, end: float) -> Array:
+    """Instants (N,) of the rows after `start` up to `end`, s, on whole milliseconds."""
+    first, last = np.floor(start / ROW_STEP + 1e-6) + 1, np.floor(end / ROW_STEP + 1e-6)
+    return np.minimum(np.arange(first, last + 1) * ROW_STEP, end)  # a product may be rounded to just beyond it
+
+
+PIECE_LENGTH = 1.0  # mm: beds of wounds are uneven over a few
+PROJECTION_STEPS = 12  # towards the surface along z; one would do if a scan's frame were never tilted against its plane
+MAX_MISS = 1e-3  # mm from the surface
+
+
+def drape_path(path: Path, shape: Shape, clearance: float, where: object = "path") -> Path:
+    """The path with its checkpoints `clearance` mm above the surface, stretches divided into pieces of about 1 mm.
+
+    Tools keep the direction that the path gives them; a path's own height (z) is kept on top of the surface's.
+    InputError with `where` for a checkpoint that lies beyond the surface's edge.
+    """
+    fine = divide_path(path, PIECE_LENGTH)
+    places = fine.surface_from_nozzle.copy()
+    points, there = surface_along_z(shape, places[:, :2, 3])
+    if not there.all():
+        x, y = places[~there][0, :2, 3]
+        allowed = "on the surface, {:g} x {:g} mm about its middle".format(*shape.size)
+        raise InputError(where, "a place on the path", f"x = {x:.2f}, y = {y:.2f} mm", allowed)
+    places[:, 2, 3] += points[:, 2] + clearance
+    return replace(fine, surface_from_nozzle=places)
+
+
+def surface_along_z(shape: Shape, xy: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Points (N, 3) mm of the surface at x and y (N, 2) mm, surface frame, and whether (N,) there is one."""
+    points, outwards = np.column_stack([xy, np.zeros(len(xy))]), shape.surface_from_grid[:3, 2]
+    for _ in range(PROJECTION_STEPS):
+        off = shape.points(shape.material(points)) - points  # along the grid's own z
+        points[:, 2] += (off @ outwards) / outwards[2]
+    material = shape.material(points)
+    return points, shape.covers(material) & (np.linalg.norm(shape.points(material) - points, axis=1) < MAX_MISS)
+
+
+def divide_path(path: Path, piece: float) -> Path:
+    """The path with stretches longer than `piece` mm cut into equal ones; a new checkpoint takes after its next."""
+    places = path.surface_from_nozzle
+    counts = np.ceil(np.linalg.norm(np.diff(places[:, :3, 3], axis=0), axis=1) / piece).astype(int)
+    counts = np.maximum(np.where(keeps_direction(places), counts, 1), 1)
+    source = np.concatenate([[0], np.repeat(np.arange(1, len(places)), counts)])
+    share = np.concatenate([[1.0], *(np.arange(1, n + 1) / n for n in counts)])
+    cut = places[source].copy()
+    before = places[np.maximum(source - 1, 0), :3, 3]
+    cut[:, :3, 3] = before + share[:, None] * (places[source, :3, 3] - before)
+    columns = {name: getattr(path, name)[source] for name in ("speed", "material", "temperature", "layer", "extrude")}
+    extra = {name: column[source] for name, column in path.extra.items()}
+    return replace(path, surface_from_nozzle=cut, extra=extra, **columns)
+
+
+def keeps_direction(surface_from_nozzle: Array) -> NDArray[np.bool_]:
+    """(N-1,) whether the tool keeps its direction from one of (N, 4, 4) to the next; others are left whole."""
+    turns = surface_from_nozzle[:, :3, :3]
+    return np.asarray(np.abs(np.diff(turns, axis=0)).max(axis=(1, 2)) < 1e-9)

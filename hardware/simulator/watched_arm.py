@@ -1,7 +1,8 @@
-"""A virtual arm before simulated cameras, all of it known exactly: what a calibration of the arm is held against.
+"""A virtual arm before simulated cameras, all of it known exactly, to test a calibration of the arm; and picture loops.
 
-The arm is served on a pseudo-terminal in real time, or in virtual time; either way it is known afterwards where it was
-at each instant, and the pictures that the cameras took meanwhile are rendered then.
+The arm is served on a pseudo-terminal in real time, or in virtual time; either way its position at each instant is
+known afterwards, and the pictures that the cameras took meanwhile are rendered then. A picture loop is a motion that
+ends where it began: rendering takes five times as long as tracking, so a loop gives hours of frame sets.
 """
 
 from __future__ import annotations
@@ -13,71 +14,70 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.synthetic.arc_rig import REST, arc_rig
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.arm.profile import ArmProfile, placed
+from hardware.files.folder_tables import SessionFolderWriter
 from hardware.files.images import encode
-from hardware.process.clock import Clock, RememberingClock
-from hardware.process.progress import Report, silent
-from hardware.session_folder import SessionFolder
+from hardware.process.clock import Clock, WatchedClock
+from hardware.process.progress import ProgressReport, no_progress
 from hardware.simulator.arm.controller import VirtualArm
+from hardware.simulator.arm.ports import run_virtual_arm
 from hardware.simulator.arm.settings import ArmSettings
-from hardware.simulator.camera_settings import CameraSettings
-from hardware.simulator.cameras import Shot, SimulatedCameras
-from hardware.simulator.instant import Instant
-from hardware.simulator.look import Look
-from hardware.simulator.pictures import NOISE
-from hardware.simulator.port import run_virtual_arm
-from hardware.simulator.render import StillScene
-from hardware.simulator.scene.scene import Scene
+from hardware.simulator.camera_pipeline import NOISE_STREAM
+from hardware.simulator.cameras import CameraSettings, Shot, SimulatedCameras
+from hardware.simulator.scene.appearance import Appearance, Sensor
+from hardware.simulator.scene.render import StillScene, render
+from hardware.simulator.scene.scene import Scene, WorldState
 from hardware.simulator.scene.shape import cylinder
-from hardware.simulator.sensor import Sensor
-from planning.kinematics import SimpleArm, nozzle_from_axes
+from perception.frames import Image
+from perception.matching.features import grey
+from planning.robot.kinematics import SimpleArm, nozzle_from_axes
 
-DEAD, LAG = (0.005, 0.025), (0.012, 0.03)  # s between which the virtual arm's own are drawn
-AWRY = np.array([0.02] * 3 + [4.0] * 3)  # rad and mm, one sigma by which it stands beside where its file says
-TOOL = 1.5  # mm, likewise of the tip
-FPS = 12.0  # pictures a second, of which one in EVERY is kept but where the arm is LIVELY: rendering takes long
-EVERY, LIVELY = 3, 300.0  # mm/s^2: what tells dead time from lag
-AROUND = 0.02  # s on both sides between which that is measured
-OPENS = 5.0  # s that a pseudo-terminal may take to appear
-QUALITY = None  # no JPEG: a needle two pixels wide is seen by its colour, which JPEG stores at half the resolution
+DEAD_TIME_RANGE, LAG_RANGE = (0.005, 0.025), (0.012, 0.03)  # s between which the virtual arm's own are drawn
+PLACEMENT_SIGMA = np.array([0.02] * 3 + [4.0] * 3)  # rad and mm, from where its file says that it stands
+TOOL_SIGMA = 1.5  # mm, likewise of the tip
+PICTURE_RATE = 12.0  # a second; one in KEPT_EVERY is rendered, as that takes long, but all at high acceleration
+KEPT_EVERY, MIN_ACCELERATION = 3, 300.0  # mm/s^2: what tells dead time from lag
+ACCELERATION_SPAN = 0.02  # s on both sides between which that is measured
+OPEN_TIMEOUT = 5.0  # s that a pseudo-terminal may take to appear
+LOSSLESS = None  # no JPEG: a needle two pixels wide is seen by its colour, which JPEG stores at half the resolution
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WatchedArm:
-    """A virtual arm and its cameras. rig: as it is. told: the arm as its file says; true: as it is. settings: of the
-    controller. begin: (6,) where it stands first."""
+    """A virtual arm and its cameras."""
 
-    rig: Rig
-    told: ArmProfile
-    true: SimpleArm
-    settings: ArmSettings
+    rig: Rig  # as it is
+    profile: ArmProfile  # the arm as its file says
+    true: SimpleArm  # the arm as it is
+    settings: ArmSettings  # of the controller
     cameras: CameraSettings
-    begin: Array
+    begin: Array  # (6,) where it stands first
     seed: int
 
 
-def watched_arm(seed: int, fps: float = FPS) -> WatchedArm:
-    """One, with errors of its own for each seed; it stands where the cameras look."""
+def watched_arm(seed: int, fps: float = PICTURE_RATE) -> WatchedArm:
+    """An arm before the cameras, with its own placement, tool and timing errors for each seed."""
     rng = np.random.default_rng([seed, 89])
-    rig, told = arc_rig(), placed(ArmProfile(), REST)
-    awry = se3.exp(rng.normal(size=6) * AWRY)
-    tool = rng.normal(size=3) * TOOL
-    true = replace(told.arm, arm_from_base=told.arm.arm_from_base @ awry, tool_offset=tool)
-    settings = ArmSettings(dead_time=float(rng.uniform(*DEAD)), servo_lag=float(rng.uniform(*LAG)))
+    rig, profile = arc_rig(), placed(ArmProfile(), BASE_FROM_REST)
+    awry = se3.exp(rng.normal(size=6) * PLACEMENT_SIGMA)
+    tool = rng.normal(size=3) * TOOL_SIGMA
+    true = replace(profile.arm, arm_from_base=profile.arm.arm_from_base @ awry, tool_offset=tool)
+    settings = ArmSettings(dead_time=float(rng.uniform(*DEAD_TIME_RANGE)), servo_lag=float(rng.uniform(*LAG_RANGE)))
     phases = tuple(float(v) for v in rng.uniform(0, 0.01, len(rig)))
     cameras = CameraSettings(phases, (0.0,) * len(rig), fps=fps)
-    return WatchedArm(rig, told, true, settings, cameras, told.arm.home - [0, 0, 3.0, 0, 0, 0], seed)
+    return WatchedArm(rig, profile, true, settings, cameras, profile.arm.home - [0, 0, 3.0, 0, 0, 0], seed)
 
 
 @dataclass(slots=True)
-class Served:
+class ServedArm:
     """A virtual arm on a pseudo-terminal. device: its name. Afterwards, arm, and begun: its time 0 by the clock."""
 
     device: str
@@ -86,17 +86,17 @@ class Served:
 
 
 @contextmanager
-def served(watched: WatchedArm, link: Path, clock: Clock) -> Iterator[Served]:
+def serve_arm(watched: WatchedArm, link: Path, clock: Clock) -> Iterator[ServedArm]:
     """Serve the arm on a pseudo-terminal at `link`, in a thread, until the context ends."""
-    stop, since, result = threading.Event(), RememberingClock(clock), Served(str(link))
-    standing = replace(watched.told, arm=replace(watched.told.arm, home=watched.begin))
+    stop, since, result = threading.Event(), WatchedClock(clock), ServedArm(str(link))
+    standing = replace(watched.profile, arm=replace(watched.profile.arm, home=watched.begin))
 
     def serve() -> None:
-        result.arm = run_virtual_arm(watched.settings, standing, (), link, clock=since, stop=stop, say=_nobody)
+        result.arm = run_virtual_arm(watched.settings, standing, (), link, clock=since, stop=stop, say=_ignore)
 
     thread = threading.Thread(target=serve, name="virtual arm", daemon=True)
     thread.start()
-    end = clock.now() + OPENS
+    end = clock.now() + OPEN_TIMEOUT
     while not link.exists() and clock.now() < end and thread.is_alive():
         clock.wait_until(clock.now() + 0.01)
     try:
@@ -107,42 +107,94 @@ def served(watched: WatchedArm, link: Path, clock: Clock) -> Iterator[Served]:
         result.begun = since.begun or 0.0
 
 
-def _nobody(words: str) -> None:
-    """Tell nobody."""
+def _ignore(words: str) -> None:
+    pass
 
 
 def _lively(arm: VirtualArm, instants: Array) -> NDArray[np.bool_]:
-    """Whether (N,) the arm changes its speed quickly at instants (N,), s."""
-    around = [arm.axes_at(np.clip(instants + h, 0.0, arm.now))[:, :3] for h in (-AROUND, 0.0, AROUND)]
-    return np.asarray(np.linalg.norm(around[2] - 2 * around[1] + around[0], axis=1) > LIVELY * AROUND**2)
+    offsets = (-ACCELERATION_SPAN, 0.0, ACCELERATION_SPAN)
+    before, at, after = (arm.axes_at(np.clip(instants + h, 0.0, arm.now))[:, :3] for h in offsets)
+    change = np.linalg.norm(after - 2 * at + before, axis=1)
+    return np.asarray(change > MIN_ACCELERATION * ACCELERATION_SPAN**2)
 
 
 def take_pictures(
-    watched: WatchedArm, arm: VirtualArm, begun: float, span: tuple[float, float], folder: Path, report: Report = silent
+    watched: WatchedArm,
+    arm: VirtualArm,
+    begun: float,
+    span: tuple[float, float],
+    folder: Path,
+    report: ProgressReport = no_progress,
 ) -> None:
     """Write the session folder of what the cameras saw of the arm from one instant to another, s, by the clock.
 
     begun: the arm's time 0 by the clock.
     """
-    scene = Scene(cylinder((80.0, 60.0), 80.0), Look(texel=0.3, drape=False), seed=watched.seed)
+    scene = Scene(cylinder((80.0, 60.0), 80.0), Appearance(texel=0.3, drape=False), seed=watched.seed)
     exposure, sensor = watched.cameras.exposure, Sensor()
-    before = StillScene(scene, watched.rig.cameras, Instant(0.0, exposure, REST, np.zeros(6)))
+    before = StillScene(scene, watched.rig.cameras, WorldState(0.0, exposure, BASE_FROM_REST, np.zeros(6)))
     cameras = SimulatedCameras(watched.cameras, watched.seed)
     until = min(span[1] - begun, arm.now)
     streams = [cameras.shots(c, until) for c in range(len(watched.rig))]
     rounds = [shots for shots in zip(*streams, strict=False) if shots[0].exposed + begun >= span[0]]
     lively = _lively(arm, np.array([shots[0].exposed for shots in rounds]))
-    rounds = [shots for number, shots in enumerate(rounds) if lively[number] or number % EVERY == 0]
+    rounds = [shots for number, shots in enumerate(rounds) if lively[number] or number % KEPT_EVERY == 0]
 
     def taken(shot: Shot) -> tuple[str, bytes]:
         axes = arm.axes_at(np.array([min(shot.exposed, arm.now)]))[0]
         nozzle = nozzle_from_axes(watched.true, axes)
-        instant = Instant(shot.exposed, exposure, REST, np.zeros(6), 0.0, nozzle, shot.gain)
-        rng = np.random.default_rng([watched.seed, NOISE, shot.camera, shot.picture])
-        return encode(before(shot.camera, instant, sensor, rng), QUALITY)
+        instant = WorldState(shot.exposed, exposure, BASE_FROM_REST, np.zeros(6), 0.0, nozzle, shot.gain)
+        rng = np.random.default_rng([watched.seed, NOISE_STREAM, shot.camera, shot.picture])
+        return encode(before(shot.camera, instant, sensor, rng), LOSSLESS)
 
-    with SessionFolder(folder, watched.rig, ()) as session, ThreadPoolExecutor(2) as pool:
+    with SessionFolderWriter(folder, watched.rig, ()) as session, ThreadPoolExecutor(2) as pool:
         for number, shots in enumerate(rounds):
             for shot, picture in zip(shots, pool.map(taken, shots), strict=True):
                 session.picture(shot.camera, shot.stamp + begun, *picture)
             report(number + 1, len(rounds))
+
+
+NOISE_MARGIN_PX = 97  # px by which the stored noise is larger than an image, so that each image takes another cut of it
+NOISE_SIGMA = 1.2  # grey levels, one sigma
+
+
+def closed_motion(count: int, rest: Array, rng: np.random.Generator, lively: float = 1.0) -> Array:
+    """Poses (N, 4, 4) of one period of a breath-like motion about `rest`: 3 mm and 2 degrees, with two harmonics.
+
+    lively: by what the amplitudes are multiplied.
+    """
+    phase = 2 * np.pi * np.arange(count) / count
+    xi = np.zeros((count, 6))
+    for harmonic, part in ((1, 1.0), (2, 0.35), (3, 0.12)):
+        wave = np.sin(harmonic * phase[:, None] + rng.uniform(0, 2 * np.pi, 6))
+        xi += part * wave * rng.normal(0, 1, 6) * lively * np.array([0.02] * 3 + [1.5, 1.5, 2.5])
+    return np.asarray(rest @ se3.exp(xi))
+
+
+class PictureLoop:
+    """The grey pictures of one closed motion. poses: (N, 4, 4), base_from_surface."""
+
+    def __init__(self, scene: Scene, rig: Rig, poses: Array, seed: int) -> None:
+        self.poses, self._rng = poses, np.random.default_rng([seed, 47])
+        clean, draws = Sensor(noise=0.0), self._rng.spawn(len(rig))
+        self._images = []
+        for pose in poses:
+            instants = [WorldState(0.0, 0.0, pose, np.zeros(6))] * len(rig)
+            self._images.append([grey(i) for i in render(scene, rig.cameras, instants, clean, draws)])
+        w, h = rig.cameras[0].size
+        grain = self._rng.standard_normal((h + NOISE_MARGIN_PX, w + NOISE_MARGIN_PX))
+        self._grain = (NOISE_SIGMA * grain).astype(np.int16)
+        self._fine = np.zeros(0)
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def images(self, number: int) -> list[Image]:
+        """The noiseless pictures (H, W) at a place of the loop, which goes on for ever."""
+        return self._images[number % len(self.poses)]
+
+    def noisy(self, image: Image) -> Image:
+        """The picture with noise that was not seen before."""
+        h, w = image.shape
+        y, x = self._rng.integers(0, NOISE_MARGIN_PX, 2)
+        return np.asarray(cv2.add(image, self._grain[y : y + h, x : x + w], dtype=cv2.CV_8U), np.uint8)

@@ -1,9 +1,13 @@
 """The closed loop in virtual time: the wound moves, cameras expose, poses and commands travel, the arm executes.
 
-Nothing here decides anything: TrackingStep and MotionStep are those of the live run, and the loop only lets time pass
-between them. Whatever takes time in a real run takes it here: the exposure's way to the computer, the tracking, the
+Nothing here decides anything: the tracking step and the motion step are those of the live run, and the loop only lets
+time pass between them. Whatever takes time in a real run takes it here: the transport of a picture, the tracking, the
 48 bytes on the wire, the arm's interpolation and its servo. Virtual time does not depend on how fast this runs, unless
 the scenario asks for measured tracking times.
+
+Without a scan the tracker chooses its own surface frame, and the path must be registered to it. Live, an operator does
+that. Here every track of one frame set is cast along its true ray onto the true surface, and the pose of these points
+is solved with the cameras and pixels that the tracker has. Calibration errors are in both poses and stay in the error.
 """
 
 from __future__ import annotations
@@ -14,60 +18,113 @@ from functools import partial
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
+from estimation.online.pose_solver import PointTracks, solve_pose
 from estimation.pose import SurfacePose, TrackState
+from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware.commanded import Commanded
+from hardware.arm.protocol import frame_from_command
+from hardware.motion.loop import CommandedPose
 from hardware.motion.step import MotionStep
-from hardware.offline.track import Step
+from hardware.offline.track import FrameSetStep
 from hardware.process.clock import Clock
-from hardware.process.faults import Part, struck
-from hardware.process.progress import Report, silent
-from hardware.simulator.agenda import ARRIVAL, TICK, Agenda
+from hardware.process.faults import FaultPart, faults_striking
+from hardware.process.progress import ProgressReport, no_progress
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.camera_pipeline import Exposures, Sight, Watcher
-from hardware.simulator.cameras import Shot
-from hardware.simulator.instant import Instant
-from hardware.simulator.ledger import Ledger, executed_rows
-from hardware.simulator.lenses import Lenses
-from hardware.simulator.nozzle_log import NozzleLog
-from hardware.simulator.pictures import Pictures
-from hardware.simulator.registering import truth_from_estimate
+from hardware.simulator.arm.serial_line import SerialWire
+from hardware.simulator.camera_pipeline import (
+    ARRIVAL_EVENT,
+    TICK_EVENT,
+    CameraPipeline,
+    EventQueue,
+    Exposures,
+    PictureRenderer,
+    PipelineSink,
+)
+from hardware.simulator.cameras import Shot, TrueCameras
+from hardware.simulator.deposit import NozzleLog
 from hardware.simulator.scenario import Scenario
-from hardware.simulator.scene.scene import Scene
-from hardware.simulator.truth import Truth
-from hardware.simulator.wire import Wire
+from hardware.simulator.scene.scene import Scene, WorldState
+from hardware.simulator.scene.shape import Shape
+from hardware.simulator.truth import Truth, TruthLog, row_instants
 from perception.frames import FrameSet, PrintHead
 from planning.command import Command
-from planning.kinematics import nozzle_from_axes
 from planning.path import Path
-from planning.progress import Phase
-from planning.progress import Progress as Print
+from planning.progress import PrintPhase, PrintProgress
+from planning.robot.kinematics import nozzle_from_axes
 
-BLOCK = 0.2  # s of rows given out at once
-REST = 0.3  # s that the run goes on after the path is finished
+ROW_BLOCK = 0.2  # s of truth rows handed to the sink at once
+RUN_OUT = 0.3  # s that the run goes on after the path is finished
 BEAD_STEP = 0.01  # s between the ends of the pieces in which a bead is drawn
+NEWTON_STEPS = 12  # from the mean plane onto the surface; a wound takes four
+SLOPE_STEP = 1e-3  # mm, for the slope along the surface
+MAX_RAY_MISS = 1e-3  # mm between ray and surface: such a track does not lie on it
+MIN_REGISTRATION_TRACKS = 12
 
 
-class Sink(Watcher, Protocol):
-    """What is told of everything that passes."""
+def truth_from_estimate(
+    pose: SurfacePose, observations: Observations, rigs: tuple[Rig, Rig], truth: Truth, shape: Shape, exposed: Array
+) -> Array | None:
+    """truth_surface_from_estimated_surface (4, 4) from one frame set; None where too few tracks lie on the surface.
 
-    def command(self, command: Command, progress: Print, frame: bytes, received: bytes) -> None:
+    rigs: the true one and the one that the tracker has. exposed: (C,) s, when each camera truly took its picture.
+    """
+    true_rig, known_rig = rigs
+    points, hit = surface_points(observations, true_rig, truth, shape, exposed)
+    if hit.sum() < MIN_REGISTRATION_TRACKS:
+        return None
+    start = truth.base_from_surface(np.array([pose.stamp]))[0]
+    tracks = PointTracks.of(observations.only(hit), points[hit])
+    solved = solve_pose(known_rig, tracks, start, tolerance=1e-9, iterations=20)
+    return np.asarray(se3.inverse(solved.base_from_surface) @ pose.base_from_surface)
+
+
+def surface_points(
+    observations: Observations, rig: Rig, truth: Truth, shape: Shape, exposed: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Points (N, 3) mm of the undeformed surface under each track's pixel, and whether (N,) the ray truly meets one."""
+    camera, amount = observations.camera, truth.amount(exposed)[observations.camera]
+    base_from_camera = np.stack([c.base_from_camera for c in rig.cameras])[camera]
+    surface_from_camera = se3.inverse(truth.base_from_surface(exposed)[camera]) @ base_from_camera
+    matrices = rig.matrices[camera]
+    focal, centre = matrices[:, [0, 1], [0, 1]], matrices[:, :2, 2]
+    rays = np.column_stack([(observations.pixels - centre) / focal, np.ones(len(observations))])
+    rays = (surface_from_camera[:, :3, :3] @ rays[..., None])[..., 0]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    origin = surface_from_camera[:, :3, 3]
+
+    def off(xy: Array) -> Array:  # (N, 3) mm, from the ray to the surface point
+        points = shape.points(xy)
+        from_origin = points + truth.displacement(points, amount) - origin
+        return np.asarray(from_origin - np.sum(from_origin * rays, 1, keepdims=True) * rays)
+
+    up, middle = shape.surface_from_grid[:3, 2], shape.surface_from_grid[:3, 3]
+    reach = ((middle - origin) @ up) / (rays @ up)
+    xy = shape.material(origin + reach[:, None] * rays)
+    for _ in range(NEWTON_STEPS):
+        now = off(xy)
+        slope = np.stack([(off(xy + SLOPE_STEP * axis) - now) / SLOPE_STEP for axis in np.eye(2)], -1)  # (N, 3, 2)
+        xy = xy - (np.linalg.pinv(slope) @ now[..., None])[..., 0]
+    return shape.points(xy), shape.covers(xy) & (np.linalg.norm(off(xy), axis=1) < MAX_RAY_MISS)
+
+
+class WorldSink(PipelineSink, Protocol):
+    """Receives everything that happens in a run."""
+
+    def command(self, command: Command, progress: PrintProgress, frame: bytes, received: bytes) -> None:
         """A command was sent, how far the print is by it, and what came from the arm since the last."""
-        ...
 
     def rows(self, log: NozzleLog) -> None:
         """The next rows of the truth at the nozzle."""
-        ...
 
     def registered(self, truth_from_estimate: Array) -> None:
         """The path was registered: truth_surface_from_estimated_surface (4, 4)."""
-        ...
 
 
-class World:
+class SimulatedWorld:
     """One run of one scenario; `run` lets its time pass."""
 
     def __init__(
@@ -76,77 +133,65 @@ class World:
         scene: Scene,
         path: Path,
         truth: Truth,
-        step: Step,
+        step: FrameSetStep,
         exposures: Exposures,
-        sink: Sink,
+        sink: WorldSink,
         clock: Clock,
         threads: int = 2,
         line: Callable[[bytes], bytes] = bytes,
     ) -> None:
-        """scene: the scenario's, rendered into. path: in the true surface frame. clock: measures tracking times.
+        """scene: the scenario's; beads are drawn into it. path: in the true surface frame. clock: for tracking times.
 
         exposures: filled with the shot of each picture, for a step that may know. line: carries bytes from the
         motion to the arm, e.g. over a pty.
         """
         self.scenario, self._scene, self._path, self._sink = scenario, scene, path, sink
-        self._truth, self._exposed = truth, exposures
+        self._truth, self._exposures = truth, exposures
         profile = scenario.profile
         self.arm = VirtualArm(scenario.arm, profile.dialect, profile.arm.home, scenario.faults, scenario.baud)
-        self._wire, self._line = Wire(scenario.baud), line
-        self._ledger = Ledger(path, scenario.true_arm, self._truth, profile.tick, profile.lag)
-        self._pictures: Pictures | None = None
+        self._wire, self._line = SerialWire(scenario.baud), line
+        self._truth_log = TruthLog(path, scenario.true_arm, self._truth, profile.tick, profile.lag)
+        pictures: PictureRenderer | None = None
         if scenario.tracking.pictures:
-            quality = scenario.jpeg_quality
-            self._pictures = Pictures(
-                scene, Lenses(scenario.rig.cameras), scenario.sensor, quality, scenario.seed, threads, self._lay
-            )
-        self._instant_before: Instant | None = None
-        self._agenda = Agenda()
-        watched = self._pictures, self._instant, self._head
-        self._sight = Sight(scenario, self._agenda, step, exposures, sink, clock, self._know, *watched)
-        self._hangs = struck(scenario.faults, Part.MOTION)
+            encoding = scenario.sensor, scenario.jpeg_quality, scenario.seed
+            pictures = PictureRenderer(scene, TrueCameras(scenario.rig.cameras), *encoding, threads, self._print_beads)
+        self._last_state: WorldState | None = None
+        self._events = EventQueue()
+        looks = pictures, self._state_at, self._head
+        self.pipeline = CameraPipeline(scenario, self._events, step, exposures, sink, clock, self._on_pose, *looks)
+        self._motion_stalls = faults_striking(scenario.faults, FaultPart.MOTION)
         self._pose: SurfacePose | None = None
         self._motion: MotionStep | None = None
-        self._commanded = Commanded(profile)
-        self._ticks, self._given, self._laid = 0, 0.0, 0.0
-        self._bead: Array | None = None  # (2,) where the last piece of bead ended
+        self._commanded = CommandedPose(profile)
+        self._ticks, self._rows_until, self._printed_until = 0, 0.0, 0.0
+        self._bead_end: Array | None = None  # (2,) where the last piece of bead ended
         self._end = scenario.seconds
 
-    @property
-    def tracked(self) -> int:
-        """Frame sets that the tracker took."""
-        return self._sight.tracked
-
-    @property
-    def skipped(self) -> int:
-        """Frame sets that the tracker had no time for."""
-        return self._sight.skipped
-
-    def run(self, progress: Report = silent) -> None:
-        """Let the scenario's time pass; progress is told of each frame set tracked. What was given out stays given."""
+    def run(self, progress: ProgressReport = no_progress) -> None:
+        """Let the scenario's time pass; `progress` is called for each frame set tracked."""
         total = int(self.scenario.seconds / self.scenario.cameras.period)
-        self._sight.begin()
-        self._agenda.at(0.0, TICK, self._tick)
-        told, complete = 0, False
+        self.pipeline.begin()
+        self._events.at(0.0, TICK_EVENT, self._tick)
+        reported, complete = 0, False
         try:
-            for _ in self._agenda.run(lambda: self._end):
-                if self.tracked > told:
-                    told = self.tracked
-                    progress(told, total)
+            for _ in self._events.run(lambda: self._end):
+                if self.pipeline.tracked > reported:
+                    reported = self.pipeline.tracked
+                    progress(reported, total)
             complete = True
         finally:
-            self._give_rows(self._end if complete else self.arm.now)
+            self._emit_rows(self._end if complete else self.arm.now)
 
-    def _instant(self, shot: Shot, now: float) -> Instant:
+    def _state_at(self, shot: Shot, now: float) -> WorldState:
         """The world as a shot meets it; the very same object for cameras that expose together."""
-        last = self._instant_before
+        last = self._last_state
         if last is not None and (last.stamp, last.gain) == (shot.exposed, shot.gain):
             return last
         times, truth, nozzle = np.array([shot.exposed]), self._truth, None
         if self.scenario.nozzle:
             self.arm.advance(now)
             nozzle = nozzle_from_axes(self.scenario.true_arm, self.arm.axes_at(times)[0])
-        self._instant_before = Instant(
+        self._last_state = WorldState(
             stamp=shot.exposed,
             exposure=shot.exposure,
             base_from_surface=truth.base_from_surface(times)[0],
@@ -155,73 +200,66 @@ class World:
             base_from_nozzle=nozzle,
             gain=shot.gain,
         )
-        return self._instant_before
+        return self._last_state
 
     def _head(self, stamp: float) -> PrintHead | None:
         return self._commanded.at(stamp) if self.scenario.nozzle else None
 
-    def _know(self, pose: SurfacePose, frames: FrameSet, seen: Observations) -> None:
-        """A pose has reached the motion."""
+    def _on_pose(self, pose: SurfacePose, frames: FrameSet, observations: Observations) -> None:
         self._pose = pose
         if self._motion is None and pose.state is TrackState.TRACKING:
-            self._register(pose, frames, seen)
+            self._register(pose, frames, observations)
 
-    def _register(self, pose: SurfacePose, frames: FrameSet, seen: Observations) -> None:
-        """Tell the motion where its path lies on the surface that the tracker follows, if that can be told yet."""
+    def _register(self, pose: SurfacePose, frames: FrameSet, observations: Observations) -> None:
+        """Start the motion with the path in the tracker's surface frame, as soon as that frame can be measured."""
         scenario = self.scenario
         change: Array | None = np.eye(4)
         if scenario.tracking.pictures and not scenario.tracking.scan:
             exposed = np.full(len(scenario.rig), pose.stamp)
             for frame in frames.frames:
-                exposed[frame.camera] = self._exposed[frame.camera, frame.stamp].exposed
-            rigs = scenario.rig, scenario.told_rig
-            change = truth_from_estimate(pose, seen, rigs, self._truth, self._scene.shape, exposed)
+                exposed[frame.camera] = self._exposures[frame.camera, frame.stamp].exposed
+            rigs = scenario.rig, scenario.known_rig
+            change = truth_from_estimate(pose, observations, rigs, self._truth, self._scene.shape, exposed)
         if change is None:
             return
         moved = se3.inverse(change) @ self._path.surface_from_nozzle
         self._motion = MotionStep(replace(self._path, surface_from_nozzle=moved), scenario.profile)
         self._sink.registered(change)
 
-    # -- motion and arm
-
     def _tick(self, now: float) -> None:
         self._ticks += 1
-        self._agenda.at(self._ticks * self.scenario.profile.tick, TICK, self._tick)
-        if self._motion is not None and not any(fault.covers(now) for fault in self._hangs):
-            frame = self._motion(self._pose, now)
+        self._events.at(self._ticks * self.scenario.profile.tick, TICK_EVENT, self._tick)
+        if self._motion is not None and not any(fault.covers(now) for fault in self._motion_stalls):
+            command = self._motion(self._pose, now)
+            frame = frame_from_command(command, self.scenario.profile.dialect)
             arrival = float(self._wire.send(frame, now)[-1])
-            self._agenda.at(arrival, ARRIVAL, partial(self._receive, self._line(frame)))
-            self._ledger.write(self._motion.last, self._motion.progress)
-            self._commanded.add(self._motion.last, now)
+            self._events.at(arrival, ARRIVAL_EVENT, partial(self.arm.receive, self._line(frame)))
+            self._truth_log.write(command, self._motion.progress)
+            self._commanded.add(command, now)
             self.arm.advance(now)
-            self._sink.command(self._motion.last, self._motion.progress, frame, self.arm.transmit(now))
-            if self._motion.progress.phase is Phase.FINISHED:
-                self._end = min(self._end, now + REST)
-        if now - self._given >= BLOCK:
-            self._give_rows(now)
+            self._sink.command(command, self._motion.progress, frame, self.arm.transmit(now))
+            if self._motion.progress.phase is PrintPhase.FINISHED:
+                self._end = min(self._end, now + RUN_OUT)
+        if now - self._rows_until >= ROW_BLOCK:
+            self._emit_rows(now)
 
-    def _receive(self, data: bytes, now: float) -> None:
-        self.arm.receive(data, now)
-
-    def _give_rows(self, now: float) -> None:
-        """Give out the truth at the nozzle up to `now`, s."""
+    def _emit_rows(self, now: float) -> None:
         self.arm.advance(now)
-        times = executed_rows(self._given, now)
+        times = row_instants(self._rows_until, now)
         if len(times):
-            self._given = now
-            self._sink.rows(self._ledger.rows(times, self.arm.axes_at))
+            self._rows_until = now
+            self._sink.rows(self._truth_log.rows(times, self.arm.axes_at))
 
-    def _lay(self, until: float) -> None:
-        """Bring the printed material in the pictures up to `until`, s."""
-        ends = np.arange(self._laid + BEAD_STEP, until, BEAD_STEP)
+    def _print_beads(self, until: float) -> None:
+        ends = np.arange(self._printed_until + BEAD_STEP, until, BEAD_STEP)
         if not self.scenario.beads or not len(ends):
             return
-        self._laid = float(ends[-1])
+        self._printed_until = float(ends[-1])
         self.arm.advance(max(until, self.arm.now))
-        extruding = self._ledger.extruding(ends)
+        extruding = self._truth_log.extruding(ends)
         nozzle = nozzle_from_axes(self.scenario.true_arm, self.arm.axes_at(ends))
         places = self._scene.shape.material(self._truth.material(ends, nozzle[:, :3, 3]))
         for place, extrude in zip(places, extruding, strict=True):
-            if extrude and self._bead is not None:
-                self._scene.ink.lay(self._bead, place, self.scenario.bead)
-            self._bead = place if extrude else None
+            if extrude and self._bead_end is not None:
+                self._scene.ink.lay(self._bead_end, place, self.scenario.bead)
+            self._bead_end = place if extrude else None

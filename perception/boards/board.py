@@ -1,4 +1,7 @@
-"""A calibration board as it was printed: a chessboard, with markers in its white squares (ChArUco) or without."""
+"""A printed calibration board: a chessboard, with markers in its white squares (ChArUco) or without.
+
+And undistorted pictures for reports (thesis 4.2): every pixel kept, black where there is none.
+"""
 
 from __future__ import annotations
 
@@ -8,32 +11,30 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.rig import Camera
 from estimation.se3 import Array
+from perception.frames import Image
 
-KINDS = ("charuco", "chessboard")
+BOARD_KINDS = ("charuco", "chessboard")
 DICTIONARIES = {
     f"{n}X{n}_{count}": getattr(cv2.aruco, f"DICT_{n}X{n}_{count}")
     for n in (4, 5, 6, 7)
     for count in (50, 100, 250, 1000)
-}  # names as OpenCV has them, without DICT_
+}  # OpenCV's names without DICT_
+THUMBNAIL_QUALITY = 80  # of the JPEG, 0 to 100
 
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """What is on the board.
-
-    squares: columns and rows. square: mm, edge of one. marker: edge of a marker in parts of a square's. dictionary: a
-    key of DICTIONARIES. inverted: black and white exchanged in print. legacy: the layout of OpenCV before 4.6, which
-    differs where the rows are even. A chessboard has no use for the last four but `inverted`.
-    """
+    """A board's pattern. A chessboard has no markers: `marker`, `dictionary` and `legacy` do not matter."""
 
     kind: str = "charuco"
-    squares: tuple[int, int] = (7, 10)
-    square: float = 25.0
-    marker: float = 0.75
-    dictionary: str = "4X4_50"
-    inverted: bool = False
-    legacy: bool = False
+    squares: tuple[int, int] = (7, 10)  # columns and rows
+    square: float = 25.0  # mm, edge
+    marker: float = 0.75  # ratio of a marker's edge to a square's
+    dictionary: str = "4X4_50"  # a key of DICTIONARIES
+    inverted: bool = False  # printed with black and white exchanged
+    legacy: bool = False  # the layout of OpenCV before 4.6, which differs for an even number of rows
 
     @property
     def corners(self) -> Array:
@@ -47,11 +48,10 @@ class Board:
         return self.squares[0] * self.square, self.squares[1] * self.square
 
     def markers(self) -> int:
-        """How many markers it holds."""
+        """Number of markers."""
         return 0 if self.kind == "chessboard" else self.squares[0] * self.squares[1] // 2
 
     def __str__(self) -> str:
-        """As a person would name it."""
         columns, rows = self.squares
         text = f"{self.kind} of {columns} x {rows} squares of {self.square:g} mm"
         if self.kind == "charuco":
@@ -59,7 +59,7 @@ class Board:
         return text + (", inverted" if self.inverted else "") + (", legacy layout" if self.legacy else "")
 
 
-def charuco(board: Board) -> cv2.aruco.CharucoBoard:
+def charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
     """OpenCV's own record of a ChArUco board."""
     dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[board.dictionary])
     made = cv2.aruco.CharucoBoard(board.squares, board.square, board.marker * board.square, dictionary)
@@ -67,12 +67,12 @@ def charuco(board: Board) -> cv2.aruco.CharucoBoard:
     return made
 
 
-def black(board: Board) -> tuple[NDArray[np.bool_], float]:
+def ink_cells(board: Board) -> tuple[NDArray[np.bool_], float]:
     """The print as a grid of cells, True where there is ink (H, W), and the edge of a cell, mm.
 
-    The grid is as coarse as squares and markers allow, as `grid_of` tells.
+    The grid is as coarse as squares and markers allow, as `cells_per_square` tells.
     """
-    per_square = grid_of(board)
+    per_square = cells_per_square(board)
     columns, rows = board.squares
     y, x = np.indices((rows, columns))
     dark = (x + y) % 2 == (1 if board.legacy and rows % 2 == 0 else 0)
@@ -82,8 +82,8 @@ def black(board: Board) -> tuple[NDArray[np.bool_], float]:
     return (~ink if board.inverted else ink), board.square / per_square
 
 
-def grid_of(board: Board) -> int:
-    """Cells along a square's edge so that squares, markers and their bits all fall on cells; 0 where none will do."""
+def cells_per_square(board: Board) -> int:
+    """Cells along a square's edge so that squares, markers and their bits all fall on cells; 0 if impossible."""
     if board.kind == "chessboard":
         return 1
     bits = int(board.dictionary[0]) + 2
@@ -105,3 +105,22 @@ def _add_markers(board: Board, ink: NDArray[np.bool_], per_square: int) -> None:
         picture = cv2.aruco.generateImageMarker(dictionary, number, bits)
         y, x = row * per_square + margin, column * per_square + margin
         ink[y : y + cell * bits, x : x + cell * bits] = np.kron(picture == 0, np.ones((cell, cell))).astype(bool)
+
+
+def whole_view(camera: Camera) -> Array:
+    """Camera matrix (3, 3) of an undistorted picture of the same size with every pixel (thesis: alpha = 1)."""
+    return np.asarray(cv2.getOptimalNewCameraMatrix(camera.matrix, camera.distortion, camera.size, 1.0)[0])
+
+
+def undistort(camera: Camera, image: Image) -> Image:
+    """The picture without distortion, with every pixel."""
+    return np.asarray(cv2.undistort(image, camera.matrix, camera.distortion, None, whole_view(camera)), np.uint8)
+
+
+def thumbnail(image: Image, width: int) -> bytes:
+    """The picture as JPEG, `width` px wide."""
+    height = round(image.shape[0] * width / image.shape[1])
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    ok, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, THUMBNAIL_QUALITY])
+    assert ok
+    return data.tobytes()

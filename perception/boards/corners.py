@@ -1,83 +1,85 @@
-"""A board's corners in a picture: where they are, how well each is told, and how sharp the picture is there."""
+"""A board's corners in a picture, with their sigma and its blur; and those of a recording, for calibration."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.calibration.lens_fit import MIN_VIEW_CORNERS
+from estimation.calibration.lens_model import BoardViews
 from estimation.se3 import Array
-from perception.boards.board import Board, charuco
+from perception.boards.board import Board, charuco_board
 from perception.frames import Image
 
-LEAST = 4  # corners: fewer do not fix a plane
-STEPS, DONE = 10, 1e-3  # most steps of a corner's refinement; px that are not worth another one
-WINDOW = (2, 9)  # px, half: smaller holds no edge, larger meets the next corner of what is far away
-REACH = 0.4  # of a square, that is looked at along an edge: beyond half, the next corner's edges begin
-HALVES = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])  # of a square, to both sides along both axes
-FRINGE, NARROWEST = 2.0, 1.5  # px about an edge that its blur fills: between the window and the markers; in it
-FINEST = 0.01  # px; rendered pictures without noise leave as much
-STEP = 2.5066  # sqrt(2 pi): a step blurred by one sigma rises by 1 / (2.5066 sigma) a pixel
+MIN_CORNERS = 4  # that fix a homography
+REFINE_STEPS, REFINE_TOLERANCE = 10, 1e-3  # iterations; px of the last step
+HALF_WINDOWS = (2, 9)  # px, half the window: smaller holds no edge, larger reaches the next corner of a far board
+EDGE_REACH = 0.4  # of a square, used along an edge: beyond half, the next corner's edges begin
+HALF_SQUARES = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])  # to both sides along both axes
+BLUR_FRINGE, MIN_EDGE_BAND = 2.0, 1.5  # px: blurred rim of a marker that is left out; least width of an edge's band
+MIN_CORNER_SIGMA = 0.01  # px: what rendered pictures without noise leave
+BLURRED_STEP_SLOPE = 2.5066  # sqrt(2 pi): a step blurred by sigma has a slope of 1 / (2.5066 sigma) per pixel
+MAX_BLUR = 4.0  # px, one sigma of an edge: beyond it the edges of two corners overlap
+MAX_BLUR_RATIO, MIN_BLUR_LIMIT = 2.5, 1.5  # a view is blurred beyond so many times the camera's median, and so many px
+MIN_CORNER_SPREAD = 0.02  # ratio of the corners' spread across and along: collinear ones fix no plane
+MOST_INSTANTS = 250  # taken evenly from longer recordings: more would cost minutes and add nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
-    """The corners of one picture.
+class BoardCorners:
+    """The corners of one picture."""
 
-    pixels: (P, 2), nan where not seen. sigma: px, one standard deviation per axis that the picture's noise and the
-    edges' slopes make. blur: px, one sigma of the edges, the worse of the board's two directions. marker: measured
-    edge of the markers in parts of a square's, nan without markers. strangers: ids of markers that the board has not.
-    """
-
-    pixels: Array
-    sigma: float
-    blur: float
-    marker: float
-    strangers: tuple[int, ...]
+    pixels: Array  # (P, 2), nan where not seen
+    sigma: float  # px, one standard deviation per axis, from the image noise and the edges' gradients
+    blur: float  # px, one sigma of the edges, the worse of the board's two directions
+    marker: float  # measured ratio of a marker's edge to a square's, nan without markers
+    strangers: tuple[int, ...]  # ids of markers that are not on the board
 
     @property
     def count(self) -> int:
-        """How many corners were seen."""
+        """Number of corners seen."""
         return int(np.isfinite(self.pixels[:, 0]).sum())
 
 
 class CornerFinder:
-    """Finds a board's corners; made once for many pictures, and not shared between threads."""
+    """Finds a board's corners in many pictures; not to be shared between threads."""
 
     def __init__(self, board: Board) -> None:
         self.board = board
-        self._charuco = cv2.aruco.CharucoDetector(charuco(board)) if board.kind == "charuco" else None
+        self._charuco = cv2.aruco.CharucoDetector(charuco_board(board)) if board.kind == "charuco" else None
 
-    def __call__(self, image: Image) -> Found:
+    def __call__(self, image: Image) -> BoardCorners:
         """The corners of a picture (H, W) grey or (H, W, 3) BGR."""
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if self.board.inverted:
             grey = 255 - grey
         grey = np.ascontiguousarray(grey, np.uint8)
         pixels, marker, strangers = self._with_markers(grey)
-        if np.isfinite(pixels[:, 0]).sum() < LEAST:
-            return Found(np.full_like(pixels, np.nan), 0.0, 0.0, marker, strangers)
-        pixels, window = _refined(self.board, grey, pixels)
+        if np.isfinite(pixels[:, 0]).sum() < MIN_CORNERS:
+            return BoardCorners(np.full_like(pixels, np.nan), 0.0, 0.0, marker, strangers)
+        pixels, window = _refine(self.board, grey, pixels)
         sigma, blur = _quality(self.board, grey, pixels, window)
-        return Found(pixels, sigma, blur, marker, strangers)
+        return BoardCorners(pixels, sigma, blur, marker, strangers)
 
     def _with_markers(self, grey: Image) -> tuple[Array, float, tuple[int, ...]]:
-        """Corners to a pixel, the markers' size, and strangers among them."""
+        """Corners to a pixel, the markers' size ratio, and unknown markers."""
         if self._charuco is None:
             return _chessboard(self.board, grey), float("nan"), ()
         at, number, squares, ids = self._charuco.detectBoard(grey)
         pixels = np.full((len(self.board.corners), 2), np.nan)
-        if number is not None and len(number) >= LEAST:
+        if number is not None and len(number) >= MIN_CORNERS:
             pixels[np.ravel(number)] = np.asarray(at, float).reshape(-1, 2)
-        found = () if ids is None else tuple(sorted({int(i) for i in np.ravel(ids)}))
-        strangers = tuple(i for i in found if i >= self.board.markers())
+        known = self.board.markers()
+        strangers = () if ids is None else tuple(sorted({int(i) for i in np.ravel(ids) if i >= known}))
         return pixels, _marker_size(self.board, pixels, squares), strangers
 
 
 def _marker_size(board: Board, pixels: Array, squares: object) -> float:
-    """Median edge of the markers in the plane of the corners, in parts of a square's; nan where it is not told."""
+    """Median edge of the markers in the plane of the corners, relative to a square's; nan if undetermined."""
     seen = np.isfinite(pixels[:, 0])
     if seen.sum() < 6 or squares is None or not len(squares):  # type: ignore[arg-type]
         return float("nan")
@@ -90,7 +92,7 @@ def _marker_size(board: Board, pixels: Array, squares: object) -> float:
 
 
 def _chessboard(board: Board, grey: Image) -> Array:
-    """Corners (P, 2) of a chessboard without markers, or nan; counted from where the colours are as drawn."""
+    """Corners (P, 2) of a chessboard without markers, or nan; numbered by the colours of the squares."""
     columns, rows = board.squares[0] - 1, board.squares[1] - 1
     ok, found = cv2.findChessboardCornersSB(grey, (columns, rows), flags=cv2.CALIB_CB_ACCURACY)
     if not ok:
@@ -98,33 +100,32 @@ def _chessboard(board: Board, grey: Image) -> Array:
     grid = np.asarray(found, float).reshape(rows, columns, 2)
     along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if along[0] * down[1] - along[1] * down[0] < 0:
-        grid = grid[:, ::-1]  # no board is seen from behind
+        grid = grid[:, ::-1]  # a board is never seen from behind
     if not _first_is_dark(grey, grid):
         grid = grid[::-1, ::-1]
     return grid.reshape(-1, 2)
 
 
 def _first_is_dark(grey: Image, grid: Array) -> bool:
-    """Whether the square right and below of the first inner corner is the darker one of the first two."""
+    """Whether the square right and below of the first inner corner is darker than the next one."""
     centres = np.stack([grid[:2, k : k + 2].mean((0, 1)) for k in (0, 1)])
     levels = [float(cv2.getRectSubPix(grey, (5, 5), tuple(map(float, c))).mean()) for c in centres]
     return levels[0] < levels[1]
 
 
-def _refined(board: Board, grey: Image, pixels: Array) -> tuple[Array, int]:
-    """The corners to fractions of a pixel, and half the window that was looked at, px.
+def _refine(board: Board, grey: Image, pixels: Array) -> tuple[Array, int]:
+    """The corners to fractions of a pixel, and half the window, px.
 
-    Where the gradients about a corner are all square to the way there (Foerstner and Guelch 1987), as OpenCV's
-    cornerSubPix has it, but of the two edges alone: a window in the board's own axes keeps clear of the markers and is
-    still long along the edges.
+    All gradients about a corner are perpendicular to the way there (Foerstner and Guelch 1987), as in OpenCV's
+    cornerSubPix, but only gradients of the two edges count: a window along the board's axes avoids the markers.
     """
     seen = np.flatnonzero(np.isfinite(pixels[:, 0]))
-    half = int(np.clip(REACH * _spacing(board, pixels), *WINDOW))
+    half = int(np.clip(EDGE_REACH * _spacing(board, pixels), *HALF_WINDOWS))
     turn = _squares_from_pixels(board, pixels)
     out, known = np.full_like(pixels, np.nan), np.isfinite(turn).all((1, 2))
     seen, at, turn = seen[known], pixels[seen[known]], turn[known]
     size = np.array(grey.shape[::-1])
-    for _ in range(STEPS):
+    for _ in range(REFINE_STEPS):
         near = np.round(at).astype(int)
         inside = (near >= half + 1).all(1) & (near <= size - half - 2).all(1)
         seen, at, near, turn = seen[inside], at[inside], near[inside], turn[inside]
@@ -138,14 +139,14 @@ def _refined(board: Board, grey: Image, pixels: Array) -> tuple[Array, int]:
         at = at + step
         kept = np.linalg.norm(at - pixels[seen], axis=1) < max(half / 2, 1.5)
         seen, at, turn, step = seen[kept], at[kept], turn[kept], step[kept]
-        if np.abs(step).max(initial=0.0) < DONE:
+        if np.abs(step).max(initial=0.0) < REFINE_TOLERANCE:
             break
     out[seen] = at
     return out, half
 
 
 def _slopes(grey: Image, near: NDArray[np.int64], half: int) -> tuple[Array, Array]:
-    """Grey levels per pixel (N, K, 2) in windows about pixels (N, 2), and where they are (N, K, 2)."""
+    """Gradients (N, K, 2), grey levels per pixel, in windows about pixels (N, 2), and their places (N, K, 2)."""
     y, x = np.mgrid[-half - 1 : half + 2, -half - 1 : half + 2]
     part = grey[near[:, 1, None, None] + y, near[:, 0, None, None] + x].astype(float)
     gx, gy = (part[:, 1:-1, 2:] - part[:, 1:-1, :-2]) / 2, (part[:, 2:, 1:-1] - part[:, :-2, 1:-1]) / 2
@@ -154,26 +155,23 @@ def _slopes(grey: Image, near: NDArray[np.int64], half: int) -> tuple[Array, Arr
 
 
 def _weights(board: Board, away: Array, squares_from_pixels: Array, half: int) -> Array:
-    """(N, K) what gradients `away` (N, K, 2), px, from a corner are worth: those of its own edges, less far out."""
+    """Weights (N, K) of gradients `away` (N, K, 2), px, from a corner: of its own edges, decreasing outwards."""
     along = np.abs(away @ np.swapaxes(squares_from_pixels, 1, 2))  # in squares, along the board's two axes
     per_pixel = np.linalg.norm(squares_from_pixels, axis=-1)[:, None]  # (N, 1, 2) squares, square to the edges
-    white = (1 - board.marker) / 2 if board.kind == "charuco" else REACH
-    room = np.maximum(white / per_pixel - FRINGE, NARROWEST)
-    edges = (along / per_pixel < room).any(-1) & (along < REACH).all(-1)
+    white = (1 - board.marker) / 2 if board.kind == "charuco" else EDGE_REACH
+    room = np.maximum(white / per_pixel - BLUR_FRINGE, MIN_EDGE_BAND)
+    edges = (along / per_pixel < room).any(-1) & (along < EDGE_REACH).all(-1)
     return np.where(edges, np.exp(-(away**2).sum(-1) / half**2), 0.0)
 
 
 def _squares_from_pixels(board: Board, pixels: Array) -> Array:
-    """(N, 2, 2) squares along the board's axes per pixel about each corner that is seen, by the plane of all of them.
-
-    nan where they tell no plane.
-    """
+    """Squares along the board's axes per pixel (N, 2, 2) at each corner seen, by a homography; nan if there is none."""
     seen = np.isfinite(pixels[:, 0])
     squares = board.corners[seen, :2] / board.square
     plane = cv2.findHomography(squares, pixels[seen])[0]
     if plane is None:
         return np.full((len(squares), 2, 2), np.nan)
-    ends = [cv2.perspectiveTransform((squares + e)[:, None], plane)[:, 0] for e in HALVES]
+    ends = [cv2.perspectiveTransform((squares + e)[:, None], plane)[:, 0] for e in HALF_SQUARES]
     across = np.stack([ends[0] - ends[1], ends[2] - ends[3]], -1)
     flat = np.abs(np.linalg.det(across)) < 1.0  # px^2 of a square
     return np.where(flat[:, None, None], np.nan, np.linalg.inv(np.where(flat[:, None, None], np.eye(2), across)))
@@ -183,15 +181,15 @@ def _spacing(board: Board, pixels: Array) -> float:
     """Least distance, px, between neighbouring corners."""
     grid = pixels.reshape(board.squares[1] - 1, board.squares[0] - 1, 2)
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
-    found = np.concatenate(steps)
-    found = found[np.isfinite(found)]
-    return float(found.min()) if len(found) else float(WINDOW[0]) / REACH
+    lengths = np.concatenate(steps)
+    lengths = lengths[np.isfinite(lengths)]
+    return float(lengths.min()) if len(lengths) else float(HALF_WINDOWS[0]) / EDGE_REACH
 
 
 def _quality(board: Board, grey: Image, pixels: Array, half: int) -> tuple[float, float]:
-    """sigma and blur as `Found` has them."""
+    """sigma and blur as `BoardCorners` has them."""
     seen = np.flatnonzero(np.isfinite(pixels[:, 0]))
-    if len(seen) < LEAST:
+    if len(seen) < MIN_CORNERS:
         return 0.0, 0.0
     at = pixels[seen]
     near = np.round(at).astype(int)
@@ -203,12 +201,12 @@ def _quality(board: Board, grey: Image, pixels: Array, half: int) -> tuple[float
     y, x = np.mgrid[-half - 1 : half + 2, -half - 1 : half + 2].reshape(2, -1)
     levels = np.percentile(grey[near[:, 1, None] + y, near[:, 0, None] + x], [5, 95], axis=1)
     steepest = np.percentile(np.abs(slopes @ _axes(board, pixels).T), 98, axis=1).min(1)
-    blur = (levels[1] - levels[0]) / np.maximum(steepest, 1e-3) / STEP
-    return max(float(np.median(sigma)), FINEST), float(np.median(blur))
+    blur = (levels[1] - levels[0]) / np.maximum(steepest, 1e-3) / BLURRED_STEP_SLOPE
+    return max(float(np.median(sigma)), MIN_CORNER_SIGMA), float(np.median(blur))
 
 
 def _axes(board: Board, pixels: Array) -> Array:
-    """(2, 2) unit directions, in the picture, of what the edges along either side of the board are steepest in."""
+    """Unit normals (2, 2), in the picture, of the edges along either side of the board."""
     grid = pixels.reshape(board.squares[1] - 1, board.squares[0] - 1, 2)
     out = []
     for axis in (0, 1):
@@ -221,7 +219,7 @@ def _axes(board: Board, pixels: Array) -> Array:
 
 
 def _noise(grey: Image, at: Array) -> float:
-    """Grey levels, one sigma, about the board (Immerkaer 1996, by the median, which the edges do not pull)."""
+    """Image noise about the board, one sigma of grey levels (Immerkaer 1996, with a median against the edges)."""
     low = np.maximum(np.floor(at.min(0)).astype(int), 0)
     high = np.ceil(at.max(0)).astype(int) + 1
     part = grey[low[1] : high[1], low[0] : high[0]].astype(np.float32)
@@ -229,3 +227,68 @@ def _noise(grey: Image, at: Array) -> float:
         return 2.0
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     return max(float(np.median(np.abs(cv2.filter2D(part, -1, mask)[1:-1, 1:-1]))) / 0.6745 / 6, 0.5)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CornerTable:
+    """The corners of a recording: one row per picture that shows the board."""
+
+    camera: NDArray[np.int64]  # (V,) number of the camera
+    instant: NDArray[np.int64]  # (V,) number of the frame set
+    stamp: Array  # (V,) s, by the camera's own clock
+    pixels: Array  # (V, P, 2), nan where not seen
+    sigma: Array  # (V,) px
+    blur: Array  # (V,) px
+    marker: Array  # (V,) measured ratio of a marker's edge to a square's
+    looked: NDArray[np.int64]  # (C,) number of pictures searched
+    strangers: NDArray[np.int64]  # ids of markers that are not on the board, one for each time seen
+    done: int  # number of instants searched
+
+    def __len__(self) -> int:
+        return len(self.camera)
+
+
+def empty_table(board: Board, cameras: int) -> CornerTable:
+    """The table of a recording that has not been searched yet."""
+    none, whole = np.zeros(0), np.zeros(0, np.int64)
+    pixels = np.zeros((0, len(board.corners), 2))
+    return CornerTable(whole, whole, none, pixels, none, none, none, np.zeros(cameras, np.int64), whole, 0)
+
+
+def usable_views(
+    table: CornerTable, board: Board, names: tuple[str, ...], sizes: tuple[tuple[int, int], ...]
+) -> tuple[BoardViews, Counter[tuple[str, str]]]:
+    """The views that are good enough, and the number of others by camera and reason."""
+    reasons = [_reason(table, row) for row in range(len(table))]
+    kept = np.array([not reason for reason in reasons], bool)
+    dropped = Counter((names[c], reason) for c, reason in zip(table.camera, reasons, strict=True) if reason)
+    chosen = thin_instants(table.instant, kept)
+    dropped.update((names[c], "more than are needed") for c in table.camera[kept & ~chosen])
+    points, sigma = board.corners, np.maximum(table.sigma, 1e-3)
+    views = BoardViews(names, sizes, points, table.camera, table.instant, table.stamp, table.pixels, sigma)
+    return views.only(chosen), dropped
+
+
+def _reason(table: CornerTable, row: int) -> str:
+    """Why a view is useless, or ''."""
+    pixels = table.pixels[row]
+    pixels = pixels[np.isfinite(pixels[:, 0])]
+    if len(pixels) < MIN_VIEW_CORNERS:
+        return f"fewer than {MIN_VIEW_CORNERS} corners"
+    spread = np.linalg.svd(pixels - pixels.mean(0), compute_uv=False)
+    if spread[1] < MIN_CORNER_SPREAD * spread[0]:
+        return "corners nearly in one line"
+    usual = float(np.median(table.blur[table.camera == table.camera[row]]))
+    if table.blur[row] > max(min(MAX_BLUR_RATIO * usual, MAX_BLUR), MIN_BLUR_LIMIT):
+        return "blurred"
+    return ""
+
+
+def thin_instants(instant: NDArray[np.int64], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(V,) the rows of at most MOST_INSTANTS of the instants kept: runs of neighbours, which show the motion."""
+    there = np.unique(instant[kept])
+    if len(there) <= MOST_INSTANTS:
+        return kept
+    runs = np.array_split(there, MOST_INSTANTS // 10)
+    chosen = np.concatenate([run[:10] for run in runs])
+    return np.asarray(kept & np.isin(instant, chosen))

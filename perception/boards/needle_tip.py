@@ -1,9 +1,9 @@
-"""The tip of a needle in a picture, to fractions of a pixel: what moved since the background, its thin part, its end.
+"""The tip of a needle in a picture, to fractions of a pixel, by background subtraction.
 
-The tool is what differs from the background, the needle is the longest thin part that hangs on it, and its axis and end
-are measured in linear light, where a pixel half covered is half as bright: so the end is where the needle's area ends,
-whatever blurs it on both sides. A shadow, or another thing that moved, may be taken for the tool in one camera; the
-others do not agree with that, and it is left out later.
+The tool is what differs from the background; the needle is the longest thin part attached to it. Its axis and end are
+measured in linear light, where a pixel half covered is half as bright: the end is where the needle's area ends,
+whatever the blur. A shadow or another moving thing may be taken for the tool in one camera; the other cameras
+disagree, and it is left out later.
 """
 
 from __future__ import annotations
@@ -22,92 +22,89 @@ from perception.frames import Image
 Light = NDArray[np.float32]  # (H, W, 3), linear, 0 to 1
 Mask = NDArray[np.uint8]
 
-NOISE, FAINTEST = 4.0, 8.0  # times the usual difference, and grey levels, that a picture differs by where the tool is
-FAINT = 0.01  # of full light: a needle that adds or takes less cannot be measured
-WINDOW = 48  # px around the rough tip that are measured in
-LEAST_TOOL = 400  # px of area
-SHORTEST = 9.0  # px of needle that must be seen: less has no axis
-FITTED = 24.0  # px of needle behind the end that its axis is fitted to, at most
-BEYOND, INSIDE = 6.0, 4.0  # px on both sides of the end between which it is fitted: farther in, a ground tip is wider
-STEPS = 8  # of that fit
-ACROSS = 5.0  # px beside the axis that are looked at
-FINE = 0.25  # px between samples
-COLOURED = 0.3  # of the contrast, by which needle and background must differ in colour: else brightness must tell
-STEADY = 0.35  # of its brightness by which the needle's may differ from a straight line: else it is not one
+NOISE_RATIO, MIN_DIFFERENCE = 4.0, 8.0  # of the tool's pixels: to the median difference; grey levels
+MIN_CONTRAST = 0.01  # of full light: a needle that adds or takes less cannot be measured
+TIP_WINDOW = 48  # px around the rough tip
+MIN_TOOL_AREA = 400  # px
+MIN_NEEDLE_LENGTH = 9.0  # px: a shorter needle has no axis
+AXIS_LENGTH = 24.0  # px of needle behind the end to which its axis is fitted, at most
+END_BEYOND, END_INSIDE = 6.0, 4.0  # px on both sides of the end in its fit: farther in, a ground tip is wider
+END_FIT_STEPS = 8
+STRIP_HALF_WIDTH = 5.0  # px on either side of the axis
+SAMPLE_STEP = 0.25  # px
+MIN_COLOUR_CONTRAST = 0.3  # of the contrast, between needle and background: below, brightness is used
+MAX_BRIGHTNESS_CHANGE = 0.35  # of the brightness along the needle, from a straight line: else it is no needle
 _TO_LIGHT = np.where((grey := np.arange(256) / 255.0) <= 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4).astype(
     np.float32
 )  # IEC 61966-2-1, which cameras' pictures follow
 
-_WEAK = np.array([0.02, 1.0, 0.0, 0.02])  # information on level, taper and blur, in samples of the profile
+_WEAK_PRIOR = np.array([0.02, 1.0, 0.0, 0.02])  # information on level, taper and blur, in samples of the profile
 
 
 @dataclass(frozen=True, slots=True)
 class Tip:
-    """pixel: (2,) as imaged, where the needle's outline ends on its axis. towards: (2,) unit, along it to the tool.
+    """A needle's tip in a picture."""
 
-    sigma: px, of noise. width: px, of the needle. contrast: of full light, between needle and background.
-    """
-
-    pixel: tuple[float, float]
-    towards: tuple[float, float]
-    sigma: float
-    width: float
-    contrast: float
+    pixel: tuple[float, float]  # distorted, where the needle's outline ends on its axis
+    towards: tuple[float, float]  # unit vector along the axis to the tool
+    sigma: float  # px, from noise
+    width: float  # px, of the needle
+    contrast: float  # of full light, between needle and background
 
 
 def background(images: Sequence[Image]) -> Image:
-    """What stays, (H, W, 3), while the tool is elsewhere in most of the pictures: their median."""
+    """The background (H, W, 3): the median of pictures of which most show the tool elsewhere."""
     assert len(images) >= 3
-    return np.asarray(np.median(np.stack([_coloured(image) for image in images]), axis=0), np.uint8)
+    return np.asarray(np.median(np.stack([_as_bgr(image) for image in images]), axis=0), np.uint8)
 
 
-def _coloured(image: Image) -> Image:
+def _as_bgr(image: Image) -> Image:
     return image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
 
 
 class TipFinder:
-    """Finds the tip in one camera's pictures before a background that stays."""
+    """Finds the tip in one camera's pictures before a constant background."""
 
     def __init__(self, behind: Image, radius: float) -> None:
-        """behind: as `background` gives. radius: px, of the needle at most; what is thicker is what it hangs on."""
+        """behind: the background. radius: px, largest of the needle; thicker parts are the tool that holds it."""
         self._behind, self._radius = behind, max(2, round(radius))
 
     def __call__(self, image: Image) -> Tip | None:
-        """The tip, or None where no needle is seen whole."""
-        image = _coloured(image)
-        mask = _changed(image, self._behind)
+        """The tip, or None where no whole needle is seen."""
+        image = _as_bgr(image)
+        mask = _tool_mask(image, self._behind)
         rough = None if mask is None else _thin_end(mask, self._radius)
         if rough is None:
             return None
         tip, towards = rough
-        x0, y0 = (int(v) for v in np.maximum(tip - WINDOW, 0))
-        part = slice(y0, int(tip[1]) + WINDOW), slice(x0, int(tip[0]) + WINDOW)
+        x0, y0 = (int(v) for v in np.maximum(tip - TIP_WINDOW, 0))
+        part = slice(y0, int(tip[1]) + TIP_WINDOW), slice(x0, int(tip[0]) + TIP_WINDOW)
         behind = _in_light(self._behind[part])
-        found = _measured(_in_light(image[part]) - behind, behind, tip - [x0, y0], towards)
-        return None if found is None else replace(found, pixel=(found.pixel[0] + x0, found.pixel[1] + y0))
+        part_tip = _measure_tip(_in_light(image[part]) - behind, behind, tip - [x0, y0], towards)
+        return None if part_tip is None else replace(part_tip, pixel=(part_tip.pixel[0] + x0, part_tip.pixel[1] + y0))
 
 
 def _in_light(image: Image) -> Light:
     return np.asarray(cv2.LUT(image, _TO_LIGHT), np.float32)
 
 
-def _changed(image: Image, behind: Image) -> Mask | None:
-    """Where the tool is: the largest part that differs; None where nothing does."""
+def _tool_mask(image: Image, behind: Image) -> Mask | None:
+    """The tool: the largest connected part that differs from the background; None where nothing does."""
     size = cv2.blur(cv2.absdiff(image, behind).max(axis=2), (3, 3))
     noise = float(np.median(size[::4, ::4]))
-    mask = (size > max(NOISE * noise, FAINTEST)).astype(np.uint8)
+    mask = (size > max(NOISE_RATIO * noise, MIN_DIFFERENCE)).astype(np.uint8)
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if count < 2:
         return None
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
-    if stats[largest, cv2.CC_STAT_AREA] < LEAST_TOOL:
+    if stats[largest, cv2.CC_STAT_AREA] < MIN_TOOL_AREA:
         return None
     return np.asarray(labels == largest, np.uint8)
 
 
 def _thin_end(mask: Mask, radius: int) -> tuple[Array, Array] | None:
-    """Rough tip (2,) px and direction (2,) to the tool: the far end of the longest thin part that hangs on it."""
+    """Rough tip (2,) px and direction (2,) to the tool: the far end of the longest thin part attached to it."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     thick = cv2.morphologyEx(cv2.copyMakeBorder(mask, 1, 1, 1, 1, cv2.BORDER_REPLICATE), cv2.MORPH_OPEN, disc)
     thick = thick[1:-1, 1:-1]
@@ -121,39 +118,39 @@ def _thin_end(mask: Mask, radius: int) -> tuple[Array, Array] | None:
         rows, columns = np.nonzero(labels == part)
         points = np.column_stack([columns, rows]).astype(float)
         joint = points[touching[rows, columns] > 0]
-        if len(points) < SHORTEST or not len(joint):
+        if len(points) < MIN_NEEDLE_LENGTH or not len(joint):
             continue
         root = joint.mean(0)
         away = points - root
         tip = points[np.linalg.norm(away, axis=1).argmax()]
         length = float(np.linalg.norm(tip - root))
-        if length >= SHORTEST and (best is None or length > best[0]):
+        if length >= MIN_NEEDLE_LENGTH and (best is None or length > best[0]):
             best = length, tip, (root - tip) / length
     return None if best is None or _at_border(best[1], mask) else best[1:]
 
 
 def _at_border(pixel: Array, mask: Mask) -> bool:
     h, w = mask.shape
-    margin = BEYOND + ACROSS
+    margin = END_BEYOND + STRIP_HALF_WIDTH
     return not (margin <= pixel[0] <= w - 1 - margin and margin <= pixel[1] <= h - 1 - margin)
 
 
-def _measured(change: Light, behind: Light, tip: Array, towards: Array) -> Tip | None:
-    """Axis and end of the needle whose rough tip (2,) and direction (2,) are given."""
+def _measure_tip(change: Light, behind: Light, tip: Array, towards: Array) -> Tip | None:
+    """The needle's axis and end, from a rough tip (2,) and direction (2,)."""
     for _ in range(3):
         along, across, amount, contrast = _strip(change, behind, tip, towards)
-        if contrast < FAINT:
+        if contrast < MIN_CONTRAST:
             return None
         inner = (along >= 2.0) & (along <= _reach(amount, along))
-        if inner.sum() * FINE < SHORTEST - 3:
+        if inner.sum() * SAMPLE_STEP < MIN_NEEDLE_LENGTH - 3:
             return None
         core = np.clip(amount[inner], 0.0, None)
         weight = core.sum(1)
         middle = (core * across).sum(1) / np.maximum(weight, 1e-6)
         slope, offset = np.polyfit(along[inner], middle, 1, w=np.sqrt(np.maximum(weight, 1e-6)))
         side = np.array([-towards[1], towards[0]])
-        end = _end(along, amount.sum(1) * FINE, inner)
-        if end is None or abs(end) > BEYOND:
+        end = _end(along, amount.sum(1) * SAMPLE_STEP, inner)
+        if end is None or abs(end) > END_BEYOND:
             return None
         tip = tip + end * towards + (offset + slope * end) * side
         turned = towards + slope * side
@@ -170,24 +167,27 @@ def _tip(
     towards: Array,
     contrast: float,
 ) -> Tip | None:
-    profile = amount.sum(1)[inner] * FINE
+    profile = amount.sum(1)[inner] * SAMPLE_STEP
     line = np.polyval(np.polyfit(along[inner], profile, 1), along[inner])
     width = float(np.median(profile))
-    if width < 0.5 or np.std(profile - line) > STEADY * width:
+    if width < 0.5 or np.std(profile - line) > MAX_BRIGHTNESS_CHANGE * width:
         return None
-    outside = (np.abs(across) > ACROSS - 1.5)[None, :] & (along[:, None] < 0)
+    outside = (np.abs(across) > STRIP_HALF_WIDTH - 1.5)[None, :] & (along[:, None] < 0)
     noise = float(np.std(amount[np.broadcast_to(outside, amount.shape)]))
-    sigma = noise * np.sqrt((BEYOND + INSIDE) * 2 * ACROSS) / width
+    sigma = noise * np.sqrt((END_BEYOND + END_INSIDE) * 2 * STRIP_HALF_WIDTH) / width
     return Tip((float(tip[0]), float(tip[1])), (float(towards[0]), float(towards[1])), sigma, width, contrast)
 
 
 def _strip(change: Light, behind: Light, tip: Array, towards: Array) -> tuple[Array, Array, Array, float]:
     """Samples along (S,) and across (W,), px, from the tip, share of needle (S, W) there, and the contrast.
 
-    A round needle is of one colour, but bright on one side and dark on the other: its share is how much is gone of that
-    part of the background's light which the needle's colour does not have. Brightness tells it where there is none.
+    A round needle has one colour, but is bright on one side and dark on the other: its share is the loss of the
+    background light that its own colour does not contain. Without a colour difference brightness is used.
     """
-    along, across = np.arange(-BEYOND - 2, FITTED + FINE, FINE), np.arange(-ACROSS, ACROSS + FINE, FINE)
+    along, across = (
+        np.arange(-END_BEYOND - 2, AXIS_LENGTH + SAMPLE_STEP, SAMPLE_STEP),
+        np.arange(-STRIP_HALF_WIDTH, STRIP_HALF_WIDTH + SAMPLE_STEP, SAMPLE_STEP),
+    )
     side = np.array([-towards[1], towards[0]])
     at = tip + along[:, None, None] * towards + across[None, :, None] * side
     x, y = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
@@ -201,39 +201,39 @@ def _strip(change: Light, behind: Light, tip: Array, towards: Array) -> tuple[Ar
     )
     contrast = float(np.linalg.norm(added))
     own = own / max(float(np.linalg.norm(own)), 1e-9)
-    left = np.eye(3) - np.outer(own, own)  # of a light: what is not of the needle's colour
+    left = np.eye(3) - np.outer(own, own)  # projects a light onto what is not of the needle's colour
     foreign = back @ left
     size = np.sum(foreign**2, axis=-1)
     usual = float(np.median(size))
-    if usual < (COLOURED * contrast) ** 2:
+    if usual < (MIN_COLOUR_CONTRAST * contrast) ** 2:
         return along, across, patch @ added / max(contrast**2, 1e-12), contrast
     return along, across, -np.sum(patch @ left * foreign, axis=-1) / np.maximum(size, usual / 4), contrast
 
 
 def _reach(amount: Array, along: Array) -> float:
-    """How far, px, the needle goes on evenly from its end: to where it turns into something thicker."""
-    profile = amount.sum(1) * FINE
+    """Length, px, over which the needle's width stays constant from its end."""
+    profile = amount.sum(1) * SAMPLE_STEP
     usual = float(np.median(profile[(along > 2.5) & (along < 8.0)]))
     wrong = np.flatnonzero((along > 8.0) & (np.abs(profile - usual) > 0.5 * usual))
-    return float(along[wrong[0]]) - 1.5 if len(wrong) else FITTED
+    return float(along[wrong[0]]) - 1.5 if len(wrong) else AXIS_LENGTH
 
 
 def _end(along: Array, profile: Array, inner: NDArray[np.bool_]) -> float | None:
-    """Where along the axis, px, the needle ends: half way up to its own width there, which may taper.
+    """End of the needle along the axis, px: where the profile reaches half of the needle's own width there.
 
-    The profile's model is (a + b s) Phi((s - e) / w), fitted by Gauss-Newton; blur and a round end are in w.
+    Model of the profile: (a + b s) Phi((s - e) / w), by Gauss-Newton; w holds blur and a round end, b a taper.
     """
     level = float(np.median(profile[inner]))
-    window = (along >= -BEYOND) & (along <= INSIDE)
+    window = (along >= -END_BEYOND) & (along <= END_INSIDE)
     s, y = along[window], profile[window] / max(level, 1e-9)
     a, b, e, w = 1.0, 0.0, 0.0, 1.0
-    for _ in range(STEPS):
+    for _ in range(END_FIT_STEPS):
         step, bell = ndtr((s - e) / w), np.exp(-0.5 * ((s - e) / w) ** 2) / np.sqrt(2 * np.pi)
         line = a + b * s
         slopes = np.column_stack([step, s * step, -line * bell / w, -line * bell * (s - e) / w**2])
         left = y - line * step
-        held = slopes.T @ slopes + np.diag(_WEAK)
-        change = np.linalg.solve(held, slopes.T @ left - _WEAK * np.array([a - 1.0, b, 0.0, w - 1.0]))
+        held = slopes.T @ slopes + np.diag(_WEAK_PRIOR)
+        change = np.linalg.solve(held, slopes.T @ left - _WEAK_PRIOR * np.array([a - 1.0, b, 0.0, w - 1.0]))
         a, b, e = a + change[0], b + change[1], e + float(np.clip(change[2], -1.0, 1.0))
         w = float(np.clip(w + change[3], 0.3, 3.0))
-    return e if a > 0.3 and abs(e) <= BEYOND else None
+    return e if a > 0.3 and abs(e) <= END_BEYOND else None

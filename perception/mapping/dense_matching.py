@@ -1,8 +1,12 @@
-"""Dense matching across cameras: their pictures laid onto one rough surface, and the flow that is left between them.
+"""Dense matching across cameras on one rough surface, and the surface's depth map at the first instant.
 
-Cameras stand 36 to 84 degrees apart, but once laid onto a surface that is right to a millimetre their pictures look
+Cameras stand 36 to 84 degrees apart, but once resampled on a surface that is right to a millimetre their pictures look
 alike, and what is left is a shift of a node or two. On the true surface thousands of points were measured to come out
 to 0.02 mm (skin) and 0.07 mm (a wet wound) at 0.36 mm a pixel, where flat patches across a wound's wall give 0.2.
+
+The depth map is a height field over the first map. Landmarks are few and their patches flat, so they miss a wound's
+walls by tenths of a millimetre. Their smooth surface is where dense matching begins; it is then matched and corrected
+repeatedly, from coarse to fine.
 """
 
 from __future__ import annotations
@@ -13,25 +17,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation import se3
 from estimation.mapping.triangulation import triangulate
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from perception.frames import Image
 from perception.lens import Lenses
+from perception.mapping.first_map import FirstMap
+from perception.matching.features import polygon_mask
 
-PIXELS = 1.1  # of the cameras, a node: a finer lattice shows nothing more
-PATCH, STRIDE, ROUNDS = 12, 3, 25  # nodes, nodes and steps of the flow
-CONTRAST = 6.0  # nodes over which brightness and contrast are evened out, since glare and light differ by camera
-EVEN, FAINT = 40.0, 100.0  # grey levels of contrast once evened out; their square below which it tells nothing
-ALIKE = 0.6  # correlation below which a match is not believed
-ASIDE = 0.5  # px off the epipolar line, or three times the median, beyond which it is not
-FACING = 0.2  # cosine of the viewing angle below which a camera sees too little of a node
+NODE_PIXELS = 1.1  # of the cameras, a node: a finer lattice shows nothing more
+FLOW_PATCH_NODES, FLOW_STRIDE_NODES, FLOW_STEPS = 12, 3, 25  # nodes, nodes and steps of the flow
+EVENING_SIGMA_NODES = 6.0  # over which brightness and contrast are evened out: glare and light differ by camera
+EVENED_CONTRAST = 40.0  # grey levels
+MIN_EVENED_VARIANCE = 100.0  # grey levels squared, below which a correlation tells nothing
+MIN_MATCH_CORRELATION = 0.6  # correlation below which a match is not believed
+MAX_EPIPOLAR_ERROR_PX = 0.5  # px off the epipolar line, or three times the median, beyond which it is not
+MIN_NODE_FACING = 0.2  # cosine of the viewing angle below which a camera sees too little of a node
 
 Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Matched:
+class DenseMatch:
     """What a lattice's nodes turned out to be. points: (H, W, 3) mm, base frame; sure: (H, W) whether to believe it."""
 
     points: Array
@@ -39,7 +47,7 @@ class Matched:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Laid:
+class _LatticeImage:
     """One camera's picture on the lattice. even: (H, W) uint8, evened out; pixels: (H, W, 2) ideal; seen: (H, W)."""
 
     even: Image
@@ -53,32 +61,34 @@ def node_size(lenses: Lenses, cameras: list[int], centre: Array) -> float:
     for c in cameras:
         lens = lenses.rig.cameras[c]
         away = float(np.linalg.norm(centre - lens.base_from_camera[:3, 3]))
-        sizes.append(PIXELS * away / float(lens.matrix[[0, 1], [0, 1]].mean()))
+        sizes.append(NODE_PIXELS * away / float(lens.matrix[[0, 1], [0, 1]].mean()))
     return min(sizes)
 
 
-def match_on(lenses: Lenses, images: dict[int, Image], nodes: Array, reference: int, every: int = 1) -> Matched | None:
+def match_near(
+    lenses: Lenses, images: dict[int, Image], nodes: Array, reference: int, every: int = 1
+) -> DenseMatch | None:
     """Where the surface near `nodes` (H, W, 3), base frame, really is; None where no two cameras see any of it.
 
     Each node's ray in the reference camera is met with those of the other cameras at the places that look like it.
     every: only each so manieth row and column of nodes is given, (H', W', 3).
     """
     towards = _normals(nodes)
-    first = _laid(lenses, reference, images[reference], nodes, towards)
+    first = _lattice_image(lenses, reference, images[reference], nodes, towards)
     flow = _flow()
     pixels, camera, used = [first.pixels], [reference], [first.seen]
     for c in sorted(set(images) - {reference}):
-        other = _laid(lenses, c, images[c], nodes, towards)
-        found, alike = _moved(flow, first, other)
+        other = _lattice_image(lenses, c, images[c], nodes, towards)
+        found, alike = _shifted(flow, first, other)
         pixels.append(found)
         camera.append(c)
-        used.append(first.seen & other.seen & (alike > ALIKE))
+        used.append(first.seen & other.seen & (alike > MIN_MATCH_CORRELATION))
     if len(used) < 2:
         return None
     chosen = (slice(None), slice(None, None, every), slice(None, None, every))
     seen, where = np.stack(used)[chosen], np.stack(pixels)[chosen]
     both = np.asarray(seen[1:].any(axis=0), bool)
-    return _met(lenses, nodes[chosen[1:]], where, np.array(camera), seen & both, both) if both.any() else None
+    return _triangulated(lenses, nodes[chosen[1:]], where, np.array(camera), seen & both, both) if both.any() else None
 
 
 def middle_camera(lenses: Lenses, cameras: list[int], centre: Array) -> int:
@@ -88,14 +98,14 @@ def middle_camera(lenses: Lenses, cameras: list[int], centre: Array) -> int:
     return cameras[int(np.argmax(views @ views.sum(0)))]
 
 
-def _met(
+def _triangulated(
     lenses: Lenses,
     nodes: Array,
     pixels: Array,
     camera: NDArray[np.int64],
     used: NDArray[np.bool_],
     both: NDArray[np.bool_],
-) -> Matched:
+) -> DenseMatch:
     """The points where rays (K, H, W, 2) meet, K cameras, of those `used` (K, H, W), at nodes seen by `both` (H, W)."""
     number = np.cumsum(both.ravel()).reshape(both.shape) - 1
     which, row, column = np.nonzero(used)
@@ -107,8 +117,8 @@ def _met(
     np.maximum.at(aside, point, np.linalg.norm(residual, axis=1))
     points, sure = nodes.copy(), both.copy()
     points[both] = found
-    sure[both] = (aside < max(ASIDE, 3 * float(np.median(aside)))) & np.isfinite(found).all(1)
-    return Matched(points, sure)
+    sure[both] = (aside < max(MAX_EPIPOLAR_ERROR_PX, 3 * float(np.median(aside)))) & np.isfinite(found).all(1)
+    return DenseMatch(points, sure)
 
 
 def _normals(nodes: Array) -> Array:
@@ -117,7 +127,7 @@ def _normals(nodes: Array) -> Array:
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-12))
 
 
-def _laid(lenses: Lenses, camera: int, image: Image, nodes: Array, normals: Array) -> _Laid:
+def _lattice_image(lenses: Lenses, camera: int, image: Image, nodes: Array, normals: Array) -> _LatticeImage:
     lens = lenses.rig.cameras[camera]
     ideal, depth = ideal_pixels(lens, nodes.reshape(-1, 3))
     imaged, seen = lenses.image(camera, ideal, depth)
@@ -127,30 +137,32 @@ def _laid(lenses: Lenses, camera: int, image: Image, nodes: Array, normals: Arra
     x, y = imaged.astype(np.float32).reshape(*nodes.shape[:2], 2).transpose(2, 0, 1)
     laid = cv2.remap(image, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_CUBIC)
     shape = nodes.shape[:2]
-    return _Laid(_evened(np.asarray(laid)), ideal.reshape(*shape, 2), inside.reshape(shape) & (facing > FACING))
+    return _LatticeImage(
+        _even_out(np.asarray(laid)), ideal.reshape(*shape, 2), inside.reshape(shape) & (facing > MIN_NODE_FACING)
+    )
 
 
-def _evened(image: Image) -> Image:
+def _even_out(image: Image) -> Image:
     grey = image.astype(np.float32)
-    centred = grey - cv2.GaussianBlur(grey, (0, 0), CONTRAST)
-    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), CONTRAST))
-    return np.asarray(np.clip(np.rint(128 + EVEN * centred / (spread + 2.0)), 0, 255), np.uint8)
+    centred = grey - cv2.GaussianBlur(grey, (0, 0), EVENING_SIGMA_NODES)
+    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), EVENING_SIGMA_NODES))
+    return np.asarray(np.clip(np.rint(128 + EVENED_CONTRAST * centred / (spread + 2.0)), 0, 255), np.uint8)
 
 
 def _flow() -> cv2.DISOpticalFlow:
     """Dense inverse search (Kroeger et al. 2016). Patches do not ask their neighbours: with that, results would depend
     on the number of threads."""
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow.setPatchSize(PATCH)
-    flow.setPatchStride(STRIDE)
+    flow.setPatchSize(FLOW_PATCH_NODES)
+    flow.setPatchStride(FLOW_STRIDE_NODES)
     flow.setFinestScale(0)
-    flow.setGradientDescentIterations(ROUNDS)
+    flow.setGradientDescentIterations(FLOW_STEPS)
     flow.setVariationalRefinementIterations(0)
     flow.setUseSpatialPropagation(False)
     return flow
 
 
-def _moved(flow: cv2.DISOpticalFlow, first: _Laid, other: _Laid) -> tuple[Array, Float32]:
+def _shifted(flow: cv2.DISOpticalFlow, first: _LatticeImage, other: _LatticeImage) -> tuple[Array, Float32]:
     """Ideal pixels (H, W, 2) in the other camera of what the first sees at each node, and how alike they look."""
     still = np.zeros((*first.even.shape, 2), np.float32)
     shift = np.asarray(flow.calc(first.even, other.even, still))
@@ -158,14 +170,106 @@ def _moved(flow: cv2.DISOpticalFlow, first: _Laid, other: _Laid) -> tuple[Array,
     x, y = x + shift[..., 0], y + shift[..., 1]
     found = cv2.remap(other.pixels.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     there = cv2.remap(other.even, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found, float), _likeness(first.even, np.asarray(there))
+    return np.asarray(found, float), _correlation(first.even, np.asarray(there))
 
 
-def _likeness(a: Image, b: Image) -> Float32:
+def _correlation(a: Image, b: Image) -> Float32:
     """Correlation (H, W) of two evened pictures about each node."""
     here, there = a.astype(np.float32) - 128, b.astype(np.float32) - 128
 
     def mean(product: Float32) -> Float32:
-        return np.asarray(cv2.GaussianBlur(product, (0, 0), CONTRAST / 2), np.float32)
+        return np.asarray(cv2.GaussianBlur(product, (0, 0), EVENING_SIGMA_NODES / 2), np.float32)
 
-    return np.asarray(mean(here * there) / (np.sqrt(mean(here * here) * mean(there * there)) + FAINT), np.float32)
+    return np.asarray(
+        mean(here * there) / (np.sqrt(mean(here * here) * mean(there * there)) + MIN_EVENED_VARIANCE), np.float32
+    )
+
+
+GUESS_SIGMA_MM = 6.0  # mm over which landmarks are averaged for the first guess: about the distance between them
+LATTICE_MARGIN_MM = 3.0  # mm that the lattice reaches beyond the landmarks
+NODE_WIDTHS = (2.0, 2.0, 1.0, 1.0)  # widths of a node, in its finest size
+CORRECTION_SIGMA_NODES = 1.2  # over which corrections are averaged: neighbours share their matches anyway
+MAX_JUMP_MM = 0.5  # mm: a correction this far from its neighbours' is a wrong match
+POINT_SPACING_NODES = 6  # nodes from one point given out to the next: half a matched patch, so they share little
+
+
+def relief_points(lenses: Lenses, images: dict[int, Image], first: FirstMap, polygons: dict[int, Array]) -> Array:
+    """Points (N, 3) mm, base frame, spread over the surface inside the middle camera's polygon; none without matches.
+
+    images: grey, by camera. polygons: (N, 2) px as imaged, by camera.
+    """
+    cameras, centre = sorted(images), first.base_from_surface[:3, 3]
+    reference = middle_camera(lenses, [c for c in cameras if c in polygons] or cameras, centre)
+    finest = node_size(lenses, cameras, centre)
+    points = first.map.points
+    low, high = np.percentile(points[:, :2], [1, 99], axis=0) + np.array([[-LATTICE_MARGIN_MM], [LATTICE_MARGIN_MM]])
+    heights, found, sure = None, np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
+    for width in NODE_WIDTHS:
+        flat = _lattice(low, high, width * finest)
+        heights = (
+            _initial_heights(points, low, high, flat.shape[:2])
+            if heights is None
+            else _resized(heights, flat.shape[:2])
+        )
+        nodes = np.dstack([flat, heights.astype(float)])
+        matched = match_near(lenses, images, _transformed(first.base_from_surface, nodes), reference)
+        if matched is None:
+            return np.zeros((0, 3))
+        found, sure = matched.points, matched.sure
+        inner = _transformed(se3.inverse(first.base_from_surface), found)
+        heights = _corrected(nodes, inner, sure, width * finest)
+    sure &= _inside(lenses, reference, found, polygons)
+    return np.asarray(
+        found[::POINT_SPACING_NODES, ::POINT_SPACING_NODES][sure[::POINT_SPACING_NODES, ::POINT_SPACING_NODES]]
+    )
+
+
+def _lattice(low: Array, high: Array, step: float) -> Array:
+    x, y = (np.arange(a, b + step, step) for a, b in zip(low, high, strict=True))
+    return np.stack(np.meshgrid(x, y), -1)
+
+
+def _initial_heights(points: Array, low: Array, high: Array, shape: tuple[int, ...]) -> Float32:
+    """Heights on the lattice by a plane through the landmarks (N, 3) around each node, the nearer the more."""
+    flat = _lattice(low, high, GUESS_SIGMA_MM / 2)
+    away = points[None, :, :2] - flat.reshape(-1, 1, 2)
+    weight = np.exp(-(away**2).sum(2) / (2 * GUESS_SIGMA_MM**2)) + 1e-6
+    design = np.concatenate([np.ones((*away.shape[:2], 1)), away / GUESS_SIGMA_MM], 2)
+    normal = np.einsum("nmi,nm,nmj->nij", design, weight, design, optimize=True) + 1e-4 * np.eye(3)
+    right = np.einsum("nmi,nm->ni", design, weight * points[:, 2])
+    rough = np.linalg.solve(normal, right[..., None])[:, 0, 0].reshape(flat.shape[:2])
+    return _resized(rough.astype(np.float32), shape)
+
+
+def _resized(heights: Float32, shape: tuple[int, ...]) -> Float32:
+    return np.asarray(cv2.resize(heights, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC), np.float32)
+
+
+def _transformed(transform: Array, nodes: Array) -> Array:
+    return se3.transform_points(transform, nodes.reshape(-1, 3)).reshape(nodes.shape)
+
+
+def _corrected(nodes: Array, found: Array, sure: NDArray[np.bool_], step: float) -> Float32:
+    """New heights (H, W) from where the nodes (H, W, 3) were found, in the surface frame."""
+    heights, off = nodes[..., 2], found - nodes
+    down, right = np.gradient(heights, step)
+    up = (off[..., 2] - right * off[..., 0] - down * off[..., 1]).astype(np.float32)
+    up = np.where(sure, up, 0).astype(np.float32)
+    around = np.asarray(cv2.medianBlur(up, 5))
+    up = np.where(np.abs(up - around) < MAX_JUMP_MM, up, around)
+    weight = sure.astype(np.float32) + 1e-6
+    mean = cv2.GaussianBlur(up * weight, (0, 0), CORRECTION_SIGMA_NODES) / cv2.GaussianBlur(
+        weight, (0, 0), CORRECTION_SIGMA_NODES
+    )
+    return np.asarray(heights + mean, np.float32)
+
+
+def _inside(lenses: Lenses, camera: int, points: Array, polygons: dict[int, Array]) -> NDArray[np.bool_]:
+    """Whether points (H, W, 3) fall into the camera's polygon; without one, all do."""
+    if camera not in polygons:
+        return np.ones(points.shape[:2], bool)
+    lens = lenses.rig.cameras[camera]
+    mask = polygon_mask(lens.size, polygons[camera])
+    ideal, depth = ideal_pixels(lens, points.reshape(-1, 3))
+    x, y = np.clip(np.rint(lenses.image(camera, ideal, depth)[0]), 0, np.array(lens.size) - 1).astype(int).T
+    return np.asarray(mask[y, x].reshape(points.shape[:2]) > 0)

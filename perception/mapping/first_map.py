@@ -7,7 +7,9 @@ Cameras are seldom exposed together: all epipolar distances of a moving surface 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +21,24 @@ from estimation.mapping.triangulation import epipolar_distance, rays, triangulat
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals, moved_map, surface_frame
-from perception.alignment import align, coarse_score
-from perception.features import Mask, corners, match, polygon_mask, sift
 from perception.lens import Lenses, undistort
+from perception.matching.features import Features, ImageMask, corners, match, polygon_mask, sift
 from perception.matching.masks import trackable
-from perception.matching.patches import FLAT, Pyramid, Templates, join, project_squares, take_templates
+from perception.matching.patches import (
+    MIN_PATCH_CONTRAST,
+    Pyramid,
+    Templates,
+    align,
+    coarse_score,
+    cut_templates,
+    join,
+    project_squares,
+)
 
-EPIPOLAR_REACH = 40.0  # px: 0.3 m/s at 60 ms between exposures, f 700 px, 400 mm away
-LEAST_SEEDS, LEAST_LANDMARKS = 10, 20
-SAME = 2.0  # px: features closer than this show one spot
-LANDMARKS = 240  # in all: more cost time and gain nothing (the map's own error stays)
+MAX_EPIPOLAR_OFFSET_PX = 40.0  # px: 0.3 m/s at 60 ms between exposures, f 700 px, 400 mm away
+MIN_SEEDS, MIN_LANDMARKS = 10, 20
+SAME_SPOT_PX = 2.0  # px: features closer than this show one spot
+TARGET_LANDMARKS = 240  # in all: more cost time and gain nothing (the map's own error stays)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,25 +110,25 @@ def _smooth(points: Array, neighbours: int = 8) -> NDArray[np.bool_]:
     return keep
 
 
-def find_seeds(
-    lenses: Lenses, a: int, b: int, features: dict[int, tuple[Array, NDArray[np.float32]]], rng: np.random.Generator
-) -> Seeds | None:
+def find_seeds(lenses: Lenses, a: int, b: int, features: dict[int, Features], rng: np.random.Generator) -> Seeds | None:
     """SIFT matches between two cameras that agree on one epipolar offset and on a surface."""
     cameras = lenses.rig.cameras
     pairs = match(features[a][1], features[b][1], 0.85)
-    if len(pairs) < LEAST_SEEDS:
+    if len(pairs) < MIN_SEEDS:
         return None
     both = np.concatenate([features[a][0][pairs[:, 0]], features[b][0][pairs[:, 1]]], 1)
-    _, first = np.unique(np.round(both / SAME), axis=0, return_index=True)  # one spot was found under several tilts
+    _, first = np.unique(
+        np.round(both / SAME_SPOT_PX), axis=0, return_index=True
+    )  # one spot was found under several tilts
     pixels_a, pixels_b = undistort(cameras[a], both[first, :2]), undistort(cameras[b], both[first, 2:])
     distance = epipolar_distance(lenses.rig, a, b, pixels_a, pixels_b)
-    good = consensus(pixels_b, distance, EPIPOLAR_REACH, 2.0, rng)
+    good = consensus(pixels_b, distance, MAX_EPIPOLAR_OFFSET_PX, 2.0, rng)
     points, _, _ = _pair_points(lenses.rig, a, b, pixels_a[good], pixels_b[good])
     depth_a = ideal_pixels(cameras[a], points)[1]
     depth_b = ideal_pixels(cameras[b], points)[1]
     plausible = (depth_a > 20) & (depth_b > 20) & np.isfinite(points).all(1)
     plausible[plausible] &= _smooth(points[plausible])
-    if plausible.sum() < LEAST_SEEDS:
+    if plausible.sum() < MIN_SEEDS:
         return None
     return Seeds(a, b, pixels_a[good][plausible], pixels_b[good][plausible], points[plausible])
 
@@ -131,7 +141,7 @@ def _pair_points(rig: Rig, a: int, b: int, pixels_a: Array, pixels_b: Array) -> 
     return points, covariance, residual
 
 
-def _on_seeds(
+def _meet_seed_surface(
     rig: Rig, seeds: Seeds, camera: int, pixels: Array, outward: Array
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """Where rays of pixels (N, 2) meet the seeds' surface: points (N, 3) and normals (N, 3), base frame.
@@ -183,8 +193,8 @@ def find_landmarks(
     pixels = undistort(rig.cameras[camera], corners(pyramids[camera][0], mask, count))
     if len(pixels) < 4:
         return None
-    points, normals, offset, near = _on_seeds(rig, seeds, camera, pixels, outward)
-    found, good = _place(lenses, pyramids, camera, other, points, normals, offset, least=0.8)
+    points, normals, offset, near = _meet_seed_surface(rig, seeds, camera, pixels, outward)
+    found, good = _align_in_other(lenses, pyramids, camera, other, points, normals, offset, least=0.8)
     good &= near
     if good.sum() >= 4:
         surface = _pair_points(rig, camera, other, pixels[good], found[good])[0]
@@ -192,26 +202,51 @@ def find_landmarks(
     missing = np.nonzero(~good)[0]
     if len(missing):
         swept, sure = _sweep(lenses, pyramids, camera, other, pixels[missing], normals[missing], seeds, offset[missing])
-        again, back = _place(lenses, pyramids, camera, other, swept, normals[missing], offset[missing], least=0.85)
+        again, back = _align_in_other(
+            lenses, pyramids, camera, other, swept, normals[missing], offset[missing], least=0.85
+        )
         found[missing], good[missing] = again, back & sure
     for _ in range(2):
         pixels, found = pixels[good], found[good]
         if len(pixels) < 6:
             return None
         points, _, residual = _pair_points(rig, camera, other, pixels, found)
-        keep = _smooth(points) & _steady(pixels, residual.reshape(2, -1, 2)[1])
+        keep = _smooth(points) & _affine_consistent(pixels, residual.reshape(2, -1, 2)[1])
         pixels, found, points = pixels[keep], found[keep], points[keep]
         if len(pixels) < 6:
             return None
         normals = smooth_normals(points, outward)
         on_ray = on_rays(rig, camera, pixels, points)
         offset = found - ideal_pixels(rig.cameras[other], on_ray)[0]
-        found, good = _place(lenses, pyramids, camera, other, on_ray, normals, offset, least=0.8)
+        found, good = _align_in_other(lenses, pyramids, camera, other, on_ray, normals, offset, least=0.8)
     points = _pair_points(rig, camera, other, pixels[good], found[good])[0]
     return Landmarks(camera, other, pixels[good], found[good], points, normals[good])
 
 
-def _place(
+def best_landmarks(
+    lenses: Lenses,
+    pyramids: dict[int, Pyramid],
+    masks: dict[int, ImageMask],
+    counts: dict[int, int],
+    seeds_between: Callable[[int, int], Seeds | None],
+) -> list[Landmarks]:
+    """The landmarks of each reference camera, each with the partner in which most of its corners are found.
+
+    counts: corners by camera, in ascending order of cameras; one with none is no reference.
+    """
+    best: dict[int, Landmarks] = {}
+    for a, b in combinations(counts, 2):
+        seeds = seeds_between(a, b)
+        for c in (a, b):
+            if seeds is None or counts[c] <= 0:
+                continue
+            part = find_landmarks(lenses, pyramids, masks[c], seeds, c, counts[c])
+            if part is not None and (c not in best or len(part.points) > len(best[c].points)):
+                best[c] = part
+    return [best[c] for c in sorted(best)]
+
+
+def _align_in_other(
     lenses: Lenses,
     pyramids: dict[int, Pyramid],
     camera: int,
@@ -222,12 +257,14 @@ def _place(
     least: float,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Ideal pixels (N, 2) in the other camera where the patches of points (N, 3), base frame, fit, and whether."""
-    templates = take_templates(lenses, pyramids[camera], camera, np.eye(4), points, normals)
+    templates = cut_templates(lenses, pyramids[camera], camera, np.eye(4), points, normals)
     where = project_squares(lenses, other, np.eye(4), points, normals, templates.axes)
     start = where.centre + offset
     result = align(templates, pyramids[other], where, start, least)
     near = np.linalg.norm(result.pixels - start, axis=1) < 10
-    return undistort(lenses.rig.cameras[other], result.pixels), result.found & near & (templates.contrast > FLAT)
+    return undistort(lenses.rig.cameras[other], result.pixels), result.found & near & (
+        templates.contrast > MIN_PATCH_CONTRAST
+    )
 
 
 def _sweep(
@@ -250,7 +287,7 @@ def _sweep(
     scores = np.full((len(pixels), steps), -1.0)
     for k, value in enumerate(inverse):
         points = origins + directions / value
-        templates = take_templates(lenses, pyramids[camera], camera, np.eye(4), points, normals)
+        templates = cut_templates(lenses, pyramids[camera], camera, np.eye(4), points, normals)
         where = project_squares(lenses, other, np.eye(4), points, normals, templates.axes)
         current = coarse_score(templates, pyramids[other], where, where.centre + offset)
         scores[:, k] = np.where(where.visible, current, -1.0)
@@ -267,7 +304,7 @@ def on_rays(rig: Rig, camera: int, pixels: Array, points: Array) -> Array:
     return np.asarray(origins + np.einsum("ni,ni->n", points - origins, directions)[:, None] * directions)
 
 
-def _steady(pixels: Array, residual: Array) -> NDArray[np.bool_]:
+def _affine_consistent(pixels: Array, residual: Array) -> NDArray[np.bool_]:
     """Whether each residual (N, 2) agrees with an affine field over the image, as a common capture offset makes."""
     design = np.c_[np.ones(len(pixels)), (pixels - pixels.mean(0)) / np.maximum(pixels.std(0), 1.0)]
     keep = np.ones(len(pixels), bool)
@@ -281,7 +318,7 @@ def _steady(pixels: Array, residual: Array) -> NDArray[np.bool_]:
 
 
 def build_first_map(
-    lenses: Lenses, pyramids: dict[int, Pyramid], polygons: dict[int, Array], heads: dict[int, Mask] | None = None
+    lenses: Lenses, pyramids: dict[int, Pyramid], polygons: dict[int, Array], heads: dict[int, ImageMask] | None = None
 ) -> FirstMap | str:
     """The map of what lies inside the polygons at this instant, or the reason why there is none.
 
@@ -298,19 +335,10 @@ def build_first_map(
         c: trackable(pyramids[c][0], polygon_mask(rig.cameras[c].size, polygons[c]), heads.get(c)) for c in cameras
     }
     features = {c: sift(pyramids[c][0], masks[c], 1000, tilted=True) for c in cameras}
-    best: dict[int, Landmarks] = {}  # by reference camera, with the partner that sees most of its corners
-    for i, a in enumerate(cameras):
-        for b in cameras[i + 1 :]:
-            seeds = find_seeds(lenses, a, b, features, rng)
-            if seeds is None:
-                continue
-            for c in (a, b):
-                part = find_landmarks(lenses, pyramids, masks[c], seeds, c, LANDMARKS // len(cameras))
-                if part is not None and (c not in best or len(part.points) > len(best[c].points)):
-                    best[c] = part
-    parts = [best[c] for c in sorted(best)]
-    if sum(len(p.points) for p in parts) < LEAST_LANDMARKS:
-        return f"fewer than {LEAST_LANDMARKS} spots could be matched between two cameras"
+    counts = dict.fromkeys(cameras, TARGET_LANDMARKS // len(cameras))
+    parts = best_landmarks(lenses, pyramids, masks, counts, lambda a, b: find_seeds(lenses, a, b, features, rng))
+    if sum(len(p.points) for p in parts) < MIN_LANDMARKS:
+        return f"fewer than {MIN_LANDMARKS} spots could be matched between two cameras"
     points = np.concatenate([p.points for p in parts])
     centre = np.mean([rig.cameras[p.camera].base_from_camera[:3, 3] for p in parts], axis=0)
     frame = surface_frame(points, centre, rig.cameras[parts[0].camera].base_from_camera[:3, 0])
@@ -330,7 +358,7 @@ def assemble(
     first = np.cumsum([0] + [len(p.points) for p in parts])
     templates = join(
         [
-            take_templates(lenses, pyramids[p.camera], p.camera, base_from_surface, points[i:j], normals[i:j])
+            cut_templates(lenses, pyramids[p.camera], p.camera, base_from_surface, points[i:j], normals[i:j])
             for p, i, j in zip(parts, first[:-1], first[1:], strict=True)
         ]
     )
@@ -341,7 +369,7 @@ def assemble(
         for j, block in enumerate(turned):
             at = 3 * (i + j)
             covariance[at : at + 3, at : at + 3] = block
-    good = templates.contrast > FLAT
+    good = templates.contrast > MIN_PATCH_CONTRAST
     rows = np.repeat(good, 3)
     surface_map = SurfaceMap(points[good], normals[good], covariance[np.ix_(rows, rows)])
     return FirstMap(base_from_surface, surface_map, templates.take(good))

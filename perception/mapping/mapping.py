@@ -1,77 +1,96 @@
-"""Making the map of a surface and keeping it: the first map, its confirmation, and its refinement at key frames."""
+"""The map of a surface: the first map, its confirmation, its refinement at key frames, and its growth."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.deferred import Deferred, sets_until_ready
-from estimation.fit import Fit
-from estimation.mapping.bundle_adjustment import Adjusted, single_fit
-from estimation.mapping.refiner import Refiner
+from estimation.mapping.bundle_adjustment import AdjustedMap, single_fit
+from estimation.mapping.refiner import DelayedJob, Refiner, sets_until_ready
 from estimation.observations import Observations
 from estimation.online.estimator import Estimator
+from estimation.online.fit import FrameFit
 from estimation.pose import SurfacePose
-from estimation.scan import Scan
 from estimation.scans.registration import Registration
+from estimation.scans.scan import Scan
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, joined_map, moved_map
-from estimation.warp import Warp
 from perception.frames import FrameSet, Roi
 from perception.lens import Lenses
 from perception.mapping.first_map import FirstMap, build_first_map, in_frame
-from perception.mapping.growth import LEAST, SHARE, WANTED, Found, Look, Probation, amid, look_for_more
-from perception.mapping.scan_map import ScanPlacing, as_at_one_instant
+from perception.mapping.growth import (
+    GROWTH_SHARE,
+    MIN_NEW_LANDMARKS,
+    WANTED_PER_CAMERA,
+    NewLandmarks,
+    Probation,
+    SurfaceSnapshot,
+    between_known,
+    find_new_landmarks,
+)
+from perception.mapping.scan_map import ScanPlacing, as_at_one_instant, landmarks_on_scan
 from perception.matching.features import Relocaliser
-from perception.matching.masks import KeepOut, patch_reach
+from perception.matching.masks import TrackingMasks, patch_reach
 from perception.matching.matcher import Matcher
 from perception.matching.patches import Pyramid
-from perception.scanned_map import scanned
 
-EAGER = 5  # tries for a first map, 0.5 s and more each, before only every tenth frame set is tried
-RELAXED = 10  # frame sets from one try to the next after those
-MOST = 600  # landmarks; those out of view are kept, and cost little
-SHOWN = 0.5  # of the landmarks in a camera's view: fewer are found where it is blurred or covered
-CROOKED = 6  # refinements, two of them the confirmation, until what looks bent is not the first map itself
-PATIENCE = 2.0  # s: a first map that nobody confirms is dropped, and the next images are tried
+EAGER_TRIES = 5  # tries for a first map, 0.5 s and more each, before only every tenth frame set is tried
+RETRY_INTERVAL_SETS = 10  # frame sets from one try to the next after those
+MAX_LANDMARKS = 600  # those out of view are kept, and cost little
+MIN_SHOWN_SHARE = 0.5  # of the landmarks in a camera's view; fewer are found where its image is blurred or covered
+FIRST_MAP_REFINEMENTS = 6  # after these, two of them the confirmation, a bent look is no fault of the first map
+CONFIRMATION_TIMEOUT_S = 2.0  # after which an unconfirmed first map is dropped, and the next images are tried
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedSet:
+    """One frame set as it was tracked."""
+
+    fit: FrameFit
+    observations: Observations  # tracks are rows of the map
+    pyramids: dict[int, Pyramid]  # images by camera
 
 
 class Mapping:
-    """The map of one surface from its first look on; what it makes is handed to the matcher and the estimator."""
+    """Makes and keeps the map of one surface; every change is handed to the matcher and the estimator."""
+
+    _matcher: Matcher  # from `begin` on
 
     def __init__(
         self,
         lenses: Lenses,
         roi: Sequence[Roi],
         search: Relocaliser,
+        estimator: Estimator,
+        masks: TrackingMasks,
         executor: Executor | None = None,
         scan: Scan | None = None,
-        keep_out: KeepOut | None = None,
     ) -> None:
-        """roi: where the surface is when it first comes into view. search: learns each view that is mapped.
+        """Nothing is mapped yet.
 
-        executor: where the map is refined. scan: its frame is the surface frame. keep_out: where no landmark may begin.
+        roi: where the surface is when it first comes into view. search: learns each view that is mapped. masks: where
+        no landmark may begin. executor: where the map is refined. scan: its frame is the surface frame.
         """
-        self._keep_out = keep_out or KeepOut(lenses)
         self._lenses, self._roi, self._search = lenses, tuple(roi), search
+        self._estimator, self._masks = estimator, masks
         self._placing = None if scan is None else ScanPlacing(scan)
         self._place: Registration | None = None  # of the scan at the first instant
         self._refiner = Refiner(lenses.rig, executor)
         self._cameras = np.mean([c.base_from_camera[:3, 3] for c in lenses.rig.cameras], axis=0)
-        self._tries, self._why = 0, ""  # to make a first map, and why the last one failed
+        self._tries, self._failure = 0, ""  # to make a first map, and why the last one failed
         self._mapped = 0.0  # s, stamp of the first map
         self._caveat = ""
-        self._taken = 0  # refinements of this map
-        self._bent = False  # whether its surface seemed to deform
-        self._growth: Deferred[Found] = Deferred(executor)
+        self._refinements = 0  # of this map
+        self._seemed_bent = False  # whether the surface seemed to deform while the first map could be the cause
+        self._growth: DelayedJob[NewLandmarks] = DelayedJob(executor)
         self._probation: Probation | None = None
-        self._wanted: dict[int, int] = {}  # landmarks, by camera
-        self._last: tuple[Fit, Observations, dict[int, Pyramid], bool] | None = None  # and whether it is sound
+        self._wanted: dict[int, int] = {}  # landmarks by camera
+        self._offered: tuple[TrackedSet, bool] | None = None  # the last frame set, and whether the map may learn of it
 
     def first_map(self, frames: FrameSet, pyramids: dict[int, Pyramid]) -> FirstMap | str:
         """A first map of what these images (by camera) show, or the reason why there is none yet."""
@@ -79,222 +98,188 @@ class Mapping:
         if isinstance(polygons, str):
             return polygons
         self._tries += 1
-        if self._tries > EAGER and self._tries % RELAXED:
-            return self._why
-        first = build_first_map(self._lenses, pyramids, polygons, self._keep_out.masks)
+        if self._tries > EAGER_TRIES and self._tries % RETRY_INTERVAL_SETS:
+            return self._failure
+        first = build_first_map(self._lenses, pyramids, polygons, self._masks.print_head)
         if isinstance(first, str):
-            self._why = first
+            self._failure = first
             return first
         self._caveat = ""
         if self._placing is None:
             return first
         images = {c: pyramids[c][0] for c in polygons}
-        return self._on_scan(first, self._placing.search(self._lenses, images, first, polygons))
+        self._place = self._placing.search(self._lenses, images, first, polygons)
+        self._set_caveat(self._place)
+        return in_frame(first, self._place.base_from_surface)
 
     def begin(
-        self, stamp: float, first: FirstMap, matcher: Matcher, estimator: Estimator, pyramids: dict[int, Pyramid]
-    ) -> tuple[SurfacePose, Observations, Fit]:
-        """Take a first map into use: its pose, and what the images it was made of show of it."""
-        start, self._mapped = first.base_from_surface, stamp
-        pose = estimator.begin(stamp, start, first.map, self._caveat)
+        self, stamp: float, first: FirstMap, matcher: Matcher, pyramids: dict[int, Pyramid]
+    ) -> tuple[SurfacePose, TrackedSet]:
+        """Take a first map and its matcher into use: its pose, and what the images it was made of show of it."""
+        start, self._mapped, self._matcher = first.base_from_surface, stamp, matcher
+        pose = self._estimator.begin(stamp, start, first.map, self._caveat)
         observations = matcher.align(stamp, pyramids, dict.fromkeys(pyramids, start), coarse=True)
-        fit = estimator.fit(observations, start)
+        fit = self._estimator.fit(observations, start)
         self._refiner.begin(first.map, stamp, start, observations)
-        self._growth.forget()
-        self._probation = self._last = None
-        self._taken, self._bent = 0, False
+        self._growth.cancel()
+        self._probation = self._offered = None
+        self._refinements, self._seemed_bent = 0, False
         matcher.remember(pyramids, observations, fit.inlier, start)
         for camera, images in pyramids.items():
             self._search.learn(camera, images[0], start, first.map)
-        return pose, observations, fit
+        return pose, TrackedSet(fit, observations, pyramids)
 
     def expired(self, stamp: float) -> bool:
         """Whether a first map that is still not confirmed at `stamp` should be dropped."""
-        return stamp - self._mapped > PATIENCE
+        return stamp - self._mapped > CONFIRMATION_TIMEOUT_S
 
-    def confirm(
-        self, matcher: Matcher, estimator: Estimator, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations
-    ) -> tuple[Fit, Observations]:
-        """The first measured frame set after the first map: correct the map by it, look and fit again, twice."""
+    def confirm(self, tracked: TrackedSet) -> TrackedSet:
+        """Correct the first map by the first measured frame set after it, align and fit that again, twice."""
         for _ in range(2):
-            refined = self._refiner.confirm(fit, observations, estimator.cameras.delays)
+            refined = self._refiner.confirm(tracked.fit, tracked.observations, self._estimator.cameras.delays)
             if refined is None:
                 break
-            self._take(refined, matcher, estimator)
-            estimator.moving(self._refiner.speed(fit))
-            fit, observations = self._again(matcher, estimator, pyramids, fit, observations)
-        self._wanted = dict.fromkeys(range(len(self._lenses.rig)), WANTED)
-        if self._placing is not None:
-            fit = self._lay_scan(self._placing, matcher, estimator, pyramids, fit, observations)
-        return fit, observations
+            self._take(refined)
+            self._estimator.set_twist(self._refiner.speed(tracked.fit))
+            tracked = self._realigned(tracked)
+        self._wanted = dict.fromkeys(range(len(self._lenses.rig)), WANTED_PER_CAMERA)
+        return tracked if self._placing is None else self._put_on_scan(self._placing, tracked)
 
-    def rebuild(
-        self, matcher: Matcher, estimator: Estimator, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations
-    ) -> tuple[Fit, Observations]:
-        """A frame set after the confirmation, before any pose is given out, of a surface that moves fast.
+    def rebuild(self, tracked: TrackedSet) -> TrackedSet:
+        """Make the map of a fast surface anew by a frame set after the confirmation, before any pose is given out.
 
-        The map of its first instants is as bent as the cameras' instants are unknown; later ones are calmer or, at
-        least, others, and no path is laid yet that could jump.
+        The map of its first instants is as bent as the cameras' exposure offsets are unknown. Later frame sets are
+        calmer or, at least, others, and no path is laid yet that could jump.
         """
-        refined = self._refiner.rebuild(fit, observations, estimator.cameras.delays)
+        refined = self._refiner.rebuild(tracked.fit, tracked.observations, self._estimator.cameras.delays)
         if refined is None:
-            return fit, observations
-        self._take(refined, matcher, estimator)
-        return self._again(matcher, estimator, pyramids, fit, observations)
+            return tracked
+        self._take(refined)
+        return self._realigned(tracked)
 
-    def _again(
-        self, matcher: Matcher, estimator: Estimator, pyramids: dict[int, Pyramid], fit: Fit, observations: Observations
-    ) -> tuple[Fit, Observations]:
-        """Look and fit again with a corrected map; what was there, where that is no measurement."""
-        starts = self._single(matcher, fit, observations, pyramids)
-        again = matcher.align(fit.stamp, pyramids, starts, coarse=True)
-        refit = estimator.fit(again, fit.solution.base_from_surface)
-        return (refit, again) if refit.measured else (fit, observations)
+    def _realigned(self, tracked: TrackedSet) -> TrackedSet:
+        """The frame set aligned and fitted again with a corrected map; as it was where that is no measurement."""
+        again = self._matcher.align(tracked.fit.stamp, tracked.pyramids, self._camera_poses(tracked), coarse=True)
+        refit = self._estimator.fit(again, tracked.fit.solution.base_from_surface)
+        return TrackedSet(refit, again, tracked.pyramids) if refit.measured else tracked
 
-    def offer(
-        self,
-        fit: Fit,
-        observations: Observations,
-        twist: Array,
-        estimator: Estimator,
-        pyramids: dict[int, Pyramid],
-    ) -> None:
-        """A measured frame set, from which the map may be refined or grow. twist: (6,), the surface's."""
-        self._refiner.offer(fit, observations, twist, estimator.cameras.delays)
-        self._last = fit, observations, pyramids, estimator.sound(fit)
+    def offer(self, tracked: TrackedSet, twist: Array) -> None:
+        """A measured frame set, by which the map may be refined or grow. twist: (6,), the surface's."""
+        self._refiner.offer(tracked.fit, tracked.observations, twist, self._estimator.cameras.delays)
+        self._offered = tracked, self._estimator.may_learn(tracked.fit)
 
-    def keep(self, matcher: Matcher, estimator: Estimator) -> None:
-        """Once a frame set, when no pose waits: put what is due into force, ask for what comes next."""
-        if self._last is not None:
-            fit, _, pyramids, sound = self._last
-            if not sound and not self._shown(matcher, fit, pyramids):
-                self._refiner.withdraw()
-                self._last = None
-        bends = estimator.deforms and (self._bent or self._taken > CROOKED)
+    def update(self) -> None:
+        """Once a frame set, when no pose waits: put what is due into force, and start what comes next."""
+        if self._offered is not None and not self._offered[1] and not self._enough_shown(self._offered[0]):
+            self._refiner.withdraw()
+            self._offered = None
+        bends = self._estimator.deforms and (self._seemed_bent or self._refinements > FIRST_MAP_REFINEMENTS)
         refined = self._refiner.freeze() if bends else self._refiner.poll()
         if refined is not None:
-            self._take(refined, matcher, estimator, bends)
-        found = self._growth.poll()
-        if found is not None:
-            distance = float(np.linalg.norm(found.look.base_from_surface[:3, 3] - self._cameras))
-            self._probation = Probation(found, amid(found, matcher.map, distance))
-        if self._last is None:
+            self._take(refined, bends)
+        new = self._growth.poll()
+        if new is not None:
+            distance = float(np.linalg.norm(new.snapshot.base_from_surface[:3, 3] - self._cameras))
+            self._probation = Probation(new, between_known(new, self._matcher.map, distance))
+        if self._offered is None:
             return
-        (fit, observations, pyramids, _), self._last = self._last, None
-        lacking = any(fit.used[c] < SHARE * self._wanted[c] for c in pyramids)
-        if self._probation is not None and self._refiner.kept:
-            self._prove(self._probation, matcher, estimator, fit, observations, pyramids)
-        elif self._refiner.kept and lacking and not self._growth.busy and len(matcher.map) < MOST:
-            warp = None if estimator.pose is None else estimator.pose.warp
-            look = self._look(matcher, fit, observations, pyramids, warp)
+        (tracked, _), self._offered = self._offered, None
+        if not self._refiner.took_keyframe:
+            return
+        if self._probation is not None:
+            self._prove(self._probation, tracked)
+        elif not self._growth.busy and len(self._matcher.map) < MAX_LANDMARKS and self._lacks_landmarks(tracked):
             self._growth.delay = sets_until_ready(self._refiner.interval)
-            self._growth.ask(look_for_more, self._lenses.rig, look, matcher.map)
+            self._growth.submit(find_new_landmarks, self._lenses.rig, self._snapshot(tracked), self._matcher.map)
 
-    def _shown(self, matcher: Matcher, fit: Fit, pyramids: dict[int, Pyramid]) -> bool:
+    def _enough_shown(self, tracked: TrackedSet) -> bool:
         """Whether a camera shows most of what it has in view: few tracks are no fault where little is to be seen."""
-        view = matcher.in_view(list(pyramids), fit.solution.base_from_surface)
-        return any(fit.used[c] >= max(LEAST, SHOWN * min(count, WANTED)) for c, count in view.items())
+        view = self._matcher.in_view(list(tracked.pyramids), tracked.fit.solution.base_from_surface)
+        least = {c: max(MIN_NEW_LANDMARKS, MIN_SHOWN_SHARE * min(n, WANTED_PER_CAMERA)) for c, n in view.items()}
+        return any(tracked.fit.used[c] >= count for c, count in least.items())
 
-    def _look(
-        self, matcher: Matcher, fit: Fit, observations: Observations, pyramids: dict[int, Pyramid], warp: Warp | None
-    ) -> Look:
-        seen, kept = observations, fit.inlier
-        inliers = seen.only(kept)
-        single = self._single(matcher, fit, observations, pyramids)
-        images = {c: p[0] for c, p in pyramids.items()}
-        heads, pose, doubt = self._keep_out.masks, fit.solution.base_from_surface, fit.covariance + fit.lasting
-        return Look(images, pose, single, doubt, inliers, self._wanted, heads, warp)
+    def _lacks_landmarks(self, tracked: TrackedSet) -> bool:
+        return any(tracked.fit.used[c] < GROWTH_SHARE * self._wanted[c] for c in tracked.pyramids)
 
-    def _single(
-        self, matcher: Matcher, fit: Fit, observations: Observations, pyramids: dict[int, Pyramid]
-    ) -> dict[int, Array]:
-        """Where the surface was at each camera's own instant."""
-        pose, points, rig = fit.solution.base_from_surface, matcher.map.points, self._lenses.rig
-        return {c: single_fit(rig, points, observations, c, pose).base_from_surface for c in pyramids}
+    def _snapshot(self, tracked: TrackedSet) -> SurfaceSnapshot:
+        fit, pose = tracked.fit, self._estimator.pose
+        return SurfaceSnapshot(
+            {c: images[0] for c, images in tracked.pyramids.items()},
+            fit.solution.base_from_surface,
+            self._camera_poses(tracked),
+            fit.covariance + fit.parts.lasting,
+            tracked.observations.only(fit.inlier),
+            self._wanted,
+            self._masks.print_head,
+            None if pose is None else pose.warp,
+        )
 
-    def _prove(
-        self,
-        waiting: Probation,
-        matcher: Matcher,
-        estimator: Estimator,
-        fit: Fit,
-        observations: Observations,
-        pyramids: dict[int, Pyramid],
-    ) -> None:
-        """Look for the new landmarks again; those that move with the surface join the map."""
-        single = self._single(matcher, fit, observations, pyramids)
-        waiting.look(self._lenses, fit.stamp, pyramids, single, fit.covariance + fit.lasting)
-        new, axes = waiting.map.points, waiting.found.templates.axes
-        proven = waiting.proven & ~self._keep_out.ink.covers(new, patch_reach(axes), fit.stamp)
-        if proven.sum() >= LEAST:
-            self._join(waiting, proven, matcher, estimator)
-        if proven.sum() >= LEAST or waiting.over:
+    def _camera_poses(self, tracked: TrackedSet) -> dict[int, Array]:
+        """Where the surface was (4, 4) at each camera's own exposure."""
+        pose, points, rig = tracked.fit.solution.base_from_surface, self._matcher.map.points, self._lenses.rig
+        seen = tracked.observations
+        return {c: single_fit(rig, points, seen, c, pose).base_from_surface for c in tracked.pyramids}
+
+    def _prove(self, waiting: Probation, tracked: TrackedSet) -> None:
+        """Align the new landmarks again; those that move with the surface join the map."""
+        fit, single = tracked.fit, self._camera_poses(tracked)
+        waiting.look(self._lenses, fit.stamp, tracked.pyramids, single, fit.covariance + fit.parts.lasting)
+        points, reach = waiting.map.points, patch_reach(waiting.new.templates.axes)
+        proven = waiting.proven & ~self._masks.ink.covers(points, reach, fit.stamp)
+        if proven.sum() >= MIN_NEW_LANDMARKS:
+            self._join(waiting, proven)
+        if proven.sum() >= MIN_NEW_LANDMARKS or waiting.over:
             self._probation = None
 
-    def _join(self, proven: Probation, which: NDArray[np.bool_], matcher: Matcher, estimator: Estimator) -> None:
-        chosen = np.flatnonzero(which)[: MOST - len(matcher.map)]
+    def _join(self, waiting: Probation, proven: NDArray[np.bool_]) -> None:
+        chosen = np.flatnonzero(proven)[: MAX_LANDMARKS - len(self._matcher.map)]
         rows = (3 * chosen[:, None] + np.arange(3)).ravel()
-        found, new = proven.found, proven.map
-        points, normals = new.points[chosen], new.normals[chosen]
-        longer = joined_map(matcher.map, SurfaceMap(points, normals, new.covariance[np.ix_(rows, rows)]))
-        matcher.extend(longer, found.templates.take(chosen))
-        estimator.replace_map(longer)
-        self._refiner.extend(longer, proven.level[chosen])
-        for c, features in found.features.items():
-            pose = found.look.single.get(c, found.look.base_from_surface)
+        new, part = waiting.new, waiting.map
+        part = SurfaceMap(part.points[chosen], part.normals[chosen], part.covariance[np.ix_(rows, rows)])
+        longer = joined_map(self._matcher.map, part)
+        self._matcher.extend(longer, new.templates.take(chosen))
+        self._estimator.replace_map(longer)
+        self._refiner.extend(longer, waiting.level[chosen])
+        for c, features in new.features.items():
+            pose = new.snapshot.single.get(c, new.snapshot.base_from_surface)
             self._search.add(c, features, pose, longer)
 
-    def _on_scan(self, first: FirstMap, place: Registration) -> FirstMap:
-        """The first map in the scan's frame; notes what the scan's shape leaves open."""
-        self._place = place
+    def _set_caveat(self, place: Registration) -> None:
         self._caveat = "" if place.sure else f"the scan's place is open: {place.verdict}"
-        return in_frame(first, place.base_from_surface)
 
-    def _lay_scan(
-        self,
-        placing: ScanPlacing,
-        matcher: Matcher,
-        estimator: Estimator,
-        pyramids: dict[int, Pyramid],
-        fit: Fit,
-        observations: Observations,
-    ) -> Fit:
+    def _put_on_scan(self, placing: ScanPlacing, tracked: TrackedSet) -> TrackedSet:
         """Place the scan anew now that each camera's own instant is known, and put the landmarks onto it."""
+        estimator, matcher = self._estimator, self._matcher
         assert self._place is not None and estimator.pose is not None and estimator.map is not None
-        rig, pose = self._lenses.rig, fit.solution.base_from_surface
-        single = {c: single_fit(rig, matcher.map.points, observations, c, pose).base_from_surface for c in pyramids}
-        lenses = Lenses(as_at_one_instant(rig, pose, single))
-        images = {c: p[0] for c, p in pyramids.items()}
+        pose = tracked.fit.solution.base_from_surface
+        lenses = Lenses(as_at_one_instant(self._lenses.rig, pose, self._camera_poses(tracked)))
+        images = {c: p[0] for c, p in tracked.pyramids.items()}
         place = placing.refine(lenses, images, replace(self._place, base_from_surface=pose))
-        self._caveat = "" if place.sure else f"the scan's place is open: {place.verdict}"
+        self._set_caveat(place)
         new_from_old = se3.inverse(place.base_from_surface) @ pose
-        there = moved_map(estimator.map, new_from_old)
-        laid, anchors = scanned(there, matcher.templates.camera, lenses, placing.scan, place)
+        moved = moved_map(estimator.map, new_from_old)
+        on_scan, anchors = landmarks_on_scan(moved, matcher.templates.camera, lenses, placing.scan, place)
         first = estimator.pose.base_from_surface @ se3.inverse(new_from_old)
-        self._refiner.reframe(laid, new_from_old, anchors)
-        matcher.reframe(laid, new_from_old)
+        self._refiner.reframe(on_scan, new_from_old, anchors)
+        matcher.reframe(on_scan, new_from_old)
         self._search.reframe(new_from_old)
-        estimator.begin(estimator.pose.stamp, first, laid, self._caveat)
-        fit = estimator.fit(observations, place.base_from_surface)
-        estimator.moving(self._refiner.speed(fit))
-        return estimator.fit(observations, place.base_from_surface)
+        estimator.begin(estimator.pose.stamp, first, on_scan, self._caveat)
+        estimator.set_twist(self._refiner.speed(estimator.fit(tracked.observations, place.base_from_surface)))
+        return replace(tracked, fit=estimator.fit(tracked.observations, place.base_from_surface))
 
-    def _take(self, refined: Adjusted, matcher: Matcher, estimator: Estimator, bends: bool = False) -> None:
-        self._taken += 1
-        crooked = self._taken <= CROOKED and not bends
-        self._bent |= (
-            crooked and estimator.deforms
-        )  # if it is seen again with a better map, that was no fault of the map
-        estimator.replace_map(refined.map, crooked, bends)
-        matcher.take(refined.map, refined.agrees)
+    def _take(self, refined: AdjustedMap, bends: bool = False) -> None:
+        self._refinements += 1
+        crooked = self._refinements <= FIRST_MAP_REFINEMENTS and not bends
+        # a bent look now may be the first map's fault; seen again with a better map, it is the surface's
+        self._seemed_bent |= crooked and self._estimator.deforms
+        self._estimator.replace_map(refined.map, crooked, bends)
+        self._matcher.take(refined.map, refined.agrees)
 
     def _polygons(self, frames: FrameSet) -> dict[int, Array] | str:
         """Where the surface is in these images, by camera, or why that is not known yet."""
         if not self._roi:
-            return {
-                f.camera: np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float) * self._lenses.rig.cameras[f.camera].size
-                for f in frames.frames
-            }
+            corners, cameras = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), self._lenses.rig.cameras
+            return {f.camera: corners * cameras[f.camera].size for f in frames.frames}
         start = max(r.stamp for r in self._roi)
         if frames.stamp < start - 0.1:
             return f"waiting for the region of interest at {start:.3f} s"

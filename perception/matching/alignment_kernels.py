@@ -16,22 +16,22 @@ from perception.frames import Image
 
 Float32 = NDArray[np.float32]
 
-RADIUS = 7  # samples: 15 x 15, of which 225 decide
-SIDE = 2 * RADIUS + 1
-GRID_SIZE = SIDE * SIDE
-ARRIVED = 0.03  # samples: a last step; what is left after it is a tenth of that
-UNSEEN = 0.3  # samples: the longest step taken without a look at where it leads
-STRIDE = 3.0  # samples: the longest step at all
-FAINT = 1e-6  # grey levels squared: no contrast at all
+PATCH_RADIUS = 7  # samples: 15 x 15, of which 225 decide
+PATCH_SIDE = 2 * PATCH_RADIUS + 1
+PATCH_SAMPLES = PATCH_SIDE * PATCH_SIDE
+CONVERGED_STEP = 0.03  # samples: a last step; what is left after it is a tenth of that
+MAX_UNCHECKED_STEP = 0.3  # samples: the longest step taken without a look at where it leads
+MAX_STEP = 3.0  # samples: the longest step at all
+MIN_VARIANCE = 1e-6  # grey levels squared: no contrast at all
 
 
 @compiled("void(u1[:,::1], f8, f8, f8[:,::1], f8, f4[::1])")
-def _look(image: Image, x: float, y: float, per_sample: Array, scale: float, seen: Float32) -> None:
+def _sample_clamped(image: Image, x: float, y: float, per_sample: Array, scale: float, seen: Float32) -> None:
     """Grey levels (S,) of the grid about x, y px, bilinear; outside the image its border's."""
     right, low = image.shape[1] - 1, image.shape[0] - 1
     k = 0
-    for row in range(-RADIUS, RADIUS + 1):
-        for column in range(-RADIUS, RADIUS + 1):
+    for row in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
+        for column in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
             u = min(max(x + scale * (per_sample[0, 0] * column + per_sample[0, 1] * row), 0.0), float(right))
             v = min(max(y + scale * (per_sample[1, 0] * column + per_sample[1, 1] * row), 0.0), float(low))
             i, j = int(u), int(v)
@@ -43,23 +43,23 @@ def _look(image: Image, x: float, y: float, per_sample: Array, scale: float, see
 
 
 @compiled("b1(u1[:,::1], f8, f8, f8[:,::1], f8, f4[::1])")
-def _look_inside(image: Image, x: float, y: float, per_sample: Array, scale: float, seen: Float32) -> bool:
-    """`_look` at half the time where the whole grid is inside the image; whether it is.
+def _sample_inside(image: Image, x: float, y: float, per_sample: Array, scale: float, seen: Float32) -> bool:
+    """`_sample_clamped` at half the time where the whole grid is inside the image; whether it is.
 
     Single precision from the nearest whole pixel on, and unsigned indices, which numba need not check for a sign.
     """
     right, low = image.shape[1] - 1, image.shape[0] - 1
-    across = RADIUS * scale * (abs(per_sample[0, 0]) + abs(per_sample[0, 1]))
-    along = RADIUS * scale * (abs(per_sample[1, 0]) + abs(per_sample[1, 1]))
+    across = PATCH_RADIUS * scale * (abs(per_sample[0, 0]) + abs(per_sample[0, 1]))
+    along = PATCH_RADIUS * scale * (abs(per_sample[1, 0]) + abs(per_sample[1, 1]))
     if not (x - across >= 0 and x + across < right and y - along >= 0 and y + along < low):
         return False
     du, dv = np.float32(scale * per_sample[0, 0]), np.float32(scale * per_sample[1, 0])
     left, top = int(x - across), int(y - along)
     k = 0
-    for row in range(-RADIUS, RADIUS + 1):
-        u0 = np.float32(x - left + scale * (per_sample[0, 1] * row - RADIUS * per_sample[0, 0]))
-        v0 = np.float32(y - top + scale * (per_sample[1, 1] * row - RADIUS * per_sample[1, 0]))
-        for column in range(SIDE):
+    for row in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
+        u0 = np.float32(x - left + scale * (per_sample[0, 1] * row - PATCH_RADIUS * per_sample[0, 0]))
+        v0 = np.float32(y - top + scale * (per_sample[1, 1] * row - PATCH_RADIUS * per_sample[1, 0]))
+        for column in range(PATCH_SIDE):
             u, v = u0 + du * np.float32(column), v0 + dv * np.float32(column)
             i, j = np.int32(u), np.int32(v)
             a, b = u - np.float32(i), v - np.float32(j)
@@ -80,7 +80,7 @@ def _sums(seen: Float32, picture: Float32, steepest: Float32) -> Array:
     """
     total, squares = np.float32(0), np.float32(0)
     alike, across, down = np.float32(0), np.float32(0), np.float32(0)
-    for k in range(GRID_SIZE):
+    for k in range(PATCH_SAMPLES):
         level = seen[k] - np.float32(128)
         total += level
         squares += level * level
@@ -91,12 +91,12 @@ def _sums(seen: Float32, picture: Float32, steepest: Float32) -> Array:
 
 
 @compiled("f4[:,::1](u1[:,::1], f8[:,::1], f8[:,:,::1], f8)")
-def look(image: Image, centre: Array, per_sample: Array, scale: float) -> Float32:
+def sample_grids(image: Image, centre: Array, per_sample: Array, scale: float) -> Float32:
     """Grey levels (N, S) of grids at centres (N, 2) px, per_sample (N, 2, 2) px a step, times `scale`."""
-    seen: Float32 = np.empty((len(centre), GRID_SIZE), np.float32)
+    seen: Float32 = np.empty((len(centre), PATCH_SAMPLES), np.float32)
     for n in range(len(centre)):
-        if not _look_inside(image, centre[n, 0], centre[n, 1], per_sample[n], scale, seen[n]):
-            _look(image, centre[n, 0], centre[n, 1], per_sample[n], scale, seen[n])
+        if not _sample_inside(image, centre[n, 0], centre[n, 1], per_sample[n], scale, seen[n]):
+            _sample_clamped(image, centre[n, 0], centre[n, 1], per_sample[n], scale, seen[n])
     return seen
 
 
@@ -124,7 +124,7 @@ def descend(
     and what it would still have moved, samples.
     """
     ended = np.zeros((len(start), 3))
-    seen: Float32 = np.empty(GRID_SIZE, np.float32)
+    seen: Float32 = np.empty(PATCH_SAMPLES, np.float32)
     for n in range(len(start)):
         if not wanted[n]:
             continue
@@ -132,20 +132,20 @@ def descend(
         for left in range(rounds - 1, -1, -1):
             x = start[n, 0] + scale * (step[0, 0] * shift[n, 0] + step[0, 1] * shift[n, 1])
             y = start[n, 1] + scale * (step[1, 0] * shift[n, 0] + step[1, 1] * shift[n, 1])
-            if not _look_inside(image, x, y, step, scale * spacing, seen):
-                _look(image, x, y, step, scale * spacing, seen)
+            if not _sample_inside(image, x, y, step, scale * spacing, seen):
+                _sample_clamped(image, x, y, step, scale * spacing, seen)
             total, squares, alike, across, down = _sums(seen, picture[n], steepest[n])
-            mean = total / GRID_SIZE
-            contrast = np.sqrt(max(squares / GRID_SIZE - mean * mean, FAINT))
-            ended[n, 0], ended[n, 1] = alike / (GRID_SIZE * contrast), contrast
+            mean = total / PATCH_SAMPLES
+            contrast = np.sqrt(max(squares / PATCH_SAMPLES - mean * mean, MIN_VARIANCE))
+            ended[n, 0], ended[n, 1] = alike / (PATCH_SAMPLES * contrast), contrast
             dx = -(inverse_hessian[n, 0, 0] * across + inverse_hessian[n, 0, 1] * down) / contrast
             dy = -(inverse_hessian[n, 1, 0] * across + inverse_hessian[n, 1, 1] * down) / contrast
             length = np.sqrt(dx * dx + dy * dy)
-            ended[n, 2] = 0.0 if length < ARRIVED else length
-            if left or spacing > 1 or length <= UNSEEN:
-                stride = spacing * min(1.0, STRIDE / max(length, 1e-9))
+            ended[n, 2] = 0.0 if length < CONVERGED_STEP else length
+            if left or spacing > 1 or length <= MAX_UNCHECKED_STEP:
+                stride = spacing * min(1.0, MAX_STEP / max(length, 1e-9))
                 shift[n, 0] += stride * dx
                 shift[n, 1] += stride * dy
-            if length < ARRIVED:
+            if length < CONVERGED_STEP:
                 break
     return ended

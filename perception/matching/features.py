@@ -1,4 +1,4 @@
-"""Finding the surface again without knowing where it was: SIFT against what was learned from reference images."""
+"""Corners and SIFT features: where tracks can begin, which features of two images match, and relocalisation by them."""
 
 from __future__ import annotations
 
@@ -10,21 +10,127 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.mapping.triangulation import rays
-from estimation.online.pose_solver import project, solve_pose
+from estimation.online.pose_solver import PointTracks, project, solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from perception.features import match, sift
 from perception.frames import Image
 from perception.lens import Lenses, undistort
 from perception.matching.patches import Pyramid
 
-CAPACITY = 6000  # descriptors: matching 600 features against them takes 30 ms
-LEAST_MATCHES = 8
+ImageMask = NDArray[np.uint8]
+Features = tuple[Array, NDArray[np.float32]]  # (N, 2) px and descriptors (N, 128)
+SIFT_OFFSET_PX = 0.25  # cv2's SIFT doubles the image and does not take the half pixel back (measured: 0.26)
+MAX_BRUTE_FORCE_DISTANCES = 12_000_000  # above which FLANN's trees are quicker
+FLANN_KD_TREE = 1  # OpenCV's number for that index
+MAX_FEATURES = 5000  # strongest first: matching two images then takes 0.15 s and 100 MB
+
+
+def grey(image: Image) -> Image:
+    """The image as one grey channel (H, W)."""
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def polygon_mask(size: tuple[int, int], polygon: Array) -> ImageMask:
+    """Mask (H, W), 255 inside a polygon (N, 2) px that may leave the image. size: (W, H)."""
+    mask = np.zeros((size[1], size[0]), np.uint8)
+    cv2.fillPoly(mask, [np.round(np.clip(polygon, -30000, 30000)).astype(np.int32)], 255)
+    return mask
+
+
+def bounding_box(points: Array, size: tuple[int, int], margin: float) -> tuple[int, int, int, int]:
+    """x0, y0, x1, y1 px of the points' box (N, 2) plus a margin, clipped to the image; never empty."""
+    low = np.floor(points.min(0) - margin).astype(int)
+    high = np.ceil(points.max(0) + margin).astype(int) + 1
+    x0, y0 = np.clip(low, 0, np.array(size) - 8)
+    x1, y1 = np.clip(high, (x0 + 8, y0 + 8), size)
+    return int(x0), int(y0), int(x1), int(y1)
+
+
+def corners(image: Image, mask: ImageMask, count: int, border: int = 16) -> Array:
+    """Up to `count` Shi-Tomasi corners (N, 2) px, spread over the mask, best first, refined to sub-pixel."""
+    inner = mask.copy()
+    inner[:border], inner[-border:], inner[:, :border], inner[:, -border:] = 0, 0, 0, 0
+    area = cv2.countNonZero(inner)
+    if area == 0:
+        return np.zeros((0, 2))
+    spread = max(4.0, 0.55 * np.sqrt(area / count))
+    found = cv2.goodFeaturesToTrack(image, count, 0.005, spread, mask=inner, blockSize=7)
+    if found is None:
+        return np.zeros((0, 2))
+    return np.asarray(found, np.float64).reshape(-1, 2)
+
+
+def sift(image: Image, mask: ImageMask | None = None, count: int = 1500, tilted: bool = False) -> Features:
+    """SIFT keypoints (N, 2) px and descriptors (N, 128) inside a mask.
+
+    tilted: also as the image would look from the side (affine SIFT, Morel and Yu 2009): 0.1 s and ten times the
+    features, but cameras that stand 60 degrees apart then share hundreds of matches instead of ten.
+    """
+    x0, y0, x1, y1 = 0, 0, image.shape[1], image.shape[0]
+    if mask is not None:
+        if cv2.countNonZero(mask) == 0:
+            return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+        x, y, w, h = cv2.boundingRect(mask)
+        x0, y0, x1, y1 = max(x - 16, 0), max(y - 16, 0), min(x + w + 16, x1), min(y + h + 16, y1)
+        mask = np.ascontiguousarray(mask[y0:y1, x0:x1])
+    detector: cv2.Feature2D = cv2.SIFT.create(nfeatures=count, contrastThreshold=0.02)
+    if tilted:
+        detector = cv2.AffineFeature.create(detector, maxTilt=3)
+    keypoints, descriptors = detector.detectAndCompute(np.ascontiguousarray(image[y0:y1, x0:x1]), mask)
+    if not keypoints:
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+    best = np.argsort([-k.response for k in keypoints], kind="stable")[:MAX_FEATURES]
+    pixels = np.array([k.pt for k in keypoints]) + (x0 - SIFT_OFFSET_PX, y0 - SIFT_OFFSET_PX)
+    return pixels[best], np.asarray(descriptors, np.float32)[best]
+
+
+def match(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float = 0.8) -> NDArray[np.int64]:
+    """Pairs (M, 2) of rows of a and b that choose each other and pass Lowe's ratio test (thesis 4.4: 0.8).
+
+    All distances are compared, which numpy does four times quicker than OpenCV's brute force, as long as they are not
+    too many; beyond that FLANN's trees are asked, which miss one pair in 500 and give the same answer every time.
+    """
+    if len(a) < 2 or len(b) < 2:
+        return np.zeros((0, 2), np.int64)
+    first, second, best, back = (
+        _by_trees(a, b) if len(a) * len(b) > MAX_BRUTE_FORCE_DISTANCES else _by_all_distances(a, b)
+    )
+    rows = np.arange(len(a))
+    good = (first < ratio**2 * second) & (back[best] == rows)
+    return np.stack([rows[good], best[good]], -1).astype(np.int64)
+
+
+NearestRows = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]
+
+
+def _by_all_distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NearestRows:
+    """Squared distances (N,) of a to the nearest and next row of b, which row is nearest, and the same back (M,)."""
+    distance = np.maximum((a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T), 0.0)
+    best, back = np.argmin(distance, axis=1), np.argmin(distance, axis=0)
+    rows = np.arange(len(a))
+    first = distance[rows, best]
+    distance[rows, best] = np.inf
+    return first, distance.min(axis=1), best, back
+
+
+def _by_trees(a: NDArray[np.float32], b: NDArray[np.float32]) -> NearestRows:
+    """As `_by_all_distances`, nearly always."""
+    cv2.setRNGSeed(0)  # of this thread; the trees are cut at random
+    trees: dict[str, bool | int | float | str] = {"algorithm": FLANN_KD_TREE, "trees": 4}
+    checks: dict[str, bool | int | float | str] = {"checks": 32}
+    rows, distances = cv2.flann.Index(b, trees).knnSearch(a, 2, params=checks)
+    back = cv2.flann.Index(a, trees).knnSearch(b, 1, params=checks)[0][:, 0]
+    nearest = np.asarray(distances, np.float32)
+    return nearest[:, 0], nearest[:, 1], np.asarray(rows[:, 0], np.int64), np.asarray(back, np.int64)
+
+
+MAX_DESCRIPTORS = 6000  # descriptors: matching 600 features against them takes 30 ms
+MIN_MATCHES = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class RelocalisedPose:
     """A relocalised pose. base_from_surface: (4, 4), of all cameras together. single: by camera, its own, since cameras
     are seldom exposed together. matches: how many features agree."""
 
@@ -34,7 +140,7 @@ class Found:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
+class CameraMatches:
     """Features of one camera: points (N, 3) in the surface frame, ideal pixels (N, 2), the pose they give alone."""
 
     camera: int
@@ -55,10 +161,7 @@ class Relocaliser:
     def learn(self, camera: int, image: Image, base_from_surface: Array, surface_map: SurfaceMap) -> None:
         """Add the features of one image in which the surface's pose is known: each is put on the landmarks' surface."""
         lens = self.lenses.rig.cameras[camera]
-        points_base = se3.transform_points(base_from_surface, surface_map.points)
-        ideal, depth = ideal_pixels(lens, points_base)
-        imaged, seen = self.lenses.image(camera, ideal, depth)
-        seen = seen & ((imaged >= 0) & (imaged < lens.size)).all(1)
+        _, imaged, seen = self._landmark_pixels(camera, base_from_surface, surface_map)
         if seen.sum() < 8:
             return
         mask = np.zeros((lens.size[1], lens.size[0]), np.uint8)
@@ -67,25 +170,17 @@ class Relocaliser:
         mask = np.asarray(cv2.dilate(mask, np.ones((9, 9), np.uint8)), np.uint8)
         self.add(camera, sift(image, mask, 500, tilted=True), base_from_surface, surface_map)
 
-    def add(
-        self,
-        camera: int,
-        features: tuple[Array, NDArray[np.float32]],
-        base_from_surface: Array,
-        surface_map: SurfaceMap,
-    ) -> None:
-        """Take the features of one image, (N, 2) px as imaged and (N, 128), best first, in which the pose is known.
+    def add(self, camera: int, features: Features, base_from_surface: Array, surface_map: SurfaceMap) -> None:
+        """Take the features of one image, px as imaged, best first, in which the surface's pose is known.
 
         Each view keeps its best: an equal share of what there is room for, so that no new one drives out an old one.
         """
-        lens = self.lenses.rig.cameras[camera]
-        ideal, depth = ideal_pixels(lens, se3.transform_points(base_from_surface, surface_map.points))
-        imaged, seen = self.lenses.image(camera, ideal, depth)
-        seen = seen & ((imaged >= 0) & (imaged < lens.size)).all(1)
+        ideal, _, seen = self._landmark_pixels(camera, base_from_surface, surface_map)
         keypoints, descriptors = features
         if not len(keypoints) or seen.sum() < 8:
             return
-        points = self._on_surface(camera, undistort(lens, keypoints), base_from_surface, surface_map, ideal, seen)
+        pixels = undistort(self.lenses.rig.cameras[camera], keypoints)
+        points = self._on_surface(camera, pixels, base_from_surface, surface_map, ideal, seen)
         near = np.isfinite(points).all(1)
         view = np.full(int(near.sum()), self._view.max(initial=-1) + 1)
         self._points = np.concatenate([self._points, points[near]])
@@ -93,10 +188,19 @@ class Relocaliser:
         self._view = np.concatenate([self._view, view])
         self._make_room()
 
+    def _landmark_pixels(
+        self, camera: int, base_from_surface: Array, surface_map: SurfaceMap
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Ideal and imaged pixels (N, 2) of the landmarks, and which are in the image (N,)."""
+        lens = self.lenses.rig.cameras[camera]
+        ideal, depth = ideal_pixels(lens, se3.transform_points(base_from_surface, surface_map.points))
+        imaged, seen = self.lenses.image(camera, ideal, depth)
+        return ideal, imaged, seen & ((imaged >= 0) & (imaged < lens.size)).all(1)
+
     def _make_room(self) -> None:
         counts = np.bincount(self._view)
         most = int(counts.max(initial=0))
-        while np.minimum(counts, most).sum() > CAPACITY:
+        while np.minimum(counts, most).sum() > MAX_DESCRIPTORS:
             most -= 1 + most // 100
         rank = np.concatenate([np.arange(n) for n in counts]) if len(counts) else np.zeros(0, int)
         kept = rank < most
@@ -135,31 +239,30 @@ class Relocaliser:
         reach = np.einsum("ni,ni->n", anchor - origins, normal) / np.where(steep, 1.0, slope)
         return np.asarray(np.where(steep[:, None], np.nan, origins + reach[:, None] * directions))
 
-    def find(self, pyramids: dict[int, Pyramid], half: bool = True) -> Found | None:
+    def find(self, pyramids: dict[int, Pyramid], half: bool = True) -> RelocalisedPose | None:
         """The pose of the surface in images (by camera), searched everywhere, or None.
 
         half: in the half-size images, a quarter of the time (50 ms a camera); a far surface needs the whole size.
         """
-        if len(self._points) < LEAST_MATCHES:
+        if len(self._points) < MIN_MATCHES:
             return None
         seen = [self._look(c, images, half) for c, images in pyramids.items()]
         return self._agree([s for s in seen if s is not None])
 
-    def _look(self, camera: int, images: Pyramid, half: bool) -> Sighting | None:
+    def _look(self, camera: int, images: Pyramid, half: bool) -> CameraMatches | None:
         """What one camera shows of the surface, and the pose it gives alone."""
         lens = self.lenses.rig.cameras[camera]
         keypoints, descriptors = sift(images[1] if half else images[0], count=600 if half else 1500)
         if half:
             keypoints = 2 * keypoints
         pairs = match(descriptors, self._descriptors, 0.85)
-        if len(pairs) < LEAST_MATCHES:
+        if len(pairs) < MIN_MATCHES:
             return None
         points, pixels = self._points[pairs[:, 1]], undistort(lens, keypoints[pairs[:, 0]])
         alone = _pnp(points, pixels, lens.matrix)
-        return Sighting(camera, points, pixels, None if alone is None else lens.base_from_camera @ alone)
+        return CameraMatches(camera, points, pixels, None if alone is None else lens.base_from_camera @ alone)
 
-    def _agree(self, seen: list[Sighting]) -> Found | None:
-        """The camera's pose that most features of all cameras support, fitted to them."""
+    def _agree(self, seen: list[CameraMatches]) -> RelocalisedPose | None:
         if not any(s.alone is not None for s in seen):
             return None
         rig = self.lenses.rig
@@ -167,20 +270,23 @@ class Relocaliser:
         points = np.concatenate([s.points for s in seen])
         pixels = np.concatenate([s.pixels for s in seen])
         sigma = np.full(len(camera), 3.0)  # px: SIFT on half-size images, cameras not exposed together
-        best: Found | None = None
+        best: RelocalisedPose | None = None
+        tracks = PointTracks(camera, points, pixels, sigma)
         for start in (s.alone for s in seen if s.alone is not None):
-            pose = solve_pose(rig, camera, points, pixels, sigma, start, scales=(4.0, 2.0)).base_from_surface
+            pose = solve_pose(rig, tracks, start, scales=(4.0, 2.0)).base_from_surface
             away = np.linalg.norm(project(rig, camera, pose, points)[0] - pixels, axis=1)
             agreed = int((away < 4 * sigma).sum())
-            if agreed >= LEAST_MATCHES and (best is None or agreed > best.matches):
-                best = Found(pose, {}, agreed)
+            if agreed >= MIN_MATCHES and (best is None or agreed > best.matches):
+                best = RelocalisedPose(pose, {}, agreed)
         if best is None:
             return None
-        near = {s.camera: s.alone for s in seen if s.alone is not None and _alike(s.alone, best.base_from_surface)}
-        return Found(best.base_from_surface, near, best.matches)
+        near = {
+            s.camera: s.alone for s in seen if s.alone is not None and _same_surface(s.alone, best.base_from_surface)
+        }
+        return RelocalisedPose(best.base_from_surface, near, best.matches)
 
 
-def _alike(a: Array, b: Array) -> bool:
+def _same_surface(a: Array, b: Array) -> bool:
     """Whether two poses could be one surface at two cameras' instants, one camera's depth being what it is."""
     apart = se3.inverse(a) @ b
     return bool(se3.angle_of(apart) < 0.35 and np.linalg.norm(apart[:3, 3]) < 60.0)
@@ -191,6 +297,6 @@ def _pnp(points: Array, pixels: Array, matrix: Array) -> Array | None:
     ok, rotation, translation, inliers = cv2.solvePnPRansac(
         points, pixels, matrix, None, iterationsCount=400, reprojectionError=6.0, flags=cv2.SOLVEPNP_SQPNP
     )
-    if not ok or inliers is None or len(inliers) < LEAST_MATCHES:
+    if not ok or inliers is None or len(inliers) < MIN_MATCHES:
         return None
     return se3.make(cv2.Rodrigues(rotation)[0], np.asarray(translation).ravel())

@@ -1,60 +1,153 @@
-"""What must not be tracked: the print head, fresh ink, and highlights, which move otherwise than the surface does."""
+"""What must not be tracked, as it moves otherwise than the surface: the print head, fresh ink, and highlights."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from estimation import se3
 from estimation.se3 import Array
-from perception.features import Mask
-from perception.frames import Image, PrintHead
-from perception.ink import Ink
+from perception.frames import SYRINGE, Image, PrintHead, check_profile
 from perception.lens import Lenses
-from perception.matching.alignment_kernels import RADIUS
-from perception.tool import Tool, draw
-from perception.tool_profile import SYRINGE
+from perception.matching.alignment_kernels import PATCH_RADIUS
+from perception.matching.features import ImageMask
 
-SCALE = 0.25  # of the masks to the images: to a landmark's patch four pixels are nothing
-MARGIN = 1.5  # mm: to which an arm is registered to the cameras, and its lag known
-BRIGHT = 250  # grey levels, at which a pixel is taken for a highlight,
-GLINTS = 0.2  # unless more of the region is as bright: then it is the tissue, or paper, that is overexposed
-HALO = 5  # px around a highlight that still belong to it
+BEAD_REACH_MM = 1.0  # mm from the bead's middle: half of a wide bead, as it spreads
+BEAD_STEP_MM = 0.5  # mm between the points that stand for a bead
+GEL_TIME_S = 60.0  # s that gelling takes; what has set may carry landmarks of its own
 
 
-class KeepOut:
+class Ink:
+    """The beads laid so far, in the surface frame."""
+
+    def __init__(self) -> None:
+        self._points: list[Array] = []
+        self._stamps: list[float] = []
+        self._tip: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def lift(self) -> None:
+        """The nozzle no longer extrudes: the next bead begins anew."""
+        self._tip = None
+
+    def lay(self, stamp: float, tip: Array) -> Array:
+        """The bead goes on to the tip (3,) mm at `stamp`, s; the points (M, 3) that are new."""
+        start = tip if self._tip is None else self._tip
+        pieces = max(1, int(np.ceil(float(np.linalg.norm(tip - start)) / BEAD_STEP_MM)))
+        new = start + (tip - start) * (np.arange(1, pieces + 1) / pieces)[:, None]
+        self._points.extend(new)
+        self._stamps.extend([stamp] * pieces)
+        self._tip = tip.copy()
+        return new
+
+    def covers(self, points: Array, reach: Array, stamp: float) -> NDArray[np.bool_]:
+        """Which points (N, 3) mm lie within their reach (N,) mm of ink that is still fresh at `stamp`, s."""
+        fresh = np.searchsorted(self._stamps, stamp - GEL_TIME_S)
+        if fresh == len(self._points):
+            return np.zeros(len(points), bool)
+        away, _ = cKDTree(np.array(self._points[fresh:])).query(points)
+        return np.asarray(away < BEAD_REACH_MM + reach)
+
+
+def near_bead(points: Array, bead: Array, reach: Array) -> NDArray[np.bool_]:
+    """Which points (N, 3) lie within REACH and their own reach (N,) of a bead's points (M, 3), all mm."""
+    away = np.linalg.norm(points[:, None] - bead, axis=2).min(1)
+    return np.asarray(away < BEAD_REACH_MM + reach)
+
+
+RING_ANGLES = np.linspace(0, 2 * np.pi, 13)[:-1]
+MIN_DRAWN_DEPTH_MM = 20.0  # mm: what is nearer to a lens than that is not drawn, as its picture has no bounds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tool:
+    """profile: (K, 2) mm, K > 1, height above the tip along the nozzle's z, rising, and radius there."""
+
+    profile: Array
+
+    def __post_init__(self) -> None:
+        check_profile("tool", "profile", self.profile)
+
+    def silhouette(self, lenses: Lenses, camera: int, base_from_nozzle: Array, margin: float) -> list[Array]:
+        """Convex polygons (M, 2) px, as imaged, that together cover the tool's picture; margin: mm around it.
+
+        base_from_nozzle: (4, 4), z from the tip up into the head.
+        """
+        heights = self.profile[:, 0] + np.r_[-margin, np.zeros(len(self.profile) - 2), margin]
+        radii = self.profile[:, 1] + margin
+        ring = np.stack([np.cos(RING_ANGLES), np.sin(RING_ANGLES)], -1)
+        rings = np.concatenate(
+            [radii[:, None, None] * ring, np.broadcast_to(heights[:, None, None], (len(radii), len(RING_ANGLES), 1))],
+            -1,
+        )
+        camera_from_nozzle = lenses.rig.camera_from_base[camera] @ base_from_nozzle
+        x, y, depth = np.moveaxis(se3.transform_points(camera_from_nozzle, rings.reshape(-1, 3)), -1, 0)
+        safe = np.maximum(depth, MIN_DRAWN_DEPTH_MM)
+        imaged, seen = lenses.bend(camera, x / safe, y / safe, depth)
+        seen = (seen & (depth > MIN_DRAWN_DEPTH_MM)).reshape(len(radii), -1)
+        spots = imaged.T.reshape(len(radii), -1, 2)
+        parts = (np.concatenate([spots[i][seen[i]], spots[i + 1][seen[i + 1]]]) for i in range(len(radii) - 1))
+        return [cv2.convexHull(p.astype(np.float32))[:, 0].astype(float) for p in parts if len(p) >= 3]
+
+
+def draw(mask: ImageMask, polygons: list[Array], scale: float, border: int) -> None:
+    """Set a mask, `scale` times the image's size, to 255 inside polygons (M, 2) px of the image and `border` px around.
+
+    border: of the mask.
+    """
+    for polygon in polygons:
+        outline = np.round(polygon * scale).astype(np.int32)
+        cv2.fillConvexPoly(mask, outline, 255)
+        if border:
+            cv2.polylines(mask, [outline], True, 255, 2 * border)
+
+
+MASK_SCALE = 0.25  # of the masks to the images: to a landmark's patch four pixels are nothing
+PRINT_HEAD_MARGIN_MM = 1.5  # mm: to which an arm is registered to the cameras, and its lag known
+HIGHLIGHT_GREY = 250  # grey levels, at which a pixel is taken for a highlight,
+MAX_HIGHLIGHT_SHARE = 0.2  # of the region; where more is as bright, the tissue or paper is overexposed
+HIGHLIGHT_HALO_PX = 5  # px around a highlight that still belong to it
+
+
+class TrackingMasks:
     """Where in the newest frame set nothing may be tracked, and what the ink on the surface covers."""
 
     def __init__(self, lenses: Lenses, tool: Tool | None = None) -> None:
         self._lenses, self._tool = lenses, tool or Tool(SYRINGE)
-        self.masks: dict[int, Mask] = {}  # by camera, SCALE times its image's size, 255 where the print head is
+        self.print_head: dict[
+            int, ImageMask
+        ] = {}  # by camera, SCALE times its image's size, 255 where the print head is
         self.ink = Ink()
 
-    def look(self, head: PrintHead | None, cameras: Iterable[int]) -> None:
+    def set_print_head(self, head: PrintHead | None, cameras: Iterable[int]) -> None:
         """Take where the print head is now; None where no arm is known."""
-        self.masks = {}
+        self.print_head = {}
         if head is None:
             return
         for camera in cameras:
-            polygons = self._tool.silhouette(self._lenses, camera, head.base_from_nozzle, MARGIN)
+            polygons = self._tool.silhouette(self._lenses, camera, head.base_from_nozzle, PRINT_HEAD_MARGIN_MM)
             w, h = self._lenses.rig.cameras[camera].size
-            mask = np.zeros((int(np.ceil(h * SCALE)), int(np.ceil(w * SCALE))), np.uint8)
-            draw(mask, polygons, SCALE, int(np.ceil(RADIUS * SCALE)))
+            mask = np.zeros((int(np.ceil(h * MASK_SCALE)), int(np.ceil(w * MASK_SCALE))), np.uint8)
+            draw(mask, polygons, MASK_SCALE, int(np.ceil(PATCH_RADIUS * MASK_SCALE)))
             if mask.any():
-                self.masks[camera] = mask
+                self.print_head[camera] = mask
 
     def hides(self, camera: int, pixels: Array) -> NDArray[np.bool_]:
         """Which pixels (N, 2), as imaged, the print head may cover."""
-        mask = self.masks.get(camera)
+        mask = self.print_head.get(camera)
         if mask is None:
             return np.zeros(len(pixels), bool)
-        x, y = np.clip((pixels * SCALE).astype(int), 0, np.array(mask.shape[::-1]) - 1).T
+        x, y = np.clip((pixels * MASK_SCALE).astype(int), 0, np.array(mask.shape[::-1]) - 1).T
         return np.asarray(mask[y, x] > 0)
 
-    def lay(self, head: PrintHead | None, stamp: float, base_from_surface: Array) -> Array | None:
+    def lay_ink(self, head: PrintHead | None, stamp: float, base_from_surface: Array) -> Array | None:
         """Take what the head has laid until `stamp`, s, on a surface that is there: the new bead's points (M, 3), mm,
         surface frame."""
         if head is None or not head.extruding:
@@ -65,22 +158,22 @@ class KeepOut:
 
 def patch_reach(axes: Array) -> Array:
     """From the middle of patches with sides (N, 3, 2) mm per sample to their edges, (N,) mm."""
-    return np.asarray(RADIUS * np.linalg.norm(axes, axis=1).mean(1))
+    return np.asarray(PATCH_RADIUS * np.linalg.norm(axes, axis=1).mean(1))
 
 
-def trackable(image: Image, region: Mask, head: Mask | None) -> Mask:
-    """The part (H, W) of a region of a grey image in which tracks may begin. head: as in `KeepOut.masks`."""
+def trackable(image: Image, region: ImageMask, head: ImageMask | None) -> ImageMask:
+    """The part (H, W) of a region of a grey image in which tracks may begin. head: as in `TrackingMasks.print_head`."""
     free = region & ~highlights(image, region)
     if head is not None:
         free &= ~np.asarray(cv2.resize(head, free.shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
     return np.asarray(free, np.uint8)
 
 
-def highlights(image: Image, region: Mask) -> Mask:
+def highlights(image: Image, region: ImageMask) -> ImageMask:
     """Mask (H, W), 255 where a grey image has highlights in a region (H, W); empty where much of it is that bright."""
-    _, bright = cv2.threshold(image, BRIGHT - 1, 255, cv2.THRESH_BINARY)
+    _, bright = cv2.threshold(image, HIGHLIGHT_GREY - 1, 255, cv2.THRESH_BINARY)
     bright = cv2.bitwise_and(bright, region)
-    if cv2.countNonZero(bright) > GLINTS * cv2.countNonZero(region):
+    if cv2.countNonZero(bright) > MAX_HIGHLIGHT_SHARE * cv2.countNonZero(region):
         return np.zeros_like(region)
-    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * HALO + 1, 2 * HALO + 1))
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * HIGHLIGHT_HALO_PX + 1, 2 * HIGHLIGHT_HALO_PX + 1))
     return np.asarray(cv2.dilate(bright, around), np.uint8)

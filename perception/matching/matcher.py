@@ -1,37 +1,140 @@
-"""Where the landmarks are in new images: flow from the last ones is the start, the fit to the reference the measure."""
+"""Where the landmarks are in new images: optical flow gives the start, alignment with reference pictures measures."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations, no_observations
-from estimation.online.pose_solver import project, solve_pose
+from estimation.online.pose_solver import PointTracks, project, solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from perception.alignment import align_in
-from perception.flow import flow as optical_flow
-from perception.frames import Image
-from perception.ink import near_bead
+from perception.frames import Image, parallel_map
 from perception.lens import Lenses, undistort
-from perception.matching.masks import KeepOut, patch_reach
-from perception.matching.patches import Pyramid, Templates, join, project_into
-from perception.side_by_side import side_by_side
+from perception.matching.features import bounding_box
+from perception.matching.masks import TrackingMasks, near_bead, patch_reach
+from perception.matching.patches import Pyramid, Templates, align_in, join, project_into
 
-LOOSE = np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3)  # how far one camera's own pose may stray from the joint one
-FLOW_TRACKS = 80  # a camera: enough for a start, and flow is only that
-DOUBTED = 8  # landmarks of a camera that tell how uncertain all of them are
-MOST = 0.8  # of a camera's landmarks: fewer found may be the fault of where they were sought
-ROUGH = 1e-3  # rad, mm: a start for the alignment need not be better
+FLOW_WINDOW_PX = 21  # px
+MIN_WINDOW_SPREAD = 2.0  # grey levels, below which a window tells no gain
+MIN_GAIN_WINDOWS = 8  # for a median
+MIN_WINDOW_CORRELATION = 0.7  # of a window before and after, to be alike
+MIN_ALIKE_SHARE = 0.35  # of alike windows, for the flow to be believed
+CHECKED_TRACKS = 40  # tracks, about
+MIN_GAIN_CHANGE = 0.08  # of brightness; flow bears smaller ones
+GAIN_RANGE = 0.4, 2.5  # beyond which it is another picture
+MAX_RETURN_ERROR_PX = 1.0  # px from where a track began to where it ends when it is followed back
+FLOW_MARGIN_PX = 48.0  # px around the tracks: flow sees that far beyond them
+
+
+def optical_flow(
+    previous: Image, current: Image, pixels: Array, guess: Array, levels: int = 4
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Where pixels (N, 2) of the previous image stand in the current one (N, 2), and whether they were found (N,).
+
+    guess: (N, 2) px, where to begin. Pyramidal Lucas-Kanade (thesis 4.4, Eq. 4.7-4.10) on the box around the tracks. It
+    takes brightness as constant, and was measured to fail where that jumps by a quarter: where most of what it finds
+    does not look like what it sought, it is tried again with the jump taken back, and the better of the two is kept.
+    What does not come back to where it began when it is followed the other way is not found (Kalal et al. 2010).
+    """
+    first = _there_and_back(previous, current, pixels, guess, levels)
+    alike = _alike(previous, current, pixels, *first)
+    if alike >= MIN_ALIKE_SHARE:
+        return first
+    gain, offset = _brightness(previous, current, pixels, guess)
+    if not GAIN_RANGE[0] < gain < GAIN_RANGE[1] or (
+        abs(gain - 1) < MIN_GAIN_CHANGE and abs(offset) < MIN_GAIN_CHANGE * 128
+    ):
+        return first
+    relit = np.asarray(cv2.addWeighted(current, 1 / gain, current, 0.0, -offset / gain), np.uint8)
+    second = _there_and_back(previous, relit, pixels, guess, levels)
+    return second if _alike(previous, relit, pixels, *second) > alike else first
+
+
+def _there_and_back(
+    previous: Image, current: Image, pixels: Array, guess: Array, levels: int
+) -> tuple[Array, NDArray[np.bool_]]:
+    there, found = _lucas_kanade(previous, current, pixels, guess, levels)
+    there[~found] = guess[~found]
+    back, returned = _lucas_kanade(current, previous, there, pixels + there - guess, levels)
+    return there, found & returned & (np.linalg.norm(back - pixels, axis=1) < MAX_RETURN_ERROR_PX)
+
+
+def _lucas_kanade(
+    previous: Image, current: Image, pixels: Array, guess: Array, levels: int
+) -> tuple[Array, NDArray[np.bool_]]:
+    h, w = current.shape[:2]
+    reach = np.concatenate([pixels, guess])
+    x0, y0, x1, y1 = bounding_box(np.clip(reach, 0, [w, h]), (w, h), FLOW_MARGIN_PX)
+    corner = np.array([x0, y0], float)
+    begin = np.ascontiguousarray((guess - corner)[:, None], np.float32)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        np.ascontiguousarray(previous[y0:y1, x0:x1]),
+        np.ascontiguousarray(current[y0:y1, x0:x1]),
+        np.ascontiguousarray((pixels - corner)[:, None], np.float32),
+        begin.copy(),
+        winSize=(FLOW_WINDOW_PX, FLOW_WINDOW_PX),
+        maxLevel=levels,
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.05),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=1e-4,
+    )
+    moved = np.asarray(found, np.float64)[:, 0]
+    return moved + corner, (np.asarray(status).ravel() > 0) & np.isfinite(moved).all(1)
+
+
+def _alike(previous: Image, current: Image, pixels: Array, moved: Array, found: NDArray[np.bool_]) -> float:
+    """Share of the tracks that look where they were found (N,) as they did before, whatever the brightness."""
+    asked = np.arange(0, len(pixels), max(1, len(pixels) // CHECKED_TRACKS))  # a few dozen tell it as well as all
+    kept = asked[found[asked]]
+    if not len(kept):
+        return 0.0
+    before, now = _around(previous, pixels[kept]), _around(current, moved[kept])
+    before, now = before - before.mean(1, keepdims=True), now - now.mean(1, keepdims=True)
+    product = (before * now).sum(1)
+    return float(np.sum(product > MIN_WINDOW_CORRELATION * np.sqrt((before**2).sum(1) * (now**2).sum(1))) / len(asked))
+
+
+def _brightness(previous: Image, current: Image, pixels: Array, guess: Array) -> tuple[float, float]:
+    """Gain and offset, grey levels, from the previous image to the current one: the median over the tracks.
+
+    Each track tells them by mean and spread of the few pixels around it, there and here.
+    """
+    before, now = _around(previous, pixels), _around(current, guess)
+    spread = before.std(1)
+    told = spread > MIN_WINDOW_SPREAD
+    if told.sum() < MIN_GAIN_WINDOWS:
+        return 1.0, 0.0
+    gain = float(np.median(now[told].std(1) / spread[told]))
+    return gain, float(np.median(now.mean(1) - gain * before.mean(1)))
+
+
+def _around(image: Image, pixels: Array) -> Array:
+    """Grey levels (N, K) at every third pixel of a window around each of pixels (N, 2)."""
+    step = np.arange(-FLOW_WINDOW_PX // 2 + 2, FLOW_WINDOW_PX // 2, 3)
+    h, w = image.shape[:2]
+    x, y = np.rint(np.clip(pixels, 0, [w - 1, h - 1])).astype(int).T
+    rows, columns = np.clip(y[:, None] + step, 0, h - 1), np.clip(x[:, None] + step, 0, w - 1)
+    return np.asarray(image[rows[:, :, None], columns[:, None, :]].reshape(len(pixels), -1), float)
+
+
+CAMERA_POSE_PRIOR = np.diag(
+    [1 / 0.02**2] * 3 + [1 / 5.0**2] * 3
+)  # how far one camera's own pose may stray from the joint one
+MAX_FLOW_TRACKS = 80  # a camera: enough for a start, and flow is only that
+UNCERTAINTY_LANDMARKS = 8  # landmarks of a camera that tell how uncertain all of them are
+COMPLETE_SHARE = 0.8  # of a camera's landmarks: fewer found may be the fault of where they were sought
+FLOW_POSE_TOLERANCE = 1e-3  # rad, mm: a start for the alignment need not be better
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class MatchedView:
     """What one camera last saw: its image, where landmarks (rows) stood in it, ideal pixels, and the pose then."""
 
     image: Image
@@ -58,18 +161,18 @@ class Matcher:
     """Finds the landmarks of one map; remembers what each camera last saw of them."""
 
     def __init__(
-        self, lenses: Lenses, surface_map: SurfaceMap, templates: Templates, keep_out: KeepOut | None = None
+        self, lenses: Lenses, surface_map: SurfaceMap, templates: Templates, masks: TrackingMasks | None = None
     ) -> None:
-        """keep_out: what is not to be tracked in the frame set that is looked at."""
+        """masks: what is not to be tracked in the frame set that is looked at."""
         self.lenses, self.rig = lenses, lenses.rig
         self.templates = templates
         self.map = surface_map
         self.agrees = np.ones(len(surface_map), bool)  # landmarks worth looking for
-        self._views: dict[int, View] = {}
+        self._views: dict[int, MatchedView] = {}
         self._gathered: tuple[NDArray[np.int64], Templates] | None = None
         self._order = spread_order(surface_map.points)
         self._inked = np.zeros(len(surface_map), bool)
-        self._keep_out = keep_out or KeepOut(lenses)
+        self._masks = masks or TrackingMasks(lenses)
 
     def take(self, surface_map: SurfaceMap, agrees: NDArray[np.bool_]) -> None:
         """A refined map, same rows, and which of them (N,) are worth looking for."""
@@ -97,7 +200,7 @@ class Matcher:
             c: replace(view, base_from_surface=view.base_from_surface @ old_from_new) for c, view in self._views.items()
         }
 
-    def seen(self, camera: int) -> int:
+    def last_count(self, camera: int) -> int:
         """How many landmarks a camera last saw."""
         return len(self._views[camera].rows) if camera in self._views else 0
 
@@ -108,29 +211,29 @@ class Matcher:
         where = project_into(self.lenses, cameras, poses, self.map.points[rows], self.map.normals[rows], axes)
         return dict(zip(cameras, where.visible.reshape(len(cameras), -1).sum(1).tolist(), strict=True))
 
-    def doubt(self, base_from_surface: Array, covariance: Array) -> float:
+    def image_sigma(self, base_from_surface: Array, covariance: Array) -> float:
         """How far off, px, one standard deviation, a pose with a covariance (6, 6) puts the landmarks in the images.
 
         The worst of a few landmarks, a camera each in turn; infinite where no camera knows the surface.
         """
-        ready = sorted(c for c in self._views if self.seen(c) >= 6)
+        ready = sorted(c for c in self._views if self.last_count(c) >= 6)
         if not ready:
             return np.inf
-        some = [self._views[c].rows[:: 1 + self.seen(c) // DOUBTED] for c in ready]
+        some = [self._views[c].rows[:: 1 + self.last_count(c) // UNCERTAINTY_LANDMARKS] for c in ready]
         camera = np.repeat(ready, [len(rows) for rows in some])
         jacobian = project(self.rig, camera, base_from_surface, self.map.points[np.concatenate(some)])[2]
         return float(np.sqrt(((jacobian @ covariance) * jacobian).sum(2).max()))
 
-    def complete(self, observations: Observations, cameras: Iterable[int]) -> bool:
+    def is_complete(self, observations: Observations, cameras: Iterable[int]) -> bool:
         """Whether each camera found most of what it last saw."""
         found = np.bincount(observations.camera, minlength=len(self.rig))
-        return all(found[c] >= MOST * self.seen(c) for c in cameras)
+        return all(found[c] >= COMPLETE_SHARE * self.last_count(c) for c in cameras)
 
     def flow(self, pyramids: dict[int, Pyramid], guess: Array) -> tuple[Array, dict[int, Array]]:
         """The joint pose by optical flow, and each camera's own: cameras are seldom exposed at the same instant."""
         points = self.map.points
-        ready = [c for c in pyramids if self.seen(c) >= 6]
-        found = side_by_side(lambda c: self._flow_one(c, pyramids[c][0], guess), ready)
+        ready = [c for c in pyramids if self.last_count(c) >= 6]
+        found = parallel_map(lambda c: self._flow_one(c, pyramids[c][0], guess), ready)
         moved = dict(zip(ready, found, strict=True))
         single = dict.fromkeys(pyramids, guess)
         if sum(len(rows) for rows, _ in moved.values()) < 6:
@@ -138,33 +241,27 @@ class Matcher:
         camera = np.concatenate([np.full(len(rows), c) for c, (rows, _) in moved.items()])
         rows = np.concatenate([rows for rows, _ in moved.values()])
         pixels = np.concatenate([pixels for _, pixels in moved.values()])
-        sigma = np.ones(len(rows))
-        fit = solve_pose(
-            self.rig, camera, points[rows], pixels, sigma, guess, scales=(8.0, 1.5), iterations=4, tolerance=ROUGH
-        )
+        tracks = PointTracks(camera, points[rows], pixels, np.ones(len(rows)))
+        fit = solve_pose(self.rig, tracks, guess, scales=(8.0, 1.5), iterations=4, tolerance=FLOW_POSE_TOLERANCE)
         good = fit.weights > 0.2
         for c in pyramids:
             mine = good & (camera == c)
             single[c] = fit.base_from_surface
             if mine.sum() >= 8 and fit.scale > 1.2:  # else the cameras agree within the flow's own error
-                where = rows[mine]
                 own = solve_pose(
                     self.rig,
-                    camera[mine],
-                    points[where],
-                    pixels[mine],
-                    sigma[mine],
+                    tracks.only(mine),
                     single[c],
-                    prior=LOOSE,
+                    prior=CAMERA_POSE_PRIOR,
                     iterations=2,
-                    tolerance=ROUGH,
+                    tolerance=FLOW_POSE_TOLERANCE,
                 )
                 single[c] = own.base_from_surface
         return fit.base_from_surface, single
 
     def _flow_one(self, camera: int, image: Image, guess: Array) -> tuple[NDArray[np.int64], Array]:
         view = self._views[camera]
-        some = slice(None, None, 1 + len(view.rows) // FLOW_TRACKS)
+        some = slice(None, None, 1 + len(view.rows) // MAX_FLOW_TRACKS)
         rows, ideal = view.rows[some], view.pixels[some]
         pixels, _ = self.lenses.image(camera, ideal, np.full(len(rows), np.inf))
         before = self._imaged(camera, view.base_from_surface, rows)
@@ -197,7 +294,7 @@ class Matcher:
         starts = np.stack([poses[c] for c in cameras])
         where = project_into(self.lenses, cameras, starts, surface_map.points[rows], surface_map.normals[rows], axes)
         centres = where.centre.reshape(len(cameras), -1, 2)
-        hidden = np.concatenate([self._keep_out.hides(c, at) for c, at in zip(cameras, centres, strict=True)])
+        hidden = np.concatenate([self._masks.hides(c, at) for c, at in zip(cameras, centres, strict=True)])
         visible = where.visible & ~hidden
         seen = np.nonzero(visible if most is None else self._some(visible, rows, most))[0]
         position, row = np.divmod(seen, len(rows))
@@ -239,4 +336,4 @@ class Matcher:
         """Keep what the cameras saw: images, the tracks that agreed (inlier, (N,)), the surface's pose (4, 4)."""
         for c, images in pyramids.items():
             mine = inlier & (observations.camera == c)
-            self._views[c] = View(images[0], observations.track[mine], observations.pixels[mine], pose)
+            self._views[c] = MatchedView(images[0], observations.track[mine], observations.pixels[mine], pose)

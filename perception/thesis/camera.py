@@ -1,19 +1,151 @@
-"""One camera's part: its region carried along from picture to picture, and how far that has moved by now."""
+"""One camera's part: its region tracked from picture to picture, that region's motion, and its Kalman filter."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import cv2
 import numpy as np
 
+from estimation.errors import InputError
 from estimation.rig import Camera
 from estimation.se3 import Array
 from perception.frames import Image
-from perception.thesis.displacement import displacement, turn
-from perception.thesis.kalman import velocity_at_rest, velocity_later, velocity_seen
-from perception.thesis.pairs import Finder
-from perception.thesis.region import corners_of, united
-from perception.thesis.view import FlatView
+from perception.lens import undistort
+from perception.matching.features import grey
+from perception.thesis.features import Finder, Pairs, corners_of, united
 
-LONGEST = 0.5  # s that a velocity is relied on without a measurement
+MIN_PAIRS = 4  # pairs that a homography takes
+MAX_REPROJECTION_PX = 3.0  # px, of RANSAC, Appendix A
+
+
+def displacement(pairs: Pairs) -> Array:
+    """The median move (2,) px, each image axis for itself: thesis 4.4 and `track` of Appendix A.
+
+    4.6 says "mean" of the shaking table's measurement; the median is what 4.4, the second experiment and the program
+    say, and the mean would follow a single wrong match.
+    """
+    return np.asarray(np.median(pairs.destination - pairs.source, axis=0))
+
+
+def turn(pairs: Pairs) -> float | None:
+    """The turn in the image, rad, from x towards y: about the camera's optical axis; None without a homography.
+
+    The arctangent of h21 / h11 of the homography H (thesis Eq. 4.19) by RANSAC. Eq. 4.20 writes H from the second
+    picture to the first; as in Appendix A it is that from the first to the second, so the turn is the surface's own.
+
+    Of Eq. 4.21-4.22, P_x = t_x / (1 - cos) and P_y = t_y / sin, no use is made: the point that a turn leaves in place
+    solves (I - R) P = t, which is another one, and turning about it while moving by the median as well (Eq. 5.4-5.7)
+    would count the same motion twice. The surface turns about its own middle instead, which the median moves.
+    """
+    if len(pairs) < MIN_PAIRS:
+        return None
+    homography, _ = cv2.findHomography(pairs.source, pairs.destination, cv2.RANSAC, MAX_REPROJECTION_PX)
+    if homography is None:
+        return None
+    return float(np.arctan2(homography[1, 0], homography[0, 0]))
+
+
+ACCELERATION_SIGMA = np.array(
+    [500.0, 500.0, 2.5]
+)  # px/s^2 and rad/s^2: 50 px/s, or 15 deg/s, within a tenth of a second
+MOVE_SIGMA = np.array([0.15, 0.15, 5e-3])  # px and rad, of one measured move: some twenty matches, each to half a px
+INITIAL_VELOCITY_SIGMA = np.array(
+    [300.0, 300.0, 1.5]
+)  # px/s and rad/s, of a surface just found: any that could be printed on
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GaussianState:
+    """A state (n,) as it is believed and its covariance (n, n): X and P of the thesis."""
+
+    mean: Array
+    covariance: Array
+
+
+def predict(belief: GaussianState, transition: Array, noise: Array) -> GaussianState:
+    """The state one step later, thesis Eq. 4.12-4.13. transition: A (n, n). noise: Q (n, n).
+
+    The term B U is left out: nothing that drives a wound is known.
+    """
+    return GaussianState(transition @ belief.mean, transition @ belief.covariance @ transition.T + noise)
+
+
+def update(belief: GaussianState, measured: Array, observation: Array, noise: Array) -> GaussianState:
+    """The state after a measurement (m,), thesis Eq. 4.14-4.18. observation: H (m, n). noise: R (m, m)."""
+    residual = measured - observation @ belief.mean  # Eq. 4.14
+    spread = observation @ belief.covariance @ observation.T + noise  # Eq. 4.15
+    gain = np.linalg.solve(spread, observation @ belief.covariance).T  # Eq. 4.16; S and P are symmetric
+    return GaussianState(belief.mean + gain @ residual, belief.covariance - gain @ spread @ gain.T)  # Eq. 4.17, 4.18
+
+
+def initial_velocity() -> GaussianState:
+    """What is believed of the image velocity (3,), px/s, px/s, rad/s, of a surface just found."""
+    return GaussianState(np.zeros(3), np.diag(INITIAL_VELOCITY_SIGMA**2))
+
+
+def predict_velocity(belief: GaussianState, dt: float) -> GaussianState:
+    """The velocity `dt` s later: the same, less surely."""
+    return predict(belief, np.eye(3), np.diag((ACCELERATION_SIGMA * dt) ** 2))
+
+
+def update_velocity(belief: GaussianState, move: Array, dt: float) -> GaussianState:
+    """The velocity after a move (3,) px, px, rad was measured over `dt` s.
+
+    Thesis 4.4: the median displacement gives the velocity between the frames, which is the filter's observation and
+    corrects its predictions. The thesis gives no matrices; here H = I, and R is that of a move divided by its time.
+    """
+    return update(predict_velocity(belief, dt), move / dt, np.eye(3), np.diag((MOVE_SIGMA / dt) ** 2))
+
+
+class FlatView:
+    """One camera's undistorted view: getOptimalNewCameraMatrix with alpha = 1, which retains all pixels, thesis 4.2.
+
+    camera: what the pictures are of. matrix: (3, 3) px, the view's own. The maps are worked out once; OpenCV's
+    undistort(), which the thesis calls, makes the same ones again for each picture.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        found, _ = cv2.getOptimalNewCameraMatrix(camera.matrix, camera.distortion, camera.size, 1)
+        self.matrix = np.asarray(found, np.float64)
+        self._maps = cv2.initUndistortRectifyMap(
+            camera.matrix, camera.distortion, np.eye(3), self.matrix, camera.size, cv2.CV_16SC2
+        )
+
+    def flatten(self, image: Image) -> Image:
+        """The whole picture, grey (H, W), as the view shows it; InputError where it is not of the camera's size."""
+        (h, w), size = image.shape[:2], self.camera.size
+        if (w, h) != size:
+            raise InputError(f"camera {self.camera.name}", "image size", f"{w} x {h}", "{} x {} px".format(*size))
+        return np.asarray(cv2.remap(grey(image), *self._maps, cv2.INTER_LINEAR), np.uint8)
+
+    def pixels(self, imaged: Array) -> Array:
+        """The view's pixels (N, 2) of pixels as the lens images them (N, 2)."""
+        return self._between(self.camera.matrix, self.matrix, undistort(self.camera, imaged))
+
+    def ideal(self, pixels: Array) -> Array:
+        """Undistorted pixels (N, 2) of the camera's own matrix from the view's (N, 2)."""
+        return self._between(self.matrix, self.camera.matrix, pixels)
+
+    @staticmethod
+    def _between(old: Array, new: Array, pixels: Array) -> Array:
+        x = (pixels - old[:2, 2]) / old[[0, 1], [0, 1]]
+        return np.asarray(x * new[[0, 1], [0, 1]] + new[:2, 2])
+
+    def scale(self, point_base: Array) -> Array:
+        """mm per px (2,), along the image's x and y, at the depth of a point (3,) mm, base frame.
+
+        Thesis 4.2 divides the known size of a chessboard's squares by their size in pixels, the board held where the
+        surface is; of a calibrated camera that is depth over focal length. One factor an axis instead of one a camera:
+        the view's pixels are not square where alpha = 1 stretches them. As in the thesis it stays what it was at the
+        start, however the depth changes.
+        """
+        depth = (self.camera.base_from_camera[:3, :3].T @ (point_base - self.camera.base_from_camera[:3, 3]))[2]
+        return np.asarray(depth / self.matrix[[0, 1], [0, 1]])
+
+
+MAX_COAST_S = 0.5  # s that a velocity is relied on without a measurement
 
 
 class CameraTrack:
@@ -40,7 +172,7 @@ class CameraTrack:
         self._corners = corners_of(self.view.pixels(np.clip(polygon, 0, np.array(size) - 1.0)), size)
         found = self._finder.begin(self.view.flatten(image), united(self._corners, self._corners, size))
         self._seen, self._sum = stamp, np.zeros(3)
-        self._velocity = velocity_at_rest()
+        self._velocity = initial_velocity()
         self.motion, self.covariance, self.measured = self._sum, np.zeros((3, 3)), True
         self.velocity = self._velocity
         self.pixels = self.view.ideal(found)
@@ -48,8 +180,8 @@ class CameraTrack:
     def __call__(self, stamp: float, image: Image | None) -> None:
         """The next picture, at `stamp`, s; None where this camera has none."""
         dt = stamp - self._seen
-        coasted = velocity_later(self._velocity, dt)
-        ahead = min(dt, LONGEST)
+        coasted = predict_velocity(self._velocity, dt)
+        ahead = min(dt, MAX_COAST_S)
         move = None if image is None else self._move(image, coasted.mean * ahead)
         self.measured = move is not None
         if move is None:
@@ -57,7 +189,7 @@ class CameraTrack:
             self.covariance = coasted.covariance * ahead**2
             self.velocity, self.pixels = coasted, np.zeros((0, 2))
             return
-        self.velocity = self._velocity = velocity_seen(self._velocity, move, dt)
+        self.velocity = self._velocity = update_velocity(self._velocity, move, dt)
         self._seen, self._sum = stamp, self._sum + move
         self.motion, self.covariance = self._sum, np.zeros((3, 3))
 

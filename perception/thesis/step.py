@@ -1,8 +1,8 @@
-"""ThesisStep: one frame set in, one surface pose out, by the thesis's estimator; answers like TrackingStep."""
+"""ThesisStep: one frame set in, one surface pose out, by the thesis's estimator; it answers like TrackingStep."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 
 import numpy as np
@@ -14,15 +14,70 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from perception.frames import FrameSet, Image, Roi
 from perception.lens import undistort
-from perception.thesis.axes import assign_axes, unmeasured
-from perception.thesis.camera import LONGEST, CameraTrack
-from perception.thesis.features import KeyPoints
-from perception.thesis.pairs import Finder
-from perception.tracking.step import STAGES, StepReport, trusting_report
+from perception.thesis.camera import MAX_COAST_S, CameraTrack
+from perception.thesis.features import Finder, KeyPoints
+from perception.tracking.step import STAGES, StepReport, report_without_offsets
 
-LEAST_VARIANCE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: what is taken for none, with an inverse all the same
-OUTWARD = np.diag([1.0, -1.0, -1.0])  # the top camera from the surface: z out of it, to the camera
-PIXEL = 1.0  # px, told of each feature's place: the thesis states none
+MIN_AXIS_SHARE = np.cos(np.pi / 4)  # a camera measures along or about what it sees more of than it misses
+
+
+def assign_axes(rotations: Mapping[int, Array]) -> dict[int, Array]:
+    """What each camera's motion in its image is taken for, (6, 3) by camera number.
+
+    rotations: base_from_camera (3, 3) of each camera that sees the surface, the top one first. A row set (6, 3) makes
+    of (mm along image x, mm along image y, rad from x towards y) a turn, rad, and a move, mm, [rx ry rz tx ty tz] in
+    base axes; what a rig moved is the sum over its cameras. A camera that measures nothing is left out.
+
+    The world's axes are the cameras' own (thesis 4.2). The first camera is the top one and measures both moves in its
+    image and the turn about its optical axis z. The bottom one is that which stands across it most nearly, 84 degrees
+    in the thesis; its image's direction nearest to z, the image's y there, measures the move along z, and it measures
+    the turn about the axis h that it looks along, taken as square to z. The side camera measures the turn about the
+    third axis, cross(z, h).
+
+    4.2, 4.6 and Appendix A assign the axes differently. The program's assignment is taken (X, Y and a turn from the
+    top, Z and a turn from the bottom camera), which agrees with 4.2; 4.6 gives Y to the bottom camera, and names the
+    turn about X twice. The side camera of 4.6 turns for cross(z, h) only where it looks along that more than across:
+    at 36 degrees between the two others it does not see that turn at all, but four fifths of the one about z, which
+    would be counted again. Then, as in the program, no camera measures it, and it is taken for none.
+    """
+    top, *others = rotations
+    z = rotations[top][:, 2]
+    shares = {top: _share(z, rotations[top][:, :2])}
+    bottom = min(others, key=lambda c: abs(float(rotations[c][:, 2] @ z)), default=None)
+    if bottom is None or abs(float(rotations[bottom][:, 2] @ z)) > MIN_AXIS_SHARE:
+        return shares
+    h = _unit(rotations[bottom][:, 2] - (rotations[bottom][:, 2] @ z) * z)
+    up = _unit(rotations[bottom][:, :2].T @ z)  # (2,) in the bottom camera's image
+    shares[bottom] = _share(h, np.outer(z, up))
+    third = np.cross(z, h)
+    seen = {c: float(rotations[c][:, 2] @ third) for c in others if c != bottom}
+    side = max(seen, key=lambda c: abs(seen[c]), default=None)
+    if side is not None and abs(seen[side]) >= MIN_AXIS_SHARE:
+        shares[side] = _share(np.sign(seen[side]) * third, np.zeros((3, 2)))
+    return shares
+
+
+def _share(axis: Array, moves: Array) -> Array:
+    """(6, 3) of the axis (3,) that is turned about and what the image's two axes move along (3, 2)."""
+    share = np.zeros((6, 3))
+    share[:3, 2], share[3:, :2] = axis, moves
+    return share
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def unmeasured(shares: Mapping[int, Array]) -> str:
+    """What no camera measures, in words; '' if nothing."""
+    if len(shares) == 1:
+        return "no camera stands across the first one: moves along its view, and two turns, are not measured"
+    return "" if len(shares) == 3 else "no camera looks along the third axis: turns about it are not measured"
+
+
+MIN_COVARIANCE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: what is taken for none, with an inverse all the same
+CAMERA_FROM_SURFACE_AXES = np.diag([1.0, -1.0, -1.0])  # the top camera from the surface: z out of it, to the camera
+FEATURE_SIGMA_PX = 1.0  # px, told of each feature's place: the thesis states none
 
 
 class ThesisStep:
@@ -63,7 +118,9 @@ class ThesisStep:
         self._spent, start = np.zeros(len(STAGES)), self._clock()
         last = self._pose
         if last is not None and frames.stamp <= last.stamp:  # the same instant again tells nothing new
-            self.last = trusting_report(no_observations(frames.stamp), np.zeros(len(self.rig), np.int64), self._spent)
+            self.last = report_without_offsets(
+                no_observations(frames.stamp), np.zeros(len(self.rig), np.int64), self._spent
+            )
             return last
         images = {f.camera: f.image for f in frames.frames}
         pose = self._begin(frames, images) if last is None else self._follow(last, frames.stamp, images)
@@ -71,7 +128,7 @@ class ThesisStep:
         used = np.zeros(len(self.rig), np.int64)
         for camera, track in self._tracks.items():
             used[camera] = len(track.pixels)
-        self.last = trusting_report(self._observations(frames.stamp), used, self._spent)
+        self.last = report_without_offsets(self._observations(frames.stamp), used, self._spent)
         return pose
 
     def idle(self) -> None:
@@ -98,7 +155,7 @@ class ThesisStep:
         self._shares = {c: share * np.append(scales[c], 1.0) for c, share in shares.items()}
         for camera, track in self._tracks.items():
             track.begin(frames.stamp, images[camera], polygons[camera])
-        towards = rotations[next(iter(rotations))] @ OUTWARD
+        towards = rotations[next(iter(rotations))] @ CAMERA_FROM_SURFACE_AXES
         return self._taken(frames.stamp, se3.make(towards, middle))
 
     def _polygons(self) -> dict[int, Array]:
@@ -127,7 +184,6 @@ class ThesisStep:
     # -- every frame set after it
 
     def _follow(self, last: SurfacePose, stamp: float, images: dict[int, Image]) -> SurfacePose:
-        """Each camera's motion, and the pose moved and turned by what that is beyond the last."""
         list(self._each(lambda c: self._tracks[c](stamp, images.get(c)), self._tracks))
         moved = np.sum([share @ self._tracks[c].motion for c, share in self._shares.items()], axis=0)
         more, self._moved = moved - self._moved, moved
@@ -146,7 +202,7 @@ class ThesisStep:
             twist += own @ track.velocity.mean
             spread += own @ track.velocity.covariance @ own.T
         self._pose = SurfacePose(
-            stamp, base_from_surface, covariance + LEAST_VARIANCE, twist, state, spread, reason=reason
+            stamp, base_from_surface, covariance + MIN_COVARIANCE, twist, state, spread, reason=reason
         )
         return self._pose
 
@@ -158,7 +214,7 @@ class ThesisStep:
             reasons = ([f"{' and '.join(names)} not measured"] if names else []) + ([lacking] if lacking else [])
             whole = not names and len(self._tracks) > 1
             return TrackState.TRACKING if whole else TrackState.DEGRADED, "; ".join(reasons)
-        lost = stamp - self._seen > LONGEST
+        lost = stamp - self._seen > MAX_COAST_S
         return TrackState.LOST if lost else TrackState.COASTING, "no camera found its features again"
 
     def _observations(self, stamp: float) -> Observations:
@@ -168,4 +224,4 @@ class ThesisStep:
             return no_observations(stamp)
         camera = np.repeat(list(self._tracks), [len(p) for p in pixels])
         number = np.concatenate([np.arange(len(p)) for p in pixels])
-        return Observations(stamp, camera, number, np.concatenate(pixels), np.full(len(camera), PIXEL))
+        return Observations(stamp, camera, number, np.concatenate(pixels), np.full(len(camera), FEATURE_SIGMA_PX))

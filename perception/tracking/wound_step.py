@@ -1,28 +1,132 @@
-"""A tracking step that asks first where the wound is, where nobody has said so."""
+"""The wound over time in each camera, segmented beside the tracker, and a tracking step that begins where it lies."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass
 
 import numpy as np
 
+from estimation.mapping.refiner import DelayedJob
 from estimation.observations import no_observations
 from estimation.pose import SurfacePose, identity_pose
 from estimation.rig import Rig
+from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from perception.frames import FrameSet, Roi
-from perception.tracking.step import STAGES, StepReport, TrackingStep, trusting_report
-from perception.wound.segmentation import Segmenter
-from perception.wound_beside import WoundBeside
-from perception.wound_region import polygon, region
-from perception.wound_watch import Sight
+from perception.frames import FrameSet, Image, Roi
+from perception.tracking.step import STAGES, StepReport, TrackingStep, report_without_offsets
+from perception.wound.segmentation import (
+    Box,
+    Segmentation,
+    Segmenter,
+    WoundMask,
+    box_of,
+    centroid,
+    largest_part,
+    polygon,
+    region,
+)
 
-LOOKS = 2  # at all cameras, without a wound in two of them, before the whole pictures are taken for the surface
-AROUND = 0.6  # of the wound's box on every side: the skin beside it moves with it, and has more to track
+SAME_WOUND_OVERLAP = 0.3  # intersection over union of two boxes: a wound moves little between looks
+MAX_MISSED_LOOKS = 3  # looks without it, after which a wound is no longer believed in
 
 
-class WoundFirst:
+@dataclass(frozen=True, slots=True, eq=False)
+class WoundEstimate:
+    """One camera's wound, filtered over time."""
+
+    mask: WoundMask  # (H, W) bool, of its largest part, as last seen
+    box: Box | None  # round the mask; None: no wound
+    roi: Box  # where to look for it now
+    centroid: Array  # (2,) px
+    confidence: float  # of the last look
+    missed: int  # looks since it was seen
+
+
+class WoundFilter:
+    """Remembers where one camera saw the wound."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        """size: (W, H) px of the camera's images."""
+        self._size = size
+        self._mask: WoundMask = np.zeros(size[::-1], bool)
+        self._box: Box | None = None
+        self._elsewhere: Box | None = None  # where another place was seen once
+        self._missed = 0
+
+    def take(self, seen: Segmentation) -> WoundEstimate:
+        """Add one look. A wound that jumps is believed at the second look that shows it there; one that is not seen
+        stays for a few looks; the region holds both where it is and where it was (thesis Fig. 3.4)."""
+        before = self._box
+        mask = largest_part(seen.mask)
+        box = box_of(mask)
+        if box is None or not self._believed(box):
+            self._missed += 1
+            if self._missed > MAX_MISSED_LOOKS:
+                self._box, self._mask = None, np.zeros_like(self._mask)
+        else:
+            self._box, self._mask, self._missed = box, mask, 0
+        self._elsewhere = box
+        roi = region(self._box, before, self._size) if not self._missed else region(None, before, self._size)
+        return WoundEstimate(self._mask, self._box, roi, centroid(self._mask), seen.confidence, self._missed)
+
+    def _believed(self, box: Box) -> bool:
+        if self._box is None:
+            return True
+        return overlap(box, self._box) > SAME_WOUND_OVERLAP or (
+            self._elsewhere is not None and overlap(box, self._elsewhere) > SAME_WOUND_OVERLAP
+        )
+
+
+def overlap(a: Box, b: Box) -> float:
+    """Area of two boxes' intersection over that of their union."""
+    width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
+    both = max(0, width) * max(0, height)
+    return both / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - both)
+
+
+SEGMENTATION_DELAY_SETS = 3  # until a result counts: three cameras take 60 ms of one core, a set comes every 33 ms
+
+
+class AsyncSegmentation:
+    """Looks for the wound at its own pace.
+
+    A result counts a fixed number of frame sets after its pictures, however soon it was ready: a recording gives the
+    same every time. Pictures that come while a job is under way are let go; the next job takes the newest.
+    """
+
+    def __init__(
+        self, rig: Rig, segmenter: Segmenter, executor: Executor | None = None, delay: int = SEGMENTATION_DELAY_SETS
+    ) -> None:
+        """executor: one thread (onnxruntime lets go of the interpreter); without one the work is done when due."""
+        self._segmenter, self._delay = segmenter, delay
+        self._watches = [WoundFilter(camera.size) for camera in rig.cameras]
+        self._job: DelayedJob[dict[int, Segmentation]] = DelayedJob(executor, delay)
+        self._stamp = float("nan")
+
+    def __call__(self, frames: FrameSet) -> tuple[float, dict[int, WoundEstimate]] | None:
+        """Once a frame set: what is due, as the stamp of the pictures and what each camera sees; None: nothing is."""
+        found = self._job.poll()
+        due = None
+        if found is not None:
+            due = self._stamp, {camera: self._watches[camera].take(seen) for camera, seen in found.items()}
+        if not self._job.busy and frames.frames:
+            self._stamp = frames.stamp
+            self._job.submit(segment_all, self._segmenter, {f.camera: f.image for f in frames.frames})
+        return due
+
+
+def segment_all(segmenter: Segmenter, images: Mapping[int, Image]) -> dict[int, Segmentation]:
+    """Each camera's picture, segmented one after another."""
+    return {camera: segmenter(image) for camera, image in images.items()}
+
+
+MAX_EMPTY_LOOKS = 2  # without a wound in two cameras; then the whole pictures are taken for the surface
+SKIN_MARGIN_SHARE = 0.6  # of the wound's box on every side: the skin beside it moves with it, and has more to track
+
+
+class WoundTrackingStep:
     """TrackingStep on the region where a segmenter sees the wound; on whole pictures where it sees none."""
 
     last: StepReport
@@ -30,22 +134,22 @@ class WoundFirst:
     def __init__(
         self,
         rig: Rig,
-        made: Callable[[Sequence[Roi]], TrackingStep],
+        make_step: Callable[[Sequence[Roi]], TrackingStep],
         segmenter: Segmenter,
         executor: Executor | None = None,
     ) -> None:
-        """made: the step for a region, or for none. executor: one thread, as `WoundBeside` takes it."""
-        self._rig, self._made = rig, made
-        self._beside: WoundBeside | None = WoundBeside(rig, segmenter, executor)
+        """make_step: the step for a region, or for none. executor: one thread, as `AsyncSegmentation` takes it."""
+        self._rig, self._make_step = rig, make_step
+        self._segmentation: AsyncSegmentation | None = AsyncSegmentation(rig, segmenter, executor)
         self._step: TrackingStep | None = None
         self._looks = 0
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
         """The pose at `frames.stamp`; INITIALISING while the wound is looked for."""
         if self._step is None:
-            self._step = self._found(frames)
+            self._step = self._start(frames)
         if self._step is None:
-            self.last = trusting_report(
+            self.last = report_without_offsets(
                 no_observations(frames.stamp), np.zeros(len(self._rig), np.int64), np.zeros(len(STAGES))
             )
             return identity_pose(frames.stamp, "the wound is being looked for")
@@ -68,26 +172,26 @@ class WoundFirst:
         if self._step is not None:
             self._step.idle()
 
-    def _found(self, frames: FrameSet) -> TrackingStep | None:
-        assert self._beside is not None
-        due = self._beside(frames)
+    def _start(self, frames: FrameSet) -> TrackingStep | None:
+        assert self._segmentation is not None
+        due = self._segmentation(frames)
         if due is None:
             return None
         self._looks += 1
         stamp, sights = due
         rois = self._rois(stamp, sights)
         if len([s for s in sights.values() if s.box is not None]) < 2:
-            if self._looks < LOOKS:
+            if self._looks < MAX_EMPTY_LOOKS:
                 return None
             rois = ()
-        self._beside = None
-        return self._made(rois)
+        self._segmentation = None
+        return self._make_step(rois)
 
-    def _rois(self, stamp: float, sights: dict[int, Sight]) -> tuple[Roi, ...]:
+    def _rois(self, stamp: float, sights: dict[int, WoundEstimate]) -> tuple[Roi, ...]:
         """Round each camera's wound; the whole picture of a camera that sees none."""
         found = []
         for camera, sight in sights.items():
             size = self._rig.cameras[camera].size
             side = 0 if sight.box is None else max(sight.box[2] - sight.box[0], sight.box[3] - sight.box[1])
-            found.append(Roi(camera, stamp, polygon(region(sight.box, None, size, AROUND * side))))
+            found.append(Roi(camera, stamp, polygon(region(sight.box, None, size, SKIN_MARGIN_SHARE * side))))
         return tuple(found)

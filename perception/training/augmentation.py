@@ -1,4 +1,6 @@
-"""One training sample from one labelled picture: where it is looked at, what covers it, and under what light."""
+"""One training sample from one labelled picture: the view, what covers the wound, and the light."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 
@@ -7,12 +9,121 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.training.dataset import Labelled
-from perception.training.light import relit
-from perception.training.occluders import covered
+
+
+def relight(picture: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB as another camera might have taken it."""
+    seen = np.asarray(_shaded(_coloured(picture, rng), rng))
+    if rng.random() < 0.2:
+        seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), rng.uniform(0.4, 1.6)), np.float32)
+    if rng.random() < 0.25:
+        seen = seen + rng.normal(0, rng.uniform(2, 10), seen.shape).astype(np.float32)
+    exposed = np.clip(seen, 0, 255).astype(np.uint8)
+    return _compressed(exposed, int(rng.integers(25, 80))) if rng.random() < 0.1 else exposed
+
+
+def _coloured(picture: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.float32]:
+    """White balance, gamma, brightness, saturation and a small turn of the hue; now and then no colour at all."""
+    levels = np.arange(256, dtype=np.float32) / 255
+    gamma, gain = np.exp(rng.normal(0, 0.25)), np.exp(rng.normal(0, 0.15))
+    balance = np.exp(rng.normal(0, 0.08, 3))
+    tables = np.clip(255 * gain * balance[None] * levels[:, None] ** gamma, 0, 255).astype(np.uint8)
+    seen = cv2.LUT(picture, np.ascontiguousarray(tables[None]))
+    if rng.random() < 0.3:
+        turned = cv2.cvtColor(seen, cv2.COLOR_RGB2HSV)
+        turned[..., 0] = (turned[..., 0].astype(np.int16) + int(rng.integers(-7, 8))) % 180
+        seen = cv2.cvtColor(turned, cv2.COLOR_HSV2RGB)
+    saturation = 0.0 if rng.random() < 0.04 else rng.uniform(0.5, 1.4)
+    grey = cv2.cvtColor(seen, cv2.COLOR_RGB2GRAY).astype(np.float32)[..., None]
+    return np.asarray(grey + np.float32(saturation) * (seen - grey), np.float32)
+
+
+def _shaded(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Light that falls off to one side, a third of the time."""
+    if rng.random() > 0.33:
+        return picture
+    height, width = picture.shape[:2]
+    across, down = rng.normal(0, 0.25, 2)
+    slope = 1 + down * np.linspace(-1, 1, height)[:, None] + across * np.linspace(-1, 1, width)[None]
+    return picture * np.clip(slope, 0.2, 2).astype(np.float32)[..., None]
+
+
+def _compressed(picture: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    written, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert written
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+
+
+def cover_sample(
+    picture: NDArray[np.uint8], wound: NDArray[np.uint8], texture: NDArray[np.uint8], rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """One to three shapes drawn over the picture (H, W, 3); what they hide is no longer wound (H, W)."""
+    picture, wound = picture.copy(), wound.copy()
+    for _ in range(int(rng.integers(1, 4)) if rng.random() < 0.4 else 1):
+        shape = _shape(wound, rng)
+        edge = cv2.GaussianBlur(shape, (0, 0), rng.uniform(0.4, 1.2))
+        opaque = edge[..., None].astype(np.float32) / 255
+        picture = (picture + opaque * (_surface(picture.shape[0], texture, rng) - picture)).astype(np.uint8)
+        wound[shape > 127] = 0
+    return picture, wound
+
+
+def _shape(wound: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """(H, W) 0/255: a bar, an ellipse, a polygon, or everything beyond a line through the wound."""
+    side = wound.shape[0]
+    drawn = np.zeros((side, side), np.uint8)
+    rows, columns = np.nonzero(wound > 127)
+    place = rng.uniform(0, side, 2)
+    if len(rows) and rng.random() < 0.8:
+        chosen = rng.integers(len(rows))
+        place = np.array([columns[chosen], rows[chosen]], np.float64)
+    angle = rng.uniform(0, 2 * np.pi)
+    along = np.array([np.cos(angle), np.sin(angle)])
+    kind = rng.integers(4)
+    if kind == 0:
+        _fill(drawn, place + _rectangle(along, rng.uniform(0.3, 1.6) * side, rng.uniform(0.03, 0.2) * side, shift=True))
+    elif kind == 1:
+        axes = (int(rng.uniform(0.05, 0.3) * side), int(rng.uniform(0.05, 0.3) * side))
+        cv2.ellipse(drawn, (int(place[0]), int(place[1])), axes, np.degrees(angle), 0, 360, 255, -1)
+    elif kind == 2:
+        turns = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 8))))
+        radius = rng.uniform(0.06, 0.35, len(turns)) * side
+        _fill(drawn, place + radius[:, None] * np.column_stack([np.cos(turns), np.sin(turns)]))
+    else:
+        depth = rng.uniform(0.1, 1.0) * side
+        _fill(
+            drawn, place + along[None] * depth / 2 + _rectangle(along, depth, rng.uniform(0.3, 2) * side, shift=False)
+        )
+    return drawn
+
+
+def _rectangle(along: NDArray[np.float64], length: float, width: float, shift: bool) -> NDArray[np.float64]:
+    """(4, 2) corners round the origin, or with one short side there."""
+    across = np.array([-along[1], along[0]])
+    ends = np.array([[0, -1], [1, -1], [1, 1], [0, 1]] if shift else [[-0.5, -1], [0.5, -1], [0.5, 1], [-0.5, 1]])
+    return ends[:, :1] * length * along + ends[:, 1:] * width / 2 * across
+
+
+def _fill(drawn: NDArray[np.uint8], corners: NDArray[np.float64]) -> None:
+    cv2.fillPoly(drawn, [np.round(corners).astype(np.int32)], 255)
+
+
+def _surface(side: int, texture: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.float32]:
+    """(side, side, 3) what the thing looks like: one colour under a slope of light, or cut from another picture."""
+    if rng.random() < 0.3 and min(texture.shape[:2]) > 32:
+        length = int(rng.integers(24, min(texture.shape[:2])))
+        top, left = (int(rng.integers(0, full - length + 1)) for full in texture.shape[:2])
+        cut = texture[top : top + length, left : left + length]
+        return cv2.resize(cut, (side, side), interpolation=cv2.INTER_LINEAR).astype(np.float32)
+    grey = rng.uniform(0, 255)
+    colour = np.full(3, grey) if rng.random() < 0.6 else rng.uniform(0, 255, 3)
+    slope = np.linspace(-1, 1, side)[:, None] * rng.normal(0, 25) + np.linspace(-1, 1, side)[None] * rng.normal(0, 25)
+    grain = rng.normal(0, rng.uniform(0, 8), (side, side))
+    return np.clip(colour + (slope + grain)[..., None], 0, 255).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
-class Pyramid:
+class SamplePyramid:
     """A picture (H, W, 3) uint8 RGB and its wound (H, W) uint8 0/255 at full, half and quarter size, and the box
     [top, left, bottom, right] round the wound at full size (None: no wound)."""
 
@@ -35,7 +146,7 @@ class Augmentation:
     cover: float = 0.42  # share of samples with something in front
 
 
-def pyramid(labelled: Labelled) -> Pyramid:
+def sample_pyramid(labelled: Labelled) -> SamplePyramid:
     """The picture at three sizes: shrinking by more than half in one warp would alias."""
     pictures, wounds = [labelled.picture], [labelled.wound.astype(np.uint8) * np.uint8(255)]
     for _ in range(2):
@@ -43,18 +154,18 @@ def pyramid(labelled: Labelled) -> Pyramid:
         size = (max(1, width // 2), max(1, height // 2))
         for planes in (pictures, wounds):
             planes.append(np.asarray(cv2.resize(planes[-1], size, interpolation=cv2.INTER_AREA), np.uint8))
-    return Pyramid(tuple(pictures), tuple(wounds), _box(labelled.wound))
+    return SamplePyramid(tuple(pictures), tuple(wounds), _box(labelled.wound))
 
 
-def sample(
-    source: Pyramid, other: Pyramid, how: Augmentation, rng: np.random.Generator
+def draw_sample(
+    source: SamplePyramid, other: SamplePyramid, how: Augmentation, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Picture (side, side, 3) RGB and wound (side, side) 0..255; `other` lends its texture to what covers."""
-    scale, centre = _look(source, how, rng)
+    scale, centre = _draw_view(source, how, rng)
     picture, wound = _warped(source, scale, centre, how, rng)
     if rng.random() < how.cover:
-        picture, wound = covered(picture, wound, other.pictures[1], rng)
-    return relit(picture, rng), wound
+        picture, wound = cover_sample(picture, wound, other.pictures[1], rng)
+    return relight(picture, rng), wound
 
 
 def _box(wound: NDArray[np.bool_]) -> NDArray[np.float64] | None:
@@ -62,7 +173,7 @@ def _box(wound: NDArray[np.bool_]) -> NDArray[np.float64] | None:
     return np.array([rows[0], columns[0], rows[-1] + 1, columns[-1] + 1], np.float64) if len(rows) else None
 
 
-def _look(source: Pyramid, how: Augmentation, rng: np.random.Generator) -> tuple[float, NDArray[np.float64]]:
+def _draw_view(source: SamplePyramid, how: Augmentation, rng: np.random.Generator) -> tuple[float, NDArray[np.float64]]:
     """Scale and centre (row, column) of one look at the picture."""
     size = np.array(source.pictures[0].shape[:2], np.float64)
     kind = rng.random()
@@ -85,7 +196,7 @@ def _middle(box: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _warped(
-    source: Pyramid, scale: float, centre: NDArray[np.float64], how: Augmentation, rng: np.random.Generator
+    source: SamplePyramid, scale: float, centre: NDArray[np.float64], how: Augmentation, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """The look, turned by any angle, mirrored half the time, stretched and sheared a little."""
     level = int(np.clip(np.floor(-np.log2(scale)), 0, 2))

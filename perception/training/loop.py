@@ -1,19 +1,44 @@
-"""The training loop: seeded, resumable after every round, the same steps on every machine of one kind."""
+"""The networks, their losses, and the training loop: seeded, and resumable after every round."""
+
+from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
-from perception.coarse_to_fine import Looks, wound_logits
-from perception.dice import dice
-from perception.training.augmentation import Augmentation, Pyramid, sample
+from perception.training.augmentation import Augmentation, SamplePyramid, draw_sample
 from perception.training.dataset import Labelled
-from perception.training.losses import thesis_loss, wound_loss
+from perception.wound.network import Looks, wound_logits
+from perception.wound.segmentation import dice
+
+# Pixels added above and below the soft Dice, which keep it defined for a sample without a wound; about the area of
+# the smallest wound in a sample.
+DICE_SMOOTHING = 20.0
+
+
+def wound_loss(logits: Tensor, wound: Tensor) -> Tensor:
+    """Binary cross-entropy plus one minus the soft Dice of every picture by itself, (N, 1, H, W) each.
+
+    Dice is taken per picture because that is what is judged: over a batch, the large wounds would decide.
+    """
+    probability = torch.sigmoid(logits)
+    both = (probability * wound).sum((1, 2, 3))
+    total = probability.sum((1, 2, 3)) + wound.sum((1, 2, 3))
+    dice = (2 * both + DICE_SMOOTHING) / (total + DICE_SMOOTHING)
+    return functional.binary_cross_entropy_with_logits(logits, wound) + (1 - dice).mean()
+
+
+def thesis_loss(logits: Tensor, wound: Tensor) -> Tensor:
+    """Binary cross-entropy alone, as in thesis 3.3."""
+    return functional.binary_cross_entropy_with_logits(logits, wound)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +76,7 @@ class Recipe:
 
 # What thesis 3.3 did, on the same pictures: grey ones of 128 px seen whole, binary cross-entropy. Half of the samples
 # are seen nearer: from whole pictures alone, with wounds of ten pixels, its network learned little but their share.
-THESIS = Recipe(
+THESIS_RECIPE = Recipe(
     Augmentation(side=128, long_side=128.0, whole=0.35, away=0.1, cover=0.0), thesis_loss, Looks(128, window=0)
 )
 # About an hour of one core; of so few steps, weights averaged over a thousand would hold the first ones.
@@ -70,7 +95,7 @@ class Curve:
 class Source:
     """Pictures to draw samples from, and how often each is drawn relative to the others (N,)."""
 
-    pyramids: Sequence[Pyramid]
+    pyramids: Sequence[SamplePyramid]
     weights: NDArray[np.float64]
 
 
@@ -189,8 +214,139 @@ def _step(
 def _batch(source: Source, count: int, augmentation: Augmentation, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """(N, 3, side, side) pictures and (N, 1, side, side) wounds, both 0..1."""
     drawn = rng.choice(len(source.pyramids), (2, count), p=source.weights / source.weights.sum())
-    samples = [sample(source.pyramids[a], source.pyramids[b], augmentation, rng) for a, b in drawn.T]
+    samples = [draw_sample(source.pyramids[a], source.pyramids[b], augmentation, rng) for a, b in drawn.T]
     pictures = torch.from_numpy(np.stack([picture for picture, _ in samples]))
     wounds = torch.from_numpy(np.stack([wound for _, wound in samples]))
     # NHWC bytes seen as NCHW are what "channels last" means: no copy in between
     return pictures.permute(0, 3, 1, 2).float() / 255, wounds[:, None].float() / 255
+
+
+def draw_curves(file: Path, curve: Curve, steps: int) -> None:
+    """A PNG: loss above, mean Dice on the pictures kept for choosing below, over steps (`steps` a round)."""
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    at = [steps * (number + 1) for number in range(len(curve.loss))]
+    above.plot(at, curve.loss)
+    above.set_ylabel("loss of the samples")
+    below.plot(at, curve.dice)
+    below.set_ylabel("mean Dice, averaged weights")
+    below.set_xlabel("steps")
+    below.set_ylim(0, 1)
+    for axes in (above, below):
+        axes.grid(alpha=0.3)
+    figure.savefig(file, dpi=110)
+
+
+def _convolution(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+    layer = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
+    return nn.Sequential(layer, nn.BatchNorm2d(outputs))
+
+
+class ResidualBlock(nn.Module):
+    """Residual block of two 3x3 convolutions (He et al., CVPR 2016). Depth-wise blocks of the same accuracy class
+    have a third fewer multiplications but take 1.3 times as long to train on a CPU, where they wait for memory."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = _convolution(channels, channels)
+        self.second = _convolution(channels, channels)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(N, C, H, W) -> the same shape."""
+        return features + self.second(functional.relu(self.first(features)))
+
+
+class Context(nn.Module):
+    """Adds what the whole picture looks like to every place (squeeze and add)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.mix = nn.Sequential(nn.Conv2d(channels, channels, 1), nn.ReLU(), nn.Conv2d(channels, channels, 1))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(N, C, H, W) -> the same shape."""
+        return features + self.mix(features.mean((2, 3), keepdim=True))
+
+
+def _up(features: Tensor) -> Tensor:
+    return functional.interpolate(features, scale_factor=2.0, mode="nearest")
+
+
+def build_network(name: str, seed: int) -> nn.Module:
+    """A network by name, "wound" or "thesis", with its first weights drawn from the seed."""
+    torch.manual_seed(seed)
+    return WoundNet() if name == "wound" else ThesisUNet()
+
+
+def parameter_count(network: nn.Module) -> int:
+    """How many numbers were learned."""
+    return sum(parameter.numel() for parameter in network.parameters())
+
+
+class WoundNet(nn.Module):
+    """Encoder of five levels and a light decoder; (N, 3, H, W) in 0..1, RGB -> (N, 1, H, W) logits.
+
+    H and W are multiples of 32. The first two levels only halve the picture, the depth lies at strides 8 and 16,
+    and the last step puts out four sub-pixel logits a place, so that no layer runs at full size.
+    """
+
+    def __init__(self, widths: Sequence[int] = (16, 32, 64, 128, 192), depths: Sequence[int] = (1, 2, 3, 1)) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(_convolution(3, widths[0], stride=2), nn.ReLU())
+        self.downs = nn.ModuleList(_convolution(a, b, stride=2) for a, b in pairwise(widths))
+        self.stages = nn.ModuleList(
+            nn.Sequential(*(ResidualBlock(width) for _ in range(depth)))
+            for width, depth in zip(widths[1:], depths, strict=True)
+        )
+        self.context = Context(widths[-1])
+        rising = list(reversed(widths))
+        self.laterals = nn.ModuleList(_convolution(a, b, 1) for a, b in pairwise(rising))
+        self.skips = nn.ModuleList(_convolution(width, width, 1) for width in rising[1:])
+        self.merges = nn.ModuleList(ResidualBlock(width) for width in rising[1:-1])
+        self.fine = nn.Sequential(_convolution(widths[0], widths[0]), nn.ReLU())
+        self.head = nn.Conv2d(widths[0], 4, 1)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Logits of "this pixel belongs to a wound"."""
+        levels = [self.stem((pictures - 0.45) * 4.0)]
+        for down, stage in zip(self.downs, self.stages, strict=True):
+            levels.append(stage(down(levels[-1])))
+        features = self.context(levels.pop())
+        for index, (lateral, skip) in enumerate(zip(self.laterals, self.skips, strict=True)):
+            features = functional.relu(_up(lateral(features)) + skip(levels.pop()))
+            features = self.merges[index](features) if index < len(self.merges) else self.fine(features)
+        return functional.pixel_shuffle(self.head(features), 2)
+
+
+class ThesisUNet(nn.Module):
+    """The U-Net of thesis 3.3: four levels of two 3x3 convolutions with 32, 64, 128 and 256 filters, max pooling, a
+    bottleneck of 256, nearest up-sampling and skips; (N, 3, H, W) RGB in 0..1, made grey -> (N, 1, H, W) logits."""
+
+    def __init__(self, filters: Sequence[int] = (32, 64, 128, 256)) -> None:
+        super().__init__()
+        self.encoder = nn.ModuleList(_pair(a, b) for a, b in pairwise((1, *filters)))
+        self.bottom = _pair(filters[-1], filters[-1])
+        below = (filters[-1], *reversed(filters))
+        self.decoder = nn.ModuleList(_pair(a + b, b) for a, b in zip(below, reversed(filters), strict=False))
+        self.head = nn.Conv2d(filters[0], 1, 1)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Logits of "this pixel belongs to a wound"."""
+        red, green, blue = pictures.split(1, 1)
+        levels, features = [], 0.299 * red + 0.587 * green + 0.114 * blue  # ITU-R BT.601, as OpenCV
+        for pair in self.encoder:
+            levels.append(pair(features))
+            features = functional.max_pool2d(levels[-1], 2)
+        features = self.bottom(features)
+        for pair in self.decoder:
+            features = pair(torch.cat([levels.pop(), _up(features)], 1))
+        return self.head(features)
+
+
+def _pair(inputs: int, outputs: int) -> nn.Sequential:
+    """Two convolutions with ReLU, He-initialised as in Appendix A; no normalisation, as there."""
+    layers = (nn.Conv2d(inputs, outputs, 3, padding=1), nn.Conv2d(outputs, outputs, 3, padding=1))
+    for layer in layers:
+        nn.init.kaiming_normal_(layer.weight)
+        nn.init.zeros_(layer.bias)
+    return nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU())

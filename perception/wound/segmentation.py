@@ -1,7 +1,8 @@
-"""Where the wound is in one picture, and how sure that is; by the network, or by anything that answers like it."""
+"""Where the wound is in one picture and how sure that is; the region round it, its area, Dice, and overlays."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -9,17 +10,40 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation import se3
+from estimation.rig import Camera
 from estimation.se3 import Array
-from perception.coarse_to_fine import Network, wound_logits
 from perception.frames import Image
-from perception.padding import picture_box
-from perception.wound.network import Settings
+from perception.lens import undistort
+from perception.wound.network import Network, Settings, wound_logits
 
-HIGHEST, LOWEST, STEP = 0.7, 0.1, 0.1  # thresholds tried in turn, `find_wound` of Appendix A
-LEAST_PIXELS = 12  # of a part at the picture's own size: fewer have no shape
-LARGEST_SHARE = 0.9  # of the picture: a wound that fills it shows no skin, and none was taught so
+# A padded row is black but for what JPEG smears over its edge; a dark room still has sensor noise in most pixels.
+MAX_PADDING_GREY = 12
+MIN_LIT_SHARE = 0.02
+# What is left must still be a picture.
+MIN_PICTURE_SHARE = 0.3
 
-Mask = NDArray[np.bool_]
+
+def picture_box(picture: NDArray[np.uint8]) -> tuple[slice, slice]:
+    """Rows and columns of (H, W, 3) or (H, W) that are not padding; all of them where hardly anything would be left."""
+    lit = (picture.max(2) if picture.ndim == 3 else picture) > MAX_PADDING_GREY
+    rows, columns = (_span(lit.mean(axis)) for axis in (1, 0))
+    left = (rows.stop - rows.start) * (columns.stop - columns.start)
+    if left < MIN_PICTURE_SHARE * lit.size:
+        return slice(0, lit.shape[0]), slice(0, lit.shape[1])
+    return rows, columns
+
+
+def _span(lit_share: NDArray[np.float64]) -> slice:
+    inside = np.flatnonzero(lit_share > MIN_LIT_SHARE)
+    return slice(int(inside[0]), int(inside[-1]) + 1) if len(inside) else slice(0, 0)
+
+
+MAX_THRESHOLD, MIN_THRESHOLD, THRESHOLD_STEP = 0.7, 0.1, 0.1  # thresholds tried in turn, `find_wound` of Appendix A
+MIN_PART_PIXELS = 12  # of a part at the picture's own size: fewer have no shape
+MAX_WOUND_SHARE = 0.9  # of the picture: a wound that fills it shows no skin, and none was taught so
+
+WoundMask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +51,7 @@ class Segmentation:
     """mask: (H, W) bool; all False where no wound was found. confidence: 0..1, that the mask is a wound; also where it
     was too low for one. threshold: probability at which it was found, nan without."""
 
-    mask: Mask
+    mask: WoundMask
     confidence: float
     threshold: float
 
@@ -42,7 +66,6 @@ class Segmenter(Protocol):
 
     def __call__(self, image: Image) -> Segmentation:
         """image: (H, W, 3) BGR or (H, W) grey."""
-        ...
 
 
 class NetworkSegmenter:
@@ -54,7 +77,7 @@ class NetworkSegmenter:
 
     def __call__(self, image: Image) -> Segmentation:
         """Looks twice (`coarse_to_fine`), lowers the threshold until something is found, and drops what is unlikely."""
-        return judged(self.logits(image), self._settings)
+        return segmentation_from_logits(self.logits(image), self._settings)
 
     def logits(self, image: Image) -> NDArray[np.float32]:
         """(H, W) logits of "wound"; very low in the picture's black padding."""
@@ -65,26 +88,26 @@ class NetworkSegmenter:
         return out
 
 
-def judged(logits: NDArray[np.float32], settings: Settings) -> Segmentation:
+def segmentation_from_logits(logits: NDArray[np.float32], settings: Settings) -> Segmentation:
     """The mask that (H, W) logits amount to.
 
     Where a threshold of 0.7, 0.6, ... 0.1 is first passed there is a wound, and it reaches as far as the probability
     stays above `settings.edge` (or that threshold, if lower): the seed tells that there is one, not how large it is.
     """
-    for threshold in np.arange(HIGHEST, LOWEST - STEP / 2, -STEP).tolist():
+    for threshold in np.arange(MAX_THRESHOLD, MIN_THRESHOLD - THRESHOLD_STEP / 2, -THRESHOLD_STEP).tolist():
         seeds = logits > _logit(threshold)
         if not seeds.any():
             continue
-        mask = parts(logits > _logit(min(threshold, settings.edge)), seeds, settings.smallest)
+        mask = seeded_parts(logits > _logit(min(threshold, settings.edge)), seeds, settings.smallest)
         if not mask.any():
             continue
         confidence = confidence_of(logits, mask, settings)
-        kept = confidence >= settings.trust and mask.mean() <= LARGEST_SHARE
+        kept = confidence >= settings.trust and mask.mean() <= MAX_WOUND_SHARE
         return Segmentation(mask if kept else np.zeros_like(mask), confidence, threshold if kept else np.nan)
     return Segmentation(np.zeros(logits.shape, bool), 0.0, np.nan)
 
 
-def parts(mask: Mask, seeds: Mask, smallest: float) -> Mask:
+def seeded_parts(mask: WoundMask, seeds: WoundMask, smallest: float) -> WoundMask:
     """The connected parts of a mask (H, W) that hold a seed and are no specks: at least `smallest` of the largest."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA]
@@ -92,23 +115,23 @@ def parts(mask: Mask, seeds: Mask, smallest: float) -> Mask:
     seeded[0] = False
     if not seeded.any():
         return np.zeros_like(mask)
-    kept = seeded & (area >= max(LEAST_PIXELS, smallest * area[seeded].max()))
+    kept = seeded & (area >= max(MIN_PART_PIXELS, smallest * area[seeded].max()))
     return np.asarray(kept[labels])
 
 
-def largest_part(mask: Mask) -> Mask:
+def largest_part(mask: WoundMask) -> WoundMask:
     """The largest connected part of a mask (H, W)."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     return mask if count < 3 else np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])))
 
 
-def confidence_of(logits: NDArray[np.float32], mask: Mask, settings: Settings) -> float:
+def confidence_of(logits: NDArray[np.float32], mask: WoundMask, settings: Settings) -> float:
     """0..1, that a mask is a wound: a logistic of its mean logit, fitted to pictures with and without one."""
     mean = float(logits[mask].mean())
     return float(1 / (1 + np.exp(-(settings.slope * mean + settings.offset))))
 
 
-def centroid(mask: Mask) -> Array:
+def centroid(mask: WoundMask) -> Array:
     """(2,) px of a mask's middle, by its image moments (thesis 5.2); nan without a wound."""
     moments = cv2.moments(mask.astype(np.uint8), binaryImage=True)
     if not moments["m00"]:
@@ -123,3 +146,161 @@ def rgb(image: Image) -> NDArray[np.uint8]:
 
 def _logit(probability: float) -> float:
     return float(np.log(probability / (1 - probability)))
+
+
+def dice(found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
+    """2 |A and B| / (|A| + |B|) of two masks (H, W); two empty masks agree: 1."""
+    total = int(found.sum()) + int(truth.sum())
+    return 2 * int((found & truth).sum()) / total if total else 1.0
+
+
+FOUND_COLOUR, TRUTH_COLOUR = (60, 220, 60), (255, 160, 40)  # BGR of the outlines
+TINT_SHARE = 0.25  # of the outline's colour inside it
+
+
+def draw_overlay(image: Image, found: Segmentation, truth: WoundMask | None = None, told: bool = True) -> Image:
+    """(H, W, 3) BGR: the wound's outline, the true outline where there is one, and in words how sure it is."""
+    drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
+    inside = found.mask
+    drawn[inside] = ((1 - TINT_SHARE) * drawn[inside] + TINT_SHARE * np.array(FOUND_COLOUR)).astype(np.uint8)
+    width = max(1, round(max(image.shape[:2]) / 500))
+    for mask, colour in ((truth, TRUTH_COLOUR), (found.mask, FOUND_COLOUR)):
+        if mask is not None:
+            outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+            cv2.drawContours(drawn, outlines, -1, colour, width)
+    if not told:
+        return np.asarray(drawn, np.uint8)
+    text = f"wound {found.confidence:.2f}" if found.found else f"no wound {found.confidence:.2f}"
+    scale = max(image.shape[:2]) / 1000
+    cv2.putText(
+        drawn, text, (8, int(8 + 28 * scale)), cv2.FONT_HERSHEY_SIMPLEX, scale, FOUND_COLOUR, max(1, round(2 * scale))
+    )
+    return np.asarray(drawn, np.uint8)
+
+
+Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px, the last two excluded
+
+REGION_BORDER_PX = 5  # px round the box, Appendix A
+MIN_REGION_SIDE_PX = 8  # px: less holds no patch that could be tracked
+
+
+def box_of(mask: WoundMask) -> Box | None:
+    """The box round a mask (H, W); None where it is empty."""
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return (x, y, x + width, y + height) if width and height else None
+
+
+def region(now: Box | None, before: Box | None, size: tuple[int, int], border: float = REGION_BORDER_PX) -> Box:
+    """The box round where the wound is and where it was, `border` px wider, inside a picture of `size` (W, H).
+
+    Never empty. The whole picture where the wound is not seen now: it may be anywhere.
+    """
+    if now is None:
+        return 0, 0, *size
+    boxes = np.array([now, now if before is None else before], float)
+    low = np.clip(np.floor(boxes[:, :2].min(0) - border), 0, np.array(size) - min(MIN_REGION_SIDE_PX, *size))
+    high = np.clip(np.ceil(boxes[:, 2:].max(0) + border), low + min(MIN_REGION_SIDE_PX, *size), size)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def polygon(box: Box) -> Array:
+    """(4, 2) px corners of a box."""
+    x0, y0, x1, y1 = box
+    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], float)
+
+
+def area_on_plane(mask: WoundMask, camera: Camera, base_from_surface: Array) -> float:
+    """mm^2 of a mask (H, W) laid through the lens onto the plane z = 0 of the surface; nan where rays miss it.
+
+    base_from_surface: (4, 4) mm, z out of the surface, where the picture was taken. Holes in the mask count.
+    """
+    camera_from_surface = se3.inverse(camera.base_from_camera) @ base_from_surface
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    total = 0.0
+    for each in contours:
+        contour = np.asarray(each, np.int32)
+        places = _on_plane(contour.reshape(-1, 2).astype(float), camera, camera_from_surface)
+        if not np.isfinite(places).all():
+            return float("nan")
+        total += _enclosed(places) * _half_pixel(contour)
+    return total
+
+
+def _half_pixel(contour: NDArray[np.int32]) -> float:
+    """What the outline through the outermost pixels' middles leaves out, as a factor: half a pixel all round."""
+    inner = cv2.contourArea(contour)
+    outer = inner + len(contour) / 2 + 1  # Pick's theorem: of a contour whose pixels are all listed
+    return outer / inner if inner else 1.0
+
+
+def _on_plane(pixels: Array, camera: Camera, camera_from_surface: Array) -> Array:
+    """(N, 2) mm on the surface's plane that pixels (N, 2) show; nan behind the camera."""
+    ideal = undistort(camera, pixels)
+    rays = np.column_stack([ideal, np.ones(len(ideal))]) @ np.linalg.inv(camera.matrix).T
+    surface_from_camera = se3.inverse(camera_from_surface)
+    directions, origin = rays @ surface_from_camera[:3, :3].T, surface_from_camera[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = -origin[2] / directions[:, 2]
+    return np.where(reach[:, None] > 0, origin[:2] + reach[:, None] * directions[:, :2], np.nan)
+
+
+def _enclosed(places: Array) -> float:
+    """Area of a closed polygon (N, 2) (Gauss's formula)."""
+    x, y = places.T
+    return float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)
+
+
+SHEET_COLUMNS = 8  # pictures a row; a row each of the best, the median and the worst
+SHEET_CELL_PX = 240  # px, side of a picture on the sheet
+SHEET_MARGIN_SHARE = 1.5  # of the wound's longer side that is shown beyond it on every side
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedPicture:
+    """A picture (H, W, 3) BGR, what was found in it and the truth (H, W)."""
+
+    image: Image
+    found: Segmentation
+    truth: WoundMask
+
+    @property
+    def dice(self) -> float:
+        """How well the two agree."""
+        return dice(self.found.mask, self.truth)
+
+
+def contact_sheet(shown: Sequence[JudgedPicture]) -> Image:
+    """(H, W, 3) BGR of three rows: best, median, worst; truth in blue, found in green, Dice below each."""
+    order = sorted(shown, key=lambda each: -each.dice)
+    middle = max(0, (len(order) - SHEET_COLUMNS) // 2)
+    rows = (order[:SHEET_COLUMNS], order[middle : middle + SHEET_COLUMNS], order[-SHEET_COLUMNS:])
+    return np.vstack([np.hstack([_cell(each) for each in _padded(row)]) for row in rows])
+
+
+def _padded(row: Sequence[JudgedPicture]) -> list[JudgedPicture]:
+    return [*row, *[row[-1]] * (SHEET_COLUMNS - len(row))]
+
+
+def _cell(shown: JudgedPicture) -> Image:
+    rows, columns = _square(shown.truth | shown.found.mask)
+    part = Segmentation(shown.found.mask[rows, columns], shown.found.confidence, shown.found.threshold)
+    drawn = draw_overlay(np.ascontiguousarray(shown.image[rows, columns]), part, shown.truth[rows, columns], False)
+    cell = np.asarray(cv2.resize(drawn, (SHEET_CELL_PX, SHEET_CELL_PX), interpolation=cv2.INTER_AREA), np.uint8)
+    cv2.putText(cell, f"{shown.dice:.2f}", (6, SHEET_CELL_PX - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 2)
+    return cell
+
+
+def _square(mask: WoundMask) -> tuple[slice, slice]:
+    """Rows and columns of a square round a mask, inside the picture; of its middle where the mask is empty."""
+    least = min(mask.shape)
+    rows, columns = np.nonzero(mask)
+    if not len(rows):
+        rows, columns, extent = np.array([mask.shape[0] // 2]), np.array([mask.shape[1] // 2]), least
+    else:
+        extent = max(int(np.ptp(rows)), int(np.ptp(columns)), 16)
+    side = min(least, int((1 + 2 * SHEET_MARGIN_SHARE) * extent))
+    spans = []
+    for places, full in ((rows, mask.shape[0]), (columns, mask.shape[1])):
+        start = int(np.clip((places.min() + places.max()) // 2 - side // 2, 0, full - side))
+        spans.append(slice(start, start + side))
+    return spans[0], spans[1]

@@ -1,13 +1,14 @@
 """Segmentation by shape (thesis 3.2): the outline in the picture that is most like the scan's.
 
-`plain` is the thesis's own: adaptive threshold, contours, matchShapes. `ShapeSegmenter` keeps the idea and mends what
-failed there: outlines come from colour separation at many levels instead of one threshold full of noise, each is judged
-by colour and contrast as well as by its Hu moments, and an active contour (GrabCut) settles the chosen one's edge.
+`thesis_mask` is the thesis's own method: adaptive threshold, contours, matchShapes. `ShapeSegmenter` keeps the idea and
+mends what failed there: outlines come from colour separation at many levels instead of one noisy threshold, each is
+rated by colour and contrast as well as by its Hu moments, and an active contour (GrabCut) refines the chosen one.
 """
 
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,19 +17,135 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.errors import InputError
-from estimation.scan import Scan
+from estimation.scans.scan import Scan
 from estimation.se3 import Array
 from perception.frames import Image
-from perception.padding import picture_box
-from perception.wound.segmentation import Mask, Segmentation, rgb
-from perception.wound_candidates import COLOUR_TERMS, FEATURES, Contour, described, outlines, scene_of
+from perception.wound.segmentation import Segmentation, WoundMask, picture_box, rgb
 
-BLOCK, OFFSET = 11, 2  # of the adaptive threshold, thesis 3.2
-SPECK = 20.0  # px^2: smaller outlines of the threshold are its noise
-LAYERS = 10  # of a scan's height, whose topmost gives the outline
-GRID = 128  # cells along a scan's longer side
-ROUNDS = 2  # of GrabCut
-TERMS = (FEATURES + 1) * (FEATURES + 2) // 2
+Contour = NDArray[np.int32]  # (N, 1, 2) px, as OpenCV has them
+
+SMALL_SIDE_PX = 256  # px of the picture's longer side: outlines are no finer than the network's first look
+SURROUNDINGS_SIGMA_PX = 24.0  # px, one sigma: what a pixel's own surroundings are
+ODDS_LEVELS = np.arange(-4.0, 6.0, 0.5)  # of the colour's log odds
+REDNESS_PERCENTILES = (80.0, 86.0, 90.0, 93.0, 95.0, 97.0, 98.5, 99.3)  # percentiles above which a* may be a wound's
+DARKNESS_PERCENTILES = (88.0, 93.0, 96.0, 98.0, 99.0)  # the same of darkness: dead tissue is black
+YELLOWNESS_PERCENTILES = (90.0, 94.0, 97.0, 98.5)  # and of b*: slough
+MIN_OUTLINE_AREA_PX, MAX_OUTLINE_SHARE = 10.0, 0.4  # px, share of the picture
+RING_SHARE = 0.25  # width of an outline's surroundings, of its longer side
+MAX_SHAPE_DISTANCE = 3.0  # matchShapes beyond this says no more
+SHAPE_DISTANCES = (cv2.CONTOURS_MATCH_I1, cv2.CONTOURS_MATCH_I2, cv2.CONTOURS_MATCH_I3)
+COLOUR_TERMS = 28  # of `colour_terms`
+OUTLINE_FEATURES = 19  # of `outline_features`
+MAX_LOG_AREA_RATIO = 2.5  # the logarithm of two areas' ratio beyond which more says no more
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmallPicture:
+    """A picture made small. lab: (H, W, 3) CIE Lab, blurred by a pixel. odds: (H, W) log odds of the wound's colours.
+    scale: px of it per px of the picture."""
+
+    lab: NDArray[np.float32]
+    odds: NDArray[np.float32]
+    scale: float
+
+
+def small_picture(picture: NDArray[np.uint8], weights: Array) -> SmallPicture:
+    """What outlines are looked for in. picture: (H, W, 3) RGB. weights: (COLOUR_TERMS,) of the log odds."""
+    scale = min(1.0, SMALL_SIDE_PX / max(picture.shape[:2]))
+    seen = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    lab = np.asarray(
+        cv2.GaussianBlur(cv2.cvtColor(seen, cv2.COLOR_RGB2LAB).astype(np.float32), (0, 0), 1.0), np.float32
+    )
+    return SmallPicture(lab, np.asarray(colour_terms(lab) @ weights, np.float32), scale)
+
+
+def colour_terms(lab: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W, COLOUR_TERMS): one, the colour, how it differs from its surroundings, and all products of two."""
+    around = cv2.GaussianBlur(lab, (0, 0), SURROUNDINGS_SIGMA_PX)
+    terms = cv2.split(np.dstack([lab / 64 - 2, (lab - around) / 64]))
+    products = [terms[i] * terms[j] for i in range(len(terms)) for j in range(i, len(terms))]
+    return np.dstack([np.ones_like(terms[0]), *terms, *products])
+
+
+def find_outlines(scene: SmallPicture) -> list[Contour]:
+    """Outlines of everything above some level of the colour's odds, of redness, darkness or yellowness."""
+    light, red, yellow = cv2.split(scene.lab)
+    maps = [(scene.odds, ODDS_LEVELS)]
+    for value, shares in ((red, REDNESS_PERCENTILES), (-light, DARKNESS_PERCENTILES), (yellow, YELLOWNESS_PERCENTILES)):
+        maps.append((np.asarray(value), np.percentile(value, shares)))
+    found: list[Contour] = []
+    for value, levels in maps:
+        for level in levels:
+            above = (value > level).astype(np.uint8)
+            for mask in (above, cv2.morphologyEx(above, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))):
+                seen, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+                found += [np.asarray(each, np.int32) for each in seen]
+    return [c for c in found if MIN_OUTLINE_AREA_PX <= cv2.contourArea(c) <= MAX_OUTLINE_SHARE * scene.odds.size]
+
+
+def outline_features(scene: SmallPicture, contour: Contour, patterns: Sequence[Contour], area: float | None) -> Array:
+    """(FEATURES,) colour inside and around, compactness, size, place, and how unlike the most alike pattern it is.
+
+    area: px^2 of the picture that the wound should cover, None where nobody knows.
+    """
+    x, y, width, height = cv2.boundingRect(contour)
+    reach = max(3, int(RING_SHARE * max(width, height)))
+    rows, columns = scene.odds.shape
+    x0, y0, x1, y1 = (
+        max(0, x - reach),
+        max(0, y - reach),
+        min(columns, x + width + reach),
+        min(rows, y + height + reach),
+    )
+    filled = np.zeros((y1 - y0, x1 - x0), np.uint8)
+    cv2.drawContours(filled, [contour - np.array([[x0, y0]], np.int32)], -1, 1, -1)
+    wide = np.asarray(cv2.dilate(filled, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)), np.uint8)
+    inside, ring = _means(scene, (slice(y0, y1), slice(x0, x1)), filled, wide - filled)
+    covered, length = cv2.contourArea(contour), cv2.arcLength(contour, True)
+    hull = max(cv2.contourArea(cv2.convexHull(contour)), 1.0)
+    cut = x <= 1 or y <= 1 or x + width >= columns - 1 or y + height >= rows - 1
+    away = np.hypot((x + width / 2) / columns - 0.5, (y + height / 2) / rows - 0.5)
+    shape = (
+        covered / hull,
+        4 * np.pi * covered / max(length, 1.0) ** 2,
+        np.log(covered / scene.odds.size),
+        float(cut),
+        away,
+    )
+    size = (
+        0.0
+        if area is None
+        else np.clip(np.log(covered / (area * scene.scale**2)), -MAX_LOG_AREA_RATIO, MAX_LOG_AREA_RATIO)
+    )
+    return np.array(
+        [*inside, *ring, inside[0] - ring[0], *shape, *_shape_distances(contour, patterns), size, abs(size)]
+    )
+
+
+def _means(
+    scene: SmallPicture, part: tuple[slice, slice], inside: NDArray[np.uint8], ring: NDArray[np.uint8]
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    odds, lab = scene.odds[part], scene.lab[part]
+    found = []
+    for mask in (inside, ring if ring.any() else inside):
+        level = cv2.mean(odds, mask)[0]
+        found.append((level, *(value / 64 - 2 for value in cv2.mean(lab, mask)[:3])))
+    return found[0], found[1]
+
+
+def _shape_distances(contour: Contour, patterns: Sequence[Contour]) -> Array:
+    """(3,) root of the least matchShapes score of any pattern, by each of OpenCV's three measures of Hu moments."""
+    scores = [[cv2.matchShapes(contour, pattern, method, 0.0) for method in SHAPE_DISTANCES] for pattern in patterns]
+    least = np.min(scores, axis=0) if scores else np.full(3, MAX_SHAPE_DISTANCE)
+    return np.asarray(np.sqrt(np.minimum(least, MAX_SHAPE_DISTANCE)))
+
+
+THRESHOLD_BLOCK_PX, THRESHOLD_OFFSET = 11, 2  # of the adaptive threshold, thesis 3.2
+MIN_CONTOUR_AREA_PX = 20.0  # px^2: smaller outlines of the threshold are its noise
+SCAN_LAYERS = 10  # of a scan's height, whose topmost gives the outline
+SCAN_GRID_CELLS = 128  # cells along a scan's longer side
+GRABCUT_ROUNDS = 2  # of GrabCut
+RANK_TERMS = (OUTLINE_FEATURES + 1) * (OUTLINE_FEATURES + 2) // 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,22 +175,24 @@ class ShapeSegmenter:
         """The most plausible outline, its edge settled; empty where none is plausible."""
         colour = rgb(image)
         box = picture_box(colour)
-        scene = scene_of(colour[box], self._model.colour)
-        found = outlines(scene)
+        scene = small_picture(colour[box], self._model.colour)
+        found = find_outlines(scene)
         mask = np.zeros(image.shape[:2], bool)
         if not found:
             return Segmentation(mask, 0.0, np.nan)
-        expected = ranked(np.array([described(scene, each, self._patterns, self._area) for each in found]), self._rank)
+        expected = expected_dice(
+            np.array([outline_features(scene, each, self._patterns, self._area) for each in found]), self._rank
+        )
         best = int(np.argmax(expected))
         confidence = float(np.clip(expected[best], 0, 1))
         if confidence < self._model.trust:
             return Segmentation(mask, confidence, np.nan)
-        small = settled(scene.lab, found[best])
+        small = refine_outline(scene.lab, found[best])
         mask[box] = cv2.resize(small.astype(np.float32), colour[box].shape[1::-1]) > 0.5
         return Segmentation(mask, confidence, np.nan)
 
 
-def ranked(features: Array, rank: Array) -> Array:
+def expected_dice(features: Array, rank: Array) -> Array:
     """(N,) expected Dice of outlines described by (N, FEATURES)."""
     return np.asarray(products(features) @ rank)
 
@@ -85,7 +204,7 @@ def products(features: Array) -> Array:
     return np.asarray(full[:, first] * full[:, second])
 
 
-def settled(lab: NDArray[np.float32], contour: Contour) -> Mask:
+def refine_outline(lab: NDArray[np.float32], contour: Contour) -> WoundMask:
     """(H, W) the outline filled, its edge moved to where the colours part (GrabCut, Rother et al. 2004)."""
     filled = np.zeros(lab.shape[:2], np.uint8)
     cv2.drawContours(filled, [contour], -1, 1, -1)
@@ -100,37 +219,37 @@ def settled(lab: NDArray[np.float32], contour: Contour) -> Mask:
     part = np.s_[max(0, y - height) : y + 2 * height, max(0, x - width) : x + 2 * width]
     seen, state = np.ascontiguousarray(np.clip(lab[part], 0, 255).astype(np.uint8)), np.ascontiguousarray(labels[part])
     cv2.setRNGSeed(0)
-    cv2.grabCut(seen, state, (0, 0, 1, 1), np.zeros((1, 65)), np.zeros((1, 65)), ROUNDS, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(seen, state, (0, 0, 1, 1), np.zeros((1, 65)), np.zeros((1, 65)), GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
     filled[part] = np.isin(state, (cv2.GC_FGD, cv2.GC_PR_FGD))
     return filled > 0
 
 
-def plain(image: Image, pattern: Contour) -> Mask:
+def thesis_mask(image: Image, pattern: Contour) -> WoundMask:
     """(H, W) the thesis's own method: of the contours of an adaptive threshold, the one most like the pattern."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     kind = cv2.ADAPTIVE_THRESH_GAUSSIAN_C
-    threshold = cv2.adaptiveThreshold(grey, 255, kind, cv2.THRESH_BINARY, BLOCK, OFFSET)
+    threshold = cv2.adaptiveThreshold(grey, 255, kind, cv2.THRESH_BINARY, THRESHOLD_BLOCK_PX, THRESHOLD_OFFSET)
     found, _ = cv2.findContours(threshold, cv2.RETR_TREE, cv2.CHAIN_APPROX_SIMPLE)
     mask = np.zeros(grey.shape, np.uint8)
-    likely = [c for c in found if cv2.contourArea(c) > SPECK]
+    likely = [c for c in found if cv2.contourArea(c) > MIN_CONTOUR_AREA_PX]
     if likely:
         best = min(likely, key=lambda c: cv2.matchShapes(c, pattern, cv2.CONTOURS_MATCH_I1, 0.0))
         cv2.drawContours(mask, [best], -1, 1, -1)
     return mask > 0
 
 
-def pattern_of(mask: Mask) -> Contour | None:
+def largest_outline(mask: WoundMask) -> Contour | None:
     """The outline of the largest part of a mask (H, W); None of an empty one."""
     found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return np.asarray(max(found, key=cv2.contourArea), np.int32) if found else None
 
 
-def pattern_of_scan(scan: Scan, layers: int = LAYERS) -> tuple[Contour, float]:
+def scan_outline(scan: Scan, layers: int = SCAN_LAYERS) -> tuple[Contour, float]:
     """The outline of the topmost layer of a scan of the wound itself, seen along z (thesis Fig. 3.7, 3.8), at a scale
     of its own, and its area, mm^2."""
     height = scan.vertices[:, 2]
     top = scan.vertices[height >= height.max() - np.ptp(height) / layers][:, :2]
-    cell = max(float(np.ptp(top, axis=0).max()) / GRID, 1e-9)
+    cell = max(float(np.ptp(top, axis=0).max()) / SCAN_GRID_CELLS, 1e-9)
     hull = cv2.convexHull(np.round((top - top.min(0)) / cell).astype(np.int32))
     if cv2.contourArea(hull) == 0:
         raise InputError("scan", "top layer", f"{len(top)} vertices in a line", "an area seen along z")
@@ -146,8 +265,8 @@ def read_shape_model(file: Path) -> ShapeModel:
         trust = float(table["trust"])
     except (OSError, KeyError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(file, "shape model", str(error), "the file that comes with stillbed") from None
-    if colour.shape != (COLOUR_TERMS,) or rank.shape != (TERMS,) or usual.shape != (TERMS,):
-        raise InputError(file, "shape model", (colour.shape, rank.shape), f"{COLOUR_TERMS} and {TERMS} numbers")
+    if colour.shape != (COLOUR_TERMS,) or rank.shape != (RANK_TERMS,) or usual.shape != (RANK_TERMS,):
+        raise InputError(file, "shape model", (colour.shape, rank.shape), f"{COLOUR_TERMS} and {RANK_TERMS} numbers")
     if not np.isfinite([*colour, *rank, *usual, trust]).all():
         raise InputError(file, "shape model", "a number that is not finite", "the file that comes with stillbed")
     return ShapeModel(colour, rank, usual, trust, patterns)

@@ -1,31 +1,36 @@
-"""A bead: one extruded run in the plane."""
+"""Beads, extruded runs in the plane: their pattern, the widths that a nozzle allows, and the time they take."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from estimation.errors import InputError
 from estimation.se3 import Array
+from planning.fill import PATTERN_KINDS, PatternKind
 
-SAME = 1e-9  # mm: two points nearer are one
+POINT_TOLERANCE = 1e-9  # mm: two points nearer are one
+TWO_BEADS_FROM = 0.75  # spacings: radius from which two beads are laid: one would be half as wide again as nominal
+SHARP_TURN = np.deg2rad(30.0)  # a turn beyond costs time; as the other planners' figures were counted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bead:
-    """One run of the nozzle without a stop of the flow.
+    """One run of the nozzle without a stop of the flow."""
 
-    points: (N, 2) mm, N >= 2; a closed run repeats its first point. width: (N,) mm, of the line laid at each point,
-    linear between them.
-    """
-
-    points: Array
-    width: Array
+    points: Array  # (N, 2) mm, N >= 2; a closed run repeats its first point
+    width: Array  # (N,) mm of the line at each point, linear between them
 
     @property
     def closed(self) -> bool:
         """Whether it ends where it began."""
-        return len(self.points) > 3 and bool(np.abs(self.points[0] - self.points[-1]).max() < SAME)
+        return len(self.points) > 3 and bool(np.abs(self.points[0] - self.points[-1]).max() < POINT_TOLERANCE)
 
     @property
     def steps(self) -> Array:
@@ -39,7 +44,7 @@ class Bead:
         return float(self.steps.sum())
 
     @property
-    def laid(self) -> float:
+    def area(self) -> float:
         """Area of its material, mm2: length times width."""
         return float(self.steps @ (self.width[:-1] + self.width[1:]) / 2)
 
@@ -61,7 +66,7 @@ class Bead:
     def between(self, start: float, end: float) -> Bead:
         """The stretch from one length to another, mm from the start."""
         length = self.along
-        a, b = np.searchsorted(length, [start + SAME, end - SAME])
+        a, b = np.searchsorted(length, [start + POINT_TOLERANCE, end - POINT_TOLERANCE])
         ends = self.at(np.array([start, end]))
         lines = np.concatenate([ends[:1], np.column_stack([self.points[a:b], self.width[a:b]]), ends[1:]])
         return Bead(lines[:, :2], lines[:, 2])
@@ -69,14 +74,135 @@ class Bead:
     def turned(self, start: float) -> Bead:
         """A closed bead that begins and ends at `start` mm from its start instead."""
         length = self.along
-        if start < SAME or start > length[-1] - SAME:
+        if start < POINT_TOLERANCE or start > length[-1] - POINT_TOLERANCE:
             return self
-        a, b = np.searchsorted(length, [start - SAME, start + SAME])
+        a, b = np.searchsorted(length, [start - POINT_TOLERANCE, start + POINT_TOLERANCE])
         here, lines = self.at(np.array([start])), np.column_stack([self.points, self.width])
         lines = np.concatenate([here, lines[b:], lines[1:a], here])
         return Bead(lines[:, :2], lines[:, 2])
 
 
-def even(points: Array, width: float) -> Bead:
+def even_bead(points: Array, width: float) -> Bead:
     """A bead of one width, mm, through points (N, 2)."""
     return Bead(points, np.full(len(points), width))
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """How a region is filled.
+
+    angle: rad from the x axis, of the lines of zigzag, raster and hybrid; "shorter" takes the shorter of horizontal and
+    vertical (thesis 5.3), "fastest" the fastest of `angles` many. seam: where on a closed line printing begins, counted
+    along it from the point farthest in `start`; a different one in each layer keeps seams from lying on one another.
+    """
+
+    kind: PatternKind = "best"  # see docs/patterns.md
+    width: float = 0.4  # mm of a nominal bead
+    overlap: float = 0.0  # share of the width by which neighbours overlap
+    inset: float = 0.0  # mm left free along the contour
+    angle: float | Literal["shorter", "fastest"] = "fastest"
+    angles: int = 12
+    rims: int = 1  # closed lines around the lines of hybrid
+    narrowest: float = 0.5  # of the width, that the nozzle can lay
+    widest: float = 1.75  # of the width, that the nozzle can lay
+    start: tuple[float, float] = (-1.0, 1.0)  # direction of the side to begin at; here top left where y points up
+    seam: float = 0.0  # 0 to 1
+
+    def __post_init__(self) -> None:
+        _require(self.kind in PATTERN_KINDS, "kind", self.kind, " | ".join(PATTERN_KINDS))
+        _require(0.01 <= self.width <= 20, "width", self.width, "0.01 to 20 mm")
+        _require(0 <= self.overlap <= 0.9, "overlap", self.overlap, "0 to 0.9 of the width")
+        _require(0 <= self.inset <= 100, "inset", self.inset, "0 to 100 mm")
+        worded = self.angle in ("shorter", "fastest")
+        _require(worded or math.isfinite(float(self.angle)), "angle", self.angle, "rad, shorter or fastest")
+        _require(1 <= self.angles <= 360, "angles", self.angles, "1 to 360")
+        _require(0 <= self.rims <= 100, "rims", self.rims, "0 to 100")
+        _require(0.1 <= self.narrowest <= 1, "narrowest", self.narrowest, "0.1 to 1")
+        _require(1 <= self.widest <= 4, "widest", self.widest, "1 to 4")
+        _require(0 < math.hypot(*self.start) < math.inf, "start", self.start, "a direction")
+        _require(0 <= self.seam <= 1, "seam", self.seam, "0 to 1")
+
+    @property
+    def spacing(self) -> float:
+        """From line to line, mm."""
+        return self.width * (1 - self.overlap)
+
+
+def _require(fine: bool, what: str, got: object, allowed: str) -> None:
+    if not fine:
+        raise InputError("pattern", what, got, allowed)
+
+
+@dataclass(frozen=True, slots=True)
+class BeadFit:
+    """How many beads fit into a place, and how wide they may be."""
+
+    spacing: float  # mm, of closed lines
+    one: float  # mm, radius from which one bead fits
+    two: float  # mm, radius from which two fit
+    most: float  # mm, greatest width of a bead
+    outermost: float  # mm, spacing of the outermost closed lines alone
+
+    @property
+    def three(self) -> float:
+        """Radius, mm, from which a third bead fits between two: two share less."""
+        return self.spacing + self.one
+
+    def at(self, level: int) -> BeadFit:
+        """What fits at a level of closed lines, 0 the outermost."""
+        return self if level else replace(self, spacing=self.outermost)
+
+    def outside(self, level: NDArray[np.intp] | int) -> Array:
+        """How thick, mm, all levels outside this one are together."""
+        return np.where(np.asarray(level) > 0, self.outermost + self.spacing * (np.asarray(level) - 1), 0.0)
+
+    def level(self, radius: Array) -> NDArray[np.intp]:
+        """The level of the innermost lines where discs have this radius; -1 where not even one bead fits."""
+        further = np.floor((radius - self.outermost - self.one) / self.spacing).astype(int) + 1
+        return np.where(radius < self.one, -1, np.maximum(further, 0))
+
+
+def bead_fit(pattern: Pattern) -> BeadFit:
+    """The fit of a pattern's nozzle; overlap brings neighbours closer, the nozzle does not lay less."""
+    s = pattern.spacing
+    return BeadFit(s, pattern.narrowest * s / 2, min(TWO_BEADS_FROM, pattern.widest / 2) * s, pattern.widest * s, s)
+
+
+@dataclass(frozen=True, slots=True)
+class PrintPace:
+    """Speeds by which the time of a print is counted."""
+
+    printing: float = 20.0  # mm/s
+    travel: float = 60.0  # mm/s
+    turn: float = 0.05  # s for each turn of more than SHARP_TURN
+
+
+@dataclass(frozen=True, slots=True)
+class PrintCost:
+    """The cost of a list of beads."""
+
+    printed: float  # mm
+    travelled: float  # mm
+    turns: int  # of more than SHARP_TURN, within beads
+    seconds: float
+
+
+def print_cost(beads: Sequence[Bead], pace: PrintPace) -> PrintCost:
+    """Length, travel, turns and time of beads printed in this order."""
+    printed = sum(bead.length for bead in beads)
+    travelled = travel_length(beads)
+    turns = sum(int((turn_angles(bead.points) > SHARP_TURN).sum()) for bead in beads)
+    seconds = printed / pace.printing + travelled / pace.travel + turns * pace.turn
+    return PrintCost(printed, travelled, turns, seconds)
+
+
+def travel_length(beads: Sequence[Bead]) -> float:
+    """Length mm of the way from the end of each bead to the start of the next."""
+    return sum(math.dist(a.points[-1], b.points[0]) for a, b in pairwise(beads))
+
+
+def turn_angles(points: Array) -> Array:
+    """Turn angles (N-2,), rad, 0 to pi, at the inner points of a line (N, 2)."""
+    x, y = (points[1:] - points[:-1]).T
+    cross, dot = x[:-1] * y[1:] - y[:-1] * x[1:], x[:-1] * x[1:] + y[:-1] * y[1:]
+    return np.asarray(np.abs(np.arctan2(cross, dot)))

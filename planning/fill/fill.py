@@ -1,4 +1,4 @@
-"""Fill a region with beads, in printing order."""
+"""Fills a region with beads in printing order, their corners cut so that the nozzle need not slow down."""
 
 from __future__ import annotations
 
@@ -8,148 +8,176 @@ from dataclasses import replace
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from estimation.se3 import Array
-from planning.fill.bead import Bead, even
-from planning.fill.coverage import covered_by
-from planning.fill.ease import eased
-from planning.fill.fit import fit_of
-from planning.fill.mend import mended
-from planning.fill.order import Run, ordered
-from planning.fill.pace import Pace, hops, spent
-from planning.fill.pattern import Pattern
-from planning.fill.region import Region, checked, roughness
-from planning.fill.rings import Level, ring_levels
-from planning.fill.scan import Boundary, boundary_of
-from planning.fill.spiral import apart, nests, wound
-from planning.fill.zigzag import raster_lines, zigzag_lines
+from planning.fill.bead import (
+    SHARP_TURN,
+    Bead,
+    Pattern,
+    PrintPace,
+    bead_fit,
+    even_bead,
+    print_cost,
+    travel_length,
+    turn_angles,
+)
+from planning.fill.gap_fill import fill_gaps
+from planning.fill.region import Region, check_region, covered_area, roughness
+from planning.fill.rings import ring_levels
+from planning.fill.spiral import BeadRun, nest_rings, order_runs, separate_rings, spiral_runs
+from planning.fill.zigzag import Boundary, raster_lines, region_boundary, zigzag_lines
 
-INTO_RIM = 0.1  # spacings by which lines run into the rim of hybrid, whose round ends leave gaps else
-CORNER = 0.05  # spacings by which corners are cut: what that leaves open is less than a hundredth of a bead
-ROUGH = 0.001  # of the area, lost in corners of the contour: below, gaps come to half a percent at most
-TWICE = 5  # mm2 laid twice are as bad as one left open, as the limits of both are: 5 and 1 % of a wound
-AS_GOOD = 0.001  # of what is covered: less is no difference
-LINED = ("zigzag", "raster", "hybrid")  # patterns with straight lines, whose angle matters
-NOTHING = shapely.MultiPolygon()
+MAX_CUTS = 4  # each halves the turns: a reversal is smooth after four
+SHARP_MARGIN = 0.95  # of SHARP_TURN, so that rounding decides nothing
+RIM_OVERLAP = 0.1  # spacings by which lines run into the rim of hybrid; their round ends would leave gaps there
+CORNER_CUT = 0.05  # spacings by which corners are cut: that leaves less than a hundredth of a bead open
+MIN_ROUGHNESS = 0.001  # of the area, lost in corners of the contour: below, gaps come to half a percent at most
+DOUBLE_WEIGHT = 5  # mm2 laid twice that count as one left open, by the limits of both: 5 and 1 % of a wound
+COVERAGE_TOLERANCE = 0.001  # of the covered area: less is no difference
+LINE_PATTERNS = ("zigzag", "raster", "hybrid")  # patterns with straight lines, whose angle matters
+EMPTY_REGION = shapely.MultiPolygon()
+Lines = Callable[[Boundary, float, float], tuple[list[Array], float]]  # (boundary, angle, spacing): lines, spacing
 
-Lines = Callable[[Boundary, float, float], tuple[list[Array], float]]
 
-
-def fill(region: Region, pattern: Pattern, pace: Pace) -> list[Bead]:
+def fill(region: Region, pattern: Pattern, pace: PrintPace) -> list[Bead]:
     """Beads that fill a region, mm, in printing order; none where it is empty. InputError where contours cross."""
-    rim, core = _rim(_within(region, pattern), pattern, pace)
+    rim, core = _rim(_inset(region, pattern), pattern, pace)
     return rim + _lines(core, pattern, pace)
 
 
-def turned(region: Region, pattern: Pattern, pace: Pace) -> Pattern:
-    """The pattern with the angle of its lines settled, by which the region is filled fastest or the way is shortest."""
-    if pattern.kind not in LINED:
+def settle_angle(region: Region, pattern: Pattern, pace: PrintPace) -> Pattern:
+    """The pattern with a number as angle: the one that fills the region fastest, or with the shortest way."""
+    if pattern.kind not in LINE_PATTERNS:
         return pattern
-    rim, core = _rim(_within(region, pattern), pattern, pace)
-    tried = [replace(pattern, angle=angle) for angle in _angles(pattern)]
-    costs = [spent(rim + _lines(core, one, pace), pace) for one in tried]
+    rim, core = _rim(_inset(region, pattern), pattern, pace)
+    candidates = [replace(pattern, angle=angle) for angle in _angles(pattern)]
+    costs = [print_cost(rim + _lines(core, one, pace), pace) for one in candidates]
     shorter = pattern.angle == "shorter"
-    return tried[int(np.argmin([c.printed + c.travelled if shorter else c.seconds for c in costs]))]
+    return candidates[int(np.argmin([c.printed + c.travelled if shorter else c.seconds for c in costs]))]
 
 
-def _within(region: Region, pattern: Pattern) -> Region:
+def smooth_corners(bead: Bead, reach: float) -> Bead:
+    """The bead with each sharp corner cut `reach` mm before and after it, or less where its sides are short."""
+    lines = np.column_stack([bead.points, bead.width])
+    for _ in range(MAX_CUTS):
+        sharp = (turn_angles(lines[:, :2]) > SHARP_MARGIN * SHARP_TURN).nonzero()[0] + 1
+        if not len(sharp):
+            break
+        lines = _cut(lines, sharp, reach)
+        reach /= 2
+    return Bead(lines[:, :2], lines[:, 2])
+
+
+def _cut(lines: Array, corner: NDArray[np.intp], reach: float) -> Array:
+    """Lines (N, 3) with two points instead of each corner (C,), equally far from it so that each turns half as much."""
+    here = lines[corner]
+    back, on = lines[corner - 1] - here, lines[corner + 1] - here
+    far_back, far_on = np.hypot(back[:, 0], back[:, 1]), np.hypot(on[:, 0], on[:, 1])
+    cut = np.minimum(reach, 0.4 * np.minimum(far_back, far_on))
+    times = np.ones(len(lines), int)
+    times[corner] = 2
+    doubled = np.repeat(lines, times, axis=0)
+    place = corner + np.arange(len(corner))
+    doubled[place] = here + (cut / np.maximum(far_back, 1e-12))[:, None] * back
+    doubled[place + 1] = here + (cut / np.maximum(far_on, 1e-12))[:, None] * on
+    return doubled
+
+
+def _inset(region: Region, pattern: Pattern) -> Region:
     """The part of a region that is filled."""
-    region = checked(region)
+    region = check_region(region)
     return shapely.buffer(region, -pattern.inset) if pattern.inset else region
 
 
-def _rim(region: Region, pattern: Pattern, pace: Pace) -> tuple[list[Bead], Region]:
-    """Beads along the contour, in printing order, and the region that they leave for lines."""
+# -- closed lines
+
+
+def _rim(region: Region, pattern: Pattern, pace: PrintPace) -> tuple[list[Bead], Region]:
+    """Beads along the contour, in printing order, and the region that they leave for parallel lines."""
     if region.is_empty or pattern.kind in ("zigzag", "raster"):
         return [], region
-    hybrid = pattern.kind == "hybrid"
-    lost = roughness(region, pattern.spacing)
-    levels, core = _levels(region, lost, pattern, pattern.rims if hybrid else None)
-    runs, corner = _runs(levels, lost, pattern, pace), _corner(region, pattern)
-    if not hybrid:
-        return ordered(_mended(runs, region, lost, pattern), corner), NOTHING
-    return ordered(runs, corner), shapely.buffer(core, INTO_RIM * pattern.spacing)
+    hybrid, fit, spacing = pattern.kind == "hybrid", bead_fit(pattern), pattern.spacing
+    lost = roughness(region, spacing)
+    reached = shapely.buffer(region, (spacing - pattern.width) / 2) if pattern.overlap else region
+    levels, core = ring_levels(reached, lost, fit, pattern.rims if hybrid else None)
+    nests = nest_rings([level.rings for level in levels], spacing)
+    runs = [_nest_run(nest, lost, pattern, pace) for nest in nests]
+    runs += [[_printed_bead(bead, pattern)] for level in levels for bead in level.single]
+    if hybrid:
+        return order_runs(runs, _corner(region, pattern)), shapely.buffer(core, RIM_OVERLAP * spacing)
+    if lost >= MIN_ROUGHNESS:  # gaps between beads are filled where the region is rough or narrow, else it costs time
+        runs = [[_cut_corners(bead, pattern) for bead in run] for run in fill_gaps(runs, region, fit)]
+    return order_runs(runs, _corner(region, pattern)), EMPTY_REGION
 
 
 def _corner(region: Region, pattern: Pattern) -> Array:
-    """The corner (2,) of the box around a region that printing begins nearest to."""
+    """The corner (2,) of the region's bounding box at which printing begins."""
     left, low, right, high = region.bounds
     x, y = pattern.start
     return np.array([right if x > 0 else left, high if y > 0 else low])
 
 
-def _mended(runs: list[Run], region: Region, lost: float, pattern: Pattern) -> list[Run]:
-    """Runs without gaps between them where the region is rough or narrow; elsewhere it would be lost time."""
-    if lost < ROUGH:
-        return runs
-    better = mended(runs, region, fit_of(pattern))
-    return [[eased(bead, CORNER * pattern.spacing) for bead in run] for run in better]
-
-
-def _levels(region: Region, lost: float, pattern: Pattern, most: int | None = None) -> tuple[list[Level], Region]:
-    reached = shapely.buffer(region, (pattern.spacing - pattern.width) / 2) if pattern.overlap else region
-    return ring_levels(reached, lost, fit_of(pattern), most)
-
-
-def _runs(levels: list[Level], lost: float, pattern: Pattern, pace: Pace) -> list[Run]:
-    nested = nests([level.rings for level in levels], pattern.spacing)
-    runs = [_nest_run(nest, lost, pattern, pace) for nest in nested]
-    return runs + [[_laid(bead, pattern)] for level in levels for bead in level.single]
-
-
-def _nest_run(nest: list[Bead], lost: float, pattern: Pattern, pace: Pace) -> Run:
-    """A nest's lines one by one, or joined: as the pattern says, or whichever is faster and fills as well."""
+def _nest_run(nest: list[Bead], lost: float, pattern: Pattern, pace: PrintPace) -> BeadRun:
+    """A nest's lines one by one or joined: by the pattern, or whichever is faster and fills as well."""
     start = np.array(pattern.start)
     if pattern.kind != "spiral":
-        closed = [_laid(bead, pattern) for bead in apart(nest, start, pattern.seam)]
+        closed = [_printed_bead(bead, pattern) for bead in separate_rings(nest, start, pattern.seam)]
         if pattern.kind == "contour":
             return closed
-    joined = [_laid(bead, pattern) for bead in wound(nest, pattern.spacing, start, pattern.seam)]
+    joined = [_printed_bead(bead, pattern) for bead in spiral_runs(nest, pattern.spacing, start, pattern.seam)]
     if pattern.kind == "spiral":
         return joined
-    slower = spent(joined, pace).seconds >= spent(closed, pace).seconds
-    return closed if slower or (lost >= ROUGH and _worse(joined, closed)) else joined
+    slower = print_cost(joined, pace).seconds >= print_cost(closed, pace).seconds
+    return closed if slower or (lost >= MIN_ROUGHNESS and _worse(joined, closed)) else joined
 
 
-def _worse(joined: Run, closed: Run) -> bool:
-    """Whether a spiral fills worse than the closed lines that it joins: where these lie unevenly, ramps between them
-    leave open or lay twice what they do not, more or less as the spiral happens to begin."""
-    covered = [covered_by(run).area for run in (joined, closed)]
-    twice = [sum(bead.laid for bead in run) - area for run, area in zip((joined, closed), covered, strict=True)]
-    return bool(covered[1] - covered[0] + (twice[0] - twice[1]) / TWICE > AS_GOOD * covered[1])
+def _worse(joined: BeadRun, closed: BeadRun) -> bool:
+    """Whether a spiral fills worse than the closed lines that it joins.
+
+    Where these lie unevenly, the ramps between them leave areas open or lay them twice, depending on where it begins.
+    """
+    covered = [covered_area(run).area for run in (joined, closed)]
+    double = [sum(bead.area for bead in run) - area for run, area in zip((joined, closed), covered, strict=True)]
+    return bool(covered[1] - covered[0] + (double[0] - double[1]) / DOUBLE_WEIGHT > COVERAGE_TOLERANCE * covered[1])
 
 
-def _laid(bead: Bead, pattern: Pattern) -> Bead:
-    """A bead as wide as the overlap makes it, its corners eased."""
-    return eased(Bead(bead.points, bead.width / (1 - pattern.overlap)), CORNER * pattern.spacing)
+def _printed_bead(bead: Bead, pattern: Pattern) -> Bead:
+    """A bead as wide as the overlap makes it, its corners cut."""
+    return _cut_corners(Bead(bead.points, bead.width / (1 - pattern.overlap)), pattern)
 
 
-def _lines(region: Region, pattern: Pattern, pace: Pace) -> list[Bead]:
+def _cut_corners(bead: Bead, pattern: Pattern) -> Bead:
+    return smooth_corners(bead, CORNER_CUT * pattern.spacing)
+
+
+# -- parallel lines
+
+
+def _lines(region: Region, pattern: Pattern, pace: PrintPace) -> list[Bead]:
     """The shortest or fastest way to fill a region with parallel lines, begun on the side of the pattern's start."""
     lay: Lines = raster_lines if pattern.kind == "raster" else zigzag_lines
     middle = shapely.buffer(region, -pattern.width / 2)
     if middle.is_empty:
         return []
-    corner, boundary = _corner(region, pattern), boundary_of(middle)
-    found = [_placed(lay(boundary, angle, pattern.spacing), pattern, corner) for angle in _angles(pattern)]
+    corner, boundary = _corner(region, pattern), region_boundary(middle)
+    ways = [_line_beads(lay(boundary, angle, pattern.spacing), pattern, corner) for angle in _angles(pattern)]
     if pattern.angle == "shorter":  # the printed line and the way between its parts, thesis 5.3
-        return [_cut(b, pattern) for b in min(found, key=lambda way: sum(bead.length for bead in way) + hops(way))]
-    return min(([_cut(bead, pattern) for bead in way] for way in found), key=lambda way: spent(way, pace).seconds)
+        shortest = min(ways, key=lambda way: sum(bead.length for bead in way) + travel_length(way))
+        return [_cut_corners(bead, pattern) for bead in shortest]
+    smooth = ([_cut_corners(bead, pattern) for bead in way] for way in ways)
+    return min(smooth, key=lambda way: print_cost(way, pace).seconds)
 
 
-def _placed(laid: tuple[list[Array], float], pattern: Pattern, corner: Array) -> list[Bead]:
-    """Lines as beads of one width, in printing order."""
-    lines, step = laid
+def _line_beads(spaced: tuple[list[Array], float], pattern: Pattern, corner: Array) -> list[Bead]:
+    """Lines and their spacing as beads of one width, in printing order."""
+    lines, step = spaced
     width = min(pattern.width, step / (1 - pattern.overlap))
-    beads = [even(line, width) for line in lines]
+    beads = [even_bead(line, width) for line in lines]
     if pattern.kind == "raster":
         first, last = (min(math.dist(end, corner) for end in bead.points[[0, -1]]) for bead in (beads[0], beads[-1]))
         return beads if first <= last else beads[::-1]
-    return ordered([[bead] for bead in beads], corner)
-
-
-def _cut(bead: Bead, pattern: Pattern) -> Bead:
-    return eased(bead, CORNER * pattern.spacing)
+    return order_runs([[bead] for bead in beads], corner)
 
 
 def _angles(pattern: Pattern) -> list[float]:

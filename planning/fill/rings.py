@@ -1,8 +1,11 @@
-"""Closed lines parallel to the contour, level by level, as wide as the place between their neighbours.
+"""Closed lines parallel to the contour, level by level, as wide as the room between their neighbours.
 
-After Kuipers et al. 2020: where the thickness left is no multiple of the spacing, two neighbours share it, wider or
-narrower than nominal, or one bead along the medial axis takes it. The line outside a corner widens into what is
+After Kuipers et al. 2020: where the remaining thickness is no multiple of the spacing, two neighbours share it, wider
+or narrower than nominal, or a single bead along the medial axis fills it. The line outside a corner widens into what is
 left open there.
+
+The medial axis comes from the Voronoi diagram of points along the boundary (Brandt and Algazi 1992). Only the part
+along which the thickness changes slowly is used: every kink and all noise of a contour adds a branch into its corners.
 """
 
 from __future__ import annotations
@@ -13,148 +16,251 @@ from dataclasses import dataclass, replace
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import QhullError, Voronoi, cKDTree
 from shapely.geometry.base import BaseGeometry
 
-from planning.fill.axis import Axis, axis_of
-from planning.fill.bead import Bead, even
-from planning.fill.coverage import covered_by
-from planning.fill.fit import Fit
-from planning.fill.gap_fill import widened
-from planning.fill.region import Region, joined, minus, points_of
-from planning.fill.strokes import strokes
+from estimation.se3 import Array
+from planning.fill.bead import Bead, BeadFit, even_bead
+from planning.fill.gap_fill import dot_beads, widen_ring
+from planning.fill.region import Region, covered_area, difference, points_of, union_of
 
-SAMPLED = 0.25  # spacings from point to point of the boundary whose medial axis is sought
-ROUND = 0.15  # spacings: radius of corners, so that none stops the nozzle
-DOT = 0.05  # spacings to either side of a dot's middle: the nozzle hardly moves
-OUTERMOST = 0.05  # the same at the contour, where no line outside widens into them
-SLIVER = 0.02  # spacings squared: a smaller loop is a dot
-FINE = 0.003  # spacings: to which lines are simplified; offsets of offsets double their points each time
-FACING = 0.15  # spacings: a line's point nearer to or farther from a disc's rim faces another disc
-HAIR = 0.01  # spacings: a narrower opening between two lines is none
-LOST = 0.003  # of the area: what the corners of the outermost line may lose before it is made narrower
-ARC = 8  # edges of a quarter circle: off by a thousandth of a bead at most, less than FINE
-SMALLEST = 0.04  # spacings squared: of a gap worth filling, as in a corner of 110 degrees
+# mm per mm by which the radius may grow along the axis: cos 67.5 degrees, as Kuipers et al. 2020
+MAX_RADIUS_SLOPE = 0.38
+MIN_LENGTH = 0.1  # spacings: a shorter line is a dot
+POINT_SPACING = 0.25  # spacings from point to point
+END_CLEARANCE = 0.5  # of the radius at a wide end, by which a bead stays away from the line that turns there
+WIDE_END = 0.9  # of the widest: an end at least that wide lies before such a turn
+AXIS_SMOOTHING = 4  # roundings, each over two points
+BOUNDARY_SPACING = 0.25  # spacings from point to point of the boundary whose medial axis is sought
+CORNER_RADIUS = 0.15  # spacings: radius of corners, so that none stops the nozzle
+OUTER_CORNER_RADIUS = 0.05  # the same at the contour, where no line outside widens into them
+MIN_LOOP_AREA = 0.02  # spacings squared: a smaller loop is a dot
+SIMPLIFY_TOLERANCE = 0.003  # spacings: to which lines are simplified; offsets of offsets double their points each time
+RIM_TOLERANCE = 0.15  # spacings: a line's point nearer to or farther from a disc's rim faces another disc
+MIN_OPENING = 0.01  # spacings: a narrower opening between two lines is none
+MAX_CORNER_LOSS = 0.003  # of the area: what the corners of the outermost line may lose before it is made narrower
+ARC_SEGMENTS = 8  # edges of a quarter circle: off by a thousandth of a bead at most, less than SIMPLIFY_TOLERANCE
+MIN_GAP_AREA = 0.04  # spacings squared: of a gap worth filling, as in a corner of 110 degrees
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Level:
+class MedialAxis:
+    """Middles (V, 2) mm and radii (V,) mm of inscribed discs; edges (E, 2) join them."""
+
+    middles: Array
+    radii: Array
+    edges: NDArray[np.intp]
+
+
+EMPTY_AXIS = MedialAxis(np.empty((0, 2)), np.empty(0), np.empty((0, 2), np.intp))
+
+
+def medial_axis(region: Region, step: float) -> MedialAxis:
+    """The medial axis of a region whose boundary is sampled every `step` mm."""
+    sites = _sites(region, step)
+    if len(sites) < 4:
+        return EMPTY_AXIS
+    try:
+        diagram = Voronoi(sites)
+    except QhullError:  # all on one line: nothing inside
+        return EMPTY_AXIS
+    ridge, pair = np.asarray(diagram.ridge_vertices), np.asarray(diagram.ridge_points)
+    bounded = (ridge >= 0).all(axis=1)
+    ridge, pair = ridge[bounded], pair[bounded]
+    chord = np.linalg.norm(sites[pair[:, 0]] - sites[pair[:, 1]], axis=1)
+    radius = np.linalg.norm(diagram.vertices[ridge] - sites[pair[:, :1]], axis=2)  # (E, 2)
+    flat = chord / 2 >= np.sqrt(1 - MAX_RADIUS_SLOPE**2) * radius.max(axis=1)
+    ridge, radius = ridge[flat], radius[flat]
+    shapely.prepare(region)
+    inside = shapely.contains_xy(region, *diagram.vertices[ridge].reshape(-1, 2).T).reshape(-1, 2).all(axis=1)
+    used, edges = np.unique(ridge[inside], return_inverse=True)
+    edges = edges.reshape(-1, 2)
+    radii = np.zeros(len(used))
+    radii[edges] = radius[inside]
+    return MedialAxis(diagram.vertices[used], radii, edges)
+
+
+def _sites(region: Region, step: float) -> Array:
+    points, ring = shapely.get_coordinates(
+        shapely.segmentize(shapely.get_rings(shapely.get_parts(region)), step), return_index=True
+    )
+    return np.asarray(points[np.diff(ring, prepend=-1) == 0])  # a ring repeats its first point
+
+
+def graph_paths(edges: NDArray[np.intp]) -> list[list[int]]:
+    """The edges (E, 2) of a graph as paths between its ends and forks; circles end where they begin."""
+    beside: dict[int, list[int]] = {}
+    for a, b in np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0).tolist():
+        beside.setdefault(a, []).append(b)
+        beside.setdefault(b, []).append(a)
+    paths, gone = [], set()
+    ends = [v for v, near in beside.items() if len(near) != 2]
+    for start in (*ends, *beside):
+        for second in beside[start]:
+            if (start, second) in gone:
+                continue
+            path = [start, second]
+            gone |= {(start, second), (second, start)}
+            while len(beside[path[-1]]) == 2 and path[-1] != start:
+                a, b = beside[path[-1]]
+                path.append(b if a == path[-2] else a)
+                gone |= {(path[-2], path[-1]), (path[-1], path[-2])}
+            paths.append(path)
+    return paths
+
+
+def thin_beads(axis: MedialAxis, edge: BaseGeometry, fit: BeadFit, levels: int | None = None) -> list[tuple[int, Bead]]:
+    """Beads along the parts of an axis that closed lines at multiples of the spacing leave, each with its level.
+
+    edge: the boundary that the axis belongs to; no bead reaches over it.
+    """
+    level = fit.level(axis.radii)
+    single = (axis.radii - fit.outside(level) < fit.two) & (level >= 0)
+    if levels is not None:
+        single &= level < levels
+    a, b = axis.edges.T
+    edges = axis.edges[single[a] & single[b] & (level[a] == level[b])]
+    beads = []
+    for path in graph_paths(edges):
+        points = _smooth(axis.middles[path], fit.spacing)
+        if len(points):
+            inner = int(level[path[0]])
+            radius = shapely.distance(edge, shapely.points(points)) - float(fit.outside(inner))
+            bead = _clear(Bead(points, 2 * np.clip(radius, fit.one, fit.two)), fit)
+            if bead is not None:
+                beads.append((inner, bead))
+    return beads
+
+
+def _clear(bead: Bead, fit: BeadFit) -> Bead | None:
+    """What stays of a bead once it keeps clear of the closed lines that turn round where it is widest."""
+    start, end = (END_CLEARANCE * fit.two if width > WIDE_END * 2 * fit.two else 0.0 for width in bead.width[[0, -1]])
+    if bead.length - start - end < MIN_LENGTH * fit.spacing:
+        return None
+    return bead.between(start, bead.length - end)
+
+
+def _smooth(points: Array, spacing: float) -> Array:
+    """The same line (N, 2) without the Voronoi diagram's jitter; none where it is too short to be one."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    if along[-1] < MIN_LENGTH * spacing:
+        return points[:0]
+    at = np.linspace(0, along[-1], max(2, int(np.ceil(along[-1] / (POINT_SPACING * spacing))) + 1))
+    line = np.stack([np.interp(at, along, v) for v in points.T], axis=1)
+    for _ in range(AXIS_SMOOTHING):
+        line[1:-1] = (line[:-2] + 2 * line[1:-1] + line[2:]) / 4
+    return line
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RingLevel:
     """One level: closed lines, and the single beads that fill what is too narrow for two."""
 
     rings: list[Bead]
     single: list[Bead]
 
 
-def ring_levels(region: Region, lost: float, fit: Fit, most: int | None = None) -> tuple[list[Level], Region]:
+def ring_levels(region: Region, lost: float, fit: BeadFit, most: int | None = None) -> tuple[list[RingLevel], Region]:
     """Levels of closed lines from the contour inwards, at most so many, and the region that they leave.
 
     lost: the region's roughness for one spacing.
     """
     fit = _following(lost, fit)
-    axis = axis_of(region, SAMPLED * fit.spacing)
-    thin = strokes(axis, shapely.boundary(region), fit, most)
-    levels: list[Level] = []
+    axis = medial_axis(region, BOUNDARY_SPACING * fit.spacing)
+    thin = thin_beads(axis, shapely.boundary(region), fit, most)
+    levels: list[RingLevel] = []
     left = region
     while not left.is_empty and (most is None or len(levels) < most):
         here = fit.at(len(levels))
         spacing = here.spacing
         own = [bead for k, bead in thin if k == len(levels)]
-        middle = _middle(left, own, here, (ROUND if levels else OUTERMOST) * spacing)
+        middle = _middle(left, own, here, (CORNER_RADIUS if levels else OUTER_CORNER_RADIUS) * spacing)
         gaps = _gaps(left, middle, own, spacing)
-        own += dots(gaps, here)
+        own += dot_beads(gaps, here)
         if levels and len(gaps):
             outer = levels[-1]
             before = fit.at(len(levels) - 1)
-            levels[-1] = Level([widened(ring, gaps, before) for ring in outer.rings], outer.single)
+            levels[-1] = RingLevel([widen_ring(ring, gaps, before) for ring in outer.rings], outer.single)
         between = _between(axis, float(fit.outside(len(levels))), here)
         rings = shapely.get_rings(shapely.get_parts(_simple(middle, spacing)))
-        levels.append(Level([_shared(ring, between, here) for ring in rings], own))
-        left = _simple(shapely.buffer(left, -spacing, quad_segs=ARC), spacing)
+        levels.append(RingLevel([_shared(ring, between, here) for ring in rings], own))
+        left = _simple(shapely.buffer(left, -spacing, quad_segs=ARC_SEGMENTS), spacing)
     return levels, left
 
 
-def _following(lost: float, fit: Fit) -> Fit:
+def _following(lost: float, fit: BeadFit) -> BeadFit:
     """The fit whose outermost line is so narrow that it follows a contour in whose corners so much is lost."""
-    share = math.sqrt(LOST / max(lost, LOST))  # what rounded corners lose grows with the square of their radius
+    share = math.sqrt(
+        MAX_CORNER_LOSS / max(lost, MAX_CORNER_LOSS)
+    )  # what rounded corners lose grows with the square of their radius
     return replace(fit, outermost=max(share * fit.spacing, 2 * fit.one))
 
 
 def _simple(region: Region, spacing: float) -> Region:
     """Without points that offsets of offsets double each time."""
-    return shapely.simplify(region, FINE * spacing, preserve_topology=False)
+    return shapely.simplify(region, SIMPLIFY_TOLERANCE * spacing, preserve_topology=False)
 
 
-def _middle(left: Region, single: list[Bead], fit: Fit, radius: float) -> Region:
+def _middle(left: Region, single: list[Bead], fit: BeadFit, radius: float) -> Region:
     """What lies inside the middle lines of the next level, corners rounded; tongues for single beads are cut off."""
     spacing = fit.spacing
-    middle = shapely.buffer(shapely.buffer(left, -spacing / 2 - radius, quad_segs=ARC), radius, quad_segs=4)
+    middle = shapely.buffer(shapely.buffer(left, -spacing / 2 - radius, quad_segs=ARC_SEGMENTS), radius, quad_segs=4)
     if single:
         lean = max(fit.two - spacing / 2, radius)
         wide = shapely.buffer(
-            shapely.buffer(middle, -lean, quad_segs=ARC), lean + HAIR * spacing, quad_segs=ARC
+            shapely.buffer(middle, -lean, quad_segs=ARC_SEGMENTS), lean + MIN_OPENING * spacing, quad_segs=ARC_SEGMENTS
         )  # not edge upon edge: that is slow
-        rest = shapely.get_parts(minus(middle, wide))
+        rest = shapely.get_parts(difference(middle, wide))
         lines = shapely.multilinestrings([shapely.linestrings(bead.points) for bead in single])
         shapely.prepare(lines)
-        middle = minus(middle, joined(rest[shapely.intersects(lines, rest)]))
+        middle = difference(middle, union_of(rest[shapely.intersects(lines, rest)]))
         middle = shapely.buffer(shapely.buffer(middle, -radius, quad_segs=4), radius, quad_segs=4)
     parts = shapely.get_parts(middle)
-    return shapely.multipolygons(parts[shapely.area(parts) > SLIVER * spacing**2])
+    return shapely.multipolygons(parts[shapely.area(parts) > MIN_LOOP_AREA * spacing**2])
 
 
 def _gaps(left: Region, middle: Region, single: list[Bead], spacing: float) -> NDArray[np.object_]:
     """What a level leaves open between the line outside it and its own."""
-    reached = shapely.buffer(middle, (0.5 + HAIR) * spacing, quad_segs=4)
-    beyond = HAIR * spacing * reached.length  # by so much its area is larger than the beads' own (Steiner's formula)
-    if left.area - reached.area + beyond < SMALLEST * spacing**2:
+    reached = shapely.buffer(middle, (0.5 + MIN_OPENING) * spacing, quad_segs=4)
+    beyond = (
+        MIN_OPENING * spacing * reached.length
+    )  # by so much its area is larger than the beads' own (Steiner's formula)
+    if left.area - reached.area + beyond < MIN_GAP_AREA * spacing**2:
         return np.empty(0, object)
-    gaps = _large(minus(left, reached), spacing)
+    gaps = _large(difference(left, reached), spacing)
     if not single or not len(gaps):
         return gaps
     lines = np.array([shapely.linestrings(bead.points) for bead in single], dtype=object)
     reach = np.array([bead.width.max() / 2 for bead in single])
     far = shapely.distance(lines[:, None], gaps[None])  # to gaps (S, G)
     own = [bead for bead, near in zip(single, far.min(axis=1) < reach, strict=True) if near]
-    return _large(minus(shapely.multipolygons(gaps), covered_by(own, ARC)), spacing) if own else gaps
+    return _large(difference(shapely.multipolygons(gaps), covered_area(own, ARC_SEGMENTS)), spacing) if own else gaps
 
 
 def _large(gaps: BaseGeometry, spacing: float) -> NDArray[np.object_]:
     """The parts of gaps that are worth filling."""
     parts = shapely.get_parts(gaps)
-    return np.asarray(parts[shapely.area(parts) > SMALLEST * spacing**2])
+    return np.asarray(parts[shapely.area(parts) > MIN_GAP_AREA * spacing**2])
 
 
-def dots(gaps: NDArray[np.object_], fit: Fit) -> list[Bead]:
-    """A short bead in the middle of each gap that is wide enough for one."""
-    large = gaps[shapely.area(gaps) > np.pi * fit.one**2]
-    dots = []
-    for circle in [shapely.maximum_inscribed_circle(gap, 0.1 * fit.one) for gap in large]:
-        middle, rim = shapely.get_coordinates(circle)
-        radius = math.dist(middle, rim)
-        if radius >= fit.one:
-            half = np.array([DOT * fit.spacing, 0.0])
-            dots.append(even(np.stack([middle - half, middle + half]), min(2 * radius, fit.most)))
-    return dots
-
-
-def _between(axis: Axis, outside: float, fit: Fit) -> Axis:
+def _between(axis: MedialAxis, outside: float, fit: BeadFit) -> MedialAxis:
     """The part of an axis that only two lines of a level pass, one on each side; radii less what is outside them."""
     radii = axis.radii - outside
     two = (radii >= fit.two) & (radii < fit.three)
-    return Axis(axis.middles[two], radii[two], axis.edges[:0])
+    return MedialAxis(axis.middles[two], radii[two], axis.edges[:0])
 
 
-def _shared(ring: BaseGeometry, between: Axis, fit: Fit) -> Bead:
+def _shared(ring: BaseGeometry, between: MedialAxis, fit: BeadFit) -> Bead:
     """A closed line, moved and widened where only two fit between the lines outside it."""
     spacing = fit.spacing
     points = points_of(shapely.segmentize(ring, spacing))
     if not len(between.radii):
-        return even(points, spacing)
+        return even_bead(points, spacing)
     far, near = cKDTree(between.middles).query(points, distance_upper_bound=0.8 * spacing)
     near[np.isinf(far)] = 0
-    beside = np.abs(far + spacing / 2 - between.radii[near]) < FACING * spacing
+    beside = np.abs(far + spacing / 2 - between.radii[near]) < RIM_TOLERANCE * spacing
     if not beside.any():
-        return even(points, spacing)
+        return even_bead(points, spacing)
     more = np.where(beside, np.minimum(between.radii[near], fit.most) - spacing, 0.0)
     way = (between.middles[near] - points) / np.maximum(far, 1e-9)[:, None]
     points = points + way * (more / 2)[:, None]

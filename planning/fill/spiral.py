@@ -1,25 +1,125 @@
-"""Closed lines that lie in one another, joined to one run inwards, or printed one after the other from one side."""
+"""Closed lines printed one by one or joined to a spiral, and the order of runs with the least travel between them.
+
+The order is nearest neighbour first, then 2-opt and Or-opt (thesis 2.1.3). Printing itself takes as long in any order
+and direction, so the shortest travel is the shortest time.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from estimation.se3 import Array
-from planning.fill.bead import SAME, Bead
-from planning.fill.order import Run
+from planning.fill.bead import POINT_TOLERANCE, Bead
 
-RAMP = 2.2  # spacings along which a line leads over to the next: 24 degrees, no sharp turn
-NEAR = 1.6  # spacings: a line farther from the one outside it is not joined to it
-STEPS = 6  # points of a ramp
-PLACES = 12  # where along the innermost line a run may begin
+BeadRun = list[Bead]  # beads that follow one another
+MAX_IMPROVEMENTS = 300  # improvements: a bound on time, reached by no layer that a wound was seen to need
+MIN_GAIN = 1e-6  # mm: a smaller gain is none
+RAMP_LENGTH = 2.2  # spacings along which a line leads over to the next: 24 degrees, no sharp turn
+JOIN_DISTANCE = 1.6  # spacings: a line farther from the one outside it is not joined to it
+RAMP_POINTS = 6  # points of a ramp
+START_CANDIDATES = 12  # where along the innermost line a run may begin
 
 
-def nests(levels: list[list[Bead]], spacing: float) -> list[list[Bead]]:
+def order_runs(runs: Sequence[BeadRun], start: Array) -> list[Bead]:
+    """The beads of all runs, runs in the order and direction that travel least from `start` (2,)."""
+    if len(runs) < 2:
+        near = min((math.dist(end, start), way) for way, end in enumerate(_ends(runs[0]))) if runs else (0.0, 0)
+        return [bead for run in runs for bead in (_reversed(run) if near[1] else run)]
+    ends = np.array([_ends(run) for run in runs])  # (M, entry or exit, 2)
+    tour = _nearest(ends, start)
+    for _ in range(MAX_IMPROVEMENTS):
+        better = _turned(tour, ends, start)
+        better = _moved(tour, ends, start) if better is None else better
+        if better is None:
+            break
+        tour = better
+    return [bead for run, flipped in tour for bead in (_reversed(runs[run]) if flipped else runs[run])]
+
+
+Tour = NDArray[np.intp]  # (M, 2): number of the run, and 1 where it is printed from its end
+
+
+def _ends(run: BeadRun) -> tuple[Array, Array]:
+    return run[0].points[0], run[-1].points[-1]
+
+
+def _reversed(run: BeadRun) -> BeadRun:
+    return [bead.reversed for bead in reversed(run)]
+
+
+def _nearest(ends: Array, start: Array) -> Tour:
+    free = np.ones(len(ends), bool)
+    tour, here = [], start
+    for _ in range(len(ends)):
+        far = np.linalg.norm(ends - here, axis=2)
+        far[~free] = np.inf
+        run, end = divmod(int(far.argmin()), 2)
+        free[run] = False
+        tour.append((run, end))
+        here = ends[run, 1 - end]
+    return np.array(tour)
+
+
+def _places(tour: Tour, ends: Array, start: Array) -> tuple[Array, Array]:
+    """Where each run of a tour begins (M, 2), and where the nozzle leaves before the first and after each (M+1, 2)."""
+    run, flipped = tour.T
+    return ends[run, flipped], np.concatenate([start[None], ends[run, 1 - flipped]])
+
+
+def _turned(tour: Tour, ends: Array, start: Array) -> Tour | None:
+    """The tour with its best stretch printed backwards (2-opt); None where none is better."""
+    entry, leave = _places(tour, ends, start)
+    hop = np.linalg.norm(entry - leave[:-1], axis=1)
+    into = np.linalg.norm(leave[:-1, None] - leave[None, 1:], axis=2)  # (i, j): from before i to the end of j
+    out = np.zeros_like(into)
+    out[:, :-1] = np.linalg.norm(entry[:, None] - entry[None, 1:], axis=2)  # from the start of i to what follows j
+    gain = into + out - hop[:, None] - np.append(hop[1:], 0.0)
+    gain[np.tri(len(tour), k=-1, dtype=bool)] = 0.0
+    i, j = divmod(int(gain.argmin()), len(tour))
+    if gain[i, j] > -MIN_GAIN:
+        return None
+    better = tour.copy()
+    better[i : j + 1] = tour[i : j + 1][::-1]
+    better[i : j + 1, 1] ^= 1
+    return better
+
+
+def _moved(tour: Tour, ends: Array, start: Array) -> Tour | None:
+    """The tour with one run moved to its best place, in its better direction (Or-opt); None where none is better."""
+    if len(tour) < 3:
+        return None
+    entry, leave = _places(tour, ends, start)
+    hop = np.linalg.norm(entry - leave[:-1], axis=1)
+    skip = np.append(np.linalg.norm(entry[1:] - leave[:-2], axis=1), 0.0)  # from before i to what follows it
+    saved = hop + np.append(hop[1:], 0.0) - skip
+    best, move = -MIN_GAIN, None
+    for flip in (0, 1):
+        first, last = (leave[1:], entry) if flip else (entry, leave[1:])
+        into = np.linalg.norm(leave[None] - first[:, None], axis=2)  # (i, place): after `place` runs
+        out = np.zeros_like(into)
+        out[:, :-1] = np.linalg.norm(entry[None] - last[:, None], axis=2)
+        cost = into + out - np.append(hop, 0.0) - saved[:, None]
+        i = np.arange(len(tour))
+        cost[i, i] = cost[i, i + 1] = 0.0
+        at = int(cost.argmin())
+        if cost.flat[at] < best:
+            best, move = float(cost.flat[at]), (*divmod(at, len(tour) + 1), flip)
+    if move is None:
+        return None
+    run, place, flip = move
+    changed = tour[run] ^ [0, flip]
+    rest = np.delete(tour, run, axis=0)
+    return np.insert(rest, place - (place > run), changed, axis=0)
+
+
+def nest_rings(levels: list[list[Bead]], spacing: float) -> list[list[Bead]]:
     """Lines of all levels, outermost first, as nests: each line in one the only one inside the line before."""
     open_nests: list[tuple[list[Bead], BaseGeometry]] = []
     done: list[list[Bead]] = []
@@ -30,7 +130,7 @@ def nests(levels: list[list[Bead]], spacing: float) -> list[list[Bead]]:
         alone = []
         for i in range(len(lines)):
             far = shapely.distance(outer, shapely.points(rings[i].points[0])) if len(outer) else np.empty(0)
-            if len(far) and far.min() < NEAR * spacing:
+            if len(far) and far.min() < JOIN_DISTANCE * spacing:
                 inside[int(far.argmin())].append(i)
             else:
                 alone.append(i)
@@ -45,7 +145,7 @@ def nests(levels: list[list[Bead]], spacing: float) -> list[list[Bead]]:
     return done + [nest for nest, _ in open_nests]
 
 
-def apart(nest: list[Bead], start: Array, seam: float) -> Run:
+def separate_rings(nest: list[Bead], start: Array, seam: float) -> BeadRun:
     """The lines of a nest one by one, outermost first, begun near the side that `start` (2,) points to.
 
     seam: share of the outermost line by which the run begins later.
@@ -53,9 +153,9 @@ def apart(nest: list[Bead], start: Array, seam: float) -> Run:
     return _begun(nest, _inwards(nest, _wanted(nest[0], start, seam)))
 
 
-def wound(nest: list[Bead], spacing: float, start: Array, seam: float) -> Run:
+def spiral_runs(nest: list[Bead], spacing: float, start: Array, seam: float) -> BeadRun:
     """The same lines joined inwards wherever one begins beside the one before."""
-    turned = apart(nest, start, seam)
+    turned = separate_rings(nest, start, seam)
     if any(_far(outer, inner, spacing) for outer, inner in pairwise(turned)):
         turned = _begun(nest, _outwards(nest, _wanted(nest[0], start, seam), spacing))
     runs: list[list[Bead]] = [[turned[0]]]
@@ -66,7 +166,7 @@ def wound(nest: list[Bead], spacing: float, start: Array, seam: float) -> Run:
             runs.append([inner])  # not beside one another here
             closing = []
             continue
-        ramp = min(RAMP * spacing, inner.length / 4, outer.length / 4)
+        ramp = min(RAMP_LENGTH * spacing, inner.length / 4, outer.length / 4)
         runs[-1] += [_ramp(outer, inner, ramp), inner.between(ramp, inner.length)]
         closing = [inner.between(0.0, ramp)]
     runs[-1] += closing
@@ -76,8 +176,8 @@ def wound(nest: list[Bead], spacing: float, start: Array, seam: float) -> Run:
 def _chained(run: list[Bead]) -> Bead:
     """Beads that follow one another without a step, as one."""
     points, width = np.concatenate([b.points for b in run]), np.concatenate([b.width for b in run])
-    kept = np.append(True, np.abs(np.diff(points, axis=0)).max(axis=1) > SAME)
-    return Bead(points[kept], width[kept])
+    distinct = np.append(True, np.abs(np.diff(points, axis=0)).max(axis=1) > POINT_TOLERANCE)
+    return Bead(points[distinct], width[distinct])
 
 
 def _wanted(ring: Bead, start: Array, seam: float) -> Array:
@@ -88,7 +188,7 @@ def _wanted(ring: Bead, start: Array, seam: float) -> Array:
 
 def _far(outer: Bead, inner: Bead, spacing: float) -> bool:
     """Whether two lines begin too far apart to be joined there."""
-    return math.dist(outer.points[0], inner.points[0]) > NEAR * spacing
+    return math.dist(outer.points[0], inner.points[0]) > JOIN_DISTANCE * spacing
 
 
 def _inwards(nest: list[Bead], wanted: Array) -> list[float]:
@@ -103,12 +203,12 @@ def _inwards(nest: list[Bead], wanted: Array) -> list[float]:
 def _outwards(nest: list[Bead], wanted: Array, spacing: float) -> list[float]:
     """The same, so that each begins beside the one within it, the outermost as near to `wanted` as that allows."""
     inmost = nest[-1]
-    place = inmost.at(np.linspace(0, inmost.length, PLACES, endpoint=False))[:, :2]
-    arcs, far = [], np.zeros(PLACES)
+    place = inmost.at(np.linspace(0, inmost.length, START_CANDIDATES, endpoint=False))[:, :2]
+    arcs, far = [], np.zeros(START_CANDIDATES)
     for ring in nest[::-1]:
         arc = shapely.line_locate_point(shapely.linestrings(ring.points), shapely.points(place))
         outer = ring.at(arc)[:, :2]
-        far += np.linalg.norm(outer - place, axis=1) > NEAR * spacing
+        far += np.linalg.norm(outer - place, axis=1) > JOIN_DISTANCE * spacing
         place = outer
         arcs.append(arc)
     best = int((np.linalg.norm(place - wanted, axis=1) + 1e6 * far).argmin())
@@ -119,13 +219,13 @@ def _begun(nest: list[Bead], arcs: list[float]) -> list[Bead]:
     """The lines begun at these lengths, all in the sense of the first."""
     number = np.repeat(np.arange(len(nest)), [len(ring.points) for ring in nest])
     sense = shapely.is_ccw(shapely.linearrings(np.concatenate([ring.points for ring in nest]), indices=number))
-    found = [ring.turned(arc) for ring, arc in zip(nest, arcs, strict=True)]
-    return [ring if way == sense[0] else ring.reversed for ring, way in zip(found, sense, strict=True)]
+    rings = [ring.turned(arc) for ring, arc in zip(nest, arcs, strict=True)]
+    return [ring if way == sense[0] else ring.reversed for ring, way in zip(rings, sense, strict=True)]
 
 
 def _ramp(outer: Bead, inner: Bead, length: float) -> Bead:
     """From the start of a line over to `length` mm after the start of the one within it."""
-    share = np.linspace(0, 1, STEPS)[1:, None]
+    share = np.linspace(0, 1, RAMP_POINTS)[1:, None]
     on_inner = inner.at(share[:, 0] * length)
     beside = outer.between(0.0, min(2 * length, outer.length / 2))
     arc = shapely.line_locate_point(shapely.linestrings(beside.points), shapely.points(on_inner[:, :2]))

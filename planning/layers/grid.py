@@ -1,26 +1,37 @@
-"""Heights over a plane: a regular grid, the triangles' topmost height at its nodes, and values between them."""
+"""A regular grid over a plane: interpolation, rasterised triangles, contours, and the chart of a surface.
+
+Contours are found by marching triangles, which have no ambiguous case. The chart is the plane stretched to the length
+of the skin, so that beads side by side in it lie side by side on the limb: lengths are summed along x and y from the
+middle of the wound. A cylinder along either axis is unrolled exactly; on any other surface areas are right to the
+second order of the slope.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
+from shapely import MultiPolygon
 
 from estimation.se3 import Array
 
 Mask = NDArray[np.bool_]
-MOST_CANDIDATES = 2_000_000  # nodes tried against triangles at once: 100 MB
+MAX_CANDIDATES = 2_000_000  # nodes tried against triangles at once: 100 MB
+ZERO_BAND = 1e-9  # values nearer to 0 than this are moved off it, so that no crossing falls on a node
+NEWTON_STEPS = 8  # of Newton's method, each at least halving the error where the skin slopes by less than 60 degrees
+MAX_SLOPE = 1.5  # slope, 56 degrees: of skin; beyond, it is the edge of a scan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """Nodes of a square lattice. step: mm. origin: (2,) mm, x and y of node (0, 0). shape: (H, W), rows along y."""
+    """Nodes of a square lattice."""
 
-    step: float
-    origin: Array
-    shape: tuple[int, int]
+    step: float  # mm
+    origin: Array  # (2,) mm, x and y of node (0, 0)
+    shape: tuple[int, int]  # (H, W), rows along y
 
     @property
     def x(self) -> Array:
@@ -50,7 +61,7 @@ def grid_over(low: ArrayLike, high: ArrayLike, step: float) -> Grid:
     return Grid(step, low, (rows, columns))
 
 
-def at(grid: Grid, values: Array, xy: ArrayLike) -> Array:
+def interpolate(grid: Grid, values: Array, xy: ArrayLike) -> Array:
     """Values (N,) or (N, K) at points (N, 2) mm, bilinear between nodes (H, W) or (H, W, K), beside as at the edge."""
     rows, columns = grid.shape
     u = (np.asarray(xy, float) - grid.origin) / grid.step
@@ -59,8 +70,8 @@ def at(grid: Grid, values: Array, xy: ArrayLike) -> Array:
     s, t = x - i, y - j
     flat, k = values.reshape(rows * columns, -1), j * columns + i
     parts = ((1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t)
-    found = sum(w[:, None] * flat[k + d] for w, d in zip(parts, (0, 1, columns, columns + 1), strict=True))
-    return np.asarray(found).reshape(-1, *values.shape[2:])
+    values_at = sum(w[:, None] * flat[k + d] for w, d in zip(parts, (0, 1, columns, columns + 1), strict=True))
+    return np.asarray(values_at).reshape(-1, *values.shape[2:])
 
 
 def gradient(grid: Grid, values: Array) -> Array:
@@ -104,7 +115,7 @@ def topmost(points: Array, triangles: NDArray[np.int64], grid: Grid) -> Array:
 
 def _parts(keep: NDArray[np.int64], counts: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     total = np.cumsum(counts)
-    cuts = np.searchsorted(total, np.arange(MOST_CANDIDATES, total[-1] if len(total) else 0, MOST_CANDIDATES))
+    cuts = np.searchsorted(total, np.arange(MAX_CANDIDATES, total[-1] if len(total) else 0, MAX_CANDIDATES))
     return [part for part in np.split(keep, cuts) if len(part)]
 
 
@@ -127,3 +138,145 @@ def _raise(
     w, s, t = which[inside], s[inside], t[inside]
     height = z[w, 0] + s * (z[w, 1] - z[w, 0]) + t * (z[w, 2] - z[w, 0])
     np.maximum.at(heights, y[inside] * columns + x[inside], height)
+
+
+Index = NDArray[np.int64]
+
+
+def positive_region(grid: Grid, values: Array, least: float, slack: float) -> MultiPolygon:
+    """Where values (H, W), linear between nodes, are positive, in mm.
+
+    least: mm^2, smaller pieces and holes are left out. slack: mm that the outline may be moved to make it simple.
+    """
+    rings = [ring for ring in _rings(grid, values) if abs(_area(ring)) >= least]
+    if not rings:
+        return MultiPolygon()
+    polygons = shapely.build_area(shapely.multilinestrings([shapely.linestrings(_closed(r)) for r in rings]))
+    return as_multi(shapely.make_valid(shapely.simplify(polygons, slack)), least)
+
+
+def as_multi(shape: shapely.Geometry, least: float = 0.0) -> MultiPolygon:
+    """The polygons of any shape that are at least `least` mm^2 large, the largest first."""
+    parts = [p for p in shapely.get_parts(shapely.get_parts(shape)) if isinstance(p, shapely.Polygon)]
+    parts = [p for p in parts if not p.is_empty and p.area >= least]
+    return MultiPolygon(sorted(parts, key=lambda p: (-p.area, p.bounds)))
+
+
+def _closed(ring: Array) -> Array:
+    return np.concatenate([ring, ring[:1]])
+
+
+def _area(ring: Array) -> float:
+    x, y = ring.T
+    return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2)
+
+
+def _rings(grid: Grid, values: Array) -> list[Array]:
+    """Closed rings (N, 2), mm, with the positive side on their left."""
+    f = np.pad(np.asarray(values, float), 1, constant_values=-1.0)
+    f = np.where(np.abs(f) < ZERO_BAND, -ZERO_BAND, f)
+    starts, ends = _segments(f)
+    columns = f.shape[1]
+    order = np.argsort(starts)
+    keys = starts[order]  # each edge is left once
+    following = np.searchsorted(keys, ends[order])
+    places = grid.origin + (_crossings(f, keys, columns) - 1) * grid.step
+    return [places[loop] for loop in _loops(following)]
+
+
+def _segments(f: Array) -> tuple[Index, Index]:
+    """Lines across the triangles of the grid: the edges, by number, where each enters and leaves."""
+    number = np.arange(f.size).reshape(f.shape)
+    inside = f > 0
+    mixed = inside[:-1, :-1] != inside[:-1, 1:]
+    mixed |= (inside[:-1, :-1] != inside[1:, 1:]) | (inside[:-1, :-1] != inside[1:, :-1])
+    a, b, c, d = (n[mixed] for n in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+    corners = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    flags = inside.ravel()[corners]
+    count = flags.sum(axis=1)
+    crossed = (count == 1) | (count == 2)
+    corners, flags, count = corners[crossed], flags[crossed], count[crossed]
+    odd = np.argmax(flags == (count == 1)[:, None], axis=1)
+    rows = np.arange(len(corners))
+    p, q, r = (corners[rows, (odd + k) % 3] for k in range(3))
+    one, two = _edge(p, q, f.size), _edge(r, p, f.size)
+    lone_inside = count == 1
+    return np.where(lone_inside, one, two), np.where(lone_inside, two, one)
+
+
+def _edge(a: Index, b: Index, size: int) -> Index:
+    return np.asarray(np.minimum(a, b) * size + np.maximum(a, b))
+
+
+def _crossings(f: Array, keys: Index, columns: int) -> Array:
+    """Points (N, 2), in nodes, where f is zero on edges."""
+    low, high = keys // f.size, keys % f.size
+    flat = f.ravel()
+    t = flat[low] / (flat[low] - flat[high])
+    x = low % columns + t * (high % columns - low % columns)
+    y = low // columns + t * (high // columns - low // columns)
+    return np.column_stack([x, y])
+
+
+def _loops(following: Index) -> list[Index]:
+    """The cycles of a permutation."""
+    todo, successors = np.ones(len(following), bool), following.tolist()
+    loops = []
+    for start in range(len(successors)):
+        if not todo[start]:
+            continue
+        loop, k = list[int](), start
+        while todo[k]:
+            todo[k] = False
+            loop.append(k)
+            k = successors[k]
+        loops.append(np.array(loop))
+    return loops
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chart:
+    """A stretched plane."""
+
+    grid: Grid  # in the plane
+    places: Array  # (H, W, 2) mm, of each node in the chart
+    stretch: Array  # (H, W, 2) chart length over plane length, along x and y
+    cosine: Array  # (H, W) plane area over chart area
+
+    def from_plane(self, xy: Array) -> Array:
+        """Points (N, 2) in the chart, mm, of points in the plane."""
+        edge = np.clip(xy, self.grid.origin, [self.grid.x[-1], self.grid.y[-1]])
+        return interpolate(self.grid, self.places, xy) + xy - edge
+
+    def to_plane(self, uv: Array) -> Array:
+        """Points (N, 2) in the plane, mm, of points in the chart."""
+        xy = np.array(uv, float)
+        for _ in range(NEWTON_STEPS):
+            off = uv - self.from_plane(xy)
+            xy = xy + off / interpolate(self.grid, self.stretch, xy)
+            if not len(off) or np.abs(off).max() < 1e-6:
+                break
+        return xy
+
+
+def flat_chart(grid: Grid) -> Chart:
+    """The plane itself."""
+    return Chart(grid, grid.nodes, np.ones((*grid.shape, 2)), np.ones(grid.shape))
+
+
+def unroll(grid: Grid, heights: Array) -> Chart:
+    """The chart of a surface with heights (H, W) over the plane."""
+    slopes = np.clip(gradient(grid, heights), -MAX_SLOPE, MAX_SLOPE)
+    stretch = np.sqrt(1 + slopes**2)
+    middle = tuple(np.clip(np.rint(-grid.origin / grid.step), 0, np.array(grid.shape[::-1]) - 1).astype(int))
+    places = np.stack([_summed(stretch[..., 0], 1), _summed(stretch[..., 1], 0)], axis=-1) * grid.step
+    places[..., 0] += grid.x[middle[0]] - places[:, middle[0], 0][:, None]
+    places[..., 1] += grid.y[middle[1]] - places[middle[1], :, 1][None, :]
+    return Chart(grid, places, stretch, 1 / np.prod(stretch, axis=-1))
+
+
+def _summed(values: Array, axis: int) -> Array:
+    """The trapezoid sums of values (H, W) from the first node on, along an axis."""
+    total = np.cumsum(values, axis=axis)
+    first = np.take(values, [0], axis=axis)
+    return np.asarray(total - values / 2 - first / 2)

@@ -1,8 +1,10 @@
-"""The whole way from a wound to a path: layers, beads in each, checkpoints, and what they come to."""
+"""The whole plan, from a wound to a path: layers, beads, checkpoints, and the figures of each layer."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,122 +12,249 @@ import shapely
 from shapely import MultiPolygon
 
 from estimation.errors import InputError
-from planning.fill.bead import Bead
-from planning.fill.coverage import Coverage, coverage
-from planning.fill.fill import fill, turned
-from planning.fill.pace import Pace
-from planning.fill.pattern import Pattern
-from planning.layers.bumps import Passing
-from planning.layers.chart import Chart, flat, unrolled
-from planning.layers.checkpoints import Ground, Laid, Way, ceiling, curvature, laid, path_of
-from planning.layers.contour import as_multi
-from planning.layers.slicing import Layer, Mode, Stack, stack_in
-from planning.layers.tissue import Tissue
-from planning.layers.tool import tilts
-from planning.layers.wound import Wound, nodes_within
+from estimation.se3 import Array
+from planning.fill.bead import SHARP_TURN, Bead, Pattern, PrintPace
+from planning.fill.fill import fill, settle_angle
+from planning.fill.region import FillCoverage, fill_coverage, region_of
+from planning.layers.bumps import BumpPassing
+from planning.layers.checkpoints import (
+    Checkpoints,
+    CheckpointSettings,
+    TipSurface,
+    ceiling,
+    checkpoints_on,
+    curvature,
+    path_from,
+    tilt_field,
+)
+from planning.layers.grid import Chart, as_multi, flat_chart, grid_over, unroll
+from planning.layers.slicing import Layer, LayerMode, LayerStack, Tissue, layer_stack
+from planning.layers.wound import WoundFindings, WoundVolume, nodes_within
 from planning.path import Path
 
 Report = Callable[[int, int], None]  # (layers done, layers)
-TURN = 0.05  # s for each sharp turn, as other planners' times are counted
-GOLDEN = 0.6180339887498949  # of a closed line's length: by so much the seam moves on from layer to layer,
-# which puts no two of them near one another for as long as can be (the three-distance theorem)
+SHARP_TURN_TIME = 0.05  # s for each sharp turn, as other planners' times are counted
+# of a closed line's length, by which the seam moves from layer to layer: keeps seams apart for the most layers, by the
+# three-distance theorem
+SEAM_SHIFT = 0.6180339887498949
+DISC_AREA = 0.75  # widths squared: a part of less area holds no disc of that width, which has pi / 4 of them
+GRID_STEP, GRID_MARGIN = 1.0, 5.0  # mm: a plane needs no fine grid
+MAX_GRID_NODES = 1000.0  # nodes along a side
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
-    """What is asked for. mode: how layers lie. crossed: every second layer's lines across the others'. passing: how
-    bumps of the bed are passed."""
+class PlanOrder:
+    """What is to be planned."""
 
     tissues: tuple[Tissue, ...]
     pattern: Pattern = field(default_factory=Pattern)
-    mode: Mode = "skin"
-    way: Way = field(default_factory=Way)
-    crossed: bool = True
-    passing: Passing = field(default_factory=Passing)
+    mode: LayerMode = "skin"  # how layers lie
+    way: CheckpointSettings = field(default_factory=CheckpointSettings)
+    crossed: bool = True  # lines of every second layer across the others'
+    passing: BumpPassing = field(default_factory=BumpPassing)  # how bumps of the bed are passed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedLayer:
-    """One layer as it is printed. region: in the chart, mm. beads: in the chart, mm, in order.
-
-    over, around: bumps in the chart, mm, that it goes over, and that it goes round.
-    """
+    """One layer as it is printed; regions and beads in the chart, mm."""
 
     layer: Layer
     region: MultiPolygon
-    beads: tuple[Bead, ...]
-    over: MultiPolygon
-    around: MultiPolygon
+    beads: tuple[Bead, ...]  # in printing order
+    over: MultiPolygon  # bumps that it goes over
+    around: MultiPolygon  # bumps that it goes round
 
     @property
-    def coverage(self) -> Coverage:
+    def coverage(self) -> FillCoverage:
         """How much of the region the beads cover."""
-        return coverage(self.beads, self.region)
+        return fill_coverage(self.beads, self.region)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """A path, and what it was made of. points: its checkpoints in the plane's frame."""
+    """A path, and what it was made of."""
 
     path: Path
-    points: Laid
-    wound: Wound
-    stack: Stack
+    points: Checkpoints  # in the plane's frame
+    wound: WoundVolume
+    stack: LayerStack
     chart: Chart
-    ground: Ground
+    ground: TipSurface
     layers: tuple[PlannedLayer, ...]
-    order: Order
+    order: PlanOrder
 
 
-def make_plan(wound: Wound, order: Order, where: object = "plan", report: Report = lambda done, total: None) -> Plan:
+def make_plan(
+    wound: WoundVolume, order: PlanOrder, where: object = "plan", report: Report = lambda done, total: None
+) -> Plan:
     """The plan of a wound; InputError where no bead finds room in it."""
-    stack = stack_in(wound, order.tissues, order.mode, order.pattern.width, order.passing)
-    chart = flat(wound.grid) if order.mode == "horizontal" else unrolled(wound.grid, wound.skin)
-    order = replace(order, pattern=_turned(stack, chart, order))
+    stack = layer_stack(wound, order.tissues, order.mode, order.pattern.width, order.passing)
+    chart = flat_chart(wound.grid) if order.mode == "horizontal" else unroll(wound.grid, wound.skin)
+    order = replace(order, pattern=_with_angle(stack, chart, order))
     planned = []
     for i, layer in enumerate(stack.layers):
-        planned.append(_filled(layer, chart, order))
+        planned.append(_planned_layer(layer, chart, order))
         report(i + 1, len(stack.layers))
     beads = [bead for layer in planned for bead in layer.beads]
     if not beads:
-        raise InputError(
-            where, "beads", "none has room", f"a wound wider than {order.pattern.width:g} mm, or finer beads"
-        )
+        wider = f"a wound wider than {order.pattern.width:g} mm, or finer beads"
+        raise InputError(where, "beads", "none has room", wider)
     layer_of = np.repeat([p.layer.number for p in planned], [len(p.beads) for p in planned])
-    ground = _ground(wound, stack, chart, order.way)
-    points = laid(ground, beads, layer_of, order.way)
-    path = path_of(points, ground, order.way.tool.spin)
+    ground = _tip_surface(wound, stack, chart, order.way)
+    points = checkpoints_on(ground, beads, layer_of, order.way)
+    path = path_from(points, ground, order.way.tool.spin)
     return Plan(path, points, wound, stack, chart, ground, tuple(planned), order)
 
 
-def _turned(stack: Stack, chart: Chart, order: Order) -> Pattern:
-    """The pattern with the angle of its lines settled: for all layers by the largest."""
+def _with_angle(stack: LayerStack, chart: Chart, order: PlanOrder) -> Pattern:
+    """The pattern with a number as angle: of all layers, the best for the largest."""
     if not isinstance(order.pattern.angle, str):
         return order.pattern
     layer = max(stack.layers, key=lambda layer: layer.region.area)
-    return turned(_charted(layer.region, chart), order.pattern, _pace(layer, order))
+    return settle_angle(_in_chart(layer.region, chart), order.pattern, _pace(layer, order))
 
 
-def _charted(shape: MultiPolygon, chart: Chart) -> MultiPolygon:
+def _in_chart(shape: MultiPolygon, chart: Chart) -> MultiPolygon:
     return shape if shape.is_empty else as_multi(shapely.make_valid(shapely.transform(shape, chart.from_plane)))
 
 
-def _pace(layer: Layer, order: Order) -> Pace:
-    return Pace(layer.slab.tissue.speed, order.way.travel, TURN)
+def _pace(layer: Layer, order: PlanOrder) -> PrintPace:
+    return PrintPace(layer.slab.tissue.speed, order.way.travel, SHARP_TURN_TIME)
 
 
-def _filled(layer: Layer, chart: Chart, order: Order) -> PlannedLayer:
-    region = _charted(layer.region, chart)
-    pattern = replace(order.pattern, seam=(order.pattern.seam + GOLDEN * layer.number) % 1.0)
+def _planned_layer(layer: Layer, chart: Chart, order: PlanOrder) -> PlannedLayer:
+    region = _in_chart(layer.region, chart)
+    pattern = replace(order.pattern, seam=(order.pattern.seam + SEAM_SHIFT * layer.number) % 1.0)
     if order.crossed and layer.number % 2 and not isinstance(pattern.angle, str):
         pattern = replace(pattern, angle=pattern.angle + np.pi / 2)
     beads = () if region.is_empty else tuple(fill(region, pattern, _pace(layer, order)))
-    return PlannedLayer(layer, region, beads, _charted(layer.bumps.over, chart), _charted(layer.bumps.around, chart))
+    return PlannedLayer(layer, region, beads, _in_chart(layer.bumps.over, chart), _in_chart(layer.bumps.around, chart))
 
 
-def _ground(wound: Wound, stack: Stack, chart: Chart, way: Way) -> Ground:
+def _tip_surface(wound: WoundVolume, stack: LayerStack, chart: Chart, way: CheckpointSettings) -> TipSurface:
     inside = nodes_within(wound.grid, wound.outline)
     ends = [stack.lowest, stack.highest]
-    low, high = (tilts(wound.grid, end, inside, way.tool) for end in ends)
-    bent = np.stack([curvature(wound.grid, end, way.spacing / 2) for end in ends], axis=-1)
-    return Ground(stack, chart, wound.surface_from_plane, low, high, bent, ceiling(wound.grid, wound.bed))
+    low, high = (tilt_field(wound.grid, end, inside, way.tool) for end in ends)
+    curvatures = np.stack([curvature(wound.grid, end, way.spacing / 2) for end in ends], axis=-1)
+    return TipSurface(stack, chart, wound.surface_from_plane, low, high, curvatures, ceiling(wound.grid, wound.bed))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LayerFigures:
+    """The figures of one layer."""
+
+    number: int
+    tissue: str
+    material: str
+    area: float  # mm^2
+    beads: int
+    checkpoints: int
+    printed: float  # mm
+    travelled: float  # mm
+    seconds: float  # of printing, travels, turns and waits
+    volume: float  # mm^3
+    coverage: FillCoverage
+    gap: float  # mm^2 of all gaps
+    half_gap: float  # mm^2 of gaps wider than half a bead
+    bead_gap: float  # mm^2 of gaps wider than a bead
+
+
+@dataclass(frozen=True, slots=True)
+class PlanTotal:
+    """All layers together. covered, over, double: shares of their area. volume: mm^3 by material."""
+
+    area: float
+    covered: float
+    over: float
+    double: float
+    gap: float
+    bead_gap: float
+    printed: float
+    travelled: float
+    seconds: float
+    volume: tuple[tuple[str, float], ...]
+
+
+def seconds_to(points: Checkpoints) -> Array:
+    """Times (N,), s from the first, at which checkpoints are reached: ways at their speeds, sharp turns and waits.
+
+    A turn of more than SHARP_TURN costs SHARP_TURN_TIME, as in other planners' figures; the arm's planner knows more.
+    """
+    step = np.diff(points.tip, axis=0)
+    length = np.linalg.norm(step, axis=1)
+    cosine = np.einsum("ni,ni->n", step[:-1], step[1:]) / np.maximum(length[:-1] * length[1:], 1e-12)
+    sharp = (cosine < np.cos(SHARP_TURN)) & points.extrude[1:-1] & points.extrude[2:]
+    durations = np.r_[0.0, length / points.speed[1:]] + points.wait
+    durations[1:-1] += SHARP_TURN_TIME * sharp
+    return np.asarray(np.cumsum(durations))
+
+
+def figures_of(plan: Plan, report: Callable[[int, int], None] = lambda done, total: None) -> list[LayerFigures]:
+    """The figures of each layer that has beads. One thread a core: GEOS, which unites the beads, releases the GIL."""
+    moments = seconds_to(plan.points)
+    printed_layers = [layer for layer in plan.layers if layer.beads]
+    figures_list = []
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        try:
+            for figures in pool.map(lambda layer: _figures(plan, layer, moments), printed_layers):
+                figures_list.append(figures)
+                report(len(figures_list), len(printed_layers))
+        finally:
+            pool.shutdown(cancel_futures=True)  # Ctrl-C waits for no layer that has not begun
+    return figures_list
+
+
+def _figures(plan: Plan, layer: PlannedLayer, moments: Array) -> LayerFigures:
+    points, number = plan.points, layer.layer.number
+    own = points.layer == number
+    step = np.r_[0.0, np.linalg.norm(np.diff(points.tip, axis=0), axis=1)]
+    taken = np.diff(moments, prepend=0.0)
+    result, tissue = layer.coverage, layer.layer.slab.tissue
+    half, whole = (_wide_area(result.gaps, part * plan.order.pattern.width) for part in (0.5, 1.0))
+    return LayerFigures(
+        number, tissue.name, tissue.material, float(layer.region.area), len(layer.beads), int(own.sum()),
+        float(step[own & points.extrude].sum()), float(step[own & ~points.extrude].sum()), float(taken[own].sum()),
+        float(points.volume[own].sum()), result, float(result.gaps.area), half, whole,
+    )  # fmt: skip
+
+
+def _wide_area(gaps: shapely.MultiPolygon, width: float) -> float:
+    """Area, mm^2, of the parts of gaps into which a disc `width` mm wide fits."""
+    parts = shapely.get_parts(gaps)
+    large = shapely.multipolygons(parts[shapely.area(parts) > DISC_AREA * width**2])
+    core = shapely.buffer(large, -width / 2)
+    return float(shapely.intersection(shapely.buffer(core, width / 2), large).area) if not core.is_empty else 0.0
+
+
+def total_of(layers: Iterable[LayerFigures]) -> PlanTotal:
+    """All layers together."""
+    layers = list(layers)
+    area = np.array([layer.area for layer in layers])
+    volumes: dict[str, float] = {}
+    for layer in layers:
+        volumes[layer.material] = volumes.get(layer.material, 0.0) + layer.volume
+
+    def mean(values: list[float]) -> float:
+        return float(area @ values / area.sum())
+
+    return PlanTotal(
+        float(area.sum()), mean([f.coverage.covered for f in layers]), mean([f.coverage.over for f in layers]),
+        mean([f.coverage.double for f in layers]), sum(f.gap for f in layers), sum(f.bead_gap for f in layers),
+        sum(f.printed for f in layers), sum(f.travelled for f in layers), sum(f.seconds for f in layers),
+        tuple(volumes.items()),
+    )  # fmt: skip
+
+
+def flat_wound(contour: Array, thickness: float, where: object) -> WoundVolume:
+    """The wound inside a contour (N, 2), mm, with a flat bed at z = 0 and `thickness` mm to be laid on it."""
+    outline = MultiPolygon([region_of(contour, where)])
+    low, high = np.array(outline.bounds).reshape(2, 2)
+    step = max(GRID_STEP, float((high - low).max()) / MAX_GRID_NODES)
+    grid = grid_over(low - GRID_MARGIN, high + GRID_MARGIN, step)
+    bed = np.zeros(grid.shape)
+    area = float(shapely.area(outline))
+    findings = WoundFindings(
+        given=True, area=area, volume=area * thickness, depth=thickness, level=0.0, noise=0.0, smoothing=0.0,
+        scatter=0.0, closed=0.0, hidden=0.0, cut=0.0, others=0, notes=(),
+    )  # fmt: skip
+    return WoundVolume(np.eye(4), grid, bed, bed + thickness, outline, findings)

@@ -10,16 +10,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from estimation.errors import InputError
-from estimation.scan import Scan, scan_from_triangles
+from estimation.scans.scan import Scan, scan_from_triangles
 from estimation.se3 import Array
 
 Index = NDArray[np.int64]
-SAME = 1e-4  # mm: vertices nearer than this are one; scanners resolve a hundredth, and float32 a hundred-thousandth
-ISLAND = 0.05  # of the whole area: smaller pieces are dirt, a table behind the limb, or a hair
-SPIKE_NOISE, SPIKE_EDGE = 6.0, 0.75  # a vertex is a spike when it stands out by so many deviations, and so many edges
+# mm: vertices nearer than this are one; scanners resolve a hundredth, and float32 a hundred-thousandth
+MERGE_DISTANCE = 1e-4
+MIN_ISLAND_SHARE = 0.05  # of the whole area: smaller pieces are dirt, a table behind the limb, or a hair
+SPIKE_SIGMAS, SPIKE_EDGES = 6.0, 0.75  # a vertex is a spike when it stands out by so many deviations, and so many edges
 SPIKE_ROUNDS = 3  # a spike may hide the one beside it
-LEAST_FACING = 0.1  # mean of the normals by area: a closed body's is 0, and no plane is its mean plane
-FEWEST = 50  # triangles: fewer give no shape
+MIN_MEAN_NORMAL = 0.1  # mean of the normals by area: a closed body's is 0, and no plane is its mean plane
+MIN_TRIANGLES = 50  # triangles: fewer give no shape
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +59,7 @@ class Repairs:
         ]
 
 
-def repaired(vertices: ArrayLike, triangles: ArrayLike, where: object, flip: bool = False) -> tuple[Scan, Repairs]:
+def repair_mesh(vertices: ArrayLike, triangles: ArrayLike, where: object, flip: bool = False) -> tuple[Scan, Repairs]:
     """The mesh with vertices (V, 3) mm and triangles (T, 3), put right, and what was done; InputError if it is no use.
 
     flip: turn the whole scan over, for one whose normals all point inwards.
@@ -77,13 +78,13 @@ def repaired(vertices: ArrayLike, triangles: ArrayLike, where: object, flip: boo
     double, before = before - len(faces), len(faces)
     faces = faces[_uncrowded(points, faces)]
     crowded, before = before - len(faces), len(faces)
-    kept, islands = _mainland(points, faces)
-    faces = faces[kept]
+    mainland, islands = _mainland(points, faces)
+    faces = faces[mainland]
     island_triangles = before - len(faces)
     _enough(faces, where, read[1])
     turned = _against(points, faces)
     faces = np.where(turned[:, None] ^ flip, faces[:, ::-1], faces)
-    points, spikes = _levelled(points, faces, _mean_normal(points, faces, where))
+    points, spikes = _levelled(points, faces, mean_normal(points, faces, where))
     scan = scan_from_triangles(points, faces)
     done = Repairs(
         *read, broken, merged, empty, double, crowded, islands, island_triangles, int(turned.sum()), spikes, flip,
@@ -92,27 +93,23 @@ def repaired(vertices: ArrayLike, triangles: ArrayLike, where: object, flip: boo
     return scan, done
 
 
-def mean_normal(scan: Scan, where: object) -> Array:
+def mean_normal(points: Array, faces: Index, where: object) -> Array:
     """The mean unit normal (3,) by area; InputError for a closed body, which faces no way."""
-    return _mean_normal(scan.vertices, scan.triangles, where)
-
-
-def _mean_normal(points: Array, faces: Index, where: object) -> Array:
     crosses = _crosses(points, faces)
     z = crosses.sum(axis=0) / np.linalg.norm(crosses, axis=1).sum()
     facing = float(np.linalg.norm(z))
-    if not facing >= LEAST_FACING:
+    if not facing >= MIN_MEAN_NORMAL:
         allowed = (
-            f"{LEAST_FACING:g} or more: the skin around the wound seen from one side; cut it out of the whole body"
+            f"{MIN_MEAN_NORMAL:g} or more: the skin around the wound seen from one side; cut it out of the whole body"
         )
         raise InputError(where, "length of the mean normal", round(facing, 3), allowed)
     return np.asarray(z / facing)
 
 
 def _enough(faces: Index, where: object, read: int) -> None:
-    if len(faces) < FEWEST:
+    if len(faces) < MIN_TRIANGLES:
         got = f"{len(faces)} triangles that can be used of {read}"
-        raise InputError(where, "scan", got, f"{FEWEST} or more: scan the wound again")
+        raise InputError(where, "scan", got, f"{MIN_TRIANGLES} or more: scan the wound again")
 
 
 def _usable(points: Array, faces: Index) -> NDArray[np.bool_]:
@@ -126,7 +123,7 @@ def _merged(points: Array, faces: Index) -> tuple[Array, Index, int]:
     used, number = np.unique(faces, return_inverse=True)
     faces = number.reshape(-1, 3)
     points = points[used] + 0.0
-    key = np.round(points / SAME)
+    key = np.round(points / MERGE_DISTANCE)
     order = np.lexsort(key.T)
     new = np.r_[True, (np.diff(key[order], axis=0) != 0).any(axis=1)]
     number = np.empty(len(points), np.int64)
@@ -137,7 +134,7 @@ def _merged(points: Array, faces: Index) -> tuple[Array, Index, int]:
 def _with_area(points: Array, faces: Index) -> NDArray[np.bool_]:
     corners = points[faces]
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    return np.asarray(2 * _areas(points, faces) > 1e-6 * np.maximum(sides, SAME) ** 2)
+    return np.asarray(2 * _areas(points, faces) > 1e-6 * np.maximum(sides, MERGE_DISTANCE) ** 2)
 
 
 def _areas(points: Array, faces: Index) -> Array:
@@ -193,7 +190,7 @@ def _mainland(points: Array, faces: Index) -> tuple[NDArray[np.bool_], int]:
     a, b, _ = _pairs(faces)
     count, piece = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(faces),) * 2), directed=False)
     areas = np.bincount(piece, _areas(points, faces), count)
-    large = (areas >= ISLAND * areas.sum()) | (areas == areas.max())
+    large = (areas >= MIN_ISLAND_SHARE * areas.sum()) | (areas == areas.max())
     return np.asarray(large[piece]), int(count - large.sum())
 
 
@@ -227,7 +224,7 @@ def _levelled(points: Array, faces: Index, normal: Array) -> tuple[Array, int]:
         heights = points @ normal
         low, high, middle = _around(heights, start, end)
         noise = 1.4826 * float(np.median(np.abs(heights - middle)))
-        out = np.maximum(heights - high, low - heights) > max(SPIKE_NOISE * noise, SPIKE_EDGE * edge)
+        out = np.maximum(heights - high, low - heights) > max(SPIKE_SIGMAS * noise, SPIKE_EDGES * edge)
         if not out.any():
             break
         points[out] += (middle - heights)[out, None] * normal

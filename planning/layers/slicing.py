@@ -1,7 +1,7 @@
-"""Layers between the wound's bed and the restored skin: horizontal as in the thesis (5.2), or along the surface.
+"""Tissues and layers between the wound's bed and the restored skin: horizontal (thesis 5.2) or along the surface.
 
-All layers of a stack are mixtures of a lowest and a highest surface, so that each place in the stack is a height over
-the plane, by a share from 0 to 1:
+All layers of a stack are mixtures of a lowest and a highest surface: a place in the stack is a height over the plane,
+by a share from 0 to 1.
 
     horizontal   flat, from the deepest point of the bed to the highest of the skin
     skin         parallel to the restored skin
@@ -19,34 +19,94 @@ import shapely
 from shapely import MultiPolygon
 
 from estimation.errors import InputError
-from estimation.scan import Index
+from estimation.scans.scan import Index
 from estimation.se3 import Array
-from planning.fill.region import around
-from planning.layers.bumps import USUAL, Bumps, Passing, Step, bumps_in, within
-from planning.layers.contour import as_multi, region
-from planning.layers.grid import Grid, Mask, at, smoothed
-from planning.layers.tissue import Slab, Tissue, slabs
-from planning.layers.wound import SLACK, Wound, nodes_within
+from planning.fill.region import without_bumps
+from planning.layers.bumps import DEFAULT_PASSING, BumpLayer, BumpPassing, Bumps, bumps_in, nodes_in_outline
+from planning.layers.grid import Grid, Mask, as_multi, interpolate, positive_region, smoothed
+from planning.layers.wound import OUTLINE_TOLERANCE, WoundVolume, nodes_within
 
-Mode = Literal["horizontal", "skin", "conformal"]
-MODES: tuple[Mode, ...] = get_args(Mode)
-THINNEST = 0.6  # of a layer's height: where blended layers would be thinner, every second one is left out
-LOWEST = 0.75  # of the layers that one replaces: with fewer under it, it is left to the next
-HEIGHTS = 0.2, 2.0  # of a layer's own height: what a bead on an uneven bed may have
+MAX_LAYERS = 400  # a wound of 40 mm in layers of 0.1 mm
+MIN_BLENDED_HEIGHT = 0.6  # of a layer's height: where blended layers would be thinner, every second one is left out
+MIN_REPLACED = 0.75  # of the layers that one replaces: with fewer under it, it is left to the next
+BEAD_HEIGHT_RANGE = 0.2, 2.0  # of a layer's own height: what a bead on an uneven bed may have
+
+
+@dataclass(frozen=True, slots=True)
+class Tissue:
+    """One tissue and what it is printed with."""
+
+    name: str
+    thickness: float | None  # mm; None: what the others leave of the wound's depth
+    material: str  # as the path names it
+    temperature: float = 20.0  # degrees C
+    speed: float = 20.0  # mm/s of printing
+    height: float = 0.4  # mm of a layer, about
+
+
+@dataclass(frozen=True, slots=True)
+class Slab:
+    """One printed layer of the stack: from `low` to `high`, mm above the bottom of a stack `whole` mm high."""
+
+    tissue: Tissue
+    low: float
+    high: float
+    whole: float
+
+    @property
+    def middle(self) -> float:
+        """mm above the bottom."""
+        return (self.low + self.high) / 2
+
+
+def slabs(tissues: Sequence[Tissue], whole: float) -> list[Slab]:
+    """The layers of a stack `whole` mm high, bottom up, each tissue cut into equal ones near its layer height.
+
+    A tissue without a thickness takes what the others leave: those over it then lie at their thickness under the skin.
+    Where all have one, they are laid from the bottom and the last one goes on to the top. What a shallow wound has no
+    room for is left out.
+    """
+    thicknesses = _fitted(tissues, whole)
+    layers, low = [], 0.0
+    for tissue, thickness in zip(tissues, thicknesses, strict=True):
+        count = max(1, round(thickness / tissue.height)) if thickness > 1e-6 else 0
+        for k in range(count):
+            layers.append(Slab(tissue, low + thickness * k / count, low + thickness * (k + 1) / count, whole))
+        low += thickness
+    if len(layers) > MAX_LAYERS:
+        raise InputError("plan", "layers", len(layers), f"{MAX_LAYERS} at most: thicker layers")
+    return layers
+
+
+def _fitted(tissues: Sequence[Tissue], whole: float) -> list[float]:
+    rest = next((i for i, t in enumerate(tissues) if t.thickness is None), None)
+    below, above = (tissues, []) if rest is None else (tissues[:rest], tissues[rest + 1 :])
+    room, top, bottom = whole, list[float](), list[float]()
+    for tissue in reversed(above):
+        top.append(min(tissue.thickness or 0.0, room))
+        room -= top[-1]
+    for tissue in below:
+        bottom.append(min(tissue.thickness or 0.0, room))
+        room -= bottom[-1]
+    if rest is None:
+        bottom[-1] += room
+        return bottom
+    return [*bottom, room, *reversed(top)]
+
+
+LayerMode = Literal["horizontal", "skin", "conformal"]
+LAYER_MODES: tuple[LayerMode, ...] = get_args(LayerMode)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layer:
-    """One printed layer. share: of its top between the stack's lowest and highest surface. region: in the plane, mm.
+    """One printed layer."""
 
-    number: from 0 at the bottom. bumps: what of the bed stands over it; the region holds the low ones.
-    """
-
-    number: int
+    number: int  # from 0 at the bottom
     slab: Slab
-    share: float
-    region: MultiPolygon
-    bumps: Bumps
+    share: float  # of its top between the stack's lowest and highest surface
+    region: MultiPolygon  # in the plane, mm; with the low bumps
+    bumps: Bumps  # of the bed, that stand over it
 
     @property
     def height(self) -> float:
@@ -55,19 +115,16 @@ class Layer:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stack:
-    """Layers, bottom up, and their surfaces over a grid in the plane.
+class LayerStack:
+    """Layers, bottom up, and their surfaces over a grid in the plane."""
 
-    lowest, highest: (H, W) mm, heights at share 0 and 1. bed: (H, W) mm. missing: tissues the wound has no room for.
-    """
-
-    mode: Mode
+    mode: LayerMode
     grid: Grid
-    lowest: Array
-    highest: Array
-    bed: Array
+    lowest: Array  # (H, W) mm, heights at share 0
+    highest: Array  # (H, W) mm, heights at share 1
+    bed: Array  # (H, W) mm
     layers: tuple[Layer, ...]
-    missing: tuple[str, ...]
+    missing: tuple[str, ...]  # tissues that the wound has no room for
 
     def tops(self, xy: Array, number: Index) -> Array:
         """Heights (N,) mm of the tip over points (N, 2) in the plane in layers `number` (N,): on top of the bead.
@@ -80,21 +137,21 @@ class Stack:
 
     def _surfaces(self, xy: Array) -> tuple[Array, Array, Array]:
         """Heights (N,) of the lowest and the highest surface and of the bed."""
-        low, high, bed = at(self.grid, np.stack([self.lowest, self.highest, self.bed], axis=-1), xy).T
+        low, high, bed = interpolate(self.grid, np.stack([self.lowest, self.highest, self.bed], axis=-1), xy).T
         return low, high, bed
 
     def _crossed(self, xy: Array, number: Index) -> Mask:
         """Which points (N, 2) lie on a bump that their layer (N,) goes over."""
-        found = np.zeros(len(xy), bool)
+        crossed = np.zeros(len(xy), bool)
         for layer in self.layers:
             if not layer.bumps.over.is_empty:
                 own = np.flatnonzero(number == layer.number)
-                found[own] = shapely.contains_xy(layer.bumps.over, *xy[own].T)
-        return found
+                crossed[own] = shapely.contains_xy(layer.bumps.over, *xy[own].T)
+        return crossed
 
     def _lifted(self, number: Index, top: Array, bed: Array, crossed: Mask) -> Array:
         """Tops (N,) of layers `number` (N,), lifted over the bed where they cross a bump."""
-        thinnest = HEIGHTS[0] * np.array([layer.height for layer in self.layers])[number]
+        thinnest = BEAD_HEIGHT_RANGE[0] * np.array([layer.height for layer in self.layers])[number]
         return np.where(crossed, np.maximum(top, bed + thinnest), top)
 
     def bead_heights(self, xy: Array, number: Index) -> Array:
@@ -114,19 +171,19 @@ class Stack:
             there = (below >= 0) & (low + middles[np.maximum(below, 0)] * (high - low) >= bed)
             crossed = self._crossed(xy, below)
             floor = np.where(there | crossed, self._lifted(below, floor, bed, crossed), bed)
-        return np.asarray(np.clip(top - floor, HEIGHTS[0] * nominal, HEIGHTS[1] * nominal))
+        return np.asarray(np.clip(top - floor, BEAD_HEIGHT_RANGE[0] * nominal, BEAD_HEIGHT_RANGE[1] * nominal))
 
     def _below(self, number: Index, part: Array) -> Index:
         """The layer (N,) under each of layers (N,), where the wound has `part` (N,) of its greatest depth."""
         if self.mode != "conformal":
             return np.asarray(number - 1)
         stride = _stride(part)
-        return np.where(number + 1 < (1 + LOWEST) * stride, -1, number - stride).astype(np.int64)
+        return np.where(number + 1 < (1 + MIN_REPLACED) * stride, -1, number - stride).astype(np.int64)
 
 
-def stack_in(
-    wound: Wound, tissues: Sequence[Tissue], mode: Mode, width: float, passing: Passing = USUAL
-) -> Stack:  # fmt: skip
+def layer_stack(
+    wound: WoundVolume, tissues: Sequence[Tissue], mode: LayerMode, width: float, passing: BumpPassing = DEFAULT_PASSING
+) -> LayerStack:  # fmt: skip
     """The layers of a wound. width: mm of a bead: what is smaller in the bed is not followed, nor laid.
 
     passing: how bumps of the bed are passed.
@@ -135,23 +192,27 @@ def stack_in(
     lowest, highest = _ends(wound, inside, mode, width)
     whole = float((highest - lowest)[inside].max())
     cut = slabs(tissues, whole)
-    hollow = within(wound.grid, wound.outline)
+    hollow = nodes_in_outline(wound.grid, wound.outline)
     layers = []
     for k, slab in enumerate(cut):
-        shape = region(wound.grid, _presence(wound, lowest, highest, cut, k, mode), width**2, SLACK)
+        shape = positive_region(
+            wound.grid, _presence(wound, lowest, highest, cut, k, mode), width**2, OUTLINE_TOLERANCE
+        )
         height, rise = slab.high - slab.low, wound.bed - lowest - slab.high / whole * (highest - lowest)
-        bumps = bumps_in(wound.grid, hollow, rise, Step(height, passing.limit(height), mode != "conformal"), SLACK)
+        bumps = bumps_in(
+            wound.grid, hollow, rise, BumpLayer(height, passing.limit(height), mode != "conformal"), OUTLINE_TOLERANCE
+        )
         if not bumps.over.is_empty:
-            shape = shape.union(bumps.over.buffer(SLACK))  # not edge upon edge: that leaves threads
-        shape = around(shape.intersection(wound.outline), bumps.around, passing.clear(width))
+            shape = shape.union(bumps.over.buffer(OUTLINE_TOLERANCE))  # not edge upon edge: that leaves threads
+        shape = without_bumps(shape.intersection(wound.outline), bumps.around, passing.clear(width))
         layers.append(Layer(k, slab, slab.high / whole, as_multi(shape, width**2), bumps))
     if not any(not layer.region.is_empty for layer in layers):
         raise InputError("plan", "layers", "none with room for a bead", f"a wound wider than {width:g} mm, finer beads")
     missing = tuple(t.name for t in tissues if all(slab.tissue is not t for slab in cut))
-    return Stack(mode, wound.grid, lowest, highest, wound.bed, tuple(layers), missing)
+    return LayerStack(mode, wound.grid, lowest, highest, wound.bed, tuple(layers), missing)
 
 
-def _ends(wound: Wound, inside: Mask, mode: Mode, width: float) -> tuple[Array, Array]:
+def _ends(wound: WoundVolume, inside: Mask, mode: LayerMode, width: float) -> tuple[Array, Array]:
     """The lowest and the highest surface (H, W) of the stack."""
     if mode == "horizontal":
         low, high = float(wound.bed[inside].min()), float(wound.skin[inside].max())
@@ -162,7 +223,7 @@ def _ends(wound: Wound, inside: Mask, mode: Mode, width: float) -> tuple[Array, 
 
 
 def _presence(
-    wound: Wound, lowest: Array, highest: Array, cut: Sequence[Slab], number: int, mode: Mode
+    wound: WoundVolume, lowest: Array, highest: Array, cut: Sequence[Slab], number: int, mode: LayerMode
 ) -> Array:  # fmt: skip
     """Positive (H, W) where a layer is laid: by its middle, which lies over the bed and under the skin."""
     slab = cut[number]
@@ -177,10 +238,10 @@ def _least_part(number: int, count: int) -> float:
     """From which part of the greatest depth on a blended layer is laid: of those over it, every second, fourth ..."""
     above = count - 1 - number
     doubled = (above & -above).bit_length() - 1 if above else 60
-    doubled = min(doubled, int(np.floor(np.log2((number + 1) / LOWEST))))
-    return float(THINNEST / 2**doubled)
+    doubled = min(doubled, int(np.floor(np.log2((number + 1) / MIN_REPLACED))))
+    return float(MIN_BLENDED_HEIGHT / 2**doubled)
 
 
 def _stride(part: Array) -> Array:
     """How many blended layers one replaces, (N,), where the wound has `part` (N,) of its greatest depth."""
-    return np.asarray(2.0 ** np.clip(np.ceil(np.log2(THINNEST / np.maximum(part, 1e-9)) - 1e-9), 0, 40))
+    return np.asarray(2.0 ** np.clip(np.ceil(np.log2(MIN_BLENDED_HEIGHT / np.maximum(part, 1e-9)) - 1e-9), 0, 40))

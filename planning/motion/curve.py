@@ -1,11 +1,11 @@
-"""The way through checkpoints as a curve by length: straight between them, each corner a parabola, in turns as well.
+"""The path, its approach and its exit as curves by arc length, and the grid points at which their timing is decided.
 
-A cubic spline through sparse checkpoints was measured to leave the path by 1 mm and to run at 2.7 times the speed limit
-in corners. Here corners are blended on purpose (Kunz and Stilman 2012, with parabolas, which serve reversals as well):
-the first derivative is continuous and never longer than 1, so speed along the curve bounds the tool's speed everywhere.
+Stretches between checkpoints are straight, corners are parabolic blends (Kunz and Stilman 2012; parabolas also serve
+reversals). The first derivative is continuous and never longer than 1, so the speed along the curve bounds the tool's
+speed. A cubic spline through sparse checkpoints left the path by 1 mm and ran at 2.7 times the speed limit in corners.
 
-The tool's turn is blended over the same length: a parabola times the change of spin, after the stretch's own turn. The
-change is fixed in the tool's frame when the tool turns about it, so that the spin itself is continuous, exactly.
+The tool's rotation is blended over the same length: the stretch's own turn, then a parabola times the change of spin.
+The change is fixed in the tool's frame when the tool turns about it, so the spin is continuous, exactly.
 """
 
 from __future__ import annotations
@@ -17,47 +17,48 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.se3 import Array
-from planning.path import LEVER, lengths_of, steps
+from planning.motion.follow import LOOKAHEAD
+from planning.path import LEVER_ARM, MIN_SPACING, lengths_from, moves_and_turns, way_lengths
 
-EDGE = 1e-9  # mm: so near its ends a blend has begun, as where it ends is known no better
-SHORTEST = 1.0  # mm: a horizon in which any printing speed can be stopped
+BLEND_TOLERANCE = 1e-9  # mm: this near its ends a blend has begun; its ends are known no better
+MIN_HORIZON = 1.0  # mm: within it any printing speed can be stopped
+MIN_BLEND = 1e-9  # mm: half length of a blend that is none, where nothing changes at a checkpoint
+HORIZON_POINTS = 30  # evenly spread grid points of one horizon: some 15 us for each
+APPROACH_HEIGHT = 10.0  # mm above the surface, along the nozzle, on the way to and from the path
+APPROACH_SPEED = 20.0  # mm/s on that way, slow enough for a person to step in
+DIRECT_DISTANCE = 2.0  # mm: from here the nozzle goes straight to its place, without going up first
+CORNER_TOLERANCE = 0.05  # mm by which corners are cut: an eighth of a thin bead
+# mm/s: a velocity change in less than LOOKAHEAD is cut by LOOKAHEAD / 8 of it, which is CORNER_TOLERANCE once more
+CORNER_SPEED_CHANGE = 8 * CORNER_TOLERANCE / LOOKAHEAD
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Curve:
-    """A way in the surface frame, by length s in mm (turns count too, see path.LEVER).
+class PathCurve:
+    """A curve through K checkpoints in the surface frame, by length s in mm (turns count too, see path.LEVER_ARM)."""
 
-    knots: (K,) s of the checkpoints, from 0. points: (K, 3) mm. rotations: (K, 3, 3) of the nozzle. direction:
-    (K-1, 3) and spin: (K-1, 3), body rad/mm, of each stretch. bend: (K, 3), change of direction, and swing: (K, 3),
-    change of spin, at each checkpoint. half: (K,), length of the blend before and after each, 0 where there is none.
-    bent, swung: (K, 3), bend and swing over four halves of the blend, 0 where there is none. speed: (K-1,) mm/s allowed
-    on each stretch. corner: (K,) mm/s allowed in each blend. due: (K,) s, when each checkpoint is reached at the
-    stretches' speeds.
-    """
-
-    knots: Array
-    points: Array
-    rotations: Array
-    direction: Array
-    spin: Array
-    bend: Array
-    swing: Array
-    half: Array
-    bent: Array
-    swung: Array
-    speed: Array
-    corner: Array
-    due: Array
+    knots: Array  # (K,) s of the checkpoints, from 0
+    points: Array  # (K, 3) mm
+    rotations: Array  # (K, 3, 3) of the nozzle
+    direction: Array  # (K-1, 3) of each stretch
+    spin: Array  # (K-1, 3) of each stretch, body rad/mm
+    bend: Array  # (K, 3) change of direction at each checkpoint
+    swing: Array  # (K, 3) change of spin at each checkpoint
+    half: Array  # (K,) mm, length of the blend before and after each; 0 where there is none
+    bend_rate: Array  # (K, 3) bend / (4 half), 0 where there is no blend
+    swing_rate: Array  # (K, 3) swing / (4 half), 0 where there is no blend
+    speed: Array  # (K-1,) mm/s allowed on each stretch
+    corner: Array  # (K,) mm/s allowed in each blend
+    due: Array  # (K,) s, when each checkpoint is reached at the stretches' speeds
 
     @property
     def length(self) -> float:
-        """Its whole length, mm."""
+        """mm."""
         return float(self.knots[-1])
 
     def after(self, s: float, seconds: float) -> float:
-        """Where one is `seconds` s after s, mm, at the speeds allowed, and at least SHORTEST mm on; at most the end."""
+        """The place, mm, `seconds` s after s at the speeds allowed: at least MIN_HORIZON on, at most the end."""
         there = float(np.interp(np.interp(s, self.knots, self.due) + seconds, self.due, self.knots))
-        return min(max(there, s + SHORTEST), self.length)
+        return min(max(there, s + MIN_HORIZON), self.length)
 
     def stretch(self, s: Array) -> NDArray[np.intp]:
         """Number (...) of the stretch that each s (...) lies on; a checkpoint belongs to the stretch after it."""
@@ -69,20 +70,20 @@ class Curve:
         along = (s - self.knots[i])[:, None]
         into, out_of = self._depths(i, s)
         before, after = np.maximum(into, 0.0) ** 2, np.maximum(out_of, 0.0) ** 2
-        turns = self.spin[i] * along, after * self.swung[i] + before * self.swung[i + 1]
-        rounding = after * self.bent[i] + before * self.bent[i + 1]
+        turns = self.spin[i] * along, after * self.swing_rate[i] + before * self.swing_rate[i + 1]
+        rounding = after * self.bend_rate[i] + before * self.bend_rate[i + 1]
         return se3.make(_turned(self.rotations[i], *turns), self.points[i] + self.direction[i] * along + rounding)
 
     def derivatives(self, s: Array) -> tuple[Array, Array]:
         """First derivative (N, 3) of the position at s (N,), at most 1 long, and second (N, 3), 1/mm.
 
-        Where the second steps it is the stronger side's.
+        Where the second derivative steps, the larger side is given.
         """
         i = self.stretch(s)
         into, out_of = self._depths(i, s)
-        before, after = 2 * self.bent[i + 1], 2 * self.bent[i]
+        before, after = 2 * self.bend_rate[i + 1], 2 * self.bend_rate[i]
         first = self.direction[i] + np.maximum(into, 0.0) * before - np.maximum(out_of, 0.0) * after
-        return np.asarray(first), np.asarray((into > -EDGE) * before + (out_of > -EDGE) * after)
+        return np.asarray(first), np.asarray((into > -BLEND_TOLERANCE) * before + (out_of > -BLEND_TOLERANCE) * after)
 
     def _depths(self, i: NDArray[np.intp], s: Array) -> tuple[Array, Array]:
         """How deep s (N,) is in the blend at the end and at the start of its stretch i, mm (N, 1), negative outside."""
@@ -90,19 +91,19 @@ class Curve:
         return into[:, None], out_of[:, None]
 
 
-def curve_through(surface_from_nozzle: Array, speed: Array, tolerance: float, swerve: float) -> Curve:
+def curve_through(surface_from_nozzle: Array, speed: Array, tolerance: float, swerve: float) -> PathCurve:
     """The curve through poses (K, 4, 4), no two in a row the same.
 
     speed: (K-1,) mm/s. tolerance: mm by which corners are cut. swerve: mm/s by which a corner may change the velocity.
-    A turn counts as the way of a point LEVER beside the tip.
+    A turn counts as the motion of a point LEVER_ARM beside the tip.
     """
     points, rotations = surface_from_nozzle[:, :3, 3], surface_from_nozzle[:, :3, :3]
-    moves, turns = steps(surface_from_nozzle)
-    length = lengths_of(moves, turns)
+    moves, turns = moves_and_turns(surface_from_nozzle)
+    length = lengths_from(moves, turns)
     direction, spin = moves / length[:, None], turns / length[:, None]
     bend, swing = np.zeros_like(points), np.zeros_like(points)
     bend[1:-1], swing[1:-1] = np.diff(direction, axis=0), np.diff(spin, axis=0)
-    turned = np.maximum(np.linalg.norm(bend, axis=1), LEVER * np.linalg.norm(swing, axis=1))
+    turned = np.maximum(np.linalg.norm(bend, axis=1), LEVER_ARM * np.linalg.norm(swing, axis=1))
     half = np.zeros(len(points))
     wanted = 4 * tolerance / np.maximum(turned[1:-1], 1e-9)  # the curve passes a corner at |bend| * half / 4
     half[1:-1] = np.where(turned[1:-1] > 1e-9, np.minimum(wanted, np.minimum(length[:-1], length[1:]) / 2), 0.0)
@@ -110,7 +111,7 @@ def curve_through(surface_from_nozzle: Array, speed: Array, tolerance: float, sw
     corner = np.where(half > 0, swerve / np.maximum(turned, 1e-9), np.inf)
     quarter = np.where(half > 0, 0.25 / np.where(half > 0, half, 1.0), 0.0)[:, None]
     blends = bend, swing, half, bend * quarter, swing * quarter
-    return Curve(knots, points, rotations, direction, spin, *blends, np.asarray(speed, float), corner, due)
+    return PathCurve(knots, points, rotations, direction, spin, *blends, np.asarray(speed, float), corner, due)
 
 
 def _turned(rotation: Array, along: Array, within: Array) -> Array:
@@ -119,3 +120,104 @@ def _turned(rotation: Array, along: Array, within: Array) -> Array:
         return rotation
     first, second = se3.exp_rotation(np.stack([along, within]))
     return np.asarray(rotation @ first @ second)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gridpoints:
+    """M grid points on a part of a curve, rising. Each bound is the strictest of both sides of its point."""
+
+    places: Array  # (M,) mm
+    allowed: Array  # (M,) mm/s allowed on the stretches and in the corners
+    cruise: Array  # (M,) mm/s allowed on the stretches alone
+    bend: Array  # (M,) 1/mm, largest change of direction per mm within a corner
+    swing: Array  # (M,) rad/mm^2, largest change of spin per mm within a corner
+    spin: Array  # (M,) rad/mm, largest spin
+
+    @property
+    def due(self) -> Array:
+        """Earliest time (M,), s after the first point, at which each is reached: at the speeds allowed."""
+        pace = self.allowed[:-1] + self.allowed[1:]
+        return np.concatenate([[0.0], np.cumsum(2 * np.diff(self.places) / pace)])
+
+
+def gridpoints_on(curve: PathCurve, start: float, end: float) -> Gridpoints:
+    """Grid points from `start` to `end`, mm: evenly spread, and where there is room the ends of each blend."""
+    places = _places(curve, start, end)
+    first, last = curve.stretch(places[:-1]), curve.stretch(np.nextafter(places[1:], 0.0))
+    before = np.searchsorted(curve.knots + curve.half, places[:-1], "right")  # the first blend not yet passed
+    beyond = np.searchsorted(curve.knots - curve.half, places[1:], "left") - 1  # the last one begun
+    part = slice(int(min(first[0], before[0])), int(max(last[-1], beyond[-1])) + 2)
+    stretches, corners = (first - part.start, last - part.start), (before - part.start, beyond - part.start)
+    within = 2 * np.maximum(curve.half[part], MIN_BLEND)
+    bend, swing, spin = (np.linalg.norm(of[part], axis=1) for of in (curve.bend, curve.swing, curve.spin))
+    of_corners = np.stack([1 / curve.corner[part], bend / within, swing / within], axis=1)
+    of_stretches = np.stack([1 / curve.speed[part], spin], axis=1)
+    slowest, bend, swing = _at_points(_largest(of_corners, *corners)).T
+    cruise, spin = _at_points(_largest(of_stretches, *stretches)).T
+    return Gridpoints(places, 1 / np.maximum(cruise, slowest), 1 / cruise, bend, swing, spin)
+
+
+def _places(curve: PathCurve, start: float, end: float) -> Array:
+    even = np.linspace(start, end, HORIZON_POINTS)
+    inside = (curve.knots > start) & (curve.knots < end)
+    if inside.sum() > HORIZON_POINTS // 3:
+        return even
+    knots, half = curve.knots[inside], curve.half[inside]
+    points = np.concatenate([even, knots - half, knots + half])
+    points = np.sort(points[(points >= start) & (points <= end)])
+    points = points[np.concatenate([[True], np.diff(points) > 1e-6])]
+    points[-1] = end
+    return np.asarray(points)
+
+
+def _largest(values: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
+    """The largest (M, D) of values (K, D), none below 0, from `first` to `last` (M,); 0 where there is none."""
+    padded = np.concatenate([values, np.zeros((2, values.shape[1]))])
+    ends = np.stack([np.minimum(first, len(values)), np.maximum(last, first) + 1], 1).ravel()
+    largest = np.maximum.reduceat(padded, np.minimum(ends, len(values) + 1))[::2]
+    return np.where((last >= first)[:, None], largest, 0.0)
+
+
+def _at_points(between: Array) -> Array:
+    """The largest (M, D) on both sides of grid points of (M-1, D) in the intervals between them."""
+    return np.concatenate([between[:1], np.maximum(between[:-1], between[1:]), between[-1:]])
+
+
+def entry_curve(surface_from_nozzle: Array, goal: Array, speed: float) -> PathCurve | None:
+    """From the nozzle (4, 4) up, over and down to `goal` (4, 4), at the end at `speed`, mm/s; None if it is there."""
+    outwards, place = goal[:3, 2], surface_from_nozzle[:3, 3]
+    lift = max(0.0, float((goal[:3, 3] + APPROACH_HEIGHT * outwards - place) @ outwards))
+    lifted = se3.make(surface_from_nozzle[:3, :3], place + lift * outwards)
+    over, before = (
+        se3.make(goal[:3, :3], goal[:3, 3] + height * outwards) for height in (APPROACH_HEIGHT, DIRECT_DISTANCE)
+    )
+    near = np.linalg.norm(place - goal[:3, 3]) < DIRECT_DISTANCE
+    return _through([surface_from_nozzle, goal] if near else [surface_from_nozzle, lifted, over, before, goal], speed)
+
+
+def point_above(surface_from_nozzle: Array) -> Array:
+    """The nozzle (4, 4) straight above where it is now, where it touches nothing."""
+    return se3.make(
+        surface_from_nozzle[:3, :3], surface_from_nozzle[:3, 3] + APPROACH_HEIGHT * surface_from_nozzle[:3, 2]
+    )
+
+
+def straight_curve(surface_from_nozzle: Array, goal: Array) -> PathCurve | None:
+    """From the nozzle (4, 4) to `goal` (4, 4); None if there."""
+    return _through([surface_from_nozzle, goal], APPROACH_SPEED)
+
+
+def exit_curve(surface_from_nozzle: Array) -> PathCurve:
+    """From the nozzle (4, 4) straight up."""
+    curve = straight_curve(surface_from_nozzle, point_above(surface_from_nozzle))
+    assert curve is not None
+    return curve
+
+
+def _through(poses: list[Array], last_speed: float) -> PathCurve | None:
+    way = np.stack(poses)
+    way = way[np.concatenate([way_lengths(way) >= MIN_SPACING, [True]])]  # (K, 4, 4): of one place, the last
+    if len(way) < 2:
+        return None
+    speed = np.array([APPROACH_SPEED] * (len(way) - 2) + [min(last_speed, APPROACH_SPEED)])
+    return curve_through(way, speed, CORNER_TOLERANCE, CORNER_SPEED_CHANGE)

@@ -1,10 +1,10 @@
 """The arm's commanded motion: six axes that follow a moving target under speed, acceleration and jerk limits.
 
-Each axis is aimed at the state that the target will have LEAD s ahead, to be met in LEAD s: aimed at the present state,
-a time-optimal controller chatters between the limits (measured: 0.26 mm rms that way, 0.02 mm this way). Where the
-quintic from here to there keeps the limits it is taken, else Ruckig's motion (Berscheid and Kroeger 2021), which always
-does. Ruckig alone will not do: with a minimum duration its motions are not unique, and it was measured to send an axis
-that had nothing to do 0.17 mm away and back at full jerk (0.040 mm rms off a still path that way, 0.004 mm this way).
+Each axis aims at the state that the target will have LOOKAHEAD s from now, to reach it then. A time-optimal controller
+that aims at the present state chatters between the limits (measured: 0.26 mm rms; this way 0.02 mm). If the quintic
+from here to there keeps the limits, it is taken; otherwise the motion of Ruckig (Berscheid and Kroeger 2021), which
+always keeps them. Ruckig alone is not enough: with a minimum duration its motions are not unique, and it was measured
+to send an axis with nothing to do 0.17 mm away and back at full jerk (0.040 mm rms off a still path; this way 0.004).
 """
 
 from __future__ import annotations
@@ -13,33 +13,33 @@ import numpy as np
 from ruckig import ControlInterface, InputParameter, Ruckig, RuckigError, Synchronization, Trajectory
 
 from estimation.se3 import Array
-from planning.limits import Limits
+from planning.limits import MotionLimits
 
-LEAD = 0.1  # s; half of it doubled the error by chatter, twice of it by what the prediction lacks
-WITHIN = 0.999  # of each limit, so that rounding never breaks one
+LOOKAHEAD = 0.1  # s; half of it doubled the error by chatter, twice of it by errors of the prediction
+LIMIT_FRACTION = 0.999  # of each limit, so that rounding never breaks one
 
 
-class Follower:
-    """Where the axes (6,) are commanded to be, and how they move there: one tick of motion a call."""
+class AxisFollower:
+    """Commanded position, velocity and acceleration of the axes (6,) each; a call moves them one tick."""
 
-    def __init__(self, axes: Array, limits: Limits, tick: float) -> None:
+    def __init__(self, axes: Array, limits: MotionLimits, tick: float) -> None:
         self.position, self.velocity, self.acceleration = axes.copy(), np.zeros(6), np.zeros(6)
-        self._speed = WITHIN * limits.per_tick(tick)
-        self._acceleration, self._jerk = WITHIN * limits.acceleration, WITHIN * limits.jerk
+        self._speed = LIMIT_FRACTION * limits.per_tick(tick)
+        self._acceleration, self._jerk = LIMIT_FRACTION * limits.acceleration, LIMIT_FRACTION * limits.jerk
         self._tick, self._ruckig = tick, Ruckig(6, tick)
 
     @property
     def at_rest(self) -> bool:
-        """Whether nothing moves any more."""
+        """Whether no axis moves."""
         return not self.velocity.any() and not self.acceleration.any()
 
     def rest(self, axes: Array | None = None) -> None:
-        """Take it that the arm stands still, at `axes` (6,) where they are given: it was stopped by something else."""
+        """Set the motion to rest, at `axes` (6,) if given: something else stopped the arm."""
         self.position = self.position if axes is None else axes.copy()
         self.velocity, self.acceleration = np.zeros(6), np.zeros(6)
 
     def aim(self, position: Array, velocity: Array, acceleration: Array) -> Array | str:
-        """Move one tick towards a target that in LEAD s will be in the state given, each (6,); new axes (6,).
+        """Move one tick towards the target's state (6,) each, LOOKAHEAD s from now; new axes (6,).
 
         A target faster than the limits is followed as fast as they allow. A str says why there is no such motion.
         """
@@ -48,14 +48,14 @@ class Follower:
         smooth = np.ones(6, bool)
         for bound, limit in zip(controls[1:], (self._speed, self._acceleration, self._jerk), strict=True):
             smooth &= (np.abs(bound) <= limit).all(axis=0)
-        state = np.stack([_bezier(control, self._tick / LEAD) for control in controls[:3]])
+        state = np.stack([_bezier(control, self._tick / LOOKAHEAD) for control in controls[:3]])
         if not smooth.all():
             request = self._request()
             request.target_position = position
-            request.target_velocity = np.clip(velocity, -WITHIN * self._speed, WITHIN * self._speed)
-            request.minimum_duration = LEAD
+            request.target_velocity = np.clip(velocity, -LIMIT_FRACTION * self._speed, LIMIT_FRACTION * self._speed)
+            request.minimum_duration = LOOKAHEAD
             limited = self._solve(request)
-            if isinstance(limited, str):  # the axes cannot be brought to one duration: each as soon as it can
+            if isinstance(limited, str):  # the axes cannot share one duration: each as soon as it can
                 request.synchronization, request.minimum_duration = Synchronization.No, None
                 limited = self._solve(request)
             if isinstance(limited, str):
@@ -64,7 +64,7 @@ class Follower:
         return self._take(state)
 
     def brake(self) -> Array | str:
-        """Move one tick towards rest, as soon as the limits allow; new axes (6,)."""
+        """Move one tick towards rest as fast as the limits allow; new axes (6,), or why there is no such motion."""
         request = self._request()
         request.control_interface = ControlInterface.Velocity
         request.synchronization = Synchronization.No  # together, one brake in 30,000 ticks had no solution
@@ -96,21 +96,17 @@ class Follower:
 
 
 def _quintic(start: Array, end: Array) -> tuple[Array, Array, Array, Array]:
-    """Control points (6 to 3, 6) of position, velocity, acceleration and jerk between two states (3, 6) LEAD s apart.
+    """Bernstein control points (6 to 3, 6) of position, velocity, acceleration, jerk between states LOOKAHEAD s apart.
 
-    In Bernstein form: a derivative stays between the least and the greatest of its control points.
+    start, end: (3, 6). A derivative stays between the least and the greatest of its control points.
     """
     (p0, v0, a0), (p1, v1, a1) = start, end
-    fifth, twentieth = LEAD / 5, LEAD**2 / 20
-    position = np.stack(
-        [
-            *(p0, p0 + fifth * v0, p0 + 2 * fifth * v0 + twentieth * a0),
-            *(p1 - 2 * fifth * v1 + twentieth * a1, p1 - fifth * v1, p1),
-        ]
-    )
-    velocity = 5 / LEAD * np.diff(position, axis=0)
-    acceleration = 4 / LEAD * np.diff(velocity, axis=0)
-    return position, velocity, acceleration, np.asarray(3 / LEAD * np.diff(acceleration, axis=0))
+    fifth, twentieth = LOOKAHEAD / 5, LOOKAHEAD**2 / 20
+    first_half = p0, p0 + fifth * v0, p0 + 2 * fifth * v0 + twentieth * a0
+    position = np.stack([*first_half, p1 - 2 * fifth * v1 + twentieth * a1, p1 - fifth * v1, p1])
+    velocity = 5 / LOOKAHEAD * np.diff(position, axis=0)
+    acceleration = 4 / LOOKAHEAD * np.diff(velocity, axis=0)
+    return position, velocity, acceleration, np.asarray(3 / LOOKAHEAD * np.diff(acceleration, axis=0))
 
 
 def _bezier(control: Array, u: float) -> Array:

@@ -1,15 +1,15 @@
-"""How fast along the curve: TOPP-RA (Pham and Pham 2018) over the next horizon, always ending at rest.
+"""The timing along a curve: TOPP-RA (Pham and Pham 2018) over the next horizon, always ending at rest.
 
-The limits of the axes hold for path and surface together: what the surface's predicted motion takes of them at each
-grid point is not the path's to use. Corners lie between grid points, too: each is passed so slowly that no axis changes
-its speed within it faster than what is left allows, or that the way straight back would not within a tick. Speed
-changes by no more than the cruising speed in RISE, as the follower, whose jerk is limited, rounds off what is faster: a
-start at 5 mm/s was measured to cost 40 um along the path without that.
+The axis limits hold for path and surface together: at each grid point the surface's predicted motion is subtracted
+from them, the path gets what is left. Corners lie between grid points, too: each is passed so slowly that no axis
+changes its speed within it faster than what is left allows, or by more in one tick than straight back would. The speed
+changes by no more than the cruising speed in RISE_TIME, because the follower's limited jerk rounds off what is faster:
+without that, a start at 5 mm/s was measured to cost 40 um along the path.
 
-What was measured of toppra 0.6.10 and is kept here: its passes take 20 us a grid point, its programs 4; the start speed
-is carried at most at 0.999 of a limit, or half of all replans fail; the speed between grid points follows constant
-acceleration (ParametrizeConstAccel's rule), not a spline; a solve can end without a result or with an infinite time. It
-is exact to a fixed 1e-8 of whatever unit: in mm, 3 in 600 random paths had no result; in the horizon's length, none.
+Measured with toppra 0.6.10: its passes take 20 us a grid point, its programs 4; the start speed must stay at 0.999 of a
+limit or less, or half of all replans fail; the speed between grid points follows constant acceleration (the rule of
+ParametrizeConstAccel), not a spline; a solve can end without a result or with an infinite time. It is exact to a fixed
+1e-8 of any unit: in mm, 3 of 600 random paths had no result; in units of the horizon's length, none.
 """
 
 from __future__ import annotations
@@ -20,32 +20,85 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 from toppra import constraint
 from toppra.constants import MAX_TRIES, SMALL, TINY
 from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
 from toppra.interpolator import AbstractGeometricPath
 from toppra.solverwrapper import seidelWrapper
 
+from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from planning.demand import PAUSE, Demand
-from planning.stations import Stations
+from planning.motion.curve import Gridpoints, PathCurve
+from planning.robot.kinematics import SimpleArm, limited_axes, max_axis_change
 
-CARRIED = 0.999  # of a limit, as start speed
-RISE = 0.1  # s from rest to cruising speed: with it a start costs 3 um, with half of it 9
-TOTAL = 0.8  # of the axes' limits, for path and surface together; the rest makes good what was not foreseen
-PATH_SPEED, PATH_ACCELERATION = 0.5, 0.2  # of the axes' limits, for the path at most: jerk bears no more
-LEAST = 0.02  # of the axes' limits, for the path however the surface moves: slow, and never stuck
-FASTEST = np.array([1e-9, -1.0])  # toppra's objective: the greatest squared speed, and of its accelerations the least
-BRAKED = 0.9  # of the change of speed that is allowed, where a speed carried over is brought down
+DIFFERENCE_STEP = 0.05  # mm along the path between differences: what a slow tool moves in one tick
+DIFFERENCE_TIME = 0.02  # s between differences: one tick
+FILTER_RADIUS = 3  # grid points to each side, of a horizon's 30: a place may be passed later than at its earliest
+START_SPEED_FRACTION = 0.999  # of a limit, as start speed
+RISE_TIME = 0.1  # s from rest to cruising speed: a start then costs 3 um along the path, with half of it 9
+LIMIT_SHARE = 0.8  # of the axis limits, for path and surface together; the rest corrects what was not predicted
+PATH_SPEED_SHARE, PATH_ACCELERATION_SHARE = 0.5, 0.2  # of the axis limits, for the path at most: jerk allows no more
+MIN_PATH_SHARE = 0.02  # of the axis limits, for the path however the surface moves: slow, but never stuck
+FASTEST_OBJECTIVE = np.array([1e-9, -1.0])  # toppra's: greatest squared speed, then the least acceleration
+BRAKING_FRACTION = 0.9  # of the allowed change of speed, by which a speed that is too high is reduced
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AxisDerivatives:
+    """The D limited axes (`limited_axes`; mm, rad) at M grid points of a curve on a moving surface."""
+
+    axes: Array  # (M, D) when each point is passed at its earliest
+    first: Array  # (M, D) derivative per mm; beside a corner the largest of both sides
+    second: Array  # (M, D) second derivative per mm
+    bend: Array  # (M, D) largest change of `first` per mm within a corner beside the point
+    swerve: Array  # (M, D) largest change of `first` over such a corner
+    speed: Array  # (M, D) per s, largest of the surface's predicted motion alone around the point
+    acceleration: Array  # (M, D) per s^2, the same
+
+
+def axis_derivatives(
+    arm: SimpleArm, pose: SurfacePose, curve: PathCurve, grid: Gridpoints, begin: float
+) -> AxisDerivatives:
+    """The derivatives where the surface moves as `pose` predicts and the grid is entered at `begin`, s.
+
+    X Y Z follow from the curve's own derivatives, blends included, the other axes from differences.
+    """
+    places, times = grid.places, begin + grid.due
+    count = len(places)
+    nozzle = curve.poses(np.concatenate([places - DIFFERENCE_STEP, places, places + DIFFERENCE_STEP]))
+    if pose.warp is not None:
+        nozzle = pose.warp.carry(nozzle)
+    base = pose.base_at(np.concatenate([times - DIFFERENCE_TIME, times, times + DIFFERENCE_TIME]))
+    nozzle, base = nozzle.reshape(3, count, 4, 4), base.reshape(3, count, 4, 4)
+    now = base[1]
+    # by place on the surface at rest, and by time at a fixed place: (2, 3, M, D)
+    axes = limited_axes(arm, np.stack([now @ nozzle, base @ nozzle[1]])).reshape(2, 3, count, -1)
+    first, second = _differences(axes[0], DIFFERENCE_STEP)
+    turn = arm.arm_from_base[:3, :3] @ now[:, :3, :3]
+    along = turn @ np.stack(curve.derivatives(places), axis=-1)
+    first[:, :3], second[:, :3] = along[..., 0], along[..., 1]
+    surface = maximum_filter1d(np.abs(np.stack(_differences(axes[1], DIFFERENCE_TIME))), 2 * FILTER_RADIUS + 1, axis=1)
+    by_move, by_turn = max_axis_change(arm, axes[0, 1])
+    bend = by_move * grid.bend[:, None] + by_turn * grid.swing[:, None]
+    most = by_move + by_turn * grid.spin[:, None]
+    first = np.where(bend > 0, np.copysign(np.maximum(np.abs(first), most), first), first)
+    return AxisDerivatives(axes[0, 1], first, second, bend, 2 * most, *surface)
+
+
+def _differences(values: Array, step: float) -> tuple[Array, Array]:
+    """First and second derivative (M, D) of values (3, M, D) `step` apart."""
+    before, here, after = values
+    return (after - before) / (2 * step), (after - 2 * here + before) / step**2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timing:
-    """s over time on one horizon. times: (M,) s. places: (M,) mm. speeds: (M,) mm/s, the last 0."""
+    """s over time on one horizon."""
 
-    times: Array
-    places: Array
-    speeds: Array
+    times: Array  # (M,) s
+    places: Array  # (M,) mm
+    speeds: Array  # (M,) mm/s, the last 0
 
     @property
     def end(self) -> float:
@@ -73,22 +126,24 @@ class Timing:
         return np.asarray((self.speeds[i + 1] - self.speeds[i]) / (self.times[i + 1] - self.times[i]))
 
 
-def retime(grid: Stations, asked: Demand, speed: float, begin: float, limits: tuple[Array, Array]) -> Timing | str:
+def retime(
+    grid: Gridpoints, derivatives: AxisDerivatives, speed: float, begin: float, limits: tuple[Array, Array]
+) -> Timing | str:
     """The fastest timing along the grid that begins at `begin`, s, with `speed`, mm/s, and ends at rest.
 
-    limits: speed and acceleration (D,) of what `asked` is about. The grid's speeds hold everywhere, not at its points
-    only. A speed too high for limits that have shrunk since is brought down to them as the grid's `cruise` lets it.
+    limits: speed and acceleration (D,) of the limited axes. The grid's speed bounds hold everywhere, not only at its
+    points. A start speed above limits that have shrunk is reduced to them as fast as the grid's `cruise` allows.
     A str says why there is no timing.
     """
-    carried = min(speed, CARRIED * float(grid.allowed[0]))
-    change = grid.cruise / RISE
-    left = _left(limits[1], asked.acceleration, PATH_ACCELERATION)
-    axes = _borne(asked, _left(limits[0], asked.speed, PATH_SPEED), left)
-    bounds = _speeds(grid, axes, carried, float(change.min()))
+    carried = min(speed, START_SPEED_FRACTION * float(grid.allowed[0]))
+    change = grid.cruise / RISE_TIME
+    left = _path_share(limits[1], derivatives.acceleration, PATH_ACCELERATION_SHARE)
+    axes = _axis_speed(derivatives, _path_share(limits[0], derivatives.speed, PATH_SPEED_SHARE), left)
+    bounds = _speed_bounds(grid, axes, carried, float(change.min()))
     start, end = grid.places[[0, -1]]
     unit = end - start
-    constraints = [_Speed(bounds / unit, change / unit), *_acceleration(asked, left, bounds, change, unit)]
-    speeds = _solved(constraints, (grid.places - start) / unit, carried / unit)
+    constraints = [_Speed(bounds / unit, change / unit), *_acceleration(derivatives, left, bounds, change, unit)]
+    speeds = _solve(constraints, (grid.places - start) / unit, carried / unit)
     if speeds is None or not np.isfinite(speeds).all():
         return f"no timing from {start:.2f} to {end:.2f} mm at {speed:.2f} mm/s"
     pace = unit * (speeds[:-1] + speeds[1:])
@@ -98,51 +153,56 @@ def retime(grid: Stations, asked: Demand, speed: float, begin: float, limits: tu
     return Timing(times, grid.places, np.asarray(unit * speeds))
 
 
-def _left(limit: Array, taken: Array, most: float) -> Array:
-    """What (M, D) the surface, which takes (M, D) of limits (D,), leaves to the path; `most` of the limits at most."""
-    return np.clip(TOTAL * limit - taken, LEAST * limit, most * limit)
+def _path_share(limit: Array, taken: Array, most: float) -> Array:
+    """What the surface, which takes (M, D) of limits (D,), leaves to the path: (M, D), `most` of the limits at most."""
+    return np.clip(LIMIT_SHARE * limit - taken, MIN_PATH_SHARE * limit, most * limit)
 
 
-def _borne(asked: Demand, speed: Array, acceleration: Array) -> Array:
-    """Speed (M,), mm/s, at which no axis exceeds what is left to the path (M, D), on straights and in corners."""
-    straight = speed / np.maximum(np.abs(asked.first), 1e-12)
-    within, at_once = acceleration / np.maximum(asked.bend, 1e-12), acceleration / np.maximum(asked.swerve, 1e-12)
-    return np.asarray(np.minimum(straight, np.maximum(np.sqrt(within), PAUSE * at_once)).min(axis=1))
+def _axis_speed(derivatives: AxisDerivatives, speed: Array, acceleration: Array) -> Array:
+    """Speed (M,), mm/s, at which no axis exceeds the path's share (M, D) of the limits, on straights and in corners."""
+    straight = speed / np.maximum(np.abs(derivatives.first), 1e-12)
+    within, at_once = (
+        acceleration / np.maximum(derivatives.bend, 1e-12),
+        acceleration / np.maximum(derivatives.swerve, 1e-12),
+    )
+    return np.asarray(np.minimum(straight, np.maximum(np.sqrt(within), DIFFERENCE_TIME * at_once)).min(axis=1))
 
 
-def _speeds(grid: Stations, axes: Array, carried: float, change: float) -> Array:
-    """Speed (M,), mm/s, that tool and axes bear; from `carried` down no faster than by `change`, mm/s^2."""
-    braking = np.sqrt(np.maximum(carried**2 - 2 * BRAKED * change * (grid.places - grid.places[0]), 0.0))
-    return np.asarray(np.minimum(grid.allowed, np.maximum(axes, braking / CARRIED)))
+def _speed_bounds(grid: Gridpoints, axes: Array, carried: float, change: float) -> Array:
+    """Speed bounds (M,), mm/s, of tool and axes; below `carried` they fall no faster than `change`, mm/s^2."""
+    braking = np.sqrt(np.maximum(carried**2 - 2 * BRAKING_FRACTION * change * (grid.places - grid.places[0]), 0.0))
+    return np.asarray(np.minimum(grid.allowed, np.maximum(axes, braking / START_SPEED_FRACTION)))
 
 
-def _acceleration(asked: Demand, left: Array, speed: Array, change: Array, unit: float) -> list[_Acceleration]:
-    """The constraint on the axes that can reach what is left to them, lengths in `unit` mm; none, if none can.
+def _acceleration(
+    derivatives: AxisDerivatives, left: Array, speed: Array, change: Array, unit: float
+) -> list[_Acceleration]:
+    """The acceleration constraint on the axes that can reach their bound, lengths in `unit` mm; [] where none can.
 
-    An axis that cannot at the greatest speed and change of speed does not alter the solution, only its cost.
+    An axis that cannot reach it at the greatest speed and change of speed only costs time.
     """
-    first, second = asked.first / left, asked.second / left
+    first, second = derivatives.first / left, derivatives.second / left
     reached = ~((np.abs(first) * change.max() + np.abs(second) * speed[:, None] ** 2).max(axis=0) <= 1)  # NaN is
     return [_Acceleration(first[:, reached] * unit, second[:, reached] * unit**2)] if reached.any() else []
 
 
-def _solved(constraints: list[constraint.LinearConstraint], places: Array, start: float) -> Array | None:
+def _solve(constraints: list[constraint.LinearConstraint], places: Array, start: float) -> Array | None:
     """The fastest speeds (M,) along places (M,), 0 to 1, from `start` to rest; None where there are none.
 
-    The two passes of TOPP-RA and toppra's program at each point, with its care for rounding, in plain floats: its own
-    loops take three times as long. Rest is always controllable, as at rest no limit is near: the least speed from which
-    the end can be reached is 0 everywhere, and is not solved for.
+    The two passes of TOPP-RA with toppra's linear program at each point and its guards against rounding, in plain
+    floats: toppra's own loops take three times as long. Rest is controllable everywhere, since at rest no limit is
+    near; so the lower end of the controllable set is 0 and is not solved for.
     """
     steps = np.diff(places)
     if not (steps > 0).all():
         return None
     program = seidelWrapper(constraints, _Way(places), places, solve_lp1d=True).solve_stagewise_optim
-    greatest = np.zeros(len(places)).tolist()  # squared speed from which the end can be reached
+    greatest = np.zeros(len(places)).tolist()  # backward pass: squared speed from which the end can be reached
     for i in reversed(range(len(places) - 1)):
-        greatest[i] = program(i, None, FASTEST, math.nan, math.nan, 0.0, greatest[i + 1])[1]
+        greatest[i] = program(i, None, FASTEST_OBJECTIVE, math.nan, math.nan, 0.0, greatest[i + 1])[1]
         if math.isnan(greatest[i]):
             return None
-    squared = [start**2]
+    squared = [start**2]  # forward pass: the greatest squared speed within those bounds
     if not squared[0] <= greatest[0] + SMALL:
         return None
     objectives = np.stack([-2 * steps, -np.ones_like(steps)], 1)
@@ -160,7 +220,7 @@ def _solved(constraints: list[constraint.LinearConstraint], places: Array, start
 
 
 class _Way(AbstractGeometricPath):  # type: ignore[misc]
-    """What toppra asks of a path when the constraints know the rest."""
+    """The part of a path that toppra needs where the constraints know the rest."""
 
     def __init__(self, places: Array) -> None:
         self._interval = places[[0, -1]]
@@ -177,10 +237,7 @@ class _Way(AbstractGeometricPath):  # type: ignore[misc]
 
 
 class _Speed(constraint.LinearConstraint):  # type: ignore[misc]
-    """Speed along the curve at each grid point, and how fast that may change.
-
-    It is exact for the tool, whose way is never longer than the curve's.
-    """
+    """Bounds on the speed along the curve and on its change; exact for the tool, whose way is never longer."""
 
     def __init__(self, allowed: Array, change: Array) -> None:
         super().__init__()
@@ -195,7 +252,7 @@ class _Speed(constraint.LinearConstraint):  # type: ignore[misc]
 
 
 class _Acceleration(constraint.LinearConstraint):  # type: ignore[misc]
-    """|q' u + q'' x| of each axis, (M, D) as a share of what is left to the path at each grid point, is at most 1."""
+    """|q' u + q'' x| <= 1 of each axis, (M, D) relative to the path's share of its limit at each grid point."""
 
     def __init__(self, first: Array, second: Array) -> None:
         super().__init__()
@@ -208,7 +265,5 @@ class _Acceleration(constraint.LinearConstraint):  # type: ignore[misc]
         """a, b, c (M, 2 D), F and g of F (a u + b x + c) <= g; no bounds."""
         none, one = np.zeros_like(self._first), np.eye(self._first.shape[1])
         rows, ends = np.concatenate([one, -one]), np.ones(2 * len(one))
-        made = canlinear_colloc_to_interpolate(
-            self._first, self._second, none, rows, ends, None, None, gridpoints, identical=True
-        )
-        return tuple(made)
+        terms = self._first, self._second, none, rows, ends, None, None, gridpoints
+        return tuple(canlinear_colloc_to_interpolate(*terms, identical=True))

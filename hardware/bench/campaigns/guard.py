@@ -1,13 +1,14 @@
-"""An oracle beside the guard: written from the limits alone, it shares no arithmetic with it.
+"""Random commands before the guard, on and beside all its limits, judged by an oracle of its own.
 
-It looks at all commands of a run at once, afterwards, and takes another way to each number: the surface's speed and the
-spread of a place by moving the place a little, the joints by where they bring the nozzle. A verdict is 1 where a limit
-is kept, -1 where it is broken and 0 within rounding of it.
+The oracle is written from the limits alone, it shares no arithmetic with the guard. It looks at all commands of a run
+at once, afterwards, and takes another way to each number: the surface's speed and the spread of a place by moving the
+place a little, the joints by where they bring the nozzle. A verdict is 1 where a limit is kept, -1 where it is broken
+and 0 within rounding of it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,24 +16,26 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from planning.kinematics import SimpleArm, joints_from_axes
-from planning.limits import Limits
-from planning.no_go import NoGo
-from planning.robot.kinematics import arm_from_nozzle
+from hardware.bench.figures import Figure, at_most
+from perception.package_data import shipped_file
+from planning.command import Command, Hold, Move
+from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
+from planning.motion.guard import Guard
+from planning.robot.kinematics import SimpleArm, joints_from_axes, nozzle_from_joints
 
 Flags = NDArray[np.bool_]
 Verdicts = NDArray[np.int_]
 
-ROUNDING = 1e-12  # of a limit
-COARSE = 1e-5  # of one whose number is differentiated by steps
-SMALL = 1e-5  # rad and mm, or s, of these steps
-CLOSER = 40  # thirds: 1e-7 of a way
-NEAR = 1e-6  # mm, of a zone's surface
-REACHED = 1e-6  # mm and rad: joints that bring the nozzle where it shall be
+ROUNDING_SHARE = 1e-12  # of a limit
+DIFFERENCE_ERROR = 1e-5  # of one whose number is differentiated by steps
+DIFFERENCE_STEP = 1e-5  # rad and mm, or s, of these steps
+ZONE_THIRDS = 40  # thirds: 1e-7 of a way
+ZONE_MARGIN = 1e-6  # mm, of a zone's surface
+REACH_TOLERANCE = 1e-6  # mm and rad: joints that bring the nozzle where it shall be
 
 
 @dataclass(slots=True)
-class Log:
+class GuardLog:
     """What a guard was asked and let pass, in order, a row each; N rows.
 
     stamps, nows: (N,) s. axes: (N, 6). feeds: (N,). extrude, holds: (N,) bool, whether it was a hold. poses: N of them.
@@ -50,17 +53,17 @@ class Log:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rules:
+class GuardRules:
     """What the guard was told. zone: (2, 3) mm. tick, lag: s."""
 
     arm: SimpleArm
-    limits: Limits
+    limits: MotionLimits
     zone: Array
     tick: float
     lag: float
 
 
-def judge(log: Log, rules: Rules) -> NDArray[np.int_]:
+def judge_guard(log: GuardLog, rules: GuardRules) -> NDArray[np.int_]:
     """(4,) counts: asked, passed, passed though a limit is broken, refused though all are kept."""
     before = _last(np.where((log.passed & ~log.holds)[:, None], log.axes, np.nan), rules.arm.home)
     order, worth = _order(log), _worth(log, before, rules)
@@ -73,7 +76,7 @@ def judge(log: Log, rules: Rules) -> NDArray[np.int_]:
     return np.array([len(verdict), log.passed.sum(), wrong[0].sum(), wrong[1].sum()])
 
 
-def _within(values: Array, limit: float | Array, rounding: float = ROUNDING) -> Verdicts:
+def _within(values: Array, limit: float | Array, rounding: float = ROUNDING_SHARE) -> Verdicts:
     """Verdicts on values that must not exceed a limit; what is not a number does."""
     kept, near = values <= limit * (1 - rounding), values <= limit * (1 + rounding)
     return np.where(kept, 1, np.where(near, 0, -1))
@@ -98,18 +101,18 @@ def _last(rows: Array, first: Array | float) -> Array:
     return filled
 
 
-def _order(log: Log) -> Verdicts:
+def _order(log: GuardLog) -> Verdicts:
     after = _last(np.where(log.passed, log.nows, np.nan), -np.inf)
     return _exactly(np.isfinite(log.nows) & (log.stamps == log.nows) & (log.nows > after))
 
 
-def _reach(log: Log, rules: Rules) -> Verdicts:
+def _reach(log: GuardLog, rules: GuardRules) -> Verdicts:
     inside = _every((log.axes >= rules.limits.low) & (log.axes <= rules.limits.high))
     feed: Flags = (log.feeds > 0) & (log.feeds <= rules.limits.feed)
     return _exactly(_every(np.isfinite(log.axes)) & inside & feed)
 
 
-def _motion(log: Log, before: Array, rules: Rules) -> Verdicts:
+def _motion(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
     limits, way = rules.limits, log.axes - before
     jump = _within(np.sqrt((way[:, :3] ** 2).sum(axis=1)), limits.jump)
     turn = _within(np.abs(way[:, 3:]).max(axis=1), limits.turn)
@@ -117,7 +120,7 @@ def _motion(log: Log, before: Array, rules: Rules) -> Verdicts:
     return np.asarray(np.minimum.reduce([jump, turn, speed]))
 
 
-def _joints(log: Log, before: Array, rules: Rules) -> Verdicts:
+def _joints(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
     """Verdicts on the joints of an arm that is sent its last three."""
     model = rules.arm.jointed
     if model is None:
@@ -126,14 +129,14 @@ def _joints(log: Log, before: Array, rules: Rules) -> Verdicts:
     after, start = joints_from_axes(model, axes), joints_from_axes(model, before)
     known = _every(np.isfinite(after))
     after = np.where(known[:, None], after, 0.0)
-    off = np.abs(arm_from_nozzle(model, after)[:, :3, 3] - axes[:, :3]).max(axis=1)
+    off = np.abs(nozzle_from_joints(model, after)[:, :3, 3] - axes[:, :3]).max(axis=1)
     off = np.maximum(off, np.abs(after[:, 3:] - axes[:, 3:]).max(axis=1))
     inside = _exactly(_every((after >= model.low) & (after <= model.high)))
     speed = _within(np.abs(after - start), model.speed * rules.tick).min(axis=1)
-    return np.where(known & (off < REACHED), np.minimum(inside, speed), -1)
+    return np.where(known & (off < REACH_TOLERANCE), np.minimum(inside, speed), -1)
 
 
-def _zones(log: Log, before: Array, rules: Rules) -> Verdicts:
+def _zones(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
     """Verdicts on the tip's straight ways: how far outside is convex along each, so thirds close in on its least."""
     finite = _every(np.isfinite(log.axes))
     start, end = (
@@ -143,13 +146,13 @@ def _zones(log: Log, before: Array, rules: Rules) -> Verdicts:
     verdict = np.ones(len(start), int)
     for zone in rules.limits.zones:
         low, high = np.zeros(len(start)), np.ones(len(start))
-        for _ in range(CLOSER):
+        for _ in range(ZONE_THIRDS):
             left, right = low + (high - low) / 3, high - (high - low) / 3
             nearer = _outside(zone, _between(start, end, left)) < _outside(zone, _between(start, end, right))
             low, high = np.where(nearer, low, left), np.where(nearer, right, high)
         shares = (np.zeros(len(start)), (low + high) / 2, np.ones(len(start)))
         least = np.min([_outside(zone, _between(start, end, share)) for share in shares], axis=0)
-        verdict = np.minimum(verdict, np.where(least > NEAR, 1, np.where(least > -NEAR, 0, -1)))
+        verdict = np.minimum(verdict, np.where(least > ZONE_MARGIN, 1, np.where(least > -ZONE_MARGIN, 0, -1)))
     return np.where(finite, verdict, -1)
 
 
@@ -166,25 +169,25 @@ def _outside(zone: NoGo, places: Array) -> Array:
     return np.asarray(np.maximum(faces.max(axis=1), np.sqrt((off**2).sum(axis=1)) - zone.radius))
 
 
-def _stopping(log: Log, order: Verdicts, worth: Verdicts, before: Array, limits: Limits) -> Verdicts:
+def _stopping(log: GuardLog, order: Verdicts, worth: Verdicts, before: Array, limits: MotionLimits) -> Verdicts:
     """Verdicts on moves that follow no pose worth it: no ink, and soon and near at rest."""
     sure, perhaps = (_since(log, before, (order > 0) & trusted, limits) for trusted in (worth > 0, worth >= 0))
     either = np.where(sure == perhaps, sure, 0)
     return np.where(log.extrude, -1, either)
 
 
-def _since(log: Log, before: Array, trusted: Flags, limits: Limits) -> Verdicts:
+def _since(log: GuardLog, before: Array, trusted: Flags, limits: MotionLimits) -> Verdicts:
     at = _last(np.where(trusted, log.nows, np.nan), -np.inf)
     place = _last(np.where(trusted[:, None], before, np.nan), np.nan)
     way = np.sqrt(((log.axes - place)[:, :3] ** 2).sum(axis=1))
     return np.minimum(_within(log.nows - at, limits.stop_time), _within(way, limits.stop_distance))
 
 
-def _worth(log: Log, before: Array, rules: Rules) -> Verdicts:
+def _worth(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
     """Verdicts on the poses."""
     there = np.array([pose is not None for pose in log.poses])
     poses = [_standing(now) if pose is None else pose for pose, now in zip(log.poses, log.nows, strict=True)]
-    numbers = [np.array([getattr(pose, name) for pose in poses]) for name in _NUMBERS]
+    numbers = [np.array([getattr(pose, name) for pose in poses]) for name in _POSE_NUMBERS]
     stamps, base, covariance, twist, drift, psd = numbers
     finite = np.all([np.isfinite(n.reshape(len(n), -1)).all(axis=1) for n in numbers], axis=0)
     measured = np.array([pose.state in (TrackState.TRACKING, TrackState.DEGRADED) for pose in poses])
@@ -199,14 +202,14 @@ def _worth(log: Log, before: Array, rules: Rules) -> Verdicts:
         _exactly(there & finite & measured),
         _exactly(age >= 0),
         _within(age, limits.pose_age),
-        _within(error, limits.pose_error, COARSE),
-        _within(speed, limits.surface_speed, COARSE),
+        _within(error, limits.pose_error, DIFFERENCE_ERROR),
+        _within(speed, limits.surface_speed, DIFFERENCE_ERROR),
         _within(np.sqrt((twist[:, :3] ** 2).sum(axis=1)), limits.surface_turn),
     ]
     return np.asarray(np.minimum.reduce(verdicts))
 
 
-_NUMBERS = ("stamp", "base_from_surface", "covariance", "twist", "twist_covariance", "acceleration_psd")
+_POSE_NUMBERS = ("stamp", "base_from_surface", "covariance", "twist", "twist_covariance", "acceleration_psd")
 
 
 def _standing(stamp: float) -> SurfacePose:
@@ -214,7 +217,7 @@ def _standing(stamp: float) -> SurfacePose:
     return SurfacePose(stamp, np.eye(4), np.zeros((6, 6)), np.zeros(6), TrackState.LOST)
 
 
-def _place(base_from_surface: Array, axes: Array, rules: Rules) -> Array:
+def _place(base_from_surface: Array, axes: Array, rules: GuardRules) -> Array:
     """Where in the zone the nozzle is, or is nearest to (N, 3), in the surface frame. The tip is at X Y Z."""
     tip = np.column_stack([axes[:, :3], np.ones(len(axes))])
     arm_from_surface = rules.arm.arm_from_base @ base_from_surface
@@ -228,14 +231,132 @@ def _moved(place: Array, by: Array) -> Array:
 
 def _speed(place: Array, twist: Array) -> Array:
     return np.asarray(
-        np.linalg.norm(_moved(place, SMALL * twist) - _moved(place, -SMALL * twist), axis=1) / (2 * SMALL)
+        np.linalg.norm(_moved(place, DIFFERENCE_STEP * twist) - _moved(place, -DIFFERENCE_STEP * twist), axis=1)
+        / (2 * DIFFERENCE_STEP)
     )
 
 
 def _error(place: Array, spread: Array) -> Array:
     """Standard deviation (N,), mm, of places (N, 3) along the worst direction, for covariances (N, 6, 6)."""
-    steps = SMALL * np.eye(6)
+    steps = DIFFERENCE_STEP * np.eye(6)
     columns = [_moved(place, step[None]) - _moved(place, -step[None]) for step in steps]
-    jacobian = np.stack(columns, axis=-1) / (2 * SMALL)
+    jacobian = np.stack(columns, axis=-1) / (2 * DIFFERENCE_STEP)
     variance = np.linalg.norm(jacobian @ spread @ np.swapaxes(jacobian, 1, 2), 2, axis=(1, 2))
     return np.asarray(np.sqrt(variance))
+
+
+COMMANDS_A_RUN = 10_000  # commands of one run
+PRINT_ZONE = np.array([[-20.0, -20, -1], [20, 20, 5]])
+SURFACE_REST = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # base_from_surface
+TICK_S, ARM_LAG = 0.02, 0.024  # s
+AXES_BOX = np.array([12.0, 12, 12, 0.15, 0.15, 0.15])  # mm and rad about home
+POSE_OUTAGE = 0.01, 0.8  # share of the poses at which the surface is lost, and s for which at most
+TRACK_STATES = list(TrackState)
+
+
+def guard_figures(commands: int, seed: int) -> list[Figure]:
+    """How many random commands passed that break a limit, and the other way round."""
+    arms = simple_rules(), simple_rules(), simple_rules(), jointed_rules()
+    counts = np.zeros(4, int)
+    for k in range(max(1, round(commands / COMMANDS_A_RUN))):
+        rules = arms[k % len(arms)]
+        counts += judge_guard(random_log(seed + k, min(COMMANDS_A_RUN, commands), rules), rules)
+    asked, passed, broken, refused = counts.tolist()
+    what = "guard: random commands"
+    return [
+        Figure(what, asked, "", note=f"{passed} passed; one in four runs with an arm that is sent its joints"),
+        Figure(f"{what} that break a limit and passed", broken, "", at_most(0), "", "by an independent oracle"),
+        Figure(f"{what} that keep all and were refused", refused, "", at_most(0)),
+    ]
+
+
+def simple_rules() -> GuardRules:
+    """The thesis's arm, whose controller sees to its joints."""
+    return GuardRules(SimpleArm(), boxed_limits(MotionLimits()), PRINT_ZONE, TICK_S, ARM_LAG)
+
+
+def jointed_rules() -> GuardRules:
+    """An arm that is sent its last three joints."""
+    from hardware.files.arm_file import read_arm
+
+    profile = read_arm(shipped_file("arms", "six_axis.toml"))
+    return GuardRules(profile.arm, boxed_limits(profile.limits), PRINT_ZONE, TICK_S, ARM_LAG)
+
+
+def boxed_limits(limits: MotionLimits) -> MotionLimits:
+    """The limits with bounds so near home that random steps meet them."""
+    home = SimpleArm().home
+    return replace(limits, low=home - AXES_BOX, high=home + AXES_BOX, zones=zones_about(home[:3]))
+
+
+def zones_about(home: Array) -> tuple[NoGo, ...]:
+    """One zone of each kind about a place (3,), mm, that steps there meet: a bed below, a block and a post."""
+    return (
+        half_space("bed", np.array([0.1, 0, 1.0]), home - [0, 0, 9]),
+        box("block", home + [5, 4, 2], home + [9, 8, 9]),
+        cylinder("post", home - [7, 6, 20], home - [7, 6, -20], 1.5),
+    )
+
+
+def random_log(seed: int, count: int, rules: GuardRules, guard: Guard | None = None) -> GuardLog:
+    """`count` commands near all limits, and what a guard, the real one if none is given, makes of them."""
+    draw = np.random.default_rng(seed)
+    arm, limits = rules.arm, rules.limits
+    guard = Guard(limits, arm, rules.tick, rules.zone, rules.lag) if guard is None else guard
+    rows, poses, now, lost_until = [], [], 0.0, 0.0
+    for _ in range(count):
+        now += draw.choice([TICK_S, 0.1, 0.0, -TICK_S], p=[0.9, 0.06, 0.02, 0.02])
+        stamp = now if draw.random() < 0.98 else now + draw.choice([1e-9, -TICK_S, np.nan])
+        if draw.random() < POSE_OUTAGE[0]:
+            lost_until = now + draw.uniform(0, POSE_OUTAGE[1])
+        pose = None if now < lost_until else random_pose(draw, now, rules)
+        axes, feed = random_move(draw, guard.axes, rules)
+        hold, extrude = draw.random() < 0.05, draw.random() < 0.5
+        command: Command = Hold(stamp, 0.001, "") if hold else Move(stamp, axes, feed, 0, bool(extrude))
+        passed = guard(command, pose, now) is command
+        rows.append([stamp, now, *axes, feed, extrude, hold, passed])
+        poses.append(pose)
+    table = np.array(rows)
+    flags = table[:, 9:].astype(bool)
+    return GuardLog(table[:, 0], table[:, 1], table[:, 2:8], table[:, 8], flags[:, 0], flags[:, 1], poses, flags[:, 2])
+
+
+def random_move(draw: np.random.Generator, before: Array, rules: GuardRules) -> tuple[Array, float]:
+    """Axes (6,) and feed: a step about home, often on a limit or a hair beyond it."""
+    limits = rules.limits
+    near = draw.choice([0.2, 0.5, 1.0, 1 + 1e-9, 1 - 1e-9, 1.5], p=[0.5, 0.38, 0.03, 0.03, 0.03, 0.03])
+    near = near * draw.choice([1.0, 0.05])
+    way = draw.normal(size=6) * limits.speed + draw.choice([0.0, 0.0, 3.0]) * (rules.arm.home - before)
+    share = max(
+        np.abs(way / limits.speed).max(), float(np.linalg.norm(way[:3])) * TICK_S / limits.jump
+    )  # of the limits
+    axes = before + near * TICK_S * way / share
+    if draw.random() < 0.03:
+        axis = draw.integers(6)
+        low, high = limits.low[axis], limits.high[axis]
+        axes[axis] = draw.choice([low, high, np.nan, np.inf, np.nextafter(high, np.inf), np.nextafter(low, -np.inf)])
+    feed = limits.feed * draw.choice([0.3, 1.0, 1 + 1e-9, 0.0, -1.0, np.nan], p=[0.9, 0.05, 0.02, 0.01, 0.01, 0.01])
+    return axes, float(feed)
+
+
+def random_pose(draw: np.random.Generator, now: float, rules: GuardRules) -> SurfacePose | None:
+    """A pose, mostly worth following, sometimes on or beyond one of its limits; now and then there is none."""
+    limits = rules.limits
+    if draw.random() < 0.02:
+        return None
+    age = limits.pose_age * draw.choice([0.1, 0.5, 0.999, 1.001, -0.01], p=[0.4, 0.52, 0.03, 0.03, 0.02])
+    state = TRACK_STATES[draw.choice(len(TRACK_STATES), p=[0.02 if not s.measured else 0.47 for s in TRACK_STATES])]
+    known = limits.pose_error * draw.choice([0.1, 0.5, 0.99, 1.01], p=[0.5, 0.44, 0.03, 0.03])
+    covariance = known**2 * np.diag([1e-6, 1e-6, 1e-6, 1.0, *draw.uniform(0.1, 1.0, 2)])
+    turn, speed = draw.normal(size=3), draw.normal(size=3)
+    turn *= limits.surface_turn * draw.choice([0.1, 0.9, 1.001], p=[0.85, 0.1, 0.05]) / np.linalg.norm(turn)
+    speed *= limits.surface_speed * draw.choice([0.1, 0.7, 1.3], p=[0.85, 0.1, 0.05]) / np.linalg.norm(speed)
+    twist = np.concatenate([turn, speed])
+    if draw.random() < 0.01:
+        twist[draw.integers(6)] = np.nan
+    base = SURFACE_REST @ se3.exp(draw.normal(size=6) * [0.05, 0.05, 0.05, 3, 3, 3])
+    drift, psd = (
+        np.diag([0, 0, 0, 1.0, 1, 1]) * draw.choice([0.0, 1.0]),
+        np.array([0, 0, 0, 1.0, 1, 1]) * draw.choice([0, 5]),
+    )
+    return SurfacePose(now - age, base, covariance, twist, state, drift, psd)

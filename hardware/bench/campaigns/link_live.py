@@ -24,80 +24,81 @@ import numpy as np
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.arm.profile import BENCH, ArmProfile
-from hardware.arm_status import ArmState
+from hardware.arm.device import ArmState, LinkCode
+from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.bench.figures import Figure, at_least, at_most
 from hardware.motion.loop import Order
-from hardware.motion.motion_process import MotionPlan, MotionReport, motion_process
-from hardware.priority import ask_for_real_time
+from hardware.motion.step import MotionPlan, MotionReport, motion_process
 from hardware.process.clock import WallClock
-from hardware.process.faults import Fault, Kind, Part
-from hardware.process.shared_latest import Newest
-from hardware.simulator.arm.settings import ArmSettings, Replies
-from hardware.simulator.port import run_virtual_arm
+from hardware.process.faults import Fault, FaultKind, FaultPart
+from hardware.process.shared_latest import SharedLatest
+from hardware.process.system import ask_for_real_time
+from hardware.simulator.arm.ports import run_virtual_arm
+from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.path import Path as Toolpath
 
-PART = 40.0  # s with one device, where it goes and comes back
-RATE = 30.0  # poses a second
-STOP_EVERY = 3.0  # s between the operator's stops
-HALT_EVERY, HALT = 6.0, 0.6  # s between halts of the motion process, and of the longest
-READY = 60.0  # s in which a process must have started, on a busy machine
-NOTHING = float("nan")
-CALM, HALTED, ROUGH = "calm", "halted", "rough"  # what goes wrong: nothing, host and port, the arm and its wire
-PARTS = (CALM, HALTED, ROUGH)
+DEVICE_SPAN = 40.0  # s with one device, where it goes and comes back
+POSE_RATE = 30.0  # poses a second
+ORDER_STOP_PERIOD = 3.0  # s between the operator's stops
+HALT_PERIOD, MAX_HALT = 6.0, 0.6  # s between halts of the motion process, and of the longest
+READY_PATIENCE = 60.0  # s in which a process must have started, on a busy machine
+NOT_MEASURED = float("nan")
+CALM_PART, HALTED_PART, ROUGH_PART = (
+    "calm",
+    "halted",
+    "rough",
+)  # what goes wrong: nothing, host and port, the arm and its wire
+LIVE_PARTS = (CALM_PART, HALTED_PART, ROUGH_PART)
 
 
 @dataclass(frozen=True, slots=True)
-class Arrived:
-    """What a virtual arm found. deepest: s that its queue was ever ahead; left: s at its end. garbage: bytes."""
+class ArmReport:
+    """What a virtual arm found."""
 
     frames: int
     ignored: int
     refused: int
-    garbage: int
-    deepest: float
-    left: float
+    garbage: int  # bytes
+    deepest: float  # s that its queue was ever ahead
+    left: float  # s of it at its end
 
 
 @dataclass(slots=True)
-class Seen:
+class LivePart:
     """What came of one part. Times in s."""
 
-    arms: list[Arrived] = field(default_factory=list)
+    arms: list[ArmReport] = field(default_factory=list)
     flight: float = 0.0
     stops: list[float] = field(default_factory=list)  # decided to on the wire
     orders: list[float] = field(default_factory=list)  # ordered to on the wire
     load: list[float] = field(default_factory=list)
     halts: int = 0
     report: MotionReport | None = None
-    rate: float = NOTHING
+    rate: float = NOT_MEASURED
 
 
 def live_figures(seconds: float, seed: int, busy: int, real_time: bool) -> list[Figure]:
     """Three parts of equal length: a calm one, whose jitter counts, one with halts and returns, one with a bad arm."""
-    calm, halted, rough = parts = [live(seconds / 3, seed + k, busy, real_time, part) for k, part in enumerate(PARTS)]
+    calm, halted, rough = parts = [
+        run_part(seconds / 3, seed + k, busy, real_time, part) for k, part in enumerate(LIVE_PARTS)
+    ]
     name = f"real time {seconds / 60:.3g} min"
     arms = [arm for part in parts for arm in part.arms]
     obeying = calm.arms + halted.arms
-    load, report = np.mean([*calm.load, *halted.load, *rough.load] or [NOTHING]), calm.report
+    load, report = np.mean([*calm.load, *halted.load, *rough.load] or [NOT_MEASURED]), calm.report
     granted, late, skipped = (
-        ("", (NOTHING,) * 3, 0) if report is None else (report.priority, report.late, report.skipped)
+        ("", (NOT_MEASURED,) * 3, 0) if report is None else (report.priority, report.late, report.skipped)
     )
     machine = f"{granted}; load {load:.1f} on {os.cpu_count()} cores, {busy} processes burn"
     stops, orders = calm.stops + halted.stops + rough.stops, calm.orders + rough.orders
     note = f"{halted.halts} halts up to 600 ms, {len(halted.arms) - 1} returns of the device"
+    decided, moving = f"{name}: stop on the wire after its decision, 99 %", sum(p.arms[-1].left > 0 for p in parts[:2])
     return [
         Figure(f"{name}: ticks a second", calm.rate, "Hz", at_least(49.5), "thesis 30", machine),
         Figure(f"{name}: tick late, median", 1000 * late[0], "ms"),
         Figure(f"{name}: tick late, 99 %", 1000 * late[1], "ms", at_most(3), "8 in a process, 72 in a thread"),
         Figure(f"{name}: tick late, largest", 1000 * late[2], "ms", note=f"{skipped} ticks were skipped"),
-        Figure(
-            f"{name}: stop on the wire after its decision, 99 %",
-            _most(stops),
-            "ms",
-            at_most(10),
-            note=f"{len(stops)} stops",
-        ),
+        Figure(decided, _most(stops), "ms", at_most(10), note=f"{len(stops)} stops"),
         Figure(f"{name}: stop on the wire after the order, 99 %", _most(orders), "ms", note="from another process"),
         Figure(f"{name}: most under way, by the model", 1000 * max(p.flight for p in parts), "ms", at_most(50)),
         Figure(f"{name}: most queued in the arm", _queued(obeying), "ms", at_most(50), "", note),
@@ -105,39 +106,32 @@ def live_figures(seconds: float, seed: int, busy: int, real_time: bool) -> list[
         Figure(f"{name}: commands that found the queue full", sum(a.ignored for a in arms), "", at_most(0)),
         Figure(f"{name}: bytes in no frame", sum(a.garbage for a in calm.arms), "", at_most(0), "", "calm part"),
         Figure(f"{name}: frames that the arm refused", sum(a.refused for a in obeying), "", at_most(0)),
-        Figure(
-            f"{name}: arms not at rest once the motion has ended",
-            sum(part.arms[-1].left > 0 for part in (calm, halted)),
-            "",
-            at_most(0),
-            "",
-            "of 2",
-        ),
+        Figure(f"{name}: arms not at rest once the motion has ended", moving, "", at_most(0), "", "of 2"),
         Figure(f"{name}: frames taken", sum(a.frames for a in arms)),
     ]
 
 
 def _most(seconds: list[float]) -> float:
-    return 1000 * float(np.percentile(seconds, 99)) if seconds else NOTHING
+    return 1000 * float(np.percentile(seconds, 99)) if seconds else NOT_MEASURED
 
 
-def _queued(arms: list[Arrived]) -> float:
-    return 1000 * max((arm.deepest for arm in arms), default=NOTHING)
+def _queued(arms: list[ArmReport]) -> float:
+    return 1000 * max((arm.deepest for arm in arms), default=NOT_MEASURED)
 
 
-def live(seconds: float, seed: int, busy: int, real_time: bool, part: str) -> Seen:
+def run_part(seconds: float, seed: int, busy: int, real_time: bool, part: str) -> LivePart:
     """Print on a breathing surface for so long."""
     context, clock = multiprocessing.get_context("spawn"), WallClock()
-    poses, reports = Newest[SurfacePose](), Newest[MotionReport]()
+    poses, reports = SharedLatest[SurfacePose](), SharedLatest[MotionReport]()
     orders, theirs = context.Pipe()
     with tempfile.TemporaryDirectory() as folder, _burning(busy):
         link = Path(folder) / "arm"
-        arm = _VirtualArm(link, seed, part == ROUGH)
+        arm = _VirtualArm(link, seed, part == ROUGH_PART)
         plan = MotionPlan(_toolpath(), ArmProfile(), str(link), real_time=real_time)
         motion = context.Process(target=motion_process, args=(plan, poses, reports, theirs))
         motion.start()
         theirs.close()
-        operator = _Operator(orders, motion, np.random.default_rng(seed), part == HALTED)
+        operator = _Operator(orders, motion, np.random.default_rng(seed), part == HALTED_PART)
         try:
             poses.put(_pose(clock.now()))
             _wait(lambda: reports.get() is not None)
@@ -145,10 +139,10 @@ def live(seconds: float, seed: int, busy: int, real_time: bool, part: str) -> Se
             while (now := clock.now()) < begun + seconds:
                 poses.put(_pose(now))
                 operator.look(reports.get(), now)
-                if part == HALTED and now > device + PART:
+                if part == HALTED_PART and now > device + DEVICE_SPAN:
                     operator.seen.arms.append(arm.end())
                     arm, device = _VirtualArm(link, seed, False), clock.now()
-                clock.wait_until(now + 1 / RATE)
+                clock.wait_until(now + 1 / POSE_RATE)
             operator.end(reports.get())
             operator.seen.arms.append(arm.end())
         finally:
@@ -168,13 +162,13 @@ class _VirtualArm:
         self._process.start()
         _wait(link.is_symlink)
 
-    def end(self) -> Arrived:
+    def end(self) -> ArmReport:
         """Have it end; what it found."""
         pid = self._process.pid
         assert pid is not None
         os.kill(pid, signal.SIGTERM)
-        assert self._found.poll(READY)
-        found: Arrived = self._found.recv()
+        assert self._found.poll(READY_PATIENCE)
+        found: ArmReport = self._found.recv()
         self._process.join()
         return found
 
@@ -186,32 +180,32 @@ class _VirtualArm:
 
 def _serve(link: Path, seed: int, bad: bool, found: Connection) -> None:
     ask_for_real_time()  # a real controller shares no core with us
-    settings = ArmSettings(replies=Replies.STREAM, seed=seed)
+    settings = ArmSettings(replies=ReplyMode.STREAM, seed=seed)
     with redirect_stdout(StringIO()):
         arm = run_virtual_arm(settings, faults=_faults(seed) if bad else (), link=link)
     garbage = sum(len(data) for _, data in arm.garbage)
-    found.send(Arrived(arm.frames, len(arm.ignored), len(arm.refused), garbage, arm.deepest, arm.in_flight))
+    found.send(ArmReport(arm.frames, len(arm.ignored), len(arm.refused), garbage, arm.deepest, arm.in_flight))
 
 
 def _faults(seed: int) -> list[Fault]:
     """Stalls, losses and cuts of the wire, each some seconds after the last, for an hour."""
     rng, now, faults = np.random.default_rng(seed), 5.0, list[Fault]()
     while now < 3600:
-        kind = FAULTS[rng.integers(len(FAULTS))]
-        length = 0.0 if kind is Kind.DROP else float(rng.uniform(0.05, HALT))
-        faults.append(Fault(Part.ARM, kind, now, length))
+        kind = WIRE_FAULTS[rng.integers(len(WIRE_FAULTS))]
+        length = 0.0 if kind is FaultKind.DROP else float(rng.uniform(0.05, MAX_HALT))
+        faults.append(Fault(FaultPart.ARM, kind, now, length))
         now += float(rng.uniform(4, 10))
     return faults
 
 
-FAULTS = (Kind.STALL, Kind.STALL, Kind.DROP, Kind.UNPLUG)
+WIRE_FAULTS = (FaultKind.STALL, FaultKind.STALL, FaultKind.DROP, FaultKind.UNPLUG)
 
 
 class _Operator:
     """Arms, stops and arms again, halts the motion process, and keeps what it reports."""
 
     def __init__(self, orders: Connection, motion: BaseProcess, rng: np.random.Generator, halts: bool) -> None:
-        self.seen = Seen()
+        self.seen = LivePart()
         self._orders, self._motion, self._rng, self._halts = orders, motion, rng, halts
         self._stop = self._halt = self._ask = 0.0
         self._ordered: float | None = None
@@ -231,7 +225,7 @@ class _Operator:
         if status.state is ArmState.ARMED:
             self._disturb(now)
         elif now > self._ask:
-            self._orders.send(Order.HOME if "from where" in report.tick.answer else Order.ARM)
+            self._orders.send(Order.HOME if report.tick.answer.code is LinkCode.FAR_FROM_PATH else Order.ARM)
             self._ask = now + 0.5
             self._stop = max(self._stop, now + 1.0)
 
@@ -240,18 +234,18 @@ class _Operator:
             self.seen.load.append(os.getloadavg()[0])
             self._ordered = self._clock.now()
             self._orders.send(Order.STOP)
-            self._stop = now + STOP_EVERY * self._rng.uniform(0.8, 1.2)
+            self._stop = now + ORDER_STOP_PERIOD * self._rng.uniform(0.8, 1.2)
         elif self._halts and now > self._halt and self._motion.pid is not None:
-            self._halt = now + HALT_EVERY * self._rng.uniform(0.5, 1.5)
+            self._halt = now + HALT_PERIOD * self._rng.uniform(0.5, 1.5)
             os.kill(self._motion.pid, signal.SIGSTOP)
-            self._clock.wait_until(now + self._rng.uniform(0.02, HALT))
+            self._clock.wait_until(now + self._rng.uniform(0.02, MAX_HALT))
             os.kill(self._motion.pid, signal.SIGCONT)
             self.seen.halts += 1
 
     def end(self, report: MotionReport | None) -> None:
         """Have the motion end, and keep its last report."""
         self._orders.send(Order.QUIT)
-        self._motion.join(READY)
+        self._motion.join(READY_PATIENCE)
         self.seen.report = report
         if report is not None and self._first is not None:
             spent = report.tick.stamp - self._first.tick.stamp
@@ -282,7 +276,7 @@ def _burn() -> None:
 
 def _wait(ready: Callable[[], bool]) -> None:
     clock = WallClock()
-    until = clock.now() + READY
+    until = clock.now() + READY_PATIENCE
     while not ready():
         assert clock.now() < until, "a process did not start"
         clock.wait_until(clock.now() + 0.02)
@@ -308,5 +302,5 @@ def _pose(now: float) -> SurfacePose:
 def _base(now: float) -> Array:
     phase = np.pi / 2 * now  # 15 a minute
     return np.asarray(
-        BENCH @ se3.exp(np.array([0.03 * np.sin(phase), 0.02 * np.cos(phase), 0, 0, 0, 5 * np.sin(phase)]))
+        ARM_FROM_BENCH @ se3.exp(np.array([0.03 * np.sin(phase), 0.02 * np.cos(phase), 0, 0, 0, 5 * np.sin(phase)]))
     )

@@ -13,6 +13,7 @@ What thesis and public drivers leave open is decided here, for the worse case of
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 
@@ -21,11 +22,11 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.protocol import (
+    FRAME_LENGTH,
+    FRAME_TAILS,
     G1,
     G4,
     G54,
-    LENGTH,
-    TAILS,
     ControllerReset,
     Dialect,
     FrameStream,
@@ -33,26 +34,159 @@ from hardware.arm.protocol import (
     Mode,
     decode,
 )
-from hardware.process.faults import Fault, Part, struck
-from hardware.rates import Rates, Stretches
-from hardware.simulator.arm.serial_line import Answers
+from hardware.process.faults import Fault, FaultPart, WorkRates, WorkStretches, faults_striking
+from hardware.simulator.arm.serial_line import FaultyLine, Telemetry
 from hardware.simulator.arm.settings import ArmSettings
-from hardware.simulator.arm_faults import FaultyLine
-from hardware.simulator.polyline import AXES, Polyline
-from hardware.simulator.servo import Servo
-from planning.command import TURNING
+from planning.command import MIN_TRAVEL
 
-NEXT = 1e-5  # s: a move that comes this late after the last one still follows it without a stop
+AXIS_COUNT = 6
+
+
+class Polyline:
+    """Knots, each an instant, the axes (6,) there and their slope until the next knot; it grows at its end.
+
+    Before the first knot and, where the last slope is zero, after the last one, the axes rest.
+    """
+
+    def __init__(self, instant: float, axes: Array) -> None:
+        self._knots = np.zeros((64, 1 + 2 * AXIS_COUNT))  # instant, axes, slope
+        self._size = 0
+        self.append(instant, axes, np.zeros(AXIS_COUNT))
+
+    def __len__(self) -> int:
+        return self._size
+
+    @property
+    def instants(self) -> Array:
+        """Instants (N,) of the knots, s."""
+        return self._knots[: self._size, 0]
+
+    @property
+    def axes(self) -> Array:
+        """Axes (N, 6) at the knots, mm and rad."""
+        return self._knots[: self._size, 1 : 1 + AXIS_COUNT]
+
+    @property
+    def slopes(self) -> Array:
+        """Slopes (N, 6) after the knots, mm/s and rad/s."""
+        return self._knots[: self._size, 1 + AXIS_COUNT :]
+
+    def append(self, instant: float, axes: Array, slope: Array) -> None:
+        """Go on from `axes` with `slope`; a knot at the instant of the last one takes its place."""
+        if self._size and instant == self._knots[self._size - 1, 0]:
+            self._size -= 1
+        assert not self._size or instant > self._knots[self._size - 1, 0]
+        if self._size == len(self._knots):
+            self._knots = np.concatenate([self._knots, np.zeros_like(self._knots)])
+        knot = self._knots[self._size]
+        knot[0], knot[1 : 1 + AXIS_COUNT], knot[1 + AXIS_COUNT :] = instant, axes, slope
+        self._size += 1
+
+    def stop(self, instant: float) -> None:
+        """Forget what comes after `instant`, and rest there."""
+        axes = self.at(np.array([instant]))[0]
+        self._size = int(np.searchsorted(self.instants, instant, "right"))
+        self.append(instant, axes, np.zeros(AXIS_COUNT))
+
+    def before(self, instants: Array) -> tuple[np.ndarray, Array]:
+        """For instants (N,): the knot at or before each, the first where there is none, and s since then."""
+        index = np.maximum(np.searchsorted(self.instants, instants, "right") - 1, 0)
+        return index, np.maximum(instants - self.instants[index], 0.0)
+
+    def at(self, instants: Array) -> Array:
+        """Axes (N, 6) at instants (N,), s."""
+        index, since = self.before(instants)
+        return np.asarray(self.axes[index] + self.slopes[index] * since[:, None])
+
+
+SERVO_STEP = 0.001  # s, of the acceleration limit
+_STEPS_AT_ONCE = 4096  # steps at once
+
+
+class FirstOrderLag:
+    """tau y' = u - y, where u is the line `dead_time` s ago; y is u at the line's first knot."""
+
+    def __init__(self, line: Polyline, dead_time: float, tau: float) -> None:
+        self._line, self._dead_time, self._tau = line, dead_time, tau
+        self._behind = np.zeros((64, AXIS_COUNT))  # y - u at each knot
+        self._size = 1
+
+    def at(self, instants: Array, now: float) -> tuple[Array, Array]:
+        """Axes and slopes, both (N, 6), at instants (N,) up to `now`, after which the line may still change."""
+        self._settle(now)
+        index, since = self._line.before(instants - self._dead_time)
+        slopes, started = self._line.slopes[index], instants - self._dead_time >= self._line.instants[0]
+        axes = self._line.axes[index] + slopes * since[:, None]
+        if self._tau == 0:
+            return axes, slopes * started[:, None]
+        left = np.exp(-since / self._tau)[:, None]
+        behind = self._behind[index] * left + slopes * self._tau * (left - 1)
+        return axes + behind, (slopes - slopes * left - self._behind[index] / self._tau * left) * started[:, None]
+
+    def _settle(self, now: float) -> None:
+        instants, slopes = self._line.instants, self._line.slopes
+        size = int(np.searchsorted(instants, now, "right"))
+        while len(self._behind) < size:
+            self._behind = np.concatenate([self._behind, np.zeros_like(self._behind)])
+        if self._tau == 0 or size <= self._size:
+            return
+        left = np.exp(-np.diff(instants[self._size - 1 : size]) / self._tau).tolist()
+        for knot, share in zip(range(self._size, size), left, strict=True):
+            steady = slopes[knot - 1] * self._tau
+            self._behind[knot] = (self._behind[knot - 1] + steady) * share - steady
+        self._size = size
+
+
+class Servo:
+    """Where the axes really are. most: (2,) greatest accelerations of X Y Z, mm/s^2, and A B C, rad/s^2, or None."""
+
+    def __init__(self, line: Polyline, dead_time: float, tau: float, most: Array | None) -> None:
+        self._lag = FirstOrderLag(line, dead_time, tau)
+        self._most = most
+        self._limited = Polyline(float(line.instants[0]), line.axes[0])
+        self._steps = 0
+        self._at, self._speed = line.axes[0].tolist(), [0.0] * AXIS_COUNT
+
+    def at(self, instants: Array, now: float) -> Array:
+        """Axes (N, 6) at instants (N,) up to `now`."""
+        if self._most is None:
+            return self._lag.at(instants, now)[0]
+        while self._steps * SERVO_STEP < now:
+            grid = np.arange(self._steps, self._steps + _STEPS_AT_ONCE, dtype=np.float64) * SERVO_STEP
+            grid = grid[grid < now]
+            self._follow(grid, *self._lag.at(grid, now), self._most.tolist())
+            self._steps += len(grid)
+        return self._limited.at(instants)
+
+    def _follow(self, grid: Array, axes: Array, slopes: Array, most: list[float]) -> None:
+        """Take the steps that begin at instants (N,), where the lag asks for these axes and slopes (N, 6)."""
+        for instant, goal, slope in zip(grid.tolist(), axes.tolist(), slopes.tolist(), strict=True):
+            before, at = self._speed, self._at
+            linear = _next_speed(at[:3], before[:3], goal[:3], slope[:3], most[0])
+            self._speed = linear + _next_speed(at[3:], before[3:], goal[3:], slope[3:], most[1])
+            if self._speed != before:
+                self._limited.append(instant, np.array(at), np.array(self._speed))
+            self._at = [p + v * SERVO_STEP for p, v in zip(at, self._speed, strict=True)]
+
+
+def _next_speed(at: list[float], speed: list[float], goal: list[float], slope: list[float], most: float) -> list[float]:
+    """The speed of the next step: that of the goal, and as much more as can be braked in time; change is limited."""
+    gap = [g - p for g, p in zip(goal, at, strict=True)]
+    distance, step = math.hypot(*gap), most * SERVO_STEP
+    # braked by `step` a step, it ends at zero
+    closing = step * (math.sqrt(0.25 + 2 * distance / (step * SERVO_STEP)) - 0.5)
+    share = min(1 / SERVO_STEP, closing / distance) if distance else 0.0
+    change = [s + share * g - v for s, g, v in zip(slope, gap, speed, strict=True)]
+    size = math.hypot(*change)
+    scale = min(1.0, step / size) if size else 0.0
+    return [v + scale * c for v, c in zip(speed, change, strict=True)]
+
+
+CONTINUATION_GAP = 1e-5  # s: a move that comes this late after the last one still follows it without a stop
 
 
 class VirtualArm:
-    """One arm from 0 s on; it knows the time from its caller alone, which never goes back.
-
-    frames: instructions understood. ignored: instants, s, of commands that found the FIFO full. refused: of targets and
-    origins out of reach. garbage: instants and bytes that belong to no frame of this dialect. underruns: instants at
-    which the queue ran dry within a motion, so that the arm stopped before the next move came. mode: the last one set.
-    deepest: s of work that the queue ever held, however long a stall let it wait; fullest: commands.
-    """
+    """One arm from 0 s on; it knows the time from its caller alone, which never goes back."""
 
     def __init__(
         self,
@@ -62,28 +196,25 @@ class VirtualArm:
         faults: Sequence[Fault] = (),
         baud: float = 115_200,
     ) -> None:
-        """home_axes: (6,) mm and rad, where it stands at first. baud: bits/s of what it sends, inf for no delay.
-
-        faults: those of the arm count.
-        """
-        if home_axes.shape != (AXES,) or not np.isfinite(home_axes).all():
+        """home_axes: (6,) mm and rad, at first. faults: those of the arm count. baud: bits/s of replies, or inf."""
+        if home_axes.shape != (AXIS_COUNT,) or not np.isfinite(home_axes).all():
             raise InputError("arm", "home", home_axes.tolist(), "6 finite numbers X Y Z A B C, mm and rad")
-        self.frames, self.mode, self.now = 0, 0, 0.0
-        self.deepest, self.fullest = 0.0, 0
-        self.ignored: list[float] = []
-        self.refused: list[float] = []
-        self.underruns: list[float] = []
-        self.garbage: list[tuple[float, bytes]] = []
+        self.frames, self.mode, self.now = 0, 0, 0.0  # instructions understood; the last mode set; s
+        self.deepest, self.fullest = 0.0, 0  # s of work and commands that the queue ever held, stalls left out
+        self.ignored: list[float] = []  # s, commands that found the FIFO full
+        self.refused: list[float] = []  # s, targets and origins out of reach
+        self.underruns: list[float] = []  # s, the queue ran dry within a motion: the arm stopped before the next move
+        self.garbage: list[tuple[float, bytes]] = []  # s, and bytes that belong to no frame of this dialect
         self._settings = settings
-        self._stream = FrameStream(LENGTH, TAILS, lambda frame: decode(frame, dialect))
+        self._stream = FrameStream(FRAME_LENGTH, FRAME_TAILS, lambda frame: decode(frame, dialect))
         self._line_in = FaultyLine(faults, np.random.default_rng([settings.seed, 1]))
-        self._rates = Rates(struck(faults, Part.ARM))
-        self._answers = Answers(settings, baud, faults)
+        self._rates = WorkRates(faults_striking(faults, FaultPart.ARM))
+        self._answers = Telemetry(settings, baud, faults)
         self._setpoint = Polyline(0.0, home_axes)
-        self._servo = Servo(self._setpoint, settings.dead_time, settings.servo_lag, _most(settings))
+        self._servo = Servo(self._setpoint, settings.dead_time, settings.servo_lag, _acceleration_limits(settings))
         self._target = home_axes.copy()  # machine coordinates, of the last command queued
         self._origin = np.zeros(3)
-        self._fifo: deque[Stretches] = deque()  # of the commands in it
+        self._fifo: deque[WorkStretches] = deque()  # of the commands in it
         self._free = 0.0  # when the last one ends
         self._flowing = False  # it is a move, and the next one may follow without a stop
 
@@ -167,7 +298,7 @@ class VirtualArm:
     def _queue(self, work: float, target: Array | None) -> None:
         """Put a command behind the others: `work` s of motion to `target` (6,), or of pause."""
         begin, moving = max(self.now, self._free), target is not None and work > 0
-        if moving and self._flowing and self.now > self._free + NEXT:
+        if moving and self._flowing and self.now > self._free + CONTINUATION_GAP:
             self.underruns.append(self._free)
         self._flowing = moving
         stretches = self._rates.stretches(begin, work, moving)
@@ -176,10 +307,10 @@ class VirtualArm:
         self.deepest, self.fullest = max(self.deepest, self.held), max(self.fullest, self.queued)
         if target is not None and self._free > begin and moving:
             self._interpolate(stretches, (target - self._target) / work)
-            self._setpoint.append(self._free, target, np.zeros(AXES))
+            self._setpoint.append(self._free, target, np.zeros(AXIS_COUNT))
             self._target = target
 
-    def _interpolate(self, stretches: Stretches, speed: Array) -> None:
+    def _interpolate(self, stretches: WorkStretches, speed: Array) -> None:
         axes = self._target
         for begin, end, rate in stretches:
             self._setpoint.append(begin, axes, rate * speed)
@@ -192,7 +323,6 @@ class VirtualArm:
             self._origin = origin
 
     def _stop(self) -> None:
-        """Rest where the set-point is, with nothing queued."""
         self._setpoint.stop(self.now)
         self._target = self._setpoint.axes[-1].copy()
         self._fifo.clear()
@@ -202,14 +332,14 @@ class VirtualArm:
 def _duration(way: Array, feed: float, settings: ArmSettings) -> float:
     """Seconds that a move along `way` (6,), mm and rad, takes at `feed` mm/s, or degrees/s if it only turns."""
     length, turns = float(np.linalg.norm(way[:3])), np.abs(way[3:])
-    if length > TURNING or not turns.any():
+    if length > MIN_TRAVEL or not turns.any():
         asked = length / min(feed, settings.top_speed)
     else:
         asked = max(float(np.linalg.norm(turns)) / float(np.deg2rad(feed)), length / settings.top_speed)
     return max(asked, float(turns.max()) / settings.top_turn)
 
 
-def _most(settings: ArmSettings) -> Array | None:
+def _acceleration_limits(settings: ArmSettings) -> Array | None:
     if settings.acceleration is None:
         return None
     return settings.acceleration * np.array([1.0, settings.top_turn / settings.top_speed])

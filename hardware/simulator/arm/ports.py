@@ -1,40 +1,50 @@
-"""The virtual arm behind a port in virtual time, and what can go wrong with the port between host and arm.
+"""Two ways to a virtual arm: a port in virtual time with faults of its own, and a pseudo-terminal in real time.
 
-Bytes take their time on a wire each way. The port's own faults are those of an adapter: it takes a part of a write or
-nothing for a while, it is gone for a while, and stray bytes get in between. What goes wrong in the arm itself is in
-arm_faults.py.
+The port's own faults are those of an adapter: it takes a part of a write or nothing for a while, it is gone for a
+while, and stray bytes get in between. Faults of the arm itself are in serial_line.py.
 """
 
 from __future__ import annotations
 
+import os
+import pty
+import select
+import signal
+import threading
+import tty
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, TextIO
 
 import numpy as np
+import serial
 
 from estimation.errors import InputError
 from hardware.arm.port import UnpluggedError
-from hardware.arm.profile import BITS_PER_BYTE
-from hardware.process.clock import Clock
+from hardware.arm.profile import BITS_PER_BYTE, ArmProfile
+from hardware.process.checks import error_text
+from hardware.process.clock import Clock, WallClock
+from hardware.process.faults import Fault
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.wire import Wire
+from hardware.simulator.arm.serial_line import SerialWire
+from hardware.simulator.arm.settings import ArmSettings
 
-Window = tuple[float, float]  # from, until, s
+Interval = tuple[float, float]  # from, until, s
 
 
 @dataclass(frozen=True, slots=True)
 class PortFaults:
-    """blocked: when the port takes nothing. away: when the device is not there. partial: share of writes of which only
-    a part is taken. noise: stray bytes a second towards the host. noise_out: share of writes that get a stray byte.
-    """
+    """What goes wrong at the port."""
 
-    blocked: Sequence[Window] = ()
-    away: Sequence[Window] = ()
-    partial: float = 0.0
-    noise: float = 0.0
-    noise_out: float = 0.0
+    blocked: Sequence[Interval] = ()  # when the port takes nothing
+    away: Sequence[Interval] = ()  # when the device is not there
+    partial: float = 0.0  # share of writes of which only a part is taken
+    noise: float = 0.0  # stray bytes a second towards the host
+    noise_out: float = 0.0  # share of writes that get a stray byte
 
     def __post_init__(self) -> None:
         if not (0 <= self.partial < 1 and self.noise >= 0 and 0 <= self.noise_out <= 1):
@@ -42,24 +52,20 @@ class PortFaults:
             raise InputError("port", "faults", (self.partial, self.noise, self.noise_out), allowed)
 
 
-class Tap(Protocol):
+class LineListener(Protocol):
     """Who listens on the line."""
 
     def opened(self) -> None:
         """The host has opened the device."""
-        ...
 
     def from_host(self, data: bytes) -> None:
         """The port has taken bytes."""
-        ...
 
     def to_arm(self, data: bytes) -> None:
         """Bytes have reached the arm."""
-        ...
 
     def to_host(self, sent: bytes, read: bytes) -> None:
         """What the arm has sent, and what the host reads with the noise."""
-        ...
 
 
 class VirtualPort:
@@ -67,11 +73,11 @@ class VirtualPort:
 
     def __init__(self, device: VirtualDevice) -> None:
         self._device = device
-        self._wire = Wire(device.baud)
+        self._wire = SerialWire(device.baud)
         self._under_way: deque[tuple[float, bytes]] = deque()
         self._looked = device.here()
-        if device.tap is not None:
-            device.tap.opened()
+        if device.listener is not None:
+            device.listener.opened()
 
     def write(self, data: bytes) -> int:
         """Take bytes, or some of them, or none."""
@@ -82,8 +88,8 @@ class VirtualPort:
         if faults.partial and rng.random() < faults.partial:
             data = data[: rng.integers(len(data))]
         taken = len(data)
-        if device.tap is not None:
-            device.tap.from_host(data)
+        if device.listener is not None:
+            device.listener.from_host(data)
         if faults.noise_out and rng.random() < faults.noise_out:
             place = rng.integers(taken + 1)
             data = data[:place] + rng.bytes(1) + data[place:]
@@ -99,8 +105,8 @@ class VirtualPort:
         noise = device.rng.poisson(device.faults.noise * (now - self._looked)) if device.faults.noise else 0
         self._looked = now
         read = data + device.rng.bytes(noise) if noise else data
-        if device.tap is not None and read:
-            device.tap.to_host(data, read)
+        if device.listener is not None and read:
+            device.listener.to_host(data, read)
         return read
 
     def waiting(self) -> int:
@@ -129,13 +135,13 @@ class VirtualDevice:
         baud: float = 115_200,
         faults: PortFaults | None = None,
         seed: int = 0,
-        tap: Tap | None = None,
+        listener: LineListener | None = None,
     ) -> None:
-        """tap: is told all that passes."""
+        """listener: is told all that passes."""
         self.arm, self.clock, self.baud = arm, clock, baud
         self.faults = PortFaults() if faults is None else faults
         self.rng = np.random.default_rng(seed)
-        self.tap = tap
+        self.listener = listener
 
     def __call__(self) -> VirtualPort:
         """Open it; UnpluggedError while it is away."""
@@ -151,5 +157,198 @@ class VirtualDevice:
     def receive(self, data: bytes, arrival: float) -> None:
         """Bytes reach the arm at `arrival`, s."""
         self.arm.receive(data, max(arrival, self.arm.now))
-        if self.tap is not None:
-            self.tap.to_arm(data)
+        if self.listener is not None:
+            self.listener.to_arm(data)
+
+
+_CHUNK_BYTES = 1024  # bytes; a pty buffers about 4000
+_READ_TIMEOUT = 5.0  # s; bytes that are not back by then never come
+
+
+def open_pty() -> tuple[int, int, str]:
+    """A pty that changes no byte: descriptors of the arm's side and of the host's, and the host's device name.
+
+    As long as the host's descriptor stays open here, clients may come and go.
+    """
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    return ours, theirs, os.ttyname(theirs)
+
+
+class PtyLink:
+    """A pty with a serial client at one end, all in one process. name: of its device."""
+
+    def __init__(self, baud: int = 115_200) -> None:
+        self._ours, self._theirs, self.name = open_pty()
+        self._client = serial.Serial(self.name, baudrate=baud)
+
+    def transfer(self, data: bytes) -> bytes:
+        """Write `data` to the device as a client does, and give back what comes out at the arm's side."""
+        arrived = bytearray()
+        for start in range(0, len(data), _CHUNK_BYTES):
+            self._client.write(data[start : start + _CHUNK_BYTES])
+            due = min(start + _CHUNK_BYTES, len(data))
+            while len(arrived) < due:
+                if not select.select([self._ours], [], [], _READ_TIMEOUT)[0]:
+                    raise TimeoutError(f"{self.name} gave {len(arrived)} of {len(data)} bytes back")
+                arrived += os.read(self._ours, due - len(arrived))
+        return bytes(arrived)
+
+    def close(self) -> None:
+        """Close both ends; the device goes."""
+        self._client.close()
+        for descriptor in (self._theirs, self._ours):
+            os.close(descriptor)
+
+    def __enter__(self) -> PtyLink:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+LOG_HEADER = "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg"
+POLL_PERIOD = 0.002  # s between looks at the line; a frame takes 4 ms
+LOG_STEP = 0.001  # s
+_ROWS_AT_ONCE = 10_000  # of the log at once
+
+
+def _print_line(words: str) -> None:
+    print(words, flush=True)
+
+
+def run_virtual_arm(
+    settings: ArmSettings,
+    profile: ArmProfile | None = None,
+    faults: Sequence[Fault] = (),
+    link: Path | None = None,
+    log: Path | None = None,
+    clock: Clock | None = None,
+    stop: threading.Event | None = None,
+    say: Callable[[str], None] = _print_line,
+) -> VirtualArm:
+    """Serve a virtual arm on a new pty until `stop` is set, Ctrl-C or SIGTERM; say its device name, then a summary.
+
+    profile: dialect, home and baud rate; bytes are taken no faster than that, whatever rate a client asks the pty for.
+    link: a symbolic link to the device, which is removed at the end. log: a new CSV of the executed axes, each ms.
+    InputError where `link` or `log` would overwrite something. Returns the arm as it was at the end.
+    """
+    profile = ArmProfile() if profile is None else profile
+    clock, stop = clock or WallClock(), stop or threading.Event()
+    arm = VirtualArm(settings, profile.dialect, profile.arm.home, faults, profile.baud)
+    with _motion_log(log, arm):
+        ours, theirs, device = open_pty()
+        try:
+            os.set_blocking(ours, False)
+            with _device_link(link, device), _stop_on_signals(stop):
+                say(device)
+                _serve(ours, arm, profile.baud / BITS_PER_BYTE, clock, stop)
+        finally:
+            os.close(theirs)
+            os.close(ours)
+    say(run_summary(arm))
+    return arm
+
+
+@contextmanager
+def _motion_log(log: Path | None, arm: VirtualArm) -> Iterator[None]:
+    if log is None:
+        yield
+        return
+    try:
+        file = log.open("x", encoding="utf-8")
+    except OSError as error:
+        raise InputError(log, "log", error_text(error), "a new file in a folder that can be written to") from error
+    with file:
+        try:
+            yield
+        finally:
+            _write_motion(file, arm)
+
+
+def _write_motion(file: TextIO, arm: VirtualArm) -> None:
+    units = np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
+    size = int(arm.now / LOG_STEP + 1e-6) + 1  # a whole number of steps may come out just below it
+    file.write(LOG_HEADER + "\n")
+    for start in range(0, size, _ROWS_AT_ONCE):
+        stamps = np.minimum(np.arange(start, min(start + _ROWS_AT_ONCE, size)) * LOG_STEP, arm.now)
+        rows = np.column_stack([stamps, arm.axes_at(stamps) * units])
+        np.savetxt(file, rows, ["%.3f"] + ["%.6f"] * 6, delimiter=",")
+
+
+def run_summary(arm: VirtualArm) -> str:
+    """What came over the line and what became of it, in a few lines."""
+    stray = sum(len(data) for _, data in arm.garbage)
+    lines = [
+        f"{arm.frames} frames in {arm.now:.1f} s",
+        f"{len(arm.ignored)} ignored, the queue was full",
+        f"{len(arm.refused)} refused, out of reach",
+        f"{len(arm.struck)} lost or garbled by a fault",
+        f"{len(arm.underruns)} underruns" + (f", the first at {arm.underruns[0]:.3f} s" if arm.underruns else ""),
+        f"{stray} bytes in no frame" + (f", the first {_hex_dump(*arm.garbage[0])}" if stray else ""),
+    ]
+    return "\n".join(lines)
+
+
+def _hex_dump(now: float, data: bytes) -> str:
+    return f"at {now:.3f} s: {data[:12].hex(' ')}" + (" ..." if len(data) > 12 else "")
+
+
+def _serve(port: int, arm: VirtualArm, rate: float, clock: Clock, stop: threading.Event) -> None:
+    """Carry bytes both ways, in at most `rate` a second; what no client reads is lost, as on a line."""
+    start, allowed = clock.now(), 0.0
+    while not stop.is_set():
+        clock.wait_until(start + arm.now + POLL_PERIOD)
+        now = clock.now() - start
+        allowed = min(allowed, 1.0) + rate * (now - arm.now)
+        data = b""
+        with suppress(BlockingIOError):
+            data = os.read(port, int(allowed))
+        allowed -= len(data)
+        for part, instant in _arrivals(data, arm.now, now):
+            arm.receive(part, instant)
+        with suppress(BlockingIOError):
+            os.write(port, arm.transmit(now))
+
+
+def _arrivals(data: bytes, before: float, now: float) -> Iterator[tuple[bytes, float]]:
+    """Bytes with the instants, s, at which they came: evenly since the last look, where the machine held this one up.
+
+    A controller has a core of its own; one that took them all at once now would be late with all that follows.
+    """
+    looks, size = max(round((now - before) / POLL_PERIOD), 1), len(data)
+    for look in range(looks):
+        instant = before + (now - before) * (look + 1) / looks
+        yield data[size * look // looks : size * (look + 1) // looks], instant
+
+
+@contextmanager
+def _device_link(link: Path | None, device: str) -> Iterator[None]:
+    """Have `link` point at the device meanwhile; a link left behind by a run that is gone makes way."""
+    if link is None:
+        yield
+        return
+    if link.is_symlink() and (not link.exists() or os.readlink(link) == device):
+        link.unlink()
+    if link.is_symlink() or link.exists():
+        raise InputError(link, "link", "exists", "a new name, or a link left behind that leads nowhere")
+    link.symlink_to(device)
+    try:
+        yield
+    finally:
+        if link.is_symlink() and os.readlink(link) == device:
+            link.unlink()
+
+
+@contextmanager
+def _stop_on_signals(stop: threading.Event) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)

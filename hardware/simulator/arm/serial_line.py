@@ -1,21 +1,98 @@
-"""What the virtual arm sends by itself: nothing, position replies, or stray single bytes."""
+"""The virtual arm's serial line in virtual time: bytes on the wire, frames lost on the way in, and telemetry.
+
+What each fault means stands in hardware/process/faults.py. Without a duration a drop or garble takes one frame, the
+first one from its start on; with one, every frame that begins meanwhile.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.process.faults import Fault
-from hardware.replies import Reply, ReplyKind, encode_reply
-from hardware.simulator.arm.settings import ArmSettings, Replies
-from hardware.simulator.arm_faults import unplugged
-from hardware.simulator.wire import Wire
+from hardware.arm.profile import BITS_PER_BYTE
+from hardware.arm.protocol import FRAME_LENGTH, Reply, ReplyKind, encode_reply
+from hardware.process.faults import Fault, FaultKind, FaultPart, faults_striking
+from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 
 
-class Answers:
+class SerialWire:
+    """One direction of a line; remembers until when it is busy. baud: bits/s, infinite for a line without delay."""
+
+    def __init__(self, baud: float) -> None:
+        if not baud > 0:
+            raise InputError("wire", "baud", baud, "> 0 bits/s")
+        self._byte_time = BITS_PER_BYTE / baud
+        self._free = -math.inf
+
+    def send(self, data: bytes, now: float) -> Array:
+        """Instants (N,), s, at which the bytes handed over at `now` have arrived; they wait for those before them."""
+        arrivals = max(self._free, now) + self._byte_time * np.arange(1, len(data) + 1)
+        if len(arrivals):
+            self._free = float(arrivals[-1])
+        return np.asarray(arrivals)
+
+    @property
+    def free(self) -> float:
+        """Instant, s, at which the last byte sent so far has arrived; -inf before the first."""
+        return self._free
+
+
+_FRAME_BITS = 8 * FRAME_LENGTH
+_FRAME_FAULTS = (FaultKind.DROP, FaultKind.GARBLE)
+
+
+def unplugged(faults: Sequence[Fault], instant: float) -> bool:
+    """Whether the line is cut at `instant`, s."""
+    return any(fault.covers(instant) for fault in faults_striking(faults, FaultPart.ARM, FaultKind.UNPLUG))
+
+
+class FaultyLine:
+    """The line into the arm. Frames are told apart by counting 48 bytes each from the first byte on.
+
+    struck: instants, s, at which a frame began that was lost or garbled.
+    """
+
+    def __init__(self, faults: Sequence[Fault], rng: np.random.Generator) -> None:
+        self._faults, self._rng = list(faults), rng
+        self._place = 0
+        self._mask: bytes | None = bytes(FRAME_LENGTH)  # bits of this frame that flip; None where it is lost
+        self.struck: list[float] = []
+
+    def __call__(self, data: bytes, now: float) -> bytes:
+        """What arrives of `data`, which comes at `now`, s."""
+        arrived = bytearray()
+        while data:
+            if self._place == 0:
+                self._begin(now)
+            part, data = data[: FRAME_LENGTH - self._place], data[FRAME_LENGTH - self._place :]
+            if self._mask is not None:
+                arrived += bytes(a ^ b for a, b in zip(part, self._mask[self._place :], strict=False))
+            self._place = (self._place + len(part)) % FRAME_LENGTH
+        return b"" if unplugged(self._faults, now) else bytes(arrived)
+
+    def _begin(self, now: float) -> None:
+        self._mask = bytes(FRAME_LENGTH)
+        for fault in faults_striking(self._faults, FaultPart.ARM, *_FRAME_FAULTS):
+            once = fault.duration == 0
+            if not (now >= fault.start if once else fault.covers(now)):
+                continue
+            if once:
+                self._faults.remove(fault)
+            self._mask = None if fault.kind is FaultKind.DROP or self._mask is None else self._flips()
+            self.struck.append(now)
+
+    def _flips(self) -> bytes:
+        bits = np.zeros(_FRAME_BITS, np.uint8)
+        bits[self._rng.choice(_FRAME_BITS, self._rng.integers(1, 9), replace=False)] = 1
+        return np.packbits(bits).tobytes()
+
+
+class Telemetry:
     """Bytes on their way to the host.
 
     A stream begins one period after the start and gives place, tool and arm angles each period, as long as the line is
@@ -25,7 +102,7 @@ class Answers:
 
     def __init__(self, settings: ArmSettings, baud: float, faults: Sequence[Fault]) -> None:
         self._mode, self._period = settings.replies, settings.reply_period
-        self._faults, self._wire = faults, Wire(baud)
+        self._faults, self._wire = faults, SerialWire(baud)
         self._rng = np.random.default_rng([settings.seed, 0])
         self._under_way: deque[tuple[float, int]] = deque()  # when each byte arrives
         self._count, self._next, self._stray = 0, 0.0, 0
@@ -35,12 +112,12 @@ class Answers:
         """Send what is due up to `now`, s. axes_at: the executed axes (N, 6) at instants (N,). origin: (3,) mm."""
         due: list[float] = []
         words: list[bytes] = []
-        while self._mode is not Replies.OFF and self._next <= now:
+        while self._mode is not ReplyMode.OFF and self._next <= now:
             due.append(self._next)
             words.append(bytes([self._stray]))
             self._schedule()
-        if due and self._mode is Replies.STREAM:
-            words = [_replies(axes, origin) for axes in axes_at(np.array(due))]
+        if due and self._mode is ReplyMode.STREAM:
+            words = [_encoded_replies(axes, origin) for axes in axes_at(np.array(due))]
         for instant, data in zip(due, words, strict=True):
             if self._wire.free <= instant and not unplugged(self._faults, instant):
                 self._under_way.extend(zip(self._wire.send(data, instant).tolist(), data, strict=True))
@@ -54,13 +131,13 @@ class Answers:
 
     def _schedule(self) -> None:
         self._count += 1
-        if self._mode is Replies.STREAM:
+        if self._mode is ReplyMode.STREAM:
             self._next = self._count * self._period
-        elif self._mode is Replies.STRAY:
+        elif self._mode is ReplyMode.STRAY:
             self._next += self._rng.exponential(self._period)
             self._stray = int(self._rng.integers(256))
 
 
-def _replies(axes: Array, origin: Array) -> bytes:
+def _encoded_replies(axes: Array, origin: Array) -> bytes:
     numbers = (ReplyKind.PLACE, axes[:3] - origin), (ReplyKind.TOOL, axes[3:]), (ReplyKind.ARM, np.zeros(3))
     return b"".join(encode_reply(Reply(kind, values)) for kind, values in numbers)

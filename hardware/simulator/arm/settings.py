@@ -15,8 +15,10 @@ seed = 0
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,25 +26,17 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.process import checks
+from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults, faults_from_texts
 
-KEYS = (
-    "fifo",
-    "dead_time_s",
-    "servo_lag_s",
-    "acceleration_mm_s2",
-    "top_speed_mm_s",
-    "top_turn_deg_s",
-    "low_mm_deg",
-    "high_mm_deg",
-    "replies",
-    "reply_period_s",
-    "seed",
+ARM_KEYS = (
+    *("fifo", "dead_time_s", "servo_lag_s", "acceleration_mm_s2", "top_speed_mm_s", "top_turn_deg_s"),
+    *("low_mm_deg", "high_mm_deg", "replies", "reply_period_s", "seed"),
 )
-_TO_RAD = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])
-_FARTHEST = np.array([1600.0] * 3 + [np.deg2rad(320.0)] * 3)  # a reply's int16 must hold a place less an origin
+_UNITS = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])
+_REACH_LIMIT = np.array([1600.0] * 3 + [np.deg2rad(320.0)] * 3)  # a reply's int16 must hold a place less an origin
 
 
-class Replies(Enum):
+class ReplyMode(Enum):
     """What the arm sends."""
 
     OFF = "off"
@@ -58,23 +52,20 @@ def _six(x_y: float, z: float, angle_deg: float) -> Array:
 class ArmSettings:
     """One virtual arm. InputError names a setting that makes no sense.
 
-    fifo: commands it keeps. dead_time: s from set-point to servo. servo_lag: s, time constant. acceleration: mm/s^2
-    along X Y Z, None for no limit; A B C get the limit that takes them to their top speed in the same time.
-    top_speed: mm/s along X Y Z. top_turn: rad/s of each of A B C. low, high: (6,) mm and rad, where it can be sent.
-    reply_period: s between replies, or on average between stray bytes. seed: of the stray bytes and of faults.
+    A B C get the acceleration that takes them to their top speed in the same time as X Y Z.
     """
 
-    fifo: int = 200  # thesis 6.2: 9600 bytes
-    dead_time: float = 0.0  # nobody has measured it
-    servo_lag: float = 0.02  # nobody has measured it; usual for small position servos
-    acceleration: float | None = None  # the maker names none
-    top_speed: float = 250.0  # 15,000 mm/min in public drivers
-    top_turn: float = float(np.pi)  # unknown; above the 120 degrees/s that the planner asks at most
+    fifo: int = 200  # commands; thesis 6.2: 9600 bytes
+    dead_time: float = 0.0  # s from set-point to servo; nobody has measured it
+    servo_lag: float = 0.02  # s, time constant; nobody has measured it; usual for small position servos
+    acceleration: float | None = None  # mm/s^2 along X Y Z, None for no limit; the maker names none
+    top_speed: float = 250.0  # mm/s along X Y Z; 15,000 mm/min in public drivers
+    top_turn: float = float(np.pi)  # rad/s of each of A B C; unknown; above the planner's 120 degrees/s
     low: Array = field(default_factory=lambda: -_six(1000, 500, 180))  # X Y Z as in a public driver
     high: Array = field(default_factory=lambda: _six(1000, 500, 180))
-    replies: Replies = Replies.OFF  # the thesis could read none
-    reply_period: float = 0.05  # 27 bytes take 28 ms at 9600 bits/s, the slowest line of a public driver
-    seed: int = 0
+    replies: ReplyMode = ReplyMode.OFF  # the thesis could read none
+    reply_period: float = 0.05  # s, mean for stray bytes; 27 bytes take 28 ms at 9600 bits/s, a public driver's slowest
+    seed: int = 0  # of the stray bytes and of faults
 
     def __post_init__(self) -> None:
         for name, low in (("fifo", 1), ("seed", 0)):
@@ -83,7 +74,7 @@ class ArmSettings:
             self._check_positive(name, zero=name in ("dead_time", "servo_lag"))
         for name in ("low", "high"):
             value = getattr(self, name)
-            if np.shape(value) != (6,) or not (np.abs(value) <= _FARTHEST).all():
+            if np.shape(value) != (6,) or not (np.abs(value) <= _REACH_LIMIT).all():
                 raise InputError("arm", name, np.asarray(value).tolist(), "6 numbers within 1600 mm and 320 degrees")
         if (self.low >= self.high).any():
             raise InputError("arm", "low", self.low.tolist(), f"below high, {self.high.tolist()}")
@@ -98,7 +89,7 @@ class ArmSettings:
 
 def arm_settings_from_table(where: object, table: checks.Table) -> ArmSettings:
     """The settings in a table [arm]; what it leaves out keeps its default. InputError names the key."""
-    checks.check_keys(where, "arm.", table, (), KEYS)
+    checks.check_keys(where, "arm.", table, (), ARM_KEYS)
     try:
         return ArmSettings(**{_field(key): _value(where, key, value) for key, value in table.items()})
     except InputError as error:
@@ -110,14 +101,14 @@ def arm_settings_from_table(where: object, table: checks.Table) -> ArmSettings:
 def table_from_arm_settings(settings: ArmSettings) -> dict[str, Any]:
     """The table [arm] that gives these settings; angles in degrees, as arrays where there are six numbers."""
     table: dict[str, Any] = {}
-    for key in KEYS:
+    for key in ARM_KEYS:
         value = getattr(settings, _field(key))
         if key.endswith("_mm_deg"):
-            value = value / _TO_RAD
+            value = value / _UNITS
         elif key.endswith("_deg_s"):
             value = float(np.rad2deg(value))
         if value is not None:
-            table[key] = value.value if isinstance(value, Replies) else value
+            table[key] = value.value if isinstance(value, ReplyMode) else value
     return table
 
 
@@ -129,7 +120,7 @@ def _field(key: str) -> str:
 
 
 def _key(name: str) -> str:
-    return next(key for key in KEYS if _field(key) == name)
+    return next(key for key in ARM_KEYS if _field(key) == name)
 
 
 def _value(where: object, key: str, value: object) -> Any:
@@ -137,11 +128,30 @@ def _value(where: object, key: str, value: object) -> Any:
     if key in ("fifo", "seed"):
         return checks.integer(where, name, value, 0)
     if key == "replies":
-        words = [mode.value for mode in Replies]
+        words = [mode.value for mode in ReplyMode]
         if value not in words:
-            raise InputError(where, name, value, checks.meant(str(value), words))
-        return Replies(value)
+            raise InputError(where, name, value, checks.one_of_text(str(value), words))
+        return ReplyMode(value)
     if key.endswith("_mm_deg"):
-        return checks.numbers(where, name, value, (6,)) * _TO_RAD
+        return checks.numbers(where, name, value, (6,)) * _UNITS
     number = checks.number(where, name, value)
     return float(np.deg2rad(number)) if key.endswith("_deg_s") else number
+
+
+def write_virtual_arm(file: Path, settings: ArmSettings, faults: tuple[Fault, ...]) -> None:
+    """Write what `read_virtual_arm` reads back as the same."""
+    lines = [f"faults = {json.dumps([str(fault) for fault in faults])}", "[arm]"]
+    for key, value in table_from_arm_settings(settings).items():
+        lines.append(f"{key} = {checks.toml_numbers(value) if isinstance(value, np.ndarray) else json.dumps(value)}")
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def read_virtual_arm(file: Path) -> tuple[ArmSettings, tuple[Fault, ...]]:
+    """Settings and faults of a virtual arm; InputError names the key that is wrong."""
+    table = checks.read_toml(file)
+    checks.check_keys(file, "", table, ("faults", "arm"))
+    if not isinstance(table["arm"], dict):
+        raise InputError(file, "arm", table["arm"], "a table [arm]")
+    faults = faults_from_texts(file, "faults", table["faults"], FaultPart.ARM)
+    check_faults(faults, FaultRunner.ARM, file, "faults")
+    return arm_settings_from_table(file, table["arm"]), faults

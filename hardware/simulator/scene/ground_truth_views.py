@@ -1,23 +1,103 @@
-"""Pictures of a calibration board before a camera with a lens, blur and noise; every corner's place is exact."""
+"""Single rendered pictures with exact ground truth: wounds with their masks, and calibration boards with their corners.
+
+The wounds serve to train and to judge the segmentation, and as pictures that may be published.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.rig import Camera, pixels_from_points
 from estimation.se3 import Array
-from hardware.simulator.field import Field
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
+from hardware.simulator.scene.appearance import Appearance, Sensor
+from hardware.simulator.scene.fields import Field
 from hardware.simulator.scene.rays import rays_at
-from perception.boards.board import Board, black
+from hardware.simulator.scene.render import render
+from hardware.simulator.scene.scene import Scene, WorldState
+from hardware.simulator.scene.shape import BODIES, Shape, Wound, body
+from perception.boards.board import Board, ink_cells
 from perception.frames import Image
 
-SAMPLES = 3  # per pixel and axis: edges lie true to a hundredth of a pixel
-PAPER = 0.5  # of a square, white around the print
-LIGHT, DARK, WALL = 205.0, 38.0, 120.0  # grey levels of paper, ink and what is behind
-FINER = 8  # parts of a cell along its edge; between two the light is interpolated, which keeps edges from stepping
-ROOM = 12  # px around the board that are drawn
+VIEW_TEXEL = 0.15  # mm: what a camera 350 mm away resolves; half the time of the simulator's own
+MASK_SAMPLES = 4  # samples a pixel and axis of the true mask
+IMAGE_SIZES = ((1280, 720), (640, 480), (768, 576))  # px
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WoundView:
+    """One picture with its ground truth."""
+
+    image: Image  # (H, W, 3) BGR
+    wound: NDArray[np.bool_]  # (H, W), all False where the skin is healthy
+    camera: Camera
+    base_from_surface: Array  # (4, 4) mm
+    area: float  # mm^2 of the wound on the surface
+
+
+def wound_view(seed: int, wounded: bool = True) -> WoundView:
+    """The picture of a seed: body, wound, tone, wetness, drape, lamps and camera are drawn from it."""
+    rng = np.random.default_rng([seed, 41])
+    wound = Wound((rng.uniform(12, 60), rng.uniform(10, 40)), rng.uniform(0.5, 4.0)) if wounded else None
+    shape = body(rng.choice(list(BODIES)), wound, seed)
+    scene = Scene(shape, _random_appearance(rng), seed=seed)
+    camera = _random_camera(rng)
+    pose = BASE_FROM_REST @ se3.make(se3.exp_rotation(rng.normal(0, [0.15, 0.15, 1.5])), rng.normal(0, [12, 12, 6]))
+    instant = WorldState(0.0, 0.004, pose, np.zeros(6), gain=float(np.exp(rng.normal(0, 0.15))))
+    sensor = Sensor(noise=rng.uniform(0.5, 4), blur=rng.uniform(0.3, 1.2))
+    image = render(scene, [camera], [instant], sensor, [rng], threads=1)[0]
+    points = [se3.transform_points(pose, shape.points(each)) for each in _outlines(shape)]
+    outlines = [pixels_from_points(camera, each)[0] for each in points]
+    return WoundView(image, mask_from_outlines(outlines, camera.size), camera, pose, _area(shape))
+
+
+def mask_from_outlines(outlines: Sequence[Array], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """(H, W) pixels that lie for the most part inside closed outlines (N, 2) px, in an image of `size` (W, H).
+
+    Drawn finer and shrunk: OpenCV fills the outline's own pixels too, which would add half a pixel all round.
+    """
+    fine = np.zeros((size[1] * MASK_SAMPLES, size[0] * MASK_SAMPLES), np.uint8)
+    for outline in outlines:
+        cv2.fillPoly(fine, [np.round((outline + 0.5) * MASK_SAMPLES - 0.5).astype(np.int32)], 255)
+    return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA) > 127)
+
+
+def _random_appearance(rng: np.random.Generator) -> Appearance:
+    ambient, key, fill = rng.uniform(0.2, 0.5), rng.uniform(0.35, 0.8), rng.uniform(0.05, 0.4)
+    tone, wetness, hair = rng.uniform(0, 0.9), rng.uniform(0.1, 1), rng.uniform(0, 1.2)
+    drape = bool(rng.random() < 0.6)
+    return Appearance(VIEW_TEXEL, tone, wetness, hair, drape, ambient=ambient, key=key, fill=fill)
+
+
+def _random_camera(rng: np.random.Generator) -> Camera:
+    size = IMAGE_SIZES[rng.integers(len(IMAGE_SIZES))]
+    focal = size[0] * rng.uniform(0.7, 1.1)
+    return arc_rig((rng.uniform(0, 75),), rng.uniform(220, 480), focal, size).cameras[0]
+
+
+def _outlines(shape: Shape) -> list[Array]:
+    if shape.inside is None:
+        return []
+    contours, _ = cv2.findContours((shape.inside > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    middle = (np.array(shape.inside.shape[::-1]) - 1) / 2
+    return [(nodes.reshape(-1, 2) - middle) * shape.step for nodes in contours]
+
+
+def _area(shape: Shape) -> float:
+    return 0.0 if shape.inside is None else float((shape.inside > 0).sum()) * shape.step**2
+
+
+BOARD_SAMPLES = 3  # per pixel and axis: edges lie true to a hundredth of a pixel
+PAPER_MARGIN = 0.5  # of a square, white around the print
+PAPER_GREY, INK_GREY, WALL_GREY = 205.0, 38.0, 120.0  # grey levels of paper, ink and what is behind
+DRAWING_SCALE = 8  # parts of a cell along its edge; light between two is interpolated, so that edges do not step
+BOX_MARGIN_PX = 12  # px around the board that are drawn
 
 
 class BoardView:
@@ -25,18 +105,18 @@ class BoardView:
 
     def __init__(self, camera: Camera, board: Board) -> None:
         self.camera, self._board = camera, board
-        ink, cell = black(board)
-        rim = round(PAPER * board.square / cell * FINER)
-        drawn = np.kron(np.where(ink, DARK, LIGHT), np.ones((FINER, FINER)))
-        paper = DARK if board.inverted else LIGHT
+        ink, cell = ink_cells(board)
+        rim = round(PAPER_MARGIN * board.square / cell * DRAWING_SCALE)
+        drawn = np.kron(np.where(ink, INK_GREY, PAPER_GREY), np.ones((DRAWING_SCALE, DRAWING_SCALE)))
+        paper = INK_GREY if board.inverted else PAPER_GREY
         self._drawing = np.pad(drawn, rim, constant_values=paper).astype(np.float32)
-        scale, shift = FINER / cell, rim - 0.5  # cells' middles are whole numbers
+        scale, shift = DRAWING_SCALE / cell, rim - 0.5  # cells' middles are whole numbers
         self._drawing_from_board = np.array([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]])
 
     def picture(self, base_from_board: Array, blur: float, noise: float, rng: np.random.Generator) -> Image:
         """The image (H, W) grey of the board at a pose (4, 4); blur: px, noise: grey levels, one sigma each."""
         w, h = self.camera.size
-        light = np.full((h, w), WALL, np.float32)
+        light = np.full((h, w), WALL_GREY, np.float32)
         box = self._box(base_from_board)
         if box is not None:
             x0, y0, x1, y1 = box
@@ -47,24 +127,23 @@ class BoardView:
         return np.clip(np.round(light + noise * grain), 0, 255).astype(np.uint8)
 
     def _box(self, base_from_board: Array) -> tuple[int, int, int, int] | None:
-        """The part of the image that holds the paper: x0 y0 x1 y1."""
-        rim = PAPER * self._board.square
+        rim = PAPER_MARGIN * self._board.square
         w, h = self._board.size
         x, y = np.meshgrid(np.linspace(-rim, w + rim, 5), np.linspace(-rim, h + rim, 5))
         outline = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
         pixels, depth = pixels_from_points(self.camera, se3.transform_points(base_from_board, outline))
         if (depth < 1).any():
             return None
-        low = np.maximum(np.floor(pixels.min(0)).astype(int) - ROOM // 2, 0)
-        high = np.minimum(np.ceil(pixels.max(0)).astype(int) + ROOM // 2, self.camera.size)
+        low = np.maximum(np.floor(pixels.min(0)).astype(int) - BOX_MARGIN_PX // 2, 0)
+        high = np.minimum(np.ceil(pixels.max(0)).astype(int) + BOX_MARGIN_PX // 2, self.camera.size)
         return (int(low[0]), int(low[1]), int(high[0]), int(high[1])) if (high > low).all() else None
 
     def _patch(self, base_from_board: Array, box: tuple[int, int, int, int]) -> Field:
         x0, y0, x1, y1 = box
-        x, y = ((np.arange((b - a) * SAMPLES) + 0.5) / SAMPLES - 0.5 + a for a, b in ((x0, x1), (y0, y1)))
+        x, y = ((np.arange((b - a) * BOARD_SAMPLES) + 0.5) / BOARD_SAMPLES - 0.5 + a for a, b in ((x0, x1), (y0, y1)))
         u, v = rays_at(self.camera, x, y)
         camera_from_board = se3.inverse(self.camera.base_from_camera) @ base_from_board
         drawing_from_ray = self._drawing_from_board @ np.linalg.inv(camera_from_board[:3, [0, 1, 3]])
         across, down, depth = (a * u + b * v + c for a, b, c in drawing_from_ray.astype(np.float32))
-        light = cv2.remap(self._drawing, across / depth, down / depth, cv2.INTER_LINEAR, borderValue=WALL)
+        light = cv2.remap(self._drawing, across / depth, down / depth, cv2.INTER_LINEAR, borderValue=WALL_GREY)
         return np.asarray(cv2.resize(light, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA), np.float32)

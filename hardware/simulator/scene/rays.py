@@ -1,25 +1,139 @@
-"""One camera's rays: where each sample of its image looks, worked out once."""
+"""Camera rays, and where they meet a height field z = Z(x, y)."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation.rig import Camera
 from estimation.se3 import Array, inverse
-from hardware.simulator.field import Field
-from hardware.simulator.sensor import Sensor, vignette
+from hardware.simulator.scene.appearance import Sensor, vignette
+from hardware.simulator.scene.fields import Field, Mask, as_field, gradient, sample
 from perception.lens import undistort
 
-SAMPLES = 2  # per pixel and axis
-CELL = 8  # px: boxes are whole cells, and what varies slowly is worked out once a cell
-SPARE = 3 * CELL  # px by which the rays kept reach beyond the box asked for, so that a moving box is found again
-NODES = 8  # px between the rays that are traced through the lens; cubic between them, off by less than 1e-5 px
+SEARCH_STEPS = 56  # of the search downwards through all heights
+LOCAL_SEARCH_STEPS = 24  # of a search between near bounds
+NEWTON_ROUNDS = 2  # of Newton's method
+GRAZING_FACING = 0.3  # rays that meet the surface more grazing than this (1: head on) are searched for one by one
+NEWTON_TOLERANCE = 2e-3  # mm that is left over where Newton's method did not come to rest
+GRAZING_REACH = 7  # rays round a grazing one that are searched too: it may hide the surface from them
+BLOCK_WIDTH = 256  # rays
 
 
-class Box(NamedTuple):
+class RayLines(NamedTuple):
+    """Rays as lines over the height: at height z mm they stand over node (u + z du, v + z dv). All of one shape."""
+
+    u: Field
+    v: Field
+    du: Field
+    dv: Field
+
+
+class HeightField(NamedTuple):
+    """A height field (H, W) mm, its slopes a node along u and v, and the heights it keeps within, mm."""
+
+    height: Field
+    slopes: Field  # (H, W, 2)
+    low: float
+    high: float
+
+
+def height_field(height: Field) -> HeightField:
+    """A height field with its slopes."""
+    low, high = float(height.min()) - 0.1, float(height.max()) + 0.1
+    return HeightField(height, as_field(np.dstack(gradient(height, 1.0))), low, high)
+
+
+def first_hit(relief: HeightField, rays: RayLines, start: Field, odd: Mask, bounds: tuple[Field, Field]) -> Field:
+    """Height z (H, W) mm where each ray first meets the field, which goes on beyond its edge as it is there.
+
+    start: (H, W) mm, near it. odd: (H, W) which rays are searched alone, because the surface there grazes them or hides
+    itself; so are those that turn out to graze it or do not come to rest. Newton's method ends within 1e-4 mm of it.
+    bounds: (h, w) mm below and above which the search need not look, of squares of rays.
+    """
+    z, rest, facing = _newton(relief, rays, start)
+    grazed = facing < GRAZING_FACING
+    if grazed.any():
+        around = np.ones((GRAZING_REACH, GRAZING_REACH), np.uint8)
+        grazed = np.asarray(cv2.dilate(grazed.astype(np.uint8), around), bool)
+    doubt = odd | grazed | ~(np.abs(rest) < NEWTON_TOLERANCE)
+    if doubt.any():
+        doubt &= near_field(relief, rays, start)
+    place = np.nonzero(doubt)
+    if len(place[0]):
+        alone = RayLines(*(as_block(part[place]) for part in rays))
+        times = z.shape[0] // bounds[0].shape[0]
+        low, high = (as_block(b[place[0] // times, place[1] // times]) for b in bounds)
+        searched, _ = search_down(relief, alone, low, high, LOCAL_SEARCH_STEPS)
+        better, left, _ = _newton(relief, alone, searched)
+        z[place] = np.where(np.abs(left) < 10 * NEWTON_TOLERANCE, better, searched).reshape(-1)[: len(place[0])]
+    return z
+
+
+def as_block(values: Field) -> Field:
+    """Values (N,) as rows of WIDTH, the last one filled up: OpenCV looks up no more than 32767 rows."""
+    rows = -(-len(values) // BLOCK_WIDTH)
+    return as_field(np.pad(values, (0, rows * BLOCK_WIDTH - len(values)), mode="edge").reshape(rows, BLOCK_WIDTH))
+
+
+def near_field(relief: HeightField, rays: RayLines, z: Field, margin: float = 4.0) -> Mask:
+    """Whether rays stand over the field, or within `margin` nodes of it, at height z."""
+    rows, columns = relief.height.shape
+    u, v = rays.u + z * rays.du, rays.v + z * rays.dv
+    over: Mask = (u > -margin) & (u < columns + margin) & (v > -margin) & (v < rows + margin)
+    return over
+
+
+def _heights(relief: HeightField, rays: RayLines, z: Field) -> Field:
+    u, v = rays.u + z * rays.du, rays.v + z * rays.dv
+    return sample(relief.height, u, v)
+
+
+def _newton(relief: HeightField, rays: RayLines, z: Field) -> tuple[Field, Field, Field]:
+    """Heights nearer to the surface than z, what was left over before the last round, mm, and how much rays face it.
+
+    The slope at the start serves all rounds.
+    """
+    u, v = rays.u + z * rays.du, rays.v + z * rays.dv
+    slopes = sample(relief.slopes, u, v)
+    facing = 1 - slopes[..., 0] * rays.du - slopes[..., 1] * rays.dv
+    step = 1 / np.maximum(facing, 0.15)
+    for _ in range(NEWTON_ROUNDS):
+        z = as_field(z - (z - _heights(relief, rays, z)) * step)
+    rest = z - _heights(relief, rays, z)
+    return as_field(z - rest * step), rest, facing
+
+
+def search_down(relief: HeightField, rays: RayLines, low: Field, high: Field, steps: int) -> tuple[Field, Field]:
+    """Heights where rays first meet the field, by steps from high to low, and how much it faces them (1: head on)."""
+    step = (high - low) / np.float32(steps - 1)
+    z, above = low, step
+    facing = np.ones(z.shape, np.float32)
+    open_way = np.ones(z.shape, bool)
+    for k in range(steps):
+        level = high - np.float32(k) * step
+        left = level - _heights(relief, rays, level)
+        new = (left <= 0) & open_way
+        fall = np.maximum(above - left, 1e-6)
+        z = as_field(np.where(new, level - step * left / fall, z))
+        facing = as_field(np.where(new, fall / step, facing))
+        open_way &= ~new
+        if not open_way.any():
+            break
+        above = left
+    return z, facing
+
+
+SAMPLES_PER_PIXEL = 2  # per pixel and axis
+CELL_PX = 8  # px: boxes are whole cells, and what varies slowly is worked out once a cell
+RAY_MARGIN_PX = 3 * CELL_PX  # by which the rays kept reach beyond the box asked for: a moving box is found again
+LENS_NODE_PX = 8  # px between the rays that are traced through the lens; cubic between them, off by less than 1e-5 px
+
+
+class ImageBox(NamedTuple):
     """A part of an image, in whole cells: pixels x0..x1, y0..y1, the last excluded; it may reach beyond the image."""
 
     x0: int
@@ -40,7 +154,7 @@ class Rays(NamedTuple):
     y: Field
 
 
-class View:
+class RenderView:
     """One camera, and the rays of the part of its image that was last needed."""
 
     def __init__(self, camera: Camera, base_from_rest: Array) -> None:
@@ -48,8 +162,9 @@ class View:
         self.camera = camera
         self.camera_from_base = inverse(camera.base_from_camera)
         at_rest = self.camera_from_base @ base_from_rest
-        self.spacing = float(np.linalg.norm(at_rest[:3, 3])) / float(camera.matrix[0, 0]) / SAMPLES  # mm a sample
-        self._box, self._rays = Box(0, 0, 0, 0), Rays(*np.zeros((2, 0, 0), np.float32))
+        rest_depth = float(np.linalg.norm(at_rest[:3, 3]))
+        self.spacing = rest_depth / float(camera.matrix[0, 0]) / SAMPLES_PER_PIXEL  # mm a sample
+        self._box, self._rays = ImageBox(0, 0, 0, 0), Rays(*np.zeros((2, 0, 0), np.float32))
         self._coarse: dict[int, Rays] = {}
         self._fall: dict[float, NDArray[np.float32]] = {}
 
@@ -60,27 +175,31 @@ class View:
         return self._fall[sensor.vignetting]
 
     @property
-    def whole(self) -> Box:
+    def whole(self) -> ImageBox:
         """The whole image in whole cells."""
         w, h = self.camera.size
-        return Box(0, 0, -(-w // CELL) * CELL, -(-h // CELL) * CELL)
+        return ImageBox(0, 0, -(-w // CELL_PX) * CELL_PX, -(-h // CELL_PX) * CELL_PX)
 
-    def clip(self, low: Array, high: Array) -> Box | None:
+    def clip(self, low: Array, high: Array) -> ImageBox | None:
         """The cells that hold pixels low to high (2,), None if they miss the image."""
         whole = self.whole
-        x0, y0 = (int(v) for v in np.clip(np.floor(low / CELL) * CELL, 0, whole[2:]))
-        x1, y1 = (int(v) for v in np.clip(np.ceil(high / CELL) * CELL, 0, whole[2:]))
-        return Box(x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
+        x0, y0 = (int(v) for v in np.clip(np.floor(low / CELL_PX) * CELL_PX, 0, whole[2:]))
+        x1, y1 = (int(v) for v in np.clip(np.ceil(high / CELL_PX) * CELL_PX, 0, whole[2:]))
+        return ImageBox(x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
 
-    def rays(self, box: Box) -> Rays:
+    def rays(self, box: ImageBox) -> Rays:
         """Rays (H, W) of all samples of a box."""
         held = self._box
         if not (held.x0 <= box.x0 and held.y0 <= box.y0 and held.x1 >= box.x1 and held.y1 >= box.y1):
-            held = Box(box.x0 - SPARE, box.y0 - SPARE, box.x1 + SPARE, box.y1 + SPARE)
-            x, y = ((np.arange((b - a) * SAMPLES) + 0.5) / SAMPLES + a - 0.5 for a, b in (held[::2], held[1::2]))
+            margin = RAY_MARGIN_PX
+            held = ImageBox(box.x0 - margin, box.y0 - margin, box.x1 + margin, box.y1 + margin)
+            x, y = (
+                (np.arange((b - a) * SAMPLES_PER_PIXEL) + 0.5) / SAMPLES_PER_PIXEL + a - 0.5
+                for a, b in (held[::2], held[1::2])
+            )
             self._rays, self._box = Rays(*rays_at(self.camera, x, y)), held
-        rows = slice((box.y0 - held.y0) * SAMPLES, (box.y1 - held.y0) * SAMPLES)
-        columns = slice((box.x0 - held.x0) * SAMPLES, (box.x1 - held.x0) * SAMPLES)
+        rows = slice((box.y0 - held.y0) * SAMPLES_PER_PIXEL, (box.y1 - held.y0) * SAMPLES_PER_PIXEL)
+        columns = slice((box.x0 - held.x0) * SAMPLES_PER_PIXEL, (box.x1 - held.x0) * SAMPLES_PER_PIXEL)
         return Rays(self._rays.x[rows, columns], self._rays.y[rows, columns])
 
     def coarse(self, step: int) -> Rays:
@@ -93,7 +212,7 @@ class View:
 
 def rays_at(camera: Camera, x: Array, y: Array) -> NDArray[np.float32]:
     """Tangents (2, H, W) at the pixels x (W,) by y (H,)."""
-    nodes = [np.arange(v[0] - 2 * NODES, v[-1] + 3 * NODES, NODES) for v in (x, y)]
+    nodes = [np.arange(v[0] - 2 * LENS_NODE_PX, v[-1] + 3 * LENS_NODE_PX, LENS_NODE_PX) for v in (x, y)]
     pixels = np.stack(np.meshgrid(*nodes), -1)
     ideal = undistort(camera, pixels.reshape(-1, 2)).reshape(pixels.shape)
     tangents = (ideal - camera.matrix[:2, 2]) / camera.matrix[[0, 1], [0, 1]]
@@ -103,7 +222,7 @@ def rays_at(camera: Camera, x: Array, y: Array) -> NDArray[np.float32]:
 
 def _cubic(nodes: Array, places: Array) -> Array:
     """Weights (places, nodes) of the cubic through the four nodes around each place."""
-    u = (places - nodes[0]) / NODES
+    u = (places - nodes[0]) / LENS_NODE_PX
     first = np.floor(u).astype(int)
     t = u - first
     weights = np.zeros((len(places), len(nodes)))

@@ -1,4 +1,4 @@
-"""The shape of the body: a height field over a plane, exact between its nodes."""
+"""The shape of the body: a height field over a plane, its deformation, and parametric bodies with a wound."""
 
 from __future__ import annotations
 
@@ -12,30 +12,27 @@ from scipy.ndimage import distance_transform_edt
 
 from estimation import se3
 from estimation.errors import InputError
-from estimation.ray_cast import cast
-from estimation.scan import Scan, face_areas, face_normals, scan_from_triangles
+from estimation.scans.scan import Scan, cast_rays, face_areas, face_normals, scan_from_triangles
 from estimation.se3 import Array
+from hardware.simulator.scene.fields import smooth_noise
 
-STEP = 0.25  # mm between nodes: a wound's rim rises over 2 mm
-LEAST_FACING = 0.1  # mean of a scan's normals by area: a closed body's is 0, and no plane is its mean plane
-FAR = 1e7  # mm: rays from there are parallel to 1e-5 rad over a body, 0.1 um across a scan
+NODE_STEP = 0.25  # mm between nodes: a wound's rim rises over 2 mm
+MIN_FACING = 0.1  # mean of a scan's normals by area: a closed body's is 0, and no plane is its mean plane
+CAST_HEIGHT = 1e7  # mm: rays from there are parallel to 1e-5 rad over a body, 0.1 um across a scan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
     """Heights over a rectangle, bilinear between nodes: z = Z(x, y) in the grid frame, z out of the surface.
 
-    Material points are named by (x, y) mm in the grid frame, whose origin is the middle of the rectangle. step: mm
-    between nodes. heights: (H, W) mm, rows along y. surface_from_grid: (4, 4), the identity unless the surface frame
-    is a scan's own. inside: (H, W) mm into the wound from its edge, negative outside; None: no wound.
-    valid: (H, W) whether there is a surface; heights under False are those of the nearest True.
+    Material points are named by (x, y) mm in the grid frame, whose origin is the middle of the rectangle.
     """
 
-    step: float
-    heights: Array
-    surface_from_grid: Array = field(default_factory=lambda: np.eye(4))
-    inside: Array | None = None
-    valid: NDArray[np.bool_] | None = None
+    step: float  # mm between nodes
+    heights: Array  # (H, W) mm, rows along y
+    surface_from_grid: Array = field(default_factory=lambda: np.eye(4))  # (4, 4), the identity but for scans
+    inside: Array | None = None  # (H, W) mm into the wound from its edge, negative outside; None: no wound
+    valid: NDArray[np.bool_] | None = None  # (H, W) surface or hole; a hole has the height of the nearest node
 
     @property
     def size(self) -> tuple[float, float]:
@@ -106,7 +103,7 @@ def _bilinear(shape: Shape, nodes: Array) -> tuple[Array, Array, Array]:
 
 
 def shape_from_function(
-    height: Callable[[Array, Array], Array], size: tuple[float, float], step: float = STEP
+    height: Callable[[Array, Array], Array], size: tuple[float, float], step: float = NODE_STEP
 ) -> Shape:
     """The shape z = height(x, y), mm, over `size` (x, y) mm, rounded up to whole steps; the law holds at the nodes."""
     columns, rows = (int(np.ceil(s / step - 1e-9)) + 1 for s in size)
@@ -120,12 +117,12 @@ def flat(size: tuple[float, float], step: float = 1.0) -> Shape:
     return shape_from_function(lambda x, y: np.zeros_like(x), size, step)
 
 
-def cylinder(size: tuple[float, float], radius: float, step: float = STEP) -> Shape:
+def cylinder(size: tuple[float, float], radius: float, step: float = NODE_STEP) -> Shape:
     """A rectangle of `size` (x, y) mm, as seen from above, bent about its x axis to `radius` mm."""
     return shape_from_function(lambda x, y: np.sqrt(radius**2 - y**2) - radius, size, step)
 
 
-def shape_from_scan(vertices: ArrayLike, triangles: ArrayLike, step: float = STEP) -> Shape:
+def shape_from_scan(vertices: ArrayLike, triangles: ArrayLike, step: float = NODE_STEP) -> Shape:
     """The shape of a scan, vertices (V, 3) mm and triangles (T, 3) anticlockwise from outside, in the scan's own frame.
 
     The grid lies in the mean plane of the triangles (their normals' mean, weighted by area), its origin at their mean.
@@ -134,16 +131,16 @@ def shape_from_scan(vertices: ArrayLike, triangles: ArrayLike, step: float = STE
     """
     scan = scan_from_triangles(vertices, triangles)
     surface_from_grid = _mean_plane(scan)
-    seen = se3.transform_points(se3.inverse(surface_from_grid), scan.vertices)
-    half = np.abs(seen[:, :2]).max(0)
+    vertices_grid = se3.transform_points(se3.inverse(surface_from_grid), scan.vertices)
+    half = np.abs(vertices_grid[:, :2]).max(0)
     columns, rows = (int(np.ceil(2 * h / step - 1e-9)) + 1 for h in half)
     x, y = (np.arange(n) * step - (n - 1) * step / 2 for n in (columns, rows))
     nodes = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    apex = np.array([0.0, 0.0, FAR])
+    apex = np.array([0.0, 0.0, CAST_HEIGHT])
     directions = np.column_stack([nodes, np.full(len(nodes), 0.0)]) - apex
     grid_from_apex = se3.make(np.eye(3), apex)
-    local = Scan(seen, scan.triangles, scan.normals)
-    hits = cast(local, grid_from_apex, directions / FAR)
+    local = Scan(vertices_grid, scan.triangles, scan.normals)
+    hits = cast_rays(local, grid_from_apex, directions / CAST_HEIGHT)
     heights = hits.points[:, 2].reshape(rows, columns)
     valid = hits.hit.reshape(rows, columns)
     nearest = distance_transform_edt(~valid, return_distances=False, return_indices=True)
@@ -158,8 +155,8 @@ def _mean_plane(scan: Scan) -> Array:
     areas = face_areas(scan)
     z = areas @ face_normals(scan) / areas.sum()
     facing = float(np.linalg.norm(z))
-    if facing < LEAST_FACING:
-        allowed = f"{LEAST_FACING:g} or more: a surface seen from one side, no closed body"
+    if facing < MIN_FACING:
+        allowed = f"{MIN_FACING:g} or more: a surface seen from one side, no closed body"
         raise InputError("scan", "length of its mean normal", f"{facing:.2g}", allowed)
     z /= facing
     x = np.eye(3)[0 if abs(z[0]) < 0.9 else 1]
@@ -169,7 +166,142 @@ def _mean_plane(scan: Scan) -> Array:
     flattened = (scan.vertices @ rotation[:, :2]).astype(np.float32)
     turn = np.deg2rad((cv2.minAreaRect(flattened)[2] + 45) % 90 - 45)
     rotation = rotation @ se3.exp_rotation([0.0, 0.0, turn])
-    seen = scan.vertices @ rotation  # grid axes, the scan's origin
-    middle = (seen.min(0) + seen.max(0)) / 2
+    turned = scan.vertices @ rotation  # grid axes, the scan's origin
+    middle = (turned.min(0) + turned.max(0)) / 2
     middle[2] = areas @ (scan.corners.mean(1) @ rotation[:, 2]) / areas.sum()
     return se3.make(rotation, rotation @ middle)
+
+
+STRETCH_RANGE = (-0.3, 0.5)  # a skin tears beyond
+MAX_BULGE = 30.0  # mm
+BULGE_RADIUS_RANGE = (5.0, 500.0)  # mm
+
+
+@dataclass(frozen=True, slots=True)
+class Deformation:
+    """A stretch and a Gaussian bulge out of the surface, in the shape's grid frame, at amount 1."""
+
+    stretch: tuple[float, float] = (0.0, 0.0)  # (x, y), share of each length, about the origin
+    bulge: float = 0.0  # mm at the origin
+    radius: float = 40.0  # mm, one sigma, in material coordinates
+
+    def __post_init__(self) -> None:
+        for value in self.stretch:
+            if not STRETCH_RANGE[0] <= value <= STRETCH_RANGE[1]:
+                allowed = f"{STRETCH_RANGE[0]} to {STRETCH_RANGE[1]}, a share of length"
+                raise InputError("deformation", "stretch", value, allowed)
+        if not abs(self.bulge) <= MAX_BULGE:
+            raise InputError("deformation", "bulge", self.bulge, f"-{MAX_BULGE:g} to {MAX_BULGE:g} mm")
+        if not BULGE_RADIUS_RANGE[0] <= self.radius <= BULGE_RADIUS_RANGE[1]:
+            allowed = f"{BULGE_RADIUS_RANGE[0]:g} to {BULGE_RADIUS_RANGE[1]:g} mm"
+            raise InputError("deformation", "radius", self.radius, allowed)
+
+    def factors(self, amount: float) -> tuple[float, float]:
+        """By how much lengths along x and y grow."""
+        return 1 + amount * self.stretch[0], 1 + amount * self.stretch[1]
+
+    def lift(self, xy: ArrayLike, amount: float | Array) -> Array:
+        """How far out (N,) mm material points (N, 2) mm bulge; amount: one, or (N,)."""
+        square = np.einsum("...i,...i->...", np.asarray(xy, float), np.asarray(xy, float))
+        return np.asarray(amount * self.bulge * np.exp(-square / (2 * self.radius**2)))
+
+    def displacement(self, points: ArrayLike, amount: float | Array) -> Array:
+        """How far (N, 3) mm points (N, 3) mm of the shape at rest are moved, in the grid frame; amount: or (N,)."""
+        points = np.asarray(points, float)
+        along = np.asarray(amount)[..., None] * points[..., :2] * np.array(self.stretch)
+        return np.concatenate([along, self.lift(points[..., :2], amount)[..., None]], -1)
+
+    def undo(self, points: ArrayLike, amount: float | Array) -> Array:
+        """Where points (N, 3) mm of the deformed shape lie at rest, (N, 3) mm, in the grid frame; amount: or (N,)."""
+        points = np.asarray(points, float)
+        flat = points[..., :2] / (1 + np.asarray(amount)[..., None] * np.array(self.stretch))
+        return np.concatenate([flat, (points[..., 2] - self.lift(flat, amount))[..., None]], -1)
+
+
+DRAPE_MARGIN = 9.0  # mm of body under the drape on every side of the opening
+
+
+@dataclass(frozen=True, slots=True)
+class Wound:
+    """A wound about the origin. size: (x, y) mm of its irregular outline; depth: mm of its bed below the skin."""
+
+    size: tuple[float, float] = (42.0, 31.0)
+    depth: float = 2.4
+
+
+def forearm(x: Array, y: Array) -> Array:
+    """Heights of a cylinder along x that tapers from 50 to 45 mm, its muscle bulging on one side."""
+    radius = 47.5 - 0.022 * x
+    return np.asarray(_arch(y, radius) + 0.022 * x + 1.1 * np.exp(-(((x + 40) / 35) ** 2) - ((y - 14) / 18) ** 2))
+
+
+def chest(x: Array, y: Array) -> Array:
+    """Heights of a broad, gently vaulted wall with the swell of ribs under it."""
+    ribs = 0.35 * np.sin(2 * np.pi * (y + 0.25 * x) / 34.0)
+    return np.asarray(_arch(y, 190.0) + _arch(x, 260.0) + ribs)
+
+
+def foot(x: Array, y: Array) -> Array:
+    """Heights of an instep: strongly curved across, hollow along, with a tendon."""
+    tendon = 0.9 * np.exp(-(((y - 18 - 0.2 * x) / 4.5) ** 2))
+    return np.asarray(_arch(y, 52.0) + 0.0016 * x**2 - 0.05 * x + 0.0005 * x * y + tendon)
+
+
+BODIES: dict[str, tuple[Callable[[Array, Array], Array], tuple[float, float]]] = {
+    "forearm": (forearm, (120.0, 62.0)),
+    "chest": (chest, (120.0, 90.0)),
+    "foot": (foot, (110.0, 74.0)),
+}  # height and opening (x, y) mm of each
+
+
+def body(kind: str, wound: Wound | None, seed: int, step: float = NODE_STEP) -> Shape:
+    """The shape of `kind` (a key of BODIES) with a wound at the origin, its skin level there being z = 0."""
+    height, opening = BODIES[kind]
+    rng = np.random.default_rng([seed, 21])
+    bare = shape_from_function(height, (opening[0] + 2 * DRAPE_MARGIN, opening[1] + 2 * DRAPE_MARGIN), step)
+    grid = bare.heights.shape
+    heights = bare.heights - bare.heights_at([[0.0, 0.0]])
+    uneven = 0.22 * smooth_noise(grid, 26 / step, rng) + 0.05 * smooth_noise(grid, 7 / step, rng)
+    heights += uneven
+    if wound is None:
+        return Shape(step, heights)
+    inside = wound_distance(grid, step, wound, rng)
+    heights += _wound_relief(inside, step, wound, rng)
+    return Shape(step, heights, inside=inside)
+
+
+def with_wound(shape: Shape, wound: Wound, seed: int) -> Shape:
+    """The shape with a wound drawn, not carved, at its middle: a scan has its own relief."""
+    inside = wound_distance(shape.heights.shape, shape.step, wound, np.random.default_rng([seed, 21]))
+    return Shape(shape.step, shape.heights, shape.surface_from_grid, inside, shape.valid)
+
+
+def wound_distance(grid: tuple[int, int], step: float, wound: Wound, rng: np.random.Generator) -> Array:
+    """About how far inside the wound's edge each node is, (H, W) mm; an irregular oval of the wound's size."""
+    rows, columns = grid
+    x, y = np.meshgrid((np.arange(columns) - (columns - 1) / 2) * step, (np.arange(rows) - (rows - 1) / 2) * step)
+    half = np.array(wound.size) / 2
+    x = x + 0.05 * half[0] * smooth_noise(grid, 9 / step, rng)
+    y = y + 0.05 * half[1] * smooth_noise(grid, 9 / step, rng)
+    angle, edge = np.arctan2(y / half[1], x / half[0]), np.ones(grid)
+    for k in range(2, 8):
+        edge += rng.normal(0, 0.13 / k) * np.cos(k * angle + rng.uniform(0, 2 * np.pi))
+    radius = np.hypot(x / half[0], y / half[1])
+    return np.asarray((edge - radius) * half.min() + 0.12 * smooth_noise(grid, 1.6 / step, rng))
+
+
+def _wound_relief(inside: Array, step: float, wound: Wound, rng: np.random.Generator) -> Array:
+    wall = 0.9 * wound.depth  # mm wide, so that its slope stays below 1
+    t = np.clip((inside + 0.25 * wall) / (1.6 * wall), 0, 1)
+    sunk = t * t * (3 - 2 * t)
+    uneven = 0.22 * smooth_noise(inside.shape, 9 / step, rng) + 0.1 * smooth_noise(inside.shape, 3 / step, rng)
+    bed = wound.depth * (0.82 + 0.18 * np.clip(inside / 8, 0, 1) + np.clip(uneven, -0.5, 0.5))
+    swollen = 0.45 * np.exp(-(((inside + 2.2) / 1.9) ** 2))
+    return np.asarray(cv2.GaussianBlur(swollen - sunk * bed, (0, 0), 0.35 / step))
+
+
+def _arch(y: Array, radius: Array | float) -> Array:
+    """Heights of a circle's top, going on straight where its slope passes 0.85: cloth and camera see no further."""
+    edge = radius * 0.85 / np.hypot(1, 0.85)
+    near = np.clip(y, -edge, edge)
+    return np.asarray(np.sqrt(radius**2 - near**2) - radius - 0.85 * (np.abs(y) - np.abs(near)))

@@ -1,1 +1,0 @@
-"""`stillbed smooth`: recorded sessions smoothed after the fact, and what is written of them."""
