@@ -45,6 +45,7 @@ from hardware.bench.whole import (
     whole_page,
 )
 from hardware.cli.main import add_bench, main, run_bench, subject_parser
+from hardware.cli.parser import Commands
 from tests import bench_subject
 
 SUBJECT = {"toy": Subject("tests.bench_subject:run", bench_subject.add_options, "one figure of each kind")}
@@ -52,7 +53,7 @@ SUBJECT = {"toy": Subject("tests.bench_subject:run", bench_subject.add_options, 
 
 def _arguments(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
-    add_bench(parser.add_subparsers())
+    add_bench(Commands(parser, "COMMAND"))
     return parser.parse_args(["bench", *words])
 
 

@@ -9,13 +9,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hardware.cli.calibrate_arm import add_calibrate_arm
-from hardware.cli.parser import INTERRUPTED, Commands, add_command, positive
+from estimation.errors import InputError
+from hardware.cli.parser import INTERRUPTED, Commands, arm_profile, positive, progress_bar, wrong_option
+from hardware.process.clock import Clock, WallClock
+from hardware.process.progress import check_new, left_files_text
 
 if TYPE_CHECKING:
+    from hardware.calibration.arm_run import ArmCalibrationOptions, ArmCalibrationResult, ArmTruth
     from hardware.calibration.live import WavingPage
-    from hardware.process.clock import Clock
-
 
 RIG_FORMATS = {
     "opencv": "a YAML per camera",
@@ -23,37 +24,38 @@ RIG_FORMATS = {
     "kalibr": "camchain.yaml",
     "anipose": "aniposelib's and caliscope's TOML, mm",
 }
+RIG_FORMATS_TEXT = "; ".join(f"{name}: {text}" for name, text in RIG_FORMATS.items())
 NOT_GOOD_ENOUGH = 1  # exit code of a calibration that is not good enough
+ARM_SOURCES = ("folder", "device", "virtual", "touched")
 
 
 def add_calibrate(commands: Commands) -> None:
     """Add the sub-command `calibrate`."""
-    command = add_command(
-        commands,
+    command = commands.add(
         "calibrate",
+        None,
         "calibrate cameras from a printed board, and the arm: board, cameras, arm, import, export",
         "Print a board, wave it before the cameras, and get a rig that says how far it can be trusted.",
         "stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
     )
-    parts = command.add_subparsers(metavar="WHAT", required=True)
+    parts = Commands(command, "WHAT")
     _add_board(parts)
     _add_cameras(parts)
-    add_calibrate_arm(parts)
+    _add_arm(parts)
     _add_import(parts)
     _add_export(parts)
 
 
 def _add_board(parts: Commands) -> None:
-    part = add_command(
-        parts,
+    add = parts.add(
         "board",
+        _board,
         "a printable board at true scale, with a ruler to check the print by",
         "Draw a calibration board at true scale, and write the board.toml that describes it beside it. Print it at\n"
         "100 %, measure the ruler and a square, and mount the sheet on something flat.",
         "stillbed calibrate board -o board.pdf",
         "stillbed calibrate board -o board.svg --page A3 --square-mm 30 --squares 8x11",
-    )
-    add = part.add_argument
+    ).add_argument
     add("-o", "--out", type=Path, required=True, metavar="X.pdf", help=".pdf or .svg; board.toml beside it")
     add("--kind", choices=("charuco", "chessboard"), default="charuco", help="default charuco")
     add("--squares", type=_pair, metavar="CxR", help="columns x rows; default: as many as fit the page")
@@ -63,21 +65,19 @@ def _add_board(parts: Commands) -> None:
     add("--inverted", action="store_true", help="exchange black and white")
     add("--page", default="A4", metavar="SIZE", help="A5, A4, A3, A2, letter, or WxH in mm; default A4")
     add("--force", action="store_true", help="overwrite X.pdf and the board.toml beside it")
-    part.set_defaults(run=_board)
 
 
 def _add_cameras(parts: Commands) -> None:
-    part = add_command(
-        parts,
+    add = parts.add(
         "cameras",
+        _cameras,
         "lenses, places and clock offsets from a waved board, recorded or live",
         "From a recording, or from live cameras while the board is being waved: it then says where to\n"
         "hold the board next, here and on a page in the browser, and ends once enough was seen. Ctrl-C keeps the\n"
         "corners; the same command goes on.",
         "stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
         "stillbed calibrate cameras /dev/v4l/by-id/CAMERA_A /dev/v4l/by-id/CAMERA_B --board board.toml -o rig.toml",
-    )
-    add = part.add_argument
+    ).add_argument
     add(
         "which",
         nargs="+",
@@ -100,39 +100,34 @@ def _add_cameras(parts: Commands) -> None:
     )
     add("--new-rig", action="store_true", help="do not compare with the session's own rig")
     add("--force", action="store_true", help="overwrite rig.toml and what stands beside it")
-    part.set_defaults(run=_cameras)
 
 
 def _add_import(parts: Commands) -> None:
-    part = add_command(
-        parts,
+    add = parts.add(
         "import",
+        _import,
         "a rig.toml from another program's calibration",
         "Turn another program's calibration into a rig.toml. Where each camera's images are is to be added to it.",
         "stillbed calibrate import camchain.yaml --format kalibr -o rig.toml",
-    )
-    add = part.add_argument
+    ).add_argument
     add("file", type=Path, metavar="FILE", help="its file, or folder of a file per camera")
-    add("--format", choices=RIG_FORMATS, required=True, help="; ".join(f"{k}: {v}" for k, v in RIG_FORMATS.items()))
+    add("--format", choices=RIG_FORMATS, required=True, help=RIG_FORMATS_TEXT)
     add("-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write")
     add("--force", action="store_true", help="overwrite the file")
-    part.set_defaults(run=_import)
 
 
 def _add_export(parts: Commands) -> None:
-    part = add_command(
-        parts,
+    add = parts.add(
         "export",
+        _export,
         "a rig.toml in another program's format",
         "Write a rig.toml as another program reads it: lenses and places, and what else its format can hold.",
         "stillbed calibrate export rig.toml --format kalibr -o camchain.yaml",
-    )
-    add = part.add_argument
+    ).add_argument
     add("rig", type=Path, metavar="rig.toml", help="a calibrated rig")
-    add("--format", choices=RIG_FORMATS, required=True, help="; ".join(f"{k}: {v}" for k, v in RIG_FORMATS.items()))
+    add("--format", choices=RIG_FORMATS, required=True, help=RIG_FORMATS_TEXT)
     add("-o", "--out", type=Path, required=True, metavar="OUT", help="file, or folder, to write")
     add("--force", action="store_true", help="overwrite the file, or write into a folder that is not empty")
-    part.set_defaults(run=_export)
 
 
 def _pair(text: str) -> tuple[int, int]:
@@ -151,32 +146,30 @@ def _distance(text: str) -> tuple[str, str, float]:
         raise argparse.ArgumentTypeError(f"{text!r}, needed is CAMERA,CAMERA,MM") from None
 
 
-def _board(arguments: argparse.Namespace) -> int:
+def _board(a: argparse.Namespace) -> int:
     from hardware.calibration.board_print import PrintOptions, write_print
 
-    a = arguments
-    wish = PrintOptions(a.kind, a.squares, a.square_mm, a.marker, a.dictionary, a.inverted, a.page)
-    print(write_print(a.out, wish, a.force))
+    options = PrintOptions(a.kind, a.squares, a.square_mm, a.marker, a.dictionary, a.inverted, a.page)
+    print(write_print(a.out, options, a.force))
     return 0
 
 
-def _cameras(arguments: argparse.Namespace) -> int:
+def _cameras(a: argparse.Namespace) -> int:
     from hardware.calibration.run import CalibrationOptions, corners_of, run_calibration, run_live
-    from hardware.process.clock import WallClock
-    from hardware.process.progress import Progress, check_new
 
-    a, clock = arguments, WallClock()
+    clock = WallClock()
     check_new(a.out, a.force)
     recorded = _recorded(a.which)
-    wishes = CalibrationOptions(a.limit_mm, a.distance_mm, a.keep_lenses, a.new_rig)
-    _check_seconds(a.seconds, recorded)
+    options = CalibrationOptions(a.limit_mm, a.distance_mm, a.keep_lenses, a.new_rig)
+    if a.seconds is not None and (recorded is not None or not a.seconds >= 0):
+        raise wrong_option("--seconds", a.seconds, "0 or more, with live cameras")
     try:
-        with Progress("corners", "frame sets", clock.now) as progress:
+        with progress_bar("corners", "frame sets") as progress:
             if recorded is not None:
-                outcome = run_calibration(recorded, a.board, a.out, wishes, progress)
+                outcome = run_calibration(recorded, a.board, a.out, options, progress)
             else:
                 open_page = nullcontext if a.no_page else partial(_opened_page, clock)
-                outcome = run_live(a.which, a.board, a.out, wishes, a.seconds, clock, progress, open_page)
+                outcome = run_live(a.which, a.board, a.out, options, a.seconds, clock, progress, open_page)
     except KeyboardInterrupt:
         kept = f"the corners so far are in {corners_of(a.out)}; the same command goes on from there"
         print(f"\nstillbed: interrupted; {kept}", file=sys.stderr)
@@ -197,36 +190,168 @@ def _opened_page(clock: Clock) -> WavingPage:
 def _recorded(which: list[str]) -> Path | None:
     """The one recording that is named, None where live cameras are."""
     path = Path(which[0])
-    named = path.is_dir() or path.suffix == ".mcap"
-    return path if named and len(which) == 1 else None
+    return path if len(which) == 1 and (path.is_dir() or path.suffix == ".mcap") else None
 
 
-def _check_seconds(seconds: float | None, recorded: Path | None) -> None:
-    from estimation.errors import InputError
-
-    if seconds is not None and (recorded is not None or not seconds >= 0):
-        raise InputError("command line", "--seconds", seconds, "0 or more, with live cameras")
-
-
-def _import(arguments: argparse.Namespace) -> int:
+def _import(a: argparse.Namespace) -> int:
     from hardware.calibration.rig_formats import FORMATS
     from hardware.files.rig_file import write_rig
-    from hardware.process.progress import check_new
 
-    check_new(arguments.out, arguments.force)
-    rig = FORMATS[arguments.format].read(arguments.file)
-    write_rig(arguments.out, rig, [None] * len(rig))
-    print(f"{arguments.out}: {', '.join(c.name for c in rig.cameras)}; where their images are is to be added")
+    check_new(a.out, a.force)
+    rig = FORMATS[a.format].read(a.file)
+    write_rig(a.out, rig, [None] * len(rig))
+    print(f"{a.out}: {', '.join(c.name for c in rig.cameras)}; where their images are is to be added")
     return 0
 
 
-def _export(arguments: argparse.Namespace) -> int:
+def _export(a: argparse.Namespace) -> int:
     from hardware.calibration.rig_formats import FORMATS
     from hardware.files.rig_file import read_rig
-    from hardware.process.progress import check_new
 
-    check_new(arguments.out, arguments.force)
-    rig = read_rig(arguments.rig).rig
-    FORMATS[arguments.format].write(arguments.out, rig)
-    print(f"{arguments.out}: {', '.join(c.name for c in rig.cameras)}")
+    check_new(a.out, a.force)
+    rig = read_rig(a.rig).rig
+    FORMATS[a.format].write(a.out, rig)
+    print(f"{a.out}: {', '.join(c.name for c in rig.cameras)}")
     return 0
+
+
+def _add_arm(parts: Commands) -> None:
+    part = parts.add(
+        "arm",
+        _calibrate_arm,
+        "where the arm stands before the cameras, where its tip is, how late it is",
+        "Let the arm move its needle before the calibrated cameras, find the tip in the pictures, and get\n"
+        "the arm's place, the tool's offset, dead time and servo lag, each with its doubt, and a verdict. Or do\n"
+        "that again from a recorded folder; or find the place alone from points that the tip has touched.\n"
+        "Ctrl-C stops the arm and keeps what was recorded. Exit code 0: good enough to print with; 1: not.",
+        "stillbed calibrate arm --virtual --record try -o arm.toml",
+        "stillbed calibrate arm --device /dev/ttyUSB0 --cameras rig.toml --record moved --yes -o arm.toml",
+        "stillbed calibrate arm moved -o arm.toml",
+        "stillbed calibrate arm --touched points.toml --cameras rig.toml -o arm.toml",
+    )
+    add = part.add_argument
+    add("folder", nargs="?", type=Path, metavar="FOLDER", help="a calibration that was recorded before")
+    add("--device", metavar="DEVICE", help="the arm's port: a path, or a URL of pyserial's")
+    add("--virtual", action="store_true", help="an arm and cameras that are simulated, with exact truth")
+    add("--terminal", action="store_true", help="with --virtual: on a pseudo-terminal, in real time, as at a port")
+    add("--touched", type=Path, metavar="POINTS.toml", help="four or more points that the tip has touched")
+    add("-o", "--out", type=Path, required=True, metavar="ARM.toml", help="to write; report beside it")
+    add("--cameras", type=Path, metavar="RIG.toml", help="the calibrated cameras, with their sources")
+    add("--arm", type=Path, metavar="ARM.toml", help="its limits, home, dialect, lag as known so far")
+    add("--record", type=Path, metavar="FOLDER", help="new folder for pictures and commands")
+    add("--limit-mm", type=positive, default=0.1, metavar="MM", help="of the tip, to pass; default 0.1")
+    add("--keep-tool", action="store_true", help="do not seek the tool's offset: nothing is turned")
+    add("--keep-latency", action="store_true", help="do not seek dead time and lag")
+    moves = part.add_argument_group("the moves")
+    moves.add_argument("--places", type=int, default=20, metavar="N", help="to rest at; default 20")
+    moves.add_argument("--reach-mm", type=float, default=50.0, metavar="MM", help="along X and Y; default 50")
+    moves.add_argument("--up-mm", type=float, default=45.0, metavar="MM", help="above where it begins; default 45")
+    moves.add_argument("--down-mm", type=float, default=20.0, metavar="MM", help="below it; default 20")
+    moves.add_argument("--turn-deg", type=float, default=35.0, metavar="DEG", help="of A, B and C; default 35")
+    moves.add_argument("--speed-mm-s", type=float, default=80.0, metavar="MM_S", help="at most; default 80")
+    moves.add_argument("--dwell-s", type=float, default=0.6, metavar="S", help="at each place; default 0.6")
+    moves.add_argument("--swing-s", type=float, default=8.0, metavar="S", help="a swing at the end; default 8")
+    moves.add_argument("--stands", metavar="WHERE", help="where a silent arm stands: X,Y,Z,A,B,C or home")
+    moves.add_argument("--yes", action="store_true", help="somebody sees that nobody is within the arm's reach")
+    moves.add_argument("--no-pause-frame", action="store_true", help="its controller knows no frame that stops it")
+    moves.add_argument("--seed", type=int, default=0, metavar="N", help="of the virtual arm's errors; default 0")
+
+
+def _calibrate_arm(a: argparse.Namespace) -> int:
+    given = [name for name in ARM_SOURCES if getattr(a, name)]
+    if len(given) != 1:
+        allowed = "one of a recorded FOLDER, --device, --virtual or --touched"
+        raise wrong_option("calibrate arm", " and ".join(given) or "nothing", allowed)
+    if a.terminal and not a.virtual:
+        raise wrong_option("--terminal", "given", "with --virtual: a --device is at its own port")
+    needed = {"device": ("cameras", "record"), "virtual": ("record",), "touched": ("cameras",), "folder": ()}[given[0]]
+    for name in needed:
+        if getattr(a, name) is None:
+            raise wrong_option(f"--{name}", "missing", f"given with {given[0]}")
+    try:
+        outcome = {"device": _from_device, "virtual": _virtual, "touched": _touched, "folder": _folder}[given[0]](a)
+    except KeyboardInterrupt:
+        if "record" not in needed or not (a.record.is_dir() and any(a.record.iterdir())):
+            raise
+        print(f"\nstillbed: interrupted; {left_files_text(a.record)}; {_resume_hint(a.record, a.out)}", file=sys.stderr)
+        return INTERRUPTED
+    print(outcome.text)
+    return 0 if outcome.verdict.passed else NOT_GOOD_ENOUGH
+
+
+def _resume_hint(record: Path, out: Path) -> str:
+    """What may be done with a recording that was interrupted."""
+    anew = "to begin anew, name another --record or empty this one"
+    if not (record / "frames.csv").exists():
+        return anew
+    return f"`stillbed calibrate arm {record} -o {out}` takes what is there; {anew}"
+
+
+def _arm_options(a: argparse.Namespace) -> ArmCalibrationOptions:
+    import numpy as np
+
+    from estimation.calibration.arm_fit import ArmUnknowns
+    from hardware.calibration.arm_record import MoveOptions
+    from hardware.calibration.arm_run import ArmCalibrationOptions
+
+    turn = 0.0 if a.keep_tool else float(np.deg2rad(a.turn_deg))
+    swing = 0.0 if a.keep_latency else a.swing_s
+    moves = MoveOptions(a.places, a.reach_mm, a.up_mm, a.down_mm, turn, a.speed_mm_s, a.dwell_s, swing)
+    return ArmCalibrationOptions(a.limit_mm, ArmUnknowns(tool=not a.keep_tool, latency=not a.keep_latency), moves)
+
+
+def _folder(a: argparse.Namespace, truth: ArmTruth | None = None) -> ArmCalibrationResult:
+    """Solve the folder that is named, or the one that was recorded just now. truth: of a virtual arm."""
+    from hardware.calibration.arm_run import run_folder
+
+    with progress_bar("tips", "frame sets") as progress:
+        return run_folder(a.folder or a.record, a.out, _arm_options(a), progress, truth)
+
+
+def _virtual(a: argparse.Namespace) -> ArmCalibrationResult:
+    from hardware.calibration.arm_run import check_out, check_record, record_in_virtual_time, record_on_terminal
+    from hardware.simulator.watched_arm import watched_arm
+
+    check_out(a.out)
+    options = _arm_options(a).moves
+    check_record(a.record)
+    with progress_bar("moves", "ticks") as moves, progress_bar("pictures", "frame sets") as pictures:
+        watched = watched_arm(a.seed)
+        if a.terminal:
+            truth = record_on_terminal(watched, WallClock(), a.record, options, moves, pictures)
+        else:
+            truth = record_in_virtual_time(watched, a.record, options, moves, pictures)
+    return _folder(a, truth)
+
+
+def _from_device(a: argparse.Namespace) -> ArmCalibrationResult:
+    from hardware.arm.console import axes_from_text
+    from hardware.arm.port import PortOpener
+    from hardware.arm.profile import LinkSettings
+    from hardware.calibration.arm_record import record_live
+    from hardware.calibration.arm_run import check_out, check_record, copy_rig_json
+    from hardware.cameras.live import LiveCameras
+    from hardware.cameras.sources import read_live_rig
+
+    if not a.yes:
+        raise InputError("arm", "--yes", "missing", "given by whoever sees that nobody is within the arm's reach")
+    check_out(a.out)
+    options, clock, profile = _arm_options(a).moves, WallClock(), arm_profile(a.arm)
+    stands = None if a.stands is None else axes_from_text(a.stands, profile.arm.home)
+    rig, sources = read_live_rig(a.cameras)
+    check_record(a.record)
+    copy_rig_json(a.cameras, a.record)
+    device, link = PortOpener(a.device, profile.baud), LinkSettings(pause_frame=not a.no_pause_frame)
+    try:
+        with progress_bar("moves", "ticks") as moves:
+            live = LiveCameras(rig, sources, clock)
+            record_live(live, rig, device, profile, clock, a.record, stands, options, moves, link)
+    finally:
+        device.release()
+    return _folder(a)
+
+
+def _touched(a: argparse.Namespace) -> ArmCalibrationResult:
+    from hardware.calibration.arm_run import calibrate_touched
+
+    return calibrate_touched(a.touched, a.cameras, arm_profile(a.arm), a.out, a.keep_tool)

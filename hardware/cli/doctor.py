@@ -72,16 +72,18 @@ def machine_checks(folder: Path, clock: Clock, root: Path = FILE_SYSTEM_ROOT) ->
     ]
 
 
+def _check(name: str, good: bool, text: str, remedy: str, otherwise: CheckVerdict = CheckVerdict.WARN) -> Check:
+    """PASS where `good`; otherwise that verdict, with what to do."""
+    return Check(name, CheckVerdict.PASS, text) if good else Check(name, otherwise, text, remedy)
+
+
 def python_check(found: tuple[int, ...] = sys.version_info[:3]) -> Check:
     """Python, by its version."""
     text = f"{'.'.join(map(str, found))} on {platform.system()} {platform.machine()}"
     if found < (3, 11):
         return Check("python", CheckVerdict.FAIL, text, "install Python 3.11 or newer: make PYTHON=python3.12")
-    if sys.platform != "linux":
-        return Check(
-            "python", CheckVerdict.WARN, text, "live runs are made for Linux; recordings and planning work here"
-        )
-    return Check("python", CheckVerdict.PASS, text)
+    remedy = "live runs are made for Linux; recordings and planning work here"
+    return _check("python", sys.platform == "linux", text, remedy)
 
 
 def processor_check(root: Path = FILE_SYSTEM_ROOT) -> Check:
@@ -89,15 +91,11 @@ def processor_check(root: Path = FILE_SYSTEM_ROOT) -> Check:
     machine = this_machine()
     text = f"{machine.cpu}, {machine.cores} cores"
     flags = _kernel_values(root / "proc/cpuinfo", "flags")
-    lacking = [name for name in CPU_FLAGS if flags and name not in flags[0].split()]
-    if lacking:
-        return Check(
-            "processor", CheckVerdict.WARN, f"{text}, without {' and '.join(lacking)}", "poses will take longer"
-        )
-    if machine.cores < MIN_CORES:
-        remedy = "track recordings here, print on a machine with two cores"
-        return Check("processor", CheckVerdict.WARN, text, remedy)
-    return Check("processor", CheckVerdict.PASS, text)
+    missing = " and ".join(name for name in CPU_FLAGS if flags and name not in flags[0].split())
+    if missing:
+        return Check("processor", CheckVerdict.WARN, f"{text}, without {missing}", "poses will take longer")
+    remedy = "track recordings here, print on a machine with two cores"
+    return _check("processor", machine.cores >= MIN_CORES, text, remedy)
 
 
 def memory_check(root: Path = FILE_SYSTEM_ROOT) -> Check:
@@ -106,37 +104,25 @@ def memory_check(root: Path = FILE_SYSTEM_ROOT) -> Check:
     if not values:
         return Check("memory", CheckVerdict.WARN, "this system does not tell", f"have {MIN_MEMORY_GB:g} GB free")
     free = int(values[0].split()[0]) / 1e6
-    if free < MIN_MEMORY_GB:
-        return Check(
-            "memory", CheckVerdict.WARN, f"{free:.1f} GB free", f"close programs until {MIN_MEMORY_GB:g} GB are"
-        )
-    return Check("memory", CheckVerdict.PASS, f"{free:.1f} GB free")
+    remedy = f"close programs until {MIN_MEMORY_GB:g} GB are"
+    return _check("memory", free >= MIN_MEMORY_GB, f"{free:.1f} GB free", remedy)
 
 
 def disk_check(folder: Path) -> Check:
     """Room for recordings."""
-    free, text = _free_gb(folder), f"free in {folder.resolve()}"
-    verdict = (
-        CheckVerdict.FAIL
-        if free < MIN_DISK_GB[0]
-        else CheckVerdict.WARN
-        if free < MIN_DISK_GB[1]
-        else CheckVerdict.PASS
-    )
-    remedy = "" if verdict is CheckVerdict.PASS else f"record where there are {MIN_DISK_GB[1]:g} GB, or make room"
-    return Check("disk", verdict, f"{free:.1f} GB {text}", remedy)
+    free, (least, enough) = _free_gb(folder), MIN_DISK_GB
+    text, remedy = f"{free:.1f} GB free in {folder.resolve()}", f"record where there are {enough:g} GB, or make room"
+    return _check("disk", free >= enough, text, remedy, CheckVerdict.FAIL if free < least else CheckVerdict.WARN)
 
 
 def shared_check(root: Path = FILE_SYSTEM_ROOT) -> Check:
     """Room for the pictures that go from one process to another."""
     folder = root / "dev/shm"
-    if not folder.is_dir():
-        folder = Path(tempfile.gettempdir())
-    free = _free_gb(folder)
-    if free < MIN_SHARED_GB:
-        remedy = "in a container: --shm-size 1g; elsewhere: mount -o remount,size=1g /dev/shm"
-        return Check("shared memory", CheckVerdict.FAIL, f"{1000 * free:.0f} MB free", remedy)
-    return Check("shared memory", CheckVerdict.PASS, f"{free:.1f} GB free")
+    free = _free_gb(folder if folder.is_dir() else Path(tempfile.gettempdir()))
+    good = free >= MIN_SHARED_GB
+    text = f"{free:.1f} GB free" if good else f"{1000 * free:.0f} MB free"
+    remedy = "in a container: --shm-size 1g; elsewhere: mount -o remount,size=1g /dev/shm"
+    return _check("shared memory", good, text, remedy, CheckVerdict.FAIL)
 
 
 def priority_check() -> Check:
@@ -144,9 +130,7 @@ def priority_check() -> Check:
     ask = "from hardware.process.system import ask_for_real_time; print(ask_for_real_time())"
     done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, timeout=20, check=False)
     text = done.stdout.strip() or NO_ANSWER
-    if text in (NO_PRIORITY, NO_ANSWER):
-        return Check("priority", CheckVerdict.WARN, text, PRIORITY_REMEDY)
-    return Check("priority", CheckVerdict.PASS, text)
+    return _check("priority", text not in (NO_PRIORITY, NO_ANSWER), text, PRIORITY_REMEDY)
 
 
 def punctuality_check(clock: Clock, ticks: int = PROBE_TICKS) -> Check:
@@ -158,18 +142,14 @@ def punctuality_check(clock: Clock, ticks: int = PROBE_TICKS) -> Check:
         late.add(clock.now() - (begun + k * TICK_PERIOD))
     half, worst = (1000 * late.percentile(share) for share in (50, 98))
     text = f"{ticks} ticks of {1000 * TICK_PERIOD:g} ms: {half:.1f} ms late, {worst:.1f} at the worst"
-    if worst > MAX_LATE_MS:
-        return Check("clock", CheckVerdict.WARN, text, "stop other work on this machine; let it not save power")
-    return Check("clock", CheckVerdict.PASS, text)
+    return _check("clock", worst <= MAX_LATE_MS, text, "stop other work on this machine; let it not save power")
 
 
 def evenness_check(clock: Clock, pieces: int = PROBE_PIECES) -> Check:
     """Whether the same work takes the same time."""
     result = measure_evenness(clock, pieces)
-    if result.slow > MAX_SLOW_SHARE:
-        remedy = "stop other work; where nothing else runs, it is the machine: print with one that shares nothing"
-        return Check("evenness", CheckVerdict.WARN, str(result), remedy)
-    return Check("evenness", CheckVerdict.PASS, str(result))
+    remedy = "stop other work; where nothing else runs, it is the machine: print with one that shares nothing"
+    return _check("evenness", result.slow <= MAX_SLOW_SHARE, str(result), remedy)
 
 
 def loopback_check(host: str = "127.0.0.1") -> Check:
@@ -178,9 +158,8 @@ def loopback_check(host: str = "127.0.0.1") -> Check:
         with socket.create_server((host, 0)):
             return Check("operator's page", CheckVerdict.PASS, f"{host} takes connections")
     except OSError as error:
-        return Check(
-            "operator's page", CheckVerdict.FAIL, f"{host}: {error}", "let programs listen on the loopback address"
-        )
+        remedy = "let programs listen on the loopback address"
+        return Check("operator's page", CheckVerdict.FAIL, f"{host}: {error}", remedy)
 
 
 def _free_gb(folder: Path) -> float:
@@ -220,11 +199,7 @@ def library_checks(names: list[str] | None = None) -> list[Check]:
 def required_libraries() -> list[str]:
     """The distributions that this machine's stillbed needs, extras apart. PackageNotFoundError: it is not installed."""
     requirements = [Requirement(line) for line in requires("stillbed") or []]
-    return [
-        requirement.name
-        for requirement in requirements
-        if requirement.marker is None or requirement.marker.evaluate({"extra": ""})
-    ]
+    return [r.name for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
 
 
 def modules_of(names: list[str]) -> dict[str, str]:
@@ -244,13 +219,11 @@ def load_failures(modules: list[str], patience: float = LOAD_TIMEOUT) -> dict[st
     patience: s for all that one process loads.
     """
     failures: dict[str, LoadFailure] = {}
-    left = list(modules)
-    while left:
-        loaded, trouble = _load_until_failure(left, patience)
-        left = left[loaded:]
-        if left:
-            failures[left[0]] = trouble
-            left = left[1:]
+    while modules:
+        loaded, failure = _load_until_failure(modules, patience)
+        if loaded < len(modules):
+            failures[modules[loaded]] = failure
+        modules = modules[loaded + 1 :]
     return failures
 
 
@@ -302,13 +275,8 @@ def device_checks() -> list[Check]:
     from hardware.arm.port import lock_folder, serial_ports
     from hardware.cameras.sources import list_devices
 
-    return [
-        camera_check(list_devices()),
-        arm_check(serial_ports()),
-        lock_check(lock_folder()),
-        video_check(),
-        network_check(),
-    ]
+    ports = [arm_check(serial_ports()), lock_check(lock_folder())]
+    return [camera_check(list_devices()), *ports, video_check(), network_check()]
 
 
 def camera_check(devices: tuple[CameraDevice, ...]) -> Check:
@@ -338,11 +306,9 @@ def video_check() -> Check:
     """Whether recorded videos can be read."""
     from hardware.cameras.capture import reads_videos
 
-    if reads_videos():
-        return Check("videos", CheckVerdict.PASS, "read by FFmpeg")
-    return Check(
-        "videos", CheckVerdict.WARN, "this OpenCV has no FFmpeg", "pip install --force-reinstall opencv-python-headless"
-    )
+    good = reads_videos()
+    text = "read by FFmpeg" if good else "this OpenCV has no FFmpeg"
+    return _check("videos", good, text, "pip install --force-reinstall opencv-python-headless")
 
 
 def network_check() -> Check:
@@ -356,13 +322,7 @@ def network_check() -> Check:
     return Check("wound network", CheckVerdict.PASS, f"{network.size / 1e6:.1f} MB, its hash is right")
 
 
-def _access_check(name: str, nodes: list[tuple[str, str]], told: str, group: str) -> Check:
-    closed = [node for node, _ in nodes if not os.access(node, os.R_OK | os.W_OK)]
-    if closed:
-        return Check(
-            name,
-            CheckVerdict.FAIL,
-            f"{', '.join(closed)} may not be opened by this user",
-            JOIN_GROUP.format(group=group),
-        )
-    return Check(name, CheckVerdict.PASS, told)
+def _access_check(name: str, nodes: list[tuple[str, str]], text: str, group: str) -> Check:
+    closed = ", ".join(node for node, _ in nodes if not os.access(node, os.R_OK | os.W_OK))
+    text = f"{closed} may not be opened by this user" if closed else text
+    return _check(name, not closed, text, JOIN_GROUP.format(group=group), CheckVerdict.FAIL)

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import signal
 import sys
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from estimation.errors import StillbedError
 from hardware.bench.subjects import SUBJECTS, Subject, Subjects
 from hardware.cli.calibrate import add_calibrate
 from hardware.cli.live import add_arm, add_cameras, add_init, add_live
-from hardware.cli.parser import INTERRUPTED, WRONG_INPUT, Commands, Parser, add_command, add_fault, error_text
+from hardware.cli.parser import INTERRUPTED, WRONG_INPUT, Commands, Parser, add_fault, error_text, wrong_option
 from hardware.cli.plan import add_plan, add_reach, add_segment, add_train
 from hardware.cli.sessions import add_compare, add_export, add_import, add_replay, add_smooth, add_track, add_view
-from hardware.process.progress import left_files_text
+from hardware.process.clock import WallClock
+from hardware.process.progress import left_files_text, prepare_out
 from hardware.process.system import fill_standard_streams
 from perception.package_data import named_path
+
+if TYPE_CHECKING:
+    from hardware.operator.view import CheckVerdict
 
 BENCH_OUT = Path("out/bench")
 CHECK_FAILED = 1  # exit code where something failed
@@ -30,15 +36,14 @@ LIMITS_MISSED = 1  # a simulation that ran to its end and did not reach its own 
 
 def add_bench(commands: Commands) -> None:
     """Add the sub-command `bench`; what follows its subject is read once the subject's module is loaded."""
-    command = add_command(
-        commands,
+    add = commands.add(
         "bench",
+        run_bench,
         "measure a part, and print each figure beside its target",
         "Measure a part of stillbed and print each figure beside its target and its reference.",
         "stillbed bench estimator -o out/estimator",
         "stillbed bench --quick",
-    )
-    add = command.add_argument
+    ).add_argument
     add("--list", action="store_true", help="list the subjects and exit")
     add("--all", action="store_true", help="measure all subjects, each in short; what is there is kept")
     add("--quick", action="store_true", help="the same of fewer subjects, in two minutes")
@@ -46,38 +51,26 @@ def add_bench(commands: Commands) -> None:
     add("--against", type=Path, metavar="figures.json", help="with --all or --quick: tell what is worse than there")
     add("subject", nargs="?", metavar="SUBJECT", help="what to measure; see --list")
     add("rest", nargs=argparse.REMAINDER, metavar="...", help="its options; see SUBJECT --help")
-    command.set_defaults(run=lambda arguments: run_bench(arguments))
 
 
 def run_bench(arguments: argparse.Namespace, subjects: Subjects = SUBJECTS) -> None:
     """List the subjects, or measure one or all, print the table and, where a folder was named, save it there."""
+    name = arguments.subject
     if arguments.all or arguments.quick:
         from hardware.bench.whole import run_whole
 
         run_whole(arguments.out, arguments.quick, arguments.against)
-        return
-    if arguments.list or arguments.subject is None:
-        print(subjects_text(subjects))
-        return
-    name, subject = arguments.subject, _chosen_subject(arguments.subject, subjects)
-    options = subject_parser(name, subject).parse_args(arguments.rest)
-    arguments.out = out = options.out  # told where the run is interrupted
-    _measure_subject(name, subject, options, out)
+    elif arguments.list or name is None:
+        width = max(map(len, subjects), default=0)
+        print("\n".join(f"{key:<{width}}  {subject.summary}" for key, subject in subjects.items()))
+    elif name not in subjects:
+        from hardware.process.checks import one_of_text
 
-
-def subjects_text(subjects: Subjects) -> str:
-    """The subjects, a line each."""
-    width = max(map(len, subjects), default=0)
-    return "\n".join(f"{name:<{width}}  {subject.summary}" for name, subject in subjects.items())
-
-
-def _chosen_subject(name: str, subjects: Subjects) -> Subject:
-    from estimation.errors import InputError
-    from hardware.process.checks import one_of_text
-
-    if name not in subjects:
-        raise InputError("command line", "SUBJECT", name, one_of_text(name, list(subjects)))
-    return subjects[name]
+        raise wrong_option("SUBJECT", name, one_of_text(name, list(subjects)))
+    else:
+        options = subject_parser(name, subjects[name]).parse_args(arguments.rest)
+        arguments.out = options.out  # told where the run is interrupted
+        _measure_subject(name, subjects[name], options)
 
 
 def subject_parser(name: str, subject: Subject) -> argparse.ArgumentParser:
@@ -89,62 +82,55 @@ def subject_parser(name: str, subject: Subject) -> argparse.ArgumentParser:
     return parser
 
 
-def _measure_subject(name: str, subject: Subject, options: argparse.Namespace, out: Path | None) -> None:
+def _measure_subject(name: str, subject: Subject, options: argparse.Namespace) -> None:
     from hardware.bench.figures import save, table_text, this_machine
-    from hardware.process.progress import prepare_out
 
-    if out is not None:
-        prepare_out(out, options.force)
+    if options.out is not None:
+        prepare_out(options.out, options.force)
     machine = this_machine()
     print(f"{machine.cpu}, {machine.cores} cores, commit {machine.commit or 'unknown'}\n", flush=True)
     figures = subject.run(options)
     print(table_text(figures))
-    if out is not None:
-        save(out, name, vars(options), figures, machine)
+    if options.out is not None:
+        save(options.out, name, vars(options), figures, machine)
 
 
 def add_doctor(commands: Commands) -> None:
     """Add the sub-command `doctor`."""
-    command = add_command(
-        commands,
+    add = commands.add(
         "doctor",
+        _run_doctor,
         "what works on this machine, and what to do about the rest",
         "Look at the processor, memory, disk, priority, libraries, cameras, serial ports and the shipped\n"
         "network, and say of each whether a live run can be made with it, and what to do where it cannot. Moves\n"
         "nothing and writes nothing. Exit code 1 where something fails; a warning does not.",
         "stillbed doctor",
-    )
-    command.add_argument("--folder", type=Path, default=Path(), metavar="DIR", help="where sessions will be recorded")
-    command.add_argument("--json", action="store_true", help="print JSON")
-    command.set_defaults(run=_run_doctor)
+    ).add_argument
+    add("--folder", type=Path, default=Path(), metavar="DIR", help="where sessions will be recorded")
+    add("--json", action="store_true", help="print JSON")
 
 
-def _run_doctor(arguments: argparse.Namespace) -> int:
-    import json
-    from dataclasses import asdict
-
-    from estimation.errors import InputError
+def _run_doctor(a: argparse.Namespace) -> int:
     from hardware.cli.doctor import device_checks, library_checks, machine_checks
     from hardware.live.checklist import checks_table
     from hardware.operator.view import CheckVerdict
-    from hardware.process.clock import WallClock
 
-    if not arguments.folder.is_dir():
-        raise InputError("command line", "--folder", arguments.folder, "a folder that exists")
+    if not a.folder.is_dir():
+        raise wrong_option("--folder", a.folder, "a folder that exists")
     libraries = library_checks()
-    machine = machine_checks(arguments.folder, WallClock())
+    machine = machine_checks(a.folder, WallClock())
     broken = any(check.verdict is CheckVerdict.FAIL for check in libraries)
     parts = {"machine": machine, "libraries": libraries, "devices": [] if broken else device_checks()}
-    checks = [check for part in parts.values() for check in part]
-    if arguments.json:
+    verdicts = [check.verdict for part in parts.values() for check in part]
+    if a.json:
         print(json.dumps({name: [asdict(check) for check in part] for name, part in parts.items()}, indent=2))
     else:
         print("\n\n".join(f"{name}\n{checks_table(tuple(part))}" for name, part in parts.items() if part))
-        print(f"\n{_verdict_text([check.verdict for check in checks], broken)}")
-    return CHECK_FAILED if any(check.verdict is CheckVerdict.FAIL for check in checks) else 0
+        print(f"\n{_verdict_text(verdicts, broken)}")
+    return CHECK_FAILED if CheckVerdict.FAIL in verdicts else 0
 
 
-def _verdict_text(verdicts: list[Any], broken: bool) -> str:
+def _verdict_text(verdicts: list[CheckVerdict], broken: bool) -> str:
     failed, warned = (sum(v.value == word for v in verdicts) for word in ("fail", "warn"))
     if broken:
         return "libraries are missing; devices were not looked at. Mend these first, then ask again"
@@ -198,26 +184,13 @@ def parser() -> Parser:
         epilog="A SESSION is a folder with rig.toml and frames.csv, or an .mcap file. More: stillbed COMMAND --help",
     )
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
-    commands = top.add_subparsers(metavar="COMMAND", required=True)
-    _add_simulate(commands)
-    add_track(commands)
-    add_smooth(commands)
-    add_compare(commands)
-    add_view(commands)
-    add_segment(commands)
-    add_plan(commands)
-    add_live(commands)
-    add_init(commands)
-    add_replay(commands)
-    add_calibrate(commands)
-    add_reach(commands)
-    add_arm(commands)
-    add_cameras(commands)
-    add_import(commands)
-    add_export(commands)
-    add_train(commands)
-    add_bench(commands)
-    add_doctor(commands)
+    commands = Commands(top, "COMMAND")
+    for add in (
+        _add_simulate, add_track, add_smooth, add_compare, add_view, add_segment, add_plan, add_live, add_init,
+        add_replay, add_calibrate, add_reach, add_arm, add_cameras, add_import, add_export, add_train, add_bench,
+        add_doctor,
+    ):  # fmt: skip
+        add(commands)
     return top
 
 
@@ -235,34 +208,32 @@ class _Version(argparse.Action):
 
 
 def _add_simulate(commands: Commands) -> None:
-    command = add_command(
-        commands,
+    add = commands.add(
         "simulate",
+        _simulate,
         "print on a simulated wound, and measure the nozzle's error",
         "Run a scenario in virtual time: the wound moves, cameras see it, tracking and motion are a live run's, a\n"
         "virtual arm executes, and every millisecond the nozzle is compared with its true checkpoint.\n"
         "Writes the session (MCAP and folder), tracking/, commands.csv, frames.bin, nozzle.csv, summary.json and\n"
         "report.html. Exit code 0 where the scenario's own limits are met, 1 where they are not.",
         "stillbed simulate data/scenarios/breathing_calm.toml -o out/calm",
-    )
-    add = command.add_argument
+    ).add_argument
     add("scenario", type=named_path, metavar="SCENARIO.toml", help="what is simulated; see data/scenarios")
     add("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
     add("--trace", type=Path, metavar="FILE", help="a recorded motion, TUM or CSV, instead of its own")
-    add_fault(command)
+    add_fault(add)
     add("--threads", type=int, default=2, metavar="N", help="threads that render; results do not vary")
     add("--pty", action="store_true", help="send the arm's bytes through a pseudo-terminal")
     add("--force", action="store_true", help="write into a folder that is not empty")
-    command.set_defaults(run=_simulate)
 
 
-def _simulate(arguments: argparse.Namespace) -> int:
+def _simulate(a: argparse.Namespace) -> int:
     from hardware.process.faults import faults_from_texts
     from hardware.simulator.simulate import SimulationOptions, run_simulation
 
-    faults = faults_from_texts("command line", "--fault", arguments.fault)
-    options = SimulationOptions(arguments.trace, faults, arguments.threads, arguments.pty, arguments.force)
-    outcome = run_simulation(arguments.scenario, arguments.out, options)
+    faults = faults_from_texts("command line", "--fault", a.fault)
+    options = SimulationOptions(a.trace, faults, a.threads, a.pty, a.force)
+    outcome = run_simulation(a.scenario, a.out, options)
     print(outcome.text)
     return 0 if outcome.met else LIMITS_MISSED
 

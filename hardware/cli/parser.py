@@ -8,11 +8,18 @@ import math
 import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from estimation.errors import StillbedError
+from estimation.errors import InputError, StillbedError
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress
 
-Commands = Any  # argparse's own type for this is private
+if TYPE_CHECKING:
+    from hardware.arm.profile import ArmProfile
+
+Run = Callable[[argparse.Namespace], int | None]  # a command: its exit code, None for 0
+FAULT_TEXT = 'what goes wrong, such as "camera0 stuck at 5s for 2s"; may be given more than once; see docs/faults.md'
 WRONG_INPUT = 2  # exit codes
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
 USAGE = re.compile(r"python \S+\.py.*?(?=\s{2,}|$)", re.MULTILINE)  # a line of the docstring
@@ -27,17 +34,24 @@ class Parser(argparse.ArgumentParser):
         sys.exit(WRONG_INPUT)
 
 
-def add_command(commands: Commands, name: str, summary: str, text: str, *examples: str) -> argparse.ArgumentParser:
-    """Add a sub-command: a line for the list of commands, what it does, and how it is called."""
-    lines = "".join(f"\n  {example}" for example in examples)
-    made: argparse.ArgumentParser = commands.add_parser(
-        name,
-        help=summary,
-        description=text,
-        epilog=f"example{'s' if len(examples) > 1 else ''}:{lines}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    return made
+class Commands:
+    """The sub-commands of a parser."""
+
+    def __init__(self, parser: argparse.ArgumentParser, metavar: str) -> None:
+        self._parsers = parser.add_subparsers(metavar=metavar, required=True)
+
+    def add(self, name: str, run: Run | None, summary: str, text: str, *examples: str) -> argparse.ArgumentParser:
+        """Add one: what runs it, its line in the list of commands, what it does, and how it is called."""
+        lines = "".join(f"\n  {example}" for example in examples)
+        parser = self._parsers.add_parser(
+            name,
+            help=summary,
+            description=text,
+            epilog=f"example{'s' if len(examples) > 1 else ''}:{lines}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        parser.set_defaults(run=run)
+        return parser
 
 
 def error_text(error: Exception) -> str:
@@ -45,6 +59,24 @@ def error_text(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror.lower()}"
     return str(error)
+
+
+def wrong_option(option: str, got: object, allowed: str) -> InputError:
+    """The error about an option of the command line."""
+    return InputError("command line", option, got, allowed)
+
+
+def progress_bar(what: str, unit: str) -> Progress:
+    """Progress by the machine's clock, on stderr."""
+    return Progress(what, unit, WallClock().now)
+
+
+def arm_profile(path: Path | None) -> ArmProfile:
+    """The profile in an arm file, or the default one."""
+    from hardware.arm.profile import ArmProfile
+    from hardware.files.arm_file import read_arm
+
+    return ArmProfile() if path is None else read_arm(path)
 
 
 def positive(text: str) -> float:
@@ -72,15 +104,9 @@ def _number(text: str) -> float:
     return value if math.isfinite(value) else math.nan
 
 
-def add_fault(command: argparse.ArgumentParser) -> None:
+def add_fault(add: Callable[..., Any], text: str = FAULT_TEXT) -> None:
     """Add the option `--fault` of a simulated or replayed run."""
-    command.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="FAULT",
-        help='what goes wrong, such as "camera0 stuck at 5s for 2s"; may be given more than once; see docs/faults.md',
-    )
+    add("--fault", action="append", default=[], metavar="FAULT", help=text)
 
 
 def run_script(main: Callable[..., None], text: str | None, words: Sequence[str] | None = None) -> NoReturn:

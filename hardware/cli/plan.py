@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hardware.cli.parser import Commands, add_command, not_negative
+from hardware.cli.parser import Commands, not_negative, wrong_option
 from perception.package_data import named_path
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ UNET_METHOD, SHAPE_METHOD = "unet", "shape"
 def add_plan(commands: Commands) -> None:
     """Add the sub-command `plan`."""
     summary = "plan the print of a scanned wound: layers, beads, checkpoints"
-    command = add_command(commands, "plan", summary, PLAN_TEXT, *PLAN_EXAMPLES)
+    command = commands.add("plan", _run_plan, summary, PLAN_TEXT, *PLAN_EXAMPLES)
     add = command.add_argument
     add("scan", type=Path, nargs="?", metavar="SCAN", help="mesh of the wound, or contour")
     add("-o", "--out", type=Path, required=True, metavar="PATH.csv", help="path to write")
@@ -58,17 +58,14 @@ def add_plan(commands: Commands) -> None:
     _add_layers(command)
     _add_pattern(command)
     _add_way(command)
-    command.set_defaults(run=_run_plan)
 
 
 def _add_scan(command: argparse.ArgumentParser) -> None:
     add = command.add_argument_group("the scan").add_argument
     add("--unit", choices=("mm", "cm", "m", "inch"), default="mm", help="of SCAN's numbers; default mm")
     add("--flip", action="store_true", help="turn SCAN over, whose normals point inwards")
-    add(
-        "--outline", type=Path, metavar="CSV",
-        help="outline of the wound, x_mm,y_mm[,z_mm] in SCAN's frame, mm; default: found",
-    )  # fmt: skip
+    outline = "outline of the wound, x_mm,y_mm[,z_mm] in SCAN's frame, mm; default: found"
+    add("--outline", type=Path, metavar="CSV", help=outline)
 
 
 def _add_layers(command: argparse.ArgumentParser) -> None:
@@ -132,11 +129,10 @@ def _add_way(command: argparse.ArgumentParser) -> None:
         add(name, type=float, default=default, metavar=metavar, help=f"{text}; default {default:g}")
 
 
-def _run_plan(arguments: argparse.Namespace) -> None:
+def _run_plan(a: argparse.Namespace) -> None:
     from hardware.plan.order import PlanRequest, PlanSettings
     from hardware.plan.run import run_plan
 
-    a = arguments
     settings = PlanSettings(
         a.material, tuple(a.tissue), a.layers, a.layer_height, a.pattern, a.angle, a.parallel, a.bead,
         a.overlap_percent, a.inset, a.rims, a.speed, a.travel, a.temperature, a.spacing, a.chord, a.lift, a.wait,
@@ -148,32 +144,26 @@ def _run_plan(arguments: argparse.Namespace) -> None:
 
 def add_reach(commands: Commands) -> None:
     """Add the sub-command `reach`."""
-    command = add_command(
-        commands,
+    add = commands.add(
         "reach",
+        _run_reach,
         "check, before printing, that an arm can print a path",
         "Check each checkpoint of a path against the arm's joints: reach, ranges, speeds, singularities,\n"
         "on the surface at rest and wherever it moves to. Prints a table; with -o also writes path.csv (the path with\n"
         "the column `feasible`), reach.csv (joints and distances of each checkpoint) and reach.html (pictures).\n"
         "Exit code 0 where all can be printed, 1 where not.",
         "stillbed reach data/paths/wound_raster.csv --arm data/arms/s6h4d.toml --amplitude-mm 10",
-    )
-    add = command.add_argument
+    ).add_argument
     add("path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
     add("--arm", type=named_path, required=True, metavar="ARM.toml", help="with a table [kinematics]")
-    add(
-        "--surface",
-        type=_six_numbers,
-        metavar="X,Y,Z,A,B,C",
-        help="the surface at rest in the arm's frame, mm and degrees; default: level, under the default arm's home",
-    )
+    surface = "the surface at rest in the arm's frame, mm and degrees; default: level, under the default arm's home"
+    add("--surface", type=_six_numbers, metavar="X,Y,Z,A,B,C", help=surface)
     add("--amplitude-mm", type=not_negative, default=0.0, metavar="MM", help="of its motion along its normal")
     add("--turn-deg", type=not_negative, default=0.0, metavar="DEG", help="of its motion about x, y and z")
     add("--rate-hz", type=not_negative, default=0.25, metavar="HZ", help="of that motion; default 0.25")
     add("--spin", action="store_true", help="let the tool spin about its own axis where that helps")
     add("-o", "--out", type=Path, metavar="OUT", help="folder to write to, new or empty")
     add("--force", action="store_true", help="write into a folder that is not empty")
-    command.set_defaults(run=_run_reach)
 
 
 def _six_numbers(text: str) -> tuple[float, ...]:
@@ -186,10 +176,9 @@ def _six_numbers(text: str) -> tuple[float, ...]:
     return values
 
 
-def _run_reach(arguments: argparse.Namespace) -> int:
+def _run_reach(a: argparse.Namespace) -> int:
     from hardware.offline.reach import ReachQuestion, run_reach
 
-    a = arguments
     question = ReachQuestion(a.surface, a.amplitude_mm, a.turn_deg, a.rate_hz, a.spin)
     answer = run_reach(a.path, a.arm, question, a.out, a.force)
     print(answer.text)
@@ -198,109 +187,83 @@ def _run_reach(arguments: argparse.Namespace) -> int:
 
 def add_segment(commands: Commands) -> None:
     """Add the sub-command `segment`."""
-    command = add_command(
-        commands,
+    add = commands.add(
         "segment",
+        _run_segment,
         "find the wound in pictures or a video",
         "Find the wound in pictures, folders of pictures or videos. Writes a PNG mask (0 or 255) of each\n"
         "picture's own size and name, and wounds.csv: confidence, area, centroid, box and time of each. A picture\n"
         "without a wound gets an empty mask. Ctrl-C keeps what is done.",
         "stillbed segment photos/ -o masks --overlay",
         "stillbed segment ward.mp4 -o masks --method shape",
-    )
-    add = command.add_argument
+    ).add_argument
     add("inputs", type=Path, nargs="+", metavar="INPUT", help="picture, folder of pictures, or video")
     add("-o", "--out", type=Path, required=True, metavar="MASKS", help="folder, new or empty")
-    add(
-        "--method",
-        choices=(UNET_METHOD, SHAPE_METHOD),
-        default=UNET_METHOD,
-        help="unet: a trained network; shape: outlines like the scan's",
-    )
+    methods = "unet: a trained network; shape: outlines like the scan's"
+    add("--method", choices=(UNET_METHOD, SHAPE_METHOD), default=UNET_METHOD, help=methods)
     add("--model", type=Path, metavar="X.onnx", help="another network than the one that comes along")
     add("--scan", type=Path, metavar="SCAN", help="with --method shape: of the wound, z upwards")
     add("--overlay", action="store_true", help="also write the pictures with the outlines drawn in")
     add("--mm-per-px", type=float, metavar="S", help="scale at the wound, for areas in mm^2")
     add("--threads", type=int, default=2, metavar="N", help="of the network; results do not vary")
     add("--force", action="store_true", help="write into a folder that is not empty")
-    command.set_defaults(run=_run_segment)
 
 
 def add_train(commands: Commands) -> None:
     """Add the sub-command `train`."""
-    command = add_command(
-        commands,
+    add = commands.add(
         "train",
+        _run_train,
         "train the wound network on labelled pictures",
         "Train the wound network. Each DATASET holds images/ and labels/, a mask of the same name and\n"
         "size for each picture. Pictures are grouped by what they show, a part is held out and judged at the end.\n"
         "Writes X.onnx, X.toml (hash and settings), X.md (model card) and X_curves.png; X.ckpt lets a run\n"
         "that was broken off go on. Needs the extra [train]: pip install 'stillbed[train]'.",
         "stillbed train data/fuseg data/medetec -o wound.onnx",
-    )
-    add = command.add_argument
+    ).add_argument
     add("datasets", type=Path, nargs="+", metavar="DATASET", help="the first is held out in part")
     add("-o", "--out", type=Path, required=True, metavar="X.onnx", help="file to write")
-    add(
-        "--network",
-        choices=("wound", "thesis", "shape"),
-        default="wound",
-        help="thesis: the U-Net of its 3.3; shape: no network, but what segment --method shape needs, X.toml",
-    )
+    networks = "thesis: the U-Net of its 3.3; shape: no network, but what segment --method shape needs, X.toml"
+    add("--network", choices=("wound", "thesis", "shape"), default="wound", help=networks)
     add("--rounds", type=int, metavar="N", help="of 250 steps (thesis: 100); more take longer")
     add("--rendered", type=int, default=120, metavar="N", help="rendered pictures to add")
     add("--hold-out", type=int, default=160, metavar="N", help="pictures to judge by, in groups")
     add("--threads", type=int, default=1, metavar="N", help="of torch")
     add("--seed", type=int, default=1, metavar="N", help="of the weights and of all that is drawn")
     add("--force", action="store_true", help="overwrite X.onnx and begin anew")
-    command.set_defaults(run=_run_train)
 
 
-def _run_segment(arguments: argparse.Namespace) -> None:
+def _run_segment(a: argparse.Namespace) -> None:
     from hardware.offline.segment import SegmentOptions, run_segment
 
-    _check_segment(arguments)
-    how = arguments.scan, arguments.mm_per_px, arguments.threads
-    segmenter = segmenter_by(arguments.method, arguments.model, *how)
-    options = SegmentOptions(arguments.overlay, arguments.mm_per_px, arguments.force)
-    print(run_segment(arguments.inputs, arguments.out, segmenter, options))
+    if a.mm_per_px is not None and not 0 < a.mm_per_px < 100:
+        raise wrong_option("--mm-per-px", a.mm_per_px, "above 0 and below 100")
+    if not 1 <= a.threads <= 64:
+        raise wrong_option("--threads", a.threads, "1 to 64")
+    if a.method == SHAPE_METHOD and a.model is not None:
+        raise wrong_option("--model", a.model, "nothing with --method shape, which has no network")
+    if a.method == UNET_METHOD and a.scan is not None:
+        raise wrong_option("--scan", a.scan, "a scan only with --method shape")
+    segmenter = _segmenter(a)
+    print(run_segment(a.inputs, a.out, segmenter, SegmentOptions(a.overlay, a.mm_per_px, a.force)))
 
 
-def _check_segment(arguments: argparse.Namespace) -> None:
-    from estimation.errors import InputError
-
-    if arguments.mm_per_px is not None and not 0 < arguments.mm_per_px < 100:
-        raise InputError("command line", "--mm-per-px", arguments.mm_per_px, "above 0 and below 100")
-    if not 1 <= arguments.threads <= 64:
-        raise InputError("command line", "--threads", arguments.threads, "1 to 64")
-    if arguments.method == SHAPE_METHOD and arguments.model is not None:
-        raise InputError(
-            "command line", "--model", arguments.model, "nothing with --method shape, which has no network"
-        )
-    if arguments.method == UNET_METHOD and arguments.scan is not None:
-        raise InputError("command line", "--scan", arguments.scan, "a scan only with --method shape")
-
-
-def segmenter_by(
-    method: str, model: Path | None = None, scan: Path | None = None, mm_per_px: float | None = None, threads: int = 2
-) -> Segmenter:
-    """A segmenter by the name of its method. model: a network's file, None: the one that comes along. scan: of the
-    wound, for its outline, and for its size where mm_per_px is known."""
-    if method == UNET_METHOD:
-        from perception.wound.network import WoundNetwork, shipped_model
-        from perception.wound.segmentation import NetworkSegmenter
-
-        network = WoundNetwork(shipped_model() if model is None else model, threads)
-        return NetworkSegmenter(network, network.settings)
-    from perception.wound.network import shipped_model
+def _segmenter(a: argparse.Namespace) -> Segmenter:
+    """The segmenter of the method. The network is the one that comes along unless another is named; the scan of the
+    wound gives its outline, and its size where the scale is known."""
+    from perception.wound.network import WoundNetwork, shipped_model
+    from perception.wound.segmentation import NetworkSegmenter
     from perception.wound.shape_matching import ShapeSegmenter, read_shape_model, scan_outline
 
+    if a.method == UNET_METHOD:
+        network = WoundNetwork(shipped_model() if a.model is None else a.model, a.threads)
+        return NetworkSegmenter(network, network.settings)
     pattern, area = None, None
-    if scan is not None:
+    if a.scan is not None:
         from hardware.files.mesh_file import read_mesh
 
-        pattern, across = scan_outline(read_mesh(scan).scan)
-        area = None if mm_per_px is None else across / mm_per_px**2
+        pattern, across = scan_outline(read_mesh(a.scan).scan)
+        area = None if a.mm_per_px is None else across / a.mm_per_px**2
     return ShapeSegmenter(read_shape_model(shipped_model("shape", ".toml")), pattern, area)
 
 
