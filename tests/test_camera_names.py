@@ -25,7 +25,7 @@ from hardware.cameras.capture import (
     request_picture,
 )
 from hardware.cameras.feed import Arrival
-from hardware.cameras.frame_sets import LEADER_HYSTERESIS, FrameSetBuilder
+from hardware.cameras.live import LEADER_HYSTERESIS, FrameSetBuilder
 from hardware.cameras.sources import (
     CONTROL_RANGES,
     CameraSource,

@@ -26,7 +26,7 @@ from hardware.files.path_file import read_contour, read_path
 from hardware.files.ply_file import write_ply
 from hardware.plan import run as planning_command
 from hardware.plan.order import SETTING_RANGES, PlanSettings, example_scan, order_of
-from hardware.plan.run import MAX_MIDDLE_DISTANCE, ScanPlacement, WoundSighting, _sight
+from hardware.plan.run import MAX_MIDDLE_DISTANCE, WoundSighting, _sighting, placement_lines
 from perception.lens import Lenses
 from planning.command import Move
 from planning.limits import MotionLimits
@@ -243,7 +243,7 @@ def seen(camera: int, outline: Array) -> np.ndarray[tuple[int, ...], np.dtype[np
 
 @pytest.mark.parametrize("camera", range(3))
 def test_a_plan_on_the_wound_is_near_its_middle(camera: int) -> None:
-    found = _sight(arc_rig().cameras[camera], seen(camera, OUTLINE), BASE_FROM_REST, OUTLINE)
+    found = _sighting(arc_rig().cameras[camera], seen(camera, OUTLINE), BASE_FROM_REST, OUTLINE)
     assert found.off < 0.5 and found.share > 0.9
 
 
@@ -251,13 +251,13 @@ def test_a_plan_on_the_wound_is_near_its_middle(camera: int) -> None:
 @settings(max_examples=10, deadline=None)
 def test_a_plan_beside_the_wound_is_off_by_as_much(away: float, angle: float) -> None:
     moved = OUTLINE + away * np.array([np.cos(angle), np.sin(angle), 0.0])
-    offs = [_sight(arc_rig().cameras[c], seen(c, OUTLINE), BASE_FROM_REST, moved).off for c in range(3)]
+    offs = [_sighting(arc_rig().cameras[c], seen(c, OUTLINE), BASE_FROM_REST, moved).off for c in range(3)]
     assert 0.85 * away < max(offs) < 1.15 * away + 0.5
-    lines = ScanPlacement(np.eye(4), "TRACKING", (WoundSighting("top", max(offs), 1.0),)).lines()
+    lines = placement_lines("TRACKING", [WoundSighting("top", max(offs), 1.0)])
     assert (f"more than {MAX_MIDDLE_DISTANCE:g} mm" in lines[1]) == (max(offs) > MAX_MIDDLE_DISTANCE)
 
 
 def test_a_camera_that_shows_no_wound_says_so() -> None:
     nothing = np.zeros(arc_rig().cameras[0].size[::-1], bool)
-    found = _sight(arc_rig().cameras[0], nothing, BASE_FROM_REST, OUTLINE)
-    assert "no wound" in ScanPlacement(np.eye(4), "TRACKING", (found,)).lines()[1]
+    found = _sighting(arc_rig().cameras[0], nothing, BASE_FROM_REST, OUTLINE)
+    assert "no wound" in placement_lines("TRACKING", [found])[1]

@@ -30,7 +30,7 @@ from estimation.synthetic.movements import irregular, patch
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations, synthetic_world
 from hardware.bench.figures import Figure, at_least, at_most, with_progress
 from hardware.cameras.feed import Arrival, FrameWatch
-from hardware.cameras.frame_sets import FrameSetBuilder
+from hardware.cameras.live import FrameSetBuilder
 from hardware.cameras.stamping import FrameStamper
 from hardware.process.clock import CpuClock
 from perception.frames import Frame, FrameSet, Image

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import os
-import stat
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -204,7 +203,7 @@ class _OpenCapture:
     def __init__(self, capture: cv2.VideoCapture, source: CameraSource, clock: Clock) -> None:
         self._capture, self._source, self._clock = capture, source, clock
         self.clocked = source.identity.kind is SourceKind.DEVICE
-        self.ends = source.identity.kind is SourceKind.FILE and not _is_pipe(Path(source.identity.text))
+        self.ends = source.identity.kind is SourceKind.FILE and not Path(source.identity.text).is_fifo()
         rate = capture.get(cv2.CAP_PROP_FPS)
         self._period = 1 / (source.fps or (rate if rate > 0 else FILE_FPS))
         self._next = clock.now()
@@ -240,10 +239,3 @@ class _OpenCapture:
 
     def release(self) -> None:
         self._capture.release()
-
-
-def _is_pipe(path: Path) -> bool:
-    try:
-        return stat.S_ISFIFO(path.stat().st_mode)
-    except OSError:
-        return False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import cv2
@@ -27,12 +27,6 @@ def sharpness(image: Image) -> float:
     return float(cv2.Laplacian(_grey(image), cv2.CV_32F).var())
 
 
-def brightness(image: Image) -> tuple[float, float]:
-    """Mean grey level, and the share of pixels that are blown out, of an (H, W) or (H, W, 3) BGR image."""
-    grey = _grey(image)
-    return float(grey.mean()), float((grey >= BLOWN_LEVEL).mean())
-
-
 def preview_sheet(shown: Sequence[tuple[Image | None, Sequence[str], bool]]) -> Image:
     """(H, W, 3) BGR: one cell per camera with its picture, if any, and lines of text, alarming unless all is well."""
     lines = max(len(words) for _, words, _ in shown)
@@ -51,11 +45,9 @@ def _cell(image: Image | None, words: Sequence[str], well: bool, lines: int) -> 
         small = cv2.resize(_colour(image), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
         x, y = (CELL_SIZE[0] - size[0]) // 2, (CELL_SIZE[1] - size[1]) // 2
         cell[y : y + size[1], x : x + size[0]] = small
+    colour = INK_COLOUR if well else ALARM_COLOUR
     for i, line in enumerate(words):
-        place, colour = (
-            (8, CELL_SIZE[1] + LINE_HEIGHT * (i + 1) - LINE_HEIGHT // 4),
-            INK_COLOUR if well else ALARM_COLOUR,
-        )
+        place = 8, CELL_SIZE[1] + LINE_HEIGHT * (i + 1) - LINE_HEIGHT // 4
         cv2.putText(cell, line, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
     return cell
 
@@ -68,21 +60,18 @@ def _colour(image: Image) -> Image:
     return image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
 
 
-STAMP_SOURCES = {
-    "driver": "by its driver",
-    "stream": "by its stream",
-    "arrival": "by arrival",
-    "": "not at all",
-}
+STAMP_SOURCES = {"driver": "by its driver", "stream": "by its stream", "arrival": "by arrival", "": "not at all"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inspection:
-    """What was seen."""
+    """What was seen.
+
+    offsets, scatter: (C,) s, median and deviation of each camera's stamp from the first one's in the same set; nan
+    where they never met.
+    """
 
     health: LiveHealth
-    # offsets, scatter: (C,) s, median and deviation of each camera's stamp from the first one's in the same
-    # set; nan where they never met
     offsets: tuple[float, ...]
     scatter: tuple[float, ...]
 
@@ -112,12 +101,9 @@ def _behind(sets: Sequence[FrameSet], camera: int) -> tuple[float, float]:
 def inspection_table(inspection: Inspection) -> dict[str, Any]:
     """For JSON: plain numbers with their units in the keys, None for what is not known."""
     health = inspection.health
-    cameras = [
-        _camera_table(camera, offset, scatter)
-        for camera, offset, scatter in zip(health.cameras, inspection.offsets, inspection.scatter, strict=True)
-    ]
+    rows = zip(health.cameras, inspection.offsets, inspection.scatter, strict=True)
     return {
-        "cameras": cameras,
+        "cameras": [_camera_table(*row) for row in rows],
         "sets": health.sets,
         "complete_sets": health.complete,
         "late_frames": health.late,
@@ -126,31 +112,27 @@ def inspection_table(inspection: Inspection) -> dict[str, Any]:
 
 
 def _camera_table(camera: CameraState, offset: float, scatter: float) -> dict[str, Any]:
-    seen = None if camera.newest is None else (sharpness(camera.newest), *brightness(camera.newest))
+    image = camera.newest
+    grey = None if image is None else _grey(image)
     return {
         "name": camera.name,
         "source": camera.source,
-        "size_px": None if camera.newest is None else list(camera.newest.shape[1::-1]),
+        "size_px": None if image is None else list(image.shape[1::-1]),
         "rate_hz": _known(camera.rate),
         "jitter_ms": _known(1e3 * camera.jitter),
         "lag_ms": _known(1e3 * camera.lag),
         "stamped": camera.by or None,
         "offset_ms": _known(1e3 * offset),
         "offset_scatter_ms": _known(1e3 * scatter),
-        "sharpness": None if seen is None else round(seen[0], 1),
-        "grey_level": None if seen is None else round(seen[1], 1),
-        "blown_out": None if seen is None else round(seen[2], 4),
+        "sharpness": None if grey is None else round(sharpness(grey), 1),
+        "grey_level": None if grey is None else round(float(grey.mean()), 1),
+        "blown_out": None if grey is None else round(float((grey >= BLOWN_LEVEL).mean()), 4),
         "frames": camera.given,
         "missed": camera.missed,
         "not_fetched": camera.overrun,
-        "left_out": {
-            fault.name.lower(): count for fault, count in sorted(camera.faults.items(), key=lambda f: f[0].name)
-        },
+        "left_out": dict(sorted((fault.name.lower(), count) for fault, count in camera.faults.items())),
         "reopened": camera.reopened,
-        "controls": [
-            {"name": c.name, "asked": c.asked, "got": c.got, "automatic": c.automatic, "taken": c.taken}
-            for c in camera.controls
-        ],
+        "controls": [asdict(control) | {"taken": control.taken} for control in camera.controls],
         "trouble": camera.trouble,
     }
 
@@ -161,14 +143,12 @@ def _known(value: float) -> float | None:
 
 def inspection_text(inspection: Inspection) -> str:
     """A paragraph a camera, and one about their sets."""
-    table = inspection_table(inspection)
-    health = inspection.health
-    paragraphs = ["\n".join([one["name"], *(f"  {line}" for line in camera_lines(one))]) for one in table["cameras"]]
+    health, tables = inspection.health, inspection_table(inspection)["cameras"]
+    paragraphs = ["\n  ".join([one["name"], *camera_lines(one)]) for one in tables]
     if len(health.cameras) > 1:
         share = f" ({health.complete / health.sets:.1%})" if health.sets else ""
-        paragraphs.append(
-            f"{health.sets} sets, {health.complete} with all cameras{share}, {health.late} frames too late"
-        )
+        sets = f"{health.sets} sets, {health.complete} with all cameras{share}"
+        paragraphs.append(f"{sets}, {health.late} frames too late")
     return "\n\n".join(paragraphs)
 
 
@@ -178,12 +158,12 @@ def camera_lines(one: dict[str, Any]) -> list[str]:
         return [one["source"], f"TROUBLE: {one['trouble'] or 'no picture came'}"]
     width, height = one["size_px"]
     left_out = ", ".join(f"{count} {name}" for name, count in one["left_out"].items())
-    controls = ", ".join(_control_words(c) for c in one["controls"])
+    controls = ", ".join(_control_text(c) for c in one["controls"])
     lines = [
         one["source"],
         f"{width} x {height} px, {_number(one['rate_hz'])} Hz, jitter {_number(one['jitter_ms'])} ms, "
         f"lag {_number(one['lag_ms'])} ms, stamped {STAMP_SOURCES[one['stamped'] or '']}",
-        _offset_words(one),
+        _offset_text(one),
         f"sharpness {one['sharpness']:.0f}, grey level {one['grey_level']:.0f}, {one['blown_out']:.1%} blown out",
         f"{one['frames']} frames; {one['missed']} missed; left out: {left_out or 'none'}",
     ]
@@ -191,13 +171,13 @@ def camera_lines(one: dict[str, Any]) -> list[str]:
     return lines + ([f"TROUBLE: {one['trouble']}"] if one["trouble"] else [])
 
 
-def _offset_words(one: dict[str, Any]) -> str:
+def _offset_text(one: dict[str, Any]) -> str:
     if one["offset_ms"] is None:
         return "never in a set with the first camera"
     return f"{_number(one['offset_ms'])} ms after the first camera's stamp, +- {_number(one['offset_scatter_ms'])} ms"
 
 
-def _control_words(control: dict[str, Any]) -> str:
+def _control_text(control: dict[str, Any]) -> str:
     got = "not there" if control["got"] is None else _number(control["got"])
     if not control["taken"]:
         return f"{control['name']} {got} (asked for {_number(control['asked'])}: NOT TAKEN)"
@@ -211,11 +191,5 @@ def _number(value: float | str | None) -> str:
 
 def inspection_sheet(inspection: Inspection) -> Image:
     """(H, W, 3) BGR: each camera's last picture with what is known of it."""
-    tables = inspection_table(inspection)["cameras"]
-    cameras = inspection.health.cameras
-    return preview_sheet(
-        [
-            (camera.newest, [one["name"], *camera_lines(one)[1:]], not one["trouble"])
-            for camera, one in zip(cameras, tables, strict=True)
-        ]
-    )
+    pairs = zip(inspection.health.cameras, inspection_table(inspection)["cameras"], strict=True)
+    return preview_sheet([(c.newest, [one["name"], *camera_lines(one)[1:]], not one["trouble"]) for c, one in pairs])

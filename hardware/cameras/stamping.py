@@ -11,9 +11,8 @@ import numpy as np
 from perception.frames import StampedBy
 
 PLL_BEATS = 30  # beats by which phase and period are smoothed: a second of a webcam
-SKIP_AFTER = (
-    0.6  # of a period after the expected beat: later, a beat is skipped rather than late (2 %, sigma 5 of 33 ms)
-)
+# of a period after the expected beat: later, a beat is skipped rather than late (2 %, sigma 5 of 33 ms)
+SKIP_AFTER = 0.6
 MIN_BEAT_GAP = 0.4  # of a period after the last beat: a sooner instant is no beat
 PAUSE_BEATS = 10  # without an instant, after which the phase starts again
 PERIOD_INSTANTS = 10  # from which a period is estimated

@@ -87,9 +87,9 @@ class PlanSettings:
             return DEFAULT_TEXTS[name]
         if isinstance(value, bool):
             return "yes" if value else "no"
-        return (
-            "; ".join(value) if isinstance(value, tuple) else f"{value:g}" if isinstance(value, float) else str(value)
-        )
+        if isinstance(value, tuple):
+            return "; ".join(value)
+        return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,19 +122,19 @@ class PlanSubject:
 
 def order_of(settings: PlanSettings, flat: bool) -> PlanOrder:
     """What is to be planned. flat: one layer of one tissue."""
-    w = settings
+    s = settings
     for name, low, high in SETTING_RANGES:
-        value = getattr(w, name)
+        value = getattr(s, name)
         if value is not None and not low <= value <= high:
             raise InputError(COMMAND_LINE, "--" + name.replace("_", "-"), value, f"{low:g} to {high:g}")
     pattern = Pattern(
-        kind=cast(PatternKind, w.pattern), width=w.bead, overlap=w.overlap_percent / 100, inset=w.inset,
-        angle=_angle(w.angle), rims=w.rims,
+        kind=cast(PatternKind, s.pattern), width=s.bead, overlap=s.overlap_percent / 100, inset=s.inset,
+        angle=_angle(s.angle), rims=s.rims,
     )  # fmt: skip
-    tool = ToolLimits(*(math.radians(v) for v in (w.tilt_deg, w.turning_deg_mm, w.spin_deg)))
-    way = CheckpointSettings(w.spacing, w.chord, w.sideways, travel=w.travel, lift=w.lift, wait=w.wait, tool=tool)
-    mode: LayerMode = "skin" if flat else cast(LayerMode, w.layers)
-    return PlanOrder(_tissues(w, flat), pattern, mode, way, not w.parallel, BumpPassing(w.bump, w.bump_clearance))
+    tool = ToolLimits(*(math.radians(v) for v in (s.tilt_deg, s.turning_deg_mm, s.spin_deg)))
+    way = CheckpointSettings(s.spacing, s.chord, s.sideways, travel=s.travel, lift=s.lift, wait=s.wait, tool=tool)
+    mode: LayerMode = "skin" if flat else cast(LayerMode, s.layers)
+    return PlanOrder(_tissues(s, flat), pattern, mode, way, not s.parallel, BumpPassing(s.bump, s.bump_clearance))
 
 
 def _angle(text: str) -> float | AngleChoice:
@@ -163,18 +163,15 @@ def _tissues(settings: PlanSettings, flat: bool) -> tuple[Tissue, ...]:
     if flat and len(settings.tissues) > 1:
         raise InputError(COMMAND_LINE, "--tissue", ", ".join(settings.tissues), "one: a contour is one layer")
     if flat:
-        first = result[0]
-        name = first.name if settings.tissues else "layer"
-        return (Tissue(name, None, first.material, first.temperature, first.speed, first.height),)
+        return (replace(result[0], name=result[0].name if settings.tissues else "layer", thickness=None),)
     return result
 
 
 def _materials(text: str) -> Sequence[str]:
     names = [name.strip() for name in text.split(",")]
     if not all(_is_material_name(name) for name in names) or len(names) not in (1, len(DEFAULT_TISSUES)):
-        raise InputError(
-            COMMAND_LINE, "--material", text, "one name, or three with commas between: hypodermis, dermis, epidermis"
-        )
+        allowed = "one name, or three with commas between: hypodermis, dermis, epidermis"
+        raise InputError(COMMAND_LINE, "--material", text, allowed)
     return names
 
 
@@ -210,9 +207,8 @@ def check_out(out: Path, gcode: Path | None, force: bool) -> None:
         raise InputError(COMMAND_LINE, "--out", out, "a file that ends in .csv")
     for file in (out, *([gcode] if gcode else [])):
         if file.is_dir() or (file.exists() and not force):
-            raise InputError(
-                file, "--out", "a folder" if file.is_dir() else "a file that exists", "a new one, or --force"
-            )
+            got = "a folder" if file.is_dir() else "a file that exists"
+            raise InputError(file, "--out", got, "a new one, or --force")
         file.parent.mkdir(parents=True, exist_ok=True)
 
 
@@ -220,13 +216,13 @@ def subject_of(request: PlanRequest, flat: bool) -> PlanSubject:
     """The wound that is to be planned, read and found. flat: the scan is a contour."""
     step = float(np.clip(GRID_PER_BEAD * request.settings.bead, MIN_GRID_STEP, MAX_GRID_STEP))
     if request.example is not None and request.scan is not None:
-        raise InputError("command line", "SCAN", request.scan, "none beside --example")
+        raise InputError(COMMAND_LINE, "SCAN", request.scan, "none beside --example")
     if request.example is not None:
-        vertices, triangles = example_scan(request.example)
-        result = planned_scan(vertices, triangles, step, f"{request.example} (example)")
-        return replace(result, example=(vertices, triangles))
+        example, name = example_scan(request.example), f"{request.example} (example)"
+        scan, repairs = repair_mesh(*example, name)
+        return PlanSubject(name, find_wound(scan, step, name), repairs, example)
     if request.scan is None:
-        raise InputError("command line", "SCAN", "none", "a mesh, a contour, or --example forearm, chest or foot")
+        raise InputError(COMMAND_LINE, "SCAN", "none", "a mesh, a contour, or --example forearm, chest or foot")
     if flat:
         height = request.settings.layer_height or request.settings.bead
         contour = read_contour(request.scan)
@@ -238,12 +234,6 @@ def subject_of(request: PlanRequest, flat: bool) -> PlanSubject:
     scan, repairs = repair_mesh(vertices, raw.triangles, request.scan, request.flip)
     outline = None if request.outline is None else _outline(request.outline, scan.vertices)
     return PlanSubject(request.scan.name, find_wound(scan, step, request.scan, outline, request.flip), repairs)
-
-
-def planned_scan(vertices: Array, triangles: Index, step: float, where: object, flip: bool = False) -> PlanSubject:
-    """The wound in a mesh, vertices (V, 3) mm, triangles (T, 3), that may be damaged."""
-    scan, repairs = repair_mesh(vertices, triangles, where, flip)
-    return PlanSubject(str(where), find_wound(scan, step, where, flipped=flip), repairs)
 
 
 def _outline(file: Path, vertices: Array) -> Array:

@@ -38,8 +38,6 @@ text { font: 13px "Inter", "Segoe UI", "DejaVu Sans", system-ui, sans-serif; fil
 .gap { fill: #d3232f; } .start { fill: #2f9e5b; stroke: #fff; stroke-width: 1.5; }
 .end { fill: #1c2430; stroke: #fff; stroke-width: 1.5; } .bar { stroke: #1c2430; stroke-width: 2; fill: none; }
 """
-
-# tissues
 TISSUE_COLOURS = ((0.16, 0.52, 0.72), (0.87, 0.56, 0.2), (0.33, 0.66, 0.45), (0.55, 0.42, 0.75), (0.8, 0.36, 0.26))
 SURFACE_NODES = 120  # nodes along the longer side of the surfaces in the view
 PAGE_STYLE = """
@@ -84,11 +82,10 @@ LAYER_TEXT = (
 def layer_svg(layer: PlannedLayer, figures: LayerFigures, bounds: tuple[float, float, float, float]) -> str:
     """The picture of a layer. bounds: of what all pictures of a plan show, mm in the chart, low x, low y, high x, y."""
     low_x, low_y, high_x, high_y = bounds
-    scale = min(
-        (PICTURE_WIDTH - 2 * PICTURE_MARGIN) / max(high_x - low_x, 1e-3), MAX_DRAWING_HEIGHT / max(high_y - low_y, 1e-3)
-    )
-    height = HEAD_HEIGHT + (high_y - low_y) * scale + FOOT_HEIGHT + PICTURE_MARGIN
-    left = (PICTURE_WIDTH - (high_x - low_x) * scale) / 2
+    width, depth = high_x - low_x, high_y - low_y
+    scale = min((PICTURE_WIDTH - 2 * PICTURE_MARGIN) / max(width, 1e-3), MAX_DRAWING_HEIGHT / max(depth, 1e-3))
+    height = HEAD_HEIGHT + depth * scale + FOOT_HEIGHT + PICTURE_MARGIN
+    left = (PICTURE_WIDTH - width * scale) / 2
     turn = f"matrix({scale:.5f} 0 0 {-scale:.5f} {left - low_x * scale:.3f} {HEAD_HEIGHT + high_y * scale:.3f})"
     drawn = [
         f'<path class="region" fill-rule="evenodd" d="{_areas(layer.region)}"/>',
@@ -112,10 +109,8 @@ def layer_svg(layer: PlannedLayer, figures: LayerFigures, bounds: tuple[float, f
 
 def bounds_of(layers: Iterable[PlannedLayer]) -> tuple[float, float, float, float]:
     """Low and high corner, mm, of all layers' regions."""
-    boxes = np.array([layer.region.bounds for layer in layers if not layer.region.is_empty])
-    low_x, low_y = boxes[:, :2].min(axis=0)
-    high_x, high_y = boxes[:, 2:].max(axis=0)
-    return float(low_x), float(low_y), float(high_x), float(high_y)
+    low_x, low_y, high_x, high_y = shapely.total_bounds([layer.region for layer in layers]).tolist()
+    return low_x, low_y, high_x, high_y
 
 
 def _captions(title: str, layer: PlannedLayer, figures: LayerFigures, scale: float, height: float) -> str:
@@ -152,12 +147,8 @@ def _line(points: Array) -> str:
 
 def _bumps(layer: PlannedLayer) -> list[str]:
     """Bumps that are gone round, as areas, and those that are gone over, as outlines on the beads."""
-    shapes = {"around": layer.around, "over": layer.over}
-    return [
-        f'<path class="{name}" fill-rule="evenodd" d="{_areas(shape)}"/>'
-        for name, shape in shapes.items()
-        if not shape.is_empty
-    ]
+    shapes = {name: shape for name, shape in (("around", layer.around), ("over", layer.over)) if not shape.is_empty}
+    return [f'<path class="{name}" fill-rule="evenodd" d="{_areas(shape)}"/>' for name, shape in shapes.items()]
 
 
 def _travels(beads: tuple[Bead, ...]) -> str:
@@ -181,17 +172,13 @@ def _beads(beads: tuple[Bead, ...]) -> list[str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReportText:
-    """What the report tells beside the plan's figures.
+    """What the report tells beside the plan's figures."""
 
-    title: what was planned. findings: of the wound, as (what, value). repairs: of the scan, as (what, count). order:
-    what was asked for, as (what, value). notes: what somebody should look at.
-    """
-
-    title: str
-    findings: Sequence[tuple[str, str]]
-    repairs: Sequence[tuple[str, int]]
-    order: Sequence[tuple[str, str]]
-    notes: Sequence[str]
+    title: str  # what was planned
+    findings: Sequence[tuple[str, str]]  # of the wound, as (what, value)
+    repairs: Sequence[tuple[str, int]]  # of the scan, as (what, count)
+    order: Sequence[tuple[str, str]]  # what was asked for, as (what, value)
+    notes: Sequence[str]  # what somebody should look at
 
 
 def page_text(
@@ -202,20 +189,16 @@ def page_text(
     if story.notes:
         notes = "".join(f'<div class="plan-note">{escape(note)}</div>' for note in story.notes)
         body.append(f"<section><h2>Look at this before printing</h2>{notes}</section>")
-    body.append(
-        section(
-            "The beads",
-            "Drag to turn, shift and drag to move, wheel to come nearer. The slider prints as far as it is moved.",
-            f'{VIEW_CONTROLS}<script type="application/json" id="plan-data">{_data(plan)}</script><script>'
-            f"{(files('hardware.plan') / 'view.js').read_text(encoding='utf-8')}</script>",
-        )
-    )
+    script = (files("hardware.plan") / "view.js").read_text(encoding="utf-8")
+    view = f'<script type="application/json" id="plan-data">{_data(plan)}</script><script>{script}</script>'
+    help_text = "Drag to turn, shift and drag to move, wheel to come nearer. The slider prints as far as it is moved."
+    body.append(section("The beads", help_text, VIEW_CONTROLS + view))
     body.append(section("Layers", LAYER_TEXT, f'<div class="sideways">{_layer_table(layers, total)}</div>'))
-    shown_pictures = "".join(f'<div class="layer-picture">{picture}</div>' for picture in pictures)
     if pictures:
+        shown = "".join(f'<div class="layer-picture">{picture}</div>' for picture in pictures)
         unrolled = "" if plan.order.mode == "horizontal" else " They are unrolled to the lengths on the skin."
         words = f"Seen from outside, the scan's x to the right.{unrolled}"
-        body.append(section("Each layer", words, LAYER_CHOOSER.format(count=len(pictures), pictures=shown_pictures)))
+        body.append(section("Each layer", words, LAYER_CHOOSER.format(count=len(pictures), pictures=shown)))
     body.append(section("The wound", "As found in the scan.", figures_table(("", "value"), story.findings)))
     if story.repairs:
         rows = [(what, str(count)) for what, count in story.repairs]

@@ -11,6 +11,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,7 +79,7 @@ def run_plan(request: PlanRequest) -> str:
     placed = []
     if request.session is not None:
         scan = request.out.with_name(f"{request.out.stem}_scan.ply")
-        placed = scan_placement(request.session, scan, plan.wound.rim).lines()
+        placed = placement_lines(*scan_placement(request.session, scan, plan.wound.rim))
     return "\n".join([_summary_text(plan, subject, total, request.out, written), arm, *placed])
 
 
@@ -98,6 +99,7 @@ def _tables(
     """Write the coverage of each layer, the summary, the scan as it was repaired, and an example's; their names."""
     stem = request.out.with_suffix("")
     table, summary = stem.with_name(stem.name + "_layers.csv"), stem.with_suffix(".json")
+    written = [table.name, summary.name]
     _write_atomically(table, lambda file: _write_layers(file, layers))
     facts = {
         "checkpoints": len(plan.path), "mode": plan.order.mode, "missing_tissues": plan.stack.missing,
@@ -107,15 +109,13 @@ def _tables(
         "surface_from_plane": plan.wound.surface_from_plane.tolist(),
     }  # fmt: skip
     _write_atomically(summary, lambda file: file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8"))
-    if subject.repairs is None:
-        return [table.name, summary.name]
-    mesh = stem.with_name(stem.name + "_scan.ply")
-    _write_atomically(mesh, lambda file: write_ply(file, *_surface(plan.wound)))
-    if subject.example is None:
-        return [table.name, summary.name, mesh.name]
-    example, built_in = stem.with_name(stem.name + "_example.ply"), subject.example
-    _write_atomically(example, lambda file: write_ply(file, *built_in))
-    return [table.name, summary.name, mesh.name, example.name]
+    meshes = {"_scan.ply": None if subject.repairs is None else _surface(plan.wound), "_example.ply": subject.example}
+    for ending, mesh in meshes.items():
+        if mesh is not None:
+            file = stem.with_name(stem.name + ending)
+            _write_atomically(file, partial(write_ply, vertices=mesh[0], triangles=mesh[1]))
+            written.append(file.name)
+    return written
 
 
 def _write_layers(file: Path, layers: Sequence[LayerFigures]) -> None:
@@ -150,7 +150,7 @@ def _pictures(
     folder, report = stem.with_name(stem.name + "_layers"), stem.with_suffix(".html")
     folder.mkdir(exist_ok=True)
     bounds = bounds_of(plan.layers)
-    drawn = []
+    drawn: list[str] = []
     with _progress("draw", "layers") as progress:
         for i, figures in enumerate(layers):
             drawn.append(layer_svg(plan.layers[figures.number], figures, bounds))
@@ -160,9 +160,8 @@ def _pictures(
     repairs = [] if subject.repairs is None else subject.repairs.rows()
     findings = [*findings_rows(plan), ("what an arm can print", arm)]
     story = ReportText(subject.name, findings, repairs, request.settings.rows(), notes_of(plan))
-    _write_atomically(
-        report, lambda file: file.write_text(page_text(plan, layers, total, story, drawn), encoding="utf-8")
-    )
+    page = page_text(plan, layers, total, story, drawn)
+    _write_atomically(report, lambda file: file.write_text(page, encoding="utf-8"))
     return [f"{folder.name}/ ({len(drawn)} pictures)", report.name]
 
 
@@ -219,9 +218,8 @@ def notes_of(plan: Plan) -> list[str]:
         notes.append(f"not printed, as the wound is not deep enough: {', '.join(plan.stack.missing)}")
     off_deg = max(np.rad2deg(t.departure) for t in (plan.ground.low, plan.ground.high))
     if off_deg > MAX_TILT_OFF_NORMAL_DEG:
-        notes.append(
-            f"the tool stands up to {off_deg:.0f} degrees off the normal, as its limits ask for: on the steepest walls"
-        )
+        tilt = f"the tool stands up to {off_deg:.0f} degrees off the normal"
+        notes.append(f"{tilt}, as its limits ask for: on the steepest walls")
     empty = sum(not layer.beads for layer in plan.layers)
     if empty:
         notes.append(f"{empty} of {len(plan.layers)} layers have no room for a bead and are left out")
@@ -257,9 +255,8 @@ def bumps_text(plan: Plan) -> str:
     if around:
         clear = plan.order.passing.clear(plan.order.pattern.width)
         highest = max(p.layer.bumps.highest for p in plan.layers if not p.around.is_empty)
-        parts.append(
-            f"gone round with {clear:.2f} mm between in {_layers_text(around)}, up to {highest:.2f} mm over it"
-        )
+        text = f"gone round with {clear:.2f} mm between in {_layers_text(around)}"
+        parts.append(f"{text}, up to {highest:.2f} mm over it")
     return "; ".join(parts)
 
 
@@ -281,32 +278,27 @@ class WoundSighting:
     share: float  # of the two outlines' areas, the smaller over the larger
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ScanPlacement:
-    """Where a scan lies in a session."""
-
-    base_from_scan: Array | None  # (4, 4) mm; None where it was not registered
-    verdict: str  # for a person
-    sights: tuple[WoundSighting, ...]
-
-    def lines(self) -> list[str]:
-        """What it says, for a person."""
-        lines = [f"placed: {self.verdict}"]
-        for sight in self.sights:
-            if not np.isfinite(sight.off):
-                lines.append(f"placed: {sight.camera} shows no wound")
-                continue
-            doubt = f", more than {MAX_MIDDLE_DISTANCE:g} mm: is it the same wound?"
-            far = doubt if sight.off > MAX_MIDDLE_DISTANCE else ""
-            lines.append(
-                f"placed: in {sight.camera} the wound's middle is {sight.off:.2f} mm from the plan's{far}; "
-                f"their areas are as {sight.share:.2f} to 1"
-            )
-        return lines
+def placement_lines(verdict: str, sightings: Sequence[WoundSighting]) -> list[str]:
+    """Where the scan lies in a session, for a person: the registration's verdict, and each camera's sighting."""
+    lines = [f"placed: {verdict}"]
+    for sighting in sightings:
+        if not np.isfinite(sighting.off):
+            lines.append(f"placed: {sighting.camera} shows no wound")
+            continue
+        doubt = f", more than {MAX_MIDDLE_DISTANCE:g} mm: is it the same wound?"
+        far = doubt if sighting.off > MAX_MIDDLE_DISTANCE else ""
+        lines.append(
+            f"placed: in {sighting.camera} the wound's middle is {sighting.off:.2f} mm from the plan's{far}; "
+            f"their areas are as {sighting.share:.2f} to 1"
+        )
+    return lines
 
 
-def scan_placement(session_path: Path, scan_file: Path, outline: Array) -> ScanPlacement:
-    """Where a scan lies in a session's first pictures. outline: (N, 3) mm, of the planned wound, scan frame."""
+def scan_placement(session_path: Path, scan_file: Path, outline: Array) -> tuple[str, list[WoundSighting]]:
+    """Register a scan in a session's first pictures: verdict and sightings, none where it was not registered.
+
+    outline: (N, 3) mm, of the planned wound, scan frame.
+    """
     from hardware.offline.track import tracker  # loads gtsam and cv2, which a plan alone does not need
     from hardware.recording.session_reader import open_session
 
@@ -319,10 +311,10 @@ def scan_placement(session_path: Path, scan_file: Path, outline: Array) -> ScanP
             if pose.state.measured or number + 1 == MAX_FRAME_SETS:
                 break
     if pose is None or frames is None:
-        return ScanPlacement(None, "the session holds no frame set", ())
+        return "the session holds no frame set", []
     if not pose.state.measured:
-        return ScanPlacement(None, f"not placed: {pose.reason or pose.state.value}", ())
-    return ScanPlacement(pose.base_from_surface, _verdict(pose), _sights(session.rig.cameras, frames, pose, outline))
+        return f"not placed: {pose.reason or pose.state.value}", []
+    return _verdict(pose), _sightings(session.rig.cameras, frames, pose, outline)
 
 
 def _verdict(pose: SurfacePose) -> str:
@@ -331,24 +323,17 @@ def _verdict(pose: SurfacePose) -> str:
     return f"{pose.state.value}, {good}" + (f"; {pose.reason}" if pose.reason else "")
 
 
-def _sights(
-    cameras: Sequence[Camera], frames: FrameSet, pose: SurfacePose, outline: Array
-) -> tuple[WoundSighting, ...]:
+def _sightings(cameras: Sequence[Camera], frames: FrameSet, pose: SurfacePose, outline: Array) -> list[WoundSighting]:
     from perception.wound.network import WoundNetwork, shipped_model
     from perception.wound.segmentation import NetworkSegmenter  # loads onnxruntime
 
     network = WoundNetwork(shipped_model(), threads=1)
     segmenter = NetworkSegmenter(network, network.settings)
-    sightings = []
-    for frame in frames.frames:
-        mask = segmenter(frame.image).mask
-        sightings.append(_sight(cameras[frame.camera], mask, pose.base_from_surface, outline))
-    return tuple(sightings)
+    masks = ((cameras[frame.camera], segmenter(frame.image).mask) for frame in frames.frames)
+    return [_sighting(camera, mask, pose.base_from_surface, outline) for camera, mask in masks]
 
 
-def _sight(
-    camera: Camera, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], pose: Array, outline: Array
-) -> WoundSighting:
+def _sighting(camera: Camera, mask: NDArray[np.bool_], pose: Array, outline: Array) -> WoundSighting:
     from perception.lens import undistort
     from perception.wound.segmentation import centroid
 
