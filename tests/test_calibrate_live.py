@@ -128,12 +128,12 @@ def test_what_was_found_is_kept_after_ctrl_c_and_the_next_run_goes_on(still: lis
     assert f"the corners so far are in {store}; the same command goes on from there" in told and not out.exists()
     names = ("camera 1", "camera 2", "camera 3")
     before = WavingRecorder(names, (SIZE,) * 3, BOARD, store)
-    assert before.done > 0 and max(before.guide.coverage(c).parts.sum() for c in range(3)) > 0
+    assert before.search.done > 0 and max(before.guide.coverage(c).parts.sum() for c in range(3)) > 0
     assert main([*command, "--seconds", "0"]) == 2  # a board that stands still tells no lens
     after = WavingRecorder(names, (SIZE,) * 3, BOARD, store)
-    assert after.done > before.done
+    assert after.search.done > before.search.done
     assert all(after.guide.coverage(c).parts.sum() >= before.guide.coverage(c).parts.sum() for c in range(3))
-    assert WavingRecorder(names, (SIZE,) * 3, replace(BOARD, square=50.0), store).done == 0
+    assert WavingRecorder(names, (SIZE,) * 3, replace(BOARD, square=50.0), store).search.done == 0
 
 
 def test_a_camera_that_shows_nothing_is_named(

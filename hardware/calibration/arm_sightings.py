@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,21 +62,15 @@ def needle_radius(rig: Rig, tool: Array) -> float:
 
 def find_tips(session: Session, set_point: SetPoint, tool: Array, report: ProgressReport) -> TipObservations:
     """Find the tip in a session's pictures. InputError where there are too few of them."""
-    rig = session.rig
     chosen = _select_sets(session, set_point)
-    finders = _finders(session, set_point, needle_radius(rig, tool))
-    seen: list[_TipPicture] = []
-    reader = session.store.open()
-    try:
-        with ThreadPoolExecutor(2) as pool:
-            for done, (refs, places) in enumerate(chosen):
-                images = [reader.read(ref) for ref in refs]
-                jobs = zip(refs, places, images, strict=True)
-                seen += pool.map(lambda job: _find(finders, *job), jobs)
-                report(done + 1, len(chosen))
-    finally:
-        reader.close()
-    return _collect(seen, len(rig))
+    finders = _finders(session, set_point, needle_radius(session.rig, tool))
+    pictures: list[_TipPicture] = []
+    with closing(session.store.open()) as reader, ThreadPoolExecutor(2) as pool:
+        for done, (refs, places) in enumerate(chosen, 1):
+            images = [reader.read(ref) for ref in refs]
+            pictures += pool.map(partial(_find, finders), refs, places, images)
+            report(done, len(chosen))
+    return _collect(pictures, len(session.rig))
 
 
 def _select_sets(session: Session, set_point: SetPoint) -> list[tuple[tuple[FrameRef, ...], list[int]]]:
@@ -99,23 +95,18 @@ def _select_sets(session: Session, set_point: SetPoint) -> list[tuple[tuple[Fram
 
 def _finders(session: Session, set_point: SetPoint, radius: float) -> list[TipFinder]:
     """A finder for each camera, whose background is the median of pictures far apart."""
-    finders, reader = [], session.store.open()
-    own: list[list[FrameRef]] = [[] for _ in session.rig.cameras]  # a set may lack a camera
-    for ref in (ref for refs in session.sets for ref in refs):
-        own[ref.camera].append(ref)
-    picked = [ref for refs in own for ref in _spread_pictures(refs, set_point)]
-    try:
-        stacks: list[list[Image]] = [[] for _ in session.rig.cameras]
-        for ref in sorted(picked, key=lambda one: one.stamp):
+    cameras = session.rig.cameras
+    refs = [[ref for refs in session.sets for ref in refs if ref.camera == c] for c in range(len(cameras))]
+    spread = [ref for own in refs for ref in _spread_pictures(own, set_point)]
+    stacks: list[list[Image]] = [[] for _ in cameras]
+    with closing(session.store.open()) as reader:
+        for ref in sorted(spread, key=lambda one: one.stamp):
             stacks[ref.camera].append(reader.read(ref))
-    finally:
-        reader.close()
-    for camera, stack in zip(session.rig.cameras, stacks, strict=True):
+    for camera, stack in zip(cameras, stacks, strict=True):
         if len(stack) < MIN_BACKGROUND_PICTURES:
             allowed = f"{MIN_BACKGROUND_PICTURES} or more, while it moves"
             raise InputError(session.path, f"pictures of {camera.name}", len(stack), allowed)
-        finders.append(TipFinder(background(stack), radius))
-    return finders
+    return [TipFinder(background(stack), radius) for stack in stacks]
 
 
 def _spread_pictures(refs: Sequence[FrameRef], set_point: SetPoint) -> Sequence[FrameRef]:
@@ -139,30 +130,28 @@ def _crop(image: Image, pixel: Array) -> tuple[Image, Array]:
     return np.repeat(part[..., None], 3, -1) if part.ndim == 2 else part.copy(), pixel - [x, y]
 
 
-def _collect(seen: Sequence[_TipPicture], cameras: int) -> TipObservations:
-    looked, found = np.zeros(cameras, np.int64), np.zeros(cameras, np.int64)
+def _collect(pictures: Sequence[_TipPicture], cameras: int) -> TipObservations:
+    camera = np.array([one.ref.camera for one in pictures], np.int64)
+    with_tip = np.array([one.tip is not None for one in pictures], bool)
     rows: dict[tuple[int, int], list[_TipPicture]] = {}
-    for number, one in enumerate(seen):
-        looked[one.ref.camera] += 1
-        found[one.ref.camera] += one.tip is not None
+    for number, one in enumerate(pictures):
         if one.tip is not None:
-            key = (one.place, one.ref.camera) if one.place >= 0 else (-1 - number, one.ref.camera)
-            rows.setdefault(key, []).append(one)
+            rows.setdefault((one.place if one.place >= 0 else -1 - number, one.ref.camera), []).append(one)
     tips = [[o.tip for o in ones if o.tip is not None] for ones in rows.values()]
     sightings = Sightings(
         stamp=np.array([np.mean([o.ref.stamp for o in ones]) for ones in rows.values()]),
-        camera=np.array([key[1] for key in rows], np.int64),
+        camera=np.array([own for _, own in rows], np.int64),
         pixels=np.array([np.median([t.pixel for t in mine], axis=0) for mine in tips]).reshape(-1, 2),
         sigma=np.array([np.hypot(MIN_TIP_SIGMA, np.mean([t.sigma for t in mine])) for mine in tips]),
-        place=np.array([max(key[0], -1) for key in rows], np.int64),
+        place=np.array([max(place, -1) for place, _ in rows], np.int64),
     )
-    without = [one.ref for one in seen if one.tip is None]
-    missed = np.array([ref.stamp for ref in without], float), np.array([ref.camera for ref in without], np.int64)
-    return TipObservations(sightings, looked, found, tuple(_crops(seen, c) for c in range(cameras)), missed)
+    missed = np.array([one.ref.stamp for one in pictures if one.tip is None], float), camera[~with_tip]
+    looked, found = (np.bincount(each, minlength=cameras) for each in (camera, camera[with_tip]))
+    return TipObservations(sightings, looked, found, tuple(_crops(pictures, c) for c in range(cameras)), missed)
 
 
-def _crops(seen: Sequence[_TipPicture], camera: int) -> tuple[Array, Array]:
-    mine = [one.crop for one in seen if one.crop is not None and one.ref.camera == camera]
+def _crops(pictures: Sequence[_TipPicture], camera: int) -> tuple[Array, Array]:
+    mine = [one.crop for one in pictures if one.crop is not None and one.ref.camera == camera]
     chosen = mine[:: max(1, len(mine) // CROPS_PER_CAMERA)][:CROPS_PER_CAMERA]
     if not chosen:
         return np.zeros((0, CROP_SIZE, CROP_SIZE, 3), np.uint8), np.zeros((0, 2))

@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +48,7 @@ class CommandedFile:
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", encoding="utf-8")
         self._file.write(COMMANDED_HEADER + "\n")
-        self._last = -np.inf
-        self._until = -np.inf
+        self._last = self._until = -np.inf  # s: instant of the last knot, end of the last move
 
     def note(self, arm: Arm, now: float) -> None:
         """Write the moves that have ended at `now`, s."""
@@ -68,7 +66,7 @@ class CommandedFile:
     def __enter__(self) -> CommandedFile:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
 

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -19,10 +22,11 @@ from estimation import se3
 from estimation.calibration.camera_rig import Calibration
 from estimation.calibration.lens_fit import MIN_PLANE_CORNERS, focal_from_terms, focal_terms, homography, poses
 from estimation.se3 import Array
-from hardware.files.session import FrameReader, FrameRef, Session
+from hardware.files.session import Session
 from hardware.process.progress import ProgressReport
 from perception.boards.board import Board
 from perception.boards.corners import BoardCorners, CornerFinder, CornerTable, empty_table
+from perception.frames import Image
 
 CORNERS_VERSION = 3  # of the corner search, whose stored results are valid for this version only
 READ_BLOCK = 1 << 20  # bytes read at once
@@ -61,18 +65,13 @@ def _content_files(path: Path) -> list[Path]:
 
 def read_corners(path: Path, key: str) -> CornerTable | None:
     """The stored corners of exactly this recording and board; None where the file has none."""
-    names = [f.name for f in fields(CornerTable)]
     try:
         with np.load(path, allow_pickle=False) as stored:
             if str(stored["key"]) != key:
                 return None
-            parts = {name: stored[name] for name in names}
-    except (OSError, ValueError, KeyError, EOFError, RuntimeError):  # the last: a flag that no zip of ours has
-        return None
-    except Exception as error:  # a truncated zip raises zipfile's own errors, and zlib's
-        if type(error).__module__ not in ("zipfile", "zlib"):
-            raise
-        return None
+            parts = {f.name: stored[f.name] for f in fields(CornerTable)}
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error):
+        return None  # damaged; RuntimeError: a flag that no zip of ours has
     return CornerTable(**{**parts, "done": int(parts["done"])})
 
 
@@ -94,45 +93,48 @@ class CornerRow:
     corners: BoardCorners
 
 
+class CornerSearch:
+    """Searches a board in frame sets, one after the other; what is stored of an interrupted search is taken up again.
+
+    table: the corners up to the last `save`. done: number of frame sets searched by now. store: the file, or None.
+    """
+
+    def __init__(self, board: Board, cameras: int, store: Path | None, key: str) -> None:
+        self._store, self._key = store, key
+        known = None if store is None else read_corners(store, key)
+        self.table = empty_table(board, cameras) if known is None else known
+        self.done = self.table.done
+        self._finders = [CornerFinder(board) for _ in range(cameras)]
+        self._rows: list[CornerRow] = []
+
+    def add(self, pool: ThreadPoolExecutor, pictures: Sequence[tuple[int, float, Image]]) -> list[BoardCorners]:
+        """Search one frame set: of each picture the camera, its stamp (s, by the camera's own clock) and the image."""
+        corners = list(pool.map(lambda one: self._finders[one[0]](one[2]), pictures))
+        views = zip(pictures, corners, strict=True)
+        self._rows += [CornerRow(camera, self.done, stamp, own) for (camera, stamp, _), own in views]
+        self.done += 1
+        if self.done - self.table.done >= SAVE_EVERY_SETS:
+            self.save()
+        return corners
+
+    def save(self) -> None:
+        """Take the new corners into the table, and store it."""
+        self.table, self._rows = append_rows(self.table, self._rows, self.done), []
+        if self._store is not None:
+            write_corners(self._store, self._key, self.table)
+
+
 def collect_corners(session: Session, board: Board, store: Path | None, report: ProgressReport) -> CornerTable:
     """The corners of all pictures. store: the file for them, or None. InputError where a picture is missing."""
-    key = content_key(session, board) if store is not None else ""
-    known = None if store is None else read_corners(store, key)
-    table = empty_table(board, len(session.rig)) if known is None else known
-    reader = session.store.open()
-    finders = [CornerFinder(board) for _ in session.rig.cameras]
-    rows: list[CornerRow] = []
-    done = table.done
+    search = CornerSearch(board, len(session.rig), store, content_key(session, board) if store is not None else "")
     try:
-        with ThreadPoolExecutor(CORNER_THREADS) as pool:
-            for instant in range(table.done, len(session.sets)):
-                rows += _find_corners(pool, reader, finders, session.sets[instant], instant)
-                done = instant + 1
-                if done % SAVE_EVERY_SETS == 0:
-                    table, rows = _save(store, key, append_rows(table, rows, done)), []
-                report(done, len(session.sets))
+        with closing(session.store.open()) as reader, ThreadPoolExecutor(CORNER_THREADS) as pool:
+            for refs in session.sets[search.done :]:
+                search.add(pool, [(ref.camera, ref.camera_stamp, reader.read(ref)) for ref in refs])
+                report(search.done, len(session.sets))
     finally:  # Ctrl-C included
-        table = _save(store, key, append_rows(table, rows, done))
-        reader.close()
-    return table
-
-
-def _save(store: Path | None, key: str, table: CornerTable) -> CornerTable:
-    if store is not None:
-        write_corners(store, key, table)
-    return table
-
-
-def _find_corners(
-    pool: ThreadPoolExecutor,
-    reader: FrameReader,
-    finders: list[CornerFinder],
-    refs: tuple[FrameRef, ...],
-    instant: int,
-) -> list[CornerRow]:
-    images = [reader.read(ref) for ref in refs]
-    found = pool.map(lambda ref, image: finders[ref.camera](image), refs, images)
-    return [CornerRow(ref.camera, instant, ref.camera_stamp, f) for ref, f in zip(refs, found, strict=True)]
+        search.save()
+    return search.table
 
 
 def append_rows(table: CornerTable, rows: list[CornerRow], done: int) -> CornerTable:

@@ -7,6 +7,7 @@ given.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -21,7 +22,7 @@ from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.files.rig_file import ImageSource, is_calibrated, read_rig, read_uncalibrated
-from hardware.files.session import FrameRef, Session
+from hardware.files.session import Session
 from hardware.files.session_folder import open_folder
 from hardware.recording.session_reader import open_session
 from perception.boards.board import DICTIONARIES, Board
@@ -42,12 +43,9 @@ def check_table(table: CornerTable, board: Board, board_file: Path, names: Seque
     _check_strangers(table, board, board_file)
     _check_markers(table, board, board_file)
     for c, name in enumerate(names):
-        views = int((table.camera == c).sum())
-        where = f"camera {name}"
+        views, looked, where = int((table.camera == c).sum()), int(table.looked[c]), f"camera {name}"
         if views < MIN_VIEWS:
-            looked = int(table.looked[c])
-            few = 0 < looked <= 2 * views
-            why = "record more" if few else why_unseen(pictures(c), board)
+            why = "record more" if 0 < looked <= 2 * views else why_unseen(pictures(c), board)
             allowed = f"{MIN_VIEWS} or more; it has {looked} pictures: {why}"
             raise InputError(where, "pictures that show the board", views, allowed)
         blur = float(np.median(table.blur[table.camera == c]))
@@ -99,13 +97,10 @@ def _count_showing(pictures: list[Image], board: Board) -> int:
 
 def pictures_of(session: Session, camera: int) -> list[Image]:
     """A few pictures of a camera, spread over a recording."""
-    refs: list[FrameRef] = [ref for refs in session.sets for ref in refs if ref.camera == camera]
+    refs = [ref for refs in session.sets for ref in refs if ref.camera == camera]
     chosen = refs[:: max(len(refs) // SAMPLE_PICTURES, 1)][:SAMPLE_PICTURES]
-    reader = session.store.open()
-    try:
+    with closing(session.store.open()) as reader:
         return [reader.read(ref) for ref in chosen]
-    finally:
-        reader.close()
 
 
 def _similar_boards(board: Board) -> dict[str, Board]:
@@ -118,9 +113,8 @@ def _similar_boards(board: Board) -> dict[str, Board]:
     }
     if board.kind == "charuco":
         size = board.dictionary.split("_")[1]
-        for name in DICTIONARIES:
-            if name.endswith(f"_{size}") and name != board.dictionary:
-                out[f"dictionary {name}"] = replace(board, dictionary=name)
+        alike = (name for name in DICTIONARIES if name.endswith(f"_{size}") and name != board.dictionary)
+        out |= {f"dictionary {name}": replace(board, dictionary=name) for name in alike}
     return out
 
 
@@ -221,9 +215,8 @@ class RecordedSource:
 
     def material(self, table: CornerTable) -> CalibrationInput:
         """The calibration's input, once the corners are known."""
-        session, pictures = self.session, partial(pictures_of, self.session)
-        title, own = session.path.name, (self.given, self.images, self.lens_sigma)
-        return CalibrationInput(title, session.rig, *own, table, pictures)
+        session, own = self.session, (self.given, self.images, self.lens_sigma)
+        return CalibrationInput(session.path.name, session.rig, *own, table, partial(pictures_of, session))
 
 
 def open_source(path: Path) -> RecordedSource:

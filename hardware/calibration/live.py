@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol
 
 import numpy as np
@@ -28,12 +27,8 @@ from hardware.calibration.corners import (
     MIN_DEPTH_RATIO,
     MIN_PART_CORNERS,
     MIN_TILT_SHARE,
-    SAVE_EVERY_SETS,
-    CornerRow,
+    CornerSearch,
     CoverageGuide,
-    append_rows,
-    read_corners,
-    write_corners,
 )
 from hardware.calibration.inputs import CalibrationInput
 from hardware.cameras.feed import CameraPhase, CameraPlace, LiveHealth
@@ -47,7 +42,6 @@ from hardware.operator.view import RequestAnswer, WavingCamera, WavingStage, Wav
 from hardware.process.clock import Clock
 from hardware.process.progress import Progress
 from perception.boards.board import Board
-from perception.boards.corners import CornerFinder, empty_table
 from perception.frames import FrameSet, Image
 
 INITIAL_VIEW = WavingView(0.0, 1, WavingStage.WAVE)
@@ -72,9 +66,7 @@ class WavingPage:
         self._page.tend(self._clock.now())
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         if isinstance(error, KeyboardInterrupt):
             self.enter(WavingStage.STOPPED, "the corners are kept; the same command goes on from there")
         elif error is not None:
@@ -167,54 +159,33 @@ class WavingRecorder:
     """Collects corners from frame sets, with the newest pictures and the coverage so far."""
 
     def __init__(self, names: tuple[str, ...], sizes: tuple[tuple[int, int], ...], board: Board, store: Path) -> None:
-        self._store, self._key = store, _key(names, sizes, board)
-        known = read_corners(store, self._key)
-        self._table = empty_table(board, len(names)) if known is None else known
-        self._finders = [CornerFinder(board) for _ in names]
-        self._rows: list[CornerRow] = []
-        self._done, self._saved = self._table.done, self._table.done
-        self._late: float | None = None if len(self._table) else 0.0  # s, added to the cameras' stamps
+        key = hashlib.sha256(f"live {CORNERS_VERSION} {names} {sizes} {board}".encode()).hexdigest()
+        self.search = CornerSearch(board, len(names), store, key)
+        stored = self.search.table
+        self._late: float | None = None if len(stored) else 0.0  # s, added to the cameras' stamps
         self.seen: dict[int, Array] = {}  # corners (P, 2) px of the newest set by camera, nan where not seen
         self.guide = CoverageGuide(names, sizes, board)
-        self.guide.remember(self._table)
+        self.guide.remember(stored)
         self.pictures: list[list[Image]] = [[] for _ in names]
-
-    @property
-    def done(self) -> int:
-        """Number of frame sets searched, with those of earlier runs."""
-        return self._done
 
     def add(self, pool: ThreadPoolExecutor, one: FrameSet) -> None:
         """Search the board in one frame set."""
         if self._late is None:
-            self._late = float(self._table.stamp.max()) + RUN_GAP - min(frame.stamp for frame in one.frames)
-        each = list(pool.map(lambda frame: self._finders[frame.camera](frame.image), one.frames))
-        for frame, corners in zip(one.frames, each, strict=True):
-            self._rows.append(CornerRow(frame.camera, self._done, frame.stamp + self._late, corners))
+            self._late = float(self.search.table.stamp.max()) + RUN_GAP - min(frame.stamp for frame in one.frames)
+        each = self.search.add(pool, [(frame.camera, frame.stamp + self._late, frame.image) for frame in one.frames])
+        for frame in one.frames:
             self.pictures[frame.camera] = [*self.pictures[frame.camera][1 - RECENT_PICTURES :], frame.image]
         self.seen = {f.camera: c.pixels for f, c in zip(one.frames, each, strict=True) if c.count}
         self.guide.add(self.seen)
-        self._done += 1
-        if self._done - self._saved >= SAVE_EVERY_SETS:
-            self.save()
-
-    def save(self) -> None:
-        """Store the corners."""
-        self._table, self._rows = append_rows(self._table, self._rows, self._done), []
-        write_corners(self._store, self._key, self._table)
-        self._saved = self._done
 
     def material(self, devices: CalibrationCameras, sizes: tuple[tuple[int, int], ...]) -> CalibrationInput:
         """The calibration's input, once the corners are saved."""
-        rig = devices.rig if devices.rig is not None else _placeholder_rig(devices.names, sizes)
+        given = devices.rig is not None
+        rig = _placeholder_rig(devices.names, sizes) if devices.rig is None else devices.rig
         images = [ImageSource("source", source.identity.text) for source in devices.sources]
         title = ", ".join(source.identity.shown for source in devices.sources)
-        given = devices.rig is not None
-        return CalibrationInput(title, rig, given, images, devices.lens_sigma, self._table, lambda c: self.pictures[c])
-
-
-def _key(names: tuple[str, ...], sizes: tuple[tuple[int, int], ...], board: Board) -> str:
-    return hashlib.sha256(f"live {CORNERS_VERSION} {names} {sizes} {board}".encode()).hexdigest()
+        table, sigma = self.search.table, devices.lens_sigma
+        return CalibrationInput(title, rig, given, images, sigma, table, lambda c: self.pictures[c])
 
 
 def _placeholder_rig(names: tuple[str, ...], sizes: tuple[tuple[int, int], ...]) -> Rig:
@@ -256,11 +227,11 @@ def watch(
                     waving.add(pool, newest)
                     missing = waving.guide.missing()
                 progress.note = missing[0] if missing else "enough"
-                progress(waving.done, 0)
+                progress(waving.search.done, 0)
                 if page is not None and _update_page(page, waving, missing, newest):
                     break
         finally:  # Ctrl-C included
-            waving.save()
+            waving.search.save()
     return waving.material(devices, sizes)
 
 
@@ -268,7 +239,7 @@ def _update_page(page: WavingPage, waving: WavingRecorder, missing: tuple[str, .
     """Show the progress on the page; True if its user ends the collection, KeyboardInterrupt if he stops it."""
     if newest is not None:
         page.picture(waving.guide.names, newest, waving.seen)
-    page.show(waving.guide, missing, waving.done, waving.seen)
+    page.show(waving.guide, missing, waving.search.done, waving.seen)
     wish = page.poll()
     if wish is Wish.STOP:
         raise KeyboardInterrupt
