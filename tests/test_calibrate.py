@@ -189,10 +189,10 @@ def test_the_command_ends_with_the_verdict(session: Path, board_file: Path, caps
 def test_corners_are_looked_for_once_and_a_damaged_file_again(
     session: Path, outcome: CalibrationResult, tmp_path: Path
 ) -> None:
-    source, store = open_source(session), tmp_path / "x.npz"
-    key = content_key(source.session, BOARD)
+    (recording, _), store = open_source(session), tmp_path / "x.npz"
+    key = content_key(recording, BOARD)
     table = read_corners(session.parent / "rig.corners.npz", key)
-    assert table is not None and table.done == len(source.session)
+    assert table is not None and table.done == len(recording)
     write_corners(store, key, replace(table, done=0))
     assert read_corners(store, "another") is None
     whole = store.read_bytes()
@@ -201,9 +201,9 @@ def test_corners_are_looked_for_once_and_a_damaged_file_again(
     store.write_bytes(b"")
     assert read_corners(store, key) is None
     asked: list[int] = []
-    write_corners(store, key, replace(table, done=len(source.session) - 1))
-    again = collect_corners(source.session, BOARD, store, lambda done, total: asked.append(done))
-    assert asked == [len(source.session)] and again.done == len(source.session)
+    write_corners(store, key, replace(table, done=len(recording) - 1))
+    again = collect_corners(recording, BOARD, store, lambda done, total: asked.append(done))
+    assert asked == [len(recording)] and again.done == len(recording)
 
 
 def test_long_recordings_are_thinned_in_runs() -> None:
@@ -225,10 +225,10 @@ def test_a_rig_without_lenses_is_enough_to_begin_with(
     shutil.copytree(session, tmp_path / "s")
     lines = [f'[[camera]]\nname = "{n}"\nimages = "{n}/*"\nsize = [640, 480]\n' for n in "abc"]
     (tmp_path / "s" / "rig.toml").write_text("\n".join(lines))
-    source = open_source(tmp_path / "s")
-    assert not source.given and [c.name for c in source.session.rig.cameras] == ["a", "b", "c"]
+    bare, material = open_source(tmp_path / "s")
+    assert not material.given and [c.name for c in bare.rig.cameras] == ["a", "b", "c"]
     views, _ = usable_views(
-        collect_corners(open_source(session).session, BOARD, None, no_progress),
+        collect_corners(open_source(session)[0], BOARD, None, no_progress),
         BOARD,
         ("a", "b", "c"),
         ((640, 480),) * 3,

@@ -92,9 +92,9 @@ def test_live_cameras_are_calibrated_from_what_they_showed(pictures: list[list[I
     devices = devices_named(["http://h/0", "http://h/1", "http://h/2"])
     progress = Progress("corners", "frame sets", CLOCK.now, StringIO())
     once = [way[:INSTANTS] for way in pictures]
-    material = watch(ListedCameras(once), devices, BOARD, store, None, CLOCK, progress)
-    assert material.table.done == INSTANTS and "camera" in progress.note and "the board" in progress.note
-    outcome = finish(material, BOARD, file, out, CalibrationOptions(limit=1.0))
+    material, table = watch(ListedCameras(once), devices, BOARD, store, None, CLOCK, progress)
+    assert table.done == INSTANTS and "camera" in progress.note and "the board" in progress.note
+    outcome = finish(material, table, BOARD, file, out, CalibrationOptions(limit=1.0))
     assert outcome.verdict.passed and "camera 2: focal length" in outcome.text
     written = read_rig(out)
     for camera, lens in zip(written.rig.cameras, LENSES, strict=True):

@@ -52,9 +52,7 @@ class MoveOptions:
     reach: float = 50.0  # mm about the start along X and Y
     up: float = 45.0  # mm above the start
     down: float = 20.0  # mm below the start
-    turn: float = float(
-        np.deg2rad(35.0)
-    )  # rad of A, B and C at most: as far as a needle is seen, to tell tool from arm
+    turn: float = float(np.deg2rad(35.0))  # rad of A, B, C at most: as far as a needle is seen, to tell tool from arm
     speed: float = 80.0  # mm/s at most
     dwell: float = 0.6  # s at each place
     swing: float = 8.0  # s, at the end

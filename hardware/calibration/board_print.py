@@ -68,13 +68,13 @@ def page_size(options: PrintOptions) -> tuple[float, float]:
     """(W, H) mm of the page."""
     if options.page in PAGE_SIZES:
         return PAGE_SIZES[options.page]
-    words = options.page.lower().split("x")
+    allowed = f"{', '.join(PAGE_SIZES)}, or WxH in mm"
     try:
-        width, height = (float(word) for word in words)
+        width, height = (float(word) for word in options.page.lower().split("x"))
     except ValueError:
-        raise InputError("--page", "size", options.page, f"{', '.join(PAGE_SIZES)}, or WxH in mm") from None
+        raise InputError("--page", "size", options.page, allowed) from None
     if not (width > 0 and height > 0):
-        raise InputError("--page", "size", options.page, f"{', '.join(PAGE_SIZES)}, or WxH in mm, both above 0")
+        raise InputError("--page", "size", options.page, f"{allowed}, both above 0")
     return width, height
 
 
@@ -97,9 +97,8 @@ def board_of(options: PrintOptions) -> Board:
         got = f"{squares[0]} x {squares[1]} of {options.square:g} mm"
         raise InputError("--squares", "board", got, f"3 x 3 to {fits[0]} x {fits[1]} squares on {options.page}")
     if not cells_per_square(board):
-        raise InputError(
-            "--marker", "share", options.marker, "a share that whole bits of a marker make, as 0.75 or 0.6"
-        )
+        allowed = "a share that whole bits of a marker make, as 0.75 or 0.6"
+        raise InputError("--marker", "share", options.marker, allowed)
     return board
 
 
@@ -118,14 +117,11 @@ def drawing(board: Board, size: tuple[float, float]) -> PageDrawing:
     start = (size[0] - long) / 2
     ticks = [[start + x - 0.15, below, 0.3, 4 if x % 10 == 0 else 2] for x in np.arange(0, long + 1, 5)]
     ink = np.vstack([ink, [[start, below, long, 0.3]], ticks])
+    remedy = "If it is not, write the measured square_mm into board.toml. Mount the sheet on glass, flat."
     words = (
         (start + long + 2, below + 3.5, f"{long:g} mm"),
         (PAGE_MARGIN, below + 8.0, f"{board}. Print at 100 %: the ruler must be {long:g} mm long."),
-        (
-            PAGE_MARGIN,
-            below + 11.0,
-            "If it is not, write the measured square_mm into board.toml. Mount the sheet on glass, flat.",
-        ),
+        (PAGE_MARGIN, below + 11.0, remedy),
     )
     return PageDrawing(size, ink, words)
 
@@ -159,15 +155,10 @@ def svg(page: PageDrawing) -> str:
 
 def pdf(page: PageDrawing) -> bytes:
     """The page as PDF 1.4: one content stream of rectangles filled as one, and text in Helvetica."""
-    w, h = (side * POINTS_PER_MM for side in page.size)
-    boxes = "\n".join(
-        f"{x * POINTS_PER_MM:.4f} {h - (y + b) * POINTS_PER_MM:.4f} {a * POINTS_PER_MM:.4f} {b * POINTS_PER_MM:.4f} re"
-        for x, y, a, b in page.ink
-    )
-    text = "\n".join(
-        f"BT /F1 7.4 Tf {x * POINTS_PER_MM:.3f} {h - y * POINTS_PER_MM:.3f} Td ({_plain(t)}) Tj ET"
-        for x, y, t in page.words
-    )
+    k = POINTS_PER_MM
+    w, h = (side * k for side in page.size)
+    boxes = "\n".join(f"{x * k:.4f} {h - (y + b) * k:.4f} {a * k:.4f} {b * k:.4f} re" for x, y, a, b in page.ink)
+    text = "\n".join(f"BT /F1 7.4 Tf {x * k:.3f} {h - y * k:.3f} Td ({_plain(t)}) Tj ET" for x, y, t in page.words)
     stream = f"0 g\n{boxes}\nf\n{text}\n".encode("latin-1")
     parts = [
         b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",

@@ -29,7 +29,6 @@ from perception.boards.corners import BoardCorners, CornerFinder, CornerTable, e
 from perception.frames import Image
 
 CORNERS_VERSION = 3  # of the corner search, whose stored results are valid for this version only
-READ_BLOCK = 1 << 20  # bytes read at once
 SAVE_EVERY_SETS = 50  # some seconds of work
 CORNER_THREADS = 2  # search the pictures of one set at once
 COVERAGE_GRID = (4, 3)  # parts of a picture, across and down
@@ -51,8 +50,7 @@ def content_key(session: Session, board: Board) -> str:
     for path in _content_files(session.path):
         digest.update(path.name.encode())
         with path.open("rb") as stream:
-            while block := stream.read(READ_BLOCK):
-                digest.update(block)
+            hashlib.file_digest(stream, lambda: digest)  # into the one that has been begun
     return digest.hexdigest()
 
 

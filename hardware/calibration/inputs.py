@@ -120,14 +120,13 @@ def _similar_boards(board: Board) -> dict[str, Board]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationInput:
-    """What a rig is calibrated from."""
+    """What a rig is calibrated from, apart from the corners."""
 
     title: str  # of the report
     rig: Rig  # names and sizes of the cameras; the rest only if `given`
     given: bool  # whether the session has a calibrated rig
     images: Sequence[ImageSource | None]  # where each camera's pictures are, for the new rig.toml
     lens_sigma: Sequence[Array | None]  # of the given lenses, (9,) per camera or None
-    table: CornerTable
     pictures: Pictures  # a few of each camera
 
     @property
@@ -204,30 +203,17 @@ def _size(rig: Rig) -> float:
     return float(np.sqrt(((at[:, None] - at[None]) ** 2).sum(-1).mean()))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedSource:
-    """A recorded session to calibrate from."""
-
-    session: Session
-    given: bool  # whether it has a calibrated rig
-    images: Sequence[ImageSource | None]
-    lens_sigma: Sequence[Array | None]
-
-    def material(self, table: CornerTable) -> CalibrationInput:
-        """The calibration's input, once the corners are known."""
-        session, own = self.session, (self.given, self.images, self.lens_sigma)
-        return CalibrationInput(session.path.name, session.rig, *own, table, partial(pictures_of, session))
-
-
-def open_source(path: Path) -> RecordedSource:
+def open_source(path: Path) -> tuple[Session, CalibrationInput]:
     """Open a session folder, whose rig.toml may lack lenses and poses, or an .mcap file; InputError if it is wrong."""
     rig_toml = path / "rig.toml"
-    if path.is_dir() and rig_toml.is_file():
-        if is_calibrated(rig_toml):
-            session, rig = open_folder(path), read_rig(rig_toml)
-            return RecordedSource(session, True, rig.sources, rig.lens_sigma)
-        bare = read_uncalibrated(rig_toml)
-        return RecordedSource(open_folder(path, bare), False, bare.sources, bare.lens_sigma)
-    session = open_session(path)
+    if not (path.is_dir() and rig_toml.is_file()):
+        session, given, rig = open_session(path), True, None
+    elif is_calibrated(rig_toml):
+        session, given, rig = open_folder(path), True, read_rig(rig_toml)
+    else:
+        given, rig = False, read_uncalibrated(rig_toml)
+        session = open_folder(path, rig)
     nothing = [None] * len(session.rig)
-    return RecordedSource(session, True, nothing, nothing)
+    images, sigma = (nothing, nothing) if rig is None else (rig.sources, rig.lens_sigma)
+    title, pictures = session.path.name, partial(pictures_of, session)
+    return session, CalibrationInput(title, session.rig, given, images, sigma, pictures)

@@ -42,6 +42,7 @@ from hardware.operator.view import RequestAnswer, WavingCamera, WavingStage, Wav
 from hardware.process.clock import Clock
 from hardware.process.progress import Progress
 from perception.boards.board import Board
+from perception.boards.corners import CornerTable
 from perception.frames import FrameSet, Image
 
 INITIAL_VIEW = WavingView(0.0, 1, WavingStage.WAVE)
@@ -179,13 +180,12 @@ class WavingRecorder:
         self.guide.add(self.seen)
 
     def material(self, devices: CalibrationCameras, sizes: tuple[tuple[int, int], ...]) -> CalibrationInput:
-        """The calibration's input, once the corners are saved."""
+        """The calibration's input besides the corners."""
         given = devices.rig is not None
         rig = _placeholder_rig(devices.names, sizes) if devices.rig is None else devices.rig
         images = [ImageSource("source", source.identity.text) for source in devices.sources]
         title = ", ".join(source.identity.shown for source in devices.sources)
-        table, sigma = self.search.table, devices.lens_sigma
-        return CalibrationInput(title, rig, given, images, sigma, table, lambda c: self.pictures[c])
+        return CalibrationInput(title, rig, given, images, devices.lens_sigma, lambda c: self.pictures[c])
 
 
 def _placeholder_rig(names: tuple[str, ...], sizes: tuple[tuple[int, int], ...]) -> Rig:
@@ -207,7 +207,7 @@ def watch(
     clock: Clock,
     progress: Progress,
     page: WavingPage | None = None,
-) -> CalibrationInput:
+) -> tuple[CalibrationInput, CornerTable]:
     """Collect corners until the coverage suffices, for `seconds` at most (None: without end), or until the files end.
 
     The corners are then in `store`, also after an interrupt. page: shows the progress; its user may stop
@@ -232,7 +232,7 @@ def watch(
                     break
         finally:  # Ctrl-C included
             waving.search.save()
-    return waving.material(devices, sizes)
+    return waving.material(devices, sizes), waving.search.table
 
 
 def _update_page(page: WavingPage, waving: WavingRecorder, missing: tuple[str, ...], newest: FrameSet | None) -> bool:

@@ -16,7 +16,7 @@ from estimation.calibration.lens_model import PARAMETERS, lens_of, project_lens
 from estimation.calibration.validation import VolumeError
 from estimation.se3 import Array
 from hardware.calibration.corners import coverage
-from hardware.report.page import document, figures_table, row_of_tiles, section, tile
+from hardware.report.page import document, figures_table, legend, row_of_tiles, section, tile
 
 MAX_PREDICTED_ERROR = 0.1  # mm: what printing needs of the rig in the working volume, one sigma in 3D
 MAX_RESIDUAL = 0.5  # px, median of the corners
@@ -65,17 +65,15 @@ def judge_rig(calibration: Calibration, error: VolumeError, limit: float, hints:
 
 def board_scatter(calibration: Calibration) -> float:
     """RMS error, mm, of distances between triangulated corners, at instants that two cameras share."""
-    views, state = calibration.views, calibration.fit.state
-    corners = _triangulated_corners(calibration)
-    out = []
-    for i in range(len(state.base_from_board)):
-        known = np.isfinite(corners[i, :, 0])
-        a, b = corners[i, known], views.points[known]
-        if len(a) > 1:
-            rows = np.triu_indices(len(a), 1)
-            measured, true = (np.linalg.norm(p[rows[0]] - p[rows[1]], axis=1) for p in (a, b))
-            out.append(measured - true)
-    return float(np.sqrt(np.mean(np.concatenate(out) ** 2))) if out else float("nan")
+    errors = []
+    for corners in _triangulated_corners(calibration):
+        known = np.isfinite(corners[:, 0])
+        first, second = np.triu_indices(int(known.sum()), 1)
+        if len(first):
+            pair = corners[known], calibration.views.points[known]
+            measured, true = (np.linalg.norm(p[first] - p[second], axis=1) for p in pair)
+            errors.append(measured - true)
+    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2))) if errors else float("nan")
 
 
 def _triangulated_corners(calibration: Calibration) -> Array:
@@ -137,8 +135,14 @@ def page(
     """The page as HTML. dropped: views by camera and reason. pictures: undistorted JPEGs by camera."""
     word = "passed" if verdict.passed else "failed"
     residuals = f"From each corner to where the rig puts it, {RESIDUAL_SCALE} times as long."
+    tiles = [
+        tile(f"{error.worst:.3f}", "mm", "predicted error, 19 of 20 points"),
+        tile(f"{median_residual(found):.2f}", "px", "median corner residual"),
+        tile(f"{board_scatter(found):.2f}", "mm", "RMS of distances between corners"),
+        tile(str(len(found.views)), "", "views used"),
+    ]
     body = [
-        _tiles(found, error),
+        row_of_tiles(tiles),
         section("Verdict", ". ".join(verdict.lines) + ".", bullets(verdict.hints) if verdict.hints else ""),
         section("Cameras", "One sigma behind each figure.", _cameras(found) + _left_out(found, dropped)),
         section("Where the board was", "Every corner used, where the lens imaged it.", _each(found, _corners)),
@@ -159,17 +163,6 @@ def millimetres_per_pixel(found: Calibration, camera: int) -> float:
     middle = se3.transform_points(boards, views.points).mean(1)
     depth = se3.transform_points(se3.inverse(state.base_from_camera[camera]), middle)[:, 2]
     return float(np.median(depth) / np.sqrt(state.lens[camera, 0] * state.lens[camera, 1]))
-
-
-def _tiles(found: Calibration, error: VolumeError) -> str:
-    return row_of_tiles(
-        [
-            tile(f"{error.worst:.3f}", "mm", "predicted error, 19 of 20 points"),
-            tile(f"{median_residual(found):.2f}", "px", "median corner residual"),
-            tile(f"{board_scatter(found):.2f}", "mm", "RMS of distances between corners"),
-            tile(str(len(found.views)), "", "views used"),
-        ]
-    )
 
 
 def _cameras(found: Calibration) -> str:
@@ -246,8 +239,7 @@ def _volume(error: VolumeError) -> str:
     pairs = zip([*styles, ""], [*keys, "not seen by two"], strict=True)
     low, high = error.points.min(0), error.points.max(0)
     text = " x ".join(f"{b - a:.0f}" for a, b in zip(low, high, strict=True))
-    legend = "".join(_key(style, words) for style, words in pairs)
-    return f'<p class="note">{text} mm</p>{figure_row(layers)}<div class="legend">{legend}</div>'
+    return f'<p class="note">{text} mm</p>{figure_row(layers)}{legend([_key(*pair) for pair in pairs])}'
 
 
 def _layer(values: Array, z: float) -> str:
@@ -270,9 +262,6 @@ def _key(fill: str, words: str) -> str:
 
 
 def _pictures(pictures: Mapping[str, bytes]) -> str:
-    figures = []
-    for name, data in pictures.items():
-        text = base64.b64encode(data).decode()
-        image = f'<img alt="{escape(name)}" src="data:image/jpeg;base64,{text}"/>'
-        figures.append(figure(image, name))
-    return figure_row(figures)
+    images = {name: base64.b64encode(data).decode() for name, data in pictures.items()}
+    tags = {name: f'<img alt="{escape(name)}" src="data:image/jpeg;base64,{text}"/>' for name, text in images.items()}
+    return figure_row(figure(tag, name) for name, tag in tags.items())

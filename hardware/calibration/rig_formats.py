@@ -19,7 +19,7 @@ import yaml
 
 from estimation import se3
 from estimation.errors import InputError
-from estimation.rig import Camera, Rig
+from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.files.rig_file import rig_from_table
 from hardware.process import checks
@@ -66,36 +66,35 @@ def _write_yaml(path: Path, table: Table) -> None:
     path.write_text(yaml.safe_dump(table, sort_keys=False, default_flow_style=None), encoding="utf-8")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Entry:
-    name: str
-    size: Sequence[object]  # [W, H] px
-    focal: Array  # fx fy cx cy
-    distortion: Array  # k1 k2 p1 p2, maybe k3
-    place: Array | None  # (4, 4) base_from_camera, mm, or None
-    offset: float = 0.0  # s
+def _camera_table(
+    name: str, size: Sequence[object], focal: Array, distortion: Array, place: Array | None, offset: float
+) -> Table:
+    """A camera as in rig.toml, its distortion and place as they were read.
 
-
-def _rig_of(path: Path, entries: Sequence[_Entry]) -> Rig:
-    """The rig; InputError where a camera is wrong, or several have no poses."""
-    if len(entries) > 1 and any(entry.place is None for entry in entries):
-        raise InputError(path, "places of the cameras", "none", "base_from_camera of each: this file holds lenses only")
-    return rig_from_table(path, {"camera": [_table(path, entry) for entry in entries]})
-
-
-def _table(path: Path, entry: _Entry) -> Table:
-    fx, fy, cx, cy = entry.focal.tolist()
-    if not 4 <= len(entry.distortion) <= 5:
-        allowed = "k1 k2 p1 p2, or k1 k2 p1 p2 k3"
-        raise InputError(path, f"camera {entry.name!r}: distortion", entry.distortion.tolist(), allowed)
+    focal: fx fy cx cy px. distortion: k1 k2 p1 p2, maybe k3. place: (4, 4) base_from_camera, mm, or None. offset: s.
+    """
+    fx, fy, cx, cy = focal.tolist()
     return {
-        "name": entry.name,
-        "size": list(entry.size),
+        "name": name,
+        "size": list(size),  # [W, H] px
         "matrix": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
-        "distortion": [*entry.distortion.tolist(), 0.0][:5],
-        "base_from_camera": (np.eye(4) if entry.place is None else entry.place).tolist(),
-        "clock_offset_s": entry.offset,
+        "distortion": distortion.tolist(),
+        "base_from_camera": None if place is None else place.tolist(),
+        "clock_offset_s": offset,
     }
+
+
+def _rig_of(path: Path, cameras: Sequence[Table]) -> Rig:
+    """The rig; InputError where a camera is wrong, or several have no poses."""
+    if len(cameras) > 1 and any(camera["base_from_camera"] is None for camera in cameras):
+        raise InputError(path, "places of the cameras", "none", "base_from_camera of each: this file holds lenses only")
+    for camera in cameras:
+        if not 4 <= len(camera["distortion"]) <= 5:
+            where = f"camera {camera['name']!r}: distortion"
+            raise InputError(path, where, camera["distortion"], "k1 k2 p1 p2, or k1 k2 p1 p2 k3")
+        camera["distortion"] = [*camera["distortion"], 0.0][:5]
+        camera["base_from_camera"] = camera["base_from_camera"] or np.eye(4).tolist()
+    return rig_from_table(path, {"camera": cameras})
 
 
 def _numbers(path: Path, table: Table, key: str, shape: tuple[int | None, ...]) -> Array:
@@ -122,7 +121,7 @@ def _pinhole(path: Path, m: Array) -> Array:
 
 def read_opencv(path: Path) -> Rig:
     """The rig in a folder of OpenCV's calibration files, or in one of them; each has its camera's name."""
-    return _rig_of(path, [_yaml_entry(file, read_yaml(file), file.stem) for file in _camera_files(path)])
+    return _rig_of(path, [_yaml_camera(file, read_yaml(file), file.stem) for file in _camera_files(path)])
 
 
 def write_opencv(path: Path, rig: Rig) -> None:
@@ -140,14 +139,26 @@ def write_opencv(path: Path, rig: Rig) -> None:
 
 def read_ros(path: Path) -> Rig:
     """The rig in a folder of camera_info files, or in one of them."""
-    return _rig_of(path, [_ros_entry(file) for file in _camera_files(path)])
+    return _rig_of(path, [_ros_camera(file) for file in _camera_files(path)])
 
 
 def write_ros(path: Path, rig: Rig) -> None:
     """Write a folder of camera_info files, without rectification."""
     path.mkdir(parents=True, exist_ok=True)
     for camera in rig.cameras:
-        _write_yaml(path / f"{camera.name}.yaml", _ros_table(camera))
+        table = {
+            "image_width": camera.size[0],
+            "image_height": camera.size[1],
+            "camera_name": camera.name,
+            "camera_matrix": _ros_matrix(camera.matrix),
+            "distortion_model": "plumb_bob",
+            "distortion_coefficients": _ros_matrix(camera.distortion[None]),
+            "rectification_matrix": _ros_matrix(np.eye(3)),
+            "projection_matrix": _ros_matrix(np.hstack([camera.matrix, np.zeros((3, 1))])),
+            "base_from_camera": _ros_matrix(camera.base_from_camera),
+            "clock_offset_s": float(camera.clock_offset),
+        }
+        _write_yaml(path / f"{camera.name}.yaml", table)
 
 
 def _camera_files(path: Path) -> list[Path]:
@@ -163,45 +174,30 @@ def _cv_matrix(name: str, values: Array) -> list[str]:
     return [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d", f"   data: [ {data} ]"]
 
 
-def _yaml_entry(path: Path, table: Table, name: str) -> _Entry:
+def _yaml_camera(path: Path, table: Table, name: str) -> Table:
     focal = _pinhole(path, _matrix(path, table, "camera_matrix"))
     distortion = _matrix(path, table, "distortion_coefficients").ravel()
     width, height = (checks.integer(path, key, table.get(key), 1) for key in ("image_width", "image_height"))
     place = _matrix(path, table, "base_from_camera") if "base_from_camera" in table else None
     offset = checks.number(path, "clock_offset_s", table.get("clock_offset_s", 0.0))
-    return _Entry(name, (width, height), focal, distortion, place, offset)
+    return _camera_table(name, (width, height), focal, distortion, place, offset)
 
 
-def _ros_entry(path: Path) -> _Entry:
+def _ros_camera(path: Path) -> Table:
     table = read_yaml(path)
     if table.get("distortion_model") != "plumb_bob":
         raise InputError(path, "distortion_model", table.get("distortion_model"), "plumb_bob")
-    return _yaml_entry(path, table, checks.text(path, "camera_name", table.get("camera_name")))
+    return _yaml_camera(path, table, checks.text(path, "camera_name", table.get("camera_name")))
 
 
-def _ros_table(camera: Camera) -> Table:
-    return {
-        "image_width": camera.size[0],
-        "image_height": camera.size[1],
-        "camera_name": camera.name,
-        "camera_matrix": _rows(camera.matrix),
-        "distortion_model": "plumb_bob",
-        "distortion_coefficients": _rows(camera.distortion[None]),
-        "rectification_matrix": _rows(np.eye(3)),
-        "projection_matrix": _rows(np.hstack([camera.matrix, np.zeros((3, 1))])),
-        "base_from_camera": _rows(camera.base_from_camera),
-        "clock_offset_s": float(camera.clock_offset),
-    }
-
-
-def _rows(values: Array) -> Table:
+def _ros_matrix(values: Array) -> Table:
     return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
 
 
 def read_kalibr(path: Path) -> Rig:
     """The rig of a camchain; its base is the first camera. Cameras have the names of their topics, else cam0, cam1."""
     chain = read_yaml(path)
-    place, entries = np.eye(4), []
+    place, cameras = np.eye(4), []
     for number, key in enumerate(sorted(chain, key=lambda k: int(k[3:]) if str(k)[3:].isdigit() else -1)):
         table = chain[key]
         if not isinstance(table, dict) or key != f"cam{number}":
@@ -211,8 +207,12 @@ def read_kalibr(path: Path) -> Rig:
                 raise InputError(path, f"{key}.{word}", table.get(word), known)
         if number:
             place = place @ se3.inverse(_scaled(_numbers(path, table, "T_cn_cnm1", (4, 4)), MM_PER_M))
-        entries.append(_kalibr_entry(path, str(key), table, place))
-    return _rig_of(path, entries)
+        topic = str(table.get("rostopic", "")).strip("/").split("/")[0]
+        size = _numbers(path, table, "resolution", (2,)).astype(int).tolist()
+        focal, distortion = (_numbers(path, table, word, (4,)) for word in ("intrinsics", "distortion_coeffs"))
+        shift = checks.number(path, f"{key}.timeshift_cam_imu", table.get("timeshift_cam_imu", 0.0))
+        cameras.append(_camera_table(topic or str(key), size, focal, distortion, place, shift))
+    return _rig_of(path, cameras)
 
 
 def write_kalibr(path: Path, rig: Rig) -> None:
@@ -240,14 +240,6 @@ def write_kalibr(path: Path, rig: Rig) -> None:
     _write_yaml(path, chain)
 
 
-def _kalibr_entry(path: Path, key: str, table: Table, place: Array) -> _Entry:
-    topic = str(table.get("rostopic", "")).strip("/").split("/")[0]
-    size = _numbers(path, table, "resolution", (2,)).astype(int).tolist()
-    focal, distortion = (_numbers(path, table, word, (4,)) for word in ("intrinsics", "distortion_coeffs"))
-    shift = checks.number(path, f"{key}.timeshift_cam_imu", table.get("timeshift_cam_imu", 0.0))
-    return _Entry(topic or key, size, focal, distortion, place, shift)
-
-
 def _scaled(transform: Array, factor: float) -> Array:
     out = transform.copy()
     out[:3, 3] *= factor
@@ -256,7 +248,7 @@ def _scaled(transform: Array, factor: float) -> Array:
 
 def read_anipose(path: Path) -> Rig:
     """The rig; lengths are taken for mm, as aniposelib's are if its board was given in mm."""
-    entries = []
+    cameras = []
     for key, table in checks.read_toml(path).items():
         if not isinstance(table, dict) or "matrix" not in table:
             continue  # metadata and other tables of caliscope
@@ -265,8 +257,9 @@ def read_anipose(path: Path) -> Rig:
         focal = _pinhole(path, _numbers(path, table, "matrix", (3, 3)))
         distortion = _numbers(path, table, "distortions", (None,))
         offset = checks.number(path, f"{key}.clock_offset_s", table.get("clock_offset_s", 0.0))
-        entries.append(_Entry(str(table.get("name", key)), table.get("size", []), focal, distortion, place, offset))
-    return _rig_of(path, entries)
+        name, size = str(table.get("name", key)), table.get("size", [])
+        cameras.append(_camera_table(name, size, focal, distortion, place, offset))
+    return _rig_of(path, cameras)
 
 
 def write_anipose(path: Path, rig: Rig) -> None:
@@ -274,13 +267,13 @@ def write_anipose(path: Path, rig: Rig) -> None:
     blocks = []
     for number, camera in enumerate(rig.cameras):
         camera_from_base = se3.inverse(camera.base_from_camera)
-        lines = [f"[cam_{number}]", f"name = {json.dumps(camera.name)}", f"size = {list(camera.size)}"]
-        lines.append(f"matrix = {checks.toml_numbers(camera.matrix)}")
-        lines.append(f"distortions = {checks.toml_numbers(camera.distortion)}")
-        lines.append(f"rotation = {checks.toml_numbers(se3.log_rotation(camera_from_base[:3, :3]))}")
-        lines.append(f"translation = {checks.toml_numbers(np.asarray(camera_from_base[:3, 3]))}")
-        lines.append(f"clock_offset_s = {float(camera.clock_offset)!r}")
-        blocks.append("\n".join(lines) + "\n")
+        blocks.append(
+            f"[cam_{number}]\nname = {json.dumps(camera.name)}\nsize = {list(camera.size)}\n"
+            f"matrix = {checks.toml_numbers(camera.matrix)}\ndistortions = {checks.toml_numbers(camera.distortion)}\n"
+            f"rotation = {checks.toml_numbers(se3.log_rotation(camera_from_base[:3, :3]))}\n"
+            f"translation = {checks.toml_numbers(np.asarray(camera_from_base[:3, 3]))}\n"
+            f"clock_offset_s = {float(camera.clock_offset)!r}\n"
+        )
     blocks.append("[metadata]\nadjusted = true\n")
     path.write_text("\n".join(blocks), encoding="utf-8")
 

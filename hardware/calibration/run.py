@@ -41,7 +41,7 @@ from hardware.operator.view import WavingStage
 from hardware.process.clock import Clock
 from hardware.process.progress import Progress, ProgressReport
 from perception.boards.board import Board, thumbnail, undistort
-from perception.boards.corners import usable_views
+from perception.boards.corners import CornerTable, usable_views
 
 SURFACE_SPEED = 20.0  # mm/s, for the effect of clock errors: the peak of a deep breath
 PICTURE_WIDTH = 640  # px, of a picture in the report
@@ -75,11 +75,10 @@ def run_calibration(
     InputError, Undetermined and Implausible say what is wrong; then only the corners are written.
     """
     board = _check_paths(board_file, out)
-    source = open_source(session)
-    names = tuple(c.name for c in source.session.rig.cameras)
-    _check_options(names, source.given, source.session.path, options)
-    table = collect_corners(source.session, board, corners_of(out), report)
-    return finish(source.material(table), board, board_file, out, options)
+    recording, material = open_source(session)
+    _check_options(material.names, material.given, recording.path, options)
+    table = collect_corners(recording, board, corners_of(out), report)
+    return finish(material, table, board, board_file, out, options)
 
 
 def run_live(
@@ -102,10 +101,10 @@ def run_live(
     _check_options(devices.names, devices.rig is not None, "command line", options)
     with open_page() as shown:
         with LiveCameras(devices.places, devices.sources, clock) as live:
-            material = watch(live, devices, board, corners_of(out), seconds, clock, progress, shown)
+            material, table = watch(live, devices, board, corners_of(out), seconds, clock, progress, shown)
         if shown is not None:
             shown.enter(WavingStage.SOLVE)
-        outcome = finish(material, board, board_file, out, options)
+        outcome = finish(material, table, board, board_file, out, options)
         if shown is not None:
             shown.enter(WavingStage.PASSED if outcome.verdict.passed else WavingStage.FAILED, *outcome.text.split("\n"))
     return outcome
@@ -125,11 +124,12 @@ def _check_paths(board_file: Path, out: Path) -> Board:
 
 
 def finish(
-    material: CalibrationInput, board: Board, board_file: Path, out: Path, options: CalibrationOptions
-) -> CalibrationResult:
+    material: CalibrationInput, table: CornerTable, board: Board, board_file: Path, out: Path,
+    options: CalibrationOptions,
+) -> CalibrationResult:  # fmt: skip
     """Calibrate from the corners, and write all files."""
-    check_table(material.table, board, board_file, material.names, material.pictures)
-    views, dropped = usable_views(material.table, board, material.names, tuple(c.size for c in material.rig.cameras))
+    check_table(table, board, board_file, material.names, material.pictures)
+    views, dropped = usable_views(table, board, material.names, tuple(c.size for c in material.rig.cameras))
     found = calibrate(views, known=material.lenses if options.keep_lenses else None)
     if options.distance is not None:
         check_distance(found.rig, *options.distance, board_file, board.square)

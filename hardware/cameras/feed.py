@@ -126,11 +126,6 @@ class LiveHealth:
         """The cameras' troubles; "" without any."""
         return "; ".join(camera.trouble for camera in self.cameras if camera.trouble)
 
-    @property
-    def all_open(self) -> bool:
-        """Whether every camera has delivered a good frame within the last half second."""
-        return all(c.phase is CameraPhase.OPEN and c.age <= STALL_AFTER for c in self.cameras)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrival:

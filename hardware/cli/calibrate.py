@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
-from hardware.cli.parser import INTERRUPTED, Commands, arm_profile, positive, progress_bar, wrong_option
+from hardware.cli.parser import FAILED, INTERRUPTED, Commands, arm_profile, positive, progress_bar, wrong_option
 from hardware.process.clock import Clock, WallClock
 from hardware.process.progress import check_new, left_files_text
 
@@ -25,7 +25,6 @@ RIG_FORMATS = {
     "anipose": "aniposelib's and caliscope's TOML, mm",
 }
 RIG_FORMATS_TEXT = "; ".join(f"{name}: {text}" for name, text in RIG_FORMATS.items())
-NOT_GOOD_ENOUGH = 1  # exit code of a calibration that is not good enough
 ARM_SOURCES = ("folder", "device", "virtual", "touched")
 
 
@@ -78,26 +77,20 @@ def _add_cameras(parts: Commands) -> None:
         "stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
         "stillbed calibrate cameras /dev/v4l/by-id/CAMERA_A /dev/v4l/by-id/CAMERA_B --board board.toml -o rig.toml",
     ).add_argument
-    add(
-        "which",
-        nargs="+",
-        metavar="SESSION_OR_CAMERA",
-        help="session folder or .mcap (its rig may lack lenses); or live cameras as `stillbed cameras` names them, "
-        "or RIG.toml for all of a rig",
+    which = (
+        "session folder or .mcap (its rig may lack lenses); or live cameras as `stillbed cameras` names them, "
+        "or RIG.toml for all of a rig"
     )
+    add("which", nargs="+", metavar="SESSION_OR_CAMERA", help=which)
     add("--seconds", type=float, metavar="S", help="watch live cameras so long at most; default: until enough was seen")
     add("--no-page", action="store_true", help="with live cameras: without the page in the browser")
     add("--board", type=Path, required=True, metavar="board.toml", help="the board as it was printed")
     add("-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write; report beside it")
     add("--limit-mm", type=positive, default=0.1, metavar="MM", help="predicted error to pass; default 0.1")
-    add(
-        "--distance-mm", type=_distance, metavar="A,B,MM", help="two cameras and how far apart they are, to check scale"
-    )
-    add(
-        "--keep-lenses",
-        action="store_true",
-        help="take the session's lenses, within their lens_sigma; seek places and clocks",
-    )
+    distance = "two cameras and how far apart they are, to check scale"
+    add("--distance-mm", type=_distance, metavar="A,B,MM", help=distance)
+    lenses = "take the session's lenses, within their lens_sigma; seek places and clocks"
+    add("--keep-lenses", action="store_true", help=lenses)
     add("--new-rig", action="store_true", help="do not compare with the session's own rig")
     add("--force", action="store_true", help="overwrite rig.toml and what stands beside it")
 
@@ -175,7 +168,7 @@ def _cameras(a: argparse.Namespace) -> int:
         print(f"\nstillbed: interrupted; {kept}", file=sys.stderr)
         return INTERRUPTED
     print(outcome.text)
-    return 0 if outcome.verdict.passed else NOT_GOOD_ENOUGH
+    return 0 if outcome.verdict.passed else FAILED
 
 
 def _opened_page(clock: Clock) -> WavingPage:
@@ -276,7 +269,7 @@ def _calibrate_arm(a: argparse.Namespace) -> int:
         print(f"\nstillbed: interrupted; {left_files_text(a.record)}; {_resume_hint(a.record, a.out)}", file=sys.stderr)
         return INTERRUPTED
     print(outcome.text)
-    return 0 if outcome.verdict.passed else NOT_GOOD_ENOUGH
+    return 0 if outcome.verdict.passed else FAILED
 
 
 def _resume_hint(record: Path, out: Path) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
-from hardware.cli.parser import Commands, add_fault, arm_profile, positive, wrong_option
+from hardware.cli.parser import FAILED, Commands, add_fault, arm_profile, positive, wrong_option
 from hardware.process.clock import Clock, WallClock
 from perception.package_data import named_path
 
@@ -27,7 +27,6 @@ NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   in a container, hand it in (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
   a camera on the network is named by its URL: stillbed cameras rtsp://ADDRESS/PATH"""
 SHEET_JPEG_QUALITY = 90  # of JPEG: fine enough to judge focus by
-CAMERA_FAULTY = 1  # exit code where a camera delivers nothing, or did not take what it was asked
 
 
 def add_live(commands: Commands) -> None:
@@ -269,4 +268,4 @@ def _watch_cameras(a: argparse.Namespace, live: LiveCameras, clock: Clock) -> in
         a.out.write_bytes(encode(inspection_sheet(inspection), jpeg)[1])
         if not a.json:
             print(f"\ntheir last pictures are in {a.out}")
-    return CAMERA_FAULTY if inspection.faulty else 0
+    return FAILED if inspection.faulty else 0

@@ -18,7 +18,7 @@ from estimation.errors import StillbedError
 from hardware.bench.subjects import SUBJECTS, Subject, Subjects
 from hardware.cli.calibrate import add_calibrate
 from hardware.cli.live import add_arm, add_cameras, add_init, add_live
-from hardware.cli.parser import INTERRUPTED, WRONG_INPUT, Commands, Parser, add_fault, error_text, wrong_option
+from hardware.cli.parser import FAILED, INTERRUPTED, WRONG_INPUT, Commands, Parser, add_fault, error_text, wrong_option
 from hardware.cli.plan import add_plan, add_reach, add_segment, add_train
 from hardware.cli.sessions import add_compare, add_export, add_import, add_replay, add_smooth, add_track, add_view
 from hardware.process.clock import WallClock
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from hardware.operator.view import CheckVerdict
 
 BENCH_OUT = Path("out/bench")
-CHECK_FAILED = 1  # exit code where something failed
-LIMITS_MISSED = 1  # a simulation that ran to its end and did not reach its own limits
 
 
 def add_bench(commands: Commands) -> None:
@@ -127,7 +125,7 @@ def _run_doctor(a: argparse.Namespace) -> int:
     else:
         print("\n\n".join(f"{name}\n{checks_table(tuple(part))}" for name, part in parts.items() if part))
         print(f"\n{_verdict_text(verdicts, broken)}")
-    return CHECK_FAILED if CheckVerdict.FAIL in verdicts else 0
+    return FAILED if CheckVerdict.FAIL in verdicts else 0
 
 
 def _verdict_text(verdicts: list[CheckVerdict], broken: bool) -> str:
@@ -235,7 +233,7 @@ def _simulate(a: argparse.Namespace) -> int:
     options = SimulationOptions(a.trace, faults, a.threads, a.pty, a.force)
     outcome = run_simulation(a.scenario, a.out, options)
     print(outcome.text)
-    return 0 if outcome.met else LIMITS_MISSED
+    return 0 if outcome.met else FAILED
 
 
 if __name__ == "__main__":

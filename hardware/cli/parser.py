@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
 Run = Callable[[argparse.Namespace], int | None]  # a command: its exit code, None for 0
 FAULT_TEXT = 'what goes wrong, such as "camera0 stuck at 5s for 2s"; may be given more than once; see docs/faults.md'
-WRONG_INPUT = 2  # exit codes
-INTERRUPTED = 130  # what a shell expects after Ctrl-C
+FAILED = 1  # exit code where a command ran, and its result is not good enough
+WRONG_INPUT = 2  # exit code
+INTERRUPTED = 130  # exit code that a shell expects after Ctrl-C
 USAGE = re.compile(r"python \S+\.py.*?(?=\s{2,}|$)", re.MULTILINE)  # a line of the docstring
 
 
@@ -79,29 +80,23 @@ def arm_profile(path: Path | None) -> ArmProfile:
     return ArmProfile() if path is None else read_arm(path)
 
 
-def positive(text: str) -> float:
-    """A finite number above 0."""
-    value = _number(text)
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"{text!r}, needed is a number above 0")
-    return value
+def _number_that(good: Callable[[float], bool], words: str) -> Callable[[str], float]:
+    """A type of an option: a finite number that is good, in words."""
+
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and good(value)):
+            raise argparse.ArgumentTypeError(f"{text!r}, needed is {words}")
+        return value
+
+    return number
 
 
-def not_negative(text: str) -> float:
-    """A finite number, 0 or more."""
-    value = _number(text)
-    if not value >= 0:
-        raise argparse.ArgumentTypeError(f"{text!r}, needed is a number, 0 or more")
-    return value
-
-
-def _number(text: str) -> float:
-    """NaN where it is no finite number."""
-    try:
-        value = float(text)
-    except ValueError:
-        return math.nan
-    return value if math.isfinite(value) else math.nan
+positive = _number_that(lambda value: value > 0, "a number above 0")
+not_negative = _number_that(lambda value: value >= 0, "a number, 0 or more")
 
 
 def add_fault(add: Callable[..., Any], text: str = FAULT_TEXT) -> None:

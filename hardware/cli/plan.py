@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hardware.cli.parser import Commands, not_negative, wrong_option
+from hardware.cli.parser import FAILED, Commands, not_negative, wrong_option
 from perception.package_data import named_path
 
 if TYPE_CHECKING:
@@ -30,7 +31,6 @@ PLAN_EXAMPLES = (
     "stillbed plan contour.csv -o out/path.csv --bead 0.8 --pattern zigzag --angle shorter --gcode out/path.gcode",
 )
 
-PATH_NOT_REACHABLE = 1  # exit code where a checkpoint cannot be printed
 UNET_METHOD, SHAPE_METHOD = "unet", "shape"
 
 
@@ -133,11 +133,8 @@ def _run_plan(a: argparse.Namespace) -> None:
     from hardware.plan.order import PlanRequest, PlanSettings
     from hardware.plan.run import run_plan
 
-    settings = PlanSettings(
-        a.material, tuple(a.tissue), a.layers, a.layer_height, a.pattern, a.angle, a.parallel, a.bead,
-        a.overlap_percent, a.inset, a.rims, a.speed, a.travel, a.temperature, a.spacing, a.chord, a.lift, a.wait,
-        a.sideways, a.tilt_deg, a.turning_deg_mm, a.spin_deg, a.bump, a.bump_clearance,
-    )  # fmt: skip
+    values = {f.name: getattr(a, f.name) for f in fields(PlanSettings) if f.name != "tissues"}
+    settings = PlanSettings(tissues=tuple(a.tissue), **values)
     source = a.out, a.scan, a.example, a.outline, a.unit, a.flip, a.gcode, a.session
     print(run_plan(PlanRequest(*source, not a.no_pictures, a.force, a.arm, settings)))
 
@@ -182,7 +179,7 @@ def _run_reach(a: argparse.Namespace) -> int:
     question = ReachQuestion(a.surface, a.amplitude_mm, a.turn_deg, a.rate_hz, a.spin)
     answer = run_reach(a.path, a.arm, question, a.out, a.force)
     print(answer.text)
-    return 0 if answer.feasible else PATH_NOT_REACHABLE
+    return 0 if answer.feasible else FAILED
 
 
 def add_segment(commands: Commands) -> None:
@@ -251,6 +248,7 @@ def _run_segment(a: argparse.Namespace) -> None:
 def _segmenter(a: argparse.Namespace) -> Segmenter:
     """The segmenter of the method. The network is the one that comes along unless another is named; the scan of the
     wound gives its outline, and its size where the scale is known."""
+    from hardware.files.mesh_file import read_mesh
     from perception.wound.network import WoundNetwork, shipped_model
     from perception.wound.segmentation import NetworkSegmenter
     from perception.wound.shape_matching import ShapeSegmenter, read_shape_model, scan_outline
@@ -260,8 +258,6 @@ def _segmenter(a: argparse.Namespace) -> Segmenter:
         return NetworkSegmenter(network, network.settings)
     pattern, area = None, None
     if a.scan is not None:
-        from hardware.files.mesh_file import read_mesh
-
         pattern, across = scan_outline(read_mesh(a.scan).scan)
         area = None if a.mm_per_px is None else across / a.mm_per_px**2
     return ShapeSegmenter(read_shape_model(shipped_model("shape", ".toml")), pattern, area)

@@ -5,13 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hardware.cli.parser import Commands, add_fault, progress_bar, wrong_option
+from hardware.cli.parser import FAILED, Commands, add_fault, progress_bar, wrong_option
 from hardware.offline.track import MAP_METHOD, TRACKING_METHODS
 from hardware.process.progress import prepare_out
 from perception.package_data import named_path
-
-FRAMES_DIFFER = 1  # exit code of a replayed run whose frames are not those that were recorded
-SMOOTHING_FAILED = 1  # exit code where one of several sessions could not be smoothed
 
 
 def add_track(commands: Commands) -> None:
@@ -127,7 +124,7 @@ def _replay_run(a: argparse.Namespace) -> int:
     same = "all as they were given" if not count.other else f"{count.other} of them not as they were given"
     _print_damage(count.damage)
     print(f"{count.frames} frames, {same}: commands.csv and frames.bin in {a.out}")
-    return FRAMES_DIFFER if count.other else 0
+    return FAILED if count.other else 0
 
 
 def _import(a: argparse.Namespace) -> None:
@@ -175,23 +172,18 @@ def add_smooth(commands: Commands) -> None:
     add("sessions", type=Path, nargs="+", metavar="SESSION", help="session folder, .mcap file, or a folder of such")
     add("-o", "--out", type=Path, required=True, help="folder to write to")
     add("--rate", type=float, metavar="HZ", help="rows of smoothed.csv a second; default: the stamps")
-    add(
-        "--refine-cameras",
-        action="store_true",
-        help="let the recording also correct the cameras' places and lenses, with their calibration as prior",
+    refine = "let the recording also correct the cameras' places and lenses, with their calibration as prior"
+    add("--refine-cameras", action="store_true", help=refine)
+    no_relink = (
+        "take the tracks as they are; without it, all images are searched for landmarks that the tracks do not "
+        "say to be seen, such as before they joined the map"
     )
-    add(
-        "--no-relink",
-        action="store_true",
-        help="take the tracks as they are; without it, all images are searched for landmarks that the tracks do not "
-        "say to be seen, such as before they joined the map",
+    add("--no-relink", action="store_true", help=no_relink)
+    scheduler = (
+        "of a Dask scheduler, such as tcp://host:8786, whose workers reach sessions and OUT under the same paths; "
+        "local: start one here; needs the extra [cluster]"
     )
-    add(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="of a Dask scheduler, such as tcp://host:8786, whose workers reach sessions and OUT under the same paths; "
-        "local: start one here; needs the extra [cluster]",
-    )
+    add("--scheduler", metavar="ADDRESS", help=scheduler)
     add("--workers", type=int, metavar="N", help="processes of --scheduler local; default: the cores")
 
 
@@ -205,7 +197,7 @@ def _smooth(a: argparse.Namespace) -> int:
     for outcome in run_smooth(a.sessions, a.out, options, cluster):
         print(f"{outcome.job.session}: not smoothed: {outcome.text}" if outcome.failed else outcome.text, flush=True)
         failed += outcome.failed
-    return SMOOTHING_FAILED if failed else 0
+    return FAILED if failed else 0
 
 
 def add_compare(commands: Commands) -> None:
