@@ -227,17 +227,14 @@ class PictureWriter(threading.Thread):
         try:
             with SessionFolderWriter(self._folder, self._rig, ()) as session:
                 while not self._ended.is_set():
-                    self._write(session)
+                    frames = self._live.next_set(self._clock.now() + 0.2)
+                    for frame in frames.frames if frames is not None else ():
+                        stamp = frame.stamp - self._rig.cameras[frame.camera].clock_offset
+                        # lossless: JPEG stores a thin needle's colour at half the resolution
+                        session.picture(frame.camera, stamp, *encode(frame.image))
+                    self.count += frames is not None
         except Exception as error:  # raised by `check`
             self._failed = error
-
-    def _write(self, session: SessionFolderWriter) -> None:
-        frames = self._live.next_set(self._clock.now() + 0.2)
-        for frame in frames.frames if frames is not None else ():
-            stamp = frame.stamp - self._rig.cameras[frame.camera].clock_offset
-            # lossless: JPEG stores a thin needle's colour at half the resolution
-            session.picture(frame.camera, stamp, *encode(frame.image))
-        self.count += frames is not None
 
     def check(self) -> None:
         """Raise the stored failure, if any."""

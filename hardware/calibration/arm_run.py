@@ -122,9 +122,8 @@ class ArmCalibrationOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmCalibrationResult:
-    """A calibrated arm, its verdict, and the text for the terminal."""
+    """The verdict on a calibrated arm, and the text for the terminal."""
 
-    profile: ArmProfile
     verdict: CalibrationVerdict
     text: str
 
@@ -167,7 +166,7 @@ def run_folder(
     out.with_suffix(".json").write_text(numbers_text(found), encoding="utf-8")
     text = arm_page(folder.resolve().name, found, verdict, against)
     out.with_suffix(".report.html").write_text(text, encoding="utf-8")
-    return ArmCalibrationResult(profile, verdict, _text(found, verdict, against, out))
+    return ArmCalibrationResult(verdict, _text(found, verdict, against, out))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,10 +220,9 @@ def calibrate_touched(
     found = fit_touches(poses, points.points, points.sigma, profile.arm.tool_offset, not keep_tool)
     verdict = _judge_touches(found, points, poses)
     arm = replace(profile.arm, arm_from_base=se3.inverse(found.base_from_arm), tool_offset=found.tool)
-    calibrated = replace(profile, arm=arm)
-    write_arm(out, calibrated, f"calibrated by {len(points.points)} touched points\n{verdict.lines[0]}")
+    write_arm(out, replace(profile, arm=arm), f"calibrated by {len(points.points)} touched points\n{verdict.lines[0]}")
     text = ["PASS" if verdict.passed else "FAIL", *verdict.lines, *verdict.hints, f"arm file: {out}"]
-    return ArmCalibrationResult(calibrated, verdict, "\n".join(text))
+    return ArmCalibrationResult(verdict, "\n".join(text))
 
 
 def _judge_touches(found: TouchFit, points: TouchPoints, poses: Array) -> CalibrationVerdict:
@@ -245,12 +243,7 @@ def _judge_touches(found: TouchFit, points: TouchPoints, poses: Array) -> Calibr
 
 
 def record_on_terminal(
-    watched: WatchedArm,
-    clock: Clock,
-    folder: Path,
-    options: MoveOptions,
-    moves: ProgressReport,
-    pictures: ProgressReport,
+    watched: WatchedArm, clock: Clock, folder: Path, options: MoveOptions, moves: ProgressReport, images: ProgressReport
 ) -> ArmTruth:
     """Move the arm over a pseudo-terminal in real time, then render the cameras' pictures; returns the arm's truth.
 
@@ -270,14 +263,14 @@ def record_on_terminal(
             arm.close()
             port.release()
     assert device.arm is not None
-    take_pictures(watched, device.arm, device.begun, span, folder, pictures)
+    take_pictures(watched, device.arm, device.begun, span, folder, images)
     if broken is not None:
         raise broken
     return _truth(watched, device.arm, device.begun, read_commanded(folder / COMMANDED_FILE))
 
 
 def record_in_virtual_time(
-    watched: WatchedArm, folder: Path, options: MoveOptions, moves: ProgressReport, pictures: ProgressReport
+    watched: WatchedArm, folder: Path, options: MoveOptions, moves: ProgressReport, images: ProgressReport
 ) -> ArmTruth:
     """The same in virtual time: exact and repeatable, whatever the machine's load."""
     write_arm(folder / ARM_FILE, watched.profile, "the virtual arm as it is taken to be")
@@ -286,7 +279,7 @@ def record_in_virtual_time(
     arm = Arm(VirtualDevice(virtual, clock, watched.profile.baud), watched.profile, 0.0)
     move_arm(arm, clock, folder, watched.begin, options, moves)
     virtual.advance(clock.now())
-    take_pictures(watched, virtual, 0.0, (0.0, clock.now()), folder, pictures)
+    take_pictures(watched, virtual, 0.0, (0.0, clock.now()), folder, images)
     return _truth(watched, virtual, 0.0, read_commanded(folder / COMMANDED_FILE))
 
 

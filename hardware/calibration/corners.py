@@ -47,18 +47,13 @@ FOCAL_CHANGE = 0.02  # relative change of the focal length that makes all poses 
 def content_key(session: Session, board: Board) -> str:
     """Hash of all that the corners depend on: the recording's bytes, the board and the search's version."""
     digest = hashlib.sha256(f"{CORNERS_VERSION} {board}".encode())
-    for path in _content_files(session.path):
+    beside = {"roi.toml", "truth.tum", "reference.tum", "reference_async.tum", "rig.toml", "head.csv"}
+    inside = (p for p in session.path.rglob("*") if p.is_file() and p.name not in beside and p.suffix != ".npz")
+    for path in [session.path] if session.path.is_file() else sorted(inside):
         digest.update(path.name.encode())
         with path.open("rb") as stream:
             hashlib.file_digest(stream, lambda: digest)  # into the one that has been begun
     return digest.hexdigest()
-
-
-def _content_files(path: Path) -> list[Path]:
-    if path.is_file():
-        return [path]
-    beside = {"roi.toml", "truth.tum", "reference.tum", "reference_async.tum", "rig.toml", "head.csv"}
-    return sorted(p for p in path.rglob("*") if p.is_file() and p.name not in beside and p.suffix != ".npz")
 
 
 def read_corners(path: Path, key: str) -> CornerTable | None:
@@ -140,15 +135,15 @@ def append_rows(table: CornerTable, rows: list[CornerRow], done: int) -> CornerT
     looked, views = table.looked.copy(), [row for row in rows if row.corners.count]
     np.add.at(looked, [row.camera for row in rows], 1)
     strangers = np.array([*table.strangers, *(i for r in rows for i in r.corners.strangers)], np.int64)
-    table = replace(table, looked=looked, strangers=strangers, done=done)
-    if not views:
-        return table
     return replace(
         table,
+        looked=looked,
+        strangers=strangers,
+        done=done,
         camera=np.append(table.camera, [r.camera for r in views]).astype(np.int64),
         instant=np.append(table.instant, [r.instant for r in views]).astype(np.int64),
         stamp=np.append(table.stamp, [r.stamp for r in views]),
-        pixels=np.concatenate([table.pixels, np.stack([r.corners.pixels for r in views])]),
+        pixels=np.concatenate([table.pixels, *(r.corners.pixels[None] for r in views)]),
         sigma=np.append(table.sigma, [r.corners.sigma for r in views]),
         blur=np.append(table.blur, [r.corners.blur for r in views]),
         marker=np.append(table.marker, [r.corners.marker for r in views]),

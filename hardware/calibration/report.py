@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
@@ -265,3 +267,56 @@ def _pictures(pictures: Mapping[str, bytes]) -> str:
     images = {name: base64.b64encode(data).decode() for name, data in pictures.items()}
     tags = {name: f'<img alt="{escape(name)}" src="data:image/jpeg;base64,{text}"/>' for name, text in images.items()}
     return figure_row(figure(tag, name) for name, tag in tags.items())
+
+
+def rig_json(found: Calibration, error: VolumeError, verdict: CalibrationVerdict) -> str:
+    """All figures with their sigmas, mm, rad, s; the covariance is camera by camera in the order of `numbers`."""
+    numbers = [*PARAMETERS, "rx", "ry", "rz", "tx", "ty", "tz", "clock_offset_s"]
+    cameras = [
+        {
+            "name": c.name,
+            "model": found.models[i],
+            "sigma": dict(zip(numbers, np.sqrt(np.diag(found.covariance_of(i))).tolist(), strict=True)),
+            "residual_median_px": median_residual(found, i),
+            "residual_held_out_median_px": _finite_or_none(held_out_residual(found, i)),
+            "lens_held_out_rms_px": {s.model: s.held_out for s in found.scores[i]},
+            "mm_per_px": millimetres_per_pixel(found, i),
+        }
+        for i, c in enumerate(found.rig.cameras)
+    ]
+    table = {
+        "passed": verdict.passed,
+        "predicted_error_mm": {"typical": error.typical, "worst": error.worst},
+        "residual_median_px": median_residual(found),
+        "residual_held_out_median_px": _finite_or_none(held_out_residual(found)),
+        "board_distances_rms_mm": board_scatter(found),
+        "jitter_s": found.jitter,
+        "numbers": numbers,
+        "cameras": cameras,
+        "covariance": found.fit.covariance.tolist(),
+    }
+    return json.dumps(table, indent=1, allow_nan=False) + "\n"
+
+
+def _finite_or_none(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def rig_text(
+    found: Calibration, verdict: CalibrationVerdict, dropped: Mapping[tuple[str, str], int], out: Path, more: list[str]
+) -> str:
+    """What the terminal shows. dropped: views by camera and reason. more: further lines."""
+    lines = ["PASS" if verdict.passed else "FAIL", *verdict.lines]
+    for i, camera in enumerate(found.rig.cameras):
+        sigma = np.sqrt(np.diag(found.covariance_of(i)))
+        lines.append(
+            f"{camera.name}: focal length {camera.matrix[0, 0]:.1f} ± {sigma[0]:.1f} px, distortion {found.models[i]}, "
+            f"clock {1e3 * camera.clock_offset:+.2f} ± {1e3 * sigma[15]:.2f} ms, {median_residual(found, i):.2f} px, "
+            f"{millimetres_per_pixel(found, i):.3f} mm/px"
+        )
+    lines.append(f"distances between corners: {board_scatter(found):.2f} mm RMS")
+    lines += more
+    lines += [f"{name}: {count} views left out, {reason}" for (name, reason), count in sorted(dropped.items())]
+    lines += list(verdict.hints)
+    lines.append(f"rig: {out}, report: {out.with_suffix('.report.html')}")
+    return "\n".join(lines)

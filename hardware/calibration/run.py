@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,8 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from estimation.calibration.camera_rig import Calibration, calibrate, rebased
-from estimation.calibration.lens_model import PARAMETERS
-from estimation.calibration.validation import VolumeError
 from estimation.errors import InputError
 from estimation.rig import Rig
 from hardware.calibration.corners import collect_corners, coverage_hints
@@ -25,16 +22,7 @@ from hardware.calibration.inputs import (
     open_source,
 )
 from hardware.calibration.live import WavingPage, devices_named, watch
-from hardware.calibration.report import (
-    MAX_PREDICTED_ERROR,
-    CalibrationVerdict,
-    board_scatter,
-    held_out_residual,
-    judge_rig,
-    median_residual,
-    millimetres_per_pixel,
-    page,
-)
+from hardware.calibration.report import MAX_PREDICTED_ERROR, CalibrationVerdict, judge_rig, page, rig_json, rig_text
 from hardware.cameras.live import LiveCameras
 from hardware.files.rig_file import read_board, write_rig
 from hardware.operator.view import WavingStage
@@ -59,10 +47,9 @@ class CalibrationOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResult:
-    """A calibration, its predicted error and its verdict."""
+    """A calibration and its verdict."""
 
     calibration: Calibration
-    error: VolumeError
     verdict: CalibrationVerdict
     text: str  # for the terminal
 
@@ -140,11 +127,11 @@ def finish(
     placed = rebased(found.rig, material.rig.cameras[0].base_from_camera if material.given else np.eye(4))
     sigmas = [np.sqrt(np.diag(found.covariance_of(c))[:9]) for c in range(len(placed))]
     write_rig(out, placed, material.images, sigmas)
-    out.with_suffix(".json").write_text(_json(found, error, verdict), encoding="utf-8")
+    out.with_suffix(".json").write_text(rig_json(found, error, verdict), encoding="utf-8")
     text = page(material.title, found, error, verdict, dropped, _pictures(material, found))
     out.with_suffix(".report.html").write_text(text, encoding="utf-8")
     lines = _shift_lines(placed, material.rig) if material.given else []
-    return CalibrationResult(replace(found, rig=placed), error, verdict, _text(found, verdict, dropped, out, lines))
+    return CalibrationResult(replace(found, rig=placed), verdict, rig_text(found, verdict, dropped, out, lines))
 
 
 def _shift_lines(found: Rig, given: Rig) -> list[str]:
@@ -164,55 +151,3 @@ def _check_options(names: Sequence[str], given: bool, where: object, options: Ca
 def _pictures(material: CalibrationInput, found: Calibration) -> dict[str, bytes]:
     cameras = enumerate(found.rig.cameras)
     return {camera.name: thumbnail(undistort(camera, material.pictures(c)[-1]), PICTURE_WIDTH) for c, camera in cameras}
-
-
-def _json(found: Calibration, error: VolumeError, verdict: CalibrationVerdict) -> str:
-    """All figures with their sigmas, mm, rad, s; the covariance is camera by camera in the order of `numbers`."""
-    numbers = [*PARAMETERS, "rx", "ry", "rz", "tx", "ty", "tz", "clock_offset_s"]
-    cameras = [
-        {
-            "name": c.name,
-            "model": found.models[i],
-            "sigma": dict(zip(numbers, np.sqrt(np.diag(found.covariance_of(i))).tolist(), strict=True)),
-            "residual_median_px": median_residual(found, i),
-            "residual_held_out_median_px": _finite_or_none(held_out_residual(found, i)),
-            "lens_held_out_rms_px": {s.model: s.held_out for s in found.scores[i]},
-            "mm_per_px": millimetres_per_pixel(found, i),
-        }
-        for i, c in enumerate(found.rig.cameras)
-    ]
-    table = {
-        "passed": verdict.passed,
-        "predicted_error_mm": {"typical": error.typical, "worst": error.worst},
-        "residual_median_px": median_residual(found),
-        "residual_held_out_median_px": _finite_or_none(held_out_residual(found)),
-        "board_distances_rms_mm": board_scatter(found),
-        "jitter_s": found.jitter,
-        "numbers": numbers,
-        "cameras": cameras,
-        "covariance": found.fit.covariance.tolist(),
-    }
-    return json.dumps(table, indent=1, allow_nan=False) + "\n"
-
-
-def _finite_or_none(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
-def _text(
-    found: Calibration, verdict: CalibrationVerdict, dropped: Mapping[tuple[str, str], int], out: Path, more: list[str]
-) -> str:
-    lines = ["PASS" if verdict.passed else "FAIL", *verdict.lines]
-    for i, camera in enumerate(found.rig.cameras):
-        sigma = np.sqrt(np.diag(found.covariance_of(i)))
-        lines.append(
-            f"{camera.name}: focal length {camera.matrix[0, 0]:.1f} ± {sigma[0]:.1f} px, distortion {found.models[i]}, "
-            f"clock {1e3 * camera.clock_offset:+.2f} ± {1e3 * sigma[15]:.2f} ms, {median_residual(found, i):.2f} px, "
-            f"{millimetres_per_pixel(found, i):.3f} mm/px"
-        )
-    lines.append(f"distances between corners: {board_scatter(found):.2f} mm RMS")
-    lines += more
-    lines += [f"{name}: {count} views left out, {reason}" for (name, reason), count in sorted(dropped.items())]
-    lines += list(verdict.hints)
-    lines.append(f"rig: {out}, report: {out.with_suffix('.report.html')}")
-    return "\n".join(lines)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -100,7 +100,7 @@ def request_picture(port: ControlPort, source: CameraSource, size: tuple[int, in
 
 def lock_controls(port: ControlPort, source: CameraSource) -> None:
     """Request a device's controls, after switching their automatics off, which would undo it."""
-    for one, asked in zip(LOCKABLE_CONTROLS, _requested(source), strict=True):
+    for one, asked in _requests(source):
         if asked is not None:
             if one.automatic is not None:
                 port.set(one.automatic, one.off)
@@ -112,15 +112,14 @@ def read_controls(port: ControlPort, source: CameraSource) -> tuple[Control, ...
     code = int(port.get(cv2.CAP_PROP_FOURCC))
     picture_format = "".join(chr(code >> 8 * i & 0xFF) for i in range(4)) if code > 0 else None
     rate = port.get(cv2.CAP_PROP_FPS)
-    own = [_read_one(port, one, asked) for one, asked in zip(LOCKABLE_CONTROLS, _requested(source), strict=True)]
+    own = [_read_one(port, one, asked) for one, asked in _requests(source)]
     fps = Control("fps", source.fps, rate if rate > 0 else None)
     return (Control("format", source.format, picture_format), fps, *own)
 
 
 def ignored_controls(source: CameraSource) -> tuple[Control, ...]:
     """The controls requested of a stream or a file, which accepts none."""
-    wanted = zip(LOCKABLE_CONTROLS, _requested(source), strict=True)
-    return tuple(Control(one.name, asked, None) for one, asked in wanted if asked is not None)
+    return tuple(Control(one.name, asked, None) for one, asked in _requests(source) if asked is not None)
 
 
 def locked_exposure(controls: Sequence[Control]) -> float:
@@ -139,8 +138,9 @@ def _read_one(port: ControlPort, one: _Lockable, asked: float | None) -> Control
     return Control(one.name, asked, value * one.unit, automatic)
 
 
-def _requested(source: CameraSource) -> tuple[float | None, ...]:
-    return source.exposure, source.gain, source.focus, source.white_balance  # in the order of LOCKABLE_CONTROLS
+def _requests(source: CameraSource) -> Iterable[tuple[_Lockable, float | None]]:
+    """Each lockable control with the value that is requested, None for none."""
+    return zip(LOCKABLE_CONTROLS, (source.exposure, source.gain, source.focus, source.white_balance), strict=True)
 
 
 def reads_videos() -> bool:

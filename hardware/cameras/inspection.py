@@ -42,7 +42,8 @@ def _cell(image: Image | None, words: Sequence[str], well: bool, lines: int) -> 
     if image is not None:
         scale = min(CELL_SIZE[0] / image.shape[1], CELL_SIZE[1] / image.shape[0])
         size = (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0])))
-        small = cv2.resize(_colour(image), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
         x, y = (CELL_SIZE[0] - size[0]) // 2, (CELL_SIZE[1] - size[1]) // 2
         cell[y : y + size[1], x : x + size[0]] = small
     colour = INK_COLOUR if well else ALARM_COLOUR
@@ -54,10 +55,6 @@ def _cell(image: Image | None, words: Sequence[str], well: bool, lines: int) -> 
 
 def _grey(image: Image) -> Image:
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-
-
-def _colour(image: Image) -> Image:
-    return image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
 
 
 STAMP_SOURCES = {"driver": "by its driver", "stream": "by its stream", "arrival": "by arrival", "": "not at all"}

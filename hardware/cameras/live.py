@@ -88,14 +88,14 @@ class FrameSetBuilder:
     apart; the jitter-free beat is known to a few percent of a period after a second.
     """
 
-    def __init__(self, cameras: int, period: float, offsets: Sequence[float] | Array | None = None) -> None:
+    def __init__(self, cameras: int, period: float) -> None:
         self._pairing = Pairing(cameras, period)
         self._period, self._phases = period, FreeRunPhases()
         self._periods: list[float | None] = [None] * cameras  # s
         self._keys, self._stamp, self._now = [-math.inf] * cameras, -math.inf, -math.inf
         self._discarded = 0
         self.behind = np.zeros(cameras)  # s: mean lag of each camera's stamps behind the set's
-        self.set_offsets(np.zeros(cameras) if offsets is None else offsets)
+        self._offsets = np.zeros(cameras)
 
     @property
     def late(self) -> int:

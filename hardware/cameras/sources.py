@@ -162,7 +162,12 @@ def read_live_rig(path: str | Path) -> tuple[Rig, tuple[CameraSource, ...]]:
     checks.check_keys(path, "", table, ["camera"], ["surface"])
     rig = rig_from_table(path, table, (*RECORDED_KEYS, *LIVE_KEYS))
     sources = tuple(source_from_table(path, camera["name"], camera, path.parent) for camera in table["camera"])
-    return rig, _all_different(path, rig, sources)
+    owners: dict[Identity, str] = {}
+    for camera, source in zip(rig.cameras, sources, strict=True):
+        if (owner := owners.setdefault(source.identity, camera.name)) != camera.name:
+            allowed = f"a source of its own; camera {owner!r} has this one"
+            raise InputError(path, f"camera {camera.name!r}: source", source.identity.shown, allowed)
+    return rig, sources
 
 
 def source_from_table(where: object, name: str, camera: Table, folder: Path) -> CameraSource:
@@ -193,13 +198,3 @@ def _format(where: object, key: str, camera: Table) -> str | None:
     if len(text) != 4 or not text.isascii():
         raise InputError(where, key, text, "four characters, such as MJPG or YUYV")
     return text
-
-
-def _all_different(where: object, rig: Rig, sources: tuple[CameraSource, ...]) -> tuple[CameraSource, ...]:
-    seen: dict[Identity, str] = {}
-    for camera, source in zip(rig.cameras, sources, strict=True):
-        if source.identity in seen:
-            allowed = f"a source of its own; camera {seen[source.identity]!r} has this one"
-            raise InputError(where, f"camera {camera.name!r}: source", source.identity.shown, allowed)
-        seen[source.identity] = camera.name
-    return sources

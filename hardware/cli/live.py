@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
 from hardware.cli.parser import FAILED, Commands, add_fault, arm_profile, positive, wrong_option
-from hardware.process.clock import Clock, WallClock
+from hardware.process.clock import WallClock
 from perception.package_data import named_path
 
 if TYPE_CHECKING:
     from hardware.arm.profile import ArmProfile
-    from hardware.cameras.live import LiveCameras
     from hardware.cameras.sources import CameraDevice
 
 SETTINGS_FLAGS = (
@@ -219,15 +218,12 @@ def add_cameras(commands: Commands) -> None:
 def _run_cameras(a: argparse.Namespace) -> int:
     from hardware.cameras.sources import list_devices
 
-    if not a.which:
-        print(_list_json(list_devices()) if a.json else list_text(list_devices()))
-        return 0
-    if not 0 < a.seconds <= 3600:
-        raise wrong_option("--seconds", a.seconds, "0 < seconds <= 3600")
-    if a.out is not None and a.out.suffix.lower() not in (".jpg", ".jpeg", ".png"):
-        raise wrong_option("--out", a.out, "a file that ends in .jpg or .png")
-    clock = WallClock()
-    return _watch_cameras(a, cameras_named(a.which, clock), clock)
+    if a.which:
+        return _watch_cameras(a)
+    devices, keys = list_devices(), ("identity", "name", "serial", "by_id", "by_path")
+    table = [{"node": str(device.node)} | {key: getattr(device, key) for key in keys} for device in devices]
+    print(json.dumps(table, indent=2) if a.json else list_text(devices))
+    return 0
 
 
 def list_text(devices: tuple[CameraDevice, ...]) -> str:
@@ -243,24 +239,18 @@ def list_text(devices: tuple[CameraDevice, ...]) -> str:
     return "\n".join(lines)
 
 
-def _list_json(devices: tuple[CameraDevice, ...]) -> str:
-    keys = ("identity", "name", "serial", "by_id", "by_path")
-    return json.dumps([{"node": str(d.node)} | {key: getattr(d, key) for key in keys} for d in devices], indent=2)
-
-
-def cameras_named(which: list[str], clock: Clock) -> LiveCameras:
-    """The cameras of a rig.toml, or those named one by one."""
-    from hardware.cameras.live import LiveCameras, places_without_rig, sources_named
-
-    rig, sources = sources_named(which)
-    return LiveCameras(places_without_rig(len(which)) if rig is None else rig, sources, clock)
-
-
-def _watch_cameras(a: argparse.Namespace, live: LiveCameras, clock: Clock) -> int:
+def _watch_cameras(a: argparse.Namespace) -> int:
     from hardware.cameras.inspection import inspect, inspection_sheet, inspection_table, inspection_text
+    from hardware.cameras.live import LiveCameras, places_without_rig, sources_named
     from hardware.files.images import encode
 
-    with live:
+    if not 0 < a.seconds <= 3600:
+        raise wrong_option("--seconds", a.seconds, "0 < seconds <= 3600")
+    if a.out is not None and a.out.suffix.lower() not in (".jpg", ".jpeg", ".png"):
+        raise wrong_option("--out", a.out, "a file that ends in .jpg or .png")
+    rig, sources = sources_named(a.which)
+    clock = WallClock()
+    with LiveCameras(places_without_rig(len(a.which)) if rig is None else rig, sources, clock) as live:
         inspection = inspect(live, a.seconds, clock)
     print(json.dumps(inspection_table(inspection), indent=2) if a.json else inspection_text(inspection))
     if a.out is not None:

@@ -87,12 +87,13 @@ def layer_svg(layer: PlannedLayer, figures: LayerFigures, bounds: tuple[float, f
     height = HEAD_HEIGHT + depth * scale + FOOT_HEIGHT + PICTURE_MARGIN
     left = (PICTURE_WIDTH - width * scale) / 2
     turn = f"matrix({scale:.5f} 0 0 {-scale:.5f} {left - low_x * scale:.3f} {HEAD_HEIGHT + high_y * scale:.3f})"
+    travels = "".join(_line(np.stack([a.points[-1], b.points[0]])) for a, b in pairwise(layer.beads))
     drawn = [
         f'<path class="region" fill-rule="evenodd" d="{_areas(layer.region)}"/>',
         *_beads(layer.beads),
         f'<path class="gap" fill-rule="evenodd" d="{_areas(figures.coverage.gaps)}"/>',
         *_bumps(layer),
-        f'<path class="travel" d="{_travels(layer.beads)}"/>',
+        f'<path class="travel" d="{travels}"/>',
     ]
     ends = np.array([layer.beads[0].points[0], layer.beads[-1].points[-1]])
     ends = ends * [scale, -scale] + [left - low_x * scale, HEAD_HEIGHT + high_y * scale]
@@ -151,10 +152,6 @@ def _bumps(layer: PlannedLayer) -> list[str]:
     return [f'<path class="{name}" fill-rule="evenodd" d="{_areas(shape)}"/>' for name, shape in shapes.items()]
 
 
-def _travels(beads: tuple[Bead, ...]) -> str:
-    return "".join(_line(np.stack([a.points[-1], b.points[0]])) for a, b in pairwise(beads))
-
-
 def _beads(beads: tuple[Bead, ...]) -> list[str]:
     """Each bead as strokes of nearly even width, and its middle line."""
     runs, middles = [], []
@@ -204,17 +201,13 @@ def page_text(
         rows = [(what, str(count)) for what, count in story.repairs]
         body.append(section("The scan", "What was found wrong with it, and put right.", figures_table(("", ""), rows)))
     body.append(section("What was asked for", "All settings, defaults included.", figures_table(("", ""), story.order)))
-    lead = _lead(layers, total)
-    return document("plan", story.title, lead, body, "mm, s, degrees; 1 mm³ is 1 µl")
-
-
-def _lead(layers: Sequence[LayerFigures], total: PlanTotal) -> str:
     inks = ", ".join(f"{volume / 1000:.2f} ml of {material_text(name)}" for name, volume in total.volume)
-    return (
+    lead = (
         f"{count_text(len(layers), 'layer')}, {len_text(total.printed)} of bead, "
         f"{duration_text(total.seconds)} to print: {inks}. "
         f"{total.covered:.2%} of the layers' area is covered, {total.double:.2%} twice."
     )
+    return document("plan", story.title, lead, body, "mm, s, degrees; 1 mm³ is 1 µl")
 
 
 def _tiles(layers: Sequence[LayerFigures], total: PlanTotal) -> list[str]:
