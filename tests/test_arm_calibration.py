@@ -24,8 +24,14 @@ from hardware.bench.calibration import set_point_of, sightings_of
 from hardware.calibration.arm_record import MoveOptions, plan_moves
 from hardware.calibration.arm_report import judge_arm
 from hardware.calibration.arm_run import calibrate_touched
-from hardware.calibration.arm_sightings import TipObservations, hidden_tips, visible_needle
-from hardware.calibration.arm_solve import ArmCalibration, calibrated_profile, kinematics_of
+from hardware.calibration.arm_solve import (
+    ArmCalibration,
+    TipObservations,
+    calibrated_profile,
+    hidden_tips,
+    kinematics_of,
+    visible_needle,
+)
 from hardware.files.arm_file import read_arm
 from hardware.files.rig_file import write_rig
 from hardware.simulator.arm.controller import Polyline, Servo

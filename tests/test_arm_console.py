@@ -23,7 +23,7 @@ from estimation.synthetic.world import arc_rig
 from hardware.arm.console import ArmRequest, axes_from_text, findings, jog_from_text, origin_from_text, run_arm
 from hardware.arm.device import ArmState, ArmStatus
 from hardware.arm.profile import BITS_PER_BYTE, ArmProfile
-from hardware.calibration.arm_solve import COMMANDED_FILE, read_commanded
+from hardware.calibration.arm_record import COMMANDED_FILE, read_commanded
 from hardware.cli.main import main
 from hardware.files.arm_file import read_arm, write_arm
 from hardware.files.rig_file import ImageSource, write_rig

@@ -19,9 +19,18 @@ from estimation.se3 import Array
 from hardware.arm.device import ArmState
 from hardware.arm.link import Arm
 from hardware.arm.profile import ArmProfile
-from hardware.calibration.arm_record import MoveOptions, check_moves, move_arm, places, plan_moves
+from hardware.calibration.arm_record import (
+    ARM_FILE,
+    COMMANDED_FILE,
+    COMMANDED_HEADER,
+    MoveOptions,
+    check_moves,
+    move_arm,
+    places,
+    plan_moves,
+    read_commanded,
+)
 from hardware.calibration.arm_run import ArmCalibrationOptions, check_out, check_record, run_folder
-from hardware.calibration.arm_solve import ARM_FILE, COMMANDED_FILE, COMMANDED_HEADER, read_commanded
 from hardware.cli.main import main
 from hardware.files.arm_file import read_arm
 from hardware.process.clock import SimClock

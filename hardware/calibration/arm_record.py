@@ -2,6 +2,12 @@
 
 The moves go to places all over the cameras' room, turned and not, and end with a swing. All set-points pass the guard
 before the first one is sent, one per tick; whatever goes wrong stops the arm.
+
+commanded.csv holds the set-points that the arm's controller was sent, as knots of a polyline, by the computer's clock:
+
+    stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg
+
+A line is written once nothing can change it any more, so an interrupted recording is complete up to then.
 """
 
 from __future__ import annotations
@@ -13,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from estimation.calibration.arm_model import SetPoint
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
@@ -21,7 +28,7 @@ from hardware.arm.device import ArmState
 from hardware.arm.link import Arm
 from hardware.arm.port import Opener
 from hardware.arm.profile import ArmProfile, LinkSettings
-from hardware.calibration.arm_solve import ARM_FILE, COMMANDED_FILE, CommandedFile
+from hardware.arm.queue import QueuedCommand
 from hardware.cameras.live import LiveCameras
 from hardware.files.arm_file import write_arm
 from hardware.files.folder_tables import SessionFolderWriter
@@ -32,6 +39,11 @@ from planning.command import Move, Refusal, feed_for
 from planning.limits import AXIS_MARGIN, MotionLimits
 from planning.motion.guard import Guard
 
+ARM_FILE = "arm.toml"  # of a recorded calibration: the arm before it
+COMMANDED_FILE = "commanded.csv"
+COMMANDED_HEADER = "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg"
+STAMP_RESOLUTION = 2e-6  # s: nearer knots are equal in six digits
+_UNITS = np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
 PEAK_SPEED_RATIO = 1.875  # peak to mean speed of a minimum-jerk move (10 s^3 - 15 s^4 + 6 s^5)
 HALTON_BASES = (2, 3, 5, 7, 11, 13)  # even for any number of places
 UPRIGHT_EVERY = 3  # one place in so many has no turn
@@ -140,6 +152,62 @@ def check_moves(profile: ArmProfile, start: Array, targets: Array) -> None:
             allowed = "moves that the arm's limits and no-go zones allow: less --reach-mm, --turn-deg or --speed-mm-s"
             raise InputError("moves", f"{number * profile.tick:.1f} s after their begin", answer.reason, allowed)
         at = target
+
+
+class CommandedFile:
+    """Writes commanded.csv."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w", encoding="utf-8")
+        self._file.write(COMMANDED_HEADER + "\n")
+        self._last = self._until = -np.inf  # s: instant of the last knot, end of the last move
+
+    def note(self, arm: Arm, now: float) -> None:
+        """Write the moves that have ended at `now`, s."""
+        for way in arm.ways(self._until):
+            if way.end <= now:
+                self._add(way)
+                self._until = way.end
+
+    def _add(self, way: QueuedCommand) -> None:
+        for instant, axes in ((way.start, way.source), (way.end, way.target)):
+            if instant >= self._last + STAMP_RESOLUTION:
+                self._file.write(f"{instant:.6f}," + ",".join(f"{v:.6f}" for v in np.array(axes) * _UNITS) + "\n")
+                self._last = instant
+
+    def __enter__(self) -> CommandedFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+
+def read_commanded(path: Path) -> SetPoint:
+    """The set-point in a commanded.csv; InputError if it is invalid."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        allowed = f"a text file that begins with {COMMANDED_HEADER}"
+        raise InputError(path, "file", "missing or not text", allowed) from None
+    if not lines or lines[0].strip() != COMMANDED_HEADER:
+        raise InputError(path, "line 1", lines[0][:60] if lines else "nothing", COMMANDED_HEADER)
+    rows = [_row(path, number, line) for number, line in enumerate(lines[1:], 2) if line.strip()]
+    if len(rows) < 2:
+        raise InputError(path, "rows", len(rows), "two or more")
+    table = np.array(rows)
+    if (back := np.flatnonzero(np.diff(table[:, 0]) <= 0)).size:
+        raise InputError(path, f"line {back[0] + 3}: stamp_s", table[back[0] + 1, 0], "stamps that rise")
+    return SetPoint(np.ascontiguousarray(table[:, 0]), table[:, 1:] / _UNITS)
+
+
+def _row(path: Path, number: int, line: str) -> Array:
+    try:
+        row = np.array([float(word) for word in line.split(",")])
+    except ValueError:
+        row = np.zeros(0)
+    if row.shape != (7,) or not np.isfinite(row).all():
+        raise InputError(path, f"line {number}", line[:60], "7 finite numbers: s, mm and degrees")
+    return row
 
 
 class ArmDrive:

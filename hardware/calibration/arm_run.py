@@ -30,16 +30,13 @@ from estimation.se3 import Array
 from hardware.arm.link import Arm
 from hardware.arm.port import PortOpener
 from hardware.arm.profile import ArmProfile
-from hardware.calibration.arm_record import MoveOptions, move_arm
+from hardware.calibration.arm_record import ARM_FILE, COMMANDED_FILE, MoveOptions, move_arm, read_commanded
 from hardware.calibration.arm_report import MAX_TIP_ERROR, arm_page, detection_text, judge_arm
 from hardware.calibration.arm_solve import (
-    ARM_FILE,
-    COMMANDED_FILE,
     ArmCalibration,
     calibrated_profile,
     kinematics_of,
     numbers_text,
-    read_commanded,
     solve_folder,
     tip_error,
 )

@@ -1,16 +1,13 @@
-"""A recorded calibration of an arm, solved: parameters, their covariance, held-out residuals and the arm file.
-
-commanded.csv holds the set-points that the arm's controller was sent, as knots of a polyline, by the computer's clock:
-
-    stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg
-
-A line is written once nothing can change it any more, so an interrupted recording is complete up to then.
-"""
+"""A recorded calibration of an arm, solved: the tip in its pictures, parameters, held-out residuals, the arm file."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,78 +21,195 @@ from estimation.calibration.lens_model import CAMERA_PARAMETERS
 from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware.arm.link import Arm
+from estimation.surface_map import farthest_points
 from hardware.arm.profile import ArmProfile
-from hardware.arm.queue import QueuedCommand
-from hardware.calibration.arm_sightings import TipObservations, find_tips, hidden_tips
+from hardware.calibration.arm_record import ARM_FILE, COMMANDED_FILE, read_commanded
 from hardware.files.arm_file import read_arm
+from hardware.files.session import FrameRef, Session
 from hardware.files.session_folder import open_folder
 from hardware.process import checks
 from hardware.process.progress import ProgressReport
+from perception.boards.needle_tip import MIN_NEEDLE_LENGTH, Tip, TipFinder, background
+from perception.frames import Image
 from planning.robot.kinematics import SimpleArm, nozzle_from_axes
 
-ARM_FILE = "arm.toml"  # of a recorded calibration: the arm before it
 HELD_OUT_FOLDS = 8  # with fewer, each fit lacks too many sightings
-COMMANDED_FILE = "commanded.csv"
-COMMANDED_HEADER = "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg"
-STAMP_RESOLUTION = 2e-6  # s: nearer knots are equal in six digits
-_UNITS = np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
+REST_AFTER = 0.25  # s after its last command, when the arm is at rest: ten times a servo's lag
+PICTURES_PER_PLACE = 3  # more show the same
+MAX_MOVING_SETS = 300  # frame sets with the arm moving, spread over all of them
+BACKGROUND_PICTURES = 11  # of which the background is the median
+MIN_BACKGROUND_PICTURES = 5
+MIN_TIP_SIGMA = 0.1  # px: effect of pixels and shading on a needle two or three pixels wide
+CROP_SIZE = 40  # px, of the pictures of tips for the report
+CROPS_PER_CAMERA = 6
+NEEDLE_RADIUS_RATIO = 1.5  # to the tip's radius, up to which a tool is a needle
 
 
-class CommandedFile:
-    """Writes commanded.csv."""
+@dataclass(frozen=True, slots=True, eq=False)
+class TipObservations:
+    """The tips in a recording's pictures."""
 
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("w", encoding="utf-8")
-        self._file.write(COMMANDED_HEADER + "\n")
-        self._last = self._until = -np.inf  # s: instant of the last knot, end of the last move
-
-    def note(self, arm: Arm, now: float) -> None:
-        """Write the moves that have ended at `now`, s."""
-        for way in arm.ways(self._until):
-            if way.end <= now:
-                self._add(way)
-                self._until = way.end
-
-    def _add(self, way: QueuedCommand) -> None:
-        for instant, axes in ((way.start, way.source), (way.end, way.target)):
-            if instant >= self._last + STAMP_RESOLUTION:
-                self._file.write(f"{instant:.6f}," + ",".join(f"{v:.6f}" for v in np.array(axes) * _UNITS) + "\n")
-                self._last = instant
-
-    def __enter__(self) -> CommandedFile:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
+    sightings: Sightings  # one per camera and resting place: the median
+    looked: NDArray[np.int64]  # (C,) number of pictures searched
+    found: NDArray[np.int64]  # (C,) number of pictures with a tip
+    crops: tuple[tuple[Array, Array], ...]  # by camera: pictures (K, H, W, 3) about tips, and the tips' pixels (K, 2)
+    missed: tuple[Array, NDArray[np.int64]]  # stamps (M,), s, and cameras (M,) of pictures without a tip
 
 
-def read_commanded(path: Path) -> SetPoint:
-    """The set-point in a commanded.csv; InputError if it is invalid."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
-        allowed = f"a text file that begins with {COMMANDED_HEADER}"
-        raise InputError(path, "file", "missing or not text", allowed) from None
-    if not lines or lines[0].strip() != COMMANDED_HEADER:
-        raise InputError(path, "line 1", lines[0][:60] if lines else "nothing", COMMANDED_HEADER)
-    rows = [_row(path, number, line) for number, line in enumerate(lines[1:], 2) if line.strip()]
-    if len(rows) < 2:
-        raise InputError(path, "rows", len(rows), "two or more")
-    table = np.array(rows)
-    if (back := np.flatnonzero(np.diff(table[:, 0]) <= 0)).size:
-        raise InputError(path, f"line {back[0] + 3}: stamp_s", table[back[0] + 1, 0], "stamps that rise")
-    return SetPoint(np.ascontiguousarray(table[:, 0]), table[:, 1:] / _UNITS)
+@dataclass(frozen=True, slots=True, eq=False)
+class _TipPicture:
+    ref: FrameRef
+    place: int
+    tip: Tip | None
+    crop: tuple[Image, Array] | None
 
 
-def _row(path: Path, number: int, line: str) -> Array:
-    try:
-        row = np.array([float(word) for word in line.split(",")])
-    except ValueError:
-        row = np.zeros(0)
-    if row.shape != (7,) or not np.isfinite(row).all():
-        raise InputError(path, f"line {number}", line[:60], "7 finite numbers: s, mm and degrees")
-    return row
+def needle_radius(rig: Rig, tool: Array) -> float:
+    """Upper bound, px, of the radius of a needle where the cameras' axes meet; tool: (K, 2) [height, radius] mm."""
+    poses = np.stack([c.base_from_camera for c in rig.cameras])
+    across = np.eye(3) - poses[:, :3, 2, None] * poses[:, None, :3, 2]
+    middle = np.linalg.lstsq(across.sum(0), (across @ poses[:, :3, 3, None]).sum(0)[:, 0], rcond=None)[0]
+    focal = rig.matrices[:, 0, 0] / np.linalg.norm(poses[:, :3, 3] - middle, axis=1)
+    return float(1.6 * focal.max() * tool[0, 1] + 1.5)
+
+
+def find_tips(session: Session, set_point: SetPoint, tool: Array, report: ProgressReport) -> TipObservations:
+    """Find the tip in a session's pictures. InputError where there are too few of them."""
+    chosen = _select_sets(session, set_point)
+    finders = _finders(session, set_point, needle_radius(session.rig, tool))
+    pictures: list[_TipPicture] = []
+    with closing(session.store.open()) as reader, ThreadPoolExecutor(2) as pool:
+        for done, (refs, places) in enumerate(chosen, 1):
+            images = [reader.read(ref) for ref in refs]
+            pictures += pool.map(partial(_find, finders), refs, places, images)
+            report(done, len(chosen))
+    return _collect(pictures, len(session.rig))
+
+
+def _select_sets(session: Session, set_point: SetPoint) -> list[tuple[tuple[FrameRef, ...], list[int]]]:
+    """The frame sets to search, with each frame's place."""
+    first, last = set_point.instants[0], set_point.instants[-1]
+    rows = [refs for refs in session.sets if refs and first <= refs[0].stamp <= last + REST_AFTER * 4]
+    if not rows:
+        raise InputError(session.path, "stamps", "none while the arm was moved", "pictures by the same clock")
+    places = [set_point.places(np.array([ref.stamp for ref in refs]), REST_AFTER).tolist() for refs in rows]
+    counts: dict[int, int] = {}
+    resting, moving = [], []
+    for refs, numbers in zip(rows, places, strict=True):
+        number = min(numbers)
+        if number < 0:
+            moving.append((refs, numbers))
+        elif counts.setdefault(number, 0) < PICTURES_PER_PLACE:
+            counts[number] += 1
+            resting.append((refs, numbers))
+    keep = np.unique(np.linspace(0, len(moving) - 1, min(MAX_MOVING_SETS, len(moving))).round().astype(int))
+    return sorted(resting + [moving[i] for i in keep], key=lambda one: one[0][0].stamp)
+
+
+def _finders(session: Session, set_point: SetPoint, radius: float) -> list[TipFinder]:
+    """A finder for each camera, whose background is the median of pictures far apart."""
+    cameras = session.rig.cameras
+    refs = [[ref for refs in session.sets for ref in refs if ref.camera == c] for c in range(len(cameras))]
+    spread = [ref for own in refs for ref in _spread_pictures(own, set_point)]
+    stacks: list[list[Image]] = [[] for _ in cameras]
+    with closing(session.store.open()) as reader:
+        for ref in sorted(spread, key=lambda one: one.stamp):
+            stacks[ref.camera].append(reader.read(ref))
+    for camera, stack in zip(cameras, stacks, strict=True):
+        if len(stack) < MIN_BACKGROUND_PICTURES:
+            allowed = f"{MIN_BACKGROUND_PICTURES} or more, while it moves"
+            raise InputError(session.path, f"pictures of {camera.name}", len(stack), allowed)
+    return [TipFinder(background(stack), radius) for stack in stacks]
+
+
+def _spread_pictures(refs: Sequence[FrameRef], set_point: SetPoint) -> Sequence[FrameRef]:
+    """Pictures with the arm far apart: farthest point sampling."""
+    if not refs:
+        return ()
+    points = set_point.lagged(np.array([ref.stamp for ref in refs]), 0.0, 0.0)[:, :3]
+    rows = farthest_points(points, 0, min(BACKGROUND_PICTURES, len(points)))
+    return [refs[i] for i in sorted(set(rows.tolist()))]
+
+
+def _find(finders: list[TipFinder], ref: FrameRef, place: int, image: Image) -> _TipPicture:
+    tip = finders[ref.camera](image)
+    return _TipPicture(ref, place, tip, None if tip is None else _crop(image, np.array(tip.pixel)))
+
+
+def _crop(image: Image, pixel: Array) -> tuple[Image, Array]:
+    x, y = (int(v) - CROP_SIZE // 2 for v in pixel)
+    x, y = min(max(x, 0), image.shape[1] - CROP_SIZE), min(max(y, 0), image.shape[0] - CROP_SIZE)
+    part = image[y : y + CROP_SIZE, x : x + CROP_SIZE]
+    return np.repeat(part[..., None], 3, -1) if part.ndim == 2 else part.copy(), pixel - [x, y]
+
+
+def _collect(pictures: Sequence[_TipPicture], cameras: int) -> TipObservations:
+    camera = np.array([one.ref.camera for one in pictures], np.int64)
+    with_tip = np.array([one.tip is not None for one in pictures], bool)
+    rows: dict[tuple[int, int], list[_TipPicture]] = {}
+    for number, one in enumerate(pictures):
+        if one.tip is not None:
+            rows.setdefault((one.place if one.place >= 0 else -1 - number, one.ref.camera), []).append(one)
+    tips = [[o.tip for o in ones if o.tip is not None] for ones in rows.values()]
+    sightings = Sightings(
+        stamp=np.array([np.mean([o.ref.stamp for o in ones]) for ones in rows.values()]),
+        camera=np.array([own for _, own in rows], np.int64),
+        pixels=np.array([np.median([t.pixel for t in mine], axis=0) for mine in tips]).reshape(-1, 2),
+        sigma=np.array([np.hypot(MIN_TIP_SIGMA, np.mean([t.sigma for t in mine])) for mine in tips]),
+        place=np.array([max(place, -1) for place, _ in rows], np.int64),
+    )
+    missed = np.array([one.ref.stamp for one in pictures if one.tip is None], float), camera[~with_tip]
+    looked, found = (np.bincount(each, minlength=cameras) for each in (camera, camera[with_tip]))
+    return TipObservations(sightings, looked, found, tuple(_crops(pictures, c) for c in range(cameras)), missed)
+
+
+def _crops(pictures: Sequence[_TipPicture], camera: int) -> tuple[Array, Array]:
+    mine = [one.crop for one in pictures if one.crop is not None and one.ref.camera == camera]
+    chosen = mine[:: max(1, len(mine) // CROPS_PER_CAMERA)][:CROPS_PER_CAMERA]
+    if not chosen:
+        return np.zeros((0, CROP_SIZE, CROP_SIZE, 3), np.uint8), np.zeros((0, 2))
+    return np.stack([image for image, _ in chosen]), np.stack([at for _, at in chosen])
+
+
+def visible_needle(profile: Array, along: Array) -> Array:
+    """Visible length (N,), mm, of the needle as seen from afar, up to where the rest of the tool hides it.
+
+    profile: (K, 2) [height, radius], mm. along: (N,) cosine between the tool's axis and the way from its tip to the
+    camera. In the picture a disc of the tool at height h with radius r reaches down to h sin - r cos above the tip.
+    """
+    height, radius = profile.T
+    thick = radius > NEEDLE_RADIUS_RATIO * radius[0]
+    if thick.any():
+        first, limit = int(np.argmax(thick)), NEEDLE_RADIUS_RATIO * radius[0]
+        end = float(np.interp(limit, radius[first - 1 : first + 1], height[first - 1 : first + 1]))
+        height, radius = np.append(end, height[first:]), np.append(limit, radius[first:])
+    else:
+        height, radius = height[-1:], radius[-1:]
+    square = np.sqrt(np.clip(1 - along**2, 0.0, None))
+    reach = square[:, None] * height - np.maximum(along, 0.0)[:, None] * radius
+    return np.asarray(np.maximum(reach.min(1), 0.0))
+
+
+def hidden_tips(
+    state: ArmParameters,
+    profile: Array,
+    set_point: SetPoint,
+    kinematics: Kinematics,
+    rig: Rig,
+    stamp: Array,
+    camera: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Whether (N,) the tool hides so much of its needle at stamps (N,), s, that cameras (N,) cannot find the tip.
+
+    profile: (K, 2) [height, radius] of the tool, mm.
+    """
+    axes = set_point.lagged(stamp, state.dead_time, state.lag)
+    axis = (state.base_from_arm @ kinematics(axes))[:, :3, 2]
+    poses = np.stack([c.base_from_camera for c in rig.cameras])[camera]
+    way = poses[:, :3, 3] - tip_positions(state, set_point, kinematics, stamp)
+    far = np.linalg.norm(way, axis=1)
+    visible = visible_needle(profile, np.sum(way * axis, 1) / far)
+    return np.asarray(visible * rig.matrices[camera, 0, 0] / far < MIN_NEEDLE_LENGTH)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
