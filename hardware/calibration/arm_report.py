@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -81,6 +83,35 @@ def _hints(found: ArmCalibration, good: list[bool]) -> list[str]:
     if not good[2]:
         hints.append("a longer swing: --swing-s 20; and cameras that take more pictures a second")
     return hints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmTruth:
+    """The truth of a simulated arm."""
+
+    base_from_arm: Array
+    tool: Array
+    late: float  # s of dead time as executed
+    lag: float  # s of its servos
+
+    def rows(self, found: ArmCalibration) -> tuple[tuple[str, str, str], ...]:
+        """Rows of the report: what, error, stated sigma."""
+        state, sigma = found.fit.state, found.fit.sigma
+        off = se3.log(se3.inverse(self.base_from_arm) @ state.base_from_arm)
+        middle = found.places.mean(0)
+        gap = se3.transform_points(state.base_from_arm @ se3.inverse(self.base_from_arm), middle[None])[0] - middle
+        rows = [
+            ("base_from_arm, in the middle of the places, mm", np.linalg.norm(gap), np.nan, 3),
+            ("base_from_arm, at the arm's origin, mm", np.linalg.norm(off[3:]), np.linalg.norm(sigma[3:6]), 3),
+            ("base_from_arm, degrees", np.degrees(np.linalg.norm(off[:3])), np.degrees(np.linalg.norm(sigma[:3])), 4),
+        ]
+        if found.unknowns.tool:
+            tool = np.linalg.norm(np.asarray(state.tool) - self.tool)
+            rows.append(("tip in the tool, mm", tool, np.linalg.norm(sigma[6:9]), 3))
+        if found.unknowns.latency:
+            rows.append(("dead time, ms", 1e3 * (state.dead_time - self.late), 1e3 * sigma[9], 2))
+            rows.append(("servo's lag, ms", 1e3 * (state.lag - self.lag), 1e3 * sigma[10], 2))
+        return tuple((w, f"{v:.{d}f}", "" if np.isnan(s) else f"{s:.{d}f}") for w, v, s, d in rows)
 
 
 def arm_page(
@@ -208,3 +239,16 @@ def _latency(found: ArmCalibration) -> str:
     svg = f'<svg class="plot" viewBox="0 0 {width} {height + 2}" role="img" aria-label="latency">'
     keys = [line_key("truth", f"{1e3 * total:.1f} ms")]
     return f"{svg}{axis}{line}{dots}{labels}</svg>{legend(keys)}"
+
+
+def arm_text(
+    found: ArmCalibration, verdict: CalibrationVerdict, against: Sequence[tuple[str, str, str]], out: Path
+) -> str:
+    """What the terminal shows; against: as on the page."""
+    lines = ["PASS" if verdict.passed else "FAIL", *verdict.lines]
+    for c, camera in enumerate(found.rig.cameras):
+        lines.append(f"{camera.name}: tip {detection_text(found, c)}")
+    lines += [f"beside the truth: {what}: {off} (stated {stated or '-'})" for what, off, stated in against]
+    lines += list(verdict.hints)
+    lines.append(f"arm file: {out}, report: {out.with_suffix('.report.html')}")
+    return "\n".join(lines)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -31,15 +30,8 @@ from hardware.arm.link import Arm
 from hardware.arm.port import PortOpener
 from hardware.arm.profile import ArmProfile
 from hardware.calibration.arm_record import ARM_FILE, COMMANDED_FILE, MoveOptions, move_arm, read_commanded
-from hardware.calibration.arm_report import MAX_TIP_ERROR, arm_page, detection_text, judge_arm
-from hardware.calibration.arm_solve import (
-    ArmCalibration,
-    calibrated_profile,
-    kinematics_of,
-    numbers_text,
-    solve_folder,
-    tip_error,
-)
+from hardware.calibration.arm_report import MAX_TIP_ERROR, ArmTruth, arm_page, arm_text, judge_arm
+from hardware.calibration.arm_solve import calibrated_profile, kinematics_of, numbers_text, solve_folder, tip_error
 from hardware.calibration.report import CalibrationVerdict
 from hardware.files.arm_file import write_arm
 from hardware.files.rig_file import read_rig
@@ -163,48 +155,7 @@ def run_folder(
     out.with_suffix(".json").write_text(numbers_text(found), encoding="utf-8")
     text = arm_page(folder.resolve().name, found, verdict, against)
     out.with_suffix(".report.html").write_text(text, encoding="utf-8")
-    return ArmCalibrationResult(verdict, _text(found, verdict, against, out))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ArmTruth:
-    """The truth of a simulated arm."""
-
-    base_from_arm: Array
-    tool: Array
-    late: float  # s of dead time as executed
-    lag: float  # s of its servos
-
-    def rows(self, found: ArmCalibration) -> tuple[tuple[str, str, str], ...]:
-        """Rows of the report: what, error, stated sigma."""
-        state, sigma = found.fit.state, found.fit.sigma
-        off = se3.log(se3.inverse(self.base_from_arm) @ state.base_from_arm)
-        middle = found.places.mean(0)
-        gap = se3.transform_points(state.base_from_arm @ se3.inverse(self.base_from_arm), middle[None])[0] - middle
-        rows = [
-            ("base_from_arm, in the middle of the places, mm", np.linalg.norm(gap), np.nan, 3),
-            ("base_from_arm, at the arm's origin, mm", np.linalg.norm(off[3:]), np.linalg.norm(sigma[3:6]), 3),
-            ("base_from_arm, degrees", np.degrees(np.linalg.norm(off[:3])), np.degrees(np.linalg.norm(sigma[:3])), 4),
-        ]
-        if found.unknowns.tool:
-            tool = np.linalg.norm(np.asarray(state.tool) - self.tool)
-            rows.append(("tip in the tool, mm", tool, np.linalg.norm(sigma[6:9]), 3))
-        if found.unknowns.latency:
-            rows.append(("dead time, ms", 1e3 * (state.dead_time - self.late), 1e3 * sigma[9], 2))
-            rows.append(("servo's lag, ms", 1e3 * (state.lag - self.lag), 1e3 * sigma[10], 2))
-        return tuple((w, f"{v:.{d}f}", "" if np.isnan(s) else f"{s:.{d}f}") for w, v, s, d in rows)
-
-
-def _text(
-    found: ArmCalibration, verdict: CalibrationVerdict, against: Sequence[tuple[str, str, str]], out: Path
-) -> str:
-    lines = ["PASS" if verdict.passed else "FAIL", *verdict.lines]
-    for c, camera in enumerate(found.rig.cameras):
-        lines.append(f"{camera.name}: tip {detection_text(found, c)}")
-    lines += [f"beside the truth: {what}: {off} (stated {stated or '-'})" for what, off, stated in against]
-    lines += list(verdict.hints)
-    lines.append(f"arm file: {out}, report: {out.with_suffix('.report.html')}")
-    return "\n".join(lines)
+    return ArmCalibrationResult(verdict, arm_text(found, verdict, against, out))
 
 
 def calibrate_touched(

@@ -15,7 +15,8 @@ from hardware.process.clock import Clock, WallClock
 from hardware.process.progress import check_new, left_files_text
 
 if TYPE_CHECKING:
-    from hardware.calibration.arm_run import ArmCalibrationOptions, ArmCalibrationResult, ArmTruth
+    from hardware.calibration.arm_report import ArmTruth
+    from hardware.calibration.arm_run import ArmCalibrationOptions, ArmCalibrationResult
     from hardware.calibration.live import WavingPage
 
 RIG_FORMATS = {
@@ -152,7 +153,8 @@ def _cameras(a: argparse.Namespace) -> int:
 
     clock = WallClock()
     check_new(a.out, a.force)
-    recorded = _recorded(a.which)
+    path = Path(a.which[0])  # of the one recording that is named, or of a live camera
+    recorded = path if len(a.which) == 1 and (path.is_dir() or path.suffix == ".mcap") else None
     options = CalibrationOptions(a.limit_mm, a.distance_mm, a.keep_lenses, a.new_rig)
     if a.seconds is not None and (recorded is not None or not a.seconds >= 0):
         raise wrong_option("--seconds", a.seconds, "0 or more, with live cameras")
@@ -178,12 +180,6 @@ def _opened_page(clock: Clock) -> WavingPage:
     page = WavingPage(clock)
     print(f"open {page.address} to see where to hold the board", file=sys.stderr, flush=True)
     return page
-
-
-def _recorded(which: list[str]) -> Path | None:
-    """The one recording that is named, None where live cameras are."""
-    path = Path(which[0])
-    return path if len(which) == 1 and (path.is_dir() or path.suffix == ".mcap") else None
 
 
 def _import(a: argparse.Namespace) -> int:

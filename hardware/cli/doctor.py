@@ -185,21 +185,16 @@ class LoadFailure:
 
 
 def library_checks(names: list[str] | None = None) -> list[Check]:
-    """A check for each library. names: of distributions; all that stillbed asks for without them."""
+    """A check for each library. names: of distributions; without them, all that stillbed needs here, extras apart."""
     if names is None:
         try:
-            names = required_libraries()
+            requirements = [Requirement(line) for line in requires("stillbed") or []]
         except PackageNotFoundError:
             return [Check("stillbed", CheckVerdict.FAIL, "runs from its sources, not installed", "pip install .")]
+        names = [r.name for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
     known = modules_of(names)
     failed = load_failures(list(known.values()))
     return [_library_check(name, known.get(name, ""), failed) for name in names]
-
-
-def required_libraries() -> list[str]:
-    """The distributions that this machine's stillbed needs, extras apart. PackageNotFoundError: it is not installed."""
-    requirements = [Requirement(line) for line in requires("stillbed") or []]
-    return [r.name for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
 
 
 def modules_of(names: list[str]) -> dict[str, str]:

@@ -17,10 +17,9 @@ if TYPE_CHECKING:
     from hardware.cameras.sources import CameraDevice
 
 SETTINGS_FLAGS = (
-    *("rig", "simulated", "path", "arm", "profile", "record"),
-    *("dry_run", "lift", "stands_home", "jpeg_quality"),
-    *("page_address", "page_port", "page_certificate", "page_key"),
-)
+    "rig", "simulated", "path", "arm", "profile", "record", "dry_run", "lift", "stands_home", "jpeg_quality",
+    "page_address", "page_port", "page_certificate", "page_key",
+)  # fmt: skip
 NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
   in a container, hand it in (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`

@@ -151,7 +151,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     out: Path | None = getattr(arguments, "out", None)
     was_there = out is not None and out.exists()
     try:
-        _interrupt_on_sigterm()
+        if threading.current_thread() is threading.main_thread():  # elsewhere, signals are somebody else's part
+            signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends this process as Ctrl-C does
         code = arguments.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # nobody reads on, as after `| head`; the files are written all the same
@@ -166,12 +167,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"\nstillbed: interrupted; {left_files_text(getattr(arguments, 'out', None))}", file=sys.stderr)
         return INTERRUPTED
     return code or 0
-
-
-def _interrupt_on_sigterm() -> None:
-    """What asks this process to end, ends it as Ctrl-C does; outside the main thread that is somebody else's part."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def parser() -> Parser:

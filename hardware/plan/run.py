@@ -24,7 +24,7 @@ from estimation.se3 import Array
 from hardware.files.path_file import gcode_text, write_path
 from hardware.files.ply_file import write_ply
 from hardware.offline.reach import with_feasible
-from hardware.plan.order import PlanRequest, PlanSubject, check_out, order_of, subject_of
+from hardware.plan.order import Index, PlanRequest, PlanSubject, check_out, order_of, subject_of
 from hardware.plan.page import ReportText, bounds_of, layer_svg, len_text, material_text, page_text
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, count_text, duration_text
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from estimation.rig import Camera
     from perception.frames import FrameSet
 
-Index = NDArray[np.int64]
 # off the normal: a bead is then pushed aside by a fifth of its width, as the tip is no point
 MAX_TILT_OFF_NORMAL_DEG = 35.0
 NO_ARM_GIVEN = "no arm was asked, so there is no column feasible; --arm ARM.toml asks one, stillbed reach one later"
