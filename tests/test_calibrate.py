@@ -226,7 +226,7 @@ def test_a_rig_without_lenses_is_enough_to_begin_with(
     lines = [f'[[camera]]\nname = "{n}"\nimages = "{n}/*"\nsize = [640, 480]\n' for n in "abc"]
     (tmp_path / "s" / "rig.toml").write_text("\n".join(lines))
     bare, material = open_source(tmp_path / "s")
-    assert not material.given and [c.name for c in bare.rig.cameras] == ["a", "b", "c"]
+    assert not material.calibrated and [c.name for c in bare.rig.cameras] == ["a", "b", "c"]
     views, _ = usable_views(
         collect_corners(open_source(session)[0], BOARD, None, no_progress),
         BOARD,

@@ -203,15 +203,15 @@ def test_controls_are_locked_and_read_back() -> None:
     request_picture(driver, ASKED, (1280, 720))
     lock_controls(driver, ASKED)
     controls = {control.name: control for control in read_controls(driver, ASKED)}
-    assert all(control.taken and not control.automatic for control in controls.values())
-    assert controls["exposure_s"].got == pytest.approx(0.0081) and controls["format"].got == "MJPG"
+    assert all(control.accepted and not control.automatic for control in controls.values())
+    assert controls["exposure_s"].actual == pytest.approx(0.0081) and controls["format"].actual == "MJPG"
     assert driver.values[cv2.CAP_PROP_FRAME_WIDTH] == 1280 and driver.values[cv2.CAP_PROP_FRAME_HEIGHT] == 720
 
 
 def test_what_a_driver_did_not_take_is_named_with_what_it_does_instead() -> None:
     driver = Driver(most_gain=16.0, focus=False)
     lock_controls(driver, ASKED)
-    refused = [str(control) for control in read_controls(driver, ASKED) if not control.taken]
+    refused = [str(control) for control in read_controls(driver, ASKED) if not control.accepted]
     assert refused == ["format YUYV, asked for MJPG", "gain 16, asked for 32", "focus_abs not there, asked for 40"]
 
 
@@ -221,13 +221,13 @@ def test_what_was_not_asked_for_is_left_as_it_is_and_told_to_be_automatic() -> N
     request_picture(driver, nothing, None)
     lock_controls(driver, nothing)
     controls = read_controls(driver, nothing)
-    assert driver.values == before and all(control.taken for control in controls)
+    assert driver.values == before and all(control.accepted for control in controls)
     assert [c.name for c in controls if c.automatic] == ["exposure_s", "focus_abs", "white_balance_k"]
 
 
 def test_an_exposure_is_taken_to_half_a_step_and_not_beyond() -> None:
-    assert Control("exposure_s", 0.001, 0.00105).taken and not Control("exposure_s", 0.001, 0.001051).taken
-    assert not Control("exposure_s", 0.001, 0.001, automatic=True).taken
+    assert Control("exposure_s", 0.001, 0.00105).accepted and not Control("exposure_s", 0.001, 0.001051).accepted
+    assert not Control("exposure_s", 0.001, 0.001, automatic=True).accepted
 
 
 def test_only_an_exposure_that_is_locked_is_known() -> None:
@@ -237,7 +237,7 @@ def test_only_an_exposure_that_is_locked_is_known() -> None:
 
 
 def test_a_stream_takes_no_controls_and_says_so() -> None:
-    assert [c.taken for c in ignored_controls(CameraSource(Identity(SourceKind.STREAM, "http://h/1"), gain=3))] == [
+    assert [c.accepted for c in ignored_controls(CameraSource(Identity(SourceKind.STREAM, "http://h/1"), gain=3))] == [
         False
     ]
 

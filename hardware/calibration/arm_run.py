@@ -147,15 +147,15 @@ def run_folder(
     """Solve a recorded calibration; writes `out` and, beside it, .report.html and .json."""
     check_out(out)
     rig_json = folder / RIG_JSON
-    found = solve_folder(folder, rig_json if rig_json.is_file() else None, options.unknowns, report)
-    verdict = judge_arm(found, options.limit)
-    profile = calibrated_profile(found.profile, found.fit.state, options.unknowns)
-    against = () if truth is None else truth.rows(found)
+    result = solve_folder(folder, rig_json if rig_json.is_file() else None, options.unknowns, report)
+    verdict = judge_arm(result, options.limit)
+    profile = calibrated_profile(result.profile, result.fit.state, options.unknowns)
+    against = () if truth is None else truth.rows(result)
     write_arm(out, profile, f"calibrated by what cameras saw of its tip\n{verdict.lines[0]}")
-    out.with_suffix(".json").write_text(numbers_text(found), encoding="utf-8")
-    text = arm_page(folder.resolve().name, found, verdict, against)
+    out.with_suffix(".json").write_text(numbers_text(result), encoding="utf-8")
+    text = arm_page(folder.resolve().name, result, verdict, against)
     out.with_suffix(".report.html").write_text(text, encoding="utf-8")
-    return ArmCalibrationResult(verdict, arm_text(found, verdict, against, out))
+    return ArmCalibrationResult(verdict, arm_text(result, verdict, against, out))
 
 
 def calibrate_touched(
@@ -165,18 +165,18 @@ def calibrate_touched(
     check_out(out)
     points = read_touches(points_file, read_rig(rig_file).rig)
     poses = kinematics_of(profile.arm)(points.axes)
-    found = fit_touches(poses, points.points, points.sigma, profile.arm.tool_offset, not keep_tool)
-    verdict = _judge_touches(found, points, poses)
-    arm = replace(profile.arm, arm_from_base=se3.inverse(found.base_from_arm), tool_offset=found.tool)
+    result = fit_touches(poses, points.points, points.sigma, profile.arm.tool_offset, not keep_tool)
+    verdict = _judge_touches(result, points, poses)
+    arm = replace(profile.arm, arm_from_base=se3.inverse(result.base_from_arm), tool_offset=result.tool)
     write_arm(out, replace(profile, arm=arm), f"calibrated by {len(points.points)} touched points\n{verdict.lines[0]}")
     text = ["PASS" if verdict.passed else "FAIL", *verdict.lines, *verdict.hints, f"arm file: {out}"]
     return ArmCalibrationResult(verdict, "\n".join(text))
 
 
-def _judge_touches(found: TouchFit, points: TouchPoints, poses: Array) -> CalibrationVerdict:
-    away = np.linalg.norm(found.residuals, axis=1)
+def _judge_touches(result: TouchFit, points: TouchPoints, poses: Array) -> CalibrationVerdict:
+    away = np.linalg.norm(result.residuals, axis=1)
     worst = int((away / points.sigma).argmax())
-    error = tip_error(found.base_from_arm, found.tool, found.covariance, poses)
+    error = tip_error(result.base_from_arm, result.tool, result.covariance, poses)
     spare = 3 * len(away) - 6
     scatter = float(np.sqrt((away**2 / points.sigma**2).sum() / spare))
     bad = away[worst] > MAX_TOUCH_SIGMAS * points.sigma[worst]

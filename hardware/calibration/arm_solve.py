@@ -51,7 +51,7 @@ class TipObservations:
 
     sightings: Sightings  # one per camera and resting place: the median
     looked: NDArray[np.int64]  # (C,) number of pictures searched
-    found: NDArray[np.int64]  # (C,) number of pictures with a tip
+    detections: NDArray[np.int64]  # (C,) number of pictures with a tip
     crops: tuple[tuple[Array, Array], ...]  # by camera: pictures (K, H, W, 3) about tips, and the tips' pixels (K, 2)
     missed: tuple[Array, NDArray[np.int64]]  # stamps (M,), s, and cameras (M,) of pictures without a tip
 
@@ -159,8 +159,8 @@ def _collect(pictures: Sequence[_TipPicture], cameras: int) -> TipObservations:
         place=np.array([max(place, -1) for place, _ in rows], np.int64),
     )
     missed = np.array([one.ref.stamp for one in pictures if one.tip is None], float), camera[~with_tip]
-    looked, found = (np.bincount(each, minlength=cameras) for each in (camera, camera[with_tip]))
-    return TipObservations(sightings, looked, found, tuple(_crops(pictures, c) for c in range(cameras)), missed)
+    looked, detections = (np.bincount(each, minlength=cameras) for each in (camera, camera[with_tip]))
+    return TipObservations(sightings, looked, detections, tuple(_crops(pictures, c) for c in range(cameras)), missed)
 
 
 def _crops(pictures: Sequence[_TipPicture], camera: int) -> tuple[Array, Array]:
@@ -324,9 +324,9 @@ def read_covariance(path: Path, cameras: int) -> Array:
     return (covariance + covariance.T) / 2
 
 
-def numbers_text(found: ArmCalibration) -> str:
+def numbers_text(result: ArmCalibration) -> str:
     """All parameters with their covariance as JSON, mm, rad, s and px."""
-    state, sigma = found.fit.state, found.fit.sigma
+    state, sigma = result.fit.state, result.fit.sigma
     arm_from_base = se3.inverse(state.base_from_arm)
     table = {
         "arm_from_base": arm_from_base.tolist(),
@@ -334,13 +334,13 @@ def numbers_text(found: ArmCalibration) -> str:
         "dead_time_s": state.dead_time,
         "servo_lag_s": state.lag,
         "end_radius_mm": state.blunt,
-        "arm_from_camera": {c.name: (arm_from_base @ c.base_from_camera).tolist() for c in found.rig.cameras},
+        "arm_from_camera": {c.name: (arm_from_base @ c.base_from_camera).tolist() for c in result.rig.cameras},
         "numbers": ["rx", "ry", "rz", "tx", "ty", "tz", "tool x", "tool y", "tool z", "dead_time_s", "lag_s", "end_mm"],
         "sigma": sigma.tolist(),
-        "covariance": found.fit.covariance.tolist(),
-        "scatter": found.fit.scatter,
-        "widened_by": found.fit.widened_by,
-        "held_out_median_px": float(np.nanmedian(found.held_px)),
-        "held_out_median_mm": float(np.nanmedian(found.held_mm)),
+        "covariance": result.fit.covariance.tolist(),
+        "scatter": result.fit.scatter,
+        "widened_by": result.fit.widened_by,
+        "held_out_median_px": float(np.nanmedian(result.held_px)),
+        "held_out_median_mm": float(np.nanmedian(result.held_mm)),
     }
     return json.dumps(table, indent=1, allow_nan=False) + "\n"

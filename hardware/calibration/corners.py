@@ -239,10 +239,10 @@ class CoverageGuide:
             rows = np.flatnonzero(table.instant == instant)
             self.add({int(table.camera[row]): table.pixels[row] for row in rows})
 
-    def add(self, seen: dict[int, Array]) -> None:
+    def add(self, corners: dict[int, Array]) -> None:
         """Add one frame set: corners (P, 2) px by camera, nan where not seen."""
-        self.together += len(seen) > 1 or len(self.names) == 1
-        for camera, pixels in seen.items():
+        self.together += len(corners) > 1 or len(self.names) == 1
+        for camera, pixels in corners.items():
             if np.isfinite(pixels[:, 0]).sum() >= MIN_PLANE_CORNERS:
                 self._cameras[camera].add(self._board, pixels)
 

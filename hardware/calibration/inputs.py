@@ -67,9 +67,9 @@ def _check_markers(table: CornerTable, board: Board, board_file: Path) -> None:
     known = table.marker[np.isfinite(table.marker)]
     if len(known) < MIN_VIEWS:
         return
-    found = float(np.median(known))
-    if abs(found / board.marker - 1) > MAX_MARKER_ERROR:
-        raise InputError(board_file, "marker", board.marker, f"what the pictures show: about {found:.2f} of a square")
+    ratio = float(np.median(known))
+    if abs(ratio / board.marker - 1) > MAX_MARKER_ERROR:
+        raise InputError(board_file, "marker", board.marker, f"what the pictures show: about {ratio:.2f} of a square")
 
 
 def why_unseen(pictures: list[Image], board: Board) -> str:
@@ -124,7 +124,7 @@ class CalibrationInput:
 
     title: str  # of the report
     rig: Rig  # names and sizes of the cameras; the rest only if `given`
-    given: bool  # whether the session has a calibrated rig
+    calibrated: bool  # whether the session has a calibrated rig
     images: Sequence[ImageSource | None]  # where each camera's pictures are, for the new rig.toml
     lens_sigma: Sequence[Array | None]  # of the given lenses, (9,) per camera or None
     pictures: Pictures  # a few of each camera
@@ -141,31 +141,31 @@ class CalibrationInput:
         return KnownLenses(np.stack([lens_of(camera) for camera in self.rig.cameras]), np.stack(sigma))
 
 
-def check_against(found: Rig, given: Rig, board_file: Path, square: float) -> None:
+def check_against(rig: Rig, before: Rig, board_file: Path, square: float) -> None:
     """InputError where the new rig is the given one with cameras swapped, turned by a quarter, or of another size."""
-    places = _rotations(given)
-    if misfit(_rotations(found), places) > OTHER_RIG_DEG:
-        for words, other in _common_mistakes(given, places):
-            if misfit(_rotations(found), other) < SAME_RIG_DEG:
+    places = _rotations(before)
+    if misfit(_rotations(rig), places) > OTHER_RIG_DEG:
+        for words, other in _common_mistakes(before, places):
+            if misfit(_rotations(rig), other) < SAME_RIG_DEG:
                 raise InputError("the recording", "cameras", words, "as in its rig.toml (or --new-rig, if it is meant)")
         return
-    ratio = _size(found) / _size(given)
+    ratio = _size(rig) / _size(before)
     if abs(ratio - 1) > MAX_SCALE_ERROR:
         allowed = f"about {square / ratio:.3g} mm by the distances between the cameras in rig.toml (or --new-rig)"
         raise InputError(board_file, "square_mm", f"{square:g} mm", allowed)
 
 
-def camera_shifts(found: Rig, given: Rig) -> tuple[tuple[float, float], ...]:
+def camera_shifts(rig: Rig, before: Rig) -> tuple[tuple[float, float], ...]:
     """Distance and angle, mm and degrees, of each camera from its given pose, if the first one's poses agree."""
-    same = given.cameras[0].base_from_camera @ se3.inverse(found.cameras[0].base_from_camera)
-    pairs = [(a.base_from_camera, b.base_from_camera) for a, b in zip(found.cameras, given.cameras, strict=True)]
+    same = before.cameras[0].base_from_camera @ se3.inverse(rig.cameras[0].base_from_camera)
+    pairs = [(a.base_from_camera, b.base_from_camera) for a, b in zip(rig.cameras, before.cameras, strict=True)]
     off = [se3.log(se3.inverse(b) @ same @ a) for a, b in pairs]
     return tuple((float(np.linalg.norm(x[3:])), float(np.degrees(np.linalg.norm(x[:3])))) for x in off)
 
 
-def check_distance(found: Rig, first: str, second: str, distance: float, board_file: Path, square: float) -> None:
+def check_distance(rig: Rig, first: str, second: str, distance: float, board_file: Path, square: float) -> None:
     """InputError unless two lenses are as far apart as measured, mm: the corners alone do not show a wrong square."""
-    ends = [found.cameras[found.index(name)].base_from_camera[:3, 3] for name in (first, second)]
+    ends = [rig.cameras[rig.index(name)].base_from_camera[:3, 3] for name in (first, second)]
     apart = float(np.linalg.norm(ends[0] - ends[1]))
     if abs(apart / distance - 1) > MAX_SCALE_ERROR:
         got = f"{square:g} mm, which puts {first} and {second} {apart:.0f} mm apart"
@@ -177,15 +177,15 @@ def _rotations(rig: Rig) -> Array:
     return np.stack([c.base_from_camera[:3, :3] for c in rig.cameras])
 
 
-def misfit(found: Array, given: Array) -> float:
+def misfit(rotations: Array, before: Array) -> float:
     """Largest angle, degrees, between rotations (C, 3, 3) and (C, 3, 3) after the best alignment of the bases."""
-    change = se3.nearest_rotation((found @ np.swapaxes(given, 1, 2)).sum(0))
-    return float(np.degrees(se3.angle_of(np.swapaxes(found, 1, 2) @ change @ given)).max())
+    change = se3.nearest_rotation((rotations @ np.swapaxes(before, 1, 2)).sum(0))
+    return float(np.degrees(se3.angle_of(np.swapaxes(rotations, 1, 2) @ change @ before)).max())
 
 
-def _common_mistakes(given: Rig, places: Array) -> Iterator[tuple[str, Array]]:
+def _common_mistakes(before: Rig, places: Array) -> Iterator[tuple[str, Array]]:
     """Frequent mistakes with cameras, as text, and the rotations (C, 3, 3) that they cause."""
-    names = [c.name for c in given.cameras]
+    names = [c.name for c in before.cameras]
     for a, b in combinations(range(len(names)), 2):
         order = np.arange(len(names))
         order[[a, b]] = b, a
@@ -207,13 +207,13 @@ def open_source(path: Path) -> tuple[Session, CalibrationInput]:
     """Open a session folder, whose rig.toml may lack lenses and poses, or an .mcap file; InputError if it is wrong."""
     rig_toml = path / "rig.toml"
     if not (path.is_dir() and rig_toml.is_file()):
-        session, given, rig = open_session(path), True, None
+        session, calibrated, rig = open_session(path), True, None
     elif is_calibrated(rig_toml):
-        session, given, rig = open_folder(path), True, read_rig(rig_toml)
+        session, calibrated, rig = open_folder(path), True, read_rig(rig_toml)
     else:
-        given, rig = False, read_uncalibrated(rig_toml)
+        calibrated, rig = False, read_uncalibrated(rig_toml)
         session = open_folder(path, rig)
     nothing = [None] * len(session.rig)
     images, sigma = (nothing, nothing) if rig is None else (rig.sources, rig.lens_sigma)
     title, pictures = session.path.name, partial(pictures_of, session)
-    return session, CalibrationInput(title, session.rig, given, images, sigma, pictures)
+    return session, CalibrationInput(title, session.rig, calibrated, images, sigma, pictures)

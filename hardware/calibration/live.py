@@ -164,7 +164,7 @@ class WavingRecorder:
         self.search = CornerSearch(board, len(names), store, key)
         stored = self.search.table
         self._late: float | None = None if len(stored) else 0.0  # s, added to the cameras' stamps
-        self.seen: dict[int, Array] = {}  # corners (P, 2) px of the newest set by camera, nan where not seen
+        self.corners: dict[int, Array] = {}  # corners (P, 2) px of the newest set by camera, nan where not seen
         self.guide = CoverageGuide(names, sizes, board)
         self.guide.remember(stored)
         self.pictures: list[list[Image]] = [[] for _ in names]
@@ -176,16 +176,16 @@ class WavingRecorder:
         each = self.search.add(pool, [(frame.camera, frame.stamp + self._late, frame.image) for frame in one.frames])
         for frame in one.frames:
             self.pictures[frame.camera] = [*self.pictures[frame.camera][1 - RECENT_PICTURES :], frame.image]
-        self.seen = {f.camera: c.pixels for f, c in zip(one.frames, each, strict=True) if c.count}
-        self.guide.add(self.seen)
+        self.corners = {f.camera: c.pixels for f, c in zip(one.frames, each, strict=True) if c.count}
+        self.guide.add(self.corners)
 
     def material(self, devices: CalibrationCameras, sizes: tuple[tuple[int, int], ...]) -> CalibrationInput:
         """The calibration's input besides the corners."""
-        given = devices.rig is not None
+        calibrated = devices.rig is not None
         rig = _placeholder_rig(devices.names, sizes) if devices.rig is None else devices.rig
         images = [ImageSource("source", source.identity.text) for source in devices.sources]
         title = ", ".join(source.identity.shown for source in devices.sources)
-        return CalibrationInput(title, rig, given, images, devices.lens_sigma, lambda c: self.pictures[c])
+        return CalibrationInput(title, rig, calibrated, images, devices.lens_sigma, lambda c: self.pictures[c])
 
 
 def _placeholder_rig(names: tuple[str, ...], sizes: tuple[tuple[int, int], ...]) -> Rig:
@@ -238,8 +238,8 @@ def watch(
 def _update_page(page: WavingPage, waving: WavingRecorder, missing: tuple[str, ...], newest: FrameSet | None) -> bool:
     """Show the progress on the page; True if its user ends the collection, KeyboardInterrupt if he stops it."""
     if newest is not None:
-        page.picture(waving.guide.names, newest, waving.seen)
-    page.show(waving.guide, missing, waving.search.done, waving.seen)
+        page.picture(waving.guide.names, newest, waving.corners)
+    page.show(waving.guide, missing, waving.search.done, waving.corners)
     wish = page.poll()
     if wish is Wish.STOP:
         raise KeyboardInterrupt

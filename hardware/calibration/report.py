@@ -128,7 +128,7 @@ def picture_frame(size: tuple[int, int], inside: str, label: str = "picture") ->
 
 def page(
     title: str,
-    found: Calibration,
+    result: Calibration,
     error: VolumeError,
     verdict: CalibrationVerdict,
     dropped: Mapping[tuple[str, str], int],
@@ -139,16 +139,16 @@ def page(
     residuals = f"From each corner to where the rig puts it, {RESIDUAL_SCALE} times as long."
     tiles = [
         tile(f"{error.worst:.3f}", "mm", "predicted error, 19 of 20 points"),
-        tile(f"{median_residual(found):.2f}", "px", "median corner residual"),
-        tile(f"{board_scatter(found):.2f}", "mm", "RMS of distances between corners"),
-        tile(str(len(found.views)), "", "views used"),
+        tile(f"{median_residual(result):.2f}", "px", "median corner residual"),
+        tile(f"{board_scatter(result):.2f}", "mm", "RMS of distances between corners"),
+        tile(str(len(result.views)), "", "views used"),
     ]
     body = [
         row_of_tiles(tiles),
         section("Verdict", ". ".join(verdict.lines) + ".", bullets(verdict.hints) if verdict.hints else ""),
-        section("Cameras", "One sigma behind each figure.", _cameras(found) + _left_out(found, dropped)),
-        section("Where the board was", "Every corner used, where the lens imaged it.", _each(found, _corners)),
-        section("Residuals", residuals, _each(found, _residuals)),
+        section("Cameras", "One sigma behind each figure.", _cameras(result) + _left_out(result, dropped)),
+        section("Where the board was", "Every corner used, where the lens imaged it.", _each(result, _corners)),
+        section("Residuals", residuals, _each(result, _residuals)),
         section("Predicted error", "mm, one sigma, over the working volume, layer by layer along z.", _volume(error)),
     ]
     if pictures:
@@ -158,56 +158,56 @@ def page(
     return document("stillbed calibrate cameras", title, f"Calibration {word}: {verdict.lines[0]}.", body, footer)
 
 
-def millimetres_per_pixel(found: Calibration, camera: int) -> float:
+def millimetres_per_pixel(result: Calibration, camera: int) -> float:
     """mm that one pixel spans at the board's median distance (thesis 4.2 reports 0.508, 0.51 and 0.33)."""
-    views, state = found.views, found.fit.state
+    views, state = result.views, result.fit.state
     boards = state.base_from_board[views.instant[views.camera == camera]]
     middle = se3.transform_points(boards, views.points).mean(1)
     depth = se3.transform_points(se3.inverse(state.base_from_camera[camera]), middle)[:, 2]
     return float(np.median(depth) / np.sqrt(state.lens[camera, 0] * state.lens[camera, 1]))
 
 
-def _cameras(found: Calibration) -> str:
-    cameras = range(len(found.views.names))
-    lone = [next((s.held_out for s in found.scores[c] if s.model == found.models[c]), np.nan) for c in cameras]
-    lenses = [lens_of(camera) for camera in found.rig.cameras]
-    sigmas = [np.sqrt(np.diag(found.covariance_of(c))) for c in cameras]
+def _cameras(result: Calibration) -> str:
+    cameras = range(len(result.views.names))
+    lone = [next((s.held_out for s in result.scores[c] if s.model == result.models[c]), np.nan) for c in cameras]
+    lenses = [lens_of(camera) for camera in result.rig.cameras]
+    sigmas = [np.sqrt(np.diag(result.covariance_of(c))) for c in cameras]
     rows = [
-        ["views", *(str(int((found.views.camera == c).sum())) for c in cameras)],
-        ["distortion model", *found.models],
-        ["residual, median px", *(f"{median_residual(found, c):.2f}" for c in cameras)],
-        ["in stretches held out of the whole, median px", *(f"{held_out_residual(found, c):.2f}" for c in cameras)],
+        ["views", *(str(int((result.views.camera == c).sum())) for c in cameras)],
+        ["distortion model", *result.models],
+        ["residual, median px", *(f"{median_residual(result, c):.2f}" for c in cameras)],
+        ["in stretches held out of the whole, median px", *(f"{held_out_residual(result, c):.2f}" for c in cameras)],
         ["lens alone, on views held out, RMS px", *(f"{v:.3f}" if np.isfinite(v) else "–" for v in lone)],
     ]
     for i, name in enumerate(PARAMETERS):
         digits = 2 if i < 4 else 5
         rows.append([name, *(f"{lenses[c][i]:.{digits}f} ± {sigmas[c][i]:.{digits}f}" for c in cameras)])
-    offsets = [f"{1e3 * found.rig.cameras[c].clock_offset:.2f} ± {1e3 * sigmas[c][15]:.2f}" for c in cameras]
+    offsets = [f"{1e3 * result.rig.cameras[c].clock_offset:.2f} ± {1e3 * sigmas[c][15]:.2f}" for c in cameras]
     rows += [
         ["place known to, mm", *(f"{np.linalg.norm(s[12:15]):.3f}" for s in sigmas)],
         ["and degrees", *(f"{np.degrees(np.linalg.norm(s[9:12])):.4f}" for s in sigmas)],
         ["clock offset, ms", *offsets],
-        ["mm per pixel at the board", *(f"{millimetres_per_pixel(found, c):.3f}" for c in cameras)],
+        ["mm per pixel at the board", *(f"{millimetres_per_pixel(result, c):.3f}" for c in cameras)],
     ]
-    return figures_table(["", *found.views.names], rows)
+    return figures_table(["", *result.views.names], rows)
 
 
-def _left_out(found: Calibration, dropped: Mapping[tuple[str, str], int]) -> str:
+def _left_out(result: Calibration, dropped: Mapping[tuple[str, str], int]) -> str:
     rows = [f"{name}: {count} views, {reason}" for (name, reason), count in sorted(dropped.items())]
-    rows.append(f"{found.dropped} single corners lay apart from all others and were left out")
+    rows.append(f"{result.dropped} single corners lay apart from all others and were left out")
     return bullets(rows)
 
 
-def _each(found: Calibration, draw: Callable[[Calibration, int], str]) -> str:
-    cameras = zip(found.views.names, found.views.sizes, strict=True)
-    return figure_row(figure(picture_frame(s, draw(found, c)), name) for c, (name, s) in enumerate(cameras))
+def _each(result: Calibration, draw: Callable[[Calibration, int], str]) -> str:
+    cameras = zip(result.views.names, result.views.sizes, strict=True)
+    return figure_row(figure(picture_frame(s, draw(result, c)), name) for c, (name, s) in enumerate(cameras))
 
 
-def _corners(found: Calibration, camera: int) -> str:
-    pixels = found.views.pixels[found.views.camera == camera].reshape(-1, 2)
+def _corners(result: Calibration, camera: int) -> str:
+    pixels = result.views.pixels[result.views.camera == camera].reshape(-1, 2)
     pixels = pixels[np.isfinite(pixels[:, 0])]
-    parts = coverage(found, camera).parts
-    w, h = found.views.sizes[camera]
+    parts = coverage(result, camera).parts
+    w, h = result.views.sizes[camera]
     rows, columns = parts.shape
     counts = "".join(
         f'<text x="{(x + 0.5) * w / columns:.0f}" y="{(y + 0.5) * h / rows:.0f}" text-anchor="middle" '
@@ -219,9 +219,9 @@ def _corners(found: Calibration, camera: int) -> str:
     return dots + counts
 
 
-def _residuals(found: Calibration, camera: int) -> str:
-    rows = found.views.camera == camera
-    pixels, rest = found.views.pixels[rows].reshape(-1, 2), found.fit.residuals[rows].reshape(-1, 2)
+def _residuals(result: Calibration, camera: int) -> str:
+    rows = result.views.camera == camera
+    pixels, rest = result.views.pixels[rows].reshape(-1, 2), result.fit.residuals[rows].reshape(-1, 2)
     known = np.isfinite(pixels[:, 0])
     ends = pixels + RESIDUAL_SCALE * rest
     return "".join(
@@ -269,31 +269,31 @@ def _pictures(pictures: Mapping[str, bytes]) -> str:
     return figure_row(figure(tag, name) for name, tag in tags.items())
 
 
-def rig_json(found: Calibration, error: VolumeError, verdict: CalibrationVerdict) -> str:
+def rig_json(result: Calibration, error: VolumeError, verdict: CalibrationVerdict) -> str:
     """All figures with their sigmas, mm, rad, s; the covariance is camera by camera in the order of `numbers`."""
     numbers = [*PARAMETERS, "rx", "ry", "rz", "tx", "ty", "tz", "clock_offset_s"]
     cameras = [
         {
             "name": c.name,
-            "model": found.models[i],
-            "sigma": dict(zip(numbers, np.sqrt(np.diag(found.covariance_of(i))).tolist(), strict=True)),
-            "residual_median_px": median_residual(found, i),
-            "residual_held_out_median_px": _finite_or_none(held_out_residual(found, i)),
-            "lens_held_out_rms_px": {s.model: s.held_out for s in found.scores[i]},
-            "mm_per_px": millimetres_per_pixel(found, i),
+            "model": result.models[i],
+            "sigma": dict(zip(numbers, np.sqrt(np.diag(result.covariance_of(i))).tolist(), strict=True)),
+            "residual_median_px": median_residual(result, i),
+            "residual_held_out_median_px": _finite_or_none(held_out_residual(result, i)),
+            "lens_held_out_rms_px": {s.model: s.held_out for s in result.scores[i]},
+            "mm_per_px": millimetres_per_pixel(result, i),
         }
-        for i, c in enumerate(found.rig.cameras)
+        for i, c in enumerate(result.rig.cameras)
     ]
     table = {
         "passed": verdict.passed,
         "predicted_error_mm": {"typical": error.typical, "worst": error.worst},
-        "residual_median_px": median_residual(found),
-        "residual_held_out_median_px": _finite_or_none(held_out_residual(found)),
-        "board_distances_rms_mm": board_scatter(found),
-        "jitter_s": found.jitter,
+        "residual_median_px": median_residual(result),
+        "residual_held_out_median_px": _finite_or_none(held_out_residual(result)),
+        "board_distances_rms_mm": board_scatter(result),
+        "jitter_s": result.jitter,
         "numbers": numbers,
         "cameras": cameras,
-        "covariance": found.fit.covariance.tolist(),
+        "covariance": result.fit.covariance.tolist(),
     }
     return json.dumps(table, indent=1, allow_nan=False) + "\n"
 
@@ -303,18 +303,18 @@ def _finite_or_none(value: float) -> float | None:
 
 
 def rig_text(
-    found: Calibration, verdict: CalibrationVerdict, dropped: Mapping[tuple[str, str], int], out: Path, more: list[str]
+    result: Calibration, verdict: CalibrationVerdict, dropped: Mapping[tuple[str, str], int], out: Path, more: list[str]
 ) -> str:
     """What the terminal shows. dropped: views by camera and reason. more: further lines."""
     lines = ["PASS" if verdict.passed else "FAIL", *verdict.lines]
-    for i, camera in enumerate(found.rig.cameras):
-        sigma = np.sqrt(np.diag(found.covariance_of(i)))
+    for i, camera in enumerate(result.rig.cameras):
+        model, sigma = result.models[i], np.sqrt(np.diag(result.covariance_of(i)))
         lines.append(
-            f"{camera.name}: focal length {camera.matrix[0, 0]:.1f} ± {sigma[0]:.1f} px, distortion {found.models[i]}, "
-            f"clock {1e3 * camera.clock_offset:+.2f} ± {1e3 * sigma[15]:.2f} ms, {median_residual(found, i):.2f} px, "
-            f"{millimetres_per_pixel(found, i):.3f} mm/px"
+            f"{camera.name}: focal length {camera.matrix[0, 0]:.1f} ± {sigma[0]:.1f} px, distortion {model}, "
+            f"clock {1e3 * camera.clock_offset:+.2f} ± {1e3 * sigma[15]:.2f} ms, {median_residual(result, i):.2f} px, "
+            f"{millimetres_per_pixel(result, i):.3f} mm/px"
         )
-    lines.append(f"distances between corners: {board_scatter(found):.2f} mm RMS")
+    lines.append(f"distances between corners: {board_scatter(result):.2f} mm RMS")
     lines += more
     lines += [f"{name}: {count} views left out, {reason}" for (name, reason), count in sorted(dropped.items())]
     lines += list(verdict.hints)

@@ -63,7 +63,7 @@ def run_calibration(
     """
     board = _check_paths(board_file, out)
     recording, material = open_source(session)
-    _check_options(material.names, material.given, recording.path, options)
+    _check_options(material.names, material.calibrated, recording.path, options)
     table = collect_corners(recording, board, corners_of(out), report)
     return finish(material, table, board, board_file, out, options)
 
@@ -117,37 +117,37 @@ def finish(
     """Calibrate from the corners, and write all files."""
     check_table(table, board, board_file, material.names, material.pictures)
     views, dropped = usable_views(table, board, material.names, tuple(c.size for c in material.rig.cameras))
-    found = calibrate(views, known=material.lenses if options.keep_lenses else None)
+    result = calibrate(views, known=material.lenses if options.keep_lenses else None)
     if options.distance is not None:
-        check_distance(found.rig, *options.distance, board_file, board.square)
-    if material.given and not options.new_rig:
-        check_against(found.rig, material.rig, board_file, board.square)
-    error = found.predicted_error(found.working_volume(), SURFACE_SPEED)
-    verdict = judge_rig(found, error, options.limit, coverage_hints(found))
-    placed = rebased(found.rig, material.rig.cameras[0].base_from_camera if material.given else np.eye(4))
-    sigmas = [np.sqrt(np.diag(found.covariance_of(c))[:9]) for c in range(len(placed))]
+        check_distance(result.rig, *options.distance, board_file, board.square)
+    if material.calibrated and not options.new_rig:
+        check_against(result.rig, material.rig, board_file, board.square)
+    error = result.predicted_error(result.working_volume(), SURFACE_SPEED)
+    verdict = judge_rig(result, error, options.limit, coverage_hints(result))
+    placed = rebased(result.rig, material.rig.cameras[0].base_from_camera if material.calibrated else np.eye(4))
+    sigmas = [np.sqrt(np.diag(result.covariance_of(c))[:9]) for c in range(len(placed))]
     write_rig(out, placed, material.images, sigmas)
-    out.with_suffix(".json").write_text(rig_json(found, error, verdict), encoding="utf-8")
-    text = page(material.title, found, error, verdict, dropped, _pictures(material, found))
+    out.with_suffix(".json").write_text(rig_json(result, error, verdict), encoding="utf-8")
+    text = page(material.title, result, error, verdict, dropped, _pictures(material, result))
     out.with_suffix(".report.html").write_text(text, encoding="utf-8")
-    lines = _shift_lines(placed, material.rig) if material.given else []
-    return CalibrationResult(replace(found, rig=placed), verdict, rig_text(found, verdict, dropped, out, lines))
+    lines = _shift_lines(placed, material.rig) if material.calibrated else []
+    return CalibrationResult(replace(result, rig=placed), verdict, rig_text(result, verdict, dropped, out, lines))
 
 
-def _shift_lines(found: Rig, given: Rig) -> list[str]:
-    apart = zip(found.cameras[1:], camera_shifts(found, given)[1:], strict=True)
+def _shift_lines(rig: Rig, before: Rig) -> list[str]:
+    apart = zip(rig.cameras[1:], camera_shifts(rig, before)[1:], strict=True)
     texts = [f"{camera.name} {millimetres:.1f} mm, {degrees:.2f} degrees" for camera, (millimetres, degrees) in apart]
     return [f"away from where the rig.toml had it: {'; '.join(texts)}"] if texts else []
 
 
-def _check_options(names: Sequence[str], given: bool, where: object, options: CalibrationOptions) -> None:
-    if options.keep_lenses and not given:
+def _check_options(names: Sequence[str], calibrated: bool, where: object, options: CalibrationOptions) -> None:
+    if options.keep_lenses and not calibrated:
         raise InputError(where, "--keep-lenses", "a rig.toml without lenses", "one that has them")
     for name in options.distance[:2] if options.distance else ():
         if name not in names:
             raise InputError("--distance-mm", "camera", name, ", ".join(names))
 
 
-def _pictures(material: CalibrationInput, found: Calibration) -> dict[str, bytes]:
-    cameras = enumerate(found.rig.cameras)
+def _pictures(material: CalibrationInput, result: Calibration) -> dict[str, bytes]:
+    cameras = enumerate(result.rig.cameras)
     return {camera.name: thumbnail(undistort(camera, material.pictures(c)[-1]), PICTURE_WIDTH) for c, camera in cameras}

@@ -48,26 +48,25 @@ class Control:
     """One control, in rig.toml's units."""
 
     name: str
-    asked: float | str | None  # requested value, None for none
-    got: float | str | None  # value read back, None if the camera does not have the control
+    requested: float | str | None  # None for none
+    actual: float | str | None  # read back, None if the camera does not have the control
     automatic: bool = False
 
     @property
-    def taken(self) -> bool:
+    def accepted(self) -> bool:
         """Whether the camera accepted the request, or there was none."""
-        if self.asked is None:
+        if self.requested is None:
             return True
-        if isinstance(self.asked, str) or isinstance(self.got, str) or self.got is None:
-            return self.asked == self.got
+        if isinstance(self.requested, str) or isinstance(self.actual, str) or self.actual is None:
+            return self.requested == self.actual
         step = EXPOSURE_UNIT if self.name == "exposure_s" else 0.0
-        near = abs(self.got - self.asked) <= max(CONTROL_TOLERANCE * abs(self.asked), step / 2)
+        near = abs(self.actual - self.requested) <= max(CONTROL_TOLERANCE * abs(self.requested), step / 2)
         return near and not self.automatic
 
     def __str__(self) -> str:
-        got = "not there" if self.got is None else f"{self.got:g}" if isinstance(self.got, float) else self.got
-        asked = f"{self.asked:g}" if isinstance(self.asked, float) else self.asked
-        text = f"{self.name} {got}" + " (automatic)" * self.automatic
-        return text if self.taken else f"{text}, asked for {asked}"
+        actual, requested = (f"{v:g}" if isinstance(v, float) else v for v in (self.actual, self.requested))
+        text = f"{self.name} {'not there' if actual is None else actual}" + " (automatic)" * self.automatic
+        return text if self.accepted else f"{text}, asked for {requested}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,11 +99,11 @@ def request_picture(port: ControlPort, source: CameraSource, size: tuple[int, in
 
 def lock_controls(port: ControlPort, source: CameraSource) -> None:
     """Request a device's controls, after switching their automatics off, which would undo it."""
-    for one, asked in _requests(source):
-        if asked is not None:
+    for one, requested in _requests(source):
+        if requested is not None:
             if one.automatic is not None:
                 port.set(one.automatic, one.off)
-            port.set(one.number, asked / one.unit)
+            port.set(one.number, requested / one.unit)
 
 
 def read_controls(port: ControlPort, source: CameraSource) -> tuple[Control, ...]:
@@ -112,30 +111,31 @@ def read_controls(port: ControlPort, source: CameraSource) -> tuple[Control, ...
     code = int(port.get(cv2.CAP_PROP_FOURCC))
     picture_format = "".join(chr(code >> 8 * i & 0xFF) for i in range(4)) if code > 0 else None
     rate = port.get(cv2.CAP_PROP_FPS)
-    own = [_read_one(port, one, asked) for one, asked in _requests(source)]
+    own = [_read_one(port, one, requested) for one, requested in _requests(source)]
     fps = Control("fps", source.fps, rate if rate > 0 else None)
     return (Control("format", source.format, picture_format), fps, *own)
 
 
 def ignored_controls(source: CameraSource) -> tuple[Control, ...]:
     """The controls requested of a stream or a file, which accepts none."""
-    return tuple(Control(one.name, asked, None) for one, asked in _requests(source) if asked is not None)
+    return tuple(Control(one.name, requested, None) for one, requested in _requests(source) if requested is not None)
 
 
 def locked_exposure(controls: Sequence[Control]) -> float:
     """The exposure read back, s; 0 where it is not locked."""
     for control in controls:
-        if control.name == "exposure_s" and control.taken and not control.automatic and isinstance(control.got, float):
-            return control.got
+        value = control.actual
+        if control.name == "exposure_s" and control.accepted and not control.automatic and isinstance(value, float):
+            return value
     return 0.0
 
 
-def _read_one(port: ControlPort, one: _Lockable, asked: float | None) -> Control:
+def _read_one(port: ControlPort, one: _Lockable, requested: float | None) -> Control:
     value = port.get(one.number)
     if value == UNSUPPORTED_CONTROL:
-        return Control(one.name, asked, None)
+        return Control(one.name, requested, None)
     automatic = one.automatic is not None and port.get(one.automatic) not in (one.off, UNSUPPORTED_CONTROL)
-    return Control(one.name, asked, value * one.unit, automatic)
+    return Control(one.name, requested, value * one.unit, automatic)
 
 
 def _requests(source: CameraSource) -> Iterable[tuple[_Lockable, float | None]]:
@@ -232,7 +232,7 @@ class _OpenCapture:
         if not self.clocked:
             return ignored_controls(self._source)
         controls = read_controls(self._capture, self._source)
-        if all(control.taken for control in controls):
+        if all(control.accepted for control in controls):
             return controls
         lock_controls(self._capture, self._source)  # some drivers take a control only once pictures flow
         return read_controls(self._capture, self._source)

@@ -107,7 +107,7 @@ class CameraState:
         if self.age > STALL_AFTER:
             why = "delivers nothing" if self.fault is None else self.fault.value
             return f"{self.name} {why} since {self.age:.1f} s ({self.source})"
-        refused = [str(control) for control in self.controls if not control.taken]
+        refused = [str(control) for control in self.controls if not control.accepted]
         return f"{self.name} did not take {', '.join(refused)}" if refused else ""
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -27,10 +27,10 @@ def sharpness(image: Image) -> float:
     return float(cv2.Laplacian(_grey(image), cv2.CV_32F).var())
 
 
-def preview_sheet(shown: Sequence[tuple[Image | None, Sequence[str], bool]]) -> Image:
+def preview_sheet(cameras: Sequence[tuple[Image | None, Sequence[str], bool]]) -> Image:
     """(H, W, 3) BGR: one cell per camera with its picture, if any, and lines of text, alarming unless all is well."""
-    lines = max(len(words) for _, words, _ in shown)
-    cells = [_cell(image, words, well, lines) for image, words, well in shown]
+    lines = max(len(words) for _, words, _ in cameras)
+    cells = [_cell(image, words, well, lines) for image, words, well in cameras]
     columns = min(SHEET_COLUMNS, len(cells))
     empty = np.full_like(cells[0], PAPER_COLOUR)
     rows = [cells[i : i + columns] for i in range(0, len(cells), columns)]
@@ -42,8 +42,8 @@ def _cell(image: Image | None, words: Sequence[str], well: bool, lines: int) -> 
     if image is not None:
         scale = min(CELL_SIZE[0] / image.shape[1], CELL_SIZE[1] / image.shape[0])
         size = (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0])))
-        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+        coloured = image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+        small = cv2.resize(coloured, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
         x, y = (CELL_SIZE[0] - size[0]) // 2, (CELL_SIZE[1] - size[1]) // 2
         cell[y : y + size[1], x : x + size[0]] = small
     colour = INK_COLOUR if well else ALARM_COLOUR
@@ -129,7 +129,10 @@ def _camera_table(camera: CameraState, offset: float, scatter: float) -> dict[st
         "not_fetched": camera.overrun,
         "left_out": dict(sorted((fault.name.lower(), count) for fault, count in camera.faults.items())),
         "reopened": camera.reopened,
-        "controls": [asdict(control) | {"taken": control.taken} for control in camera.controls],
+        "controls": [
+            {"name": c.name, "asked": c.requested, "got": c.actual, "automatic": c.automatic, "taken": c.accepted}
+            for c in camera.controls
+        ],
         "trouble": camera.trouble,
     }
 

@@ -88,14 +88,14 @@ class FrameSetBuilder:
     apart; the jitter-free beat is known to a few percent of a period after a second.
     """
 
-    def __init__(self, cameras: int, period: float) -> None:
+    def __init__(self, cameras: int, period: float, offsets: Sequence[float] | Array | None = None) -> None:
         self._pairing = Pairing(cameras, period)
         self._period, self._phases = period, FreeRunPhases()
         self._periods: list[float | None] = [None] * cameras  # s
         self._keys, self._stamp, self._now = [-math.inf] * cameras, -math.inf, -math.inf
         self._discarded = 0
         self.behind = np.zeros(cameras)  # s: mean lag of each camera's stamps behind the set's
-        self._offsets = np.zeros(cameras)
+        self.set_offsets(np.zeros(cameras) if offsets is None else offsets)
 
     @property
     def late(self) -> int:
@@ -108,12 +108,12 @@ class FrameSetBuilder:
         assert values.shape == (len(self._periods),) and np.isfinite(values).all(), offsets
         self._offsets = values
 
-    def learn(self, learned: Sequence[float] | Array) -> None:
+    def learn(self, offsets: Sequence[float] | Array) -> None:
         """Take over the estimator's exposure offsets after the set's stamp, (C,) s.
 
         The mean lag of each camera's stamps behind the set's is subtracted: counted twice, it would shift the sets.
         """
-        self.set_offsets(np.asarray(learned, float) - self.behind)
+        self.set_offsets(np.asarray(offsets, float) - self.behind)
 
     def add(self, arrival: Arrival) -> list[FrameSet]:
         """Add a frame; the sets that are complete by it."""

@@ -26,7 +26,12 @@ RIG_FORMATS = {
     "anipose": "aniposelib's and caliscope's TOML, mm",
 }
 RIG_FORMATS_TEXT = "; ".join(f"{name}: {text}" for name, text in RIG_FORMATS.items())
-ARM_SOURCES = ("folder", "device", "virtual", "touched")
+ARM_SOURCES: dict[str, tuple[str, ...]] = {  # of an arm's calibration: the options that each needs
+    "folder": (),
+    "device": ("cameras", "record"),
+    "virtual": ("record",),
+    "touched": ("cameras",),
+}
 
 
 def add_calibrate(commands: Commands) -> None:
@@ -166,8 +171,8 @@ def _cameras(a: argparse.Namespace) -> int:
                 open_page = nullcontext if a.no_page else partial(_opened_page, clock)
                 outcome = run_live(a.which, a.board, a.out, options, a.seconds, clock, progress, open_page)
     except KeyboardInterrupt:
-        kept = f"the corners so far are in {corners_of(a.out)}; the same command goes on from there"
-        print(f"\nstillbed: interrupted; {kept}", file=sys.stderr)
+        message = f"the corners so far are in {corners_of(a.out)}; the same command goes on from there"
+        print(f"\nstillbed: interrupted; {message}", file=sys.stderr)
         return INTERRUPTED
     print(outcome.text)
     return 0 if outcome.verdict.passed else FAILED
@@ -247,20 +252,20 @@ def _add_arm(parts: Commands) -> None:
 
 
 def _calibrate_arm(a: argparse.Namespace) -> int:
-    given = [name for name in ARM_SOURCES if getattr(a, name)]
-    if len(given) != 1:
+    sources = [name for name in ARM_SOURCES if getattr(a, name)]
+    if len(sources) != 1:
         allowed = "one of a recorded FOLDER, --device, --virtual or --touched"
-        raise wrong_option("calibrate arm", " and ".join(given) or "nothing", allowed)
+        raise wrong_option("calibrate arm", " and ".join(sources) or "nothing", allowed)
     if a.terminal and not a.virtual:
         raise wrong_option("--terminal", "given", "with --virtual: a --device is at its own port")
-    needed = {"device": ("cameras", "record"), "virtual": ("record",), "touched": ("cameras",), "folder": ()}[given[0]]
-    for name in needed:
+    source = sources[0]
+    for name in ARM_SOURCES[source]:
         if getattr(a, name) is None:
-            raise wrong_option(f"--{name}", "missing", f"given with {given[0]}")
+            raise wrong_option(f"--{name}", "missing", f"given with {source}")
     try:
-        outcome = {"device": _from_device, "virtual": _virtual, "touched": _touched, "folder": _folder}[given[0]](a)
+        outcome = {"device": _from_device, "virtual": _virtual, "touched": _touched, "folder": _folder}[source](a)
     except KeyboardInterrupt:
-        if "record" not in needed or not (a.record.is_dir() and any(a.record.iterdir())):
+        if "record" not in ARM_SOURCES[source] or not (a.record.is_dir() and any(a.record.iterdir())):
             raise
         print(f"\nstillbed: interrupted; {left_files_text(a.record)}; {_resume_hint(a.record, a.out)}", file=sys.stderr)
         return INTERRUPTED

@@ -77,10 +77,10 @@ def _check(name: str, good: bool, text: str, remedy: str, otherwise: CheckVerdic
     return Check(name, CheckVerdict.PASS, text) if good else Check(name, otherwise, text, remedy)
 
 
-def python_check(found: tuple[int, ...] = sys.version_info[:3]) -> Check:
+def python_check(release: tuple[int, ...] = sys.version_info[:3]) -> Check:
     """Python, by its version."""
-    text = f"{'.'.join(map(str, found))} on {platform.system()} {platform.machine()}"
-    if found < (3, 11):
+    text = f"{'.'.join(map(str, release))} on {platform.system()} {platform.machine()}"
+    if release < (3, 11):
         return Check("python", CheckVerdict.FAIL, text, "install Python 3.11 or newer: make PYTHON=python3.12")
     remedy = "live runs are made for Linux; recordings and planning work here"
     return _check("python", sys.platform == "linux", text, remedy)

@@ -94,8 +94,8 @@ def _run_live(a: argparse.Namespace) -> int:
     if a.page_name is not None:
         flags["page_names"] = parse_host_names("command line", "--page-name", a.page_name)
     if a.resume is None:
-        given = LiveSettings() if a.settings is None else read_settings(a.settings)
-        prepared = prepare(override_settings(given, flags), a.settings or "command line", a.force)
+        settings = LiveSettings() if a.settings is None else read_settings(a.settings)
+        prepared = prepare(override_settings(settings, flags), a.settings or "command line", a.force)
     elif a.settings is not None or a.record is not None:
         raise wrong_option("--resume", a.resume, "without session.toml and --record")
     else:

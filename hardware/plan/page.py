@@ -88,7 +88,7 @@ def layer_svg(layer: PlannedLayer, figures: LayerFigures, bounds: tuple[float, f
     left = (PICTURE_WIDTH - width * scale) / 2
     turn = f"matrix({scale:.5f} 0 0 {-scale:.5f} {left - low_x * scale:.3f} {HEAD_HEIGHT + high_y * scale:.3f})"
     travels = "".join(_line(np.stack([a.points[-1], b.points[0]])) for a, b in pairwise(layer.beads))
-    drawn = [
+    shapes = [
         f'<path class="region" fill-rule="evenodd" d="{_areas(layer.region)}"/>',
         *_beads(layer.beads),
         f'<path class="gap" fill-rule="evenodd" d="{_areas(figures.coverage.gaps)}"/>',
@@ -101,7 +101,7 @@ def layer_svg(layer: PlannedLayer, figures: LayerFigures, bounds: tuple[float, f
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {PICTURE_WIDTH:g} {height:.0f}" role="img" '
         f'aria-label="{escape(title)}"><style>{PICTURE_STYLE}</style><rect class="page" width="100%" height="100%"/>'
-        f'<g transform="{turn}">{"".join(drawn)}</g>'
+        f'<g transform="{turn}">{"".join(shapes)}</g>'
         f'<rect class="end" x="{ends[1, 0] - 5:.1f}" y="{ends[1, 1] - 5:.1f}" width="10" height="10"/>'
         f'<circle class="start" cx="{ends[0, 0]:.1f}" cy="{ends[0, 1]:.1f}" r="6.5"/>'
         f"{_captions(title, layer, figures, scale, height)}</svg>"
@@ -179,12 +179,12 @@ class ReportText:
 
 
 def page_text(
-    plan: Plan, layers: Sequence[LayerFigures], total: PlanTotal, story: ReportText, pictures: Sequence[str]
+    plan: Plan, layers: Sequence[LayerFigures], total: PlanTotal, text: ReportText, pictures: Sequence[str]
 ) -> str:
     """The whole page."""
     body = [f"<style>{PAGE_STYLE}</style>", row_of_tiles(_tiles(layers, total))]
-    if story.notes:
-        notes = "".join(f'<div class="plan-note">{escape(note)}</div>' for note in story.notes)
+    if text.notes:
+        notes = "".join(f'<div class="plan-note">{escape(note)}</div>' for note in text.notes)
         body.append(f"<section><h2>Look at this before printing</h2>{notes}</section>")
     script = (files("hardware.plan") / "view.js").read_text(encoding="utf-8")
     view = f'<script type="application/json" id="plan-data">{_data(plan)}</script><script>{script}</script>'
@@ -196,18 +196,18 @@ def page_text(
         unrolled = "" if plan.order.mode == "horizontal" else " They are unrolled to the lengths on the skin."
         words = f"Seen from outside, the scan's x to the right.{unrolled}"
         body.append(section("Each layer", words, LAYER_CHOOSER.format(count=len(pictures), pictures=shown)))
-    body.append(section("The wound", "As found in the scan.", figures_table(("", "value"), story.findings)))
-    if story.repairs:
-        rows = [(what, str(count)) for what, count in story.repairs]
+    body.append(section("The wound", "As found in the scan.", figures_table(("", "value"), text.findings)))
+    if text.repairs:
+        rows = [(what, str(count)) for what, count in text.repairs]
         body.append(section("The scan", "What was found wrong with it, and put right.", figures_table(("", ""), rows)))
-    body.append(section("What was asked for", "All settings, defaults included.", figures_table(("", ""), story.order)))
+    body.append(section("What was asked for", "All settings, defaults included.", figures_table(("", ""), text.order)))
     inks = ", ".join(f"{volume / 1000:.2f} ml of {material_text(name)}" for name, volume in total.volume)
     lead = (
         f"{count_text(len(layers), 'layer')}, {len_text(total.printed)} of bead, "
         f"{duration_text(total.seconds)} to print: {inks}. "
         f"{total.covered:.2%} of the layers' area is covered, {total.double:.2%} twice."
     )
-    return document("plan", story.title, lead, body, "mm, s, degrees; 1 mm³ is 1 µl")
+    return document("plan", text.title, lead, body, "mm, s, degrees; 1 mm³ is 1 µl")
 
 
 def _tiles(layers: Sequence[LayerFigures], total: PlanTotal) -> list[str]:

@@ -149,19 +149,19 @@ def _pictures(
     folder, report = stem.with_name(stem.name + "_layers"), stem.with_suffix(".html")
     folder.mkdir(exist_ok=True)
     bounds = bounds_of(plan.layers)
-    drawn: list[str] = []
+    pictures: list[str] = []
     with _progress("draw", "layers") as progress:
         for i, figures in enumerate(layers):
-            drawn.append(layer_svg(plan.layers[figures.number], figures, bounds))
+            pictures.append(layer_svg(plan.layers[figures.number], figures, bounds))
             name = f"layer_{figures.number + 1:03d}.svg"
-            (folder / name).write_text(drawn[-1], encoding="utf-8")
+            (folder / name).write_text(pictures[-1], encoding="utf-8")
             progress(i + 1, len(layers))
     repairs = [] if subject.repairs is None else subject.repairs.rows()
     findings = [*findings_rows(plan), ("what an arm can print", arm)]
-    story = ReportText(subject.name, findings, repairs, request.settings.rows(), notes_of(plan))
-    page = page_text(plan, layers, total, story, drawn)
+    text = ReportText(subject.name, findings, repairs, request.settings.rows(), notes_of(plan))
+    page = page_text(plan, layers, total, text, pictures)
     _write_atomically(report, lambda file: file.write_text(page, encoding="utf-8"))
-    return [f"{folder.name}/ ({len(drawn)} pictures)", report.name]
+    return [f"{folder.name}/ ({len(pictures)} pictures)", report.name]
 
 
 def _summary_text(plan: Plan, subject: PlanSubject, total: PlanTotal, out: Path, written: Sequence[str]) -> str:
@@ -233,7 +233,7 @@ def layers_with_bumps(plan: Plan) -> list[PlannedLayer]:
 def bump_facts(plan: Plan) -> dict[str, Any]:
     """How bumps were to be passed, and what was met in which layer (counted from 1). mm, mm2."""
     passing, width = plan.order.passing, plan.order.pattern.width
-    met = [
+    bumps = [
         {
             "layer": p.layer.number + 1, "limit_mm": passing.limit(p.layer.height), "over": len(p.over.geoms),
             "over_mm2": p.over.area, "around": len(p.around.geoms), "around_mm2": p.around.area,
@@ -241,7 +241,7 @@ def bump_facts(plan: Plan) -> dict[str, Any]:
         }
         for p in layers_with_bumps(plan)
     ]  # fmt: skip
-    return {"clearance_mm": passing.clear(width), "layers": met}
+    return {"clearance_mm": passing.clear(width), "layers": bumps}
 
 
 def bumps_text(plan: Plan) -> str:
