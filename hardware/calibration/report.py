@@ -211,9 +211,8 @@ def _corners(result: Calibration, camera: int) -> str:
     rows, columns = parts.shape
     counts = "".join(
         f'<text x="{(x + 0.5) * w / columns:.0f}" y="{(y + 0.5) * h / rows:.0f}" text-anchor="middle" '
-        f'style="font-size:34px">{int(parts[y, x])}</text>'
-        for y in range(rows)
-        for x in range(columns)
+        f'style="font-size:34px">{int(count)}</text>'
+        for (y, x), count in np.ndenumerate(parts)
     )
     dots = "".join(f'<circle class="estimate" cx="{x:.0f}" cy="{y:.0f}" r="4"/>' for x, y in pixels)
     return dots + counts
@@ -246,14 +245,12 @@ def _volume(error: VolumeError) -> str:
 
 def _layer(values: Array, z: float) -> str:
     cells = []
-    for x in range(GRID_SIDE):
-        for y in range(GRID_SIDE):
-            value = values[x, y]
-            colour = next((style for most, style in ERROR_COLOURS if value <= most), WORST_COLOUR)
-            fill = colour if np.isfinite(value) else UNSEEN_COLOUR
-            words = f"{value:.3f} mm" if np.isfinite(value) else "not seen by two cameras"
-            place = f'x="{20 * x + 1}" y="{20 * y + 1}" width="18" height="18"'
-            cells.append(f'<rect style="fill:{fill}" {place}><title>{words}</title></rect>')
+    for (x, y), value in np.ndenumerate(values):
+        colour = next((style for limit, style in ERROR_COLOURS if value <= limit), WORST_COLOUR)
+        fill = colour if np.isfinite(value) else UNSEEN_COLOUR
+        words = f"{value:.3f} mm" if np.isfinite(value) else "not seen by two cameras"
+        place = f'x="{20 * x + 1}" y="{20 * y + 1}" width="18" height="18"'
+        cells.append(f'<rect style="fill:{fill}" {place}><title>{words}</title></rect>')
     box = f'<svg class="plot heat" viewBox="0 0 {20 * GRID_SIDE} {20 * GRID_SIDE}">{"".join(cells)}</svg>'
     return figure(box, f"z = {z:.0f} mm")
 

@@ -128,8 +128,7 @@ def write_opencv(path: Path, rig: Rig) -> None:
     """Write a folder of files that cv2.FileStorage reads."""
     path.mkdir(parents=True, exist_ok=True)
     for camera in rig.cameras:
-        w, h = camera.size
-        lines = ["%YAML:1.0", "---", f"image_width: {w}", f"image_height: {h}"]
+        lines = ["%YAML:1.0", "---", f"image_width: {camera.size[0]}", f"image_height: {camera.size[1]}"]
         lines += _cv_matrix("camera_matrix", camera.matrix)
         lines += _cv_matrix("distortion_coefficients", camera.distortion[None])
         lines += _cv_matrix("base_from_camera", camera.base_from_camera)

@@ -26,12 +26,8 @@ RIG_FORMATS = {
     "anipose": "aniposelib's and caliscope's TOML, mm",
 }
 RIG_FORMATS_TEXT = "; ".join(f"{name}: {text}" for name, text in RIG_FORMATS.items())
-ARM_SOURCES: dict[str, tuple[str, ...]] = {  # of an arm's calibration: the options that each needs
-    "folder": (),
-    "device": ("cameras", "record"),
-    "virtual": ("record",),
-    "touched": ("cameras",),
-}
+# of an arm's calibration, and the options that each needs
+ARM_SOURCES = {"folder": (), "device": ("cameras", "record"), "virtual": ("record",), "touched": ("cameras",)}
 
 
 def add_calibrate(commands: Commands) -> None:
@@ -267,18 +263,13 @@ def _calibrate_arm(a: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         if "record" not in ARM_SOURCES[source] or not (a.record.is_dir() and any(a.record.iterdir())):
             raise
-        print(f"\nstillbed: interrupted; {left_files_text(a.record)}; {_resume_hint(a.record, a.out)}", file=sys.stderr)
+        hint = "to begin anew, name another --record or empty this one"
+        if (a.record / "frames.csv").exists():
+            hint = f"`stillbed calibrate arm {a.record} -o {a.out}` takes what is there; {hint}"
+        print(f"\nstillbed: interrupted; {left_files_text(a.record)}; {hint}", file=sys.stderr)
         return INTERRUPTED
     print(outcome.text)
     return 0 if outcome.verdict.passed else FAILED
-
-
-def _resume_hint(record: Path, out: Path) -> str:
-    """What may be done with a recording that was interrupted."""
-    anew = "to begin anew, name another --record or empty this one"
-    if not (record / "frames.csv").exists():
-        return anew
-    return f"`stillbed calibrate arm {record} -o {out}` takes what is there; {anew}"
 
 
 def _arm_options(a: argparse.Namespace) -> ArmCalibrationOptions:

@@ -33,7 +33,6 @@ from planning.layers.wound import WoundVolume
 from planning.path import check_path
 
 if TYPE_CHECKING:
-    from estimation.pose import SurfacePose
     from estimation.rig import Camera
     from perception.frames import FrameSet
 
@@ -313,23 +312,20 @@ def scan_placement(session_path: Path, scan_file: Path, outline: Array) -> tuple
         return "the session holds no frame set", []
     if not pose.state.measured:
         return f"not placed: {pose.reason or pose.state.value}", []
-    return _verdict(pose), _sightings(session.rig.cameras, frames, pose, outline)
-
-
-def _verdict(pose: SurfacePose) -> str:
     sigma = np.sqrt(np.diag(pose.covariance))
-    good = f"good to {np.linalg.norm(sigma[3:]):.3f} mm and {np.rad2deg(np.linalg.norm(sigma[:3])):.2f} degrees"
-    return f"{pose.state.value}, {good}" + (f"; {pose.reason}" if pose.reason else "")
+    accuracy = f"good to {np.linalg.norm(sigma[3:]):.3f} mm and {np.rad2deg(np.linalg.norm(sigma[:3])):.2f} degrees"
+    verdict = f"{pose.state.value}, {accuracy}" + (f"; {pose.reason}" if pose.reason else "")
+    return verdict, _sightings(session.rig.cameras, frames, pose.base_from_surface, outline)
 
 
-def _sightings(cameras: Sequence[Camera], frames: FrameSet, pose: SurfacePose, outline: Array) -> list[WoundSighting]:
+def _sightings(cameras: Sequence[Camera], frames: FrameSet, pose: Array, outline: Array) -> list[WoundSighting]:
     from perception.wound.network import WoundNetwork, shipped_model
     from perception.wound.segmentation import NetworkSegmenter  # loads onnxruntime
 
     network = WoundNetwork(shipped_model(), threads=1)
     segmenter = NetworkSegmenter(network, network.settings)
     masks = ((cameras[frame.camera], segmenter(frame.image).mask) for frame in frames.frames)
-    return [_sighting(camera, mask, pose.base_from_surface, outline) for camera, mask in masks]
+    return [_sighting(camera, mask, pose, outline) for camera, mask in masks]
 
 
 def _sighting(camera: Camera, mask: NDArray[np.bool_], pose: Array, outline: Array) -> WoundSighting:
