@@ -73,7 +73,7 @@ def _check_markers(table: CornerTable, board: Board, board_file: Path) -> None:
 
 
 def why_unseen(pictures: list[Image], board: Board) -> str:
-    """Why pictures do not show the board, as far as other boards and mirrors tell."""
+    """Why pictures do not show the board: tries similar boards and mirrored pictures."""
     if not pictures:
         return "it has no pictures"
     half, shown = len(pictures) // 2, _count_showing(pictures, board)

@@ -58,7 +58,7 @@ SYSTEM_REMEDY = "install the system's package that has this file: `apt-file sear
 
 
 def machine_checks(folder: Path, clock: Clock, root: Path = FILE_SYSTEM_ROOT) -> list[Check]:
-    """All of this. folder: where sessions would be recorded. root: of the file system."""
+    """All checks of the machine. folder: where sessions would be recorded. root: of the file system."""
     return [
         python_check(),
         processor_check(root),
@@ -167,7 +167,7 @@ def _free_gb(folder: Path) -> float:
 
 
 def _kernel_values(file: Path, key: str) -> list[str]:
-    """What stands behind `key:` in a file of the kernel's."""
+    """The values of `key:` in a file of /proc; none where there is no such file."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except OSError:  # not Linux

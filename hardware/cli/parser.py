@@ -1,4 +1,4 @@
-"""What all commands share: their parsers, their refusals, and the entry of a script such as those in docs/examples."""
+"""What all commands share: parsers, option types, error texts, and the entry of scripts such as docs/examples."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ USAGE = re.compile(r"python \S+\.py.*?(?=\s{2,}|$)", re.MULTILINE)  # a line of 
 
 
 class Parser(argparse.ArgumentParser):
-    """Tells a wrong command line in one line, as all wrong input is told, and where its options stand."""
+    """Reports a wrong command line in one line, as all wrong input, and refers to --help."""
 
     def error(self, message: str) -> NoReturn:
         """Print the line, and exit."""
@@ -56,7 +56,7 @@ class Commands:
 
 
 def error_text(error: Exception) -> str:
-    """What was wrong; of what the system refuses, the file first, as everywhere."""
+    """The message of an error; of a system error with a file, the file first."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror.lower()}"
     return str(error)

@@ -169,7 +169,7 @@ def _beads(beads: tuple[Bead, ...]) -> list[str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReportText:
-    """What the report tells beside the plan's figures."""
+    """The texts of the report beside the plan's figures."""
 
     title: str  # what was planned
     findings: Sequence[tuple[str, str]]  # of the wound, as (what, value)

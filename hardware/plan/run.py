@@ -49,7 +49,7 @@ REPAIRED_SCAN_STEP = 0.5  # mm between the vertices of the repaired scan that is
 
 
 def run_plan(request: PlanRequest) -> str:
-    """Plan and write; what it came to, in words. The path is whole before anything beside it is begun."""
+    """Plan, and write all files, the path first; returns a summary for the terminal."""
     from hardware.recording.session_reader import open_session
 
     flat = request.scan is not None and request.scan.suffix.lower() == ".csv"
@@ -82,7 +82,7 @@ def run_plan(request: PlanRequest) -> str:
 
 
 def _write_atomically(file: Path, write: Callable[[Path], object]) -> None:
-    """Write a file under another name first: whoever sees it sees all of it."""
+    """Write a file atomically: under another name first, then renamed."""
     part = file.with_name(file.name + ".part")
     try:
         write(part)
@@ -187,7 +187,7 @@ def _progress(what: str, unit: str) -> Progress:
 
 
 def findings_rows(plan: Plan) -> list[tuple[str, str]]:
-    """What the wound is like, in words."""
+    """Rows about the wound and its scan: what, value."""
     f = plan.wound.findings
     low_tilt, high_tilt = (np.rad2deg(t.departure) for t in (plan.ground.low, plan.ground.high))
     rows = [
@@ -230,7 +230,7 @@ def layers_with_bumps(plan: Plan) -> list[PlannedLayer]:
 
 
 def bump_facts(plan: Plan) -> dict[str, Any]:
-    """How bumps were to be passed, and what was met in which layer (counted from 1). mm, mm2."""
+    """How bumps are passed, and those of each layer (counted from 1). mm, mm2."""
     passing, width = plan.order.passing, plan.order.pattern.width
     bumps = [
         {
