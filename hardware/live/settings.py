@@ -5,14 +5,15 @@ recording. Files in it are relative to it. The operator's page is served to this
 named, and then encrypted (TLS) alone.
 """
 
+# ruff: noqa: RUF009: `_key` makes a field
+
 from __future__ import annotations
 
 import os
 import re
 import socket
 import ssl
-from collections.abc import Collection
-from dataclasses import dataclass, fields, replace
+from dataclasses import Field, dataclass, field, fields, replace
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
@@ -26,135 +27,98 @@ VIRTUAL_ARM = "virtual"  # the arm that needs no device
 MAX_LIFT_MM = 100.0  # mm of a dry run: above, the arm leaves the room that was looked at
 MAX_PATIENCE = 600.0  # s of patience
 MAX_CORES = 1024
-MAX_PORT = 65535  # the highest
+MAX_PORT = 65535
 HOST_NAME = re.compile(r"(?!.*\.\.)[A-Za-z0-9][A-Za-z0-9.-]{0,252}")  # of a machine
+
+
+def _key(name: str, example: str, about: str = "", default: object = None) -> Any:
+    """A setting: "table.key" in the file, an example as TOML, what it means, and the default."""
+    return field(default=default, metadata={"name": name, "example": example, "about": about})
 
 
 @dataclass(frozen=True, slots=True)
 class LiveSettings:
-    """What a run is told.
+    """All settings of a run, in the order of the file."""
 
-    rig: session folder, MCAP or rig.toml whose cameras are used; simulated: a scenario instead. path: checkpoints; of
-    a scenario, its own. arm: device, URL of pyserial's or "virtual". profile: arm file. record: the recording.
-    jpeg_quality: of pictures that come unencoded; 0 keeps them exactly. dry_run: nothing is extruded, the
-    nozzle `lift` mm higher. unattended: nobody confirms. stands_home: the operator says that the arm does. pause_frame:
-    the arm knows the frame that stops it. page: serve the operator's page, at page_address and page_port (0: any that
-    is free); other machines are let in only encrypted, by page_certificate and page_key, and under page_names.
-    patience: s without pictures that stop the arm. real_time: ask for that priority. cores_*: to run on, or all.
-    """
-
-    rig: Path | None = None
-    simulated: Path | None = None
-    path: Path | None = None
-    arm: str = ""
-    profile: Path | None = None
-    record: Path | None = None
-    jpeg_quality: int = 90  # three cameras' exact pictures take three cores to encode
-    dry_run: bool = False
-    lift: float = 10.0  # above a wound's rim, below what a hand would be put under
-    unattended: bool = False
-    stands_home: bool = False
-    pause_frame: bool = True
-    page: bool = True
-    page_address: str = LOOPBACK
-    page_port: int = 0
-    page_certificate: Path | None = None
-    page_key: Path | None = None
-    page_names: tuple[str, ...] = ()
-    patience: float = 10.0  # somebody finds a loose cable in that
-    real_time: bool = True
-    cores_tracking: tuple[int, ...] = ()
-    cores_motion: tuple[int, ...] = ()
-    cores_recorder: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class SettingKey:
-    """One key of the file: its table and name there, the setting it is, what it means, and an example."""
-
-    table: str
-    name: str
-    setting: str
-    about: str
-    example: str
+    rig: Path | None = _key(
+        "cameras.rig", '"rig.toml"', "session folder, recording or rig.toml: which cameras, where they stand"
+    )
+    simulated: Path | None = _key(
+        "cameras.simulated", '"x.toml"', "a scenario instead, rendered once and then shown in real time"
+    )
+    patience: float = _key(  # s: somebody finds a loose cable in that
+        "cameras.patience_s", "10.0", "without pictures, after which the arm is stopped; 1 to 600", 10.0
+    )
+    path: Path | None = _key("print.path", '"path.csv"', "checkpoints on the surface; a scenario has its own")
+    dry_run: bool = _key("print.dry_run", "false", "nothing is extruded, and the nozzle stays above", False)
+    lift: float = _key(  # mm: above a wound's rim, below what a hand would be put under
+        "print.lift_mm", "10.0", "how far above, in a dry run; 0 to 100", 10.0
+    )
+    unattended: bool = _key("print.unattended", "false", "nobody confirms the path and the start", False)
+    arm: str = _key("arm.device", '"/dev/ttyUSB0"', 'path of a port, URL of pyserial\'s, or "virtual"', "")
+    profile: Path | None = _key("arm.profile", '"arm.toml"', "arm file: place, limits, dialect, lag, tool")
+    stands_home: bool = _key("arm.stands_home", "false", "an arm that does not answer stands at its home now", False)
+    pause_frame: bool = _key("arm.pause_frame", "true", "its controller knows the frame that stops it at once", True)
+    real_time: bool = _key("arm.real_time", "true", "ask the system for real-time priority", True)
+    record: Path | None = _key("record.file", '"run.mcap"', "the recording; what else a run leaves stands beside it")
+    jpeg_quality: int = _key(  # three cameras' exact pictures take three cores to encode
+        "record.jpeg_quality", "90", "of pictures that come unencoded, 1 to 100; 0: exact", 90
+    )
+    page: bool = _key("page.serve", "true", "the operator's page in the browser", True)
+    page_address: str = _key(
+        "page.address", '"0.0.0.0"', "where it is served; other machines are let in by TLS alone", LOOPBACK
+    )
+    page_port: int = _key("page.port", "8443", "0: any that is free", 0)
+    page_certificate: Path | None = _key(
+        "page.certificate", '"page.pem"', "PEM file, with all between it and an authority"
+    )
+    page_key: Path | None = _key("page.key", '"page.key"', "its PEM file, without a password")
+    page_names: tuple[str, ...] = _key("page.names", '["printer.local"]', "by which browsers call this machine", ())
+    cores_tracking: tuple[int, ...] = _key("cores.tracking", "[0]", "processor cores to run on; left out: all", ())
+    cores_motion: tuple[int, ...] = _key("cores.motion", "[1]", default=())
+    cores_recorder: tuple[int, ...] = _key("cores.recorder", "[0]", default=())
 
 
-SETTING_KEYS = (
-    SettingKey(
-        "cameras", "rig", "rig", "session folder, recording or rig.toml: which cameras, where they stand", '"rig.toml"'
-    ),
-    SettingKey(
-        "cameras", "simulated", "simulated", "a scenario instead, rendered once and then shown in real time", '"x.toml"'
-    ),
-    SettingKey(
-        "cameras", "patience_s", "patience", "without pictures, after which the arm is stopped; 1 to 600", "10.0"
-    ),
-    SettingKey("print", "path", "path", "checkpoints on the surface; a scenario has its own", '"path.csv"'),
-    SettingKey("print", "dry_run", "dry_run", "nothing is extruded, and the nozzle stays above", "false"),
-    SettingKey("print", "lift_mm", "lift", "how far above, in a dry run; 0 to 100", "10.0"),
-    SettingKey("print", "unattended", "unattended", "nobody confirms the path and the start", "false"),
-    SettingKey("arm", "device", "arm", 'path of a port, URL of pyserial\'s, or "virtual"', '"/dev/ttyUSB0"'),
-    SettingKey("arm", "profile", "profile", "arm file: place, limits, dialect, lag, tool", '"arm.toml"'),
-    SettingKey("arm", "stands_home", "stands_home", "an arm that does not answer stands at its home now", "false"),
-    SettingKey("arm", "pause_frame", "pause_frame", "its controller knows the frame that stops it at once", "true"),
-    SettingKey("arm", "real_time", "real_time", "ask the system for real-time priority", "true"),
-    SettingKey("record", "file", "record", "the recording; what else a run leaves stands beside it", '"run.mcap"'),
-    SettingKey("record", "jpeg_quality", "jpeg_quality", "of pictures that come unencoded, 1 to 100; 0: exact", "90"),
-    SettingKey("page", "serve", "page", "the operator's page in the browser", "true"),
-    SettingKey(
-        "page", "address", "page_address", "where it is served; other machines are let in by TLS alone", '"0.0.0.0"'
-    ),
-    SettingKey("page", "port", "page_port", "0: any that is free", "8443"),
-    SettingKey(
-        "page", "certificate", "page_certificate", "PEM file, with all between it and an authority", '"page.pem"'
-    ),
-    SettingKey("page", "key", "page_key", "its PEM file, without a password", '"page.key"'),
-    SettingKey("page", "names", "page_names", "by which browsers call this machine", '["printer.local"]'),
-    SettingKey("cores", "tracking", "cores_tracking", "processor cores to run on; left out: all", "[0]"),
-    SettingKey("cores", "motion", "cores_motion", "", "[1]"),
-    SettingKey("cores", "recorder", "cores_recorder", "", "[0]"),
-)
-FILE_SETTINGS = ("rig", "simulated", "path", "profile", "record", "page_certificate", "page_key")
-SWITCH_SETTINGS = ("dry_run", "unattended", "stands_home", "pause_frame", "page", "real_time")
-SETTING_TABLES = tuple(dict.fromkeys(key.table for key in SETTING_KEYS))
+SETTING_KEYS: dict[str, dict[str, Field[Any]]] = {}  # table and key in the file to the setting
+for _setting in fields(LiveSettings):
+    _table, _, _name = _setting.metadata["name"].partition(".")
+    SETTING_KEYS.setdefault(_table, {})[_name] = _setting
 FILE_HEADER = "# A live run of stillbed: `stillbed live session.toml`. Lines that begin with # are examples.\n"
 
 
 def read_settings(file: Path) -> LiveSettings:
     """The settings in a session.toml; InputError names the key that makes no sense."""
     tables = checks.read_toml(file)
-    checks.check_keys(file, "", tables, (), SETTING_TABLES)
-    given: dict[str, Any] = {}
-    for name in SETTING_TABLES:
+    checks.check_keys(file, "", tables, (), SETTING_KEYS)
+    values: dict[str, Any] = {}
+    for name, settings in SETTING_KEYS.items():
         table = tables.get(name, {})
         if not isinstance(table, dict):
             raise InputError(file, name, table, f"a table [{name}]")
-        checks.check_keys(file, f"{name}.", table, (), [key.name for key in SETTING_KEYS if key.table == name])
-        for key in SETTING_KEYS:
-            if key.table == name and key.name in table:
-                given[key.setting] = _value(file, key, table[key.name])
-    return LiveSettings(**given)
+        checks.check_keys(file, f"{name}.", table, (), settings)
+        for key, setting in settings.items():
+            if key in table:
+                values[setting.name] = _value(file, f"{name}.{key}", setting.type, table[key])
+    return LiveSettings(**values)
 
 
-def _value(file: Path, key: SettingKey, value: object) -> Any:
-    where = f"{key.table}.{key.name}"
-    if key.setting in FILE_SETTINGS:
-        return file.parent / checks.text(file, where, value)
-    if key.setting in SWITCH_SETTINGS:
+def _value(file: Path, key: str, kind: object, value: object) -> Any:
+    """The value of a key, checked by the annotation of its setting."""
+    if kind == "Path | None":
+        return file.parent / checks.text(file, key, value)
+    if kind == "bool":
         if not isinstance(value, bool):
-            raise InputError(file, where, value, "true or false")
+            raise InputError(file, key, value, "true or false")
         return value
-    if key.setting.startswith("cores"):
+    if kind == "tuple[int, ...]":
         if not (isinstance(value, list) and all(isinstance(core, int) and 0 <= core < MAX_CORES for core in value)):
-            raise InputError(file, where, value, "a list of core numbers, such as [0]")
+            raise InputError(file, key, value, "a list of core numbers, such as [0]")
         return tuple(value)
-    if key.setting == "page_names":
-        return parse_host_names(file, where, value)
-    if key.setting in ("arm", "page_address"):
-        return checks.text(file, where, value)
-    if key.setting in ("jpeg_quality", "page_port"):
-        return checks.integer(file, where, value, 0)
-    return checks.number(file, where, value)
+    if kind == "tuple[str, ...]":
+        return parse_host_names(file, key, value)
+    if kind == "str":
+        return checks.text(file, key, value)
+    return checks.integer(file, key, value, 0) if kind == "int" else checks.number(file, key, value)
 
 
 def parse_host_names(where: object, key: str, names: object) -> tuple[str, ...]:
@@ -181,8 +145,11 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
         raise InputError(where, "cameras.patience_s", s.patience, f"1 to {MAX_PATIENCE:g} s")
     if not 0 <= s.jpeg_quality <= 100:
         raise InputError(where, "record.jpeg_quality", s.jpeg_quality, "0 to 100")
-    for key in (key for key in SETTING_KEYS if key.table == "cores"):
-        _check_cores(where, f"cores.{key.name}", getattr(s, key.setting))
+    usable = available_cores()
+    for key, setting in SETTING_KEYS["cores"].items():
+        if not set(usable).issuperset(cores := getattr(s, setting.name)):
+            allowed = f"cores that there are: {', '.join(map(str, usable))}"
+            raise InputError(where, f"cores.{key}", list(cores), allowed)
     if not 0 <= s.page_port <= MAX_PORT:
         raise InputError(where, "page.port", s.page_port, f"1 to {MAX_PORT}, or 0: any that is free")
     for name in ("rig", "simulated", "path", "profile"):
@@ -190,12 +157,6 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
         if file is not None and not file.exists():
             raise InputError(where, name, file, "a file that exists")
     return replace(s, arm=s.arm or VIRTUAL_ARM)
-
-
-def _check_cores(where: object, key: str, cores: Collection[int]) -> None:
-    there = available_cores()
-    if not set(there).issuperset(cores):
-        raise InputError(where, key, list(cores), f"cores that there are: {', '.join(map(str, there))}")
 
 
 def available_cores() -> tuple[int, ...]:
@@ -207,22 +168,19 @@ def available_cores() -> tuple[int, ...]:
 
 def settings_text(settings: LiveSettings | None = None) -> str:
     """A session.toml: of these settings, with whole paths, or one of comments and examples to begin with."""
-    default, lines = LiveSettings(), [FILE_HEADER]
-    for table in SETTING_TABLES:
+    lines = [FILE_HEADER]
+    for table, keys in SETTING_KEYS.items():
         lines.append(f"[{table}]")
-        for key in (key for key in SETTING_KEYS if key.table == table):
-            value = getattr(settings or default, key.setting)
-            shown = _shown(value)
-            remark = f"  # {key.about}" if key.about else ""
-            if shown is None:
-                lines.append(f"# {key.name} = {key.example}{remark}")
-            else:
-                lines.append(f"{key.name} = {shown}{remark}")
+        for key, setting in keys.items():
+            value = _toml_value(getattr(settings or LiveSettings(), setting.name))
+            about, example = setting.metadata["about"], setting.metadata["example"]
+            line = f"# {key} = {example}" if value is None else f"{key} = {value}"
+            lines.append(f"{line}  # {about}" if about else line)
         lines.append("")
     return "\n".join(lines)
 
 
-def _shown(value: object) -> str | None:
+def _toml_value(value: object) -> str | None:
     """A value as TOML writes it; None for one that is left out."""
     if value is None or value in ("", ()):
         return None
@@ -247,7 +205,7 @@ def override_settings(settings: LiveSettings, flags: dict[str, Any]) -> LiveSett
 
 
 def page_settings(settings: LiveSettings, where: object) -> OperatorSettings:
-    """What the page's process is told; InputError (where) names the key that lets nobody in, or too many."""
+    """Settings of the page's process; InputError (where) names the key that lets nobody in, or too many."""
     s = settings
     try:
         address = ip_address(s.page_address)
