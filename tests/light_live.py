@@ -43,18 +43,7 @@ def prepare_files(folder: Path, lines: int = 40, speed: float = 5.0) -> None:
     write_arm(folder / "arm.toml", replace(profile, arm=replace(profile.arm, home=home)), "near the surface")
 
 
-def track_nothing(
-    prepared: Any,
-    ring: Any,
-    words: Any,
-    poses: Any,
-    reports: Any,
-    motion: Any,
-    link: Any,
-    sender: Any,
-    lifeline: Any,
-    last: str = "",
-) -> None:
+def track_nothing(prepared: Any, channels: Any, last: str = "") -> None:
     """The body of a tracking process that knows where the surface is. last: phase of the print that it sees no more of.
 
     "" to see all of it.
@@ -71,23 +60,23 @@ def track_nothing(
     from tests.moving import breathing, pose_at
 
     set_up_process("tracking")
-    clock, outbox, picture = WallClock(), RecorderSender(sender), png()
+    clock, outbox, picture = WallClock(), RecorderSender(channels.recorder), png()
     outbox.put(RigEntry(prepared.rig))
     names = tuple(camera.name for camera in prepared.rig.cameras)
     begin = due = clock.now()
-    while not pipe_closed(lifeline):
+    while not pipe_closed(channels.lifeline):
         due += 1 / RATE
         clock.wait_until(due)
         stamp, sets = due - AGE, round((due - begin) * RATE)
         pose = pose_at(lambda t: breathing(t, height=1.0, tilt=0.005), stamp)
-        poses.put(PoseHandover(pose, due - AGE / 2, clock.now()))
+        channels.poses.put(PoseHandover(pose, due - AGE / 2, clock.now()))
         known = np.eye(4), begin
-        reports.put(TrackingReport(clock.now(), names, (0, 1), pose, *known, sets, 0, 1 / RATE, used=(50, 50)))
+        channels.reports.put(TrackingReport(clock.now(), names, (0, 1), pose, *known, sets, 0, 1 / RATE, used=(50, 50)))
         outbox.put(SetEntry({0: stamp, 1: stamp}, {0: ("png", picture), 1: ("png", picture)}))
         outbox.put(PoseEntry(pose, no_observations(stamp)))
-        moved = motion.get()
+        moved = channels.motion.get()
         if moved is not None and moved.progress is not None and moved.progress.phase.value == last:
-            reports.put(replace(reports.get(), ended="session is over"))
+            channels.reports.put(replace(channels.reports.get(), ended="session is over"))
             break
     outbox.close()
 

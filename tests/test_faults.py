@@ -6,7 +6,9 @@ import math
 import signal
 import threading
 from collections.abc import Callable
+from ctypes import c_double
 from multiprocessing import Pipe
+from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +27,6 @@ from hardware.files.path_file import read_path
 from hardware.live.fault_injection import FaultInjector
 from hardware.live.frame_source import FrameRing, RingSource
 from hardware.live.ipc import ProcessGroup
-from hardware.live.records import PrintStart
 from hardware.live.session_player import play_session
 from hardware.offline.replay import FrameFaults, tracked_sets
 from hardware.process.clock import SimClock, WallClock
@@ -286,7 +287,7 @@ def test_cables_of_cameras_that_differ_cannot_be_exchanged() -> None:
 
 
 def test_processes_are_stopped_and_go_on_when_it_is_due_and_not_before(tmp_path: Path) -> None:
-    crew, begun = ProcessGroup(), PrintStart()
+    crew, begun = ProcessGroup(), RawValue(c_double, math.nan)
     crew.start("tracking", signal.pause, ())
     process = state_of(crew)
     injector = FaultInjector(
@@ -294,7 +295,7 @@ def test_processes_are_stopped_and_go_on_when_it_is_due_and_not_before(tmp_path:
     )
     try:
         assert not injector.update(50.0) and process() != "T"
-        begun.instant = 100.0
+        begun.value = 100.0
         assert not injector.update(100.9)
         assert [str(each) for each in injector.update(101.0)] == ["tracking hang at 1s for 1s"]
         assert becomes(lambda: process() == "T")
@@ -328,8 +329,8 @@ def test_a_virtual_arm_is_read_back_from_its_file(tmp_path: Path) -> None:
 
 def test_a_feed_shows_what_struck_cameras_deliver(tmp_path: Path) -> None:
     session = make_folder(tmp_path / "session", count=20, cameras=2, pictures=True)
-    ring, (ours, theirs), begun = FrameRing([SIZE, SIZE]), Pipe(duplex=False), PrintStart()
-    begun.instant = WallClock().now()
+    ring, (ours, theirs), begun = FrameRing([SIZE, SIZE]), Pipe(duplex=False), RawValue(c_double, math.nan)
+    begun.value = WallClock().now()
     struck = fault("camera0 off"), fault("camera1 black")
     shown = threading.Thread(target=play_session, args=(open_session(session), False, struck, ring, theirs, begun))
     ring.want()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Iterator
+from ctypes import c_double
+from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +17,6 @@ from hardware.files.arm_file import read_arm
 from hardware.live.fault_injection import FaultInjector
 from hardware.live.ipc import ProcessGroup
 from hardware.live.recorded_run import replay_run
-from hardware.live.records import PrintStart
 from hardware.process.faults import fault_from_text, faults_from_texts
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from tests.light_live import prepare_files
@@ -72,7 +74,7 @@ def stands_still(pid: int, expected: bool) -> bool:
 
 
 def test_what_is_slow_runs_for_its_share_of_every_period_and_freely_afterwards(tmp_path: Path) -> None:
-    crew, begun = ProcessGroup(), PrintStart()
+    crew, begun = ProcessGroup(), RawValue(c_double, math.nan)
     slow = fault_from_text("here", "fault", "tracking slow 25% at 1s for 1s")
     try:
         crew.start("tracking", time.sleep, (600.0,))
@@ -80,7 +82,7 @@ def test_what_is_slow_runs_for_its_share_of_every_period_and_freely_afterwards(t
         assert pid is not None
         injector = FaultInjector([slow], crew, tmp_path / "run.mcap", begun)
         assert injector.update(99.0) == []  # nothing has begun
-        begun.instant = 100.0
+        begun.value = 100.0
         assert injector.update(100.99) == [] and stands_still(pid, False)
         assert injector.update(101.01) == [str(slow)] and stands_still(pid, False)
         for k in range(1, 8):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import os
 import signal
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from ctypes import c_double
 from dataclasses import replace
+from multiprocessing.sharedctypes import RawValue
 from typing import Any
 
 import aiohttp
@@ -21,7 +24,6 @@ from hypothesis import strategies as st
 
 from hardware.live import fault_injection as flood
 from hardware.live.fault_injection import FloodCount
-from hardware.live.records import PrintStart
 from hardware.operator.process import OperatorPage
 from hardware.operator.server import MAX_DROPPED_MESSAGES
 from hardware.operator.settings import OperatorSettings, WindowLimits
@@ -250,8 +252,8 @@ def test_a_flood_of_stops_is_one_stop_after_another_and_nothing_else() -> None:
 def test_a_flood_of_windows_is_turned_away_and_another_one_is_served_all_the_while(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    count, begun = FloodCount(), PrintStart()
-    begun.instant = WallClock().now()
+    count, begun = RawValue(FloodCount), RawValue(c_double, math.nan)
+    begun.value = WallClock().now()
     poured = Fault(FaultPart.PAGE, FaultKind.FLOOD, 0.0, 60.0)
     monkeypatch.setattr(flood, "RECONNECT_AFTER", 0.01)
 

@@ -16,12 +16,12 @@ import resource
 import signal
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from multiprocessing.sharedctypes import RawArray
+from ctypes import Structure, c_double, c_uint64
+from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hardware.live.ipc import ProcessGroup
-from hardware.live.records import PrintStart
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart
 from hardware.process.system import set_up_process
@@ -45,49 +45,27 @@ RECONNECT_AFTER = 0.05  # s until a window that was closed comes back: a reload 
 BROWSER_NICENESS = 5  # as the page's own process: a browser is another program
 
 
-class FloodCount:
-    """What a flood of the page came to, in shared memory."""
+class FloodCount(Structure):
+    """What a flood of the page came to: messages sent, windows closed for what they sent, windows not let in."""
 
-    def __init__(self) -> None:
-        self._memory: Any = RawArray("Q", 3)
-
-    def add(self, messages: int = 0, closed: int = 0, refused: int = 0) -> None:
-        """Count messages that were sent, windows that were closed for it, and windows that were not let in."""
-        for i, more in enumerate((messages, closed, refused)):
-            self._memory[i] += more
-
-    @property
-    def messages(self) -> int:
-        """Messages sent."""
-        return int(self._memory[0])
-
-    @property
-    def closed(self) -> int:
-        """Windows closed for what they sent."""
-        return int(self._memory[1])
-
-    @property
-    def refused(self) -> int:
-        """Windows not let in."""
-        return int(self._memory[2])
+    _fields_ = (("messages", c_uint64), ("closed", c_uint64), ("refused", c_uint64))
 
     def __str__(self) -> str:
-        messages, closed, refused = self._memory
-        return f"{messages} messages sent, {closed} windows closed for it, {refused} not let in"
+        return f"{self.messages} messages sent, {self.closed} windows closed for it, {self.refused} not let in"
 
 
-def flood_process(address: str, fault: Fault, start: PrintStart, count: FloodCount) -> None:
+def flood_process(address: str, fault: Fault, start: c_double, count: FloodCount) -> None:
     """The body of a process: flood the page at `address` while the fault lasts."""
     set_up_process("flood", nice=BROWSER_NICENESS)
     asyncio.run(flood(address, fault, start, count))
 
 
-async def flood(address: str, fault: Fault, start: PrintStart, count: FloodCount) -> None:
+async def flood(address: str, fault: Fault, start: c_double, count: FloodCount) -> None:
     """Flood the page as part of an event loop."""
     import aiohttp  # for this process alone
 
     clock = WallClock()
-    while not clock.now() - start.instant >= fault.start:  # nan before printing began
+    while not clock.now() - start.value >= fault.start:  # nan before printing began
         await asyncio.sleep(START_POLL_PERIOD)
     lasts = fault.duration if math.isfinite(fault.duration) else None
     async with aiohttp.ClientSession(headers={"Origin": "/".join(address.split("/", 3)[:3])}) as session:
@@ -105,11 +83,11 @@ async def _window(session: aiohttp.ClientSession, address: str, count: FloodCoun
             async with session.ws_connect(address, max_msg_size=0) as socket:
                 await _send_flood(socket, count)
                 if socket.close_code == aiohttp.WSCloseCode.POLICY_VIOLATION:
-                    count.add(closed=1)
+                    count.closed += 1
                 else:
-                    count.add(refused=1)
+                    count.refused += 1
         except (aiohttp.ClientError, ConnectionError):
-            count.add(refused=1)
+            count.refused += 1
         await asyncio.sleep(RECONNECT_AFTER)
 
 
@@ -120,7 +98,7 @@ async def _send_flood(socket: aiohttp.ClientWebSocketResponse, count: FloodCount
         while not listening.done():
             for message in FLOOD_MESSAGES:
                 await socket.send_str(message)
-            count.add(messages=len(FLOOD_MESSAGES))
+            count.messages += len(FLOOD_MESSAGES)
             await asyncio.sleep(0)
     except asyncio.CancelledError:
         listening.cancel()
@@ -139,11 +117,11 @@ class FaultInjector:
     """Injects faults into the processes of a run when they are due, and ends them afterwards."""
 
     def __init__(
-        self, faults: Sequence[Fault], processes: ProcessGroup, record: Path, start: PrintStart, page: str = ""
+        self, faults: Sequence[Fault], processes: ProcessGroup, record: Path, start: c_double, page: str = ""
     ) -> None:
         """page: its address. The processes that flood it start at once, as loading their libraries takes a while."""
         self._processes, self._record, self._start = processes, record, start
-        self._flooded, self._floods = FloodCount(), list[Fault]()
+        self._flooded, self._floods = RawValue(FloodCount), list[Fault]()
         self._slow: dict[Fault, bool] = {}  # what is slow now, and whether it runs
         self._due: list[tuple[float, Fault, Callable[[Fault], None]]] = []
         for fault in faults:
@@ -158,7 +136,7 @@ class FaultInjector:
 
     def update(self, now: float) -> list[str]:
         """Begin and end what is due at `now`, s; lines for the log."""
-        elapsed = now - self._start.instant
+        elapsed = now - self._start.value
         due = [each for each in self._due if elapsed >= each[0]]
         self._due = [each for each in self._due if each not in due]
         for _, fault, act in due:

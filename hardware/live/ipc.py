@@ -5,15 +5,18 @@ Each process is spawned and runs one of the functions `run_*` below, which impor
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from ctypes import c_double
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from multiprocessing.sharedctypes import RawValue
 from pathlib import Path as File
 from typing import Any
 
@@ -23,12 +26,19 @@ from estimation.errors import StillbedError
 from hardware.live.frame_source import FrameRing
 from hardware.live.prepared import Prepared
 from hardware.live.recorder_process import RecorderSender, record
-from hardware.live.records import LiveMotionReport, PoseHandover, PrintStart, RecorderReport, TrackingReport
+from hardware.live.records import (
+    LiveMotionReport,
+    MotionChannels,
+    PoseHandover,
+    RecorderReport,
+    TrackingChannels,
+    TrackingReport,
+)
 from hardware.live.settings import VIRTUAL_ARM
 from hardware.operator.shared_state import OperatorLink
 from hardware.process.clock import WallClock, WatchedClock
 from hardware.process.faults import Fault
-from hardware.process.shared_latest import SharedLatest, SharedPathPlace
+from hardware.process.shared_latest import SharedLatest
 from hardware.process.system import ask_for_real_time, blocked_sigint, set_up_process
 
 SPAWN = multiprocessing.get_context("spawn")  # a forked child would have loaded all that its parent has
@@ -48,16 +58,14 @@ class ProcessGroup:
 
     members: dict[str, BaseProcess] = field(default_factory=dict)
 
-    def start(self, name: str, body: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-        """Start a process. Ends of pipes among its arguments are its own from now on."""
+    def start(self, name: str, body: ProcessBody, arguments: tuple[Any, ...], ends: Sequence[Connection] = ()) -> None:
+        """Start a process. ends: of pipes among its arguments, which are its own from now on."""
         process = SPAWN.Process(target=body, args=arguments, name=name)
         with blocked_sigint():
             process.start()
         self.members[name] = process
-        for argument in arguments:
-            for end in argument if isinstance(argument, list) else [argument]:
-                if isinstance(end, Connection):
-                    end.close()
+        for end in ends:
+            end.close()
 
     def alive(self, name: str) -> bool:
         """Whether a process was started and has not ended."""
@@ -102,45 +110,25 @@ class ProcessGroup:
             os.killpg(member.pid, signal.SIGKILL)
 
 
-def run_player(prepared: Prepared, ring: FrameRing, notices: Connection, start: PrintStart) -> None:
+def run_player(prepared: Prepared, ring: FrameRing, notices: Connection, start: c_double) -> None:
     """Show a recorded session, as cameras would."""
     from hardware.live.session_player import play
 
     play(prepared, ring, notices, start)
 
 
-def run_tracker(
-    prepared: Prepared,
-    ring: FrameRing,
-    notices: Connection,
-    poses: SharedLatest[PoseHandover],
-    reports: SharedLatest[TrackingReport],
-    motion: SharedLatest[LiveMotionReport],
-    link: OperatorLink,
-    sender: Connection,
-    lifeline: Connection,
-) -> None:
+def run_tracker(prepared: Prepared, channels: TrackingChannels) -> None:
     """Track the surface."""
-    from hardware.live.tracking_process import TrackingChannels, track
+    from hardware.live.tracking_process import track
 
-    track(prepared, TrackingChannels(ring, notices, poses, reports, motion, link, sender, lifeline))
+    track(prepared, channels)
 
 
-def run_motion(
-    prepared: Prepared,
-    url: str,
-    place: SharedPathPlace,
-    poses: SharedLatest[PoseHandover],
-    reports: SharedLatest[LiveMotionReport],
-    orders: Connection,
-    link: OperatorLink,
-    trouble: SharedLatest[str],
-    sender: Connection,
-) -> None:
-    """Plan the motion, and send it to the arm at `url`."""
-    from hardware.live.motion_process import MotionChannels, move
+def run_motion(prepared: Prepared, channels: MotionChannels) -> None:
+    """Plan the motion, and send it to the arm."""
+    from hardware.live.motion_process import move
 
-    move(prepared, url, MotionChannels(place, poses, reports, orders, link.requests, trouble, sender))
+    move(prepared, channels)
 
 
 def run_arm(prepared: Prepared, device: File, lifeline: Connection) -> None:
@@ -179,7 +167,7 @@ class RunChannels:
 
     processes: ProcessGroup
     url: str  # of the arm's port
-    place: SharedPathPlace
+    place: c_double  # on the path, in checkpoints; NaN before it is begun
     tracking: SharedLatest[TrackingReport]
     motion: SharedLatest[LiveMotionReport]
     recorder: SharedLatest[RecorderReport]
@@ -189,7 +177,7 @@ class RunChannels:
     sender: RecorderSender
     link: OperatorLink
     trouble: SharedLatest[str]  # why the arm cannot be used at all
-    start: PrintStart
+    start: c_double  # s, when printing began; NaN before
 
     def end(self) -> None:
         """End the processes so that none misses another: motion first, then what feeds the recorder, the arm last."""
@@ -224,35 +212,32 @@ def _start_all(processes: ProcessGroup, prepared: Prepared, folder: File, tracke
     if url == VIRTUAL_ARM:
         url = str(folder / "arm")
         _start_arm(processes, prepared, File(url), arm_lifeline[0])
-    place, ring = SharedPathPlace(), FrameRing([camera.size for camera in prepared.rig.cameras])
+    place, start = RawValue(c_double, math.nan), RawValue(c_double, math.nan)
+    ring, link = FrameRing([camera.size for camera in prepared.rig.cameras]), OperatorLink()
     poses, tracking, motion = (
         SharedLatest[PoseHandover](),
         SharedLatest[TrackingReport](),
         SharedLatest[LiveMotionReport](),
     )
-    recorder, link, trouble, start = (
-        SharedLatest[RecorderReport](),
-        OperatorLink(),
-        SharedLatest[str](TROUBLE_BYTES),
-        PrintStart(),
-    )
-    senders = [SPAWN.Pipe(duplex=False) for _ in range(3)]
+    recorder, trouble = SharedLatest[RecorderReport](), SharedLatest[str](TROUBLE_BYTES)
+    to_recorder = [SPAWN.Pipe(duplex=False) for _ in range(3)]  # from the motion, the tracking and this process
     lifeline, notices, orders = (SPAWN.Pipe(duplex=False) for _ in range(3))
-    processes.start("recorder", record, (prepared.settings, [end for end, _ in senders], recorder))
-    processes.start(
-        "motion", run_motion, (prepared, url, place, poses, motion, orders[0], link, trouble, senders[0][1])
-    )
+    ends = [end for end, _ in to_recorder]
+    processes.start("recorder", record, (prepared.settings, ends, recorder), ends)
+    mover = MotionChannels(url, place, poses, motion, orders[0], link.requests, trouble, to_recorder[0][1])
+    processes.start("motion", run_motion, (prepared, mover), (orders[0], mover.recorder))
     if not prepared.live:
-        processes.start("feed", run_player, (prepared, ring, notices[1], start))
-    tracking_ends = motion, link, senders[1][1], lifeline[0]
-    processes.start("tracking", tracker, (prepared, ring, notices[0], poses, tracking, *tracking_ends))
-    ends = orders[1], lifeline[1], arm_lifeline[1], RecorderSender(senders[2][1])
-    return RunChannels(processes, url, place, tracking, motion, recorder, *ends, link, trouble, start)
+        processes.start("feed", run_player, (prepared, ring, notices[1], start), (notices[1],))
+    track = TrackingChannels(ring, notices[0], poses, tracking, motion, link, to_recorder[1][1], lifeline[0])
+    processes.start("tracking", tracker, (prepared, track), (notices[0], track.recorder, lifeline[0]))
+    sender = RecorderSender(to_recorder[2][1])
+    own_ends = orders[1], lifeline[1], arm_lifeline[1], sender
+    return RunChannels(processes, url, place, tracking, motion, recorder, *own_ends, link, trouble, start)
 
 
 def _start_arm(processes: ProcessGroup, prepared: Prepared, device: File, lifeline: Connection) -> None:
     """Start a virtual arm, and wait for its device."""
-    processes.start("arm", run_arm, (prepared, device, lifeline))
+    processes.start("arm", run_arm, (prepared, device, lifeline), (lifeline,))
     clock = WallClock()
     until = clock.now() + ARM_START_TIMEOUT
     while not device.is_symlink():

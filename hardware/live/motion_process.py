@@ -9,8 +9,8 @@ import math
 import signal
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
+from ctypes import c_double
+from dataclasses import replace
 from types import FrameType
 
 from estimation.errors import InputError
@@ -29,6 +29,7 @@ from hardware.live.records import (
     LATE_TICK_STAGE,
     BeginPrint,
     LiveMotionReport,
+    MotionChannels,
     PauseOrder,
     PoseHandover,
     StageHistograms,
@@ -37,9 +38,7 @@ from hardware.live.records import (
 )
 from hardware.motion.loop import MotionLoop, Order, RecordedTick, Tick
 from hardware.motion.step import MotionStep
-from hardware.operator.shared_state import RequestLine
 from hardware.process.clock import WallClock
-from hardware.process.shared_latest import SharedLatest, SharedPathPlace
 from hardware.process.system import ask_for_real_time, set_up_process
 from hardware.process.ticks import PoseLockedSchedule
 from planning.command import Command, Hold
@@ -61,7 +60,7 @@ class LiveMotion:
 
     last: Command
 
-    def __init__(self, profile: ArmProfile, place: SharedPathPlace) -> None:
+    def __init__(self, profile: ArmProfile, place: c_double) -> None:
         self._profile, self._place = profile, place
         self._step: MotionStep | None = None
         self._order: BeginPrint | None = None
@@ -98,13 +97,13 @@ class LiveMotion:
         self.last = self._step(pose, now)
         if self.paused and isinstance(self.last, Hold):
             self.last = replace(self.last, reason=PAUSED_REASON)
-        self._place.fraction = self._step.progress.fraction
+        self._place.value = self._step.progress.fraction
         return self.last
 
     def _make(self, start: float) -> None:
         assert self._order is not None
         self._step = MotionStep(self._order.path, self._order.profile, start)
-        self._place.fraction = self.begun = start
+        self._place.value = self.begun = start
 
 
 ByteListener = Callable[[bytes, bool], None]  # (bytes, whether they were sent rather than received)
@@ -146,19 +145,6 @@ class _LoggedPort:
     def close(self) -> None:
         """Let the device go."""
         self._port.close()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionChannels:
-    """What joins the motion process to the others."""
-
-    place: SharedPathPlace
-    poses: SharedLatest[PoseHandover]
-    reports: SharedLatest[LiveMotionReport]
-    orders: Connection
-    requests: RequestLine  # of the operator's page
-    trouble: SharedLatest[str]  # why the arm cannot be used at all
-    recorder: Connection
 
 
 class _OrderReceiver:
@@ -267,14 +253,14 @@ class _TickReporter:
         )
 
 
-def move(prepared: Prepared, url: str, channels: MotionChannels) -> None:
+def move(prepared: Prepared, channels: MotionChannels) -> None:
     """The body of the process: follow orders until QUIT, or until the process that gives them is gone.
 
-    Then the arm is stopped; in the second case the place on the path is kept here. url: of the arm's port.
+    Then the arm is stopped; in the second case the place on the path is kept here.
     """
     settings, profile = prepared.settings, prepared.task.profile
     set_up_process("motion", settings.cores_motion)
-    clock, device, sender = WallClock(), PortOpener(url, profile.baud), RecorderSender(channels.recorder)
+    clock, device, sender = WallClock(), PortOpener(channels.url, profile.baud), RecorderSender(channels.recorder)
     link_settings = LinkSettings(pause_frame=settings.pause_frame)
     ticks = PoseLockedSchedule(profile.tick, link_settings.ease, clock.now())
     motion = LiveMotion(profile, channels.place)
@@ -296,7 +282,7 @@ def move(prepared: Prepared, url: str, channels: MotionChannels) -> None:
     finally:
         device.release()
         if orders.alone and orders.fingerprint:
-            write_progress_durably(prepared.files.progress, orders.fingerprint, channels.place.fraction)
+            write_progress_durably(prepared.files.progress, orders.fingerprint, channels.place.value)
         for entry in reporter.times.entries(clock.now()):
             sender.put(entry)
         sender.close()

@@ -16,6 +16,7 @@ import multiprocessing
 import re
 import shutil
 import threading
+from ctypes import c_double
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path as File
@@ -43,7 +44,6 @@ from hardware.live.state_machine import PrintTask
 from hardware.process import checks
 from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults
 from hardware.process.progress import cache_error, cache_folder
-from hardware.process.shared_latest import SharedPathPlace
 from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from hardware.recording.messages import rig_from_message
 
@@ -297,8 +297,8 @@ class ProgressWriter:
     failed: the error of the disk, "" if there is none.
     """
 
-    def __init__(self, file: File, fingerprint: str, place: SharedPathPlace) -> None:
-        """fingerprint: of the path; "" for a dry run, of which no place is kept."""
+    def __init__(self, file: File, fingerprint: str, place: c_double) -> None:
+        """fingerprint: of the path; "" for a dry run, of which no place is kept. place: on the path, in checkpoints."""
         self.failed = ""
         self._file, self._fingerprint, self._place = file, fingerprint, place
         self._written = math.nan
@@ -317,7 +317,7 @@ class ProgressWriter:
         self._write()
 
     def _write(self) -> None:
-        fraction = self._place.fraction
+        fraction = self._place.value
         if not self._fingerprint or math.isnan(fraction) or fraction == self._written:
             return
         try:

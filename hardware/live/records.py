@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from ctypes import c_double
 from dataclasses import dataclass
 from enum import Enum
 from math import nan
-from multiprocessing.sharedctypes import RawArray
+from multiprocessing.connection import Connection
 from pathlib import Path as File
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,10 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
 from hardware.arm.profile import ArmProfile
-from hardware.live.frame_source import Encoded
+from hardware.live.frame_source import Encoded, FrameRing
 from hardware.motion.loop import RecordedTick, Tick
+from hardware.operator.shared_state import OperatorLink, RequestLine
+from hardware.process.shared_latest import SharedLatest
 from hardware.process.ticks import LATENESS_BIN, LatenessHistogram
 from perception.frames import Frame, PrintHead, Roi
 from planning.path import Path
@@ -226,17 +228,29 @@ class StageHistograms:
         ]
 
 
-class PrintStart:
-    """When printing began, where every process of a run can see it. instant: s, NaN before."""
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackingChannels:
+    """What joins the tracking process to the others."""
 
-    def __init__(self) -> None:
-        self._memory: Any = RawArray("d", [float("nan")])
+    ring: FrameRing  # frames of a session that is shown, with their notices
+    notices: Connection
+    poses: SharedLatest[PoseHandover]  # to the motion
+    reports: SharedLatest[TrackingReport]
+    motion: SharedLatest[LiveMotionReport]
+    link: OperatorLink
+    recorder: Connection
+    lifeline: Connection  # its end says that the run is gone
 
-    @property
-    def instant(self) -> float:
-        """When printing began, s."""
-        return float(self._memory[0])
 
-    @instant.setter
-    def instant(self, value: float) -> None:
-        self._memory[0] = value
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionChannels:
+    """What joins the motion process to the others."""
+
+    url: str  # of the arm's port
+    place: c_double  # on the path, in checkpoints, NaN before it is begun; set before a command goes to the arm
+    poses: SharedLatest[PoseHandover]
+    reports: SharedLatest[LiveMotionReport]
+    orders: Connection
+    requests: RequestLine  # of the operator's page
+    trouble: SharedLatest[str]  # why the arm cannot be used at all
+    recorder: Connection

@@ -92,7 +92,7 @@ class LiveRun:
             self._wait_for_rest(wake)
             self._close_page()
             self._shut_down()
-        fraction = channels.place.fraction
+        fraction = channels.place.value
         return RunOutcome(prepared, self._machine, self._statistics, self._reports, self._signal, fraction)
 
     def on_signal(self, number: int, frame: FrameType | None) -> None:
@@ -261,8 +261,8 @@ class LiveRun:
         self._silence_logged = bool(machine.silence)
         if machine.turn != self._turn:
             self._turn = machine.turn
-            if machine.stage is RunStage.PRINT and math.isnan(self._channels.start.instant):
-                self._channels.start.instant = now
+            if machine.stage is RunStage.PRINT and math.isnan(self._channels.start.value):
+                self._channels.start.value = now
             self._log(stage_line(machine.stage, machine.reason))
             if machine.stage is RunStage.FIND:
                 self._console.say(checks_table(machine.checks))

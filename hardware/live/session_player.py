@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from ctypes import c_double
 from dataclasses import dataclass, replace
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
@@ -20,7 +21,6 @@ from hardware.files.images import decode
 from hardware.files.session import FrameReader, FrameRef, Session
 from hardware.live.frame_source import Encoded, FrameRing
 from hardware.live.prepared import Prepared
-from hardware.live.records import PrintStart
 from hardware.offline.replay import FrameFaults
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault
@@ -72,7 +72,7 @@ def schedule(stamps: np.ndarray, begin: float, between: tuple[int, int] | None) 
             yield SetShowing(i, live, True)
 
 
-def play(prepared: Prepared, ring: FrameRing, notices: Connection, start: PrintStart) -> None:
+def play(prepared: Prepared, ring: FrameRing, notices: Connection, start: c_double) -> None:
     """The body of the process: show the run's session until it is over or the other end is closed.
 
     The last notice is a text that says why it ended.
@@ -88,9 +88,9 @@ def play(prepared: Prepared, ring: FrameRing, notices: Connection, start: PrintS
 
 
 def play_session(
-    session: Session, again: bool, faults: Sequence[Fault], ring: FrameRing, notices: Connection, start: PrintStart
+    session: Session, again: bool, faults: Sequence[Fault], ring: FrameRing, notices: Connection, start: c_double
 ) -> None:
-    """Put the sets of a session into the ring in real time. faults: of cameras, counted from `start`."""
+    """Put the sets of a session into the ring in real time. faults: of cameras, counted from `start`, s."""
     clock, pictures = WallClock(), _PictureCache(session, again)
     spoil = FrameFaults(faults, session.rig, "command line")
     _wait_until_wanted(ring, clock)
@@ -110,7 +110,7 @@ def play_session(
         shown = [replace(f, stamp=_live_stamp(f.stamp, anchor, showing)) for f in frames]
         head = session.heads.at(anchor)
         whole = FrameSet(frame_set(shown).stamp, tuple(shown), head)
-        spoilt = spoil(whole, showing.live - start.instant)
+        spoilt = spoil(whole, showing.live - start.value)
         same = {frame.camera for frame in spoilt.frames if frame in whole.frames}
         encoded = {camera: stored for camera, stored in encoded.items() if camera in same}
         clock.wait_until(due)

@@ -5,7 +5,7 @@ recording. Files in it are relative to it. The operator's page is served to this
 named, and then encrypted (TLS) alone.
 """
 
-# ruff: noqa: RUF009: `_key` makes a field
+# ruff: noqa: RUF009
 
 from __future__ import annotations
 

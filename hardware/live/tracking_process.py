@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import takewhile
-from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
 
@@ -25,7 +24,7 @@ from estimation.runtime import use_one_arena
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.files.session import Session, head_from_row, row_from_head
-from hardware.live.frame_source import FrameRing, FrameSource, LiveCameraSource, RingSource, TimedFrameSet
+from hardware.live.frame_source import FrameSource, LiveCameraSource, RingSource, TimedFrameSet
 from hardware.live.prepared import Prepared
 from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
@@ -37,12 +36,12 @@ from hardware.live.records import (
     ScanEntry,
     SetEntry,
     StageHistograms,
+    TrackingChannels,
     TrackingReport,
 )
 from hardware.motion.loop import CommandedPose
 from hardware.offline.track import FrameSetStep, tracker
 from hardware.operator.process import CameraShot, Thumbnailer
-from hardware.operator.shared_state import OperatorLink
 from hardware.process.clock import WallClock
 from hardware.process.shared_latest import SharedLatest
 from hardware.process.system import ask_to_go_first, pipe_closed, set_up_process, settle_memory
@@ -129,20 +128,6 @@ def _restore_map(step: FrameSetStep, record: Path, session: Session, until: floa
     if new_from_old is None:
         raise InputError(record, "recording", "no surface", "pictures in which it is found again")
     return new_from_old
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackingChannels:
-    """What joins the tracking process to the others."""
-
-    ring: FrameRing  # frames of a session that is shown, with their notices
-    notices: Connection
-    poses: SharedLatest[PoseHandover]  # to the motion
-    reports: SharedLatest[TrackingReport]
-    motion: SharedLatest[LiveMotionReport]
-    link: OperatorLink
-    recorder: Connection
-    lifeline: Connection
 
 
 def track(prepared: Prepared, channels: TrackingChannels) -> None:

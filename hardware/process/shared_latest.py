@@ -1,4 +1,4 @@
-"""Shared memory between processes: the latest value of a stream, and the place on the path.
+"""The latest value of a stream, in memory that two processes share.
 
 Neither side waits. Two slots take turns: one can be read while the other is written. A reader that is overtaken sees it
 by the count and the checksum, and reads the newer one.
@@ -59,23 +59,3 @@ class SharedLatest(Generic[Value]):
 
     def _start(self, count: int) -> int:
         return _COUNT.size + (count % 2) * (_SLOT_HEAD.size + self._capacity)
-
-
-class SharedPathPlace:
-    """How far the print is, in shared memory: outlives the process that prints.
-
-    It is written before the command goes to the arm, so what it does not hold was not printed. fraction: counted in
-    checkpoints, NaN before a path was begun.
-    """
-
-    def __init__(self) -> None:
-        self._memory: Any = RawArray("d", [float("nan")])
-
-    @property
-    def fraction(self) -> float:
-        """The place, counted in checkpoints."""
-        return float(self._memory[0])
-
-    @fraction.setter
-    def fraction(self, value: float) -> None:
-        self._memory[0] = value
