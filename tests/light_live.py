@@ -54,14 +54,14 @@ def track_nothing(prepared: Any, channels: Any, last: str = "") -> None:
 
     from estimation.observations import no_observations
     from hardware.live.recorder_process import RecorderSender
-    from hardware.live.records import PoseEntry, PoseHandover, RigEntry, SetEntry, TrackingReport
+    from hardware.live.records import PoseEntry, PoseHandover, SetEntry, TrackingReport
     from hardware.process.clock import WallClock
     from hardware.process.system import pipe_closed, set_up_process
     from tests.moving import breathing, pose_at
 
     set_up_process("tracking")
     clock, outbox, picture = WallClock(), RecorderSender(channels.recorder), png()
-    outbox.put(RigEntry(prepared.rig))
+    outbox.put(prepared.rig)
     names = tuple(camera.name for camera in prepared.rig.cameras)
     begin = due = clock.now()
     while not pipe_closed(channels.lifeline):

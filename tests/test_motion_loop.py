@@ -19,7 +19,7 @@ from hardware.motion.loop import MotionLoop, Order, Tick
 from hardware.motion.step import MotionPlan, MotionReport, MotionStep, motion_process
 from hardware.process.clock import SimClock, WallClock
 from hardware.process.shared_latest import SharedLatest
-from hardware.process.ticks import LatenessHistogram
+from hardware.process.ticks import Histogram
 from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Hold, Move
@@ -180,7 +180,7 @@ def test_the_same_input_gives_the_same_bytes() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_histogram_of_lateness_gives_percentiles_to_a_tenth_of_a_millisecond(seed: int) -> None:
     late = np.random.default_rng(seed).exponential(0.002, 5000)
-    histogram = LatenessHistogram()
+    histogram = Histogram()
     assert np.isnan(histogram.percentile(50))
     for each in late:
         histogram.add(each)

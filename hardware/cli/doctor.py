@@ -24,7 +24,7 @@ from hardware.bench.figures import this_machine
 from hardware.operator.view import Check, CheckVerdict
 from hardware.process.clock import Clock
 from hardware.process.system import NO_PRIORITY
-from hardware.process.ticks import LatenessHistogram, measure_evenness
+from hardware.process.ticks import Histogram, measure_evenness
 
 if TYPE_CHECKING:
     from hardware.cameras.sources import CameraDevice
@@ -135,7 +135,7 @@ def priority_check() -> Check:
 
 def punctuality_check(clock: Clock, ticks: int = PROBE_TICKS) -> Check:
     """How late this machine wakes a process that asked for a tick."""
-    late = LatenessHistogram()
+    late = Histogram()
     begun = clock.now()
     for k in range(1, ticks + 1):
         clock.wait_until(begun + k * TICK_PERIOD)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -41,22 +41,6 @@ class TimedFrameSet:
     handed: float = 0.0  # s, when the newest of its frames was handed over
     source: float = float("nan")  # s, its stamp on the clock of a recorded session; NaN of live cameras
     dropped: int = 0  # sets before it that were not taken
-
-
-class FrameSource(Protocol):
-    """Live cameras, or what stands for them."""
-
-    def take(self, patience: float) -> TimedFrameSet | None:
-        """The newest set, waiting `patience` s for one; None where none came. SourceEnded once there will be none."""
-        ...
-
-    def learn(self, offsets: Array) -> None:
-        """How much later than stamped each camera exposes (C,), s, as it is known by now."""
-        ...
-
-    def close(self) -> None:
-        """Let the cameras go."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +155,7 @@ class RingSource:
         return TimedFrameSet(taken[0], taken[1], notice.handed, notice.source, dropped)
 
     def learn(self, offsets: Array) -> None:
-        """Sets come paired as they were recorded."""
+        """Nothing to learn: sets come paired as they were recorded."""
 
     def close(self) -> None:
         """Close the pipe, which the writer notices."""
@@ -211,3 +195,6 @@ class LiveCameraSource:
     def close(self) -> None:
         """Let the cameras go."""
         self._cameras.close()
+
+
+FrameSource = RingSource | LiveCameraSource

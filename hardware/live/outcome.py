@@ -22,6 +22,7 @@ from hardware.live.prepared import Prepared
 from hardware.live.records import StageHistograms, StageTiming
 from hardware.live.state_machine import RunReports, RunStateMachine
 from hardware.operator.view import RunStage
+from hardware.process.ticks import Histogram
 from planning.command import Move
 from planning.progress import PrintPhase
 from planning.robot.kinematics import SimpleArm, nozzle_from_axes
@@ -89,8 +90,7 @@ class RunStatistics:
     extruding: float = 0.0  # s in which material left
     due: float = 0.0  # s in which it should have left
     times: StageHistograms = field(default_factory=StageHistograms)
-    errors: np.ndarray = field(default_factory=lambda: np.zeros(ERROR_BINS, np.int64))  # histogram of predicted errors
-    most_error: float = 0.0  # mm, the largest predicted
+    errors: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN, ERROR_BINS))  # predicted at the nozzle, mm
     last_error: float = nan  # mm, the newest predicted
     timeline: ErrorTimeline = field(default_factory=ErrorTimeline)
     _updated: float = nan
@@ -114,13 +114,6 @@ class RunStatistics:
     def duty(self) -> float:
         """Share of the time since printing began in which material left; NaN before."""
         return self.extruding / self.due if self.due > 0 else nan
-
-    def error(self, share: float) -> float:
-        """Predicted error at the nozzle, mm, that `share` percent of the extruding ticks do not exceed; NaN of none."""
-        total = self.errors.sum()
-        if not total:
-            return nan
-        return float((np.searchsorted(np.cumsum(self.errors), share / 100 * total) + 1) * ERROR_BIN)
 
     def _tick(self, reports: RunReports, stage: RunStage, arm: SimpleArm | None) -> None:
         assert reports.motion is not None
@@ -158,8 +151,8 @@ class RunStatistics:
         then = pose.predict(max(move.stamp, pose.stamp), onwards=False)
         nozzle = se3.inverse(pose.base_from_surface) @ nozzle_from_axes(arm, move.axes)
         error = float(then.error_at(nozzle[None, :3, 3])[0])
-        self.errors[min(int(error / ERROR_BIN), ERROR_BINS - 1)] += 1
-        self.most_error, self.last_error = max(self.most_error, error), error
+        self.errors.add(error)
+        self.last_error = error
         return error
 
 
@@ -213,7 +206,7 @@ class RunOutcome:
         from hardware.report.summary import finite
 
         statistics, reports, task = self.statistics, self.reports, self.prepared.task
-        tracking, motion, recorder = reports.tracking, reports.motion, reports.recorder
+        tracking, motion, recorder, errors = reports.tracking, reports.motion, reports.recorder, statistics.errors
         cleaned: dict[str, Any] = finite(
             {
                 "ended": self.machine.ended,
@@ -225,11 +218,7 @@ class RunOutcome:
                 "fraction": self.fraction,
                 "duty": statistics.duty,
                 "extruding_s": statistics.extruding,
-                "predicted_error_mm": {
-                    "p50": statistics.error(50),
-                    "p95": statistics.error(95),
-                    "max": statistics.most_error,
-                },
+                "predicted_error_mm": {"p50": errors.percentile(50), "p95": errors.percentile(95), "max": errors.most},
                 "stages_s": statistics.stages,
                 "states": statistics.states,
                 "holds": [

@@ -51,52 +51,28 @@ RIG_FILE = "rig.toml"
 PROGRESS_PERIOD = 0.05  # s between looks at the place: a tenth of a checkpoint's time, or less
 
 
-@dataclass(frozen=True, slots=True)
 class RunFiles:
-    """Names of the files beside a recording."""
+    """The files of a run, beside its recording and named after it."""
 
-    record: File
+    def __init__(self, record: File) -> None:
+        def beside(end: str) -> File:
+            return record.with_name(f"{record.stem}.{end}")
 
-    @property
-    def session(self) -> File:
-        """The settings of the run."""
-        return self._named("session.toml")
-
-    @property
-    def progress(self) -> File:
-        """How far the print is."""
-        return self._named("progress.toml")
-
-    @property
-    def surface(self) -> File:
-        """Where the path lies."""
-        return self._named("surface.toml")
-
-    @property
-    def executed(self) -> File:
-        """The motion of a virtual arm."""
-        return self._named("executed.npz")
-
-    @property
-    def report(self) -> File:
-        """The page."""
-        return self._named("report.html")
-
-    @property
-    def summary(self) -> File:
-        """Its figures."""
-        return self._named("summary.json")
+        self.record = record
+        self.session = beside("session.toml")  # the settings
+        self.progress = beside("progress.toml")  # how far the print is
+        self.surface = beside("surface.toml")  # where the path lies
+        self.executed = beside("executed.npz")  # the motion of a virtual arm
+        self.report = beside("report.html")
+        self.summary = beside("summary.json")
 
     def next(self) -> RunFiles:
-        """The recording of the run that resumes this one: the next name that is free."""
+        """The files of the run that resumes this one: the next name that is free."""
         named = re.fullmatch(r"(.+)-([0-9]+)", self.record.stem)
         stem, number = (named[1], int(named[2]) + 1) if named else (self.record.stem, 2)
         while (file := self.record.with_name(f"{stem}-{number}.mcap")).exists():
             number += 1
         return RunFiles(file)
-
-    def _named(self, end: str) -> File:
-        return self.record.with_name(f"{self.record.stem}.{end}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,8 +203,7 @@ def _prepared(settings: LiveSettings, files: RunFiles, placement: SurfacePlaceme
         unattended=settings.unattended,
         patience=settings.patience,
     )
-    rig = rig_from_session(session)
-    again = scenario is not None
+    rig, again = rig_from_session(session), scenario is not None
     return Prepared(settings, session, rig, again, virtual, task, placement, files, tuple(notes))
 
 

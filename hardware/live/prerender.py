@@ -1,9 +1,8 @@
 """Pictures of a scenario, rendered before a live run shows them in real time: small machines cannot do both at once.
 
 A cache folder holds one session for each scenario: session.mcap with exact truth, path.csv as laid onto the true
-surface, arm.toml as the motion knows the arm, virtual_arm.toml as it is, and
-scenario.toml. The nozzle and what it prints are not in the pictures,
-as nobody knows beforehand where they will be.
+surface, arm.toml as the motion knows the arm, virtual_arm.toml as it is, and scenario.toml. The nozzle and what it
+prints are not in the pictures, as nobody knows beforehand where they will be.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,6 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.observations import no_observations
 from estimation.pose import SurfacePose, Trajectory, identity_pose
-from estimation.se3 import Array
 from hardware.files.arm_file import write_arm
 from hardware.files.folder_tables import rows_from_trajectory
 from hardware.files.path_file import read_path, write_path
@@ -27,49 +25,28 @@ from hardware.process.clock import WallClock
 from hardware.process.faults import FaultPart
 from hardware.process.progress import Progress, cache_error
 from hardware.recording.recorder import Recorder
-from hardware.recording.schemas import WARNING
 from hardware.simulator.arm.settings import write_virtual_arm
 from hardware.simulator.cameras import Shot
-from hardware.simulator.deposit import NozzleLog
 from hardware.simulator.scenario import Scenario, read_scenario
 from hardware.simulator.scenario_tables import scene_from_table
 from hardware.simulator.simulate import regions
 from hardware.simulator.truth import Truth, drape_path
-from hardware.simulator.world import SimulatedWorld
-from perception.frames import FrameSet, PrintHead
+from hardware.simulator.world import SimulatedWorld, WorldSink
+from perception.frames import FrameSet
 from perception.tracking.step import StepReport, report_without_offsets
-from planning.command import Command
-from planning.progress import PrintProgress as Print
 
 CACHE_VERSION = "4"  # of what the cache holds: another one is rendered anew
 STAMP_DIGITS = 9  # of a truth's stamp: exposures of one instant are one
 
 
-@dataclass(frozen=True, slots=True)
 class PrerenderedSession:
     """A pre-rendered session in its cache folder."""
 
-    folder: Path
-
-    @property
-    def session(self) -> Path:
-        """The recording of the pictures, with exact truth."""
-        return self.folder / "session.mcap"
-
-    @property
-    def path(self) -> Path:
-        """The checkpoints in the true surface frame."""
-        return self.folder / "path.csv"
-
-    @property
-    def arm(self) -> Path:
-        """What the motion knows of the arm."""
-        return self.folder / "arm.toml"
-
-    @property
-    def scenario(self) -> Path:
-        """The scenario's file, where it was read."""
-        return Path((self.folder / "scenario").read_text(encoding="utf-8"))
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.session = folder / "session.mcap"  # pictures, with exact truth
+        self.path = folder / "path.csv"  # checkpoints in the true surface frame
+        self.arm = folder / "arm.toml"  # what the motion knows of the arm
 
 
 def cached(file: Path, cache: Path, seconds: float | None = None) -> PrerenderedSession:
@@ -161,8 +138,8 @@ class _NullTracker:
         """Nothing to do."""
 
 
-class _PictureSink:
-    """Records pictures and the truth at their exposures."""
+class _PictureSink(WorldSink):
+    """Records pictures and the truth at their exposures; of all else that happens, nothing."""
 
     def __init__(self, recorder: Recorder, truth: Truth) -> None:
         self._recorder, self._truth = recorder, truth
@@ -179,21 +156,3 @@ class _PictureSink:
         trajectory = Trajectory(stamps, self._truth.base_from_surface(stamps), exact=True)
         for row in rows_from_trajectory(trajectory):
             self._recorder.truth_row(row, exact=True)
-
-    def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
-        """Nobody looks."""
-
-    def command(self, command: Command, progress: Print, frame: bytes, received: bytes) -> None:
-        """Nothing is printed."""
-
-    def head(self, stamp: float, head: PrintHead) -> None:
-        """There is none in the pictures."""
-
-    def rows(self, log: NozzleLog) -> None:
-        """Nothing is printed."""
-
-    def registered(self, truth_from_estimate: Array) -> None:
-        """Nothing is registered."""
-
-    def event(self, stamp: float, text: str, level: int = WARNING) -> None:
-        """What goes wrong with a picture is part of the scenario."""

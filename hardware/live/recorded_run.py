@@ -1,14 +1,14 @@
 """A recorded run, examined afterwards: its motion replayed byte by byte, and its true error at the nozzle.
 
 The true error is known where a scenario's pictures were shown to a virtual arm; nobody in the loop knows it. The
-simulator's own ledger compares what was commanded with what the arm did, millisecond by millisecond. The truth is that
+simulator's truth log compares what was commanded with what the arm did, millisecond by millisecond. The truth is that
 of the pictures, which is part of the recording, interpolated between their instants.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path as File
 
 import numpy as np
@@ -35,7 +35,7 @@ from hardware.recording.messages import (
     pose_from_message,
     row_from_message,
 )
-from hardware.recording.session_reader import PATH_ATTACHMENT, inputs_from_texts, used_inputs
+from hardware.recording.session_reader import PATH_ATTACHMENT, inputs_from_texts
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.command import Command, Hold
 from planning.path import Path
@@ -45,13 +45,31 @@ RUN_REQUIRED = "the recording of a run that began to print, or give --path"
 
 
 @dataclass(slots=True)
-class _RecordedMotion:
-    """What a recording says of a run's motion."""
+class _RecordedRun:
+    """What a recording holds of a run."""
 
-    texts: dict[str, str] = field(default_factory=dict)
-    poses: dict[float, SurfacePose] = field(default_factory=dict)
-    ticks: list[Message] = field(default_factory=list)
-    damage: str = ""
+    texts: dict[str, str]  # of attached files, by name
+    messages: dict[str, list[Message]]  # by topic, in the order of the file
+    damage: str = ""  # what was lost of the file, "" if nothing
+
+    @property
+    def poses(self) -> dict[float, SurfacePose]:
+        """By stamp, s."""
+        return {pose.stamp: pose for pose in map(pose_from_message, self.messages["/pose"])}
+
+
+def _read_run(record: File, *topics: str) -> _RecordedRun:
+    run = _RecordedRun({}, {topic: [] for topic in topics})
+    for part in walk(record):
+        if isinstance(part, Damage):
+            run.damage = part.text
+        elif isinstance(part, AttachedFile):
+            run.texts[part.name] = part.data.decode("utf-8", "replace")
+        elif isinstance(part, ChunkMessages):
+            for stored in part.messages:
+                if stored.topic in run.messages:
+                    run.messages[stored.topic].append(parse(record, stored))
+    return run
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +93,15 @@ class ReplayedTick:
 
 def replay_run(record: File) -> Iterator[ReplayedTick]:
     """Every tick of a recorded run in which planner and guard were asked, decided anew from the recorded poses."""
-    run = _read_motion(record)
-    return _replay_ticks(run, *inputs_from_texts(run.texts, record), record)
+    run = _read_run(record, "/tick", "/pose")
+    return _replay_ticks(run.messages["/tick"], run.poses, *inputs_from_texts(run.texts, record), record)
 
 
-def _replay_ticks(run: _RecordedMotion, path: Path, profile: ArmProfile, record: File) -> Iterator[ReplayedTick]:
+def _replay_ticks(
+    ticks: list[Message], poses: dict[float, SurfacePose], path: Path, profile: ArmProfile, record: File
+) -> Iterator[ReplayedTick]:
     step: MotionStep | None = None
-    for tick in sorted(run.ticks, key=lambda tick: float(tick["stamp"])):
+    for tick in sorted(ticks, key=lambda tick: float(tick["stamp"])):
         if tick["begun"]:
             step = MotionStep(path, profile, float(tick["begun"][0]))
         if step is not None and tick.get("recalled"):
@@ -89,30 +109,13 @@ def _replay_ticks(run: _RecordedMotion, path: Path, profile: ArmProfile, record:
         if step is None or not tick["asked"]:
             continue
         stamp = tick["pose_stamp"]
-        if stamp and stamp[0] not in run.poses:
+        if stamp and stamp[0] not in poses:
             raise InputError(record, "/tick: pose_stamp", stamp[0], "a pose that is recorded")
         now = float(tick["stamp"])
         step.paused = bool(tick.get("paused"))
-        command = step(run.poses[stamp[0]] if stamp else None, now)
+        command = step(poses[stamp[0]] if stamp else None, now)
         frame = frame_from_command(command, profile.dialect)
         yield ReplayedTick(now, command, frame, bytes_from_message({"data": tick["frame"]}))
-
-
-def _read_motion(record: File) -> _RecordedMotion:
-    run = _RecordedMotion()
-    for part in walk(record):
-        if isinstance(part, Damage):
-            run.damage = part.text
-        elif isinstance(part, AttachedFile):
-            run.texts[part.name] = part.data.decode("utf-8", "replace")
-        elif isinstance(part, ChunkMessages):
-            for stored in part.messages:
-                if stored.topic == "/tick":
-                    run.ticks.append(parse(record, stored))
-                elif stored.topic == "/pose":
-                    pose = pose_from_message(parse(record, stored))
-                    run.poses[pose.stamp] = pose
-    return run
 
 
 def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
@@ -122,37 +125,33 @@ def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
     """
     if record.is_dir():
         raise InputError(record, "recording", "a session folder", RUN_REQUIRED)
-    run = _read_motion(record)
+    run = _read_run(record, "/tick", "/pose")
+    poses = run.poses
     if PATH_ATTACHMENT not in run.texts:
         raise InputError(record, "recording", "no path", RUN_REQUIRED)
     path, profile = inputs_from_texts(run.texts, record)
     prepare_out(out, force)
     frames = other = 0
     with CommandWriter(out) as writer:
-        for tick in _replay_ticks(run, path, profile, record):
+        for tick in _replay_ticks(run.messages["/tick"], poses, path, profile, record):
             writer.write(tick.command, tick.frame)
             frames += 1
             other += tick.frame != tick.recorded
     return ReplayCount(frames, other, run.damage)
 
 
-BLOCK_SECONDS = 10.0  # s of rows judged at once
-TRUTH_TOPICS = ("/tick", "/move", "/hold", "/truth")
+BLOCK_SECONDS = 10.0  # s of rows compared at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NozzleErrors:
-    """distance: (N,) mm, nozzle to its place, of each extruding millisecond. duty: share of the time due in which
-    material left; NaN where none was due. printed: (2,) the first and last place extruded, counted in checkpoints.
-    deepest: s of motion that the arm ever had queued. held_up: s that a busy machine kept the virtual arm from its line
-    at most.
-    """
+    """The true error at the nozzle of a run before pre-rendered pictures."""
 
-    distance: Array
-    duty: float
-    printed_range: tuple[float, float]
-    deepest: float
-    held_up: float
+    distance: Array  # (N,) mm, nozzle to its place, of each extruding millisecond
+    duty: float  # share of the time due in which material left; NaN where none was due
+    printed_range: tuple[float, float]  # first and last place extruded, in checkpoints
+    deepest: float  # s of motion that the arm ever had queued
+    held_up: float  # s that a busy machine kept the virtual arm from its line at most
 
     def figure(self, share: float) -> float:
         """Error, mm, that `share` percent do not exceed; NaN of none."""
@@ -180,52 +179,47 @@ class _TrueMotion:
 
 def nozzle_errors(record: File, path: File, arm: File) -> NozzleErrors:
     """path: checkpoints in the true surface frame; arm: the arm as it truly stands. InputError without ticks."""
-    found = _read(record)
-    if not found["/tick"] or len(found["/truth"]) < 2:
+    run = _read_run(record, "/tick", "/move", "/truth")
+    if not run.messages["/tick"] or len(run.messages["/truth"]) < 2:
         raise InputError(record, "recording", "no ticks or no truth", "a run before pre-rendered pictures")
-    true, profile = read_arm(arm), used_inputs(record)[1]  # ticks and lag are as the run took them
-    truth = Truth(np.eye(4), _TrueMotion(_increasing_stamps([row_from_message(m) for m in found["/truth"]])))
-    ledger = TruthLog(read_path(path), true.arm, truth, profile.tick, profile.lag)
-    commands = _commands(found)
+    true, profile = read_arm(arm), inputs_from_texts(run.texts, record)[1]  # ticks and lag are as the run took them
+    rows = [row_from_message(message) for message in run.messages["/truth"]]
+    truth = Truth(np.eye(4), _TrueMotion(_increasing_stamps(rows)))
+    truth_log = TruthLog(read_path(path), true.arm, truth, profile.tick, profile.lag)
+    commands = _commands(run)
     for command, progress in commands:
-        ledger.write(command, progress)
+        truth_log.write(command, progress)
     with np.load(RunFiles(record).executed) as executed:
         stamps, axes = executed["stamps"], executed["axes"]
         deepest, held_up = float(executed["deepest"]), float(executed["held_up"])
-    first, last = commands[0][0].stamp, min(ledger.known_until, float(stamps[-1]))
+    first, last = commands[0][0].stamp, min(truth_log.known_until, float(stamps[-1]))
 
-    def at(times: Array) -> Array:
+    def axes_at(times: Array) -> Array:
         return np.stack([np.interp(times, stamps, axes[:, i]) for i in range(6)], axis=1)
 
     errors, extruding, due = list[Array](), 0, 0
-    finished = _finish_instant(commands)
+    printed = PrintPhase.LEAVING, PrintPhase.FINISHED  # nothing is due any more
+    finished = min((command.stamp for command, progress in commands if progress.phase in printed), default=np.inf)
     for start in np.arange(first, last, BLOCK_SECONDS):
-        log = ledger.rows(row_instants(start, min(start + BLOCK_SECONDS, last)), at)
-        told = log.extrude & np.isfinite(log.place)
-        off = log.base_from_nozzle[told, :3, 3] - log.base_from_target[told, :3, 3]
+        log = truth_log.rows(row_instants(start, min(start + BLOCK_SECONDS, last)), axes_at)
+        known = log.extrude & np.isfinite(log.place)
+        off = log.base_from_nozzle[known, :3, 3] - log.base_from_target[known, :3, 3]
         errors.append(np.linalg.norm(off, axis=1))
         extruding += int(log.extrude.sum())
         due += int((np.isfinite(log.place) & (log.place > 0) & (log.stamps < finished)).sum())
     duty = extruding / due if due else float("nan")
-    return NozzleErrors(np.concatenate(errors), duty, printed_range(record), deepest, held_up)
+    return NozzleErrors(np.concatenate(errors), duty, _printed_range(run), deepest, held_up)
 
 
 def printed_range(record: File) -> tuple[float, float]:
     """First and last place, counted in checkpoints, at which a run extruded; NaN where it did not."""
-    found = _read(record)
-    extruding = {m["stamp"] for m in found["/move"] if m["extrude"]}
-    places = [float(m["fraction"]) for m in found["/tick"] if m["stamp"] in extruding]
+    return _printed_range(_read_run(record, "/tick", "/move"))
+
+
+def _printed_range(run: _RecordedRun) -> tuple[float, float]:
+    extruding = {m["stamp"] for m in run.messages["/move"] if m["extrude"]}
+    places = [float(m["fraction"]) for m in run.messages["/tick"] if m["stamp"] in extruding]
     return (min(places), max(places)) if places else (float("nan"), float("nan"))
-
-
-def _read(record: File) -> dict[str, list[Message]]:
-    found: dict[str, list[Message]] = {topic: [] for topic in TRUTH_TOPICS}
-    for part in walk(record):
-        if isinstance(part, ChunkMessages):
-            for stored in part.messages:
-                if stored.topic in found:
-                    found[stored.topic].append(parse(record, stored))
-    return found
 
 
 def _increasing_stamps(rows: list[list[float]]) -> Array:
@@ -233,27 +227,13 @@ def _increasing_stamps(rows: list[list[float]]) -> Array:
     return np.asarray(unique[np.concatenate([[True], np.diff(unique[:, 0]) > 0])])
 
 
-def _commands(found: dict[str, list[Message]]) -> list[tuple[Command, PrintProgress]]:
-    """What was commanded, in order, with the place on the path."""
-    ticks = {m["stamp"]: m for m in found["/tick"]}
-    moves = {m["stamp"]: m for m in found["/move"]}
-    return list(_commands_in_order(dict(sorted(ticks.items())), moves))
-
-
-def _commands_in_order(
-    ticks: dict[float, Message], moves: dict[float, Message]
-) -> Iterator[tuple[Command, PrintProgress]]:
-    for stamp, tick in ticks.items():
-        move, fraction, phase = moves.get(stamp), float(tick["fraction"]), PrintPhase(tick["phase"])
-        command: Command = Hold(stamp, 0.001, "held")
-        if move is not None:
-            command = move_from_message(move)
-        yield command, PrintProgress(phase, 0, 0, fraction, 0.0, fraction)
-
-
-def _finish_instant(commands: list[tuple[Command, PrintProgress]]) -> float:
-    """The instant, s, from which nothing is due any more."""
-    ends = [
-        command.stamp for command, progress in commands if progress.phase in (PrintPhase.LEAVING, PrintPhase.FINISHED)
-    ]
-    return min(ends, default=float("inf"))
+def _commands(run: _RecordedRun) -> list[tuple[Command, PrintProgress]]:
+    """Commands in order, with the place on the path."""
+    ticks = {m["stamp"]: m for m in run.messages["/tick"]}
+    moves = {m["stamp"]: move_from_message(m) for m in run.messages["/move"]}
+    commands: list[tuple[Command, PrintProgress]] = []
+    for stamp, tick in sorted(ticks.items()):
+        fraction = float(tick["fraction"])
+        progress = PrintProgress(PrintPhase(tick["phase"]), 0, 0, fraction, 0.0, fraction)
+        commands.append((moves.get(stamp, Hold(stamp, 0.001, "held")), progress))
+    return commands

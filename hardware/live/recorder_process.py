@@ -31,8 +31,6 @@ from hardware.live.records import (
     LatencyEntry,
     PoseEntry,
     RecorderReport,
-    RigEntry,
-    RoiEntry,
     ScanEntry,
     SetEntry,
     UsedEntry,
@@ -43,6 +41,7 @@ from hardware.motion.loop import RecordedTick
 from hardware.process.clock import ProcessorClock, WallClock
 from hardware.process.shared_latest import SharedLatest
 from hardware.process.system import set_up_process
+from perception.frames import Roi
 
 if TYPE_CHECKING:
     from hardware.recording.recorder import Recorder
@@ -227,8 +226,8 @@ class _EntryWriter:
         return sender.crowded
 
     def _write(self, entry: Entry) -> None:
-        if isinstance(entry, RigEntry):
-            self._open(entry.rig)
+        if isinstance(entry, Rig):
+            self._open(entry)
         elif self._recorder is None:
             self._early.append(entry)
         else:
@@ -276,8 +275,8 @@ def _write_entry(recorder: Recorder, entry: Entry) -> None:
         recorder.attach(entry.name, entry.text.encode())
     elif isinstance(entry, ScanEntry):
         recorder.surface(entry.file)
-    elif isinstance(entry, RoiEntry):
-        recorder.write(entry.roi)
+    elif isinstance(entry, Roi):
+        recorder.write(entry)
 
 
 def _write_pose(recorder: Recorder, entry: PoseEntry) -> None:

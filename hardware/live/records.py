@@ -23,7 +23,7 @@ from hardware.live.frame_source import Encoded, FrameRing
 from hardware.motion.loop import RecordedTick, Tick
 from hardware.operator.shared_state import OperatorLink, RequestLine
 from hardware.process.shared_latest import SharedLatest
-from hardware.process.ticks import LATENESS_BIN, LatenessHistogram
+from hardware.process.ticks import Histogram
 from perception.frames import Frame, PrintHead, Roi
 from planning.path import Path
 from planning.progress import PrintProgress
@@ -120,25 +120,11 @@ class RecorderReport:
 # -- what is recorded
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RigEntry:
-    """The cameras; nothing is written before they are known."""
-
-    rig: Rig
-
-
 @dataclass(frozen=True, slots=True)
 class ScanEntry:
     """The file of the scan that the tracker registers to."""
 
     file: File
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RoiEntry:
-    """Where the surface was looked for."""
-
-    roi: Roi
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,21 +184,19 @@ class UsedEntry:
     text: str
 
 
-Entry = (
-    RigEntry | ScanEntry | RoiEntry | UsedEntry
-    | SetEntry | PoseEntry | RecordedTick | WireEntry | EventEntry | LatencyEntry
-)  # fmt: skip
+# the rig comes first: nothing is written before the cameras are known
+Entry = Rig | ScanEntry | Roi | UsedEntry | SetEntry | PoseEntry | RecordedTick | WireEntry | EventEntry | LatencyEntry
 
 
 class StageHistograms:
     """How long each stage takes, as a histogram each: a run of any length costs the same memory."""
 
     def __init__(self) -> None:
-        self._stages: dict[str, LatenessHistogram] = {}
+        self._stages: dict[str, Histogram] = {}
 
     def add(self, stage: str, seconds: float) -> None:
         """Count one duration, s, of a stage."""
-        self._stages.setdefault(stage, LatenessHistogram()).add(seconds)
+        self._stages.setdefault(stage, Histogram()).add(seconds)
 
     def timings(self) -> tuple[StageTiming, ...]:
         """The figures of each stage."""
@@ -223,7 +207,7 @@ class StageHistograms:
     def entries(self, stamp: float) -> list[LatencyEntry]:
         """The histograms as they are at `stamp`, s, for the recording."""
         return [
-            LatencyEntry(stamp, name, LATENESS_BIN, np.array(h.counts, np.int64), h.most)
+            LatencyEntry(stamp, name, h.width, h.counts.copy(), h.most)
             for name, h in self._stages.items()
         ]
 

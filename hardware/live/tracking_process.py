@@ -31,8 +31,6 @@ from hardware.live.records import (
     LiveMotionReport,
     PoseEntry,
     PoseHandover,
-    RigEntry,
-    RoiEntry,
     ScanEntry,
     SetEntry,
     StageHistograms,
@@ -215,11 +213,11 @@ class _TrackingLoop:
 
     def _record_known(self, rois: Sequence[Roi]) -> None:
         """Record what is known before the first picture."""
-        self._sender.put(RigEntry(self._known.rig))
+        self._sender.put(self._known.rig)
         if self._known.surface is not None:
             self._sender.put(ScanEntry(self._known.surface))
         for roi in rois:
-            self._sender.put(RoiEntry(replace(roi, stamp=self.report.stamp)))
+            self._sender.put(replace(roi, stamp=self.report.stamp))
 
     def __call__(self) -> None:
         settle_memory()

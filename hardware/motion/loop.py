@@ -23,7 +23,7 @@ from hardware.arm.jog import RecalledMoves
 from hardware.arm.link import Arm, shut_down
 from hardware.arm.profile import ArmProfile
 from hardware.process.clock import Clock
-from hardware.process.ticks import LatenessHistogram, TickSchedule
+from hardware.process.ticks import Histogram, TickSchedule
 from perception.frames import PrintHead
 from planning.command import Command, Hold, Move
 from planning.progress import PrintPhase
@@ -98,7 +98,7 @@ class MotionLoop:
         one they run freely, the profile's tick and the link's ease apart.
         """
         self.motion, self.arm = motion, arm
-        self.lateness = LatenessHistogram()
+        self.lateness = Histogram()
         self.skipped = 0
         self._clock, self._pose, self._orders, self._report, self._homed = clock, pose, orders, report, homed
         profile, settings = arm.profile, arm.settings

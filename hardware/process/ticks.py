@@ -116,34 +116,29 @@ class PoseLockedSchedule(TickSchedule):
         return self.tick * (1 + min(max(TICK_SHORTENING + PHASE_GAIN * ahead, low), high))
 
 
-LATENESS_BIN = 1e-4  # s
-_BINS = 1000  # a tenth of a second; what is later counts as that
+LATENESS_BIN, LATENESS_BINS = 1e-4, 1000  # s of a bin, and how many: a tenth of a second
 
 
-class LatenessHistogram:
-    """Counts of lateness. most: s, the largest."""
+class Histogram:
+    """Counts of values from 0 on, of lateness, s, unless said otherwise. most: the largest value."""
 
-    def __init__(self) -> None:
-        self._counts = np.zeros(_BINS, np.int64)
+    def __init__(self, width: float = LATENESS_BIN, bins: int = LATENESS_BINS) -> None:
+        """width: of a bin; the last one counts all that is larger."""
+        self.width, self.counts = width, np.zeros(bins, np.int64)
         self.count, self.most = 0, 0.0
 
-    def add(self, late: float) -> None:
-        """One tick was `late` s behind its instant."""
-        self._counts[min(int(max(late, 0.0) / LATENESS_BIN), _BINS - 1)] += 1
+    def add(self, value: float) -> None:
+        """Count a value."""
+        self.counts[min(int(max(value, 0.0) / self.width), len(self.counts) - 1)] += 1
         self.count += 1
-        self.most = max(self.most, late)
-
-    @property
-    def counts(self) -> tuple[int, ...]:
-        """How many there were in each bin of BIN s; the last one holds all that were later."""
-        return tuple(self._counts.tolist())
+        self.most = max(self.most, value)
 
     def percentile(self, share: float) -> float:
-        """Lateness, s, that `share` percent of the ticks do not exceed, rounded up to a bin; NaN of none."""
+        """What `share` percent of the values do not exceed, rounded up to a bin; NaN of none."""
         if not self.count:
             return math.nan
-        wanted = max(share / 100 * self.count, 1.0)
-        return (int(np.searchsorted(np.cumsum(self._counts), wanted)) + 1) * LATENESS_BIN
+        rank = max(share / 100 * self.count, 1.0)
+        return (int(np.searchsorted(np.cumsum(self.counts), rank)) + 1) * self.width
 
 
 PROBE_CALLS = 20  # of each kind in a piece of work: a quarter of a millisecond, a fraction of a tick of the motion
