@@ -12,30 +12,25 @@ from estimation.se3 import Array
 from hardware.arm.device import ArmState, ArmStatus
 from hardware.arm.link import Arm, shut_down
 from hardware.arm.port import Opener
-from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.profile import AXIS_LETTERS, DISPLAY_UNITS, ArmProfile, LinkSettings
 from hardware.process import checks
 from hardware.process.clock import Clock
 
-AXIS_NAMES = "XYZABC"
 LISTEN_TIME = 1.0  # s before a move, in which an arm that answers has told where it stands ten times
 REPORT_PERIOD = 0.5  # s between lines
 SETTLE_TIME = 1.0  # s after a move, in which its end is answered
-_UNITS = np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmRequest:
-    """What is asked of an arm. seconds: to listen, infinite until interrupted. home: go there. jog: (6,) to go by, mm
-    and rad. origin: (3,) mm, to be its work origin, before a move. stands: (6,) where it stands, for one that does not
-    answer. All that is sent needs `confirmed`.
-    """
+    """A request to an arm from the command line."""
 
-    seconds: float = 5.0
-    home: bool = False
-    jog: Array | None = None
-    origin: Array | None = None
-    stands: Array | None = None
-    confirmed: bool = False
+    seconds: float = 5.0  # to listen, infinite until interrupted
+    home: bool = False  # go there
+    jog: Array | None = None  # (6,) mm and rad, to go by
+    origin: Array | None = None  # (3,) mm, its work origin, set before a move
+    stands: Array | None = None  # (6,) mm and rad, where it stands, for one that does not answer
+    confirmed: bool = False  # by the operator: without it nothing is sent
 
     @property
     def moves(self) -> bool:
@@ -102,17 +97,17 @@ def jog_from_text(texts: list[str]) -> Array:
             value = float(amount)
         except ValueError:
             value = float("nan")
-        if axis not in AXIS_NAMES or len(axis) != 1 or not np.isfinite(value):
+        if axis not in AXIS_LETTERS or len(axis) != 1 or not np.isfinite(value):
             raise InputError("command line", "--jog", text, "such as X=+5 (mm) or B=-2.5 (degrees)")
-        jog[AXIS_NAMES.index(axis)] = value
-    return np.asarray(jog / _UNITS)
+        jog[AXIS_LETTERS.index(axis)] = value
+    return np.asarray(jog / DISPLAY_UNITS)
 
 
 def axes_from_text(text: str, home: Array) -> Array:
     """Axes (6,), mm and rad, from "home" or six numbers X,Y,Z,A,B,C in mm and degrees."""
     if text == "home":
         return home
-    return np.asarray(_numbers("--stands", text, 6, "mm and degrees, or home") / _UNITS)
+    return np.asarray(_numbers("--stands", text, 6, "mm and degrees, or home") / DISPLAY_UNITS)
 
 
 def origin_from_text(text: str) -> Array:
@@ -133,7 +128,7 @@ class _Console:
 
     def __init__(self, arm: Arm, clock: Clock, say: Callable[[str], None], start: float) -> None:
         self.arm, self.clock, self._say = arm, clock, say
-        self._start = self._said = start
+        self._start = self._reported = start
 
     def watch(self, seconds: float, until: Callable[[float], bool] = lambda now: False) -> None:
         """Poll for so long, or until something is so."""
@@ -142,8 +137,8 @@ class _Console:
             self.arm.poll(now)
             for event in self.arm.events():
                 self._say(f"{event.stamp - self._start:.3f} s: {event.text}")
-            if now >= self._said + REPORT_PERIOD:
-                self._said = now
+            if now >= self._reported + REPORT_PERIOD:
+                self._reported = now
                 self._say(_line(self.arm.status(now)))
             self.clock.wait_until(now + self.arm.settings.poll)
 
@@ -176,4 +171,4 @@ def _line(status: ArmStatus) -> str:
 
 
 def _shown(axes: Array) -> str:
-    return " ".join(f"{name}{value:.2f}" for name, value in zip(AXIS_NAMES, axes * _UNITS, strict=True))
+    return " ".join(f"{name}{value:.2f}" for name, value in zip(AXIS_LETTERS, axes * DISPLAY_UNITS, strict=True))

@@ -22,6 +22,8 @@ from estimation.se3 import Array
 from hardware.arm.feedback import REST_TOLERANCE, ArmFeedback, near
 from hardware.arm.protocol import G1, Pause
 
+PLACE, ANGLES = slice(0, 3), slice(3, 6)  # of axes (6,)
+
 
 def travel_steps(start: Array, goal: Array, speed: float, turning: float, tick: float) -> Iterator[G1]:
     """Steps of a tick at most: to `start` (6,), mm and rad, straight to the place of `goal` (6,), then its angles.
@@ -29,8 +31,9 @@ def travel_steps(start: Array, goal: Array, speed: float, turning: float, tick: 
     speed: mm/s. turning: rad/s. The last step ends at the goal exactly.
     """
     yield G1(start, speed)
-    yield from _moved(start, goal, speed, tick)
-    yield from _turned(np.concatenate([goal[:3], start[3:]]), goal, turning, tick)
+    yield from _steps(start, goal, PLACE, speed * tick, speed)
+    turned = np.concatenate([goal[:3], start[3:]])
+    yield from _steps(turned, goal, ANGLES, turning * tick, float(np.rad2deg(turning)))  # on the spot: degrees/s
 
 
 def lifted_travel_steps(start: Array, goal: Array, speed: float, turning: float, tick: float) -> Iterator[G1]:
@@ -39,31 +42,23 @@ def lifted_travel_steps(start: Array, goal: Array, speed: float, turning: float,
     above = np.array([*goal[:2], height, *goal[3:]])
     lift = np.array([*start[:2], height, *start[3:]])
     yield G1(start, speed)
-    yield from _moved(start, lift, speed, tick)
+    yield from _steps(start, lift, PLACE, speed * tick, speed)
     yield from travel_steps(lift, above, speed, turning, tick)
-    yield from _moved(above, goal, speed, tick)
+    yield from _steps(above, goal, PLACE, speed * tick, speed)
 
 
-def _moved(start: Array, goal: Array, speed: float, tick: float) -> Iterator[G1]:
-    """Steps to the place of `goal`, with the angles of `start`."""
-    way = goal[:3] - start[:3]
-    count = int(np.ceil(np.linalg.norm(way) / (speed * tick) - 1e-9))
+def _steps(start: Array, goal: Array, part: slice, longest: float, feed: float) -> Iterator[G1]:
+    """Even steps of `longest`, mm or rad, at most, from `start` (6,) until that part of the axes is that of `goal`."""
+    way = goal[part] - start[part]
+    count = int(np.ceil(np.linalg.norm(way) / longest - 1e-9))
     for k in range(1, count + 1):
-        place = goal[:3] if k == count else start[:3] + k / count * way
-        yield G1(np.concatenate([place, start[3:]]), speed)
-
-
-def _turned(start: Array, goal: Array, turning: float, tick: float) -> Iterator[G1]:
-    """Steps to the angles of `goal`, on the spot; their feed is in degrees/s."""
-    way = goal[3:] - start[3:]
-    count = int(np.ceil(np.linalg.norm(way) / (turning * tick) - 1e-9))
-    for k in range(1, count + 1):
-        angles = goal[3:] if k == count else start[3:] + k / count * way
-        yield G1(np.concatenate([goal[:3], angles]), np.rad2deg(turning))
+        axes = start.copy()
+        axes[part] = goal[part] if k == count else start[part] + k / count * way
+        yield G1(axes, feed)
 
 
 class OwnMoves:
-    """What the link moves by itself. step: the next one, None without. last: the step that was the last move sent."""
+    """The link's own moves. step: the next one, None without. last: the step that was the last move sent."""
 
     def __init__(self, speed: float, turning: float, tick: float) -> None:
         """speed: mm/s. turning: rad/s. tick: s of a step at most."""
@@ -77,7 +72,7 @@ class OwnMoves:
         self._begin(chain((lifted_travel_steps if lift else travel_steps)(start, goal, *self._rates), then))
 
     def take(self) -> G1:
-        """The next step, once."""
+        """The next step, which is then done with."""
         step = self.step
         assert step is not None
         self.step, self.last = next(self._steps, None), step

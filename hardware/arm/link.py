@@ -214,19 +214,11 @@ class Arm(ArmDevice):
 
     def status(self, now: float) -> ArmStatus:
         """All that is known."""
-        queued = 0 if self._queue is None else self._queue.frames(now)
-        feedback = self._feedback
-        return ArmStatus(
-            *(
-                now,
-                self.state,
-                self.reason,
-                self.reckoned(now),
-                feedback.axes(now),
-                *(feedback.off, feedback.lag, feedback.rate),
-            ),
-            *(self.in_flight(now), queued, self.frames, feedback.count, self.strays),
-        )
+        queued, feedback = 0 if self._queue is None else self._queue.frames(now), self._feedback
+        answers = feedback.axes(now), feedback.off, feedback.lag, feedback.rate
+        counts = queued, self.frames, feedback.count, self.strays
+        known = self.state, self.reason, self.reckoned(now)
+        return ArmStatus(now, *known, *answers, self.in_flight(now), *counts)
 
     # -- own moves, supervision, stops
 

@@ -90,12 +90,12 @@ def _lives(process: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True
+        pass
     return True
 
 
 LOOP_WRITE_TIMEOUT = 0.1  # s of a write, where it can wait at all: loop:// is gone after that
-_CHUNK = 4096  # bytes: two seconds of answers
+READ_BYTES = 4096  # at once: two seconds of answers
 
 
 class UnpluggedError(StillbedError):
@@ -163,7 +163,7 @@ class SerialPort:
                 return bytes(self._serial.read(self._serial.in_waiting))
             if self._device and not self._asked(termios.FIONREAD):
                 return b""  # reading would say the same of a device that is gone
-            data = os.read(self._file, _CHUNK)
+            data = os.read(self._file, READ_BYTES)
         except BlockingIOError:
             return b""
         except (serial.SerialException, OSError) as error:

@@ -18,6 +18,7 @@ from planning.robot.kinematics import JointModel, SimpleArm, joints_from_axes, n
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
 MAX_LAG = 1.0  # s: nothing moving can be followed that far ahead
+AXIS_LETTERS = "XYZABC"
 DISPLAY_UNITS = np.array([1.0, 1, 1, *np.rad2deg([1.0, 1, 1])])  # of axes, mm and rad
 ARM_FROM_BENCH = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # arm_from_surface under the thesis's home, z up
 

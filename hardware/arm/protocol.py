@@ -38,18 +38,12 @@ ANGLE_JOINTS = ("J4", "J5", "J6")  # the machine axes A B C
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """What thesis and public drivers of the arm do not agree on.
+    """Where thesis and public drivers of the arm do not agree."""
 
-    motion_byte: byte 2 of a G1 frame; 1 in the thesis and one driver, 0 in another. slots: which joint stands in each
-    of the three angle slots; J4 J5 J6 in the thesis's table, J5 first in its appendix and in both drivers.
-    origin_scale: what a G54 frame multiplies mm by; 1 in the thesis, 10 in a driver. pwm: the number after the angles
-    of a G1 frame, whose use is not known; 0 in the thesis and one driver, 1500 in another.
-    """
-
-    motion_byte: int = 1
-    slots: tuple[str, str, str] = ANGLE_JOINTS
-    origin_scale: int = 1
-    pwm: float = 0.0
+    motion_byte: int = 1  # byte 2 of a G1 frame; 1 in the thesis and one driver, 0 in another
+    slots: tuple[str, str, str] = ANGLE_JOINTS  # the three angles; J5 first in the thesis's appendix and both drivers
+    origin_scale: int = 1  # what a G54 frame multiplies mm by; 1 in the thesis, 10 in a driver
+    pwm: float = 0.0  # after the angles of a G1 frame, its use not known; 0 in thesis and one driver, 1500 in another
 
     def __post_init__(self) -> None:
         if self.motion_byte not in (0, 1):
@@ -67,10 +61,10 @@ THESIS_DIALECT = Dialect()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class G1:
-    """Move in a straight line. axes: (6,) X Y Z A B C, mm and rad. feed: mm/s."""
+    """Move in a straight line."""
 
-    axes: Array
-    feed: float
+    axes: Array  # (6,) X Y Z A B C, mm and rad
+    feed: float  # mm/s
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +98,9 @@ class ControllerReset:
 
 @dataclass(frozen=True, slots=True)
 class Mode:
-    """Change to `mode`, 0 or 9; what these are, the public driver that sends them does not say."""
+    """Change to a mode."""
 
-    mode: int
+    mode: int  # 0 or 9; what these are, the public driver that sends them does not say
 
 
 Instruction = G1 | G4 | G54 | Pause | Reset | ControllerReset | Mode
@@ -132,11 +126,13 @@ def encode(instruction: Instruction, dialect: Dialect = THESIS_DIALECT) -> bytes
         angles = dict(zip(ANGLE_JOINTS, np.rad2deg(instruction.axes[3:]), strict=True))
         turns = (angles[joint] for joint in dialect.slots)
         body = _singles([*instruction.axes[:3], *turns, dialect.pwm, instruction.feed * 60], "G1")
-        _positive("G1", "feed", body[7], "mm/min")
+        if not body[7] > 0:
+            raise InputError("G1", "feed", body[7], "> 0 mm/min")
         return _G1.pack(_MOTION, b"1", dialect.motion_byte, *body, _MOTION_END)
     if isinstance(instruction, G4):
         body = _singles([instruction.duration * 1000], "G4")
-        _positive("G4", "pause", body[0], "ms")
+        if not body[0] > 0:
+            raise InputError("G4", "pause", body[0], "> 0 ms")
         return _G4.pack(_MOTION, b"6", 0, *body, _MOTION_END)
     if isinstance(instruction, G54):
         body = _singles([number * dialect.origin_scale for number in instruction.origin], "G54")
@@ -200,11 +196,6 @@ def _singles(numbers: list[float], where: str) -> list[float]:
             raise InputError(where, "parameter", number, "a finite number that binary32 can hold")
         singles.append(single)
     return singles
-
-
-def _positive(where: str, what: str, value: float, unit: str) -> None:
-    if not value > 0:
-        raise InputError(where, what, value, f"> 0 {unit}")
 
 
 Decoded = TypeVar("Decoded")

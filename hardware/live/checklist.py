@@ -10,7 +10,7 @@ from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm.device import ArmState
-from hardware.arm.profile import ArmProfile, placed
+from hardware.arm.profile import AXIS_LETTERS, ArmProfile, placed
 from hardware.live.records import LiveMotionReport, RecorderReport, TrackingReport
 from hardware.operator.view import Check, CheckVerdict
 from hardware.process.progress import count_text
@@ -18,7 +18,6 @@ from planning.limits import AXIS_MARGIN, JOINT_MARGIN
 from planning.path import Path
 from planning.robot.kinematics import axes_from_nozzle, joints_from_axes
 
-AXIS_LETTERS = "XYZABC"
 MAX_PICTURE_AGE = 1.0  # s: a camera whose pictures are older does not deliver any more
 PASS, FAIL, BUSY, WARN = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.BUSY, CheckVerdict.WARN
 

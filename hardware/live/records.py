@@ -206,10 +206,7 @@ class StageHistograms:
 
     def entries(self, stamp: float) -> list[LatencyEntry]:
         """The histograms as they are at `stamp`, s, for the recording."""
-        return [
-            LatencyEntry(stamp, name, h.width, h.counts.copy(), h.most)
-            for name, h in self._stages.items()
-        ]
+        return [LatencyEntry(stamp, name, h.width, h.counts.copy(), h.most) for name, h in self._stages.items()]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

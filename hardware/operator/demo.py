@@ -41,7 +41,7 @@ DEMO_IMAGE_SIZE = (640, 360)  # px
 BREATH_PERIOD = 4.0  # s
 WOUND_HALF_AXES = np.array([21.0, 14.0])  # mm, half axes
 SKIN_COLOUR, WOUND_COLOUR = np.array([150.0, 178.0, 216.0]), np.array([52.0, 44.0, 150.0])  # BGR
-DEMO_CHECKPOINTS = 700  # checkpoints
+DEMO_CHECKPOINTS = 700
 
 
 def demo_rig() -> Rig:
@@ -59,14 +59,8 @@ def demo_path() -> Path:
     poses[:, 2, 3] = surface_height(poses[:, 0, 3], poses[:, 1, 3]) + 0.3 + 0.3 * (share >= 0.5)
     layer = (share >= 0.5).astype(np.int64)
     extrude = np.r_[False, np.diff(layer) == 0]
-    return Path(
-        poses,
-        np.full(DEMO_CHECKPOINTS, 6.0),
-        np.zeros(DEMO_CHECKPOINTS, np.int64),
-        np.full(DEMO_CHECKPOINTS, 37.0),
-        layer,
-        extrude,
-    )
+    speed, temperature = np.full(DEMO_CHECKPOINTS, 6.0), np.full(DEMO_CHECKPOINTS, 37.0)
+    return Path(poses, speed, np.zeros(DEMO_CHECKPOINTS, np.int64), temperature, layer, extrude)
 
 
 def surface_height(x: Array, y: Array) -> Array:
@@ -80,9 +74,8 @@ def demo_scene(side: int = 24) -> PageScene:
     corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
     halves = [[corner, corner + 1, corner + side], [corner + 1, corner + side + 1, corner + side]]
     triangles = np.concatenate([np.stack(half, axis=1) for half in halves])
-    return scene_from(
-        demo_rig(), demo_path(), np.column_stack([x.ravel(), y.ravel(), surface_height(x, y).ravel()]), triangles
-    )
+    surface = np.column_stack([x.ravel(), y.ravel(), surface_height(x, y).ravel()])
+    return scene_from(demo_rig(), demo_path(), surface, triangles)
 
 
 def surface_at(now: float) -> Array:
@@ -116,14 +109,12 @@ class Painter:
 
     def shots(self, base_from_surface: Array) -> list[CameraShot]:
         """The pictures of all cameras, with outline and tracks."""
-        return [self._shot(camera, base_from_surface) for camera in self._rig.cameras]
-
-    def _shot(self, camera: Camera, base_from_surface: Array) -> CameraShot:
-        edge, marks = (
-            ideal_pixels(camera, se3.transform_points(base_from_surface, points))[0]
-            for points in (self._edge, self._marks)
-        )
-        return CameraShot(camera.name, self._image(camera, base_from_surface), (edge,), marks)
+        edge, marks = (se3.transform_points(base_from_surface, points) for points in (self._edge, self._marks))
+        shots = []
+        for camera in self._rig.cameras:
+            outline, tracks = ideal_pixels(camera, edge)[0], ideal_pixels(camera, marks)[0]
+            shots.append(CameraShot(camera.name, self._image(camera, base_from_surface), (outline,), tracks))
+        return shots
 
     def _image(self, camera: Camera, base_from_surface: Array) -> Image:
         surface_from_camera = se3.inverse(base_from_surface) @ camera.base_from_camera

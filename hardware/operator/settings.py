@@ -18,18 +18,13 @@ OWN_SITES = ("same-origin", "none")  # Sec-Fetch-Site of a request by the page i
 _TOKEN_LETTERS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_")
 
 
-def new_token() -> str:
-    """128 random bits that an address has to hold, in letters and digits of addresses."""
-    return secrets.token_urlsafe(16)
-
-
 @dataclass(frozen=True, slots=True)
 class OperatorSettings:
     """Where and to whom the page is served."""
 
     host: str = "127.0.0.1"  # address that is listened on
     port: int = 0  # 0: any that is free
-    token: str = field(default_factory=new_token, repr=False)  # that every request must know
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(16), repr=False)  # in every request
     elsewhere: bool = False  # serve other machines as well, with certificate and key
     certificate: Path | None = None  # PEM file
     key: Path | None = None  # PEM file
@@ -114,9 +109,8 @@ def allowed_hosts(settings: OperatorSettings, port: int) -> frozenset[str]:
 
 def response_headers(settings: OperatorSettings, port: int) -> dict[str, str]:
     """Headers of every response: nothing from outside, no frames, nothing cached, nothing sent to others."""
-    sockets = " ".join(
-        f"{settings.scheme.replace('http', 'ws')}://{host}" for host in sorted(allowed_hosts(settings, port))
-    )
+    scheme = settings.scheme.replace("http", "ws")
+    sockets = " ".join(f"{scheme}://{host}" for host in sorted(allowed_hosts(settings, port)))
     policy = (
         f"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self' {sockets}; "
         "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"

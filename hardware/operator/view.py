@@ -45,11 +45,7 @@ class Wish(StrEnum):
     END = "end"  # end the run, and write its report
 
 
-CALMING_WISHES = frozenset(
-    {Wish.STOP, Wish.PAUSE, Wish.END}
-)  # lead towards rest: right whatever the asking window showed
-
-
+CALMING_WISHES = frozenset({Wish.STOP, Wish.PAUSE, Wish.END})  # lead towards rest: right whatever the window showed
 ACTIVE_STAGES = (RunStage.APPROACH, RunStage.PRINT, RunStage.HOMING, RunStage.PAUSED)  # the arm may move, or is armed
 STAGE_OFFERS = {
     RunStage.CHECK: (Wish.END,),
@@ -114,118 +110,96 @@ class Activity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One line of the check table. found: in words; remedy: what to do, "" where nothing is to be done."""
+    """One line of the check table."""
 
     name: str
     verdict: CheckVerdict
-    found: str = ""
-    remedy: str = ""
+    found: str = ""  # the result in words
+    remedy: str = ""  # what to do, "" where nothing is to be done
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingView:
-    """The estimate, as it is shown.
-
-    reason: why the state is what it is. age: s, of the pose. sigma: mm, of the position along its worst direction.
-    base_from_surface: (4, 4) mm. covariance: (3, 3) mm^2 of the position, in the surface frame. tracks: in use.
-    """
+    """The estimate, as it is shown."""
 
     state: TrackState
-    reason: str
-    age: float
-    sigma: float
-    base_from_surface: Array
-    covariance: Array
-    tracks: int = 0
+    reason: str  # of the state
+    age: float  # s, of the pose
+    sigma: float  # mm, of the position along its worst direction
+    base_from_surface: Array  # (4, 4) mm
+    covariance: Array  # (3, 3) mm^2, of the position in the surface frame
+    tracks: int = 0  # in use
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionView:
-    """What the arm does, and why.
-
-    error: mm, predicted at the nozzle when it will be there; limit: mm, beyond which it
-    does not extrude. true_error: mm, where it is known because the world is simulated. in_flight: s of motion that is
-    under way in the arm; most_in_flight: s, that it may be. base_from_nozzle: (4, 4) mm, z from the tip into the tool.
-    arm: its state in words. speed: mm/s of the nozzle over the surface.
-    """
+    """What the arm does, and why."""
 
     activity: Activity
-    reason: str = ""
-    error: float = nan
-    limit: float = nan
-    true_error: float = nan
-    in_flight: float = nan
-    most_in_flight: float = nan
-    base_from_nozzle: Array | None = None
-    arm: str = ""
-    speed: float = nan
+    reason: str = ""  # why the nozzle is held
+    error: float = nan  # mm, predicted at the nozzle when it will be there
+    limit: float = nan  # mm of that, beyond which nothing is extruded
+    true_error: float = nan  # mm, known in a simulated world
+    in_flight: float = nan  # s of motion under way in the arm
+    most_in_flight: float = nan  # s, its limit
+    base_from_nozzle: Array | None = None  # (4, 4) mm, z from the tip into the tool
+    arm: str = ""  # its state in words
+    speed: float = nan  # mm/s of the nozzle over the surface
 
 
 @dataclass(frozen=True, slots=True)
 class ProgressView:
-    """How far the print is.
+    """How far the print is."""
 
-    fraction: place counted in checkpoints, of `total` of them. share: 0 to 1, of the time or
-    of the length. left: s until it is done if nothing holds it. duty: 0 to 1, share of the time since the start in
-    which it was not held. layer, layers: counted from 1, 0 where there are none.
-    """
-
-    fraction: float
-    total: int
-    share: float
-    left: float = nan
-    duty: float = nan
-    layer: int = 0
+    fraction: float  # place, in checkpoints
+    total: int  # checkpoints
+    share: float  # 0 to 1, of the time or of the length
+    left: float = nan  # s until it is done if nothing holds it
+    duty: float = nan  # 0 to 1, share of the time since the start in which it was not held
+    layer: int = 0  # from 1; 0 where there are none
     layers: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class LatencyView:
-    """From the newest image handed over to the bytes on the wire: median, 99 % and limit, s."""
+    """From the newest image handed over to the bytes on the wire, s."""
 
     median: float
-    high: float
-    limit: float = nan
+    high: float  # 99 %
+    limit: float = nan  # of that
 
 
 @dataclass(frozen=True, slots=True)
 class CameraView:
-    """How one camera fares. rate: pictures per second that arrive. tracks: in use. words: what is wrong, or ""."""
+    """The state of one camera."""
 
     name: str
     verdict: CheckVerdict
-    rate: float = nan
-    tracks: int = 0
-    words: str = ""
+    rate: float = nan  # pictures per second that arrive
+    tracks: int = 0  # in use
+    words: str = ""  # what is wrong, or ""
 
 
 @dataclass(frozen=True, slots=True)
 class RequestAnswer:
-    """What became of a request. number: its own. words: why it was not followed, or what it led to."""
+    """What became of a request."""
 
-    number: int
+    number: int  # of the request
     wish: Wish
     followed: bool
-    words: str = ""
+    words: str = ""  # why it was not followed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OperatorView:
-    """All that the page shows, but for pictures and scene.
+    """All that the page shows, but for pictures and scene."""
 
-    stamp: s, on any clock that never goes back; a view that is not newer than the last one counts as none. turn: goes
-    up whenever stage or question changes; a request tells the turn it was asked under. question: what the operator is
-    asked or told now, in a sentence. reason: why the stage is what it is. offers: what would be followed now, but for
-    Wish.STOP, which always is. notes: what one should know all the time, such as "dry run" or "simulated". events: the
-    last ones, newest last.
-    """
-
-    stamp: float
-    turn: int
+    stamp: float  # s, on any clock that never goes back; a view that is not newer than the last one counts as none
+    turn: int  # goes up whenever stage or question changes; a request tells the turn it was asked under
     stage: RunStage
-    question: str = ""
-    reason: str = ""
-    offers: tuple[Wish, ...] = ()
+    question: str = ""  # what the operator is asked or told now, in a sentence
+    reason: str = ""  # of the stage
+    offers: tuple[Wish, ...] = ()  # what would be followed now, but for Wish.STOP, which always is
     checks: tuple[Check, ...] = ()
     tracking: TrackingView | None = None
     motion: MotionView | None = None
@@ -233,8 +207,8 @@ class OperatorView:
     latency: LatencyView | None = None
     cameras: tuple[CameraView, ...] = ()
     answer: RequestAnswer | None = None
-    notes: tuple[str, ...] = ()
-    events: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what one should know all the time, such as "dry run" or "simulated"
+    events: tuple[str, ...] = ()  # the last ones, newest last
 
 
 def tracking_from_pose(pose: SurfacePose, now: float, tracks: int = 0) -> TrackingView:
@@ -255,34 +229,27 @@ class WavingStage(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class WavingCamera:
-    """What one camera has seen of the board.
-
-    size: (W, H) px of its picture. corners: in the newest one. parts: of the picture, row by row, 0 to 1 of the
-    corners that each should have. tilts: 0 to 1 of the views that should be tilted so: left, right, top, bottom
-    nearer. depth: 0 to 1 of how much nearer than the far views the near ones should be.
-    """
+    """One camera's views of the board so far."""
 
     name: str
-    size: tuple[int, int]
-    corners: int
-    parts: tuple[tuple[float, ...], ...]
-    tilts: tuple[float, ...]
-    depth: float
+    size: tuple[int, int]  # (W, H) px of its picture
+    corners: int  # in the newest picture
+    parts: tuple[tuple[float, ...], ...]  # of the picture, row by row: 0 to 1 of the corners that each should have
+    tilts: tuple[float, ...]  # left, right, top, bottom nearer: 0 to 1 of the views that should be tilted so
+    depth: float  # 0 to 1 of how much nearer than the far views the near ones should be
 
 
 @dataclass(frozen=True, slots=True)
 class WavingView:
-    """The calibration now. stamp: s. hints: what to do next, the most needed first. together: 0 to 1 of the frame sets
-    in which two cameras should have seen the board. looked: frame sets looked at. words: what came of it.
-    """
+    """The state of a calibration."""
 
-    stamp: float
+    stamp: float  # s
     turn: int
     stage: WavingStage
-    hints: tuple[str, ...] = ()
+    hints: tuple[str, ...] = ()  # what to do next, the most needed first
     cameras: tuple[WavingCamera, ...] = ()
-    together: float = 0.0
-    looked: int = 0
-    words: tuple[str, ...] = ()
+    together: float = 0.0  # 0 to 1 of the frame sets in which two cameras should have seen the board
+    looked: int = 0  # frame sets looked at
+    words: tuple[str, ...] = ()  # the result
     offers: tuple[Wish, ...] = ()
     answer: RequestAnswer | None = None
