@@ -298,13 +298,10 @@ class ArmLine:
                 break
         return share
 
-    def recall(self) -> int:
-        """Take back the frames of which no byte is gone; how many."""
-        started = 1 if self._done else 0
-        count = len(self._frames) - started
-        for _ in range(count):
+    def recall(self) -> None:
+        """Take back the frames of which no byte is gone."""
+        while len(self._frames) > (1 if self._done else 0):
             self._frames.pop()
-        return count
 
     def receive(self) -> tuple[list[Reply], bytes]:
         """Answers that have come, and the bytes known to be in none."""

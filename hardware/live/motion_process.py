@@ -18,7 +18,7 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
 from hardware.arm.link import Arm
-from hardware.arm.port import Opener, Port, PortOpener
+from hardware.arm.port import Port, PortOpener
 from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.files.path_file import write_progress_durably
 from hardware.live.prepared import Prepared
@@ -39,7 +39,7 @@ from hardware.live.records import (
 from hardware.motion.loop import MotionLoop, Order, RecordedTick, Tick
 from hardware.motion.step import MotionStep
 from hardware.process.clock import WallClock
-from hardware.process.system import ask_for_real_time, set_up_process
+from hardware.process.system import ask_for_real_time, set_up_process, take_messages
 from hardware.process.ticks import PoseLockedSchedule
 from planning.command import Command, Hold
 from planning.progress import PrintProgress
@@ -109,42 +109,24 @@ class LiveMotion:
 ByteListener = Callable[[bytes, bool], None]  # (bytes, whether they were sent rather than received)
 
 
-class PortLogger:
-    """An Opener whose ports call `listener` with all bytes that pass."""
-
-    def __init__(self, opener: Opener, listener: ByteListener) -> None:
-        self._opener, self._listener = opener, listener
-
-    def __call__(self) -> Port:
-        """Open the device."""
-        return _LoggedPort(self._opener(), self._listener)
-
-
 class _LoggedPort:
+    """A port whose listener is called with all bytes that pass."""
+
     def __init__(self, port: Port, listener: ByteListener) -> None:
         self._port, self._listener = port, listener
+        self.waiting, self.close = port.waiting, port.close
 
     def write(self, data: bytes) -> int:
-        """Give out bytes without waiting; how many were taken."""
         taken = self._port.write(data)
         if taken:
             self._listener(data[:taken], True)
         return taken
 
     def read(self) -> bytes:
-        """The bytes that have come."""
         data = self._port.read()
         if data:
             self._listener(data, False)
         return data
-
-    def waiting(self) -> int:
-        """Bytes taken that are not on the wire yet."""
-        return self._port.waiting()
-
-    def close(self) -> None:
-        """Let the device go."""
-        self._port.close()
 
 
 class _OrderReceiver:
@@ -165,23 +147,17 @@ class _OrderReceiver:
         if (stop := self._requests.last_stop) != self._last_stop:  # a stop of the page does not wait for the run's loop
             self._last_stop = stop
             orders.append(Order.STOP)
-        try:
-            while self._connection.poll():
-                order = self._connection.recv()
-                if isinstance(order, Order):
-                    orders.append(order)
-                else:
-                    self._follow(order)
-        except (EOFError, OSError):
-            self.alone = True
+        messages, closed = take_messages(self._connection)
+        for order in messages:
+            if isinstance(order, Order):
+                orders.append(order)
+            elif isinstance(order, BeginPrint):
+                self.fingerprint, self._ticks.tick = order.fingerprint, order.profile.tick
+                self._motion.begin(order)
+            else:
+                self._motion.paused = order is PauseOrder.PAUSE
+        self.alone |= closed
         return [*orders, Order.QUIT] if self.alone or self._ended else orders
-
-    def _follow(self, order: BeginPrint | PauseOrder) -> None:
-        if isinstance(order, BeginPrint):
-            self.fingerprint, self._ticks.tick = order.fingerprint, order.profile.tick
-            self._motion.begin(order)
-        else:
-            self._motion.paused = order is PauseOrder.PAUSE
 
     def _end(self, number: int, frame: FrameType | None) -> None:
         self._ended = True
@@ -268,7 +244,7 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     reporter = _TickReporter(channels, sender, ticks, priority)
     orders = _OrderReceiver(channels, motion, ticks)
     try:
-        arm = Arm(PortLogger(device, reporter.bytes_passed), profile, clock.now(), link_settings)
+        arm = Arm(lambda: _LoggedPort(device(), reporter.bytes_passed), profile, clock.now(), link_settings)
         reporter.motion = motion
         poses, report = reporter.newest_pose, reporter.report
         loop = reporter.loop = MotionLoop(motion, arm, clock, poses, orders, report, motion.homed, ticks)

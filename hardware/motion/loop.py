@@ -1,8 +1,8 @@
 """The loop of the motion, driven by a clock: 50 times a second the newest pose, the motion's command, the arm.
 
-It runs in a process of its own, or under a simulated clock. Between ticks it polls the line and the operator's orders
-every few milliseconds, so that a stop waits for no tick. The motion is called only when the arm can take a command:
-what is decided is sent, and planner, guard and arm agree on where the arm is.
+It runs in a process of its own, or under a simulated clock. Between ticks it polls the arm's line and the operator's
+orders every few milliseconds, so that a stop does not wait for the next tick. The motion is called only when the arm
+can take a command: every command that is decided is sent, so planner, guard and arm agree on where the arm is.
 """
 
 from __future__ import annotations
@@ -70,14 +70,6 @@ class Tick:
     hold: LinkCode | None = None  # why the link held the command back; None where it did not
 
 
-def ignore_tick(tick: Tick) -> None:
-    """Report to nobody."""
-
-
-def do_nothing() -> None:
-    """Do nothing."""
-
-
 class MotionLoop:
     """One motion on one arm. lateness: of its ticks. skipped: ticks left out, as their time had passed."""
 
@@ -88,8 +80,8 @@ class MotionLoop:
         clock: Clock,
         pose: Callable[[], SurfacePose | None],
         orders: Callable[[], Sequence[Order]],
-        report: Callable[[Tick], None] = ignore_tick,
-        homed: Callable[[], None] = do_nothing,
+        report: Callable[[Tick], None] = lambda tick: None,
+        homed: Callable[[], None] = lambda: None,
         schedule: TickSchedule | None = None,
     ) -> None:
         """pose: gives the newest. orders: gives those since the last call. report: called after each tick.

@@ -1,8 +1,9 @@
 """MotionStep: the newest surface pose in, the arm's next command out; no I/O and no clock of its own.
 
-The planner proposes, the guard decides; whoever owns the line to the arm encodes the command. `motion_process` runs a
-MotionStep on a real arm. The motion's processes import this module: it must never need gtsam, cv2 or onnxruntime, as a
-call of gtsam was measured to stop every other thread for as long as it takes.
+The planner proposes a command and the guard passes it or turns it into a Hold; the arm's link encodes it.
+`motion_process` runs a MotionStep on an arm, without the recorder and the page of a live run. The motion's processes
+import this module: it must never load gtsam, cv2 or onnxruntime, as a call of gtsam was measured to stop every other
+thread for as long as it takes.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.motion.loop import MotionLoop, Order, Tick
 from hardware.process.clock import WallClock
 from hardware.process.shared_latest import SharedLatest
-from hardware.process.system import ask_for_real_time
+from hardware.process.system import ask_for_real_time, take_messages
 from planning.command import Command, Hold, Move
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
@@ -34,7 +35,7 @@ class MotionStep:
     """One arm printing one path; call it once a tick."""
 
     def __init__(self, path: Path, profile: ArmProfile | None = None, start: float = 0.0) -> None:
-        """start: how much of the path is printed already, counted in checkpoints."""
+        """start: place on the path where printing begins, in checkpoints."""
         self.profile = ArmProfile() if profile is None else profile
         settings = self.profile.limits, self.profile.arm, self.profile.tick
         lag = self.profile.lag
@@ -42,9 +43,9 @@ class MotionStep:
 
     def __call__(self, pose: SurfacePose | None, now: float) -> Command:
         """The command of the tick at `now`, s, as the guard lets it pass. pose: the newest there is."""
-        wanted = self._planner(pose, now)
-        command = self._guard(wanted, pose, now)
-        if isinstance(wanted, Move) and isinstance(command, Hold):
+        proposal = self._planner(pose, now)
+        command = self._guard(proposal, pose, now)
+        if isinstance(proposal, Move) and isinstance(command, Hold):
             self._planner.refused(self._guard.axes)
         return command
 
@@ -87,7 +88,6 @@ class MotionReport:
     """The state of the motion process after a tick."""
 
     tick: Tick
-    checkpoint: int
     total: int  # checkpoints
     events: tuple[ArmEvent, ...]  # the last ones
     late: tuple[float, float, float]  # s, median, 99 % and largest lateness of all ticks so far
@@ -95,32 +95,6 @@ class MotionReport:
     skipped: int  # ticks left out
     stop: tuple[float, float] | None  # s, when the last one was decided and when it was on the wire
     priority: str  # as the system granted it
-
-
-class _Reporter:
-    def __init__(self, arm: Arm, motion: MotionStep, reports: SharedLatest[MotionReport], real_time: bool) -> None:
-        self._arm, self._motion, self._reports = arm, motion, reports
-        self._priority = ask_for_real_time() if real_time else "nothing asked for"
-        self._events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
-        self.loop: MotionLoop | None = None
-
-    def __call__(self, tick: Tick) -> None:
-        assert self.loop is not None
-        self._events.extend(self._arm.events())
-        progress, late = self._motion.progress, self.loop.lateness
-        self._reports.put(
-            MotionReport(
-                tick,
-                progress.checkpoint,
-                progress.total,
-                tuple(self._events),
-                (late.percentile(50), late.percentile(99), late.most),
-                late.count,
-                self.loop.skipped,
-                self._arm.stops[-1] if self._arm.stops else None,
-                self._priority,
-            )
-        )
 
 
 class _Orders:
@@ -133,12 +107,8 @@ class _Orders:
             signal.signal(number, self._end)
 
     def __call__(self) -> list[Order]:
-        orders: list[Order] = []
-        try:
-            while self._connection.poll():
-                orders.append(self._connection.recv())
-        except (EOFError, OSError):
-            self._ended = True
+        orders, closed = take_messages(self._connection)
+        self._ended |= closed
         return [*orders, Order.QUIT] if self._ended else orders
 
     def _end(self, number: int, frame: FrameType | None) -> None:
@@ -151,11 +121,22 @@ def motion_process(
     """Print until an order to quit, or until the process that gives orders is gone; then stop the arm."""
     clock, device = WallClock(), PortOpener(plan.url, plan.profile.baud)
     arm, motion = Arm(device, plan.profile, clock.now(), plan.settings), MotionStep(plan.path, plan.profile)
-    reporter = _Reporter(arm, motion, reports, plan.real_time)
-    loop = reporter.loop = MotionLoop(motion, arm, clock, poses.get, _Orders(orders), reporter)
+    priority = ask_for_real_time() if plan.real_time else "nothing asked for"
+    events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
+
+    loop: MotionLoop | None = None
+
+    def report(tick: Tick) -> None:
+        assert loop is not None
+        events.extend(arm.events())
+        late, total = loop.lateness, motion.progress.total
+        lateness, stop = (late.percentile(50), late.percentile(99), late.most), arm.stops[-1] if arm.stops else None
+        reports.put(MotionReport(tick, total, tuple(events), lateness, late.count, loop.skipped, stop, priority))
+
+    loop = MotionLoop(motion, arm, clock, poses.get, _Orders(orders), report)
     try:
         loop.run()
     finally:
-        reporter.loop = None  # a cycle would keep the planner's solver alive until the process ends
+        loop = None  # report and loop refer to each other: the planner's solver would live until the process ends
         arm.close()
         device.release()

@@ -106,15 +106,15 @@ async def _serve_until_end(
 
     loop, ended = asyncio.get_running_loop(), asyncio.Event()
     loop.add_signal_handler(signal.SIGTERM, ended.set)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        loop.add_reader(parent.sentinel, _on_parent_exit, loop, parent.sentinel, ended)
+    if (parent := multiprocessing.parent_process()) is not None:
+        sentinel = parent.sentinel
+
+        def on_parent_exit() -> None:
+            loop.remove_reader(sentinel)
+            ended.set()
+
+        loop.add_reader(sentinel, on_parent_exit)
     await serve(link, settings, listener, ended, limits)
-
-
-def _on_parent_exit(loop: asyncio.AbstractEventLoop, sentinel: int, ended: asyncio.Event) -> None:
-    loop.remove_reader(sentinel)
-    ended.set()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

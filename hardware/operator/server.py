@@ -141,7 +141,8 @@ class OperatorServer:
 
     def __init__(self, link: OperatorLink, settings: OperatorSettings, port: int, limits: WindowLimits) -> None:
         self._link, self._settings, self._limits, self._clock = link, settings, limits, WallClock()
-        self._access, self._headers = AccessControl(settings, port), response_headers(settings, port)
+        self._access = AccessControl(settings, port)
+        self._headers = {**response_headers(settings, port), "Server": "stillbed"}
         self._windows: dict[WindowSession, asyncio.BaseTransport | None] = {}
         self._files = page_files()
         self.broadcast = Broadcast(link)
@@ -180,30 +181,26 @@ class OperatorServer:
         changes = request.method != "GET" or "Upgrade" in request.headers
         token = request.path.partition("/")[2].partition("/")[0]
         if reason := self._access.refusal(token, request.headers, changes):
-            return web.Response(status=403, text=f"refused: {reason}\n", headers=self._own_headers())
+            return web.Response(status=403, text=f"refused: {reason}\n", headers=self._headers)
         try:
-            answer = await handler(request)
+            return await handler(request)
         except web.HTTPException as error:
-            return web.Response(status=error.status, text=f"{error.reason}\n", headers=self._own_headers())
-        return answer
-
-    def _own_headers(self) -> dict[str, str]:
-        return {**self._headers, "Server": "stillbed"}
+            return web.Response(status=error.status, text=f"{error.reason}\n", headers=self._headers)
 
     async def _file(self, request: web.Request) -> web.StreamResponse:
         name = request.match_info["name"] or self._settings.page
         if name not in self._files:
             raise web.HTTPNotFound
         kind = CONTENT_TYPES[name.rsplit(".", 1)[1]]
-        return web.Response(body=self._files[name], content_type=kind, charset="utf-8", headers=self._own_headers())
+        return web.Response(body=self._files[name], content_type=kind, charset="utf-8", headers=self._headers)
 
     async def _stop(self, request: web.Request) -> web.StreamResponse:
         number = self._link.requests.ask(Wish.STOP, 0)
-        return web.Response(text=f"{number}\n", headers=self._own_headers())
+        return web.Response(text=f"{number}\n", headers=self._headers)
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         socket = web.WebSocketResponse(max_msg_size=self._limits.message, compress=False, timeout=1.0)
-        socket.headers.update(self._own_headers())
+        socket.headers.update(self._headers)
         await socket.prepare(request)
         if len(self._windows) >= self._limits.windows:
             await socket.send_str(text(kind="full", windows=len(self._windows)))

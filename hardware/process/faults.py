@@ -88,50 +88,40 @@ class FaultSpec:
 _SIMULATE, _REPLAY, _LIVE, _ARM = FaultRunner
 _PICTURED = (_SIMULATE, _REPLAY, _LIVE)
 _ON_LINE = (_SIMULATE, _ARM)
-
+Part, Kind = FaultPart, FaultKind  # short, for the table
 FAULT_SPECS: dict[tuple[FaultPart, FaultKind], FaultSpec] = {
-    (FaultPart.CAMERA, FaultKind.OFF): FaultSpec("delivers nothing", _PICTURED),
-    (FaultPart.CAMERA, FaultKind.STUCK): FaultSpec(
-        "delivers its last picture again and again, with new stamps", _PICTURED
-    ),
-    (FaultPart.CAMERA, FaultKind.SLOW): FaultSpec(
-        "its pictures arrive later by that much", (_SIMULATE,), "s", 0.001, 10, 0.1
-    ),
-    (FaultPart.CAMERA, FaultKind.GARBLE): FaultSpec("its encoded pictures are damaged on the way", (_SIMULATE,)),
-    (FaultPart.CAMERA, FaultKind.SWAP): FaultSpec("its cable is exchanged with that of the next camera", _PICTURED),
-    (FaultPart.CAMERA, FaultKind.BUMP): FaultSpec("stands aside by that much", (_SIMULATE,), "mm", 0.01, 100, 2.0),
-    (FaultPart.CAMERA, FaultKind.BLACK): FaultSpec("its pictures are black", _PICTURED),
-    (FaultPart.CAMERA, FaultKind.FLASH): FaultSpec("its pictures are white", _PICTURED, lasts=0.1),
-    (FaultPart.CLOCK, FaultKind.JUMP): FaultSpec(
+    (Part.CAMERA, Kind.OFF): FaultSpec("delivers nothing", _PICTURED),
+    (Part.CAMERA, Kind.STUCK): FaultSpec("delivers its last picture again and again, with new stamps", _PICTURED),
+    (Part.CAMERA, Kind.SLOW): FaultSpec("its pictures arrive later by that much", (_SIMULATE,), "s", 0.001, 10, 0.1),
+    (Part.CAMERA, Kind.GARBLE): FaultSpec("its encoded pictures are damaged on the way", (_SIMULATE,)),
+    (Part.CAMERA, Kind.SWAP): FaultSpec("its cable is exchanged with that of the next camera", _PICTURED),
+    (Part.CAMERA, Kind.BUMP): FaultSpec("stands aside by that much", (_SIMULATE,), "mm", 0.01, 100, 2.0),
+    (Part.CAMERA, Kind.BLACK): FaultSpec("its pictures are black", _PICTURED),
+    (Part.CAMERA, Kind.FLASH): FaultSpec("its pictures are white", _PICTURED, lasts=0.1),
+    (Part.CLOCK, Kind.JUMP): FaultSpec(
         "the stamps of all pictures jump by that much", (_SIMULATE,), "s", -3600, 3600, 1.0
     ),
-    (FaultPart.TRACKING, FaultKind.KILL): FaultSpec("the tracking ends and does not come back", _PICTURED),
-    (FaultPart.TRACKING, FaultKind.HANG): FaultSpec("the tracking stands still", _PICTURED),
-    (FaultPart.TRACKING, FaultKind.SLOW): FaultSpec(
+    (Part.TRACKING, Kind.KILL): FaultSpec("the tracking ends and does not come back", _PICTURED),
+    (Part.TRACKING, Kind.HANG): FaultSpec("the tracking stands still", _PICTURED),
+    (Part.TRACKING, Kind.SLOW): FaultSpec(
         "the tracking has that share of its speed", (_SIMULATE, _LIVE), "%", 0.1, 100, 20.0
     ),
-    (FaultPart.MOTION, FaultKind.KILL): FaultSpec("the motion ends and does not come back", _PICTURED),
-    (FaultPart.MOTION, FaultKind.HANG): FaultSpec("the motion stands still", _PICTURED),
-    (FaultPart.ARM, FaultKind.STALL): FaultSpec(
-        "the controller does nothing; what comes in is queued", _ON_LINE, lasts=None
-    ),
-    (FaultPart.ARM, FaultKind.DROP): FaultSpec(
-        "a frame, or each of that time, is lost on the line", _ON_LINE, lasts=0.0
-    ),
-    (FaultPart.ARM, FaultKind.GARBLE): FaultSpec(
+    (Part.MOTION, Kind.KILL): FaultSpec("the motion ends and does not come back", _PICTURED),
+    (Part.MOTION, Kind.HANG): FaultSpec("the motion stands still", _PICTURED),
+    (Part.ARM, Kind.STALL): FaultSpec("the controller does nothing; what comes in is queued", _ON_LINE, lasts=None),
+    (Part.ARM, Kind.DROP): FaultSpec("a frame, or each of that time, is lost on the line", _ON_LINE, lasts=0.0),
+    (Part.ARM, Kind.GARBLE): FaultSpec(
         "one to eight bits of a frame, or of each, flip on the line", _ON_LINE, lasts=0.0
     ),
-    (FaultPart.ARM, FaultKind.UNPLUG): FaultSpec("nothing goes in or out", (*_ON_LINE, _LIVE)),
-    (FaultPart.ARM, FaultKind.SLOW): FaultSpec("moves go at that share of their feed", _ON_LINE, "%", 0.1, 100, None),
-    (FaultPart.DISK, FaultKind.FULL): FaultSpec("the recording's file can grow no more", (_LIVE,)),
-    (FaultPart.PAGE, FaultKind.FLOOD): FaultSpec("more windows than may be, each saying as much as it can", (_LIVE,)),
-    (FaultPart.SURFACE, FaultKind.FAST): FaultSpec(
+    (Part.ARM, Kind.UNPLUG): FaultSpec("nothing goes in or out", (*_ON_LINE, _LIVE)),
+    (Part.ARM, Kind.SLOW): FaultSpec("moves go at that share of their feed", _ON_LINE, "%", 0.1, 100, None),
+    (Part.DISK, Kind.FULL): FaultSpec("the recording's file can grow no more", (_LIVE,)),
+    (Part.PAGE, Kind.FLOOD): FaultSpec("more windows than may be, each saying as much as it can", (_LIVE,)),
+    (Part.SURFACE, Kind.FAST): FaultSpec(
         "the surface runs away and comes back, that fast at most", (_SIMULATE,), "mm/s", 1, 1000, 80.0, 1.0
     ),
-    (FaultPart.SURFACE, FaultKind.FOLD): FaultSpec(
-        "a ridge that high rises and falls", (_SIMULATE,), "mm", 0.1, 20, 3.0, 1.0
-    ),
-    (FaultPart.SURFACE, FaultKind.COVER): FaultSpec("something lies over the wound, before all cameras", (_SIMULATE,)),
+    (Part.SURFACE, Kind.FOLD): FaultSpec("a ridge that high rises and falls", (_SIMULATE,), "mm", 0.1, 20, 3.0, 1.0),
+    (Part.SURFACE, Kind.COVER): FaultSpec("something lies over the wound, before all cameras", (_SIMULATE,)),
 }
 
 _NUMBER = r"-?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?"
@@ -304,9 +294,8 @@ def fault_rng(fault: Fault) -> np.random.Generator:
     return np.random.default_rng([fault.seed, list(FaultKind).index(fault.kind), fault.number])
 
 
-WorkStretches = list[
-    tuple[float, float, float]
-]  # of one piece of work: begin and end, s, and the share of its usual rate
+# of one piece of work: begin and end of each stretch, s, and the share of its usual rate
+WorkStretches = list[tuple[float, float, float]]
 STALLED_KINDS = (FaultKind.STALL, FaultKind.HANG, FaultKind.KILL)
 
 

@@ -36,13 +36,9 @@ class Progress:
         if now - self._reported < self._every and done != total:
             return
         self._reported = now
-        text = progress_line(self._what, self._unit, done, total, now - self._start) + (
-            f"; {self.note}" if self.note else ""
-        )
-        if self._tty:
-            self._stream.write(f"\r\x1b[K{text}")
-        else:
-            self._stream.write(text + "\n")
+        note = f"; {self.note}" if self.note else ""
+        text = progress_line(self._what, self._unit, done, total, now - self._start) + note
+        self._stream.write(f"\r\x1b[K{text}" if self._tty else f"{text}\n")
         self._stream.flush()
         self._open = self._tty
 
@@ -129,8 +125,6 @@ def cache_folder() -> Path:
 
 def cache_error(folder: Path, error: OSError) -> InputError:
     """The error about a cache that could not be written."""
-    from hardware.process.checks import (
-        error_text,  # loads numpy, which a command line that only shows its help does not need
-    )
+    from hardware.process.checks import error_text  # loads numpy, which a command line does not need for its help
 
     return InputError(folder, "cache", error_text(error), "one that can be written: set XDG_CACHE_HOME")

@@ -12,6 +12,7 @@ from multiprocessing import parent_process, resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 
 def exit_with_parent() -> None:
@@ -21,12 +22,13 @@ def exit_with_parent() -> None:
     """
     parent = parent_process()
     assert parent is not None
-    Thread(target=_outlive_nobody, args=(parent.sentinel,), daemon=True).start()
+    sentinel = parent.sentinel
 
+    def exit_after() -> None:
+        wait([sentinel])
+        os._exit(1)
 
-def _outlive_nobody(sentinel: int) -> None:
-    wait([sentinel])
-    os._exit(1)
+    Thread(target=exit_after, daemon=True).start()
 
 
 @contextmanager
@@ -54,8 +56,6 @@ def fill_standard_streams() -> None:
 
 REAL_TIME_PRIORITY = 10  # of 1 to 99: above all ordinary work, below the kernel's own
 NICE_LEVEL = -10  # before all that asked for nothing
-
-
 NO_PRIORITY = "nothing: an ordinary process"  # what is granted where no priority is
 
 
@@ -99,6 +99,17 @@ def set_up_process(name: str, cores: Sequence[int] = (), nice: int = 0) -> None:
             os.sched_setaffinity(0, cores)
     if nice:
         os.nice(nice)
+
+
+def take_messages(connection: Connection) -> tuple[list[Any], bool]:
+    """The objects that have come, and whether the other end is closed."""
+    messages: list[Any] = []
+    try:
+        while connection.poll():
+            messages.append(connection.recv())
+    except (EOFError, OSError):
+        return messages, True
+    return messages, False
 
 
 def pipe_closed(lifeline: Connection) -> bool:
