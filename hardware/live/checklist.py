@@ -24,7 +24,7 @@ PASS, FAIL, BUSY, WARN = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.BUSY
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedPath:
-    """A path that could be begun."""
+    """A path placed on the surface, not begun yet."""
 
     path: Path  # in the tracker's surface frame
     profile: ArmProfile  # of the arm, with its place
@@ -33,9 +33,9 @@ class PlacedPath:
 
 def place_path(path: Path, surface_from_path: Array, pose: SurfacePose, profile: ArmProfile, place: bool) -> PlacedPath:
     """The path on the surface as it is now. place: put the arm where the surface lies below its home, level."""
-    moved = replace(path, surface_from_nozzle=surface_from_path @ path.surface_from_nozzle)
-    there = placed(profile, pose.base_from_surface) if place else profile
-    return PlacedPath(moved, there, reach_problem(moved, pose, there))
+    path = replace(path, surface_from_nozzle=surface_from_path @ path.surface_from_nozzle)
+    profile = placed(profile, pose.base_from_surface) if place else profile
+    return PlacedPath(path, profile, reach_problem(path, pose, profile))
 
 
 def raised_path(path: Path, lift: float) -> Path:
@@ -62,10 +62,9 @@ def _outside(values: Array, low: Array, high: Array, names: str | list[str]) -> 
     if not len(rows):
         return ""
     row, column = int(rows[0]), int(columns[0])
-    shown = [values[row, column], low[column], high[column]]
-    turns = column >= 3 or len(names[column]) > 1
-    got, least, most = np.rad2deg(shown) if turns else shown
-    unit = "degrees" if turns else "mm"
+    turns = column >= 3 or len(names[column]) > 1  # an angle of the arm's axes, or a joint
+    figures = [values[row, column], low[column], high[column]]
+    (got, least, most), unit = (np.rad2deg(figures), "degrees") if turns else (figures, "mm")
     return f"checkpoint {row}: {names[column]} = {got:.1f}, allowed {least:.1f} to {most:.1f} {unit}"
 
 
@@ -79,10 +78,8 @@ def camera_checks(report: TrackingReport | None, now: float) -> tuple[Check, Che
         return Check("cameras", BUSY, "no pictures yet", remedy), calibration
     if (age := now - report.pose.stamp) > MAX_PICTURE_AGE:
         return Check("cameras", FAIL, f"no pictures for {age:.1f} s", "plug in the cameras"), calibration
-    missing = [name for i, name in enumerate(report.cameras) if i not in report.delivering]
-    if missing:
-        verdict = WARN if len(report.delivering) >= 2 else FAIL
-        without = f"without {', '.join(missing)}"
+    if missing := [name for i, name in enumerate(report.cameras) if i not in report.delivering]:
+        verdict, without = WARN if len(report.delivering) >= 2 else FAIL, f"without {', '.join(missing)}"
         return Check("cameras", verdict, without, "plug it in, or look at its lens"), calibration
     return Check("cameras", PASS, f"all {len(report.cameras)} deliver"), calibration
 

@@ -7,9 +7,10 @@ other: the reader takes the newest whole set and counts those that it never took
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from ctypes import c_bool
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
-from multiprocessing.sharedctypes import RawArray
+from multiprocessing.sharedctypes import RawArray, RawValue
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,7 @@ class FrameRing:
         self._slot = sum(self._pixels) + sum(self._stored)
         self._memory: Any = RawArray("B", self._slot * RING_SLOTS)
         self._counts: Any = RawArray("Q", RING_SLOTS)
-        self._wanted: Any = RawArray("B", 1)
+        self.wanted = RawValue(c_bool, False)  # whether the reader has begun to ask for frames
         self._count = 0  # of the writer
 
     def put(self, frames: FrameSet, encoded: dict[int, Encoded], now: Callable[[], float], source: float) -> SetNotice:
@@ -115,18 +116,8 @@ class FrameRing:
         whole = replace(frame_set(frames), head=notice.head)
         return (whole, encoded) if self._counts[slot] == notice.count else None
 
-    @property
-    def wanted(self) -> bool:
-        """Whether the reader has begun to ask for frames."""
-        return bool(self._wanted[0])
-
-    def want(self) -> None:
-        """Tell the writer that frames are asked for."""
-        self._wanted[0] = 1
-
     def _start(self, slot: int, camera: int) -> int:
-        before = sum(self._pixels[:camera]) + sum(self._stored[:camera])
-        return slot * self._slot + before
+        return slot * self._slot + sum(self._pixels[:camera]) + sum(self._stored[:camera])
 
 
 class RingSource:
@@ -138,7 +129,7 @@ class RingSource:
     def take(self, patience: float) -> TimedFrameSet | None:
         """The newest set, waiting `patience` s for one; None where none came. SourceEnded once there will be none."""
         notice = None
-        self._ring.want()
+        self._ring.wanted.value = True
         try:
             if self._notices.poll(patience):
                 notice = self._notices.recv()

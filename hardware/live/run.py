@@ -90,7 +90,9 @@ class LiveRun:
             while not self._machine.ended:
                 self._cycle(wake, progress_writer)
             self._wait_for_rest(wake)
-            self._close_page()
+            if self._page is not None:  # it shows how the run ended; then it can be asked nothing any more
+                self._put_view(self._clock.now())
+                self._page.close()
             self._shut_down()
         fraction = channels.place.value
         return RunOutcome(prepared, self._machine, self._statistics, self._reports, self._signal, fraction)
@@ -102,7 +104,8 @@ class LiveRun:
     # -- one cycle
 
     def _cycle(self, wake: socket.socket, progress_writer: ProgressWriter) -> None:
-        ready = wait([wake, *self._channels.processes.sentinels(), *self._terminal()], POLL_PERIOD)
+        terminal = [] if self._console.file is None else [self._console.file]
+        ready = wait([wake, *self._channels.processes.sentinels(), *terminal], POLL_PERIOD)
         if wake in ready:
             wake.recv(64)
         requests = self._requests_by_key(ready) + self._channels.link.requests.take()
@@ -120,9 +123,6 @@ class LiveRun:
         self._show_surface()
         self._show_view(now)
         self._announce(now)
-
-    def _terminal(self) -> list[int]:
-        return [] if self._console.file is None else [self._console.file]
 
     def _requests_by_key(self, ready: Sequence[object]) -> list[OperatorRequest]:
         if self._console.file is None or self._console.file not in ready:
@@ -245,12 +245,8 @@ class LiveRun:
         if self._placement_written or placed is None or tracking is None or tracking.surface_from_path is None:
             return
         self._placement_written = True
-        placement = SurfacePlacement(
-            map=prepared.files.record,
-            until=tracking.registered,
-            surface_from_path=tracking.surface_from_path,
-            arm_from_base=placed.profile.arm.arm_from_base,
-        )
+        arm_from_base, record = placed.profile.arm.arm_from_base, prepared.files.record
+        placement = SurfacePlacement(record, tracking.registered, tracking.surface_from_path, arm_from_base)
         write_placement(prepared.files.surface, placement)
 
     def _announce(self, now: float) -> None:
@@ -292,12 +288,6 @@ class LiveRun:
             if status.state is not ArmState.ARMED and not status.in_flight > 0 and status.stamp > now - 2 * POLL_PERIOD:
                 return
             wait([wake, *self._channels.processes.sentinels()], POLL_PERIOD / 4)
-
-    def _close_page(self) -> None:
-        """Show how the run ended, then end the page, so that it does not look as if it could be asked anything."""
-        if self._page is not None:
-            self._put_view(self._clock.now())
-            self._page.close()
 
     def _shut_down(self) -> None:
         channels, reports = self._channels, self._reports

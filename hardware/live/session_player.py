@@ -93,7 +93,9 @@ def play_session(
     """Put the sets of a session into the ring in real time. faults: of cameras, counted from `start`, s."""
     clock, pictures = WallClock(), _PictureCache(session, again)
     spoil = FrameFaults(faults, session.rig, "command line")
-    _wait_until_wanted(ring, clock)
+    parent = parent_process()
+    while not ring.wanted.value and (parent is None or parent.is_alive()):  # a session shown once waits for the tracker
+        clock.wait_until(clock.now() + WANTED_POLL_PERIOD)
     stamps = np.array([np.mean([ref.stamp for ref in refs]) for refs in session.sets])
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     between = turning_sets(session.truth, stamps) if again and session.truth is not None else None
@@ -107,34 +109,23 @@ def play_session(
         decoding = clock.now()
         encoded, frames = pictures.decoded(refs)
         spent = max(clock.now() - decoding, DECODE_DECAY * spent)
-        shown = [replace(f, stamp=_live_stamp(f.stamp, anchor, showing)) for f in frames]
+        ahead = -1 if showing.backwards else 1  # backwards, what was earlier is later
+        shown = [replace(f, stamp=showing.live + ahead * (f.stamp - anchor)) for f in frames]
         head = session.heads.at(anchor)
         whole = FrameSet(frame_set(shown).stamp, tuple(shown), head)
         spoilt = spoil(whole, showing.live - start.value)
         same = {frame.camera for frame in spoilt.frames if frame in whole.frames}
-        encoded = {camera: stored for camera, stored in encoded.items() if camera in same}
         clock.wait_until(due)
         if spoilt.frames:
-            notices.send(ring.put(spoilt, encoded, clock.now, anchor))
-
-
-def _wait_until_wanted(ring: FrameRing, clock: WallClock) -> None:
-    """A session that is shown once begins when the tracker is ready for it."""
-    parent = parent_process()
-    while not ring.wanted and (parent is None or parent.is_alive()):
-        clock.wait_until(clock.now() + WANTED_POLL_PERIOD)
-
-
-def _live_stamp(stamp: float, anchor: float, showing: SetShowing) -> float:
-    """The stamp, s, of a frame whose set is shown at another instant; backwards, what was earlier is later."""
-    return showing.live + (anchor - stamp if showing.backwards else stamp - anchor)
+            unchanged = {camera: stored for camera, stored in encoded.items() if camera in same}
+            notices.send(ring.put(spoilt, unchanged, clock.now, anchor))
 
 
 class _PictureCache:
     """Reads and decodes pictures; of a session that is shown again and again, keeps them as they were encoded."""
 
     def __init__(self, session: Session, keep: bool) -> None:
-        self._session, self._keep, self._kept, self._size = session, keep, dict[FrameRef, Encoded](), 0
+        self._session, self._keep, self._cache, self._size = session, keep, dict[FrameRef, Encoded](), 0
         self._reader: FrameReader = session.store.open()
 
     def decoded(self, refs: tuple[FrameRef, ...]) -> tuple[dict[int, Encoded], list[Frame]]:
@@ -151,10 +142,10 @@ class _PictureCache:
         return encoded, frames
 
     def _encoded(self, ref: FrameRef) -> Encoded | None:
-        if ref in self._kept:
-            return self._kept[ref]
+        if ref in self._cache:
+            return self._cache[ref]
         stored = self._reader.encoded(ref)
         if self._keep and stored is not None and self._size < PICTURE_CACHE_BYTES:
-            self._kept[ref] = stored
+            self._cache[ref] = stored
             self._size += len(stored[1])
         return stored

@@ -1,7 +1,7 @@
-"""The stages of a run as an operator knows them: requests and events lead from one to the next.
+"""The stages of a run as its operator sees them, and the requests, reports and timeouts that change the stage.
 
-Nothing here waits, sends or reads a clock. Each call is given the newest reports and requests, and returns orders for
-the motion process.
+Nothing here waits, sends or reads a clock. Each call takes the newest reports and requests, and returns the orders for
+the motion process that follow from them.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ Orders = list[Order | PauseOrder | BeginPrint]
 
 
 def silence_text(name: str, last: float, interval: float, now: float) -> str:
-    """That a process is silent at `now`, s, long before it counts as hung; "" if it is not.
+    """The operator's message that a process is silent at `now`, s, long before it counts as hung; "" if it is not.
 
-    last: s, of its last report. interval: s from report to report; of NaN nothing can be said. Nothing is done about
-    silence: the arm rests anyhow, its queue being empty or the pose too old. But the operator is to know at once why.
+    last: s, of its last report. interval: s from report to report; NaN while unknown. Nothing is done about silence:
+    the arm rests anyhow, as its queue is empty or the pose too old.
     """
     silent = now - last
     if silent > SILENT_INTERVALS * interval + SILENCE_SLACK:
@@ -93,7 +93,7 @@ class RunReports:
 
 @dataclass(slots=True)
 class RunStateMachine:
-    """The stage of a run, and what is known for the next one."""
+    """The stage of a run; call it with each cycle's reports and requests."""
 
     task: PrintTask
     stage: RunStage = RunStage.CHECK
@@ -203,7 +203,9 @@ class RunStateMachine:
 
     def _advance(self, reports: RunReports, now: float) -> Orders:
         tracking, motion = reports.tracking, reports.motion
-        if tracking is not None and tracking.ended and not _path_printed(motion):
+        progress = None if motion is None else motion.progress
+        printed = progress is not None and progress.fraction >= progress.total - 1  # the way home needs no pictures
+        if tracking is not None and tracking.ended and not printed:
             return self.end(f"the cameras: {tracking.ended}", now)
         if reports.recorder is not None and reports.recorder.failed:
             return self.end(reports.recorder.failed, now)
@@ -345,9 +347,3 @@ class RunStateMachine:
         if (stage, reason) != (self.stage, self.reason):
             self.turn += 1
         self.stage, self.reason, self._since = stage, reason, now
-
-
-def _path_printed(motion: LiveMotionReport | None) -> bool:
-    """Whether the last checkpoint is printed: the rest, the way home, needs no pictures."""
-    progress = None if motion is None else motion.progress
-    return progress is not None and progress.fraction >= progress.total - 1

@@ -9,7 +9,7 @@ import signal
 from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
 from types import FrameType
@@ -62,7 +62,7 @@ AFTER_POSE_STAGE = "pose handed over to ready for frames"
 
 
 class SurfaceOutline:
-    """Each camera's region of interest on the surface, in the surface frame, once it is placed there."""
+    """Each camera's region of interest as an outline on the surface, once it is placed there."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -161,27 +161,6 @@ def _terminate(number: int, frame: FrameType | None) -> None:
     raise _Terminated
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _KnownSession:
-    """What is known of the cameras and the surface before the first picture."""
-
-    rig: Rig
-    roi: tuple[Roi, ...] = ()
-    surface: Path | None = None
-    truth: Trajectory | None = None
-    session: Session | None = None  # held, as it may have unpacked the scan
-
-
-def _open_source(prepared: Prepared, channels: TrackingChannels) -> tuple[_KnownSession, FrameSource]:
-    """The cameras, live or shown, and what is known of them."""
-    if prepared.live:
-        source = LiveCameraSource(prepared.session)
-        return _KnownSession(source.rig), source
-    session = open_session(prepared.session)
-    known = _KnownSession(session.rig, session.roi, session.surface, session.truth, session)
-    return known, RingSource(channels.ring, channels.notices)
-
-
 class _TrackingLoop:
     """Feeds frame sets to the tracking step, and hands on what comes of them. report: the last one."""
 
@@ -193,31 +172,37 @@ class _TrackingLoop:
         profile, placement = prepared.task.profile, prepared.placement
         self._commanded_head = _CommandedHead(channels.motion, profile)
         self._histograms_recorded = -np.inf  # s
-        self._known, self._source = _open_source(prepared, channels)
+        self._source: FrameSource
+        self._session: Session | None = None  # that is shown; held, as it may have unpacked the scan
+        if prepared.live:
+            self._source = LiveCameraSource(prepared.session)
+            rig = self._source.rig
+        else:
+            self._session = open_session(prepared.session)
+            self._source, rig = RingSource(channels.ring, channels.notices), self._session.rig
         stack.callback(self._source.close)
-        rig = self._known.rig
+        session = self._session
+        self._truth = None if session is None else session.truth
+        surface = None if session is None else session.surface
         self._thumbnailer = Thumbnailer(channels.link.pictures, channels.link.requests)
         self.report = TrackingReport(self._clock.now(), tuple(camera.name for camera in rig.cameras))
         self._outline = SurfaceOutline(rig)
         self._last_stamp, self._intervals = np.nan, deque[float](maxlen=INTERVAL_WINDOW)
         channels.reports.put(self.report)
         earlier = None if placement is None else open_session(placement.map)
-        rois = self._known.roi if earlier is None else earlier.roi
-        self._record_known(rois)
+        known = session if earlier is None else earlier
+        rois = () if known is None else known.roi
+        sender.put(rig)
+        if surface is not None:
+            sender.put(ScanEntry(surface))
+        for roi in rois:
+            sender.put(replace(roi, stamp=self.report.stamp))
         immediate = tuple(replace(roi, stamp=-np.inf) for roi in rois)
-        step = tracker(rig, immediate, self._known.surface, self._clock.now, profile.tool)
+        step = tracker(rig, immediate, surface, self._clock.now, profile.tool)
         self._step = stack.enter_context(step)
         if placement is not None and earlier is not None:
             new_from_old = _restore_map(self._step, placement.map, earlier, placement.until, self._clock.now())
             self.report = replace(self.report, surface_from_path=new_from_old @ placement.surface_from_path)
-
-    def _record_known(self, rois: Sequence[Roi]) -> None:
-        """Record what is known before the first picture."""
-        self._sender.put(self._known.rig)
-        if self._known.surface is not None:
-            self._sender.put(ScanEntry(self._known.surface))
-        for roi in rois:
-            self._sender.put(replace(roi, stamp=self.report.stamp))
 
     def __call__(self) -> None:
         settle_memory()
@@ -265,8 +250,8 @@ class _TrackingLoop:
         if self.report.surface_from_path is not None or pose.state is not TrackState.TRACKING:
             return
         surface_from_path = np.eye(4)
-        if self._prepared.again and self._known.truth is not None:
-            surface_from_path = se3.inverse(pose.base_from_surface) @ _true_pose(self._known.truth, arrived.source)
+        if self._prepared.again and self._truth is not None:
+            surface_from_path = se3.inverse(pose.base_from_surface) @ _true_pose(self._truth, arrived.source)
         self.report = replace(self.report, surface_from_path=surface_from_path, registered=pose.stamp)
         settle_memory()  # what was compiled since, as nothing moves yet
 
@@ -283,7 +268,7 @@ class _TrackingLoop:
             unrecorded=self._sender.dropped,
             timings=self.times.timings(),
             used=tuple(int(n) for n in self._step.last.used),
-            truth=None if self._known.truth is None else _true_pose(self._known.truth, arrived.source),
+            truth=None if self._truth is None else _true_pose(self._truth, arrived.source),
             surface=self._landmarks(pose),
         )
         self._channels.reports.put(self.report)

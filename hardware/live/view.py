@@ -42,7 +42,7 @@ from planning.path import Path, way_lengths
 from planning.progress import PrintPhase
 from planning.robot.kinematics import nozzle_from_axes
 
-KEPT_COMMANDS = 64  # a second of them
+MAX_COMMANDS_KEPT = 64  # a second of them
 MAX_COMMAND_GAP = 0.1  # s between two commands that a straight line joins
 MAX_LATENCY = 0.035  # s from frames to the wire that 99 % are to keep
 MAX_IN_FLIGHT = 0.05  # s of motion that may be under way
@@ -77,7 +77,7 @@ class NozzleErrorEstimate:
 
     path: Path  # as its file has it, in the true surface frame
     last: float = nan  # mm, NaN while it is unknown or nothing is printed
-    _commands: deque[tuple[float, Array, float]] = field(default_factory=lambda: deque(maxlen=KEPT_COMMANDS))
+    _commands: deque[tuple[float, Array, float]] = field(default_factory=lambda: deque(maxlen=MAX_COMMANDS_KEPT))
     _ticked: float = nan  # s, stamp of the last tick
     _compared: float = nan  # s, stamp of the last pose
 
@@ -137,6 +137,9 @@ class ViewBuilder:
     ) -> OperatorView:
         """The view at `now`, s."""
         motion, tracking = reports.motion, reports.tracking
+        estimate: TrackingView | None = None
+        if tracking is not None and tracking.pose is not None:
+            estimate = tracking_from_pose(tracking.pose, now, sum(tracking.used))
         return OperatorView(
             stamp=now,
             turn=machine.turn,
@@ -145,7 +148,7 @@ class ViewBuilder:
             reason=machine.silence or machine.reason,
             offers=machine.offers,
             checks=machine.checks,
-            tracking=None if tracking is None else _tracking(tracking, now),
+            tracking=estimate,
             motion=None if motion is None else self._motion(motion, machine, statistics),
             progress=None if motion is None else self._progress(motion, statistics),
             latency=None if motion is None else _latency(motion),
@@ -198,10 +201,6 @@ class ViewBuilder:
             verdict, words = (CheckVerdict.PASS, "") if delivers else (CheckVerdict.FAIL, "no pictures")
             views.append(CameraView(name, verdict, self._rate if delivers else 0.0, tracks, words))
         return tuple(views)
-
-
-def _tracking(report: TrackingReport, now: float) -> TrackingView | None:
-    return None if report.pose is None else tracking_from_pose(report.pose, now, sum(report.used))
 
 
 def _latency(motion: LiveMotionReport) -> LatencyView | None:
