@@ -1,6 +1,6 @@
-"""One arm's device, read and written, and what is known of the arm by what was sent and what it answered.
+"""One arm's device: frames and answers pass here, and the model of the arm's queue and its answers are kept.
 
-Nothing here waits, reads a clock or decides what is sent; that is `hardware/arm/link.py`.
+Nothing here waits, reads a clock or decides what is sent; `hardware/arm/link.py` decides.
 """
 
 from __future__ import annotations
@@ -233,11 +233,11 @@ class ArmDevice:
         for reply in replies:
             if reply.kind is ReplyKind.ORIGIN:
                 continue
-            if self._queue is not None:
-                self._feedback.take(reply, self._queue, self.origin, now)
-            else:  # nobody knows where the arm stands; its answers say so, and are believed when it is armed
+            queue, origin = self._queue, self.origin
+            if queue is None:  # nobody knows where the arm stands; its answers are believed when it is armed
                 place = [*reply.values, 0, 0, 0] if reply.kind is ReplyKind.PLACE else [0, 0, 0, *reply.values]
-                self._feedback.take(reply, ArmQueue(place, self.profile.frame_time, now), np.zeros(3), now)
+                queue, origin = ArmQueue(place, self.profile.frame_time, now), np.zeros(3)
+            self._feedback.take(reply, queue, origin, now)
         return [reply for reply in replies if reply.kind is ReplyKind.ORIGIN]
 
     def _give(self, instruction: Instruction, now: float, frame: bytes | None = None) -> None:
@@ -268,9 +268,10 @@ class ArmDevice:
         elif self._queue is not None:
             self._queue.occupy(now, share)
         if isinstance(instruction, Pause):
+            on_wire = now + share * self.profile.frame_time
             if self._queue is not None:
                 self._queue.stop()
-            on_wire = now + share * self.profile.frame_time if self._queue is None else self._queue.wire_free
+                on_wire = self._queue.wire_free
             self._stop_retry.on_wire(on_wire)
 
     def _adopt_answers(self, now: float) -> None:

@@ -1,13 +1,12 @@
 """The arm's answers compared with its queue's model: measured lag, distance from its way, whether it is at rest.
 
-The arm need not answer; then all of this stays unknown. Answers have no checksum, so one alone proves nothing: what
-counts is the smaller of the last two deviations, which a single garbled answer cannot raise.
+An arm that does not answer leaves all of this unknown. Answers have no checksum, so a single one proves nothing: the
+deviation is the smaller one of the last two answers, which one garbled answer cannot raise.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from estimation.se3 import Array
 from hardware.arm.profile import LinkSettings
 from hardware.arm.protocol import Reply, ReplyKind, unit
-from hardware.arm.queue import ArmQueue, Axes
+from hardware.arm.queue import ArmQueue
 
 MIN_ANSWERS = 3  # answers before their absence means anything, as noise that looks like one comes alone
 SPEED_SPAN = 0.05  # s over which the set-point's speed is taken, and the slowest answers of a public driver come
@@ -53,11 +52,11 @@ class _AnsweredAxes:
 class ArmFeedback:
     """The answers so far, compared with the queue's model.
 
-    An answer on the way of the last second gives the delay by itself: a garbled one is hardly ever there.
+    A single answer that lies on the way of the last second gives the delay: a garbled one hardly ever lies there.
     """
 
     settings: LinkSettings
-    late: float  # s that the arm is known to be behind its set-point
+    late: float  # s that the arm is behind its set-point, by its profile
     count: int = 0  # answered places
     behind: float = 0.0  # s, delay of the last answer on the way, beyond the lag
     lasting: float = 0.0  # s, the smaller delay of the last two, once the lag is known
@@ -151,11 +150,8 @@ class ArmFeedback:
         quiet = min(self.settings.silence, max(MAX_MISSED_ANSWERS * self._period, self.settings.slack))
         if (since := now - self._place.stamp) > quiet:
             return f"the arm has not answered for {since:.2f} s, limit {quiet:.2g} s"
-        slack = self.settings.slack
-        for late, limit, often in (
-            (self.behind, slack, ""),
-            (self.lasting, REPEATED_LATE_SHARE * slack, " twice in a row"),
-        ):
+        slack, repeated = self.settings.slack, REPEATED_LATE_SHARE * self.settings.slack
+        for late, limit, often in ((self.behind, slack, ""), (self.lasting, repeated, " twice in a row")):
             if late > limit:
                 words = f"the arm is {1000 * late:.0f} ms later on its way than its lag"
                 return f"{words}, limit {1000 * limit:g} ms{often}"
@@ -174,7 +170,8 @@ class ArmFeedback:
     def _deviation(self, values: Array, axes: slice, queue: ArmQueue, now: float) -> float:
         """How far an answer (3,) is from where the set-point was since the arm could be there."""
         low, high = queue.bounds(now - self.late - self.settings.slack, now)
-        return _beyond(values.tolist(), low[axes], high[axes])
+        ends = zip(values.tolist(), low[axes], high[axes], strict=True)
+        return math.hypot(*(max(a - v, v - b, 0.0) for v, a, b in ends))
 
     def _time(self, place: Array, queue: ArmQueue, now: float) -> None:
         """How long ago the set-point was where the arm answers from."""
@@ -204,7 +201,3 @@ def near(answered: Array | None, axes: Array | None) -> bool:
         return False
     away = np.abs(answered - axes)
     return bool(away[:3].max() <= REST_TOLERANCE[0] and away[3:].max() <= REST_TOLERANCE[1])
-
-
-def _beyond(values: Sequence[float], low: Axes, high: Axes) -> float:
-    return math.hypot(*(max(a - v, v - b, 0.0) for v, a, b in zip(values, low, high, strict=True)))

@@ -1,8 +1,9 @@
 """The arm on its line: armed by an operator only, sent no more than its queue may hold, stopped at once.
 
 The loop that owns an Arm calls `poll` every few milliseconds and `send` once a tick, with the instant; Arm reads no
-clock and never waits. A model of the arm's queue says what is under way, and the arm's answers are compared with it
-where there are any. Here is decided what is sent; `hardware/arm/device.py` sends it and keeps model and answers.
+clock and never waits. A model of the arm's queue says how much motion is under way; where the arm answers, its answers
+are compared with the model. This module decides what is sent; `hardware/arm/device.py` sends it, and keeps the model
+and the answers.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ STOP_FRAMES = 2  # the first one may complete a frame that was torn when the pro
 
 
 class Arm(ArmDevice):
-    """One arm on one line. Methods that follow an operator's order return why it was not done, "" where it was.
+    """One arm on one line. Methods that follow an operator's order return the reason for a refusal, "" without one.
 
     command_frame: of the last command given to `send`, whether it was sent or not.
     """
@@ -69,8 +70,8 @@ class Arm(ArmDevice):
             return Reason("the arm still moves", LinkCode.MOVING)
         self._adopt_answers(now)
         if self._queue is None:
-            words = "nobody knows where the arm stands: it does not answer, and was not told"
-            return Reason(words, LinkCode.UNKNOWN_PLACE)
+            why = "nobody knows where the arm stands: it does not answer, and was not told"
+            return Reason(why, LinkCode.UNKNOWN_PLACE)
         place = np.array(self._queue.target)
         if goal is not None and (away := float(np.linalg.norm((goal - place)[:3]))) > self.settings.lost:
             words = f"the arm is {away:.1f} mm from where the motion left off, limit {self.settings.lost:g} mm"
@@ -202,8 +203,7 @@ class Arm(ArmDevice):
         """Whether the arm stands where it was sent, by dead reckoning and by its answers where it gives any."""
         if self._queue is None or self.travels or self._recovery.goal is not None or self._queue.in_flight(now) > 0:
             return False
-        answered = self._feedback.axes(now)
-        if answered is None:
+        if self._feedback.axes(now) is None:
             return self._feedback.count == 0
         return self._feedback.still(now) and not self._feedback.doubt(now)
 

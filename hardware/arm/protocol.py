@@ -1,12 +1,12 @@
 """The arm's wire: motion and control frames of 48 bytes out, answers of 9 bytes in. Degrees and mm/min exist only here.
 
-G1, G4 and G54 are of thesis Table 6.1, control frames and answers of public drivers of the arm. Floats are IEEE 754
-binary32, little-endian; there is no checksum. `decode` takes what `encode` can have made and refuses all else: for
-every frame it takes, encode(decode(frame)) == frame.
+G1, G4 and G54 are from thesis Table 6.1, control frames and answers from public drivers of the arm. Floats are IEEE 754
+binary32, little-endian; there is no checksum. `decode` accepts only frames that `encode` can make: for each of them,
+encode(decode(frame)) == frame.
 
-An answer is three numbers: byte 0 is 0xCE, 1 to 6 are three int16, big-endian, 7 is the kind, 8 is 0xCF. Places count
-tenths of a millimetre, angles hundredths of a degree. The thesis knows only stray single bytes (6.2), so the reader
-gives those back as well. `decode_reply` takes what `encode_reply` can have made.
+An answer holds three numbers: byte 0 is 0xCE, 1 to 6 are three int16, big-endian, 7 is the kind, 8 is 0xCF. Places
+count tenths of a millimetre, angles hundredths of a degree. The thesis knows only stray single bytes (6.2), so the
+reader returns those as well. `decode_reply` accepts only answers that `encode_reply` can make.
 """
 
 from __future__ import annotations
@@ -202,17 +202,15 @@ Decoded = TypeVar("Decoded")
 
 
 class FrameStream(Generic[Decoded]):
-    """Finds frames in bytes that come in any split, and finds the next one again after bytes that are none.
-
-    length: bytes of a frame. tails: its last byte by its first. decode: what it says, InputError where it is none.
-    """
+    """Finds the frames in a stream of bytes that comes in pieces, and finds the next one after bytes of no frame."""
 
     def __init__(self, length: int, tails: Mapping[int, int], decode: Callable[[bytes], Decoded]) -> None:
+        """length: bytes of a frame. tails: its last byte by its first. decode: InputError for what is no frame."""
         self._length, self._tails, self._decode = length, tails, decode
         self._rest = b""
 
     def __call__(self, data: bytes) -> tuple[list[Decoded], bytes]:
-        """What the frames that `data` completes say, and the bytes that by now are known to be in no frame."""
+        """The decoded frames that `data` completes, and the bytes that are now known to be in no frame."""
         rest, start = self._rest + data, 0
         decoded: list[Decoded] = []
         stray = bytearray()
@@ -257,10 +255,10 @@ class ReplyKind(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reply:
-    """One answer. values: (3,) mm, or rad where `kind` is TOOL or ARM."""
+    """One answer."""
 
     kind: ReplyKind
-    values: Array
+    values: Array  # (3,) mm, or rad of TOOL and ARM
 
 
 def encode_reply(reply: Reply) -> bytes:
@@ -295,5 +293,5 @@ def reply_stream() -> FrameStream[Reply]:
 
 
 def unit(kind: ReplyKind) -> float:
-    """What its values count in, mm or rad."""
+    """One count of its values, mm or rad."""
     return 0.1 if kind in (ReplyKind.PLACE, ReplyKind.ORIGIN) else float(np.deg2rad(0.01))

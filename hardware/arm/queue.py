@@ -1,8 +1,8 @@
-"""A model of the arm's queue in virtual time: what is under way, where the set-point is, and whether more may be sent.
+"""Dead reckoning of the arm by a model of its queue: commands under way, the set-point, and whether more may be sent.
 
-The arm need not answer, so the model is all that is always known (thesis 6.2: home, plus what was commanded). A frame
-takes its time on the wire, then waits for those before it. A move goes straight from the last target at its feed; one
-of less than MIN_TRAVEL along X Y Z turns, and its feed is in degrees/s.
+The arm need not answer; the model is then the only source of its place (thesis 6.2: home, plus all commands). A frame
+takes its time on the wire, then waits for the commands before it. A move goes straight from the last target at its
+feed; one of less than MIN_TRAVEL along X Y Z turns, and its feed is in degrees/s.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ WIRE_ROUNDING_BYTES = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class QueuedCommand:
-    """What one command in the queue does to the set-point."""
+    """The way of the set-point that one command in the queue makes."""
 
     start: float  # s
     end: float  # s
@@ -41,7 +41,7 @@ class QueuedCommand:
 
 
 class ArmQueue:
-    """What the arm has yet to do, and where its set-point is; every frame that is sent is entered."""
+    """The commands that the arm has yet to do, and its set-point; every frame that is sent is entered."""
 
     def __init__(self, axes: Sequence[float], frame_time: float, now: float) -> None:
         """axes: (6,) where the arm stands. frame_time: s of one frame on the wire."""

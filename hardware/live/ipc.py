@@ -11,7 +11,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from ctypes import c_double
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -109,6 +109,11 @@ class ProcessGroup:
         with suppress(OSError):
             os.killpg(member.pid, signal.SIGKILL)
 
+    def kill_all(self) -> None:
+        """Leave no process behind."""
+        for name in list(self.members):
+            self.kill(name)
+
 
 def run_player(prepared: Prepared, ring: FrameRing, notices: Connection, start: c_double) -> None:
     """Show a recorded session, as cameras would."""
@@ -189,49 +194,35 @@ class RunChannels:
         self.processes.end("recorder", 30.0)
         self.processes.end("arm", 0.1)
 
-    def close(self) -> None:
-        """Leave no process behind."""
-        for name in list(self.processes.members):
-            self.processes.kill(name)
-
 
 def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> RunChannels:
     """Start all processes, or none. folder: for a virtual arm's device. tracker: body of the tracking process."""
     processes = ProcessGroup()
-    try:
-        return _start_all(processes, prepared, folder, tracker)
-    except BaseException:
-        for name in list(processes.members):
-            processes.kill(name)
-        raise
-
-
-def _start_all(processes: ProcessGroup, prepared: Prepared, folder: File, tracker: ProcessBody) -> RunChannels:
-    url = prepared.settings.arm
-    arm_lifeline = SPAWN.Pipe(duplex=False)
-    if url == VIRTUAL_ARM:
-        url = str(folder / "arm")
-        _start_arm(processes, prepared, File(url), arm_lifeline[0])
-    place, start = RawValue(c_double, math.nan), RawValue(c_double, math.nan)
-    ring, link = FrameRing([camera.size for camera in prepared.rig.cameras]), OperatorLink()
-    poses, tracking, motion = (
-        SharedLatest[PoseHandover](),
-        SharedLatest[TrackingReport](),
-        SharedLatest[LiveMotionReport](),
-    )
-    recorder, trouble = SharedLatest[RecorderReport](), SharedLatest[str](TROUBLE_BYTES)
-    to_recorder = [SPAWN.Pipe(duplex=False) for _ in range(3)]  # from the motion, the tracking and this process
-    lifeline, notices, orders = (SPAWN.Pipe(duplex=False) for _ in range(3))
-    ends = [end for end, _ in to_recorder]
-    processes.start("recorder", record, (prepared.settings, ends, recorder), ends)
-    mover = MotionChannels(url, place, poses, motion, orders[0], link.requests, trouble, to_recorder[0][1])
-    processes.start("motion", run_motion, (prepared, mover), (orders[0], mover.recorder))
-    if not prepared.live:
-        processes.start("feed", run_player, (prepared, ring, notices[1], start), (notices[1],))
-    track = TrackingChannels(ring, notices[0], poses, tracking, motion, link, to_recorder[1][1], lifeline[0])
-    processes.start("tracking", tracker, (prepared, track), (notices[0], track.recorder, lifeline[0]))
-    sender = RecorderSender(to_recorder[2][1])
-    own_ends = orders[1], lifeline[1], arm_lifeline[1], sender
+    with ExitStack() as stack:
+        stack.callback(processes.kill_all)
+        url = prepared.settings.arm
+        arm_lifeline = SPAWN.Pipe(duplex=False)
+        if url == VIRTUAL_ARM:
+            url = str(folder / "arm")
+            _start_arm(processes, prepared, File(url), arm_lifeline[0])
+        place, start = RawValue(c_double, math.nan), RawValue(c_double, math.nan)
+        ring, link = FrameRing([camera.size for camera in prepared.rig.cameras]), OperatorLink()
+        poses, tracking = SharedLatest[PoseHandover](), SharedLatest[TrackingReport]()
+        motion, recorder = SharedLatest[LiveMotionReport](), SharedLatest[RecorderReport]()
+        trouble = SharedLatest[str](TROUBLE_BYTES)
+        to_recorder = [SPAWN.Pipe(duplex=False) for _ in range(3)]  # from the motion, the tracking and this process
+        lifeline, notices, orders = (SPAWN.Pipe(duplex=False) for _ in range(3))
+        ends = [end for end, _ in to_recorder]
+        processes.start("recorder", record, (prepared.settings, ends, recorder), ends)
+        mover = MotionChannels(url, place, poses, motion, orders[0], link.requests, trouble, to_recorder[0][1])
+        processes.start("motion", run_motion, (prepared, mover), (orders[0], mover.recorder))
+        if not prepared.live:
+            processes.start("feed", run_player, (prepared, ring, notices[1], start), (notices[1],))
+        track = TrackingChannels(ring, notices[0], poses, tracking, motion, link, to_recorder[1][1], lifeline[0])
+        processes.start("tracking", tracker, (prepared, track), (notices[0], track.recorder, lifeline[0]))
+        sender = RecorderSender(to_recorder[2][1])
+        own_ends = orders[1], lifeline[1], arm_lifeline[1], sender
+        stack.pop_all()
     return RunChannels(processes, url, place, tracking, motion, recorder, *own_ends, link, trouble, start)
 
 

@@ -1,6 +1,6 @@
-"""What a run came to: counted while it goes, written at its end as message, exit code, summary.json and report.html.
+"""Statistics of a run, and its outcome at the end: message, exit code, summary.json and report.html.
 
-The counts take the same memory however long the run lasts. What reports need is loaded once the arm is at rest.
+The statistics take the same memory however long the run lasts. The modules of reports are loaded once the arm rests.
 """
 
 from __future__ import annotations
@@ -125,7 +125,10 @@ class RunStatistics:
             return
         reason = _NUMBER_PATTERN.sub("…", command.reason)
         if reason:
-            self._hold(reason, step)
+            counted = reason if reason in self.holds or len(self.holds) < MAX_REASONS else OTHER_REASONS
+            hold = self.holds.setdefault(counted, HoldTotal())
+            hold.count += counted != self._reason
+            hold.seconds += step
         self._reason = reason
         if progress.place > 0 and progress.phase not in (PrintPhase.LEAVING, PrintPhase.FINISHED):
             self.due += step
@@ -135,13 +138,6 @@ class RunStatistics:
             if arm is not None:
                 error = self._error(reports, command, arm)
         self.timeline.add(self._ticked, error, step if reason else 0.0)
-
-    def _hold(self, reason: str, step: float) -> None:
-        if reason not in self.holds and len(self.holds) >= MAX_REASONS:
-            reason = OTHER_REASONS
-        held = self.holds.setdefault(reason, HoldTotal())
-        held.count += reason != self._reason
-        held.seconds += step
 
     def _error(self, reports: RunReports, move: Move, arm: SimpleArm) -> float:
         """One standard deviation, mm, of the place under the nozzle, where it is to be after this move; NaN of none."""
@@ -222,17 +218,12 @@ class RunOutcome:
                 "stages_s": statistics.stages,
                 "states": statistics.states,
                 "holds": [
-                    {"reason": reason, "count": held.count, "total_s": held.seconds}
-                    for reason, held in sorted(statistics.holds.items(), key=lambda item: -item[1].seconds)
+                    {"reason": reason, "count": hold.count, "total_s": hold.seconds}
+                    for reason, hold in sorted(statistics.holds.items(), key=lambda item: -item[1].seconds)
                 ],
                 "latency_ms": {
-                    timing.name: {
-                        "count": timing.count,
-                        "p50": 1000 * timing.median,
-                        "p99": 1000 * timing.p99,
-                        "max": 1000 * timing.largest,
-                    }
-                    for timing in self.timings()
+                    t.name: {"count": t.count, "p50": 1000 * t.median, "p99": 1000 * t.p99, "max": 1000 * t.largest}
+                    for t in self.timings()
                 },
                 "frame_sets": 0 if tracking is None else tracking.sets,
                 "frame_sets_dropped": 0 if tracking is None else tracking.dropped,

@@ -22,8 +22,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path as File
 from typing import Any
 
-import numpy as np
-
 from estimation import se3
 from estimation.errors import InputError, StillbedError
 from estimation.rig import Rig
@@ -102,9 +100,9 @@ def read_placement(file: File) -> SurfacePlacement:
     """The placement in a file; InputError where it makes no sense."""
     table = checks.read_toml(file)
     checks.check_keys(file, "", table, ("map", "until_s", "surface_from_path", "arm_from_base"))
-    poses = [checks.numbers(file, key, table[key], (4, 4)) for key in ("surface_from_path", "arm_from_base")]
-    for key, pose in zip(("surface_from_path", "arm_from_base"), poses, strict=True):
-        if not se3.is_transform(np.asarray(pose)):
+    poses = {key: checks.numbers(file, key, table[key], (4, 4)) for key in ("surface_from_path", "arm_from_base")}
+    for key, pose in poses.items():
+        if not se3.is_transform(pose):
             raise InputError(file, key, pose.tolist(), "a finite 4x4 rigid motion, mm")
     recording = File(checks.text(file, "map", table["map"]))
     try:
@@ -113,7 +111,7 @@ def read_placement(file: File) -> SurfacePlacement:
         there = False
     if not there:
         raise InputError(file, "map", recording, "the recording that shows the surface")
-    return SurfacePlacement(recording, checks.number(file, "until_s", table["until_s"]), poses[0], poses[1])
+    return SurfacePlacement(recording, checks.number(file, "until_s", table["until_s"]), **poses)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -260,9 +258,8 @@ def add_faults(prepared: Prepared, faults: tuple[Fault, ...]) -> Prepared:
         if fault.part is FaultPart.PAGE and not prepared.settings.page:
             raise InputError("command line", "--fault", str(fault), "a run with the operator's page, without --no-page")
         if fault.part is FaultPart.ARM and math.isfinite(fault.duration):
-            raise InputError(
-                "command line", "--fault", str(fault), "no duration: a virtual arm is not plugged in again"
-            )
+            allowed = "no duration: a virtual arm is not plugged in again"
+            raise InputError("command line", "--fault", str(fault), allowed)
     return replace(prepared, faults=faults, notes=(*prepared.notes, *(f"will happen: {fault}" for fault in faults)))
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path as File
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
@@ -183,8 +182,9 @@ def nozzle_errors(record: File, path: File, arm: File) -> NozzleErrors:
     if not run.messages["/tick"] or len(run.messages["/truth"]) < 2:
         raise InputError(record, "recording", "no ticks or no truth", "a run before pre-rendered pictures")
     true, profile = read_arm(arm), inputs_from_texts(run.texts, record)[1]  # ticks and lag are as the run took them
-    rows = [row_from_message(message) for message in run.messages["/truth"]]
-    truth = Truth(np.eye(4), _TrueMotion(_increasing_stamps(rows)))
+    rows = np.unique(np.array([row_from_message(message) for message in run.messages["/truth"]]), axis=0)
+    rising = np.concatenate([[True], np.diff(rows[:, 0]) > 0])
+    truth = Truth(np.eye(4), _TrueMotion(rows[rising]))
     truth_log = TruthLog(read_path(path), true.arm, truth, profile.tick, profile.lag)
     commands = _commands(run)
     for command, progress in commands:
@@ -220,11 +220,6 @@ def _printed_range(run: _RecordedRun) -> tuple[float, float]:
     extruding = {m["stamp"] for m in run.messages["/move"] if m["extrude"]}
     places = [float(m["fraction"]) for m in run.messages["/tick"] if m["stamp"] in extruding]
     return (min(places), max(places)) if places else (float("nan"), float("nan"))
-
-
-def _increasing_stamps(rows: list[list[float]]) -> Array:
-    unique: NDArray[np.float64] = np.unique(np.array(rows), axis=0)
-    return np.asarray(unique[np.concatenate([[True], np.diff(unique[:, 0]) > 0])])
 
 
 def _commands(run: _RecordedRun) -> list[tuple[Command, PrintProgress]]:

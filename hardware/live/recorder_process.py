@@ -91,7 +91,10 @@ class RecorderSender:
     def _send(self) -> None:
         try:
             while (data := self._next()) is not None:
-                _write_all(self._connection.fileno(), ENTRY_HEAD.pack(len(data)), data)
+                pipe, head = self._connection.fileno(), ENTRY_HEAD.pack(len(data))
+                left = memoryview(data)[max(os.writev(pipe, [head, data]) - len(head), 0) :]
+                while left:
+                    left = left[os.write(pipe, left) :]
         except (OSError, ValueError):  # nobody is there any more
             with self._changed:
                 self._gone = True
@@ -110,12 +113,6 @@ class RecorderSender:
             data = self._waiting.popleft()
             self._size -= len(data)
             return data
-
-
-def _write_all(pipe: int, head: bytes, data: bytes) -> None:
-    left = memoryview(data)[max(os.writev(pipe, [head, data]) - len(head), 0) :]
-    while left:
-        left = left[os.write(pipe, left) :]
 
 
 class RecorderReceiver:
@@ -227,16 +224,13 @@ class _EntryWriter:
 
     def _write(self, entry: Entry) -> None:
         if isinstance(entry, Rig):
-            self._open(entry)
+            self._recorder = self._opened(rig=entry)
+            early, self._early = self._early, []
+            for each in early:
+                _write_entry(self._recorder, each)
         elif self._recorder is None:
             self._early.append(entry)
         else:
-            _write_entry(self._recorder, entry)
-
-    def _open(self, rig: Rig) -> None:
-        self._recorder = self._opened(rig=rig)
-        early, self._early = self._early, []
-        for entry in early:
             _write_entry(self._recorder, entry)
 
     def report(self, failed: str = "") -> None:

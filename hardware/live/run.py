@@ -75,7 +75,7 @@ class LiveRun:
         prepared, files = self._prepared, self._prepared.files
         with tempfile.TemporaryDirectory() as folder, _signal_wakeup(self) as wake, ExitStack() as stack:
             channels = self._channels = start_processes(prepared, File(folder), self._tracker)
-            stack.callback(channels.close)
+            stack.callback(channels.processes.kill_all)
             files.session.write_text(settings_text(prepared.settings), encoding="utf-8")
             channels.sender.put(UsedEntry("session.toml", settings_text(prepared.settings)))
             progress_writer = ProgressWriter(files.progress, prepared.task.fingerprint, channels.place)

@@ -249,7 +249,5 @@ def _check_free(settings: OperatorSettings, where: object) -> None:
     try:
         socket.create_server((settings.host, settings.port), family=family).close()
     except OSError as error:
-        value = f"{settings.host} port {settings.port}"
-        raise InputError(
-            where, "page.address", value, f"one that is this machine's and free ({error.strerror})"
-        ) from None
+        allowed = f"one that is this machine's and free ({error.strerror})"
+        raise InputError(where, "page.address", f"{settings.host} port {settings.port}", allowed) from None

@@ -193,26 +193,22 @@ class CommandedPose:
 
     def __init__(self, profile: ArmProfile) -> None:
         self._profile = profile
-        self._stamps: deque[float] = deque(maxlen=MAX_COMMANDS)
-        self._axes: deque[Array] = deque(maxlen=MAX_COMMANDS)
-        self._extruding: deque[bool] = deque(maxlen=MAX_COMMANDS)
+        self._commands: deque[tuple[float, Array, bool]] = deque(maxlen=MAX_COMMANDS)  # when due, axes, extruding
 
     def add(self, command: Command, now: float) -> None:
         """Enter a command that is sent at `now`, s; a hold leaves the arm where it was."""
-        moves = isinstance(command, Move)
-        if moves or self._axes:
-            self._stamps.append(now + self._profile.tick + self._profile.lag)
-            self._axes.append(command.axes if isinstance(command, Move) else self._axes[-1])
-            self._extruding.append(isinstance(command, Move) and command.extrude)
+        due = now + self._profile.tick + self._profile.lag
+        if isinstance(command, Move):
+            self._commands.append((due, command.axes, command.extrude))
+        elif self._commands:
+            self._commands.append((due, self._commands[-1][1], False))
 
     def at(self, stamp: float) -> PrintHead | None:
         """The print head at `stamp`, s; None before the first move, when nobody knows where the arm is."""
-        if not self._stamps or stamp < self._stamps[0]:
+        if not self._commands or stamp < self._commands[0][0]:
             return None
-        place = min(bisect_left(self._stamps, stamp), len(self._stamps) - 1)
-        before = max(place - 1, 0)
-        ends = self._stamps[before], self._stamps[place]
-        share = min(1.0, (stamp - ends[0]) / (ends[1] - ends[0])) if ends[1] > ends[0] else 1.0
-        axes = self._axes[before] + share * (self._axes[place] - self._axes[before])
-        extruding = self._extruding[place] and stamp <= ends[1]
-        return PrintHead(np.asarray(nozzle_from_axes(self._profile.arm, axes)), extruding)
+        place = min(bisect_left(self._commands, stamp, key=lambda command: command[0]), len(self._commands) - 1)
+        (begin, start, _), (end, goal, extrude) = self._commands[max(place - 1, 0)], self._commands[place]
+        share = min(1.0, (stamp - begin) / (end - begin)) if end > begin else 1.0
+        axes = start + share * (goal - start)
+        return PrintHead(np.asarray(nozzle_from_axes(self._profile.arm, axes)), extrude and stamp <= end)

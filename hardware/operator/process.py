@@ -40,14 +40,17 @@ Crop = tuple[int, int, int, int]  # x, y, width, height px
 
 
 class OperatorPage:
-    """The page's process, which is started again whenever it has died: the port stays with the run."""
+    """The page's process, which is started again whenever it has died: the port stays with the run.
+
+    process: that serves, None before it is started.
+    """
 
     def __init__(self, link: OperatorLink, settings: OperatorSettings, limits: WindowLimits | None = None) -> None:
         """Binds the port; OSError where it is taken, InputError where the settings would let others in."""
         self._link, self._settings, self._limits = link, check_settings(settings), limits or WindowLimits()
         family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
         self._listener = socket.create_server((settings.host, settings.port), family=family, backlog=32)
-        self._process: BaseProcess | None = None
+        self.process: BaseProcess | None = None
         self._started = float("-inf")
         self.restarts = 0
 
@@ -60,31 +63,26 @@ class OperatorPage:
         assert f"{own}:{port}" in allowed_hosts(self._settings, port)
         return f"{self._settings.scheme}://{own}:{port}/{self._settings.token}/"
 
-    @property
-    def process(self) -> BaseProcess | None:
-        """The process that serves, None before it is started."""
-        return self._process
-
     def tend(self, now: float) -> bool:
         """Start the process if it does not run, at most once a second; whether it was started. now: s."""
-        if (self._process is not None and self._process.is_alive()) or now - self._started < RESTART_AFTER:
+        if (self.process is not None and self.process.is_alive()) or now - self._started < RESTART_AFTER:
             return False
-        self.restarts += self._process is not None
+        self.restarts += self.process is not None
         self._started = now
         arguments = (self._link, self._settings, self._listener, self._limits)
         spawn = multiprocessing.get_context("spawn")
-        self._process = spawn.Process(target=operator_process, args=arguments, name="operator's page", daemon=True)
-        self._process.start()
+        self.process = spawn.Process(target=operator_process, args=arguments, name="operator's page", daemon=True)
+        self.process.start()
         return True
 
     def close(self) -> None:
         """End the process and give the port back."""
-        if self._process is not None:
-            self._process.terminate()
-            self._process.join(2.0)
-            self._process.kill()
-            self._process.join()
-            self._process = None
+        if self.process is not None:
+            self.process.terminate()
+            self.process.join(2.0)
+            self.process.kill()
+            self.process.join()
+            self.process = None
         self._listener.close()
 
 

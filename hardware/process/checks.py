@@ -115,24 +115,18 @@ def number(where: object, key: str, value: object) -> float:
 
 def numbers(where: object, key: str, value: object, shape: tuple[int | None, ...], unit: str = "") -> Array:
     """A float64 array of finite numbers; None in `shape` stands for any length."""
-    allowed = _shape_words(shape) + (f", {unit}" if unit else "")
+    size = " x ".join("N" if n is None else str(n) for n in shape)
+    allowed = (f"{size} finite numbers" if shape else "a finite number") + (f", {unit}" if unit else "")
     try:
         array = np.array(value) if _all_numbers(value) else None
     except ValueError:
         array = None
-    if array is None or array.ndim != len(shape) or array.dtype.kind not in "iuf":
+    numeric = array is not None and array.ndim == len(shape) and array.dtype.kind in "iuf"
+    if array is None or not numeric or not np.isfinite(array).all():
         raise InputError(where, key, value, allowed)
     if any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
         raise InputError(where, key, value, allowed)
-    if not np.isfinite(array).all():
-        raise InputError(where, key, value, allowed)
     return array.astype(np.float64)
-
-
-def _shape_words(shape: tuple[int | None, ...]) -> str:
-    if not shape:
-        return "a finite number"
-    return " x ".join("N" if n is None else str(n) for n in shape) + " finite numbers"
 
 
 def _all_numbers(value: object) -> bool:
