@@ -11,8 +11,8 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from hardware.arm.device import ArmState, ArmStatus, Reason
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
-from hardware.live.records import LiveMotionReport, PauseOrder, RecorderReport, TrackingReport
-from hardware.live.state_machine import PrintTask, RunReports, RunStateMachine
+from hardware.live.records import LiveMotionReport, PauseOrder, RecorderReport, RunReports, TrackingReport
+from hardware.live.state_machine import PrintTask, RunStateMachine
 from hardware.live.view import stage_line
 from hardware.motion.loop import Order, Tick
 from hardware.operator.shared_state import OperatorRequest
@@ -33,7 +33,7 @@ class Staged:
         self.now, self.arm = 0.0, ArmState.DISARMED
         self.phase: PrintPhase | None = None
         self.fraction = 1.0  # of 5 checkpoints
-        self.seen, self.pose = RunReports(recorder=RecorderReport(0.0, 0, 0.0, "")), SURFACE
+        self.seen, self.pose = RunReports(recorder=RecorderReport(0, 0.0, "")), SURFACE
         self.ended, self.asked, self.answers = "", 0, 0
         self.orders: list[object] = []
         self.led: list[object] = []  # orders on the way to where it prints, begun paths by a word
@@ -52,7 +52,7 @@ class Staged:
         status = ArmStatus(self.now, self.arm, "why", PROFILE.arm.home, None, 0.0, nan, nan, 0.0, 0, 0, self.answers, 0)
         tick = Tick(self.now, Hold(self.now, 0.001, "x"), b"", 0.0, status, Reason())
         progress = None if self.phase is None else PrintProgress(self.phase, 1, 6, self.fraction, 9.0, self.fraction)
-        self.seen.motion = LiveMotionReport(tick, progress, False, (), (), 0, 0, None, 0, "ordinary")
+        self.seen.motion = LiveMotionReport(tick, progress, (), (), 0, 0, None, 0, "ordinary")
         self.orders += self.conductor(self.now, self.seen, asked)
         return self.conductor.stage
 
@@ -146,7 +146,7 @@ def test_what_ends_a_run_stops_the_arm_and_says_so(fault: str, words: str) -> No
     if fault == "cameras":
         run.ended = "no more"
     else:
-        run.seen.recorder = RecorderReport(0.0, 0, 0.0, "the disk is full")
+        run.seen.recorder = RecorderReport(0, 0.0, "the disk is full")
     run.look()
     assert words in run.conductor.ended and run.conductor.stage is RunStage.FAILED and run.orders[-1] is Order.STOP
 

@@ -204,7 +204,7 @@ def whole(data: bytes, cuts: list[int]) -> tuple[list[bytes], bytes]:
         taken, lost = stream(data[start:end])
         frames += [encode(instruction) for instruction in taken]
         stray += lost
-    assert len(stray) + FRAME_LENGTH * len(frames) + stream.pending == len(data)
+    assert len(stray) + FRAME_LENGTH * len(frames) + len(stream._rest) == len(data)
     return frames, stray
 
 

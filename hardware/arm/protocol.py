@@ -231,11 +231,6 @@ class FrameStream(Generic[Decoded]):
         self._rest = rest[start:]
         return decoded, bytes(stray)
 
-    @property
-    def pending(self) -> int:
-        """Bytes held back because a frame may begin with them."""
-        return len(self._rest)
-
 
 REPLY_LENGTH = 9
 _REPLY = struct.Struct(">B3hBB")

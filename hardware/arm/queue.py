@@ -107,12 +107,7 @@ class ArmQueue:
 
     def frames(self, now: float) -> int:
         """Commands that are not done, those on the wire included."""
-        count = 0
-        for command in reversed(self._commands):
-            if command.end <= now:
-                break
-            count += 1
-        return count
+        return sum(command.end > now for command in self._commands)
 
     def at(self, instant: float) -> Axes:
         """The set-point (6,) at `instant`, s, no more than a second ago."""
@@ -140,9 +135,7 @@ class ArmQueue:
     def bounds(self, since: float, until: float) -> tuple[Axes, Axes]:
         """Least and greatest set-point of each axis between two instants, s."""
         knots = [self.at(since), self.at(until)]
-        for command in reversed(self._commands):
-            if command.end <= since:
-                break
+        for command in reversed(self.ways(since)):
             ends = (command.start, command.source), (command.end, command.target)
             knots += [place for instant, place in ends if since <= instant <= until]
         return tuple(map(min, *knots)), tuple(map(max, *knots))

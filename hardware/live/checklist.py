@@ -11,7 +11,7 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm.device import ArmState
 from hardware.arm.profile import AXIS_LETTERS, ArmProfile, placed
-from hardware.live.records import LiveMotionReport, RecorderReport, TrackingReport
+from hardware.live.records import LiveMotionReport, RecorderReport, RunReports, TrackingReport
 from hardware.operator.view import Check, CheckVerdict
 from hardware.process.progress import count_text
 from planning.limits import AXIS_MARGIN, JOINT_MARGIN
@@ -68,7 +68,22 @@ def _outside(values: Array, low: Array, high: Array, names: str | list[str]) -> 
     return f"checkpoint {row}: {names[column]} = {got:.1f}, allowed {least:.1f} to {most:.1f} {unit}"
 
 
-def camera_checks(report: TrackingReport | None, now: float) -> tuple[Check, Check]:
+def run_checks(
+    reports: RunReports, path: Path, start: float, placed_path: PlacedPath | None, stands_home: bool, now: float
+) -> tuple[Check, ...]:
+    """The checks of a run at `now`, s. path, start: to be printed. stands_home: the operator says that the arm does."""
+    begun = f", from checkpoint {start:.2f} on" if start else ""
+    layers = count_text(len(np.unique(path.layer)), "layer")
+    return (
+        *_camera_checks(reports.tracking, now),
+        _arm_check(reports.motion, stands_home),
+        Check("path", PASS, f"{len(path)} checkpoints, {layers}{begun}"),
+        _reach_check(placed_path),
+        _recorder_check(reports.recorder),
+    )
+
+
+def _camera_checks(report: TrackingReport | None, now: float) -> tuple[Check, Check]:
     """Whether all cameras deliver, and what is known of their calibration."""
     if report is None or not report.cameras:
         return Check("cameras", BUSY, "the tracker starts"), Check("calibration", BUSY, "the tracker starts")
@@ -84,7 +99,7 @@ def camera_checks(report: TrackingReport | None, now: float) -> tuple[Check, Che
     return Check("cameras", PASS, f"all {len(report.cameras)} deliver"), calibration
 
 
-def arm_check(report: LiveMotionReport | None, stands_home: bool) -> Check:
+def _arm_check(report: LiveMotionReport | None, stands_home: bool) -> Check:
     """Whether the arm is there, and whether anybody knows where it stands."""
     if report is None:
         return Check("arm", BUSY, "its line is opened")
@@ -99,13 +114,7 @@ def arm_check(report: LiveMotionReport | None, stands_home: bool) -> Check:
     return Check("arm", PASS, f"{known}{lag}; {report.priority}")
 
 
-def path_check(path: Path, start: float) -> Check:
-    """What is to be printed."""
-    begun = f", from checkpoint {start:.2f} on" if start else ""
-    return Check("path", PASS, f"{len(path)} checkpoints, {count_text(len(np.unique(path.layer)), 'layer')}{begun}")
-
-
-def reach_check(placed_path: PlacedPath | None) -> Check:
+def _reach_check(placed_path: PlacedPath | None) -> Check:
     """Whether the arm reaches the path where the surface is."""
     if placed_path is None:
         return Check("reach", BUSY, "the surface is not found yet")
@@ -114,7 +123,7 @@ def reach_check(placed_path: PlacedPath | None) -> Check:
     return Check("reach", PASS, "every checkpoint is within the arm's range where the surface is now")
 
 
-def recorder_check(report: RecorderReport | None) -> Check:
+def _recorder_check(report: RecorderReport | None) -> Check:
     """Whether the recorder writes."""
     if report is None:
         return Check("recording", BUSY, "the recorder starts")

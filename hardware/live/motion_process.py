@@ -212,21 +212,10 @@ class _TickReporter:
                 RecordedTick(tick.stamp, stamp, asked, begun, motion.paused, tick.command, frame, *reached)
             )
         lateness = StageTiming(LATE_TICK_STAGE, late.count, late.percentile(50), late.percentile(99), late.most)
-        stops = loop.arm.stops
-        self._reports.put(
-            LiveMotionReport(
-                tick=tick,
-                progress=progress,
-                paused=motion.paused,
-                events=tuple(self._events),
-                timings=(*self.times.timings(), lateness),
-                skipped=loop.skipped,
-                stops=len(stops),
-                stop=stops[-1] if stops else None,
-                unrecorded=self._sender.dropped,
-                priority=self._priority,
-            )
-        )
+        events, timings, stops = tuple(self._events), (*self.times.timings(), lateness), loop.arm.stops
+        stopped = len(stops), stops[-1] if stops else None
+        counts = loop.skipped, *stopped, self._sender.dropped
+        self._reports.put(LiveMotionReport(tick, progress, events, timings, *counts, self._priority))
 
 
 def move(prepared: Prepared, channels: MotionChannels) -> None:

@@ -19,8 +19,8 @@ from estimation import se3
 from estimation.se3 import Array
 from hardware.live.checklist import checks_table
 from hardware.live.prepared import Prepared
-from hardware.live.records import StageHistograms, StageTiming
-from hardware.live.state_machine import RunReports, RunStateMachine
+from hardware.live.records import RunReports, StageHistograms, StageTiming
+from hardware.live.state_machine import RunStateMachine
 from hardware.operator.view import RunStage
 from hardware.process.ticks import Histogram
 from planning.command import Move

@@ -148,7 +148,6 @@ class NozzleErrors:
 
     distance: Array  # (N,) mm, nozzle to its place, of each extruding millisecond
     duty: float  # share of the time due in which material left; NaN where none was due
-    printed_range: tuple[float, float]  # first and last place extruded, in checkpoints
     deepest: float  # s of motion that the arm ever had queued
     held_up: float  # s that a busy machine kept the virtual arm from its line at most
 
@@ -208,15 +207,12 @@ def nozzle_errors(record: File, path: File, arm: File) -> NozzleErrors:
         extruding += int(log.extrude.sum())
         due += int((np.isfinite(log.place) & (log.place > 0) & (log.stamps < finished)).sum())
     duty = extruding / due if due else float("nan")
-    return NozzleErrors(np.concatenate(errors), duty, _printed_range(run), deepest, held_up)
+    return NozzleErrors(np.concatenate(errors), duty, deepest, held_up)
 
 
 def printed_range(record: File) -> tuple[float, float]:
     """First and last place, counted in checkpoints, at which a run extruded; NaN where it did not."""
-    return _printed_range(_read_run(record, "/tick", "/move"))
-
-
-def _printed_range(run: _RecordedRun) -> tuple[float, float]:
+    run = _read_run(record, "/tick", "/move")
     extruding = {m["stamp"] for m in run.messages["/move"] if m["extrude"]}
     places = [float(m["fraction"]) for m in run.messages["/tick"] if m["stamp"] in extruding]
     return (min(places), max(places)) if places else (float("nan"), float("nan"))

@@ -239,7 +239,7 @@ class _EntryWriter:
         self._failed, self._reported = self._failed or failed, now
         share = (spent - self._begin[1]) / max(now - self._begin[0], 1e-3)
         size = self._file.stat().st_size if self._recorder is not None and self._file.exists() else 0
-        self._reports.put(RecorderReport(now, size, share, self._failed))
+        self._reports.put(RecorderReport(size, share, self._failed))
 
     def close(self) -> None:
         """Close the file, and report."""

@@ -97,7 +97,6 @@ class LiveMotionReport:
 
     tick: Tick  # the last one
     progress: PrintProgress | None  # None before a path was begun
-    paused: bool  # whether it was ordered to pause
     events: tuple[ArmEvent, ...]  # the last ones
     timings: tuple[StageTiming, ...]  # from frames to the wire, and how late ticks were
     skipped: int  # ticks that were not made
@@ -111,10 +110,18 @@ class LiveMotionReport:
 class RecorderReport:
     """The report of the recorder."""
 
-    stamp: float  # s
     written: int  # bytes
     share: float  # of one core that it takes
     failed: str  # why it stopped, "" while it writes
+
+
+@dataclass(slots=True)
+class RunReports:
+    """The newest reports."""
+
+    tracking: TrackingReport | None = None
+    motion: LiveMotionReport | None = None
+    recorder: RecorderReport | None = None
 
 
 # -- what is recorded

@@ -27,9 +27,9 @@ from hardware.live.fault_injection import FaultInjector
 from hardware.live.ipc import ProcessBody, run_tracker, start_processes
 from hardware.live.outcome import RunOutcome, RunStatistics
 from hardware.live.prepared import Prepared, ProgressWriter, SurfacePlacement, write_placement
-from hardware.live.records import BeginPrint, EventEntry, UsedEntry
+from hardware.live.records import BeginPrint, EventEntry, RunReports, UsedEntry
 from hardware.live.settings import page_settings, settings_text
-from hardware.live.state_machine import Orders, RunReports, RunStateMachine
+from hardware.live.state_machine import Orders, RunStateMachine
 from hardware.live.view import KEYS_HELP, Console, ViewBuilder, stage_line, status_line
 from hardware.motion.loop import Order
 from hardware.operator.process import OperatorPage

@@ -12,17 +12,8 @@ from math import inf, isnan, nan
 
 from hardware.arm.device import ArmState
 from hardware.arm.profile import ArmProfile
-from hardware.live.checklist import (
-    PlacedPath,
-    arm_check,
-    camera_checks,
-    path_check,
-    place_path,
-    raised_path,
-    reach_check,
-    recorder_check,
-)
-from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RecorderReport, TrackingReport
+from hardware.live.checklist import PlacedPath, place_path, raised_path, run_checks
+from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RunReports, TrackingReport
 from hardware.motion.loop import Order
 from hardware.operator.shared_state import OperatorRequest
 from hardware.operator.view import (
@@ -83,15 +74,6 @@ class PrintTask:
 
 
 @dataclass(slots=True)
-class RunReports:
-    """The newest reports."""
-
-    tracking: TrackingReport | None = None
-    motion: LiveMotionReport | None = None
-    recorder: RecorderReport | None = None
-
-
-@dataclass(slots=True)
 class RunStateMachine:
     """The stage of a run; call it with each cycle's reports and requests."""
 
@@ -129,13 +111,7 @@ class RunStateMachine:
         for request in requests:
             orders += self._answer(request, now)
         task = self.task
-        self.checks = (
-            *camera_checks(reports.tracking, now),
-            arm_check(reports.motion, task.stands_home),
-            path_check(task.path, task.start),
-            reach_check(self.placed_path),
-            recorder_check(reports.recorder),
-        )
+        self.checks = run_checks(reports, task.path, task.start, self.placed_path, task.stands_home, now)
         if not self.ended:
             orders += self._advance(reports, now)
         self.silence = self._silent_process(reports, now) if self.stage in ACTIVE_STAGES else ""

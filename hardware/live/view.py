@@ -21,8 +21,8 @@ from hardware.arm.profile import ArmProfile
 from hardware.live.checklist import MAX_PICTURE_AGE
 from hardware.live.outcome import RunStatistics
 from hardware.live.prepared import Prepared
-from hardware.live.records import FRAMES_TO_WIRE_STAGE, LiveMotionReport, TrackingReport
-from hardware.live.state_machine import RunReports, RunStateMachine
+from hardware.live.records import FRAMES_TO_WIRE_STAGE, LiveMotionReport, RunReports, TrackingReport
+from hardware.live.state_machine import RunStateMachine
 from hardware.operator.view import (
     STAGE_QUESTIONS,
     Activity,
