@@ -215,10 +215,9 @@ class Arm(ArmDevice):
     def status(self, now: float) -> ArmStatus:
         """All that is known."""
         queued, feedback = 0 if self._queue is None else self._queue.frames(now), self._feedback
-        answers = feedback.axes(now), feedback.off, feedback.lag, feedback.rate
-        counts = queued, self.frames, feedback.count, self.strays
-        known = self.state, self.reason, self.reckoned(now)
-        return ArmStatus(now, *known, *answers, self.in_flight(now), *counts)
+        measured, counts = (feedback.off, feedback.lag, feedback.rate), (self.frames, feedback.count, self.strays)
+        places = self.reckoned(now), feedback.axes(now)
+        return ArmStatus(now, self.state, self.reason, *places, *measured, self.in_flight(now), queued, *counts)
 
     # -- own moves, supervision, stops
 

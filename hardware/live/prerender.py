@@ -31,7 +31,7 @@ from hardware.simulator.scenario import Scenario, read_scenario
 from hardware.simulator.scenario_tables import scene_from_table
 from hardware.simulator.simulate import regions
 from hardware.simulator.truth import Truth, drape_path
-from hardware.simulator.world import SimulatedWorld, WorldSink
+from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet
 from perception.tracking.step import StepReport, report_without_offsets
 
@@ -138,7 +138,7 @@ class _NullTracker:
         """Nothing to do."""
 
 
-class _PictureSink(WorldSink):
+class _PictureSink:
     """Records pictures and the truth at their exposures; of all else that happens, nothing."""
 
     def __init__(self, recorder: Recorder, truth: Truth) -> None:
@@ -156,3 +156,8 @@ class _PictureSink(WorldSink):
         trajectory = Trajectory(stamps, self._truth.base_from_surface(stamps), exact=True)
         for row in rows_from_trajectory(trajectory):
             self._recorder.truth_row(row, exact=True)
+
+    def _ignore(self, *arguments: object, **named: object) -> None:
+        pass
+
+    pose = command = head = rows = registered = event = _ignore

@@ -135,19 +135,11 @@ class RecorderReceiver:
         return self._connection.fileno()
 
     def take(self) -> Iterator[Entry]:
-        """The entries that have come since the last call; waits where none has."""
+        """The complete entries that have come since the last call; waits where nothing has."""
         with memoryview(self._memory) as memory:
             count = os.readv(self._connection.fileno(), [memory[self._filled :]])
         self.ended, self.crowded = count == 0, count > CROWDED_SHARE * self._room
         self._filled += count
-        yield from self._complete_entries()
-
-    def close(self) -> None:
-        """Close the pipe, which the sender notices."""
-        self._connection.close()
-
-    def _complete_entries(self) -> Iterator[Entry]:
-        """The entries that are complete; the part of the next one is moved to the front of the memory."""
         begin, needed = 0, ENTRY_HEAD.size
         with memoryview(self._memory) as memory:
             while begin + ENTRY_HEAD.size <= self._filled:
@@ -157,10 +149,14 @@ class RecorderReceiver:
                 yield pickle.loads(memory[begin + ENTRY_HEAD.size : begin + needed])
                 begin += needed
                 needed = ENTRY_HEAD.size
-            memory[: self._filled - begin] = memory[begin : self._filled]
+            memory[: self._filled - begin] = memory[begin : self._filled]  # the part of the next entry
         self._filled -= begin
         if needed > len(self._memory):
             self._memory += bytes(needed)
+
+    def close(self) -> None:
+        """Close the pipe, which the sender notices."""
+        self._connection.close()
 
 
 def record(settings: LiveSettings, senders: Sequence[Connection], reports: SharedLatest[RecorderReport]) -> None:

@@ -88,17 +88,13 @@ class NozzleErrorEstimate:
         if profile is None or motion is None or tracking is None or tracking.truth is None or tracking.pose is None:
             return
         if motion.tick.stamp != self._ticked:
-            self._ticked = motion.tick.stamp
-            self._keep_command(motion, profile)
+            self._ticked, command = motion.tick.stamp, motion.tick.command
+            if isinstance(command, Move) and command.extrude and motion.progress is not None:
+                due = command.stamp + profile.tick + profile.lag
+                self._commands.append((due, command.axes, motion.progress.fraction))
         if tracking.pose.stamp != self._compared:
             self._compared = tracking.pose.stamp
             self.last = self._error(tracking.pose.stamp, tracking.truth, profile)
-
-    def _keep_command(self, motion: LiveMotionReport, profile: ArmProfile) -> None:
-        command = motion.tick.command
-        if isinstance(command, Move) and command.extrude and motion.progress is not None:
-            due = command.stamp + profile.tick + profile.lag
-            self._commands.append((due, command.axes, motion.progress.fraction))
 
     def _error(self, stamp: float, base_from_surface: Array, profile: ArmProfile) -> float:
         """Distance, mm, from the nozzle to its place at `stamp`, s; NaN where it was not printing then."""
@@ -125,8 +121,10 @@ class ViewBuilder:
     _rate: float = nan  # frame sets per second, smoothed
 
     def __post_init__(self) -> None:
-        self._true_error = NozzleErrorEstimate(self.prepared.task.path)
-        self._times_left = _times_left(self.prepared.task.path)
+        path = self.prepared.task.path
+        self._true_error = NozzleErrorEstimate(path)
+        seconds = way_lengths(path.surface_from_nozzle) / path.speed[1:]  # at the path's own speeds
+        self._times_left = np.concatenate([np.cumsum(seconds[::-1])[::-1], [0.0]])
 
     def update(self, reports: RunReports, profile: ArmProfile | None) -> None:
         """Take the newest reports. profile: of the arm since the path was begun; None before."""
@@ -221,12 +219,6 @@ def _activity(motion: LiveMotionReport, stage: RunStage) -> Activity:
     if motion.progress.phase is PrintPhase.PRINTING:
         return Activity.PRINTING if command.extrude else Activity.TRAVELLING
     return PHASE_ACTIVITIES.get(motion.progress.phase, Activity.HOLDING)
-
-
-def _times_left(path: Path) -> Array:
-    """Seconds (N,) from each checkpoint to the end at the path's own speeds."""
-    each = way_lengths(path.surface_from_nozzle) / path.speed[1:]
-    return np.asarray(np.concatenate([np.cumsum(each[::-1])[::-1], [0.0]]))
 
 
 class Console:

@@ -10,6 +10,7 @@ import asyncio
 import ssl
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
 from importlib.resources import files
 from socket import socket as Listener
 
@@ -111,7 +112,8 @@ class WindowSession:
             await self._put(self._status())
             await asyncio.wait_for(self._shown.wait(), self._limits.patience)
             if not self._replies:
-                await _within(news, STATUS_PULSE)
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(news.wait(), STATUS_PULSE)
 
     def _status(self) -> str:
         age = self._newest.age(self._clock.now())
@@ -127,13 +129,6 @@ class WindowSession:
     async def _close(self, why: bytes) -> None:
         closing = self._socket.close(code=WSCloseCode.POLICY_VIOLATION, message=why)
         await asyncio.wait_for(closing, self._limits.patience)
-
-
-async def _within(news: asyncio.Event, seconds: float) -> None:
-    try:
-        await asyncio.wait_for(news.wait(), seconds)
-    except TimeoutError:
-        return
 
 
 class OperatorServer:
