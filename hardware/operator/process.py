@@ -13,9 +13,9 @@ import os
 import signal
 import socket
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
-from threading import Condition, Thread
 
 import numpy as np
 
@@ -126,7 +126,7 @@ class CameraShot:
 
 
 class Thumbnailer:
-    """A thread that makes thumbnails. made: instants whose pictures were put out; dropped: those too large."""
+    """Makes thumbnails in a thread. made: instants whose pictures were put out; dropped: those too large."""
 
     def __init__(
         self, pictures: SharedLatest[PagePictures], requests: RequestLine, clock: Clock | None = None, near: bool = True
@@ -135,48 +135,26 @@ class Thumbnailer:
         self._pictures, self._requests, self._clock, self._near = pictures, requests, clock or WallClock(), near
         self._due = float("-inf")
         self._crops: dict[str, Crop] = {}
-        self._waiting: tuple[float, Sequence[CameraShot], Array | None] | None = None
-        self._changed, self._ended = Condition(), False
         self.made = self.dropped = 0
-        self._thread = Thread(target=self._work, name="live pictures", daemon=True)
-        self._thread.start()
+        self._thread = ThreadPoolExecutor(1, "live pictures")
+        self._job: Future[None] | None = None  # the last one
 
     def offer(self, stamp: float, shots: Sequence[CameraShot], base_from_surface: Array | None = None) -> bool:
         """Whether the shots of one instant (s) will be shown; never waits. base_from_surface: (4, 4) mm then."""
-        now = self._clock.now()
-        if now < self._due or not self._requests.windows:
+        now, busy = self._clock.now(), self._job is not None and not self._job.done()
+        if busy or now < self._due or not self._requests.windows:
             return False
-        if not self._changed.acquire(blocking=False):
-            return False
-        try:
-            if self._waiting is not None:
-                return False
-            self._due = now + THUMBNAIL_PERIOD
-            self._waiting = stamp, shots, base_from_surface
-            self._changed.notify()
-        finally:
-            self._changed.release()
+        self._due = now + THUMBNAIL_PERIOD
+        self._job = self._thread.submit(self._make, stamp, shots, base_from_surface)
+        self._job.add_done_callback(Future.result)  # an error in it is logged
         return True
 
     def close(self) -> None:
         """End the thread."""
-        with self._changed:
-            self._ended = True
-            self._changed.notify()
-        self._thread.join()
+        self._thread.shutdown()
 
-    def _work(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._ended or self._waiting is not None)
-                if self._ended or self._waiting is None:
-                    return
-                stamp, shots, pose = self._waiting
-            self._put(PagePictures(stamp, tuple(map(self._picture, shots)), pose))
-            with self._changed:
-                self._waiting = None
-
-    def _put(self, pictures: PagePictures) -> None:
+    def _make(self, stamp: float, shots: Sequence[CameraShot], base_from_surface: Array | None) -> None:
+        pictures = PagePictures(stamp, tuple(map(self._picture, shots)), base_from_surface)
         try:
             self._pictures.put(pictures)
             self.made += 1
