@@ -333,7 +333,7 @@ def test_a_feed_shows_what_struck_cameras_deliver(tmp_path: Path) -> None:
     begun.value = WallClock().now()
     struck = fault("camera0 off"), fault("camera1 black")
     shown = threading.Thread(target=play_session, args=(open_session(session), False, struck, ring, theirs, begun))
-    ring.wanted.value = True
+    ring.requested.value = True
     shown.start()
     source, taken = RingSource(ring, ours), None
     while taken is None and (shown.is_alive() or ours.poll()):

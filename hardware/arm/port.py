@@ -110,7 +110,7 @@ class Port(Protocol):
     """What the arm's link needs of a line. Each may raise UnpluggedError."""
 
     def write(self, data: bytes) -> int:
-        """Give out bytes without waiting; how many were taken, from the first on."""
+        """Give out bytes without waiting; how many of them, from the first on."""
         ...
 
     def read(self) -> bytes:

@@ -1,9 +1,8 @@
 """Faults injected into a run before a simulated world: processes killed, stopped or slowed, a full disk, a page flood.
 
 Faults of cameras are injected where the pictures are shown (session_player.py). Instants count from the begin of
-printing. The flood is that of a broken or hostile page: more windows than there may be, each saying as much as it can
-and showing nothing: that something was shown, wishes under a turn that never was, and garbage. A stop is not among it,
-as a stop is followed whoever asks for it.
+printing. The flood is that of a broken or hostile page: too many windows, each sending as fast as it can: false
+acknowledgements, requests under a turn that never was, and garbage. It sends no stop, which is always followed.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ BROWSER_NICENESS = 5  # as the page's own process: a browser is another program
 
 
 class FloodCount(Structure):
-    """What a flood of the page came to: messages sent, windows closed for what they sent, windows not let in."""
+    """Counts of a flood of the page: messages sent, windows closed for what they sent, windows not let in."""
 
     _fields_ = (("messages", c_uint64), ("closed", c_uint64), ("refused", c_uint64))
 

@@ -76,7 +76,7 @@ class FrameRing:
         self._slot = sum(self._pixels) + sum(self._stored)
         self._memory: Any = RawArray("B", self._slot * RING_SLOTS)
         self._counts: Any = RawArray("Q", RING_SLOTS)
-        self.wanted = RawValue(c_bool, False)  # whether the reader has begun to ask for frames
+        self.requested = RawValue(c_bool, False)  # whether the reader has begun to ask for frames
         self._count = 0  # of the writer
 
     def put(self, frames: FrameSet, encoded: dict[int, Encoded], now: Callable[[], float], source: float) -> SetNotice:
@@ -113,8 +113,8 @@ class FrameRing:
             start = self._start(slot, picture.camera) + self._pixels[picture.camera]
             if picture.size:
                 encoded[picture.camera] = picture.kind, memory[start : start + picture.size].tobytes()
-        whole = replace(frame_set(frames), head=notice.head)
-        return (whole, encoded) if self._counts[slot] == notice.count else None
+        frame_set_with_head = replace(frame_set(frames), head=notice.head)
+        return (frame_set_with_head, encoded) if self._counts[slot] == notice.count else None
 
     def _start(self, slot: int, camera: int) -> int:
         return slot * self._slot + sum(self._pixels[:camera]) + sum(self._stored[:camera])
@@ -129,7 +129,7 @@ class RingSource:
     def take(self, patience: float) -> TimedFrameSet | None:
         """The newest set, waiting `patience` s for one; None where none came. SourceEnded once there will be none."""
         notice = None
-        self._ring.wanted.value = True
+        self._ring.requested.value = True
         try:
             if self._notices.poll(patience):
                 notice = self._notices.recv()
@@ -140,10 +140,10 @@ class RingSource:
                 raise SourceEnded("the cameras have ended") from None
         if isinstance(notice, str):
             raise SourceEnded(notice)
-        if notice is None or (taken := self._ring.take(notice)) is None:
+        if notice is None or (copies := self._ring.take(notice)) is None:
             return None
         dropped, self._last = notice.count - self._last - 1, notice.count
-        return TimedFrameSet(taken[0], taken[1], notice.handed, notice.source, dropped)
+        return TimedFrameSet(*copies, notice.handed, notice.source, dropped)
 
     def learn(self, offsets: Array) -> None:
         """Nothing to learn: sets come paired as they were recorded."""

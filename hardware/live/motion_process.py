@@ -54,7 +54,7 @@ class LiveMotion:
     """The motion of a live run: holds until a path is begun, then a MotionStep that can be paused, or begun at home.
 
     last: the last command.
-    asked: whether planner and guard gave it.
+    asked: whether planner and guard made it.
     begun: place, in checkpoints, at which the step was made anew since this was last reset to NaN.
     """
 
@@ -117,10 +117,10 @@ class _LoggedPort:
         self.waiting, self.close = port.waiting, port.close
 
     def write(self, data: bytes) -> int:
-        taken = self._port.write(data)
-        if taken:
-            self._listener(data[:taken], True)
-        return taken
+        count = self._port.write(data)
+        if count:
+            self._listener(data[:count], True)
+        return count
 
     def read(self) -> bytes:
         data = self._port.read()
@@ -208,9 +208,8 @@ class _TickReporter:
             asked, begun = motion.asked and motion.last.stamp == tick.stamp, motion.begun
             motion.begun, frame = math.nan, loop.arm.command_frame if asked else b""
             reached = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
-            self._sender.put(
-                RecordedTick(tick.stamp, stamp, asked, begun, motion.paused, tick.command, frame, *reached)
-            )
+            given = stamp, asked, begun, motion.paused
+            self._sender.put(RecordedTick(tick.stamp, *given, tick.command, frame, *reached))
         lateness = StageTiming(LATE_TICK_STAGE, late.count, late.percentile(50), late.percentile(99), late.most)
         events, timings, stops = tuple(self._events), (*self.times.timings(), lateness), loop.arm.stops
         stopped = len(stops), stops[-1] if stops else None

@@ -1,7 +1,7 @@
-"""The recorder of a live run: the queue by which a process gives it entries, and the process that writes them.
+"""The recorder of a live run: each process's queue of entries to it, and the process that writes them to the file.
 
 A sender never waits: it queues a bounded number of bytes and counts the entries for which there was no room. All
-processes of a run import this module, so what writes files is imported in the recorder's process alone.
+processes of a run import this module, so the modules that write files are imported in the recorder's process alone.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ def record(settings: LiveSettings, senders: Sequence[Connection], reports: Share
 
 
 class _EntryWriter:
-    """Writes entries once the rig is known; those that came before it are written then."""
+    """Writes entries to the file, which is opened once the rig is known; earlier entries wait for that."""
 
     def __init__(self, settings: LiveSettings, reports: SharedLatest[RecorderReport]) -> None:
         from hardware.recording.recorder import Recorder  # before pictures come, as loading it takes a while

@@ -1,7 +1,7 @@
-"""`stillbed live`: the process that the user started, which supervises the processes that track, move and record.
+"""`stillbed live`: the process that the user started; it supervises the processes that track, move and record.
 
-It starts them, reads their reports, keys, signals and the requests of the page, asks the state machine what follows,
-and sends the orders. It does nothing that takes long, so that a stop never waits here.
+In each cycle it reads their reports, the keys, signals and the page's requests, calls the state machine with them, and
+sends the orders that follow. It does nothing that takes long, so that a stop never waits here.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from perception.frames import Frame, FrameSet
 from perception.pairing import frame_set
 
 TRANSPORT_DELAY = 0.025  # s from the middle of an exposure to the picture in the computer, as a scenario has it
-WANTED_POLL_PERIOD = 0.02  # s between looks whether the tracker asks for frames
+REQUEST_POLL_PERIOD = 0.02  # s between looks whether the tracker asks for frames
 TURN_SEARCH_SHARE = 0.25  # share of a session at each end in which a turn is looked for
 DECODE_LEAD = 1.5  # of the time that decoding takes: so long before a set is due it is begun
 DECODE_DECAY = 0.9  # of that time, from set to set
@@ -92,10 +92,12 @@ def play_session(
 ) -> None:
     """Put the sets of a session into the ring in real time. faults: of cameras, counted from `start`, s."""
     clock, pictures = WallClock(), _PictureCache(session, again)
-    spoil = FrameFaults(faults, session.rig, "command line")
+    inject = FrameFaults(faults, session.rig, "command line")
     parent = parent_process()
-    while not ring.wanted.value and (parent is None or parent.is_alive()):  # a session shown once waits for the tracker
-        clock.wait_until(clock.now() + WANTED_POLL_PERIOD)
+    while not ring.requested.value and (
+        parent is None or parent.is_alive()
+    ):  # a session shown once waits for the tracker
+        clock.wait_until(clock.now() + REQUEST_POLL_PERIOD)
     stamps = np.array([np.mean([ref.stamp for ref in refs]) for refs in session.sets])
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     between = turning_sets(session.truth, stamps) if again and session.truth is not None else None
@@ -110,15 +112,15 @@ def play_session(
         encoded, frames = pictures.decoded(refs)
         spent = max(clock.now() - decoding, DECODE_DECAY * spent)
         ahead = -1 if showing.backwards else 1  # backwards, what was earlier is later
-        shown = [replace(f, stamp=showing.live + ahead * (f.stamp - anchor)) for f in frames]
+        restamped = [replace(f, stamp=showing.live + ahead * (f.stamp - anchor)) for f in frames]
         head = session.heads.at(anchor)
-        whole = FrameSet(frame_set(shown).stamp, tuple(shown), head)
-        spoilt = spoil(whole, showing.live - start.value)
-        same = {frame.camera for frame in spoilt.frames if frame in whole.frames}
+        intact = FrameSet(frame_set(restamped).stamp, tuple(restamped), head)
+        struck = inject(intact, showing.live - start.value)
+        same = {frame.camera for frame in struck.frames if frame in intact.frames}
         clock.wait_until(due)
-        if spoilt.frames:
+        if struck.frames:
             unchanged = {camera: stored for camera, stored in encoded.items() if camera in same}
-            notices.send(ring.put(spoilt, unchanged, clock.now, anchor))
+            notices.send(ring.put(struck, unchanged, clock.now, anchor))
 
 
 class _PictureCache:

@@ -129,7 +129,7 @@ def parse_host_names(where: object, key: str, names: object) -> tuple[str, ...]:
 
 
 def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
-    """The settings themselves, if a run can be made of them; InputError names what is missing or out of range."""
+    """The settings, with an arm; InputError names what is missing or out of range."""
     s = settings
     if (s.rig is None) == (s.simulated is None):
         raise InputError(where, "cameras", "both" if s.rig else "neither", "one of rig and simulated")
@@ -196,12 +196,12 @@ def _toml_value(value: object) -> str | None:
 
 
 def override_settings(settings: LiveSettings, flags: dict[str, Any]) -> LiveSettings:
-    """The settings with what was given on the command line; None was not given. InputError: a lift of a real print."""
+    """The settings overridden by the command line's, None for a flag left out. InputError: a lift without a dry run."""
     names = {f.name for f in fields(LiveSettings)}
-    made = replace(settings, **{name: value for name, value in flags.items() if name in names and value is not None})
-    if flags.get("lift") is not None and not made.dry_run:
+    merged = replace(settings, **{name: value for name, value in flags.items() if name in names and value is not None})
+    if flags.get("lift") is not None and not merged.dry_run:
         raise InputError("command line", "--lift", flags["lift"], "with --dry-run")
-    return made
+    return merged
 
 
 def page_settings(settings: LiveSettings, where: object) -> OperatorSettings:
@@ -220,17 +220,11 @@ def page_settings(settings: LiveSettings, where: object) -> OperatorSettings:
     if address.is_unspecified and not s.page_names:
         allowed = "the names by which browsers call this machine, as its certificate has them"
         raise InputError(where, "page.names", "missing", allowed)
-    made = OperatorSettings(
-        host=s.page_address,
-        port=s.page_port,
-        elsewhere=not address.is_loopback,
-        certificate=s.page_certificate,
-        key=s.page_key,
-        names=s.page_names,
-    )
-    _check_certificate(made, where)
-    _check_free(made, where)
-    return made
+    page = OperatorSettings(s.page_address, s.page_port, certificate=s.page_certificate, key=s.page_key)
+    page = replace(page, elsewhere=not address.is_loopback, names=s.page_names)
+    _check_certificate(page, where)
+    _check_free(page, where)
+    return page
 
 
 def _check_certificate(settings: OperatorSettings, where: object) -> None:

@@ -1,6 +1,6 @@
-"""The tracking process of a live run: frame sets in, poses out, and what is recorded and reported of them.
+"""The tracking process of a live run: frame sets in, poses out to the motion; both are recorded and reported.
 
-It may stall or die at any instant: the pose that the motion has grows old, and the guard holds the arm.
+It may stall or die at any instant: the motion's newest pose then grows too old, and the guard holds the arm.
 """
 
 from __future__ import annotations
@@ -110,8 +110,8 @@ def _true_pose(truth: Trajectory, stamp: float) -> Array:
 def _restore_map(step: FrameSetStep, record: Path, session: Session, until: float, now: float) -> Array:
     """Give the step the first pictures of an earlier run, so that it maps the same surface; new_from_old (4, 4) mm.
 
-    From pictures that were kept exactly it is the same map; from others its frame may lie elsewhere, by what both runs
-    estimate at the last of them. InputError where the surface is not found in its own pictures.
+    Pictures recorded without loss give the same map; from others its frame may lie elsewhere, by the difference of both
+    runs' poses at the last of them. InputError where the surface is not found in its own pictures.
     """
     poses = {pose.stamp: pose for pose in read_poses(record) if pose.stamp <= until + SETTLING_TIME}
     sets = takewhile(lambda frames: frames.stamp <= until + SETTLING_TIME, session.frame_sets())
@@ -162,7 +162,7 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 class _TrackingLoop:
-    """Feeds frame sets to the tracking step, and hands on what comes of them. report: the last one."""
+    """Feeds frame sets to the tracking step, and hands its poses on. report: the last one."""
 
     def __init__(
         self, prepared: Prepared, channels: TrackingChannels, sender: RecorderSender, stack: ExitStack
@@ -190,8 +190,8 @@ class _TrackingLoop:
         self._last_stamp, self._intervals = np.nan, deque[float](maxlen=INTERVAL_WINDOW)
         channels.reports.put(self.report)
         earlier = None if placement is None else open_session(placement.map)
-        known = session if earlier is None else earlier
-        rois = () if known is None else known.roi
+        source = session if earlier is None else earlier
+        rois = () if source is None else source.roi
         sender.put(rig)
         if surface is not None:
             sender.put(ScanEntry(surface))

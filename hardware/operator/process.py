@@ -183,12 +183,12 @@ def crop_around(shot: CameraShot, present: Crop | None) -> Crop | None:
         return present
     low, high = np.percentile(points, [2, 98], axis=0)  # single tracks may lie anywhere
     height, width = shot.image.shape[:2]
-    wanted = CROP_MARGIN * max(high[0] - low[0], (high[1] - low[1]) * width / height, width / 8)
-    if present is not None and wanted > present[2] / 2 and _holds(present, low, high):
+    needed = CROP_MARGIN * max(high[0] - low[0], (high[1] - low[1]) * width / height, width / 8)
+    if present is not None and needed > present[2] / 2 and _holds(present, low, high):
         return present
-    if wanted >= width:
+    if needed >= width:
         return None
-    size = np.array([round(wanted), round(wanted * height / width)])
+    size = np.array([round(needed), round(needed * height / width)])
     corner = np.clip(np.round((low + high - size) / 2), 0, [width, height] - size).astype(int)
     return int(corner[0]), int(corner[1]), int(size[0]), int(size[1])
 

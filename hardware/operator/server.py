@@ -1,7 +1,7 @@
-"""The page over HTTP: its few files, its web sockets, and a stop for windows that have no socket (owns aiohttp).
+"""The page over HTTP: its few files, its web sockets, and a stop for windows without a socket (owns aiohttp).
 
-A window is sent the newest whenever it has confirmed what it was sent before. Receiving never waits for sending, so
-that a window which shows nothing any more can still stop the run.
+A window is sent the newest view whenever it has acknowledged the one before. Receiving never waits for sending, so a
+window that no longer shows anything can still stop the run.
 """
 
 from __future__ import annotations

@@ -148,7 +148,7 @@ def scene_from(
 ) -> PageScene:
     """The scene, thinned to what a browser draws with ease. surface: (V, 3) mm, triangles: (T, 3), surface frame."""
     empty = PageScene(rig.cameras)
-    kept = empty.checkpoint if path is None else _drawn_checkpoints(path)
+    drawn = empty.checkpoint if path is None else _drawn_checkpoints(path)
     points = empty.surface if surface is None else np.asarray(surface, float)
     corners = empty.triangles if triangles is None else np.asarray(triangles, np.int64)
     if len(corners) > MAX_TRIANGLES:
@@ -157,7 +157,7 @@ def scene_from(
         points = points[np.linspace(0, len(points) - 1, MAX_TRIANGLES).astype(np.int64)]
     if path is None:
         return PageScene(rig.cameras, surface=points, triangles=corners)
-    return PageScene(rig.cameras, path.surface_from_nozzle[kept, :3, 3], kept, path.extrude[kept], points, corners)
+    return PageScene(rig.cameras, path.surface_from_nozzle[drawn, :3, 3], drawn, path.extrude[drawn], points, corners)
 
 
 def _drawn_checkpoints(path: Path) -> NDArray[np.int64]:
@@ -178,14 +178,14 @@ def _coarser_mesh(points: Array, triangles: NDArray[np.int64]) -> tuple[Array, N
     while True:
         _, group = np.unique(np.floor((points - low) / cell).astype(np.int64), axis=0, return_inverse=True)
         group = group.reshape(-1)
-        joined = group[triangles]
-        whole = (joined != np.roll(joined, 1, axis=1)).all(axis=1)
-        kept = np.unique(np.sort(joined[whole], axis=1), axis=0)
-        if len(kept) <= MAX_TRIANGLES:
+        merged = group[triangles]
+        distinct = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
+        coarse = np.unique(np.sort(merged[distinct], axis=1), axis=0)
+        if len(coarse) <= MAX_TRIANGLES:
             break
         cell *= 1.2
     middles = np.stack([np.bincount(group, points[:, k]) for k in range(3)], axis=1) / np.bincount(group)[:, None]
-    return middles, kept
+    return middles, coarse
 
 
 @dataclass(frozen=True, slots=True, eq=False)
