@@ -29,12 +29,7 @@ if TYPE_CHECKING:
     import aiohttp
 
 
-FAULT_PROCESSES = {
-    FaultPart.TRACKING: "tracking",
-    FaultPart.MOTION: "motion",
-    FaultPart.ARM: "arm",
-    FaultPart.DISK: "recorder",
-}
+FAULT_PROCESSES = {FaultPart(name): name for name in ("tracking", "motion", "arm")} | {FaultPart.DISK: "recorder"}
 FLOOD_PROCESS = "flood"  # name of the processes that flood the page
 SLOWDOWN_PERIOD = 0.2  # s in which a slow process runs for its share: a few looks of the run's
 FLOOD_WINDOWS = 12  # more than the page lets in at once

@@ -145,13 +145,9 @@ class OperatorServer:
     def application(self) -> web.Application:
         """The routes, all behind the check of requests."""
         application = web.Application(middlewares=[self._guard], client_max_size=self._limits.message)
-        application.add_routes(
-            [
-                web.get("/{token}/socket", self._socket),
-                web.post("/{token}/stop", self._stop),
-                web.get("/{token}/{name:[a-z_.]*}", self._file),
-            ]
-        )
+        application.router.add_get("/{token}/socket", self._socket)
+        application.router.add_post("/{token}/stop", self._stop)
+        application.router.add_get("/{token}/{name:[a-z_.]*}", self._file)
         return application
 
     async def update(self, connections: Callable[[], Sequence[web.RequestHandler]]) -> None:
