@@ -68,8 +68,9 @@ def surface_height(x: Array, y: Array) -> Array:
     return np.asarray(-(x**2 + 1.6 * y**2) / 400)
 
 
-def demo_scene(side: int = 24) -> PageScene:
+def demo_scene() -> PageScene:
     """Cameras, path and surface."""
+    side = 24  # points each way
     x, y = np.meshgrid(np.linspace(-45, 45, side), np.linspace(-32, 32, side))
     corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
     halves = [[corner, corner + 1, corner + side], [corner + 1, corner + side + 1, corner + side]]

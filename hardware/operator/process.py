@@ -23,7 +23,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.operator.settings import OperatorSettings, WindowLimits, allowed_hosts, check_settings
 from hardware.operator.shared_state import CameraPicture, OperatorLink, PagePictures, RequestLine
-from hardware.process.clock import Clock, WallClock
+from hardware.process.clock import WallClock
 from hardware.process.shared_latest import SharedLatest
 from perception.frames import Image
 
@@ -45,9 +45,9 @@ class OperatorPage:
     process: that serves, None before it is started.
     """
 
-    def __init__(self, link: OperatorLink, settings: OperatorSettings, limits: WindowLimits | None = None) -> None:
+    def __init__(self, link: OperatorLink, settings: OperatorSettings) -> None:
         """Binds the port; OSError where it is taken, InputError where the settings would let others in."""
-        self._link, self._settings, self._limits = link, check_settings(settings), limits or WindowLimits()
+        self._link, self._settings = link, check_settings(settings)
         family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
         self._listener = socket.create_server((settings.host, settings.port), family=family, backlog=32)
         self.process: BaseProcess | None = None
@@ -69,7 +69,7 @@ class OperatorPage:
             return False
         self.restarts += self.process is not None
         self._started = now
-        arguments = (self._link, self._settings, self._listener, self._limits)
+        arguments = (self._link, self._settings, self._listener)
         spawn = multiprocessing.get_context("spawn")
         self.process = spawn.Process(target=operator_process, args=arguments, name="operator's page", daemon=True)
         self.process.start()
@@ -86,20 +86,16 @@ class OperatorPage:
         self._listener.close()
 
 
-def operator_process(
-    link: OperatorLink, settings: OperatorSettings, listener: socket.socket, limits: WindowLimits | None = None
-) -> None:
+def operator_process(link: OperatorLink, settings: OperatorSettings, listener: socket.socket) -> None:
     """The body of the process: serve the page until SIGTERM or until the run is gone. Ctrl-C is for the run alone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(PAGE_NICENESS)
     for name in ("aiohttp", "asyncio"):  # what strangers send is theirs: it is counted, and not written on the terminal
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    asyncio.run(_serve_until_end(link, settings, listener, limits or WindowLimits()))
+    asyncio.run(_serve_until_end(link, settings, listener))
 
 
-async def _serve_until_end(
-    link: OperatorLink, settings: OperatorSettings, listener: socket.socket, limits: WindowLimits
-) -> None:
+async def _serve_until_end(link: OperatorLink, settings: OperatorSettings, listener: socket.socket) -> None:
     from hardware.operator.server import serve  # aiohttp is for this process alone
 
     loop, ended = asyncio.get_running_loop(), asyncio.Event()
@@ -112,7 +108,7 @@ async def _serve_until_end(
             ended.set()
 
         loop.add_reader(sentinel, on_parent_exit)
-    await serve(link, settings, listener, ended, limits)
+    await serve(link, settings, listener, ended, WindowLimits())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,11 +124,9 @@ class CameraShot:
 class Thumbnailer:
     """Makes thumbnails in a thread. made: instants whose pictures were put out; dropped: those too large."""
 
-    def __init__(
-        self, pictures: SharedLatest[PagePictures], requests: RequestLine, clock: Clock | None = None, near: bool = True
-    ) -> None:
+    def __init__(self, pictures: SharedLatest[PagePictures], requests: RequestLine, near: bool = True) -> None:
         """near: whether the part around outline and tracks is shown as well."""
-        self._pictures, self._requests, self._clock, self._near = pictures, requests, clock or WallClock(), near
+        self._pictures, self._requests, self._clock, self._near = pictures, requests, WallClock(), near
         self._due = float("-inf")
         self._crops: dict[str, Crop] = {}
         self.made = self.dropped = 0
