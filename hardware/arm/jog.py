@@ -1,13 +1,13 @@
 """The link's own moves: slow steps home or back to the path, and the recovery of an arm that does not follow.
 
-Where the arm stands is known to a fraction of a millimetre only. At a feed made for a step of a micrometre, that
-fraction would take the arm a minute, and all that is sent meanwhile would wait. So an own move begins with a step to
+The arm's place is known to a fraction of a millimetre only. At a feed computed for a step of a micrometre, that
+fraction would take the arm a minute, and all frames sent meanwhile would wait. So an own move begins with a step to
 where the arm should be, never asks for less than its speed, and moves and turns one after the other.
 
-An arm that stalls, that frames do not reach, or that a garbled frame sent astray is known by its answers. What it has
-queued is called back, so that it comes to rest. Then one short trial step towards its goal, with a pause before it, is
-repeated until its answers show that it has begun. Axes are absolute: a step sent twice goes no farther than one. What
-was called back was not done, and whoever sends goes on from where the arm came to rest.
+The arm's answers show that it stalls, misses frames, or was sent astray by a garbled frame. Its queue is then called
+back, so that it comes to rest. A short trial step towards its goal, behind a pause, is repeated until the answers show
+that it has begun; axes are absolute, so a step sent twice goes no farther. The moves that were called back are
+not done: the sender goes on from where the arm came to rest.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ TRIAL_START_TIME = 0.01  # s of a step, beyond the lag, after which answers from
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecalledMoves:
-    """What whoever sends must know before anything more is sent; (6,) each, mm and rad."""
+    """Where the arm is after moves were called back, for the sender of the next ones; (6,) each, mm and rad."""
 
     place: Array  # where the arm came to rest
     stands: Array  # where it is by now, at most a part of a trial step farther; the next move begins there
@@ -116,7 +116,7 @@ class RecalledMoves:
 
 
 class AbortRecovery:
-    """What was called back from one arm, until the arm is known to obey again.
+    """The recovery of one arm: its queue was called back, until the arm is known to obey again.
 
     why: for a person.
     goal: (6,) mm and rad, where the arm had been sent; None while nothing is called back.
@@ -162,7 +162,7 @@ class AbortRecovery:
         self.undone = undone
 
     def resume(self, place: Array) -> None:
-        """The arm is armed again, at rest at `place` (6,): whoever sends is to learn what is undone."""
+        """The arm is armed again, at rest at `place` (6,): the sender is to learn that moves are undone."""
         if self.undone:
             self.place, self.obeys = place, True
 

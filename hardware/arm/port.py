@@ -2,11 +2,11 @@
 
 Two programs can never write to one arm, and a crash leaves nothing to clean up. The lock file is where terminal
 programs look for theirs (LCK..NAME in the folder for locks, the owner's process number in its first line), so minicom
-and others respect it. Between two of ours the kernel's lock on the open file decides. It goes with its process, however
-that ends; a process number left behind by a crash, or taken over by another process since, stops nobody.
+and others respect it. Between two of ours the kernel's lock on the open file decides, which ends with its process. A
+process number left by a crash, or reused since, stops nobody.
 
-A frame of which the port took a part is always completed first: torn, it would take bytes of the next one with it. One
-of which nothing went out yet may be called back.
+A frame that is partly out is always completed first: torn, it would take bytes of the next one with it. A frame of
+which no byte is out may be called back.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A recorded session shown in real time by a process of its own, as cameras would show it.
 
-A session whose truth is known to be smooth (a pre-rendered one) goes on for ever: it is shown forwards and backwards in
-turn, between two instants at which the surface hardly moves, so that the motion has no corner there.
+A pre-rendered session, whose truth is smooth, goes on for ever: it is shown forwards and backwards in turn, between two
+instants at which the surface hardly moves, so that the motion has no corner there.
 """
 
 from __future__ import annotations

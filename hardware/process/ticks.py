@@ -1,14 +1,14 @@
 """When the ticks of a motion are due, how late they come, and how evenly the machine works.
 
 Cameras give a pose each 33 ms. Ticks that run freely beside them leave each pose waiting for half a tick on average.
-Locked to the poses, a tick comes shortly after its pose, and may come as soon as the pose is there; planner and guard
-still get the instant at which it was due, so the arm's motion stays even. The arm does a tick's move in `tick`. The
-time between two ticks may be a little longer, never shorter, as the arm's queue would fill up. So a locked tick is one
-per cent shorter than its share of the time between two poses (`tick_in_step`): phase is gained and lost within that.
+Locked to the poses, a tick comes shortly after its pose, or as soon as the pose is there; planner and guard still get
+the instant at which it was due, so the arm's motion stays even. The arm does a tick's move in `tick` s. The time
+between two ticks may be a little longer, never shorter, as the arm's queue would fill up. So a locked tick is one per
+cent shorter than its share of the time between two poses (`tick_in_step`), which leaves room to correct the phase.
 
-A machine that shares its memory with others, as a virtual one does, may for some tens of milliseconds take ten times as
-long for the same work, with nothing else running on it. Neither load nor priority shows that, and no priority helps:
-`measure_evenness` times the same small work again and again.
+A virtual machine, which shares its memory with others, may take ten times as long for the same work for some tens of
+milliseconds. Neither load nor priority shows that, and no priority helps: `measure_evenness` times the same small work
+again and again.
 """
 
 from __future__ import annotations
