@@ -93,10 +93,8 @@ def play_session(
     """Put the sets of a session into the ring in real time. faults: of cameras, counted from `start`, s."""
     clock, pictures = WallClock(), _PictureCache(session, again)
     inject = FrameFaults(faults, session.rig, "command line")
-    parent = parent_process()
-    while not ring.requested.value and (
-        parent is None or parent.is_alive()
-    ):  # a session shown once waits for the tracker
+    parent = parent_process()  # a session that is shown once begins when the tracker is ready for it
+    while not ring.requested.value and (parent is None or parent.is_alive()):
         clock.wait_until(clock.now() + REQUEST_POLL_PERIOD)
     stamps = np.array([np.mean([ref.stamp for ref in refs]) for refs in session.sets])
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0

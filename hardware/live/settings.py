@@ -6,6 +6,7 @@ named, and then encrypted (TLS) alone.
 """
 
 # ruff: noqa: RUF009
+# (`_key` makes a dataclass field)
 
 from __future__ import annotations
 
