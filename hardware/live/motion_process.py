@@ -208,12 +208,12 @@ class _TickReporter:
             asked, begun = motion.asked and motion.last.stamp == tick.stamp, motion.begun
             motion.begun, frame = math.nan, loop.arm.command_frame if asked else b""
             reached = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
-            given = stamp, asked, begun, motion.paused
-            self._sender.put(RecordedTick(tick.stamp, *given, tick.command, frame, *reached))
+            inputs = stamp, asked, begun, motion.paused
+            self._sender.put(RecordedTick(tick.stamp, *inputs, tick.command, frame, *reached))
         lateness = StageTiming(LATE_TICK_STAGE, late.count, late.percentile(50), late.percentile(99), late.most)
         events, timings, stops = tuple(self._events), (*self.times.timings(), lateness), loop.arm.stops
-        stopped = len(stops), stops[-1] if stops else None
-        counts = loop.skipped, *stopped, self._sender.dropped
+        last_stop = stops[-1] if stops else None
+        counts = loop.skipped, len(stops), last_stop, self._sender.dropped
         self._reports.put(LiveMotionReport(tick, progress, events, timings, *counts, self._priority))
 
 
