@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,15 +18,15 @@ class Observations:
     """
 
     stamp: float
-    camera: NDArray[np.int64]
-    track: NDArray[np.int64]
+    camera: Index
+    track: Index
     pixels: Array
     sigma: Array
 
     def __len__(self) -> int:
         return len(self.camera)
 
-    def only(self, rows: NDArray[np.bool_]) -> Observations:
+    def only(self, rows: Mask) -> Observations:
         """Those of the rows (N,)."""
         return Observations(self.stamp, self.camera[rows], self.track[rows], self.pixels[rows], self.sigma[rows])
 

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # the axes after each and before each
 _SMALL = 1e-4  # rad: below, the fourth-order series is exact to 1e-16 relative

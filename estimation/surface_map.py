@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 
 INVERSE_STEPS = 4  # steps of the inverse: each leaves a share as large as the strain, a few hundredths
 
@@ -67,7 +66,7 @@ def local_normals(points: Array, outward: Array, neighbours: int = 12) -> Array:
     return np.asarray(normals * np.where(sign == 0, 1.0, sign)[:, None])
 
 
-def farthest_points(points: Array, first: int, count: int, nearest: float = -1.0) -> NDArray[np.int64]:
+def farthest_points(points: Array, first: int, count: int, nearest: float = -1.0) -> Index:
     """Rows of up to `count` points (N, 3): `first`, then each the farthest from those before, beyond `nearest`."""
     chosen, distance = [first], np.linalg.norm(points - points[first], axis=1)
     while len(chosen) < count:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
@@ -18,7 +17,7 @@ from estimation.observations import Observations
 from estimation.online.pose_solver import INLIER_WEIGHT, PointTracks, solve_pose
 from estimation.pose import Trajectory
 from estimation.rig import Rig
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap
 
 MIN_SIGMA_PX = 0.1  # alignment claims less on clean images, but interpolation and lens model err by it
@@ -35,12 +34,12 @@ class TrackArrays:
     """The N observations of K frame sets, of L landmarks."""
 
     stamps: Array  # (K,) s, rising
-    starts: NDArray[np.int64]  # (K + 1,) where each frame set's observations begin
-    camera: NDArray[np.int64]  # (N,)
-    landmark: NDArray[np.int64]  # (N,) row below L
+    starts: Index  # (K + 1,) where each frame set's observations begin
+    camera: Index  # (N,)
+    landmark: Index  # (N,) row below L
     pixels: Array  # (N, 2) undistorted
     precision: Array  # (N,) px^-2
-    tracks: NDArray[np.int64]  # (L,) the id that each landmark's observations bear
+    tracks: Index  # (L,) the id that each landmark's observations bear
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -53,14 +52,14 @@ class TrackArrays:
         """Where the observations of frame sets first <= k < last stand."""
         return slice(int(self.starts[first]), int(self.starts[last]))
 
-    def only(self, frames: NDArray[np.int64]) -> TrackArrays:
+    def only(self, frames: Index) -> TrackArrays:
         """The same of some frame sets (M,), rising."""
         counts = np.diff(self.starts)[frames]
         starts = np.concatenate([[0], np.cumsum(counts)])
         rows = np.repeat(self.starts[frames] - starts[:-1], counts) + np.arange(starts[-1])
         return replace(self._rows(rows), stamps=self.stamps[frames], starts=starts)
 
-    def landmarks(self, chosen: NDArray[np.bool_]) -> TrackArrays:
+    def landmarks(self, chosen: Mask) -> TrackArrays:
         """The same of some landmarks (L,) only."""
         mine = chosen[self.landmark]
         counts = np.add.reduceat(np.append(mine, 0), self.starts)[:-1] * (np.diff(self.starts) > 0)
@@ -68,7 +67,7 @@ class TrackArrays:
         row = (np.cumsum(chosen) - 1)[self.landmark[mine]]
         return replace(self._rows(mine), starts=starts, landmark=row, tracks=self.tracks[chosen])
 
-    def _rows(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> TrackArrays:
+    def _rows(self, rows: Index | Mask) -> TrackArrays:
         observations = self.camera[rows], self.landmark[rows], self.pixels[rows], self.precision[rows]
         return TrackArrays(self.stamps, self.starts, *observations, self.tracks)
 
@@ -176,7 +175,7 @@ def _fit(rig: Rig, seen: Observations, points: Array, start: Array) -> Array | N
     return fit.base_from_surface
 
 
-def _add(rig: Rig, seen: Observations, new: NDArray[np.bool_], points: Array, pose: Array) -> None:
+def _add(rig: Rig, seen: Observations, new: Mask, points: Array, pose: Array) -> None:
     """Landmarks that two cameras see in this frame set for the first time."""
     if not new.any():
         return

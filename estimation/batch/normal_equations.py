@@ -12,14 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.batch.initialisation import TrackArrays
 from estimation.batch.priors import STATE_DOF, CorrectedCameras, States, right_jacobian
 from estimation.online.pose_solver import EFFICIENCY, GATE
 from estimation.runtime import compiled
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 
 OBSERVATION_COLUMNS = 11  # of an observation: six of its camera's own pose of the surface, fx fy cx cy, its residual
 COMMON_DELAY_SIGMA_S = 1e-4  # s: as the sum of a frame set's delays is held at nothing
@@ -31,9 +30,9 @@ COMMON_DELAY_SIGMA_S = 1e-4  # s: as the sum of a frame set's delays is held at 
     reordered=True,
 )
 def frame_sums(
-    starts: NDArray[np.int64],
-    camera: NDArray[np.int64],
-    landmark: NDArray[np.int64],
+    starts: Index,
+    camera: Index,
+    landmark: Index,
     pixels: Array,
     precision: Array,
     camera_from_surface: Array,
@@ -113,9 +112,9 @@ def frame_sums(
     "f8[::1](i8[::1], i8[::1], i8[::1], f8[:,::1], f8[::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,::1])", reordered=True
 )
 def squared_residuals(
-    starts: NDArray[np.int64],
-    camera: NDArray[np.int64],
-    landmark: NDArray[np.int64],
+    starts: Index,
+    camera: Index,
+    landmark: Index,
     pixels: Array,
     precision: Array,
     camera_from_surface: Array,
@@ -162,7 +161,7 @@ class Estimate:
     cameras: CorrectedCameras  # C
     points: Array  # (L, 3) mm, landmarks in the surface frame
 
-    def moved(self, steps: Array, shared: Array, free: NDArray[np.int64]) -> Estimate:
+    def moved(self, steps: Array, shared: Array, free: Index) -> Estimate:
         """The same after steps of the states (K, 18) and of the shared unknowns (S,), the `free` cameras' first."""
         corrections = np.zeros(11 * len(self.cameras))
         corrections[free] = shared[: len(free)]
@@ -191,7 +190,7 @@ class BatchProblem:
     """What is measured, and what is free."""
 
     data: TrackArrays
-    free: NDArray[np.int64]  # numbers of the cameras' corrections (11 C,) that are free
+    free: Index  # numbers of the cameras' corrections (11 C,) that are free
 
     @property
     def landmarks(self) -> int:
@@ -240,7 +239,7 @@ class _FrameSums:
     by_landmark: Array  # (F, 3L, M), without rows where the step is known
     known: Array  # (L, 3, 3) information of the landmarks
     pull: Array  # (L, 3) their gradient
-    seeing: NDArray[np.bool_]  # (F, C) whether a camera has tracks
+    seeing: Mask  # (F, C) whether a camera has tracks
     cost: float  # robust
 
 
@@ -315,9 +314,7 @@ def _eliminate_shared(summed: _FrameSums, noise: NoiseModel, n: int, coupled: bo
     )
 
 
-def _columns(
-    states: States, cameras: CorrectedCameras, ahead: Array, camera_from_surface: Array, free: NDArray[np.int64]
-) -> Array:
+def _columns(states: States, cameras: CorrectedCameras, ahead: Array, camera_from_surface: Array, free: Index) -> Array:
     """How the ten columns of each camera's sums (F, C, 10, M) move with state, own delay and shifts, corrections."""
     frames, n = len(states), len(cameras)
     late = cameras.offsets[:, None, None]
@@ -339,7 +336,7 @@ def _columns(
     return np.ascontiguousarray(out[..., np.concatenate([np.arange(begin), begin + free])])
 
 
-def _own_prior(noise: NoiseModel, seeing: NDArray[np.bool_]) -> Array:
+def _own_prior(noise: NoiseModel, seeing: Mask) -> Array:
     """Information (F, 3C, 3C) of what each camera's tracks share. seeing: (F, C).
 
     The instant of a frame set is the mean of its cameras': what their delays have in common nobody could tell from the

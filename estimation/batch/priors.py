@@ -13,11 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.rig import Rig
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 
 COMMON_CLOCK_SIGMA_S = 1e-6  # what all clocks have in common cannot be seen; their mean is the reference
 LENS_DOF = 4  # fx fy cx cy
@@ -110,7 +109,7 @@ class States:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def __getitem__(self, rows: slice | NDArray[np.int64]) -> States:
+    def __getitem__(self, rows: slice | Index) -> States:
         """Some of them."""
         return States(self.poses[rows], self.twists[rows], self.accelerations[rows])
 

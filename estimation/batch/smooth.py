@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.batch.initialisation import TrackArrays, pack_tracks, rough_start
@@ -35,7 +34,7 @@ from estimation.observations import Observations
 from estimation.online.pose_solver import CHI2_MEDIAN, EFFICIENCY
 from estimation.pose import Trajectory
 from estimation.rig import Rig
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap, local_normals
 
 FREE_LANDMARK_MM = 50.0  # from where a landmark was begun: a prior that only keeps a hardly seen one finite
@@ -212,7 +211,7 @@ class _Solver:
             if self._learn(*self._step_states(1.0), settled=k > 1) < PSD_CONVERGED and k > 2:
                 break
 
-    def _part(self, frames: NDArray[np.int64], known: Priors) -> _Solver:
+    def _part(self, frames: Index, known: Priors) -> _Solver:
         """The same of some frame sets."""
         states = self._estimate.states[frames]
         problem = BatchProblem(self._data.only(frames), self._problem.free)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.batch.priors import (
@@ -21,7 +20,7 @@ from estimation.batch.priors import (
 from estimation.errors import InputError
 from estimation.pose import Trajectory
 from estimation.rig import Rig
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap
 
 TIMES_PER_CHUNK = 4096  # interpolated at once
@@ -42,8 +41,8 @@ class Instants:
 class FitStatistics:
     """How the tracks agree with the result."""
 
-    used: NDArray[np.int64]  # (K, C) tracks that agree
-    seen: NDArray[np.int64]  # (K, C) all tracks
+    used: Index  # (K, C) tracks that agree
+    seen: Index  # (K, C) all tracks
     rms: Array  # (K, C) px of those that agree, nan without any
     unit: Array  # (C,) size of the residuals in parts of what is claimed of them
     jitter: float  # s, of a camera's delay in one frame set
@@ -63,7 +62,7 @@ class Smoothed:
     share: Array  # (K, 18, 18) covariance by the doubt about landmarks and cameras
     psd: Array  # (K - 1, 6) density of the jerk
     map: SurfaceMap  # in the surface frame
-    tracks: NDArray[np.int64]  # (L,) the id that each landmark bears among the observations
+    tracks: Index  # (L,) the id that each landmark bears among the observations
     rig: Rig  # the cameras as corrected, clock offsets included
     calibrated: Rig  # as given
     offsets: Array  # (C,) s, how much later than stamped each camera exposes, beside the mean of all

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.calibration.arm_model import ArmParameters, Kinematics, SetPoint, Sightings, TipPrediction, predict
@@ -19,7 +18,7 @@ from estimation.calibration.lens_model import CAMERA_PARAMETERS
 from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.runtime import median
-from estimation.se3 import Array
+from estimation.se3 import Array, Mask
 
 REWEIGHT_ROUNDS = 6  # outliers are out after two or three
 TUKEY_CUTOFF = 5.0  # scatters at which a sighting's weight is zero (Tukey's biweight)
@@ -49,7 +48,7 @@ class ArmFit:
     state: ArmParameters
     covariance: Array  # (12, 12)
     residuals: Array  # (N, 2) px, prediction less measurement
-    used: NDArray[np.bool_]  # (N,) which sightings are inliers
+    used: Mask  # (N,) which sightings are inliers
     scatter: float  # of the inliers' residuals, in their stated sigmas
     widened_by: float = 1.0  # factor on the covariance by `jackknife`
 
@@ -111,7 +110,7 @@ class _ArmProblem:
             residuals = residuals + np.einsum("nij,nj->ni", prediction.by_camera, own)
         return prediction, residuals
 
-    def graph(self, weights: Array, rows: NDArray[np.bool_]) -> gtsam.NonlinearFactorGraph:
+    def graph(self, weights: Array, rows: Mask) -> gtsam.NonlinearFactorGraph:
         """All factors. weights: (N,) of the sightings. rows: (N,) which of them are used."""
         graph, root = gtsam.NonlinearFactorGraph(), (np.sqrt(weights) / self.sightings.sigma)[rows]
 

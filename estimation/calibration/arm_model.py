@@ -12,13 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.calibration.lens_model import lens_of, project_lens
 from estimation.rig import Rig
 from estimation.runtime import compiled
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 
 Kinematics = Callable[[Array], Array]  # arm_from_nozzle (N, 4, 4) mm at axes (N, 6), by the arm's own model
 
@@ -67,7 +66,7 @@ class SetPoint:
         held = np.where((when >= self.instants[0])[:, None], slopes[knot], 0.0)
         return np.asarray(self.axes[knot] + held * since[:, None] + behind[knot] * left + held * lag * (left - 1))
 
-    def places(self, stamps: Array, settle: float) -> NDArray[np.int64]:
+    def places(self, stamps: Array, settle: float) -> Index:
         """Number (N,) of the place where the arm has rested for `settle` s at each stamp, s; -1 while it moves."""
         moves = np.abs(self.slopes).max(1) > 0
         ended = np.where(np.concatenate([[False], moves[:-1]]), self.instants, -np.inf)  # end of a move, at each knot
@@ -83,15 +82,15 @@ class Sightings:
     """The tip in pictures: N pixels."""
 
     stamp: Array  # (N,) s, on the cameras' common clock
-    camera: NDArray[np.int64]  # (N,)
+    camera: Index  # (N,)
     pixels: Array  # (N, 2) distorted
     sigma: Array  # (N,) px
-    place: NDArray[np.int64]  # (N,) number of the resting place, whose errors are correlated; -1 while the arm moves
+    place: Index  # (N,) number of the resting place, whose errors are correlated; -1 while the arm moves
 
     def __len__(self) -> int:
         return len(self.stamp)
 
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Sightings:
+    def take(self, rows: Mask | Index) -> Sightings:
         """The given rows, by mask or number."""
         parts = self.stamp[rows], self.camera[rows], self.pixels[rows], self.sigma[rows], self.place[rows]
         return Sightings(*parts)
@@ -127,7 +126,7 @@ def tip_positions(state: ArmParameters, set_point: SetPoint, kinematics: Kinemat
 
 
 def predict(
-    state: ArmParameters, set_point: SetPoint, kinematics: Kinematics, rig: Rig, stamp: Array, camera: NDArray[np.int64]
+    state: ArmParameters, set_point: SetPoint, kinematics: Kinematics, rig: Rig, stamp: Array, camera: Index
 ) -> TipPrediction:
     """Predicted pixels of the tip in cameras (N,) at stamps (N,), s, with their Jacobians."""
     axes = set_point.lagged(stamp, state.dead_time, state.lag)

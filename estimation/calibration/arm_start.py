@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.calibration.arm_model import Kinematics, SetPoint, Sightings
 from estimation.errors import InputError
 from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig, distort
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 
 ARM_CALIBRATION = "arm calibration"  # where an InputError says it comes from
 MIN_PLACES = 4  # three give a pose, a fourth checks it
@@ -24,9 +23,7 @@ MIN_MOVING_PICTURES = 20  # fast enough, and again accelerated enough, to show l
 MIN_SPEED, MIN_ACCELERATION = 10.0, 400.0  # mm/s, mm/s^2
 
 
-def robust_rigid(
-    source: Array, target: Array, near: float, rng: np.random.Generator
-) -> tuple[Array, NDArray[np.bool_]]:
+def robust_rigid(source: Array, target: Array, near: float, rng: np.random.Generator) -> tuple[Array, Mask]:
     """The rigid motion that most points agree with to `near` mm, and its inliers (N,) (Fischler and Bolles 1981)."""
     best = np.zeros(len(source), bool)
     for _ in range(RANSAC_TRIES):
@@ -47,7 +44,7 @@ def robust_rigid(
     return se3.rigid_from_points(source[best], target[best]), best
 
 
-def triangulated_places(sightings: Sightings, rig: Rig) -> tuple[NDArray[np.int64], Array]:
+def triangulated_places(sightings: Sightings, rig: Rig) -> tuple[Index, Array]:
     """Numbers (P,) and points (P, 3), mm, base, of places where two cameras or more agree on the tip."""
     numbers, points = [], []
     for number in np.unique(sightings.place[sightings.place >= 0]):
@@ -87,7 +84,7 @@ def _undistorted(rig: Rig, camera: int, pixel: Array) -> Array:
 
 def first_pose(
     sightings: Sightings, set_point: SetPoint, kinematics: Kinematics, rig: Rig, seed: int = 0
-) -> tuple[Array, Array, NDArray[np.int64]]:
+) -> tuple[Array, Array, Index]:
     """base_from_arm (4, 4), axes (P, 6) of the places that agree, and their numbers; InputError where too few do.
 
     Places with equal arm angles need no tool offset: the largest such group gives the pose, if it suffices.

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.calibration.lens_fit import (
@@ -39,7 +38,7 @@ from estimation.calibration.validation import (
     volume_error,
 )
 from estimation.rig import Camera, Rig
-from estimation.se3 import Array
+from estimation.se3 import Array, Mask
 
 MIN_COMMON_INSTANTS = 3  # that two cameras must share
 MAX_COMPARED = 60  # pose estimates of one pair: the medoid compares them all with each other
@@ -189,7 +188,7 @@ def fit_lenses(views: BoardViews, known: KnownLenses | None = None) -> tuple[Boa
     return views.only(kept), choices, dropped
 
 
-def _select_model(own: BoardViews) -> tuple[BoardViews, LensChoice, NDArray[np.bool_]]:
+def _select_model(own: BoardViews) -> tuple[BoardViews, LensChoice, Mask]:
     """One camera's views with their measured sigma, their model and lens, and which corners (V, P) are outliers."""
     rough = fit_lens(_with_sigma(own, INITIAL_SIGMA), "k1 k2")
     own = _with_sigma(own, _median_sigma(rough))
@@ -198,7 +197,7 @@ def _select_model(own: BoardViews) -> tuple[BoardViews, LensChoice, NDArray[np.b
     return own, choose_model(own.without(out)), out
 
 
-def _with_known_lens(own: BoardViews, lens: Array, exact: bool) -> tuple[BoardViews, LensChoice, NDArray[np.bool_]]:
+def _with_known_lens(own: BoardViews, lens: Array, exact: bool) -> tuple[BoardViews, LensChoice, Mask]:
     """As `_select_model`, with a given lens (9,). exact: whether it has no sigma."""
     own = _with_sigma(own, _median_sigma(fit_given_lens(_with_sigma(own, INITIAL_SIGMA), lens)))
     fit = fit_given_lens(own, lens)
@@ -217,13 +216,13 @@ def _median_sigma(fit: LensFit) -> float:
     return max(float(np.nanmedian(np.linalg.norm(fit.residuals, axis=-1))) / RAYLEIGH, MIN_CORNER_SIGMA)
 
 
-def _single_outliers(own: BoardViews, fit: LensFit) -> NDArray[np.bool_]:
+def _single_outliers(own: BoardViews, fit: LensFit) -> Mask:
     out = outliers(own, fit.residuals, fit.scale)
     out &= (~out & own.seen).sum(1, keepdims=True) >= MIN_PLANE_CORNERS  # else the whole view is wrong, and dropped
     return out
 
 
-def outliers(views: BoardViews, residuals: Array, scale: float) -> NDArray[np.bool_]:
+def outliers(views: BoardViews, residuals: Array, scale: float) -> Mask:
     """(V, P) which corners are outliers by the median residual, which they do not pull."""
     away = np.linalg.norm(residuals, axis=-1)
     usual = min(scale * float(np.median(views.sigma)), float(np.nanmedian(away)) / RAYLEIGH)

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.calibration.lens_model import MODELS, BoardViews, lens_prior, project_lens
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 
 MIN_PLANE_CORNERS = 4  # corners that fix a homography
 MIN_VIEW_CORNERS = 6  # of a view: four fix its pose and leave nothing to check it by
@@ -52,7 +51,7 @@ def homographies(views: BoardViews) -> Array:
     return out
 
 
-def plane_outliers(views: BoardViews) -> NDArray[np.bool_]:
+def plane_outliers(views: BoardViews) -> Mask:
     """(V, P) corners without which the rest of their view fits a homography much better; needs no lens."""
     out = np.zeros(views.seen.shape, bool)
     for v, seen in enumerate(views.seen):
@@ -70,7 +69,7 @@ def plane_outliers(views: BoardViews) -> NDArray[np.bool_]:
     return out
 
 
-def _homography_residuals(views: BoardViews, v: int, rows: NDArray[np.int64]) -> Array:
+def _homography_residuals(views: BoardViews, v: int, rows: Index) -> Array:
     plane, pixels = views.points[rows, :2], views.pixels[v, rows]
     there = np.c_[plane, np.ones(len(rows))] @ homography(plane, pixels).T
     return np.asarray(np.linalg.norm(there[:, :2] / there[:, 2:] - pixels, axis=1))
@@ -279,7 +278,7 @@ def _infinite_cost(views: BoardViews) -> _LensEquations:
     return _LensEquations(np.inf, *nothing, np.zeros(9), np.zeros((v, 6)))
 
 
-def _schur_complement(at: _LensEquations, free: NDArray[np.int64], damping: float) -> tuple[Array, Array]:
+def _schur_complement(at: _LensEquations, free: Index, damping: float) -> tuple[Array, Array]:
     """The lens's equations with all poses eliminated: matrix (F, F) and slope (F,)."""
     cross = at.cross[:, free]
     factor = cross @ np.linalg.inv(damped(at.pose, damping))  # (V, F, 6)
@@ -287,7 +286,7 @@ def _schur_complement(at: _LensEquations, free: NDArray[np.int64], damping: floa
     return matrix, at.lens_slope[free] - (factor @ at.pose_slope[..., None]).sum((0, 2))
 
 
-def _lens_step(state: _LensState, at: _LensEquations, damping: float, free: NDArray[np.int64]) -> _LensState | None:
+def _lens_step(state: _LensState, at: _LensEquations, damping: float, free: Index) -> _LensState | None:
     try:
         matrix, slope = _schur_complement(at, free, damping)
         change = np.zeros(9)
@@ -301,7 +300,7 @@ def _lens_step(state: _LensState, at: _LensEquations, damping: float, free: NDAr
     return _LensState(state.lens + change, state.poses @ se3.exp(turn))
 
 
-def _lens_covariance(at: _LensEquations, free: NDArray[np.int64]) -> Array:
+def _lens_covariance(at: _LensEquations, free: Index) -> Array:
     matrix = _schur_complement(at, free, 0.0)[0]
     out = np.zeros((9, 9))
     try:

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from estimation.errors import StillbedError
 from estimation.rig import Camera
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 
 CAMERA_PARAMETERS = 16  # of one camera: lens 9, pose 6 (a right perturbation), clock offset 1 (s)
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -134,8 +134,8 @@ class BoardViews:
     names: tuple[str, ...]  # of the cameras
     sizes: tuple[tuple[int, int], ...]  # (W, H) px of each camera
     points: Array  # (P, 3) mm, the board's corners in its own frame
-    camera: NDArray[np.int64]  # (V,) number of the camera
-    instant: NDArray[np.int64]  # (V,) number of the frame set, from 0 in order of stamp
+    camera: Index  # (V,) number of the camera
+    instant: Index  # (V,) number of the frame set, from 0 in order of stamp
     stamp: Array  # (V,) s, by the camera's own clock
     pixels: Array  # (V, P, 2) px, distorted; nan where a corner was not seen
     sigma: Array  # (V,) px, one standard deviation per axis
@@ -144,17 +144,17 @@ class BoardViews:
         return len(self.camera)
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
+    def seen(self) -> Mask:
         """(V, P) which corners were seen."""
         return np.isfinite(self.pixels[..., 0])
 
-    def only(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> BoardViews:
+    def only(self, kept: Mask | Index) -> BoardViews:
         """The rows `kept`, a mask (V,) or numbers, with instants renumbered from 0."""
         instant = np.unique(self.instant[kept], return_inverse=True)[1].astype(np.int64)
         rows = self.camera[kept], instant, self.stamp[kept], self.pixels[kept], self.sigma[kept]
         return BoardViews(self.names, self.sizes, self.points, *rows)
 
-    def without(self, outliers: NDArray[np.bool_]) -> BoardViews:
+    def without(self, outliers: Mask) -> BoardViews:
         """The same with the corners `outliers` (V, P) taken as not seen."""
         return replace(self, pixels=np.where(outliers[..., None], np.nan, self.pixels))
 

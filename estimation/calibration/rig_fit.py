@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from estimation import se3
@@ -29,7 +28,7 @@ from estimation.calibration.lens_model import (
     lens_prior,
     project_lens,
 )
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 
 MAX_INSTANT_GAP = 0.5  # s between instants, beyond which the motion is not interpolated: the board is taken to rest
 STENCIL_SIDE = 2  # neighbours on either side
@@ -42,7 +41,7 @@ MEAN_OFFSET_SIGMA = 1e-6  # s: the mean of the offsets is held at zero, as only 
 class Stencils:
     """The neighbours through which each instant's motion is interpolated."""
 
-    neighbours: NDArray[np.int64]  # (S, K) instants, the own number where there is none
+    neighbours: Index  # (S, K) instants, the own number where there is none
     times: Array  # (S, K) s after the own instant, or nan
 
 
@@ -67,7 +66,7 @@ class BoardPoses:
     by_pose: Array  # (V, 6, 6 + 6 K) by the own pose, then by the neighbours
 
 
-def interpolate_board(poses: Array, who: Stencils, instant: NDArray[np.int64], delay: Array) -> BoardPoses:
+def interpolate_board(poses: Array, who: Stencils, instant: Index, delay: Array) -> BoardPoses:
     """The board's poses in views exposed `delay` (V,), s, after their instants (V,); poses: (S, 4, 4)."""
     own, others, times = poses[instant], poses[who.neighbours[instant]], who.times[instant]
     way = se3.log(se3.inverse(own)[:, None] @ others)  # (V, K, 6)
@@ -146,7 +145,7 @@ class RigFit:
 class RivalModel:
     """A richer model that may be the true one."""
 
-    free: NDArray[np.bool_]  # (16 C,) its additional parameters
+    free: Mask  # (16 C,) its additional parameters
     chance: float  # 0 to 1
 
 
@@ -157,7 +156,7 @@ class RigProblem:
     views: BoardViews
     who: Stencils
     late: Array  # (V,) s, each view's stamp after its instant's
-    free: NDArray[np.bool_]  # (16 C,) which of the cameras' parameters are estimated
+    free: Mask  # (16 C,) which of the cameras' parameters are estimated
     jitter: float  # s, one sigma of single pictures' delays, 0 for none
     known: KnownLenses | None  # prior of the lenses
 
@@ -172,10 +171,10 @@ class _RigEquations:
     jitter_slope: Array  # (V,)
     jitter_own: Array  # (V,)
     jitter_cross: Array  # (V, K)
-    places: NDArray[np.int64]  # (V, K) rows of the views' parameters in `matrix`
+    places: Index  # (V, K) rows of the views' parameters in `matrix`
 
 
-def free_numbers(models: tuple[str, ...], known: KnownLenses | None = None) -> NDArray[np.bool_]:
+def free_numbers(models: tuple[str, ...], known: KnownLenses | None = None) -> Mask:
     """(16 C,) which parameters are free with these distortion models: not the first pose, nor exactly known numbers."""
     free = np.zeros((len(models), CAMERA_PARAMETERS), bool)
     for c, model in enumerate(models):
@@ -187,9 +186,7 @@ def free_numbers(models: tuple[str, ...], known: KnownLenses | None = None) -> N
     return free.ravel()
 
 
-def fit_rig(
-    views: BoardViews, state: RigState, free: NDArray[np.bool_], jitter: float, known: KnownLenses | None = None
-) -> RigFit:
+def fit_rig(views: BoardViews, state: RigState, free: Mask, jitter: float, known: KnownLenses | None = None) -> RigFit:
     """The state that fits the views best, from a start near it. jitter: s, one sigma of single pictures' delays."""
     problem = _problem(views, free, jitter, known)
     state, at = minimise(state, lambda s: _equations(problem, s), lambda s, at, damping: _step(problem, s, at, damping))
@@ -200,9 +197,7 @@ def fit_rig(
     return RigFit(state, _covariance(problem, at), at.residuals, at.pace, scale)
 
 
-def with_rivals(
-    views: BoardViews, fit: RigFit, free: NDArray[np.bool_], jitter: float, rivals: Sequence[RivalModel]
-) -> RigFit:
+def with_rivals(views: BoardViews, fit: RigFit, free: Mask, jitter: float, rivals: Sequence[RivalModel]) -> RigFit:
     """The fit with a covariance scaled by the residuals, which includes the uncertainty of the model.
 
     Each rival adds, times its chance, its larger covariance and the outer product of its distance (law of total
@@ -222,7 +217,7 @@ def with_rivals(
     return replace(fit, covariance=covariance)
 
 
-def _problem(views: BoardViews, free: NDArray[np.bool_], jitter: float, known: KnownLenses | None = None) -> RigProblem:
+def _problem(views: BoardViews, free: Mask, jitter: float, known: KnownLenses | None = None) -> RigProblem:
     first = views.stamp[0]
     stamps = first + np.bincount(views.instant, views.stamp - first) / np.bincount(views.instant)  # (S,) mean
     return RigProblem(views, stencils(stamps), views.stamp - stamps[views.instant], free, jitter, known)
@@ -300,7 +295,7 @@ def _assemble(
     return _RigEquations(cost, matrix, slope, residuals, pace, jitter_slope, own, cross, places)
 
 
-def _free_rows(problem: RigProblem, size: int) -> NDArray[np.int64]:
+def _free_rows(problem: RigProblem, size: int) -> Index:
     return np.flatnonzero(np.concatenate([problem.free, np.ones(size - len(problem.free), bool)]))
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from estimation import se3
@@ -26,7 +25,7 @@ from estimation.calibration.lens_model import (
 )
 from estimation.calibration.rig_fit import RigState, fit_rig
 from estimation.rig import Rig
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 
 CROSS_FOLDS = 4
 FOLD_BLOCKS = 12  # stretches of neighbouring views that are held out as one: neighbours look alike
@@ -108,13 +107,13 @@ def _fits(views: BoardViews) -> dict[str, LensFit]:
     return out
 
 
-def folds_of(count: int) -> NDArray[np.int64]:
+def folds_of(count: int) -> Index:
     """(N,) the fold of each view; neighbours stay together, each fold is spread over the recording."""
     blocks = min(FOLD_BLOCKS, count)
     return np.asarray(np.arange(count) * blocks // count % min(CROSS_FOLDS, blocks), np.int64)
 
 
-def _fold_errors(views: BoardViews, whole: LensFit, folds: NDArray[np.int64]) -> Array:
+def _fold_errors(views: BoardViews, whole: LensFit, folds: Index) -> Array:
     """(V,) mean squared error, px^2, of each view under the lens fitted outside its fold; whole: the fit to all."""
     out = np.zeros(len(views))
     for fold in range(folds.max() + 1):
@@ -138,7 +137,7 @@ def _score(model: str, errors: Array, usual: Array) -> ModelScore:
 
 
 def held_out_residuals(
-    views: BoardViews, state: RigState, free: NDArray[np.bool_], jitter: float, known: KnownLenses | None = None
+    views: BoardViews, state: RigState, free: Mask, jitter: float, known: KnownLenses | None = None
 ) -> Array:
     """Residuals (V, P, 2) px of every view under the rig of the other folds; nan where those do not determine it.
 
@@ -157,7 +156,7 @@ def held_out_residuals(
     return out
 
 
-def _state_of(views: BoardViews, state: RigState, kept: NDArray[np.bool_]) -> RigState:
+def _state_of(views: BoardViews, state: RigState, kept: Mask) -> RigState:
     boards = state.base_from_board[np.unique(views.instant[kept])]
     return replace(state, jitter=state.jitter[kept], base_from_board=boards)
 

@@ -12,13 +12,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.blas import dger, dsyr
 from scipy.linalg.lapack import dposv
 
 from estimation import se3
 from estimation.pose import radius
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 
 TURN_LEVER_MM = 60.0  # at which a turn counts like a shift: half of a surface patch
 LINEAR_LAGS = np.array([0.033, 0.067, 0.1, 0.2, 0.3, 0.4, 0.5])  # s: below a slow camera's period they add nothing
@@ -194,7 +193,7 @@ class ExpertStack:
         """The combined prediction (H, 6) of experts' (H, E, 6)."""
         return np.asarray((self.weights[:, :, None] * experts).sum(1))
 
-    def learn(self, k: NDArray[np.int64], experts: Array, truth: Array) -> None:
+    def learn(self, k: Index, experts: Array, truth: Array) -> None:
         """Take what the experts (K, E, 6) said of horizons k (K,), each once, and the truth (K, 6)."""
         self._count[k] = np.minimum(self._count[k] + 1, 2 * STACK_MEMORY)
         self._size[k] += ((truth**2).sum(1) - self._size[k]) / self._count[k]
@@ -226,7 +225,7 @@ class IntervalCalibration:
         spread = self._shape * (recent * np.exp(2 * self._size))[:, None, None]
         return spread, radius(self._at @ spread[:, None] @ np.swapaxes(self._at, 1, 2), COVERAGE)
 
-    def learn(self, k: NDArray[np.int64], error: Array, claimed: Array) -> None:
+    def learn(self, k: Index, error: Array, claimed: Array) -> None:
         """Take errors (K, 6) of horizons k (K,), each once, and the radii (K, N) that were claimed for them."""
         squares = ((self._at @ error[:, None, :, None])[..., 0] ** 2).sum(-1)  # (K, N)
         outside = (squares > claimed**2).mean(1)

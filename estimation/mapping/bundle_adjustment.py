@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.mapping.local_surface import smooth_normals
@@ -21,7 +20,7 @@ from estimation.online.camera_errors import Delays
 from estimation.online.pose_solver import PointTracks, PoseFit, project, solve_pose
 from estimation.rig import Rig
 from estimation.runtime import trim_heap
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap, motion_of
 
 MIN_SIGHTINGS = 3
@@ -64,7 +63,7 @@ class AdjustedMap:
     """The refined map, same rows, same surface frame."""
 
     map: SurfaceMap
-    agrees: NDArray[np.bool_]  # (N,) which landmarks move with the rest
+    agrees: Mask  # (N,) which landmarks move with the rest
 
 
 def adjust(
@@ -222,7 +221,7 @@ def _graph(
     return graph, values
 
 
-def _joint_covariance(linear: gtsam.GaussianFactorGraph, rows: NDArray[np.int64]) -> Array:
+def _joint_covariance(linear: gtsam.GaussianFactorGraph, rows: Index) -> Array:
     """Joint covariance (3M, 3M) of the landmarks `rows`, from the dense information with all poses eliminated."""
     ordering = gtsam.Ordering()
     landmarks = [gtsam.symbol("l", int(r)) for r in rows]
@@ -237,7 +236,7 @@ def _joint_covariance(linear: gtsam.GaussianFactorGraph, rows: NDArray[np.int64]
     return np.asarray(np.linalg.inv((schur + schur.T) / 2), float)
 
 
-def _agreement(rig: Rig, points: Array, keyframes: list[KeyFrame], solved: gtsam.Values) -> NDArray[np.bool_]:
+def _agreement(rig: Rig, points: Array, keyframes: list[KeyFrame], solved: gtsam.Values) -> Mask:
     """Which landmarks (N,) fit most of their sightings; those that stand still while the surface moves do not."""
     fits, total = np.zeros(len(points)), np.zeros(len(points))
     if len(keyframes) < MIN_KEYFRAMES_TO_REJECT:

@@ -11,11 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from estimation.scans.scan import foot_jacobians
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 
 FIT_NEIGHBOURS = 24  # twice what the polynomial asks for where they lie on one side
 MIN_SURFACE_POINTS = 12  # fewer are no surface
@@ -38,14 +37,14 @@ class RaySurfaceHits:
     normals: Array  # (M, 3) unit, against the rays
     sigma: Array  # (M,) mm across the surface
     covariance: Array  # (3M, 3M) mm^2, joint: neighbours share a part of their heights' errors
-    good: NDArray[np.bool_]  # (M,) whether there is a surface to meet
+    good: Mask  # (M,) whether there is a surface to meet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fits:
     """One polynomial fit for each of M rays, with P coefficients, to K neighbours."""
 
-    near: NDArray[np.int64]  # (M, K) rows of the points
+    near: Index  # (M, K) rows of the points
     frames: Array  # (M, 3, 3) rows u, v and up
     centres: Array  # (M, 3)
     maps: Array  # (M, P, K) from the neighbours' heights to the coefficients
@@ -106,7 +105,7 @@ def _own(covariance: Array) -> Array:
     return np.asarray(np.einsum("ninj->nij", covariance.reshape(count, 3, count, 3)))
 
 
-def _fits(points: Array, own_covariance: Array, near: NDArray[np.int64], outward: Array) -> _Fits:
+def _fits(points: Array, own_covariance: Array, near: Index, outward: Array) -> _Fits:
     """A fit (M) to each set of neighbours, rows near (M, K) of the points (N, 3), each known to (N, 3, 3) mm^2.
 
     outward: (M, 3), the side on which up is.
@@ -140,7 +139,7 @@ def _fits(points: Array, own_covariance: Array, near: NDArray[np.int64], outward
     return _Fits(near, frames, centres, maps, coefficients, doubt, scatter, reach)
 
 
-def _nearest(points: Array, origins: Array, directions: Array) -> NDArray[np.int64]:
+def _nearest(points: Array, origins: Array, directions: Array) -> Index:
     """Rows (M, K) of the points about where each ray comes nearest to any of them."""
     away = points - origins[:, None]  # (M, N, 3)
     along = np.einsum("mni,mi->mn", away, directions)
@@ -161,7 +160,7 @@ def _slopes(coefficients: Array, u: Array, v: Array) -> tuple[Array, Array]:
     return (across * coefficients).sum(-1), (along * coefficients).sum(-1)
 
 
-def _crossing(coefficients: Array, places: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _crossing(coefficients: Array, places: Array) -> tuple[Array, Array, Mask]:
     """Where (u, v), each (M,), rays with origin and direction places (M, 2, 3) meet the fits, by Newton's method."""
     origin, direction = places[:, 0], places[:, 1]
     level = np.where(np.abs(direction[:, 2]) < MIN_RAY_COSINE, -MIN_RAY_COSINE, direction[:, 2])

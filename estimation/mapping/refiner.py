@@ -12,7 +12,6 @@ from concurrent.futures import BrokenExecutor, Executor, Future
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.mapping.bundle_adjustment import FREE_SIGMA_MM, AdjustedMap, Anchors, KeyFrame, adjust, single_fit
@@ -22,7 +21,7 @@ from estimation.online.fit import FrameFit
 from estimation.online.pose_solver import INLIER_WEIGHT
 from estimation.rig import Rig
 from estimation.runtime import trim_heap
-from estimation.se3 import Array
+from estimation.se3 import Array, Mask
 from estimation.surface_map import SurfaceMap
 
 T = TypeVar("T")
@@ -192,7 +191,7 @@ class Refiner:
         """Whether another look at a known view is due."""
         return int(self._alike(pose).sum()) < MAX_SAME_VIEW and stamp - self._stamps[-1] > SAME_VIEW_INTERVAL_S
 
-    def _alike(self, pose: Array) -> NDArray[np.bool_]:
+    def _alike(self, pose: Array) -> Mask:
         """Which key frames (K,) show about what is seen at `pose`."""
         poses = np.stack([f.base_from_surface for f in self._frames])
         turn = se3.angle_of(se3.inverse(poses) @ pose)

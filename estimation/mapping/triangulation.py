@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.pose_solver import Index, project
+from estimation.online.pose_solver import project
 from estimation.rig import Rig
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap, local_normals, surface_frame
 
 MAX_RESIDUAL_SIGMAS = 4.0  # RMS over the sightings of a landmark: beyond, one of them is wrong
@@ -71,7 +70,7 @@ class TriangulatedMap:
 
     map: SurfaceMap
     base_from_surface: Array  # (4, 4), which defines the surface frame
-    tracks: NDArray[np.int64]  # (N,) id of each landmark among the observations
+    tracks: Index  # (N,) id of each landmark among the observations
 
 
 def triangulated_map(rig: Rig, seen: Observations) -> TriangulatedMap:
@@ -91,7 +90,7 @@ def triangulated_map(rig: Rig, seen: Observations) -> TriangulatedMap:
     return _in_own_frame(rig, points[good], (covariance * widest[:, None, None] ** 2)[good], ids[good])
 
 
-def _in_own_frame(rig: Rig, points: Array, covariance: Array, tracks: NDArray[np.int64]) -> TriangulatedMap:
+def _in_own_frame(rig: Rig, points: Array, covariance: Array, tracks: Index) -> TriangulatedMap:
     """The map in its own frame."""
     poses = np.stack([c.base_from_camera for c in rig.cameras])
     base_from_surface = surface_frame(points, poses[:, :3, 3].mean(0), poses[:, :3, 0].mean(0))
@@ -106,12 +105,12 @@ def _in_own_frame(rig: Rig, points: Array, covariance: Array, tracks: NDArray[np
 
 def updated_by_looks(
     surface_map: SurfaceMap,
-    track: NDArray[np.int64],
+    track: Index,
     residuals: Array,
     jacobians: Array,
     sigma: Array,
     pose_covariance: Array,
-) -> tuple[SurfaceMap, NDArray[np.bool_]]:
+) -> tuple[SurfaceMap, Mask]:
     """The map after a look at some of its landmarks from known poses, and which looks (M,) agree with it.
 
     One joint Kalman update: the landmarks' errors are correlated, and all looks share the pose's. track: (M,) rows,
@@ -136,7 +135,7 @@ def updated_by_looks(
     return SurfaceMap(points, surface_map.normals, (covariance + covariance.T) / 2), agrees
 
 
-def _agreeing(residuals: Array, spread: Array) -> NDArray[np.bool_]:
+def _agreeing(residuals: Array, spread: Array) -> Mask:
     """Which residuals (M, 2) px their own covariance, blocks of `spread` (2M, 2M), explains."""
     count = len(residuals)
     own = np.einsum("minj->mnij", spread.reshape(count, 2, count, 2))[np.arange(count), np.arange(count)]

@@ -16,10 +16,9 @@ import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation.online.pose_solver import SharedErrors, SharedFit
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,9 +174,7 @@ class CameraErrors:
                 if doubt < min(far**2, 1e3 * variance.value):
                     variance.take(float(value), float(doubt))
 
-    def _independent(
-        self, fit: SharedFit, part: NDArray[np.int64], rest: NDArray[np.int64], new: Array
-    ) -> tuple[Array, Array]:
+    def _independent(self, fit: SharedFit, part: Index, rest: Index, new: Array) -> tuple[Array, Array]:
         """Independent combinations (K,) of one part of the errors in this frame set, and their variances (K,)."""
         # the rest of the errors is marginalised
         prior = self._covariance[np.ix_(rest, rest)] + np.diag(new[rest])

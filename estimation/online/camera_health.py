@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
@@ -22,7 +21,7 @@ from estimation.online.pose_solver import PointTracks, PoseFit, SharedErrors, ow
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.runtime import median
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 
 MAX_OUTLIERS = 2  # cameras that may be wrong at once: exchanged cables
 MIN_DISORDER_PX = 1.5  # median residual; below, it is not asked how much of it a camera's own motion explains
@@ -78,7 +77,7 @@ class CameraHealth:
         """How far each camera may stand off, px, one sigma (C,). moved: (C,) px between the cameras' instants."""
         return np.asarray(np.hypot(np.maximum(self._usual, self.settings.min_shift), moved))
 
-    def hidden(self, used: NDArray[np.int64]) -> bool:
+    def hidden(self, used: Index) -> bool:
         """Whether every camera shows so much less than usual that these (C,) tracks prove nothing."""
         return bool((used < self.settings.least_share * self._tracks)[self._tracks > 0].all() and self._tracks.any())
 
@@ -86,7 +85,7 @@ class CameraHealth:
         """No camera is left out any more."""
         self.left_out = frozenset()
 
-    def clear(self, used: NDArray[np.int64]) -> bool:
+    def clear(self, used: Index) -> bool:
         """Whether two cameras, or all that there are, carry a pose with these (C,) tracks about as they usually do."""
         known = self._tracks > 0
         clear = (used >= self.settings.leave_share * self._tracks) & known
@@ -102,7 +101,7 @@ class CameraHealth:
         together = bool(seen.any() and (off > self.settings.back_ratio * allowed)[seen].all())
         return np.where(seen & together, off, 0.0)
 
-    def blurred(self, used: NDArray[np.int64], off: Array, allowed: Array, odd: Collection[int]) -> bool:
+    def blurred(self, used: Index, off: Array, allowed: Array, odd: Collection[int]) -> bool:
         """Whether all cameras stand off together, with fewer tracks than usual: a surface that bends keeps its tracks.
 
         used: (C,) tracks that carry the pose. The rest as for `blur_offsets`.
@@ -110,9 +109,7 @@ class CameraHealth:
         fewer = used.sum() < self.settings.whole_share * self._tracks.sum()
         return bool(fewer and self.blur_offsets(off, allowed, odd).any())
 
-    def update(
-        self, stamp: float, used: NDArray[np.int64], least: float, off: Array, allowed: Array, odd: Collection[int]
-    ) -> None:
+    def update(self, stamp: float, used: Index, least: float, off: Array, allowed: Array, odd: Collection[int]) -> None:
         """Take a frame set.
 
         used: (C,) tracks that carry the pose, zero where nothing was measured. least: tracks below which a camera says
@@ -237,7 +234,7 @@ class FrameTracks:
             return ""
         return "one camera alone, against the others and the motion"
 
-    def incoherent_residual(self, fit: PoseFit, inlier: NDArray[np.bool_]) -> float:
+    def incoherent_residual(self, fit: PoseFit, inlier: Mask) -> float:
         """Median residual, px, of the inliers when each camera has a pose of its own: no rigid motion explains it."""
         whole = np.linalg.norm(fit.residuals[inlier], axis=1)
         if not len(whole) or median(whole) < MIN_DISORDER_PX:

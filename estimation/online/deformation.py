@@ -15,13 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
 from estimation.online.pose_solver import PoseFit
 from estimation.runtime import CONTIGUOUS, compiled
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap, Warp, bells, farthest_points
 
 CONTROL_POINTS = 12
@@ -151,7 +150,7 @@ class WarpFilter:
             return surface_map.points
         return np.asarray(surface_map.points + self._modes.landmarks @ self._state[: len(self._modes.share)])
 
-    def pull(self, track: NDArray[np.int64], weighted: Array, by_point: Array) -> Array:
+    def pull(self, track: Index, weighted: Array, by_point: Array) -> Array:
         """Covariance (6, 6) that the deformation's covariance adds to the weighted sum of residuals.
 
         track: (N,) rows of the map. weighted: (N, 2, 6) Jacobians times weights. by_point: (N, 2, 3) px per mm.
@@ -284,8 +283,8 @@ def warped_points(surface_map: SurfaceMap, warp: WarpFilter | None) -> Array:
 @compiled("f8[:,::1](i8, i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[::1], f8[::1])")
 def rows_of_modes(
     cameras: int,
-    camera: NDArray[np.int64],
-    landmark: NDArray[np.int64],
+    camera: Index,
+    landmark: Index,
     jacobian: Array,
     residual: Array,
     root: Array,

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.forecast.predictor import Predictor
@@ -28,7 +27,7 @@ from estimation.online.window import MeasuredPose, Smoother
 from estimation.pose import SurfacePose, TrackState, position_sigma
 from estimation.rig import Rig
 from estimation.runtime import median
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap
 
 MIN_FORECAST_PSD = np.array([1e-4] * 3 + [1.0] * 3)  # rad^2/s^3, mm^2/s^3: what lies still may begin to breathe
@@ -221,7 +220,7 @@ class Estimator:
         """Where the surface is (C, 4, 4) when each camera exposes, from its pose (4, 4) and twist (6,)."""
         return np.asarray(base_from_surface @ se3.exp(twist * self.cameras.offset[:, None]))
 
-    def _rejection(self, count: int, used: NDArray[np.int64], covariance: Array, incoherent: float) -> str:
+    def _rejection(self, count: int, used: Index, covariance: Array, incoherent: float) -> str:
         """Why a fit is no measurement, or ''. count: tracks. used: (C,) inliers. incoherent: px, median residual."""
         s, agreed = self.settings, int(used.sum())
         if agreed < s.least_tracks:
@@ -265,7 +264,7 @@ class Estimator:
         blurred = self.health.blurred(fit.used, fit.off, fit.allowed, fit.odd)
         return not (fit.odd or self.health.bumps.bumped or blurred) and self.health.clear(fit.used)
 
-    def carrying_cameras(self, fit: FrameFit) -> NDArray[np.int64]:
+    def carrying_cameras(self, fit: FrameFit) -> Index:
         """The cameras that carry a fit, by number."""
         return np.nonzero(fit.used >= self._camera_least())[0] if fit.measured else np.zeros(0, np.int64)
 

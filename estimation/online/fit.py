@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation.observations import Observations
 from estimation.online.deformation import WarpFilter
 from estimation.online.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors
 from estimation.runtime import compiled
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap
 
 PRIOR_RESIDUALS = 20.0  # residuals as which the sigmas claimed count
@@ -41,8 +40,8 @@ class FrameFit:
     parts: FitCovariance
     twist: Array  # (6,) velocity by which the cameras' instants were brought together
     twist_variance: Array  # (6,)
-    inlier: NDArray[np.bool_]  # (N,) tracks
-    used: NDArray[np.int64]  # (C,) inliers
+    inlier: Mask  # (N,) tracks
+    used: Index  # (C,) inliers
     reason: str  # why it is no measurement, or ''
     off: Array  # (C,) px by which each camera stands off the pose, nan where it does not see the surface
     allowed: Array  # (C,) px, one sigma of that
@@ -100,7 +99,7 @@ class MapError:
         self._position = np.full(count, -1)
         self._block = np.zeros((0, 0))
 
-    def through(self, rows: NDArray[np.int64], pull: Array) -> Array:
+    def through(self, rows: Index, pull: Array) -> Array:
         """Covariance (6, 6) of the sum of the landmarks' pulls (6, K, 3), of rows (K,), ascending."""
         if (self._position[rows] < 0).any() or len(self._block) > 3 * self.ROOM * len(rows):
             held = np.union1d(rows, np.flatnonzero(self._position >= 0))
@@ -127,7 +126,7 @@ class LandmarkUncertainty:
         self._vague = np.linalg.eigvalsh(blocks)[:, -1] > UNCERTAIN_MM**2
         self._blocks = np.where(self._vague[:, None, None], blocks, 0.0)
 
-    def widened(self, sigma: Array, track: NDArray[np.int64], jacobians: Array) -> Array:
+    def widened(self, sigma: Array, track: Index, jacobians: Array) -> Array:
         """The sigmas (N,) px with it. track: (N,) rows of the map. jacobians: (N, 2, 6) px by the pose."""
         rows = np.flatnonzero(self._vague[track])
         if not len(rows):
@@ -184,8 +183,8 @@ def fit_covariance(
 def pose_pulls(
     cameras: int,
     landmarks: int,
-    camera: NDArray[np.int64],
-    landmark: NDArray[np.int64],
+    camera: Index,
+    landmark: Index,
     jacobian: Array,
     weight: Array,
     twist: Array,

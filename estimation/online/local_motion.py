@@ -10,12 +10,11 @@ a part that moves by itself. It has no pose: the reported covariance of every pl
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation.observations import Observations
 from estimation.online.fit import FrameFit
 from estimation.runtime import CONTIGUOUS, compiled
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap, bells
 
 BELL_SIGMA_MM = 6.0  # of a bell: about a dozen landmarks, and a fold of the skin
@@ -35,8 +34,6 @@ SMEAR_SIGMAS = 3.0  # of the exposures, whose motion looks like a displacement: 
 HEIGHT_RATIO = 3.0  # times the bell's mean: the height of a fold, and what it grows by until the arm has obeyed
 DISPLACEMENT_RIDGE = 1.0  # mm^-2: prior of a landmark's place, also along a line that all its cameras share
 DISPLACEMENT_FLOOR = 1e-3  # mm^-2: prior of a displacement along a line that all cameras look along
-
-Rows = NDArray[np.bool_]
 
 
 class LocalMotion:
@@ -124,7 +121,7 @@ class LocalMotion:
         capped = np.minimum(1.0, MAX_LANDMARK_SIGMAS / np.sqrt(np.maximum(explained, 1e-9)))
         return normal, right, np.where((views >= MIN_VIEWS) & agree, capped, 0.0), plain
 
-    def _means(self, normal: Array, plain: Array, weight: Array, counts: Rows) -> tuple[Array, Array, Rows]:
+    def _means(self, normal: Array, plain: Array, weight: Array, counts: Mask) -> tuple[Array, Array, Mask]:
         """Mean displacement (C, 3) mm under each bell, its chi square (C,), and where enough landmarks count (C,).
 
         weight: (N,), of landmarks that count (N,). The chi square supposes that all of them have a weight of one.
@@ -138,7 +135,7 @@ class LocalMotion:
         square = (solve_symmetric3(spread[:, :9].reshape(-1, 3, 3) + ridge, pull) * pull).sum(1)
         return moved, square, sums[:, 12] ** 2 > MIN_BELL_LANDMARKS * spread[:, 9]
 
-    def _learn(self, normal: Array, right: Array, weight: Array, square: Array, enough: Rows) -> None:
+    def _learn(self, normal: Array, right: Array, weight: Array, square: Array, enough: Mask) -> None:
         """Learn what is usual, while nothing moves by itself."""
         seen = weight > 0
         forgets = seen / USUAL_MEMORY_SETS
@@ -167,8 +164,8 @@ def bell_centres(points: Array, centres: Array) -> Array:
 
 @compiled("Tuple((f8[:,:,::1], f8[:,::1], f8[::1], i8[::1]))(i8, i8[::1], f8[:,:,::1], f8[:,::1], f8[::1])")
 def displacement_sums(
-    landmarks: int, landmark: NDArray[np.int64], jacobian: Array, residual: Array, precision: Array
-) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    landmarks: int, landmark: Index, jacobian: Array, residual: Array, precision: Array
+) -> tuple[Array, Array, Array, Index]:
     """Normal equations (L, 3, 3) and (L, 3) of each landmark's own displacement in the surface frame, mm.
 
     Then the weighted square (L,) of its residuals (N, 2) px, predicted minus seen, and how many cameras see it (L,).

@@ -14,18 +14,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
 from estimation.rig import Rig
 from estimation.runtime import CONTIGUOUS, compiled
-from estimation.se3 import Array
+from estimation.se3 import Array, Index, Mask
 
 TRACK_COLUMNS = 10  # of a track's row: six of the pose, its camera's delay and two shifts, its residual
 CHI2_MEDIAN = 1.386  # of the squared length of two normal entries, in their variance
-
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +39,7 @@ class PointTracks:
         """Observations of points (N, 3), one for each row."""
         return PointTracks(seen.camera, points, seen.pixels, seen.sigma)
 
-    def only(self, rows: NDArray[np.bool_]) -> PointTracks:
+    def only(self, rows: Mask) -> PointTracks:
         """Those of the rows (N,)."""
         return PointTracks(self.camera[rows], self.points[rows], self.pixels[rows], self.sigma[rows])
 
@@ -219,7 +216,7 @@ def own_residuals(camera: Index, fit: PoseFit, sure: Array) -> Array:
 
 @compiled("Tuple((f8[:,::1], f8[::1], f8[:,:,::1]))(f8[:,:,::1], f8[:,:,::1], i8[::1], f8[:,::1])")
 def project_tracks(
-    camera_from_surface: Array, matrices: Array, camera: NDArray[np.int64], points: Array
+    camera_from_surface: Array, matrices: Array, camera: Index, points: Array
 ) -> tuple[Array, Array, Array]:
     """Ideal pixels (N, 2), depths (N,) mm and Jacobians (N, 2, 6) by the right perturbation of the pose.
 
@@ -251,9 +248,7 @@ def project_tracks(
 
 
 @compiled("f8[:,:,::1](i8, i8[::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[::1])")
-def gram_by_camera(
-    cameras: int, camera: NDArray[np.int64], jacobian: Array, residual: Array, weight: Array, twist: Array
-) -> Array:
+def gram_by_camera(cameras: int, camera: Index, jacobian: Array, residual: Array, weight: Array, twist: Array) -> Array:
     """Weighted products (C, 10, 10) of the columns of each camera's tracks: pose, own delay, own two shifts, residual.
 
     camera: (N,). jacobian: (N, 2, 6). residual: (N, 2) px. weight: (N,) px^-2. twist: (6,), along which a delay shows.
@@ -280,7 +275,7 @@ def gram_by_camera(
 
 
 @compiled("f8[:,::1](i8[::1], f8[:,:,::1], f8[::1], f8[:,::1])")
-def shared_residuals(camera: NDArray[np.int64], jacobian: Array, twist: Array, effect: Array) -> Array:
+def shared_residuals(camera: Index, jacobian: Array, twist: Array, effect: Array) -> Array:
     """What of the residuals (N, 2) px the cameras' delays and shifts, effect (3, C), make."""
     explained = np.empty((len(camera), 2))
     for i in range(len(camera)):

@@ -14,14 +14,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation.observations import Observations
 from estimation.online.camera_errors import CameraErrors
 from estimation.online.fit import FrameFit
 from estimation.online.pose_solver import INLIER_WEIGHT, PoseFit, SharedFit
 from estimation.pose import SurfacePose, TrackState
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 
 NOISE_MEMORY_SETS = 300.0  # ten seconds, over which the shares of the tracks' noise are learned
 PRIOR_TRACKS = 20.0  # tracks as which the initial belief counts: that all of their noise is new
@@ -43,7 +42,7 @@ class _TrackResiduals:
     """The inliers of one fit."""
 
     stamp: float  # s
-    key: NDArray[np.int64]  # (N,) of a track in a camera
+    key: Index  # (N,) of a track in a camera
     value: Array  # (N, 2) residuals in sigmas, as they pull at the pose
 
 

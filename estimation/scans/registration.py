@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 
 from estimation import se3
 from estimation.scans.observability import Observability, observability_of, without_free
-from estimation.scans.scan import Index, Scan, ScanIndex
-from estimation.se3 import Array
+from estimation.scans.scan import Scan, ScanIndex
+from estimation.se3 import Array, Index
 from estimation.surface_map import farthest_points
 
 MIN_REGISTRATION_POINTS = 12  # six unknowns, and as many again to see that they fit

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from estimation.se3 import Array, inverse, transform_points
-
-Index = NDArray[np.int64]
+from estimation.se3 import Array, Index, Mask, inverse, transform_points
 
 MIN_INCIDENCE = 0.1  # cosine of ray and normal: no landmark is seen more from the side
 _EDGE_SLACK = 1e-9  # barycentric, so that no ray slips through between two triangles
@@ -94,7 +92,7 @@ class Hits:
 
     points: Array
     normals: Array
-    hit: NDArray[np.bool_]
+    hit: Mask
 
 
 def cast_rays(scan: Scan, surface_from_camera: Array, directions: Array) -> Hits:
@@ -186,7 +184,7 @@ class ClosestPoints:
 
     points: Array
     normals: Array
-    rim: NDArray[np.bool_]
+    rim: Mask
 
 
 class ScanIndex:
@@ -265,7 +263,7 @@ def _spread(scan: Scan, spacing: float) -> tuple[Index, Array]:
     return np.concatenate(triangles), np.concatenate(weights)
 
 
-def _open_sides(scan: Scan) -> NDArray[np.bool_]:
+def _open_sides(scan: Scan) -> Mask:
     """(T, 3) whether the side opposite each corner is an open edge."""
     sides = np.sort(scan.triangles[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
     keys = sides[..., 0] * len(scan.vertices) + sides[..., 1]

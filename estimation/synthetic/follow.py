@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
@@ -21,7 +20,7 @@ from estimation.online.pose_solver import project
 from estimation.online.surface_state import StateSettings
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
-from estimation.se3 import Array
+from estimation.se3 import Array, Mask
 from estimation.synthetic.world import SYNTHETIC_WORLD, World
 
 MIN_FRAME_SETS = StateSettings().first + 3  # the map's, those averaged into the first pose, and two to be judged
@@ -161,7 +160,7 @@ class FollowResult:
         return filtered_bound(self.informations, dt, psd) + self.frame
 
     @property
-    def measured(self) -> NDArray[np.bool_]:
+    def measured(self) -> Mask:
         """Which poses (K,) are TRACKING or DEGRADED."""
         return np.array([pose.state.measured for pose in self.poses])
 

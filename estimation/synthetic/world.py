@@ -11,20 +11,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.pose import Trajectory
 from estimation.rig import Camera, Rig, pixels_from_points
-from estimation.se3 import Array
+from estimation.se3 import Array, Mask
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.movements import MOVEMENTS, SURFACES, Surface, SurfaceLandmarks
 
 Displacement = Callable[[Array], Array]  # times (...), s -> rest_from_surface (..., 4, 4), mm
 Outage = tuple[float, float] | tuple[float, float, int]  # from, to, s; the camera, all cameras without one
-Visibility = NDArray[np.bool_]  # (C, N)
 
 SYNTHETIC_WORLD = "synthetic world"  # where an InputError says it comes from
 SHARE_FIELDS = ("outliers", "coherent", "dropouts")
@@ -132,7 +130,7 @@ def _perturbed(camera: Camera, draw: Array) -> Camera:
     return replace(camera, matrix=matrix, distortion=distortion, base_from_camera=pose)
 
 
-def project_landmarks(rig: Rig, points: Array, poses: Array, normals: Array | None = None) -> tuple[Array, Visibility]:
+def project_landmarks(rig: Rig, points: Array, poses: Array, normals: Array | None = None) -> tuple[Array, Mask]:
     """Pixels (C, N, 2) of points (N, 3), surface frame, and which (C, N) each camera has in view.
 
     rig: without distortion for the pixels of Observations. poses: (C, 4, 4) base_from_surface at each camera's instant.
@@ -142,7 +140,7 @@ def project_landmarks(rig: Rig, points: Array, poses: Array, normals: Array | No
     return np.stack(pixels), np.stack(seen)
 
 
-def _project(camera: Camera, points: Array, pose: Array, normals: Array | None) -> tuple[Array, Visibility]:
+def _project(camera: Camera, points: Array, pose: Array, normals: Array | None) -> tuple[Array, Mask]:
     points_base = se3.transform_points(pose, points)
     pixels, depth = pixels_from_points(camera, points_base)
     seen = (depth > MIN_CAMERA_DEPTH) & (pixels > 0).all(1) & (pixels < np.array(camera.size) - 1).all(1)
@@ -153,7 +151,7 @@ def _project(camera: Camera, points: Array, pose: Array, normals: Array | None) 
     return pixels, seen
 
 
-def _observations(stamp: float, pixels: Array, seen: Visibility, sigma: float) -> Observations:
+def _observations(stamp: float, pixels: Array, seen: Mask, sigma: float) -> Observations:
     """Observations of pixels (C, N, 2) where seen (C, N), all of `sigma` px; a track's id is its column."""
     camera, track = np.nonzero(seen)
     return Observations(stamp, camera, track, pixels[camera, track], np.full(len(camera), sigma))
@@ -167,7 +165,7 @@ def observations(
     rng: np.random.Generator,
     sigma: float = 0.3,
     outliers: float = 0.0,
-    visible: Visibility | None = None,
+    visible: Mask | None = None,
 ) -> Observations:
     """Observations of points (N, 3), surface frame, by all cameras at one instant, with white noise of `sigma` px.
 
@@ -209,7 +207,7 @@ class _TrackVisibility:
         self._ever = rng.random(shape).argsort(axis=0).argsort(axis=0) < views
         self._dropped = rng.random(shape) < conditions.dropouts
 
-    def __call__(self, stamp: float, dt: float) -> Visibility:
+    def __call__(self, stamp: float, dt: float) -> Mask:
         self._dropped = self._rng.random(self._shape) < np.where(self._dropped, *self._dropout_chances(dt))
         visible = self._ever & ~self._dropped
         for start, end, *camera in self._conditions.outages:
@@ -291,12 +289,12 @@ class World:
             seen = seen & visibility(stamp, step) & self._uncovered(stamp)
             yield _observations(stamp, pixels, seen, max(c.noise, MIN_TRACK_SIGMA))
 
-    def pixels_at(self, instants: Array) -> tuple[Array, Visibility]:
+    def pixels_at(self, instants: Array) -> tuple[Array, Mask]:
         """True pixels (C, N, 2) at each camera's own instant (C,), s, and which landmarks (C, N) it has in view."""
         poses = self.base_from_surface(instants)
         return project_landmarks(self.true_rig, self.landmarks.points, poses, self.landmarks.normals)
 
-    def _uncovered(self, stamp: float) -> Visibility:
+    def _uncovered(self, stamp: float) -> Mask:
         """Which landmarks (N,) are alive and uncovered at `stamp`, s."""
         alive = (self.spans[:, 0] <= stamp) & (stamp < self.spans[:, 1])
         if self.conditions.reveal is None:

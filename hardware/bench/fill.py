@@ -25,8 +25,7 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from estimation.errors import InputError, StillbedError
-from estimation.scans.scan import Index
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 from hardware.bench.figures import Figure, at_least, at_most, with_progress
 from hardware.process.clock import CpuClock, ProcessorClock
 from planning.fill import PATTERN_KINDS, PatternKind

@@ -12,8 +12,7 @@ import shapely
 from scipy.ndimage import label
 from shapely import MultiPolygon
 
-from estimation.scans.scan import Index
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 from planning.layers.grid import Grid, Mask, positive_region
 
 EIGHT_NEIGHBOURS = np.ones((3, 3), int)  # nodes joined across corners too, so that no outline runs between them

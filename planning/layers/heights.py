@@ -15,8 +15,8 @@ from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import binary_erosion, binary_fill_holes, distance_transform_edt, gaussian_filter, map_coordinates
 
 from estimation import se3
-from estimation.scans.scan import Index, Scan
-from estimation.se3 import Array
+from estimation.scans.scan import Scan
+from estimation.se3 import Array, Index
 from planning.layers.grid import Grid, Mask, filled, grid_over, interpolate, smoothed, topmost
 
 MAX_NODES = 400_000  # of a grid: 3 MB a layer

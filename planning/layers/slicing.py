@@ -19,8 +19,7 @@ import shapely
 from shapely import MultiPolygon
 
 from estimation.errors import InputError
-from estimation.scans.scan import Index
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 from planning.fill.region import without_bumps
 from planning.layers.bumps import DEFAULT_PASSING, BumpLayer, BumpPassing, Bumps, bumps_in, nodes_in_outline
 from planning.layers.grid import Grid, Mask, as_multi, interpolate, positive_region, smoothed

@@ -12,8 +12,8 @@ from shapely import MultiPolygon
 
 from estimation import se3
 from estimation.errors import InputError
-from estimation.scans.scan import Index, Scan
-from estimation.se3 import Array
+from estimation.scans.scan import Scan
+from estimation.se3 import Array, Index
 from planning.layers.grid import Grid, Mask, as_multi, gradient, interpolate, positive_region
 from planning.layers.heights import COARSE_STEP, HeightMap, downsampled, height_map, restore_skin, skin_nodes, upsampled
 from planning.layers.repair import mean_normal
