@@ -1,4 +1,4 @@
-"""What perception hands to the estimator: where each track stands in each camera."""
+"""Observations: what perception hands to the estimator, the pixels of each track in each camera."""
 
 from __future__ import annotations
 
@@ -11,27 +11,23 @@ from estimation.se3 import Array, Index, Mask
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """The tracks of one frame set, as parallel arrays.
+    """The N tracks of one frame set, as parallel arrays."""
 
-    stamp: s. camera: (N,) number in the rig. track: (N,) id of the landmark. pixels: (N, 2) undistorted px of the
-    camera's own matrix. sigma: (N,) px, one standard deviation per axis.
-    """
-
-    stamp: float
-    camera: Index
-    track: Index
-    pixels: Array
-    sigma: Array
+    stamp: float  # s
+    camera: Index  # (N,) number in the rig
+    track: Index  # (N,) id of the landmark
+    pixels: Array  # (N, 2) undistorted px of the camera's own matrix
+    sigma: Array  # (N,) px, one standard deviation per axis
 
     def __len__(self) -> int:
         return len(self.camera)
 
     def only(self, rows: Mask) -> Observations:
-        """Those of the rows (N,)."""
+        """The same of some rows (N,)."""
         return Observations(self.stamp, self.camera[rows], self.track[rows], self.pixels[rows], self.sigma[rows])
 
 
 def no_observations(stamp: float) -> Observations:
-    """A frame set in which no track was found."""
-    nothing = np.zeros(0, np.int64)
-    return Observations(stamp, nothing, nothing, np.zeros((0, 2)), np.zeros(0))
+    """A frame set without a track."""
+    none = np.zeros(0, np.int64)
+    return Observations(stamp, none, none, np.zeros((0, 2)), np.zeros(0))

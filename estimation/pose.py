@@ -1,6 +1,6 @@
-"""The estimate: where the surface is, how fast it moves, how sure we are, and whether to trust it.
+"""The estimated pose of the surface with velocity, covariance, state, and a forecast once enough is learned.
 
-A pose has a forecast for the next half second, once enough is learned. A `Trajectory` holds poses over time.
+A `Trajectory` holds poses over time.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from estimation.surface_map import Warp
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
+
+_normal_quantile = lru_cache(maxsize=8)(NormalDist().inv_cdf)
 
 MIN_FORECAST_S = 0.01  # a shorter rest of a forecast says no more than the velocity there
 
@@ -64,7 +66,7 @@ class Forecast:
 
 
 def prepare(horizons: Array) -> None:
-    """Prepare the curve of forecasts over these horizons (H,), s: 0.1 to 0.5 s that the first need not spend."""
+    """Build the curve of forecasts over these horizons (H,), s, ahead of the first one: it takes 0.1 to 0.5 s."""
     _basis(tuple(horizons.tolist()))
 
 
@@ -108,19 +110,8 @@ def radius(covariance: Array, share: float = 0.9) -> Array:
     return np.asarray(np.sqrt(trace) * np.maximum(1 - part + _normal_quantile(share) * np.sqrt(part), 0.0) ** 1.5)
 
 
-def point_covariance(covariance: Array, points: Array) -> Array:
-    """Covariances (..., N, 3, 3), mm^2, of points (N, 3), mm, under pose covariances (..., 6, 6)."""
-    jacobian = se3.point_jacobians(points)
-    return np.asarray(jacobian @ covariance[..., None, :, :] @ np.swapaxes(jacobian, -1, -2))
-
-
-@lru_cache(maxsize=8)
-def _normal_quantile(share: float) -> float:
-    return NormalDist().inv_cdf(share)
-
-
 class TrackState(Enum):
-    """How much a pose is worth. TRACKING and DEGRADED are measured, the others are not."""
+    """Quality of a pose. TRACKING and DEGRADED are measured, the others are not."""
 
     INITIALISING = "INITIALISING"  # no surface map yet
     TRACKING = "TRACKING"  # two cameras or more agree on enough tracks
@@ -227,8 +218,7 @@ class SurfacePose:
 
     def error_at(self, points_surface: Array) -> Array:
         """Standard deviation (N,), mm, of the position of points (N, 3), surface frame, along its worst direction."""
-        spread = self._spread(points_surface)
-        return np.asarray(np.sqrt(np.linalg.eigvalsh(spread)[:, -1]))
+        return np.asarray(np.sqrt(np.linalg.eigvalsh(self._spread(points_surface))[:, -1]))
 
     def error_ahead(self, stamp: float, points_surface: Array) -> Array:
         """`predict(stamp).error_at(points)`, faster: without all else that a prediction holds."""
@@ -245,15 +235,15 @@ class SurfacePose:
 
     def _spread(self, points_surface: Array) -> Array:
         """Covariances (N, 3, 3), mm^2, of the positions of points (N, 3)."""
-        spread = point_covariance(self.covariance, points_surface)
+        jacobian = se3.point_jacobians(points_surface)
+        spread = np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2))
         return spread if self.warp is None else np.asarray(spread + self.warp.spread(points_surface))
 
 
 def identity_pose(stamp: float, reason: str) -> SurfacePose:
-    """The pose before there is any: INITIALISING, at the base's origin, without any certainty."""
-    return SurfacePose(
-        stamp, np.eye(4), np.diag([np.pi**2] * 3 + [1e6] * 3), np.zeros(6), TrackState.INITIALISING, reason=reason
-    )
+    """The pose before the first map: INITIALISING, at the base's origin, with a covariance that says nothing."""
+    covariance = np.diag([np.pi**2] * 3 + [1e6] * 3)
+    return SurfacePose(stamp, np.eye(4), covariance, np.zeros(6), TrackState.INITIALISING, reason=reason)
 
 
 def position_sigma(covariance: Array) -> float:

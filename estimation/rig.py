@@ -14,18 +14,14 @@ from estimation.se3 import Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """One pinhole camera with Brown-Conrady distortion.
-
-    size: (W, H) px. matrix: (3, 3) px. distortion: (5,) k1 k2 p1 p2 k3 (thesis Eq. 4.5, OpenCV's order).
-    base_from_camera: (4, 4) mm, x right, y down, z into the scene. clock_offset: s, to be added to its stamps.
-    """
+    """One pinhole camera with Brown-Conrady distortion."""
 
     name: str
-    size: tuple[int, int]
-    matrix: Array
-    distortion: Array
-    base_from_camera: Array
-    clock_offset: float = 0.0
+    size: tuple[int, int]  # (W, H) px
+    matrix: Array  # (3, 3) px
+    distortion: Array  # (5,) k1 k2 p1 p2 k3 (thesis Eq. 4.5, OpenCV's order)
+    base_from_camera: Array  # (4, 4) mm, x right, y down, z into the scene
+    clock_offset: float = 0.0  # s, to be added to its stamps
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +67,9 @@ def distort(camera: Camera, ideal: ArrayLike) -> Array:
     k1, k2, p1, p2, k3 = camera.distortion
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    distorted = np.stack(
-        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1
-    )
-    return np.asarray(distorted @ camera.matrix[:2, :2].T + camera.matrix[:2, 2])
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.asarray(np.stack([u, v], -1) @ camera.matrix[:2, :2].T + camera.matrix[:2, 2])
 
 
 def pixels_from_points(camera: Camera, points_base: ArrayLike) -> tuple[Array, Array]:

@@ -58,10 +58,8 @@ def exp_rotation(w: ArrayLike) -> Array:
 
 
 def _turn(x: Array, y: Array, z: Array, out: Array) -> tuple[Array, Array]:
-    """cos(a) I + s hat(w) + c w w^T into out (..., 3, 3), of w = x y z (...) and its angle a; c and a^2, each (...).
-
-    By components, as numpy takes a hundred numbers at once in the time of three.
-    """
+    """cos(a) I + s hat(w) + c w w^T into out (..., 3, 3), of w = x y z (...) and its angle a; c and a^2, each (...)."""
+    # by components: numpy takes a hundred numbers at once in the time of three
     a2 = x * x + y * y + z * z
     s, c = _coefficients(np.sqrt(a2))
     sx, sy, sz, cx, cy, cos = s * x, s * y, s * z, c * x, c * y, 1 - c * a2
@@ -131,9 +129,8 @@ def log(transform: ArrayLike) -> Array:
     angle = np.linalg.norm(w, axis=-1)
     s, c = _coefficients(angle)
     small = angle < 0.05
-    e = np.where(
-        small, 1 / 12 + angle**2 / 720 + angle**4 / 30240, (1 - s / (2 * c)) / np.where(small, 1.0, angle) ** 2
-    )
+    series = 1 / 12 + angle**2 / 720 + angle**4 / 30240
+    e = np.where(small, series, (1 - s / (2 * c)) / np.where(small, 1.0, angle) ** 2)
     h = hat(w)
     inverse_left = np.eye(3) - 0.5 * h + e[..., None, None] * (h @ h)
     return np.concatenate([w, (inverse_left @ transform[..., :3, 3:])[..., 0]], axis=-1)
@@ -141,8 +138,19 @@ def log(transform: ArrayLike) -> Array:
 
 def _log_one(transform: Array) -> Array:
     """`log` of one transform in plain floats, as `_exp_one`."""
-    (a, b, c, tx), (d, e, f, ty), (g, h, i, tz), _ = transform.tolist()
-    qx, qy, qz, qw = _quaternion_one(a, b, c, d, e, f, g, h, i)
+    (xx, xy, xz, tx), (yx, yy, yz, ty), (zx, zy, zz, tz), _ = transform.tolist()
+    # quaternion x y z w of the rotation, not of unit length
+    if xx + yy + zz > 0:
+        q = zy - yz, xz - zx, yx - xy, 1 + xx + yy + zz
+    elif xx >= yy and xx >= zz:
+        q = 1 + xx - yy - zz, xy + yx, xz + zx, zy - yz
+    elif yy >= zz:
+        q = xy + yx, 1 + yy - xx - zz, yz + zy, xz - zx
+    else:
+        q = xz + zx, yz + zy, 1 + zz - xx - yy, yx - xy
+    length = math.copysign(math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2), q[3])
+    qx, qy, qz, qw = q[0] / length, q[1] / length, q[2] / length, q[3] / length
+    # rotation vector, and the inverse of the left Jacobian
     n = math.sqrt(qx * qx + qy * qy + qz * qz)
     angle = 2 * math.atan2(n, qw)
     scale = 2.0 if n < 1e-8 else angle / n
@@ -156,22 +164,6 @@ def _log_one(transform: Array) -> Array:
     ux, uy, uz = y * tz - z * ty, z * tx - x * tz, x * ty - y * tx  # hat(w) @ t
     vx, vy, vz = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
     return np.array([x, y, z, tx - 0.5 * ux + k * vx, ty - 0.5 * uy + k * vy, tz - 0.5 * uz + k * vz])
-
-
-def _quaternion_one(
-    xx: float, xy: float, xz: float, yx: float, yy: float, yz: float, zx: float, zy: float, zz: float
-) -> tuple[float, float, float, float]:
-    """Unit quaternion x y z w, w >= 0, of one rotation's entries row by row."""
-    if xx + yy + zz > 0:
-        q = zy - yz, xz - zx, yx - xy, 1 + xx + yy + zz
-    elif xx >= yy and xx >= zz:
-        q = 1 + xx - yy - zz, xy + yx, xz + zx, zy - yz
-    elif yy >= zz:
-        q = xy + yx, 1 + yy - xx - zz, yz + zy, xz - zx
-    else:
-        q = xz + zx, yz + zy, 1 + zz - xx - yy, yx - xy
-    length = math.copysign(math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2), q[3])
-    return q[0] / length, q[1] / length, q[2] / length, q[3] / length
 
 
 def make(rotation: ArrayLike, translation: ArrayLike) -> Array:
@@ -199,6 +191,14 @@ def adjoint(transform: ArrayLike) -> Array:
     out = np.zeros((*transform.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = r
     out[..., 3:, :3] = hat(transform[..., :3, 3]) @ r
+    return out
+
+
+def small_adjoint(xi: Array) -> Array:
+    """ad (..., 6, 6) of tangent vectors (..., 6): ad(x) @ y is their Lie bracket."""
+    out = np.zeros((*xi.shape, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = hat(xi[..., :3])
+    out[..., 3:, :3] = hat(xi[..., 3:])
     return out
 
 

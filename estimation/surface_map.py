@@ -1,4 +1,4 @@
-"""The stored map of the surface, against which every frame set is matched, and the warp of soft tissue beside it."""
+"""The map of landmarks against which every frame set is matched, and the warp of soft tissue."""
 
 from __future__ import annotations
 
@@ -40,11 +40,6 @@ def joined_map(first: SurfaceMap, second: SurfaceMap) -> SurfaceMap:
     covariance[:n, :n], covariance[n:, n:] = first.covariance, second.covariance
     points = np.concatenate([first.points, second.points])
     return SurfaceMap(points, np.concatenate([first.normals, second.normals]), covariance)
-
-
-def motion_of(points: Array) -> Array:
-    """How points (N, 3) move, (3N, 6), with a right perturbation of their frame's pose, per rad and mm."""
-    return se3.point_jacobians(points).reshape(-1, 6)
 
 
 def local_normals(points: Array, outward: Array, neighbours: int = 12) -> Array:
@@ -97,7 +92,7 @@ def surface_frame(points_base: Array, towards: Array, right: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Warp:
-    """How far soft tissue departs from the rigid body that the pose describes: a smooth displacement field.
+    """Displacement field of soft tissue from the rigid body that the pose describes.
 
     A sum of Gaussian bells about K control points, so it is smooth, exact to differentiate and dies away beside the
     mapped surface. Its rigid part over the landmarks is zero: pose and warp do not share a motion.
@@ -116,28 +111,26 @@ class Warp:
         return replace(self, covariance=self.covariance + abs(seconds) * self.growth)
 
     def displacement(self, points: Array) -> Array:
-        """How far (N, 3) mm points (N, 3) of the undeformed surface are moved."""
+        """Displacements (N, 3) mm of points (N, 3) of the undeformed surface."""
         return np.asarray(bells(points, self.control, self.reach) @ self.coefficients)
 
     def apply(self, points: Array) -> Array:
-        """Where points (N, 3) mm of the undeformed surface are."""
+        """Points (N, 3) mm of the undeformed surface, displaced."""
         return np.asarray(points + self.displacement(points))
 
     def undo(self, points: Array) -> Array:
-        """Which points (N, 3) mm of the undeformed surface are at points (N, 3)."""
+        """Points (N, 3) mm of the undeformed surface that the warp moves to points (N, 3)."""
         rest = points
         for _ in range(INVERSE_STEPS):
             rest = points - self.displacement(rest)
         return np.asarray(rest)
 
     def carry(self, transforms: Array) -> Array:
-        """Poses (N, 4, 4) on the undeformed surface, moved and turned with the tissue.
-
-        The turn is that of the displacement's gradient, half its curl: the polar decomposition to first order.
-        """
+        """Poses (N, 4, 4) on the undeformed surface, moved and turned with the tissue."""
         places = transforms[:, :3, 3]
         bell = bells(places, self.control, self.reach)
         slope = -bell[..., None] * (places[:, None] - self.control) / self.reach**2  # (N, K, 3)
+        # half the curl of the displacement: the polar decomposition of its gradient, to first order
         turn = 0.5 * se3.cross(slope, self.coefficients).sum(1)
         return se3.make(se3.exp_rotation(turn) @ transforms[:, :3, :3], places + bell @ self.coefficients)
 

@@ -13,8 +13,16 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.calibration.arm_fit import ArmUnknowns, fit_arm, fit_touches, jackknife
-from estimation.calibration.arm_model import ArmParameters, SetPoint, Sightings, predict
-from estimation.calibration.arm_start import check_latency, check_places, check_turns, first_pose
+from estimation.calibration.arm_model import (
+    ArmParameters,
+    SetPoint,
+    Sightings,
+    check_latency,
+    check_places,
+    check_turns,
+    first_pose,
+    predict,
+)
 from estimation.errors import InputError
 from estimation.rig import Rig, pixels_from_points
 from estimation.se3 import Array

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from estimation import se3
-from estimation.calibration.lens_fit import MIN_PLANE_CORNERS, focal_length, homography, poses
+from estimation.calibration.lens_fit import MIN_PLANE_CORNERS, focal_from_terms, focal_terms, homography, poses
 from estimation.rig import pixels_from_points
 from hardware.calibration.corners import COVERAGE_GRID, MIN_COMMON_SETS, CoverageGuide, coverage_of, missing_coverage
 from hardware.calibration.live import WavingRecorder, devices_named, watch
@@ -235,7 +235,9 @@ def test_what_is_added_up_is_what_all_views_tell_and_old_ones_are_seldom_looked_
         guide.missing()
     seen = [np.isfinite(pixels[:, 0]) for pixels in views]
     planes = np.stack([homography(BOARD.corners[s, :2], p[s] - middle) for s, p in zip(seen, views, strict=True)])
-    whole = coverage_of(np.stack(views), SIZE, poses(planes, np.full(len(planes), focal_length(planes))))
+    whole = coverage_of(
+        np.stack(views), SIZE, poses(planes, np.full(len(planes), focal_from_terms(focal_terms(planes))))
+    )
     held = guide.coverage(0)
     assert np.array_equal(held.parts, whole.parts)
     assert held.tilts == pytest.approx(whole.tilts, abs=0.05) and held.depth == pytest.approx(whole.depth, rel=0.03)

@@ -55,15 +55,15 @@ def rested(quiet: float) -> CameraErrors:
 def test_at_once_it_is_what_the_window_said_and_what_late_cameras_make_of_it(window: float) -> None:
     cameras = CameraErrors(CAMERAS)
     pose, fit = first(window, cameras)
-    late = fit.parts.late @ cameras.delays.covariance @ fit.parts.late.T
+    late = fit.parts.by_delay @ cameras.delays.covariance @ fit.parts.by_delay.T
     assert pose.covariance(cameras, TrackNoise(CAMERAS)) == pytest.approx(window * fit.parts.noise + late, rel=1e-6)
 
 
 def test_once_the_images_are_known_to_rest_it_is_what_the_tracks_make_of_it() -> None:
     pose, fit = first(0.5, CameraErrors(CAMERAS))
     cameras = rested(0.005)
-    late = fit.parts.late @ cameras.delays.covariance @ fit.parts.late.T
-    expected = 0.5 * (fit.parts.tracks + cameras.unrest * fit.parts.bias @ fit.parts.bias.T) + late
+    late = fit.parts.by_delay @ cameras.delays.covariance @ fit.parts.by_delay.T
+    expected = 0.5 * (fit.parts.tracks + cameras.unrest * fit.parts.by_shift @ fit.parts.by_shift.T) + late
     assert pose.covariance(cameras, TrackNoise(CAMERAS)) == pytest.approx(expected, rel=1e-6)
     assert cameras.unrest < 0.1 * CameraErrors(CAMERAS).unrest
 
@@ -84,7 +84,7 @@ def test_an_offset_that_was_not_corrected_then_is_claimed_when_it_is_known() -> 
         found = np.r_[true - cameras.offset, np.zeros(2 * CAMERAS)]
         cameras.learn(SharedFit(information, information @ found), 1 / 30)
     claimed = pose.covariance(cameras, TrackNoise(CAMERAS))
-    off = fit.parts.late @ true
+    off = fit.parts.by_delay @ true
     assert off @ np.linalg.solve(claimed, off) < 2.0
 
 
@@ -96,7 +96,7 @@ def fit_at(stamp: float, tracks: int = 300, scatter: float = 1.0) -> FrameFit:
     _, fit = first(0.5, CameraErrors(CAMERAS))
     shared = SharedFit(np.diag(np.full(3 * CAMERAS, 1e4)), np.zeros(3 * CAMERAS))
     used = np.full(CAMERAS, tracks // CAMERAS)
-    small = {"late": 1e-3 * fit.parts.late, "bias": 1e-3 * fit.parts.bias}
+    small = {"by_delay": 1e-3 * fit.parts.by_delay, "by_shift": 1e-3 * fit.parts.by_shift}
     parts = replace(fit.parts, scatter=scatter, noise=BELIEVED, tracks=LITTLE, **small)
     return replace(fit, stamp=stamp, solution=replace(fit.solution, shared=shared), used=used, parts=parts)
 
@@ -193,7 +193,7 @@ def test_each_part_of_the_noise_is_resized_by_itself(scatter: float, rest: float
     _, fit = first(1.0, CAMERA_ERRORS)
     unrest = CAMERA_ERRORS.unrest
     averaged = WindowNoise(0.3 * fit.parts.noise, replace(fit, parts=replace(fit.parts, scatter=scatter)), unrest)
-    expected = 0.3 * (scatter * fit.parts.tracks + rest * unrest * fit.parts.bias @ fit.parts.bias.T)
+    expected = 0.3 * (scatter * fit.parts.tracks + rest * unrest * fit.parts.by_shift @ fit.parts.by_shift.T)
     assert averaged.covariance(TrackNoise(CAMERAS), rest * unrest) == pytest.approx(expected, rel=1e-6)
 
 

@@ -51,7 +51,7 @@ def test_a_bump_that_a_movement_could_explain_is_told_by_the_motion(camera: int)
         seen = seen_by_bumped(camera, se3.exp(np.concatenate([np.zeros(3), shift])))
         fit = estimator.fit(seen, estimator.predict(NEXT))
         away = np.linalg.norm(fit.solution.base_from_surface[:3, 3] - breathing(NEXT)[:3, 3])
-        assert fit.odd == {camera} or away < 0.4
+        assert fit.outliers == {camera} or away < 0.4
 
 
 @pytest.mark.parametrize("size", [2.0, *slowly(0.3, 5.0)])
@@ -61,7 +61,7 @@ def test_a_jerk_of_the_surface_is_followed_by_all_cameras(size: float) -> None:
         shift = draw.normal(size=3)
         jerked = breathing(NEXT) @ se3.exp(np.concatenate([np.zeros(3), size * shift / np.linalg.norm(shift)]))
         fit = estimator.fit(look(lambda stamp, pose=jerked: pose, NEXT, 1), estimator.predict(NEXT))  # type: ignore[misc]
-        assert fit.measured and not fit.odd
+        assert fit.measured and not fit.outliers
         assert np.linalg.norm(fit.solution.base_from_surface[:3, 3] - jerked[:3, 3]) < 0.15
 
 

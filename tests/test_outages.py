@@ -311,14 +311,14 @@ def test_images_are_doubted_only_where_every_camera_that_counts_stands_off() -> 
 
 def test_shape_and_clocks_are_learned_only_where_two_cameras_see_about_as_much_as_usual() -> None:
     health = CameraHealth(["a", "b", "c"])
-    assert health.clear(np.array([0, 0, 0]))  # nothing is usual yet
+    assert health.has_usual_tracks(np.array([0, 0, 0]))  # nothing is usual yet
     for k in range(10):
         health.update(0.03 * k, np.array([100, 90, 0]), 10, np.zeros(3), np.ones(3), ())
-    assert health.clear(np.array([40, 30, 0])) and health.clear(np.array([100, 28, 0]))
-    assert not health.clear(np.array([100, 20, 0])) and not health.clear(np.array([20, 20, 40]))
+    assert health.has_usual_tracks(np.array([40, 30, 0])) and health.has_usual_tracks(np.array([100, 28, 0]))
+    assert not health.has_usual_tracks(np.array([100, 20, 0])) and not health.has_usual_tracks(np.array([20, 20, 40]))
     alone = CameraHealth(["a"])
     alone.update(0.0, np.array([50]), 10, np.zeros(1), np.ones(1), ())
-    assert alone.clear(np.array([20])) and not alone.clear(np.array([10]))
+    assert alone.has_usual_tracks(np.array([20])) and not alone.has_usual_tracks(np.array([10]))
 
 
 def test_images_that_all_stand_off_are_said_to() -> None:
@@ -332,5 +332,5 @@ def test_a_lost_surface_forgives_all_cameras() -> None:
     health = CameraHealth(["a", "b"])
     health.update(0.0, np.array([50, 0]), 10, np.array([0.1, 5.0]), np.full(2, 0.25), {1})
     assert health.left_out == {1}
-    health.readmit_all()
+    health.left_out = frozenset()
     assert not health.left_out

@@ -16,8 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.forecast.innovation_gate import ACCEPT_AFTER_S, InnovationGate
-from estimation.forecast.predictor import HORIZONS, PoseHistory, Predictor
+from estimation.forecast.predictor import ACCEPT_AFTER_S, HORIZONS, InnovationGate, PoseHistory, Predictor
 from estimation.pose import Forecast, SurfacePose, TrackState, body_rate, radius
 from estimation.se3 import Array
 from tests.slowly import slowly

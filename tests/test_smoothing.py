@@ -12,8 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3, smooth
-from estimation.batch.priors import REFINED_PRIOR, STATE_DOF, States, jerk_covariance, prior_factors, transition
-from estimation.batch.smoothed import Smoothed
+from estimation.batch.smoothed import (
+    REFINED_PRIOR,
+    STATE_DOF,
+    Smoothed,
+    States,
+    jerk_covariance,
+    prior_factors,
+    transition,
+)
 from estimation.batch.solve import BlockTridiagonal
 from estimation.errors import InputError
 from estimation.observations import Observations, no_observations

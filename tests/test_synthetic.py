@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.pose_solver import PointTracks, solve_pose
+from estimation.online.pose_solver import GATE, PointTracks, solve_pose
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.follow import filtered_bound, pose_bound, pose_information
@@ -159,7 +159,7 @@ def test_least_squares_reaches_the_bound_and_does_not_pass_it() -> None:
     errors = []
     for seen in world:
         points = world.landmarks.points[seen.track]
-        plain = solve_pose(world.rig, PointTracks.of(seen, points), true, gate=1e6)
+        plain = solve_pose(world.rig, PointTracks.of(seen, points), true, scales=(1e6 / GATE,))
         errors.append(se3.log(se3.inverse(plain.base_from_surface) @ true))
     bound = pose_bound(information(world, seen))
     nees = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(bound), errors)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.mapping.local_surface import MIN_SURFACE_POINTS, RaySurfaceHits, meet_rays, smooth_normals
 from estimation.mapping.triangulation import epipolar_distance, rays, triangulate, updated_by_looks
-from estimation.online.fit import UNCERTAIN_MM, LandmarkUncertainty
+from estimation.online.fit import UNCERTAIN_MM, MapError
 from estimation.online.pose_solver import project
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
@@ -206,7 +206,7 @@ def test_a_landmark_of_unknown_depth_counts_little_in_another_camera_and_fully_i
     wide = {}
     for camera in (CAMERA, 2):
         jacobians = project(RIG, np.full(len(known), camera), BASE_FROM_REST, known.points)[2]
-        wide[camera] = LandmarkUncertainty(known).widened(sigma, rows, jacobians)
+        wide[camera] = MapError(known).widened(sigma, rows, jacobians)
     assert wide[CAMERA].max() < 1.3 * PIXEL_SIGMA and wide[2].min() > 5 * PIXEL_SIGMA
 
 
@@ -215,7 +215,7 @@ def test_landmarks_that_are_well_known_keep_their_sigmas() -> None:
     sure = SurfaceMap(known.points, known.normals, 0.9 * UNCERTAIN_MM**2 * np.eye(3 * len(known)))
     rows, sigma = np.arange(len(sure)), np.full(len(sure), PIXEL_SIGMA)
     jacobians = project(RIG, np.full(len(sure), 0), BASE_FROM_REST, sure.points)[2]
-    assert LandmarkUncertainty(sure).widened(sigma, rows, jacobians) is sigma
+    assert MapError(sure).widened(sigma, rows, jacobians) is sigma
 
 
 NOISE = 0.04  # mm

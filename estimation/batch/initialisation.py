@@ -1,7 +1,4 @@
-"""The input of smoothing: all observations as parallel arrays, and rough poses and landmarks to start from.
-
-The start comes from the tracks alone, or from a run's poses.
-"""
+"""The input of smoothing: observations as arrays, and rough poses and landmarks from the tracks or a run's poses."""
 
 from __future__ import annotations
 
@@ -44,12 +41,8 @@ class TrackArrays:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def of(self, frame: int) -> slice:
-        """Where the observations of a frame set stand."""
-        return slice(int(self.starts[frame]), int(self.starts[frame + 1]))
-
-    def between(self, first: int, last: int) -> slice:
-        """Where the observations of frame sets first <= k < last stand."""
+    def rows(self, first: int, last: int) -> slice:
+        """Rows of the observations of frame sets first <= k < last."""
         return slice(int(self.starts[first]), int(self.starts[last]))
 
     def only(self, frames: Index) -> TrackArrays:
@@ -57,7 +50,7 @@ class TrackArrays:
         counts = np.diff(self.starts)[frames]
         starts = np.concatenate([[0], np.cumsum(counts)])
         rows = np.repeat(self.starts[frames] - starts[:-1], counts) + np.arange(starts[-1])
-        return replace(self._rows(rows), stamps=self.stamps[frames], starts=starts)
+        return replace(self._take(rows), stamps=self.stamps[frames], starts=starts)
 
     def landmarks(self, chosen: Mask) -> TrackArrays:
         """The same of some landmarks (L,) only."""
@@ -65,9 +58,9 @@ class TrackArrays:
         counts = np.add.reduceat(np.append(mine, 0), self.starts)[:-1] * (np.diff(self.starts) > 0)
         starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         row = (np.cumsum(chosen) - 1)[self.landmark[mine]]
-        return replace(self._rows(mine), starts=starts, landmark=row, tracks=self.tracks[chosen])
+        return replace(self._take(mine), starts=starts, landmark=row, tracks=self.tracks[chosen])
 
-    def _rows(self, rows: Index | Mask) -> TrackArrays:
+    def _take(self, rows: Index | Mask) -> TrackArrays:
         observations = self.camera[rows], self.landmark[rows], self.pixels[rows], self.precision[rows]
         return TrackArrays(self.stamps, self.starts, *observations, self.tracks)
 
@@ -120,7 +113,7 @@ def at_stamps(trajectory: Trajectory, stamps: Array) -> Array:
 
 def _frame_observations(data: TrackArrays, frame: int) -> Observations:
     """One frame set's observations; tracks count landmarks."""
-    part = data.of(frame)
+    part = data.rows(frame, frame + 1)
     sigma = data.precision[part] ** -0.5
     return Observations(float(data.stamps[frame]), data.camera[part], data.landmark[part], data.pixels[part], sigma)
 
@@ -157,9 +150,8 @@ def _first(rig: Rig, data: TrackArrays, points: Array, mapped: bool) -> tuple[in
         start = laid.base_from_surface @ mine
         fitted = _fit(rig, seen, points, start)
         return frame, start if fitted is None else fitted
-    raise InputError(
-        "observations", "tracks", "no frame set", f"one in which two cameras see {MIN_FIT_LANDMARKS} landmarks alike"
-    )
+    allowed = f"one in which two cameras see {MIN_FIT_LANDMARKS} landmarks alike"
+    raise InputError("observations", "tracks", "no frame set", allowed)
 
 
 def _fit(rig: Rig, seen: Observations, points: Array, start: Array) -> Array | None:
@@ -177,9 +169,7 @@ def _fit(rig: Rig, seen: Observations, points: Array, start: Array) -> Array | N
 
 def _add(rig: Rig, seen: Observations, new: Mask, points: Array, pose: Array) -> None:
     """Landmarks that two cameras see in this frame set for the first time."""
-    if not new.any():
-        return
-    rows, index, count = np.unique(seen.track[new], return_inverse=True, return_counts=True)
+    _, index, count = np.unique(seen.track[new], return_inverse=True, return_counts=True)
     both = count[index] > 1
     if not both.any():
         return
@@ -192,10 +182,7 @@ def _add(rig: Rig, seen: Observations, new: Mask, points: Array, pose: Array) ->
 
 
 def intersected_landmarks(rig: Rig, data: TrackArrays, poses: Array, points: Array) -> Array:
-    """Landmarks (L, 3): those known (L, 3) as they are, others where the rays of some frame sets come nearest.
-
-    Of a landmark whose rays are nearly parallel, nothing can be said: nan.
-    """
+    """Landmarks (L, 3): the known ones; others where rays of some frame sets meet, nan where these are all parallel."""
     missing = ~np.isfinite(points[:, 0])
     if not missing.any():
         return points
@@ -214,9 +201,8 @@ def intersected_landmarks(rig: Rig, data: TrackArrays, poses: Array, points: Arr
         normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
         np.add.at(normal, landmark, weight[:, None, None] * across)
         np.add.at(right, landmark, weight[:, None] * (across @ origins[..., None])[..., 0])
-        known = missing & (
-            np.linalg.eigvalsh(normal)[:, 0] > MIN_RAY_ANGLE**2 * np.maximum(np.trace(normal, 0, 1, 2), 1e-12)
-        )
+        least = MIN_RAY_ANGLE**2 * np.maximum(np.trace(normal, 0, 1, 2), 1e-12)
+        known = missing & (np.linalg.eigvalsh(normal)[:, 0] > least)
         out[known] = np.linalg.solve(normal[known], right[known][..., None])[..., 0]
         away = np.linalg.norm((across @ (out[landmark] - origins)[..., None])[..., 0], axis=1)
         away = np.where(np.isfinite(away), away, np.inf)

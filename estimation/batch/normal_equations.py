@@ -15,10 +15,14 @@ import numpy as np
 
 from estimation import se3
 from estimation.batch.initialisation import TrackArrays
-from estimation.batch.priors import STATE_DOF, CorrectedCameras, States, right_jacobian
+from estimation.batch.smoothed import STATE_DOF, CorrectedCameras, States, right_jacobian
 from estimation.online.pose_solver import EFFICIENCY, GATE
 from estimation.runtime import compiled
 from estimation.se3 import Array, Index, Mask
+
+# starts (F + 1,) of F frame sets' rows, from 0; then camera (N,), landmark (N,), pixels (N, 2), precision (N,) px^-2
+TrackRows = tuple[Index, Index, Index, Array, Array]
+TRACK_ROWS_TYPE = "Tuple((i8[::1], i8[::1], i8[::1], f8[:,::1], f8[::1]))"
 
 OBSERVATION_COLUMNS = 11  # of an observation: six of its camera's own pose of the surface, fx fy cx cy, its residual
 COMMON_DELAY_SIGMA_S = 1e-4  # s: as the sum of a frame set's delays is held at nothing
@@ -26,15 +30,11 @@ COMMON_DELAY_SIGMA_S = 1e-4  # s: as the sum of a frame set's delays is held at 
 
 @compiled(
     "Tuple((f8[:,:,:,::1], f8[:,:,:,:,::1], f8[:,:,::1], f8[:,::1], f8))"
-    "(i8[::1], i8[::1], i8[::1], f8[:,::1], f8[::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1], b1)",
+    f"({TRACK_ROWS_TYPE}, f8[:,:,:,::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1], b1)",
     reordered=True,
 )
 def frame_sums(
-    starts: Index,
-    camera: Index,
-    landmark: Index,
-    pixels: Array,
-    precision: Array,
+    tracks: TrackRows,
     camera_from_surface: Array,
     matrices: Array,
     points: Array,
@@ -44,14 +44,15 @@ def frame_sums(
 ) -> tuple[Array, Array, Array, Array, float]:
     """Sums of the normal equations of F frame sets, robustly weighted (Geman-McClure).
 
-    starts: (F + 1,) into the rest, from 0. camera, landmark: (N,). pixels: (N, 2). precision: (N,) px^-2, of the
-    estimate. camera_from_surface: (F, C, 4, 4) at each exposure. matrices: (C, 3, 3). points: (L, 3) mm. gate: (C,)
-    squared length of a whitened residual at which a weight is a quarter. moved: (L, 3) mm, a step of the landmarks that
-    the residuals are to hold. coupled: whether the products of landmarks with the rest are wanted.
+    tracks: with the precision of the estimate. camera_from_surface: (F, C, 4, 4) at each exposure. matrices: (C, 3, 3).
+    points: (L, 3) mm. gate: (C,) squared length of a whitened residual at which a weight is a quarter. moved: (L, 3)
+    mm, a step of the landmarks that the residuals are to hold. coupled: whether to give the products of landmarks with
+    the rest.
 
     Returns products (F, C, 11, 11) of the columns; of landmarks with columns (F, L, 3, C, 10), empty where not
     coupled; information (L, 3, 3) and gradient (L, 3) of the landmarks; and the robust cost, half of squared sigmas.
     """
+    starts, camera, landmark, pixels, precision = tracks
     frames, cameras, count = len(starts) - 1, matrices.shape[0], points.shape[0]
     grams = np.zeros((frames, cameras, OBSERVATION_COLUMNS, OBSERVATION_COLUMNS))
     cross = np.zeros((frames if coupled else 0, count, 3, cameras, OBSERVATION_COLUMNS - 1))
@@ -108,20 +109,10 @@ def frame_sums(
     return grams, cross, information, gradient, cost
 
 
-@compiled(
-    "f8[::1](i8[::1], i8[::1], i8[::1], f8[:,::1], f8[::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,::1])", reordered=True
-)
-def squared_residuals(
-    starts: Index,
-    camera: Index,
-    landmark: Index,
-    pixels: Array,
-    precision: Array,
-    camera_from_surface: Array,
-    matrices: Array,
-    points: Array,
-) -> Array:
+@compiled(f"f8[::1]({TRACK_ROWS_TYPE}, f8[:,:,:,::1], f8[:,:,::1], f8[:,::1])", reordered=True)
+def squared_residuals(tracks: TrackRows, camera_from_surface: Array, matrices: Array, points: Array) -> Array:
     """Squared whitened residuals (N,); inf behind a camera. Arguments as `frame_sums` takes them."""
+    starts, camera, landmark, pixels, precision = tracks
     out = np.empty(len(camera))
     for f in range(len(starts) - 1):
         for i in range(starts[f], starts[f + 1]):
@@ -214,8 +205,8 @@ def exposed_poses(states: States, cameras: CorrectedCameras) -> tuple[Array, Arr
 def whitened_squares(data: TrackArrays, estimate: Estimate) -> Array:
     """Squared residuals (N,) of all frame sets in parts of their variance."""
     poses = exposed_poses(estimate.states, estimate.cameras)[1]
-    seen = data.starts, data.camera, data.landmark, data.pixels, data.precision
-    return squared_residuals(*seen, poses, estimate.cameras.matrices, estimate.points)
+    tracks = data.starts, data.camera, data.landmark, data.pixels, data.precision
+    return squared_residuals(tracks, poses, estimate.cameras.matrices, estimate.points)
 
 
 def condense(
@@ -247,19 +238,16 @@ def _sum_frames(
     problem: BatchProblem, first: int, last: int, estimate: Estimate, noise: NoiseModel, step: Array | None
 ) -> _FrameSums:
     data, cameras, free = problem.data, estimate.cameras, problem.free
-    n, part = len(cameras), data.between(first, last)
+    n, part = len(cameras), data.rows(first, last)
     mine = estimate.states[first:last]
     # sums over the tracks, in the columns of each camera's own pose
     ahead, camera_from_surface = exposed_poses(mine, cameras)
     camera = data.camera[part]
     worth = EFFICIENCY / noise.unit**2
     moved = np.zeros_like(estimate.points) if step is None else step[len(free) :].reshape(-1, 3)
+    starts, precision = data.starts[first : last + 1] - data.starts[first], data.precision[part] * worth[camera]
     grams, products, known, pull, cost = frame_sums(
-        data.starts[first : last + 1] - data.starts[first],
-        camera,
-        data.landmark[part],
-        data.pixels[part],
-        data.precision[part] * worth[camera],
+        (starts, camera, data.landmark[part], data.pixels[part], precision),
         camera_from_surface,
         cameras.matrices,
         estimate.points,
@@ -293,10 +281,8 @@ def _eliminate_shared(summed: _FrameSums, noise: NoiseModel, n: int, coupled: bo
     own_cross = np.concatenate([whole[:, own, rest], np.swapaxes(by_landmark[..., own], 1, 2)], axis=2)
     root = np.linalg.inv(np.linalg.cholesky(whole[:, own, own] + _own_prior(noise, summed.seeing)))
     by_state, by_shared, by_right = root @ whole[:, own, state], root @ own_cross, root @ right[:, own, None]
-    turned = np.swapaxes(by_state, 1, 2)
-    held = np.swapaxes(root, 1, 2)
-    size = by_shared.shape[2]
-    shared = np.zeros((size, size))
+    turned, held = np.swapaxes(by_state, 1, 2), np.swapaxes(root, 1, 2)
+    shared = np.zeros((by_shared.shape[2],) * 2)
     gradient = np.concatenate([right[:, rest].sum(0), summed.pull.ravel()[: by_landmark.shape[1]]])
     if coupled:
         shared = _shared(whole[:, rest, rest].sum(0), by_landmark[..., rest].sum(0), summed.known)
@@ -304,7 +290,7 @@ def _eliminate_shared(summed: _FrameSums, noise: NoiseModel, n: int, coupled: bo
         information=whole[:, state, state] - turned @ by_state,
         gradient=(right[:, state, None] - turned @ by_right)[..., 0],
         cross=cross - turned @ by_shared,
-        own=by_shared.reshape(3 * n * frames, size),
+        own=by_shared.reshape(3 * n * frames, len(shared)),
         shared=shared,
         pull=gradient - (np.swapaxes(by_shared, 1, 2) @ by_right)[..., 0].sum(0),
         effects=-(held @ by_right)[..., 0],

@@ -1,4 +1,4 @@
-"""The best estimate of a whole recording: every pose, landmark and camera from all tracks, before and after.
+"""Batch smoothing of a whole recording: each pose, landmark and camera estimated from all tracks, past and future.
 
 One Gauss-Newton problem over all frame sets (a full batch): robust reprojection errors, the continuous-time prior
 between poses, and the calibration as prior of the cameras. A frame set's tracks are condensed to its own state; states
@@ -11,24 +11,16 @@ recording too: the tracks' size, the jitter and unrest that images share, and th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from estimation import se3
+from estimation.batch import smoothed
 from estimation.batch.initialisation import TrackArrays, pack_tracks, rough_start
 from estimation.batch.normal_equations import BatchProblem, Estimate, NoiseModel, whitened_squares
-from estimation.batch.priors import CalibrationPrior, States, cameras_of, correction_sigmas, prior_information
-from estimation.batch.smoothed import FitStatistics, Smoothed
-from estimation.batch.solve import (
-    FREE_POSE_SIGMA,
-    HELD_POSE_SIGMA,
-    Elimination,
-    NormalEquations,
-    Priors,
-    shared_covariance,
-    shared_step,
-)
+from estimation.batch.smoothed import CalibrationPrior, FitStatistics, Smoothed, States
+from estimation.batch.solve import FREE_POSE_SIGMA, HELD_POSE_SIGMA, Elimination, NormalEquations, Priors
 from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.online.pose_solver import CHI2_MEDIAN, EFFICIENCY
@@ -41,9 +33,7 @@ FREE_LANDMARK_MM = 50.0  # from where a landmark was begun: a prior that only ke
 MIN_MAP_SIGMA_MM = 1e-4  # no map is known better
 MIN_LANDMARK_SIGHTINGS = 4
 KEY_FRAMES = 120  # from which landmarks and cameras are estimated first; then all frame sets correct them
-NOISE_STRETCH = (
-    240  # neighbouring frame sets from which the noise is learned first, in recordings several times as long
-)
+NOISE_STRETCH = 240  # neighbouring frame sets from which the noise is learned first, in recordings thrice as long
 GATE_WIDENINGS = (8.0, 4.0, 2.0)  # of the gate, solved from coarse to fine (graduated non-convexity)
 LOSS_SLOPE = 0.7  # of Geman-McClure's residuals for normal errors, over the mean of their weights
 MAX_STEPS = 10  # at the last width
@@ -136,17 +126,19 @@ def smooth(
     observations do not determine a pose.
     """
     prior = CalibrationPrior() if prior is None else prior
-    data = pack_tracks(_tracked(observations), len(rig))
+    # without those before anything is seen and after it: a motion carried on for seconds goes anywhere
+    some = [k for k, seen in enumerate(observations) if len(seen)]
+    data = pack_tracks(observations[some[0] : some[-1] + 1] if some else observations, len(rig))
     poses, points = rough_start(rig, data, known, start)
     usable = np.isfinite(points[:, 0]) & (np.bincount(data.landmark, minlength=len(points)) >= MIN_LANDMARK_SIGHTINGS)
     if usable.sum() < 6:
         raise InputError("observations", "landmarks", f"{int(usable.sum())} seen from apart", "6 or more")
     data, points = data.landmarks(usable), points[usable]
     held = 0 if start is None else int(np.abs(data.stamps - start.stamps[0]).argmin())
-    cameras, sigma = cameras_of(rig), correction_sigmas(prior, len(rig))
+    cameras, sigma = smoothed.cameras_of(rig), smoothed.correction_sigmas(prior, len(rig))
     before = Priors(
         calibrated=cameras,
-        calibration=prior_information(sigma, len(rig)),
+        calibration=smoothed.prior_information(sigma, len(rig)),
         points=points.copy(),
         map=np.eye(points.size) / FREE_LANDMARK_MM**2 if known is None else _information(known, data),
         pose=poses[held],
@@ -159,12 +151,6 @@ def smooth(
     return _Solver(rig, BatchProblem(data, np.flatnonzero(sigma > 0)), estimate, before, noise, progress).solve()
 
 
-def _tracked(observations: Sequence[Observations]) -> Sequence[Observations]:
-    """Without those before anything is seen and after it: a motion carried on for seconds goes anywhere."""
-    some = [k for k, seen in enumerate(observations) if len(seen)]
-    return observations[some[0] : some[-1] + 1] if some else observations
-
-
 def _rates(poses: Array, stamps: Array) -> States:
     """States (K) whose twists are differences of neighbouring poses."""
     between = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / np.diff(stamps)[:, None]
@@ -172,25 +158,21 @@ def _rates(poses: Array, stamps: Array) -> States:
     return States(poses, twists, np.zeros_like(twists))
 
 
+@dataclass(slots=True, eq=False)
 class _Solver:
     """The steps from a rough start to the result."""
 
-    def __init__(
-        self,
-        rig: Rig,
-        problem: BatchProblem,
-        estimate: Estimate,
-        known: Priors,
-        noise: NoiseModel,
-        progress: PassReport,
-    ) -> None:
-        self._rig, self._problem, self._estimate = rig, problem, estimate
-        self._known, self._noise, self._report, self._passes = known, noise, progress, 0
-        self._data = problem.data
+    rig: Rig
+    problem: BatchProblem
+    estimate: Estimate
+    known: Priors
+    noise: NoiseModel
+    report: PassReport
+    passes: int = 0
 
     def solve(self) -> Smoothed:
         """The result."""
-        if len(self._data) > 3 * NOISE_STRETCH:
+        if len(self.problem.data) > 3 * NOISE_STRETCH:
             self._from_key_frames()
             self._from_a_stretch()
             self._step_states(GATE_WIDENINGS[-1])
@@ -213,106 +195,97 @@ class _Solver:
 
     def _part(self, frames: Index, known: Priors) -> _Solver:
         """The same of some frame sets."""
-        states = self._estimate.states[frames]
-        problem = BatchProblem(self._data.only(frames), self._problem.free)
+        states = self.estimate.states[frames]
+        problem = BatchProblem(self.problem.data.only(frames), self.problem.free)
         known = replace(known, psd=np.tile(INITIAL_JERK_PSD, (len(frames) - 1, 1)))
-        return _Solver(self._rig, problem, replace(self._estimate, states=states), known, self._noise, no_report)
+        return _Solver(self.rig, problem, replace(self.estimate, states=states), known, self.noise, no_report)
 
     def _from_key_frames(self) -> None:
-        """Landmarks and cameras from some frame sets: nearly right, at a small part of the work.
-
-        So far apart they determine no velocity, and so no clocks.
-        """
-        spread = np.linspace(0, len(self._data) - 1, KEY_FRAMES).round().astype(np.int64)
-        frames = np.union1d(spread, [self._known.held])
-        few = self._part(frames, replace(self._known, held=int(np.searchsorted(frames, self._known.held))))
-        few._problem = replace(few._problem, free=self._problem.free[self._problem.free >= len(self._rig)])
+        """Landmarks and cameras from some frame sets, nearly right. These are too far apart to determine clocks."""
+        spread = np.linspace(0, len(self.problem.data) - 1, KEY_FRAMES).round().astype(np.int64)
+        frames = np.union1d(spread, [self.known.held])
+        few = self._part(frames, replace(self.known, held=int(np.searchsorted(frames, self.known.held))))
+        few.problem = replace(few.problem, free=self.problem.free[self.problem.free >= len(self.rig)])
         for gate in (*GATE_WIDENINGS, 1.0, 1.0, 1.0):
             few._step(gate)
-        self._estimate = replace(self._estimate, cameras=few._estimate.cameras, points=few._estimate.points)
-        self._noise = few._noise
+        self.estimate = replace(self.estimate, cameras=few.estimate.cameras, points=few.estimate.points)
+        self.noise = few.noise
 
     def _from_a_stretch(self) -> None:
         """The noise from the stretch with most observations, which all frame sets then correct."""
-        seen = np.convolve(np.diff(self._data.starts), np.ones(NOISE_STRETCH), mode="valid")
+        seen = np.convolve(np.diff(self.problem.data.starts), np.ones(NOISE_STRETCH), mode="valid")
         frames = int(seen.argmax()) + np.arange(NOISE_STRETCH)
-        few = self._part(
-            frames, replace(self._known, frame=FREE_POSE_SIGMA, held=0, pose=self._estimate.states.poses[frames[0]])
-        )
+        first_pose = self.estimate.states.poses[frames[0]]
+        few = self._part(frames, replace(self.known, frame=FREE_POSE_SIGMA, held=0, pose=first_pose))
         for gate in GATE_WIDENINGS:
             few._step_states(gate)
         few._learn_all()
-        usual = np.exp(np.log(few._known.psd).mean(0))
-        self._known = replace(self._known, psd=np.tile(PSD_START_RATIO * usual, (len(self._data) - 1, 1)))
-        self._noise = few._noise
+        usual = np.exp(np.log(few.known.psd).mean(0))
+        self.known = replace(self.known, psd=np.tile(PSD_START_RATIO * usual, (len(self.problem.data) - 1, 1)))
+        self.noise = few.noise
 
     def _equations(self, gate: float, slope: float = 1.0) -> NormalEquations:
-        unit = unit_of(self._data, self._estimate)
-        self._noise = replace(self._noise, unit=unit, gate=gate, slope=slope)
-        return NormalEquations(self._problem, self._estimate, self._known, self._noise)
+        unit = unit_of(self.problem.data, self.estimate)
+        self.noise = replace(self.noise, unit=unit, gate=gate, slope=slope)
+        return NormalEquations(self.problem, self.estimate, self.known, self.noise)
 
     def _step(self, gate: float) -> float:
         """One step of everything; how far, in sigmas, the landmark or camera moved that moved most."""
         equations = self._equations(gate, LOSS_SLOPE if gate == 1.0 else 1.0)
         done = equations.eliminate(self._reporter("landmarks and poses"))
-        step = shared_step(done)
-        sigma = np.sqrt(np.diag(shared_covariance(done)))
+        step = done.shared_step()
+        sigma = np.sqrt(np.diag(done.shared_covariance()))
         self._move(equations.eliminate(self._reporter("poses"), step), step)
         return float(np.abs(step / sigma).max())
 
     def _step_states(self, gate: float) -> tuple[NormalEquations, Elimination]:
         """One step of the states alone, and the equations before it."""
-        step = np.zeros(self._problem.size)
+        step = np.zeros(self.problem.size)
         equations = self._equations(gate)
         done = equations.eliminate(self._reporter("poses"), step)
         self._move(done, step)
         return equations, done
 
     def _move(self, done: Elimination, step: Array) -> None:
-        self._estimate = self._estimate.moved(done.chain.steps(), step, self._problem.free)
+        self.estimate = self.estimate.moved(done.chain.steps(), step, self.problem.free)
 
     def _learn(self, equations: NormalEquations, done: Elimination, settled: bool) -> float:
-        """Learn the noise from a pass; how much the logarithm of the jerk's density changed.
-
-        That of the images is learned only once the motion is `settled`: a jerk would be taken for late cameras.
-        """
+        """Learn the noise from a pass; how much the logarithm of the jerk's density changed on average."""
         own, after = done.chain.covariances()
         steps = done.chain.steps()
-        if settled:
-            jitter, unrest = shared_sizes(done, steps, own, self._noise)
-            self._noise = replace(self._noise, jitter=jitter, unrest=unrest)
-        before, psd = self._known.psd, jerk_psd(equations, steps, own, after)
-        self._known = replace(self._known, psd=psd)
+        if settled:  # before, a jerk would be taken for late cameras
+            jitter, unrest = shared_sizes(done, steps, own, self.noise)
+            self.noise = replace(self.noise, jitter=jitter, unrest=unrest)
+        before, psd = self.known.psd, jerk_psd(equations, steps, own, after)
+        self.known = replace(self.known, psd=psd)
         return float(np.abs(np.log(psd / before)).mean())
 
     def _reporter(self, what: str) -> Callable[[int, int], None]:
-        self._passes += 1
-        return lambda done, total: self._report(what, done, total)
+        self.passes += 1
+        return lambda done, total: self.report(what, done, total)
 
     def _result(self) -> Smoothed:
         equations = self._equations(1.0)
         done = equations.eliminate(self._reporter("covariances"))
-        shared = shared_covariance(done)
+        shared = done.shared_covariance()
         own, after = done.chain.covariances()
         share = self._share(equations, done, shared)
-        e, q, n = self._estimate, len(self._problem.free), len(self._rig)
-        clocks = np.zeros((n, n))
-        if q:
-            clocks = shared[:n, :n]
-        towards = np.mean([camera.base_from_camera[:3, 3] for camera in self._rig.cameras], axis=0)
+        e, q, n = self.estimate, len(self.problem.free), len(self.rig)
+        clocks = shared[:n, :n] if q else np.zeros((n, n))
+        towards = np.mean([camera.base_from_camera[:3, 3] for camera in self.rig.cameras], axis=0)
         outward = se3.transform_points(se3.inverse(e.states.poses[0]), towards)
         surface = SurfaceMap(e.points, local_normals(e.points, outward), shared[q:, q:])
         return Smoothed(
-            self._data.stamps,
+            self.problem.data.stamps,
             e.states,
             own,
             after,
             share,
-            self._known.psd,
+            self.known.psd,
             surface,
-            self._data.tracks,
-            e.cameras.rig(self._rig),
-            self._rig,
+            self.problem.data.tracks,
+            e.cameras.rig(self.rig),
+            self.rig,
             e.cameras.offsets,
             clocks,
             self._fitted(done.cost + equations.prior_cost()),
@@ -320,47 +293,38 @@ class _Solver:
 
     def _share(self, equations: NormalEquations, done: Elimination, shared: Array) -> Array:
         """(K, 18, 18), what landmarks and cameras add to the states' covariances."""
-        every = -(-len(self._data) // COVARIANCE_SAMPLES)
+        every = -(-len(self.problem.data) // COVARIANCE_SAMPLES)
         root = np.linalg.cholesky(shared + 1e-12 * np.diag(np.diag(shared)))
         at, shares = list[int](), list[Array]()
         for k, response in equations.responses(done):
-            if k % every == 0 or k == len(self._data) - 1:
+            if k % every == 0 or k == len(self.problem.data) - 1:
                 through = response @ root
                 at.append(k)
                 shares.append(through @ through.T)
         where, known = np.array(at[::-1]), np.stack(shares[::-1])
         if every == 1:
             return known
-        frames = np.arange(len(self._data))
+        frames = np.arange(len(self.problem.data))
         left = np.clip(np.searchsorted(where, frames, side="right") - 1, 0, len(where) - 2)
         part = ((frames - where[left]) / (where[left + 1] - where[left]))[:, None, None]
         return np.asarray((1 - part) * known[left] + part * known[left + 1])
 
     def _fitted(self, cost: float) -> FitStatistics:
-        data, e, n = self._data, self._estimate, len(self._rig)
+        data, e, n = self.problem.data, self.estimate, len(self.rig)
         square = whitened_squares(data, e)
-        worth = EFFICIENCY / self._noise.unit[data.camera] ** 2
+        worth = EFFICIENCY / self.noise.unit[data.camera] ** 2
         agrees = 1 / (1 + square * worth / (9 * EFFICIENCY)) ** 2 > 0.2
         cell = np.repeat(np.arange(len(data)), np.diff(data.starts)) * n + data.camera
         seen, used = np.bincount(cell, minlength=len(data) * n), np.bincount(cell[agrees], minlength=len(data) * n)
         pixels = np.bincount(cell[agrees], (square / data.precision)[agrees], minlength=len(data) * n)
         rms = np.sqrt(np.divide(pixels, 2 * used, out=np.full(len(used), np.nan), where=used > 0))
-        shape = len(data), n
-        return FitStatistics(
-            used.reshape(shape),
-            seen.reshape(shape),
-            rms.reshape(shape),
-            self._noise.unit,
-            self._noise.jitter,
-            self._noise.unrest,
-            cost,
-            self._passes,
-        )
+        shape, noise = (len(data), n), self.noise
+        counts = used.reshape(shape), seen.reshape(shape), rms.reshape(shape)
+        return FitStatistics(*counts, noise.unit, noise.jitter, noise.unrest, cost, self.passes)
 
 
 def _information(surface: SurfaceMap, data: TrackArrays) -> Array:
     """(3L, 3L) information of the landmarks that are tracked, by the map's own covariance."""
     place = (3 * data.tracks[:, None] + np.arange(3)).ravel()
-    return np.asarray(
-        np.linalg.inv(surface.covariance[np.ix_(place, place)] + MIN_MAP_SIGMA_MM**2 * np.eye(len(place)))
-    )
+    covariance = surface.covariance[np.ix_(place, place)]
+    return np.asarray(np.linalg.inv(covariance + MIN_MAP_SIGMA_MM**2 * np.eye(len(place))))

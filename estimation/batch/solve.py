@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -19,7 +18,7 @@ from scipy.linalg.lapack import dtrtri
 
 from estimation import se3
 from estimation.batch.normal_equations import BatchProblem, CondensedFrames, Estimate, NoiseModel, condense
-from estimation.batch.priors import STATE_DOF, CorrectedCameras, PriorFactors, prior_factors
+from estimation.batch.smoothed import STATE_DOF, CorrectedCameras, PriorFactors, prior_factors
 from estimation.se3 import Array
 
 MAX_PRODUCT_NUMBERS = 24e6  # that the products of landmarks and cameras of one stretch may take: 200 MB
@@ -39,12 +38,12 @@ class BlockTridiagonal:
         self.count, self._done = count, 0
         self._inverse = np.zeros((count, STATE_DOF, STATE_DOF))  # of the Cholesky factors
         self._links = np.zeros((count, STATE_DOF, STATE_DOF))  # inverse @ information with the next state
-        self._right = np.zeros((count, STATE_DOF))
-        self._left: Array | None = None  # what the last state takes from the next one's information,
-        self._left_border = np.zeros((0, 0))  # and from its border and gradient
+        self.right = np.zeros((count, STATE_DOF))  # gradient times the inverse of the Cholesky factors
+        self._left: Array | None = None  # (18, 18) what the last state takes from the next one's information,
+        self.border = np.zeros((0, 0))  # (18, S + 1) and from its border and gradient
 
     def take(self, information: Array, ties: Array, border: Array, gradient: Array) -> Array:
-        """Eliminate the next F states; the border's square roots (18 F, S).
+        """Eliminate the next F states; the border's square roots (18 F, S). LinAlgError where not positive definite.
 
         information: (F, 18, 18). ties: (F, 18, 18), with the state after each, zero for the last of all. border:
         (F, 18, S). gradient: (F, 18).
@@ -53,23 +52,21 @@ class BlockTridiagonal:
         roots = np.empty((frames, STATE_DOF, size))
         tall = np.concatenate([ties, border, gradient[..., None]], axis=2)
         if self._left is None:
-            self._left, self._left_border = np.zeros((STATE_DOF, STATE_DOF)), np.zeros((STATE_DOF, size + 1))
+            self._left, self.border = np.zeros((STATE_DOF, STATE_DOF)), np.zeros((STATE_DOF, size + 1))
         for f in range(frames):
             k = self._done + f
-            inverse = _inverse_root(information[f] - self._left)
-            tall[f, :, STATE_DOF:] -= self._left_border
+            upper = np.linalg.cholesky(information[f] - self._left).T  # LAPACK reads it column by column
+            inverted, failed = dtrtri(upper, lower=0)
+            assert failed == 0
+            inverse = inverted.T
+            tall[f, :, STATE_DOF:] -= self.border
             solved = inverse @ tall[f]
             link = solved[:, :STATE_DOF]
             self._inverse[k], self._links[k], roots[f] = inverse, link, solved[:, STATE_DOF:-1]
-            self._right[k] = solved[:, -1]
-            self._left, self._left_border = link.T @ link, link.T @ solved[:, STATE_DOF:]
+            self.right[k] = solved[:, -1]
+            self._left, self.border = link.T @ link, link.T @ solved[:, STATE_DOF:]
         self._done += frames
         return roots.reshape(frames * STATE_DOF, size)
-
-    @property
-    def border(self) -> Array:
-        """What the states eliminated so far take from the next one's border and gradient, (18, S + 1)."""
-        return self._left_border
 
     def again(self, stretch: tuple[int, int], border: Array, entry: Array) -> Array:
         """Square roots (18 F, S) of a border (F, 18, S) that `take` had before. entry: `border` before it."""
@@ -81,25 +78,17 @@ class BlockTridiagonal:
             left = self._links[k].T @ roots[k - first]
         return roots.reshape((last - first) * STATE_DOF, border.shape[2])
 
-    @property
-    def right(self) -> Array:
-        """(K, 18), the gradient times the Cholesky factors' inverse."""
-        return self._right
-
     def steps(self) -> Array:
         """(K, 18) that bring the states to their optimum, the shared unknowns as in the gradient."""
         out, after = np.empty((self.count, STATE_DOF)), np.zeros(STATE_DOF)
         for k in range(self.count - 1, -1, -1):
-            after = -self._inverse[k].T @ (self._right[k] + self._links[k] @ after)
+            after = -self._inverse[k].T @ (self.right[k] + self._links[k] @ after)
             out[k] = after
         return out
 
     def covariances(self) -> tuple[Array, Array]:
         """(K, 18, 18) of the states, and (K - 1, 18, 18) of each with the next, were the shared unknowns known."""
-        own, next_ = (
-            np.empty((self.count, STATE_DOF, STATE_DOF)),
-            np.empty((max(self.count - 1, 0), STATE_DOF, STATE_DOF)),
-        )
+        own, next_ = (np.empty((max(n, 0), STATE_DOF, STATE_DOF)) for n in (self.count, self.count - 1))
         after = np.zeros((STATE_DOF, STATE_DOF))
         for k in range(self.count - 1, -1, -1):
             root = self._inverse[k].T
@@ -121,14 +110,6 @@ class BlockTridiagonal:
         for k in range(last - 1, first - 1, -1):
             after = -self._inverse[k].T @ (blocks[k - first] + self._links[k] @ after)
             yield k, after
-
-
-def _inverse_root(information: Array) -> Array:
-    """Inverse of the Cholesky factor of (18, 18); LinAlgError where that is not positive definite."""
-    upper = np.linalg.cholesky(information).T  # LAPACK reads it column by column
-    inverse, failed = dtrtri(upper, lower=0)
-    assert failed == 0
-    return cast(Array, inverse.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +138,21 @@ class Elimination:
     follows: Array  # (K, 3C, 18)
     cost: float
     entries: list[Array]  # (18, S + 1): what a stretch takes over from the one before
+
+    def shared_step(self) -> Array:
+        """(S,) of the shared unknowns, where they were free."""
+        scale, factor = self._scaled_factor()
+        return np.asarray(-scale * cho_solve(factor, scale * self.pull, check_finite=False))
+
+    def shared_covariance(self) -> Array:
+        """(S, S) of the shared unknowns."""
+        scale, factor = self._scaled_factor()
+        return np.asarray(scale[:, None] * cho_solve(factor, np.eye(len(scale)), check_finite=False) * scale)
+
+    def _scaled_factor(self) -> tuple[Array, tuple[Array, bool]]:
+        """Scale (S,) that brings the diagonal to one, and the Cholesky factor of the scaled information."""
+        scale = 1 / np.sqrt(np.maximum(np.diag(self.shared), 1e-300))
+        return scale, cho_factor(self.shared * scale[:, None] * scale, check_finite=False)
 
 
 def stretches(problem: BatchProblem, cameras: int) -> list[tuple[int, int]]:
@@ -191,8 +187,13 @@ class NormalEquations:
             own.append((part.effects, part.doubts, part.follows))
             cost += part.cost
             progress(last, len(problem.data))
-        if coupled:
-            self._add_prior(shared, pull)
+        if coupled:  # the priors of calibration and map
+            known, free = self.known, problem.free
+            q, off = len(free), self.estimate.cameras.since(known.calibrated)
+            shared[:q, :q] += known.calibration[np.ix_(free, free)]
+            pull[:q] += (known.calibration @ off)[free]
+            shared[q:, q:] += known.map
+            pull[q:] += known.map @ (self.estimate.points - known.points).ravel()
         effects, doubts, follows = (np.concatenate(arrays) for arrays in zip(*own, strict=True))
         return Elimination(chain, shared, pull, effects, doubts, follows, cost, entries)
 
@@ -237,16 +238,6 @@ class NormalEquations:
             information[f][each[:6], each[:6]] += weight
             gradient[f][:6] += weight * off
 
-    def _add_prior(self, shared: Array, pull: Array) -> None:
-        """Calibration and map, in place."""
-        known, estimate, free = self.known, self.estimate, self.problem.free
-        q = len(free)
-        off = estimate.cameras.since(known.calibrated)
-        shared[:q, :q] += known.calibration[np.ix_(free, free)]
-        pull[:q] += (known.calibration @ off)[free]
-        shared[q:, q:] += known.map
-        pull[q:] += known.map @ (estimate.points - known.points).ravel()
-
     def prior_cost(self) -> float:
         """Half the squared sigmas by which the states part from the continuous-time prior."""
         off = self._links.off[..., None]
@@ -260,31 +251,12 @@ class NormalEquations:
         """
         prior = self._links
         a, b = prior.before, prior.after
-        turned = np.swapaxes(a, 1, 2), np.swapaxes(b, 1, 2)
-        both = a @ after @ turned[1]
-        spread = a @ own[:-1] @ turned[0] + b @ own[1:] @ turned[1] + both + np.swapaxes(both, 1, 2)
+        a_turned, b_turned = np.swapaxes(a, 1, 2), np.swapaxes(b, 1, 2)
+        both = a @ after @ b_turned
+        spread = a @ own[:-1] @ a_turned + b @ own[1:] @ b_turned + both + np.swapaxes(both, 1, 2)
         inverse, each = np.linalg.inv(prior.spread), np.arange(6)
         by_axis = spread.reshape(-1, 3, 6, 3, 6)[:, :, each, :, each]  # (6, K - 1, 3, 3)
-        off = prior.off + (a @ steps[:-1, :, None] + b @ steps[1:, :, None])[..., 0]
-        off = off.reshape(-1, 3, 6)
+        off = (prior.off + (a @ steps[:-1, :, None] + b @ steps[1:, :, None])[..., 0]).reshape(-1, 3, 6)
         square = np.einsum("kia,kij,kja->ka", off, inverse, off)
         open_ = (by_axis * inverse).sum((2, 3)).T / self.known.psd
         return square, np.clip(3 - open_, 0.0, 3.0)
-
-
-def shared_step(done: Elimination) -> Array:
-    """(S,) of the shared unknowns, where they were free."""
-    scale, factor = _scaled_factor(done)
-    return np.asarray(-scale * cho_solve(factor, scale * done.pull, check_finite=False))
-
-
-def shared_covariance(done: Elimination) -> Array:
-    """(S, S) of the shared unknowns."""
-    scale, factor = _scaled_factor(done)
-    return np.asarray(scale[:, None] * cho_solve(factor, np.eye(len(scale)), check_finite=False) * scale)
-
-
-def _scaled_factor(done: Elimination) -> tuple[Array, tuple[Array, bool]]:
-    """Scale (S,) that brings the diagonal to one, and the Cholesky factor of the scaled information."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(done.shared), 1e-300))
-    return scale, cho_factor(done.shared * scale[:, None] * scale, check_finite=False)

@@ -7,13 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import gtsam
 import numpy as np
 
 from estimation import se3
-from estimation.calibration.arm_model import ArmParameters, Kinematics, SetPoint, Sightings, TipPrediction, predict
-from estimation.calibration.arm_start import ARM_CALIBRATION, check_places, check_turns
+from estimation.calibration.arm_model import (
+    ARM_CALIBRATION,
+    ArmParameters,
+    Kinematics,
+    SetPoint,
+    Sightings,
+    TipPrediction,
+    check_places,
+    check_turns,
+    predict,
+)
 from estimation.calibration.lens_model import CAMERA_PARAMETERS
 from estimation.errors import InputError
 from estimation.rig import Rig
@@ -39,14 +49,12 @@ class ArmUnknowns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmFit:
-    """The estimate.
-
-    covariance: of [rx ry rz tx ty tz] (right perturbation of base_from_arm, rad and mm), tool mm, dead time s, lag s,
-    blunt mm; zero for what was not estimated.
-    """
+    """The estimate from N sightings."""
 
     state: ArmParameters
-    covariance: Array  # (12, 12)
+    # (12, 12) of [rx ry rz tx ty tz] (right perturbation of base_from_arm, rad and mm), tool mm, dead time s, lag s,
+    # blunt mm; zero for what was not estimated
+    covariance: Array
     residuals: Array  # (N, 2) px, prediction less measurement
     used: Mask  # (N,) which sightings are inliers
     scatter: float  # of the inliers' residuals, in their stated sigmas
@@ -58,26 +66,24 @@ class ArmFit:
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _ArmProblem:
     """The sightings and their model; `graph` makes factors with given weights."""
 
-    def __init__(
-        self,
-        sightings: Sightings,
-        set_point: SetPoint,
-        kinematics: Kinematics,
-        rig: Rig,
-        start: ArmParameters,
-        unknowns: ArmUnknowns,
-        rig_covariance: Array | None,
-    ) -> None:
-        self.sightings, self.start, self.unknowns, self.rig_covariance = sightings, start, unknowns, rig_covariance
-        self._world = set_point, kinematics, rig
-        self._cameras = len(rig)
-        self.keys: list[int] = [ARM_KEY]
-        for key, free in ((TOOL_KEY, unknowns.tool), (TIMING_KEY, unknowns.latency), (BLUNT_KEY, unknowns.blunt)):
-            self.keys += [key] * free
-        self.keys += [CAMERAS_KEY] * (rig_covariance is not None)
+    sightings: Sightings
+    set_point: SetPoint
+    kinematics: Kinematics
+    rig: Rig
+    start: ArmParameters
+    unknowns: ArmUnknowns
+    rig_covariance: Array | None
+
+    @property
+    def keys(self) -> list[int]:
+        free = self.unknowns
+        optional = {TOOL_KEY: free.tool, TIMING_KEY: free.latency, BLUNT_KEY: free.blunt}
+        optional[CAMERAS_KEY] = self.rig_covariance is not None
+        return [ARM_KEY, *(key for key, is_free in optional.items() if is_free)]
 
     def state(self, values: gtsam.Values) -> ArmParameters:
         """The parameters in GTSAM's values; what is not estimated is the start's."""
@@ -93,7 +99,7 @@ class _ArmProblem:
             if key in self.keys:
                 values.insert(key, vector)
         if self.rig_covariance is not None:
-            values.insert(CAMERAS_KEY, np.zeros(CAMERA_PARAMETERS * self._cameras))
+            values.insert(CAMERAS_KEY, np.zeros(CAMERA_PARAMETERS * len(self.rig)))
         return values
 
     def _vectors(self, state: ArmParameters) -> list[tuple[int, Array]]:
@@ -102,8 +108,8 @@ class _ArmProblem:
 
     def predict(self, values: gtsam.Values) -> tuple[TipPrediction, Array]:
         """The predicted pixels, and residuals (N, 2), px."""
-        s, (set_point, kinematics, rig) = self.sightings, self._world
-        prediction = predict(self.state(values), set_point, kinematics, rig, s.stamp, s.camera)
+        s = self.sightings
+        prediction = predict(self.state(values), self.set_point, self.kinematics, self.rig, s.stamp, s.camera)
         residuals = prediction.pixels - s.pixels
         if self.rig_covariance is not None:
             own = values.atVector(CAMERAS_KEY).reshape(-1, CAMERA_PARAMETERS)[s.camera]
@@ -112,7 +118,7 @@ class _ArmProblem:
 
     def graph(self, weights: Array, rows: Mask) -> gtsam.NonlinearFactorGraph:
         """All factors. weights: (N,) of the sightings. rows: (N,) which of them are used."""
-        graph, root = gtsam.NonlinearFactorGraph(), (np.sqrt(weights) / self.sightings.sigma)[rows]
+        graph, root, keys = gtsam.NonlinearFactorGraph(), (np.sqrt(weights) / self.sightings.sigma)[rows], self.keys
 
         def error(_: object, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
             prediction, residuals = self.predict(values)
@@ -122,15 +128,18 @@ class _ArmProblem:
             return np.asarray((residuals[rows] * root[:, None]).ravel())
 
         unit = gtsam.noiseModel.Unit.Create(2 * int(rows.sum()))
-        graph.add(gtsam.CustomFactor(unit, self.keys, error))
+        graph.add(gtsam.CustomFactor(unit, keys, error))
         priors = {TOOL_KEY: TOOL_SIGMA, TIMING_KEY: TIMING_SIGMA, BLUNT_KEY: BLUNT_SIGMA}
         for key, vector in self._vectors(self.start):
-            if key in self.keys:
+            if key in keys:
                 isotropic = gtsam.noiseModel.Isotropic.Sigma(len(vector), priors[key])
                 graph.add(gtsam.PriorFactorVector(key, vector, isotropic))
         if self.rig_covariance is not None:
-            noise = gtsam.noiseModel.Gaussian.Covariance(_invertible(self.rig_covariance))
-            graph.add(gtsam.PriorFactorVector(CAMERAS_KEY, np.zeros(CAMERA_PARAMETERS * self._cameras), noise))
+            scale = np.sqrt(np.maximum(np.diag(self.rig_covariance), 1e-16))
+            scales = np.outer(scale, scale)
+            invertible = (self.rig_covariance / scales + 1e-9 * np.eye(len(scale))) * scales  # also with zero variances
+            noise = gtsam.noiseModel.Gaussian.Covariance(invertible)
+            graph.add(gtsam.PriorFactorVector(CAMERAS_KEY, np.zeros(CAMERA_PARAMETERS * len(self.rig)), noise))
         return graph
 
     def _slopes(self, p: TipPrediction, values: gtsam.Values) -> list[Array]:
@@ -139,22 +148,25 @@ class _ArmProblem:
             by[TIMING_KEY] = p.by_time * [1.0, -1.0]
         slopes = [by[key] for key in self.keys if key in by]
         if self.rig_covariance is not None:
-            by_cameras = np.zeros((len(self.sightings), 2, self._cameras, CAMERA_PARAMETERS))
+            by_cameras = np.zeros((len(self.sightings), 2, len(self.rig), CAMERA_PARAMETERS))
             by_cameras[np.arange(len(self.sightings)), :, self.sightings.camera] = p.by_camera
             slopes.append(by_cameras.reshape(len(self.sightings), 2, -1))
         return slopes
 
     def covariance(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Array:
         """The marginal covariance (12, 12) of `ArmFit`."""
-        sizes = {ARM_KEY: (0, 6), TOOL_KEY: (6, 3), TIMING_KEY: (9, 2), BLUNT_KEY: (11, 1)}
-        marginals = gtsam.Marginals(graph, values)
-        keys = [key for key in self.keys if key in sizes]
-        joint, out = marginals.jointMarginalCovariance(keys), np.zeros((12, 12))
-        for a in keys:
-            for b in keys:
-                rows, columns = (slice(sizes[k][0], sum(sizes[k])) for k in (a, b))
-                out[rows, columns] = joint.at(a, b)
-        return out
+        rows = {ARM_KEY: slice(6), TOOL_KEY: slice(6, 9), TIMING_KEY: slice(9, 11), BLUNT_KEY: slice(11, 12)}
+        return _joint_covariance(graph, values, {key: rows[key] for key in self.keys if key in rows}, 12)
+
+
+def _joint_covariance(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, rows: dict[int, slice], size: int
+) -> Array:
+    """Joint marginal covariance (size, size), each key's numbers in its rows, zero elsewhere."""
+    joint, out = gtsam.Marginals(graph, values).jointMarginalCovariance(list(rows)), np.zeros((size, size))
+    for a, b in product(rows, rows):
+        out[rows[a], rows[b]] = joint.at(a, b)
+    return out
 
 
 def fit_arm(
@@ -210,25 +222,16 @@ def _solve(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Val
     return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
 
 
-def _invertible(covariance: Array) -> Array:
-    """The covariance, regularised: zero variances become tiny ones."""
-    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-16))
-    correlated = covariance / np.outer(scale, scale)
-    return np.asarray((correlated + 1e-9 * np.eye(len(scale))) * np.outer(scale, scale))
-
-
 def cross_validate(
     sightings: Sightings,
     fold: Callable[[Sightings], ArmFit],
     residuals_of: Callable[[ArmParameters, Sightings], Array],
     folds: int,
 ) -> tuple[Array, list[ArmParameters]]:
-    """Residuals (N, 2), px, of sightings under fits without their place, and the parameters of those fits.
-
-    Sightings on the way are grouped with the place that follows them in time.
-    """
+    """Residuals (N, 2), px, of sightings under fits without their place, and the parameters of those fits."""
     numbers = np.unique(sightings.place[sightings.place >= 0])
     starts = np.array([sightings.stamp[sightings.place == number].min() for number in numbers])
+    # sightings on the way belong to the place that follows them in time
     group = np.where(sightings.place >= 0, sightings.place, np.searchsorted(starts, sightings.stamp))
     out, states = np.full((len(sightings), 2), np.nan), list[ArmParameters]()
     for number in range(folds):
@@ -309,9 +312,6 @@ def fit_touches(arm_from_nozzle: Array, points: Array, sigma: Array, tool: Array
         values.insert(TOOL_KEY, np.asarray(tool, float))
         graph.add(gtsam.PriorFactorVector(TOOL_KEY, tool, gtsam.noiseModel.Isotropic.Sigma(3, TOOL_SIGMA)))
     values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    joint, covariance = gtsam.Marginals(graph, values).jointMarginalCovariance(keys), np.zeros((9, 9))
-    for i, a in enumerate(keys):
-        for j, b in enumerate(keys):
-            covariance[6 * i : 6 * i + 6 - 3 * i, 6 * j : 6 * j + 6 - 3 * j] = joint.at(a, b)
+    covariance = _joint_covariance(graph, values, dict(zip(keys, (slice(6), slice(6, 9)), strict=False)), 9)
     pose, at, inside = parts(values)
     return TouchFit(pose, at, covariance, se3.transform_points(pose, inside) - points)

@@ -4,41 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 
 from estimation import se3
-from estimation.calibration.lens_fit import (
-    MIN_PLANE_CORNERS,
-    MIN_VIEW_CORNERS,
-    LensFit,
-    fit_given_lens,
-    fit_lens,
-    plane_outliers,
-)
-from estimation.calibration.lens_model import (
-    CAMERA_PARAMETERS,
-    MODELS,
-    BoardViews,
-    KnownLenses,
-    Undetermined,
-    check_doubt,
-    check_lens,
-    check_neighbours,
-    matrix_of,
-)
+from estimation.calibration import lens_fit, lens_model, validation
+from estimation.calibration.lens_fit import MIN_PLANE_CORNERS, MIN_VIEW_CORNERS, LensFit, fit_given_lens, fit_lens
+from estimation.calibration.lens_model import CAMERA_PARAMETERS, MODELS, BoardViews, KnownLenses, Undetermined
 from estimation.calibration.rig_fit import RigFit, RigState, RivalModel, fit_rig, free_numbers, with_rivals
-from estimation.calibration.validation import (
-    LensChoice,
-    ModelScore,
-    VolumeError,
-    choose_model,
-    doubt_given_lens,
-    held_out_residuals,
-    volume_error,
-)
+from estimation.calibration.validation import LensChoice, ModelScore, VolumeError
 from estimation.rig import Camera, Rig
-from estimation.se3 import Array, Mask
+from estimation.se3 import Array, Index, Mask
 
 MIN_COMMON_INSTANTS = 3  # that two cameras must share
 MAX_COMPARED = 60  # pose estimates of one pair: the medoid compares them all with each other
@@ -63,7 +40,11 @@ def first_rig(views: BoardViews, camera_from_board: Array) -> tuple[Array, Array
     cameras that no chain of shared views connects to the first.
     """
     count = len(views.names)
-    shared = {(a, b): _common(views, a, b) for a in range(count) for b in range(count) if a != b}
+    shared: dict[tuple[int, int], Index] = {}  # (N, 2) rows of the views by two cameras of the same instants
+    for a, b in permutations(range(count), 2):
+        first, second = (np.flatnonzero(views.camera == c) for c in (a, b))
+        _, i, j = np.intersect1d(views.instant[first], views.instant[second], return_indices=True)
+        shared[a, b] = np.stack([first[i], second[j]], 1)
     base_from_camera = {0: np.eye(4)}
     while len(base_from_camera) < count:
         links = [pair for pair in shared if pair[0] in base_from_camera and pair[1] not in base_from_camera]
@@ -79,14 +60,7 @@ def first_rig(views: BoardViews, camera_from_board: Array) -> tuple[Array, Array
     return placed, np.asarray(placed[views.camera[best]] @ camera_from_board[best])
 
 
-def _common(views: BoardViews, a: int, b: int) -> Array:
-    """Rows (N, 2) of the views by cameras a and b of the same instants."""
-    first, second = (np.flatnonzero(views.camera == c) for c in (a, b))
-    _, i, j = np.intersect1d(views.instant[first], views.instant[second], return_indices=True)
-    return np.stack([first[i], second[j]], 1)
-
-
-def _refuse(views: BoardViews, placed: dict[int, Array], shared: dict[tuple[int, int], Array]) -> None:
+def _refuse(views: BoardViews, placed: dict[int, Array], shared: dict[tuple[int, int], Index]) -> None:
     alone = [c for c in range(len(views.names)) if c not in placed]
     most = max(len(shared[a, b]) for a in placed for b in alone)
     cameras, others = (", ".join(views.names[c] for c in group) for group in (alone, placed))
@@ -131,7 +105,7 @@ class Calibration:
 
     def predicted_error(self, points: Array, speed: float = 0.0) -> VolumeError:
         """The error at points (N, 3) mm, base, of a surface that moves at `speed`, mm/s, in any direction."""
-        return volume_error(self.rig, self.fit.covariance, points, speed)
+        return validation.volume_error(self.rig, self.fit.covariance, points, speed)
 
 
 def calibrate(views: BoardViews, known: KnownLenses | None = None) -> Calibration:
@@ -150,20 +124,20 @@ def calibrate(views: BoardViews, known: KnownLenses | None = None) -> Calibratio
     state = RigState(np.stack([c.fit.lens for c in choices]), base_from_camera, *nothing, base_from_board)
     views, fit, jitter, more = adjust(views, state, choices, known)
     for c, name in enumerate(names):
-        check_lens(name, views.sizes[c], fit.state.lens[c])
+        lens_model.check_lens(name, views.sizes[c], fit.state.lens[c])
         if known is None:
             rows = slice(CAMERA_PARAMETERS * c, CAMERA_PARAMETERS * c + 9)
-            check_doubt(name, fit.state.lens[c], fit.covariance[rows, rows])
-    check_neighbours(names, views.sizes, fit.state.lens)
+            lens_model.check_doubt(name, fit.state.lens[c], fit.covariance[rows, rows])
+    lens_model.check_neighbours(names, views.sizes, fit.state.lens)
     scores = tuple(choice.scores for choice in choices)
-    unseen = held_out_residuals(views, fit.state, free_numbers(models, known), jitter, known)
+    unseen = validation.held_out_residuals(views, fit.state, free_numbers(models, known), jitter, known)
     return Calibration(_rig_of(views, fit.state), fit, views, models, scores, jitter, dropped + more, unseen)
 
 
 def fit_lenses(views: BoardViews, known: KnownLenses | None = None) -> tuple[BoardViews, list[LensChoice], int]:
     """The usable views with their measured sigmas, each camera's lens by itself, and the number of corners dropped."""
-    kept, sigma, choices = np.zeros(len(views), bool), views.sigma.copy(), []
-    first = plane_outliers(views)
+    usable, sigma, choices = np.zeros(len(views), bool), views.sigma.copy(), []
+    first = lens_fit.plane_outliers(views)
     views, dropped = views.without(first), int(first.sum())
     pixels = views.pixels.copy()
     for c, name in enumerate(views.names):
@@ -180,12 +154,12 @@ def fit_lenses(views: BoardViews, known: KnownLenses | None = None) -> tuple[Boa
         begin = choice.fit.lens, choice.fit.camera_from_board[good]
         fit = fit_lens(own, choice.fit.model, begin) if known is None else fit_given_lens(own, known.lens[c])
         _check_fit(name, own, fit)
-        check_lens(name, own.sizes[c], fit.lens)
+        lens_model.check_lens(name, own.sizes[c], fit.lens)
         choices.append(replace(choice, fit=fit))
-        kept[rows[good]] = True
+        usable[rows[good]] = True
         sigma[rows[good]] = np.maximum(own.sigma * fit.scale, MIN_CORNER_SIGMA)
     views = replace(views, pixels=pixels, sigma=sigma)
-    return views.only(kept), choices, dropped
+    return views.only(usable), choices, dropped
 
 
 def _select_model(own: BoardViews) -> tuple[BoardViews, LensChoice, Mask]:
@@ -194,7 +168,7 @@ def _select_model(own: BoardViews) -> tuple[BoardViews, LensChoice, Mask]:
     own = _with_sigma(own, _median_sigma(rough))
     rough = fit_lens(own, "k1 k2", (rough.lens, rough.camera_from_board))
     out = _single_outliers(own, rough)
-    return own, choose_model(own.without(out)), out
+    return own, validation.choose_model(own.without(out)), out
 
 
 def _with_known_lens(own: BoardViews, lens: Array, exact: bool) -> tuple[BoardViews, LensChoice, Mask]:
@@ -205,7 +179,7 @@ def _with_known_lens(own: BoardViews, lens: Array, exact: bool) -> tuple[BoardVi
     if not exact:
         return own, LensChoice(fit, ()), out
     left = own.without(out)
-    return own, doubt_given_lens(left, fit_given_lens(left, lens)), out
+    return own, validation.doubt_given_lens(left, fit_given_lens(left, lens)), out
 
 
 def _with_sigma(views: BoardViews, sigma: float) -> BoardViews:
@@ -247,10 +221,10 @@ def adjust(
             jitter = _jitter(views, fit, jitter)
         jitter = jitter if jitter > MIN_JITTER else 0.0
     out = outliers(views, fit.residuals, fit.scale)
-    kept = views.without(out).seen.sum(1) >= 4
-    left = views.without(out).only(kept)
-    boards = np.isin(np.arange(len(fit.state.base_from_board)), views.instant[kept])
-    delays, poses = fit.state.jitter[kept] * (jitter > 0), fit.state.base_from_board[boards]
+    usable = views.without(out).seen.sum(1) >= 4
+    left = views.without(out).only(usable)
+    boards = np.isin(np.arange(len(fit.state.base_from_board)), views.instant[usable])
+    delays, poses = fit.state.jitter[usable] * (jitter > 0), fit.state.base_from_board[boards]
     state = replace(fit.state, jitter=delays, base_from_board=poses)
     fit = with_rivals(left, fit_rig(left, state, free, jitter, known), free, jitter, _rivals_of(choices))
     return left, fit, jitter, int(out.sum())
@@ -292,11 +266,9 @@ def _jitter(views: BoardViews, fit: RigFit, jitter: float) -> float:
 
 
 def _rig_of(views: BoardViews, state: RigState) -> Rig:
-    cameras = []
-    for c, name in enumerate(views.names):
-        lens, pose, offset = state.lens[c], state.base_from_camera[c], float(state.offset[c])
-        cameras.append(Camera(name, views.sizes[c], matrix_of(lens), lens[4:].copy(), pose, offset))
-    return Rig(tuple(cameras))
+    matrices, offsets = [lens_model.matrix_of(lens) for lens in state.lens], state.offset.tolist()
+    parts = views.names, views.sizes, matrices, state.lens[:, 4:].copy(), state.base_from_camera, offsets
+    return Rig(tuple(Camera(*each) for each in zip(*parts, strict=True)))
 
 
 def rebased(rig: Rig, base_from_first: Array) -> Rig:

@@ -75,16 +75,12 @@ def _homography_residuals(views: BoardViews, v: int, rows: Index) -> Array:
     return np.asarray(np.linalg.norm(there[:, :2] / there[:, 2:] - pixels, axis=1))
 
 
-def focal_length(planes: Array) -> float:
-    """The focal length, px, of homographies (V, 3, 3), with square pixels about the image's middle; or nan.
-
-    Each gives h1' w h2 = 0 and h1' w h1 = h2' w h2 with w = diag(1/f^2, 1/f^2, 1): linear in 1/f^2, weighted by tilt.
-    """
-    return focal_from_terms(focal_terms(planes))
-
-
 def focal_terms(planes: Array) -> Array:
-    """(3,) sums over homographies (V, 3, 3) that determine the focal length; sums of several sets add up."""
+    """(3,) sums over homographies (V, 3, 3) that determine the focal length; sums of several sets add up.
+
+    Square pixels and the axis in the image's middle are assumed: h1' w h2 = 0 and h1' w h1 = h2' w h2 with
+    w = diag(1/f^2, 1/f^2, 1), which is linear in 1/f^2; weighted by tilt.
+    """
     h = planes[np.isfinite(planes).all((1, 2))]
     a, b = h[:, :, 0], h[:, :, 1]
     flat = np.concatenate([(a[:, :2] * b[:, :2]).sum(1), (a[:, :2] ** 2 - b[:, :2] ** 2).sum(1)])
@@ -203,7 +199,7 @@ def first_lens(views: BoardViews) -> tuple[Array, Array]:
     """A lens (9,) without distortion and poses (V, 4, 4) of one camera's views, from homographies alone."""
     planes = homographies(views)
     size = np.array(views.sizes[int(views.camera[0])], float)
-    f = focal_length(planes)
+    f = focal_from_terms(focal_terms(planes))
     if not 0.3 * size.max() < f < 20 * size.max():
         f = float(size.max())
     lens = np.array([f, f, *(size - 1) / 2, 0, 0, 0, 0, 0])
@@ -217,14 +213,7 @@ def fit_lens(
     free = MODELS[model]
     lens, camera_from_board = first_lens(views) if begin is None else begin
     lens = np.where(np.isin(np.arange(9), free), lens, 0.0)
-
-    def normal(state: _LensState) -> _LensEquations:
-        return _lens_equations(views, state)
-
-    def step(state: _LensState, at: _LensEquations, damping: float) -> _LensState | None:
-        return _lens_step(state, at, damping, free)
-
-    state, at = minimise(_LensState(lens, camera_from_board), normal, step, min_gain)
+    state, at = _minimise(views, _LensState(lens, camera_from_board), free, min_gain)
     covariance, scale = _lens_covariance(at, free), _scale(views, at.residuals, len(free))
     return LensFit(model, state.lens, covariance, state.poses, at.residuals, scale)
 
@@ -233,22 +222,23 @@ def fit_poses(
     views: BoardViews, lens: Array, camera_from_board: Array, min_gain: float = MIN_GAIN
 ) -> tuple[Array, Array]:
     """Poses (V, 4, 4) with a fixed lens, and residuals (V, P, 2) px."""
-    state, at = minimise(
-        _LensState(lens, camera_from_board),
-        lambda state: _lens_equations(views, state),
-        lambda state, at, damping: _lens_step(state, at, damping, np.zeros(0, np.int64)),
-        min_gain,
-    )
+    state, at = _minimise(views, _LensState(lens, camera_from_board), np.zeros(0, np.int64), min_gain)
     return state.poses, at.residuals
 
 
+def _minimise(views: BoardViews, start: _LensState, free: Index, min_gain: float) -> tuple[_LensState, _LensEquations]:
+    def step(state: _LensState, at: _LensEquations, damping: float) -> _LensState | None:
+        return _lens_step(state, at, damping, free)
+
+    return minimise(start, lambda state: _lens_equations(views, state), step, min_gain)
+
+
 def _lens_equations(views: BoardViews, state: _LensState) -> _LensEquations:
-    if not (state.lens[:2] > 1).all():
-        return _infinite_cost(views)
-    points = se3.transform_points(state.poses, views.points)  # (V, P, 3)
-    seen = views.seen
-    if (points[..., 2][seen] < 1.0).any():
-        return _infinite_cost(views)
+    points, seen = se3.transform_points(state.poses, views.points), views.seen  # (V, P, 3), (V, P)
+    if not (state.lens[:2] > 1).all() or (points[..., 2][seen] < 1.0).any():  # impossible: a corner behind the lens
+        v, p = seen.shape
+        zeros = np.zeros((v, p, 2)), np.zeros((9, 9)), np.zeros((v, 9, 6)), np.zeros((v, 6, 6))
+        return _LensEquations(np.inf, *zeros, np.zeros(9), np.zeros((v, 6)))
     points[..., 2] = np.where(seen, points[..., 2], 1.0)
     pixels, by_lens, by_point = project_lens(state.lens, points)
     residuals = np.where(seen[..., None], pixels - np.nan_to_num(views.pixels), 0.0)
@@ -269,13 +259,6 @@ def _lens_equations(views: BoardViews, state: _LensState) -> _LensEquations:
         (np.swapaxes(a, 1, 2) @ (w * r)).sum((0, 2)) + prior.slope,
         (np.swapaxes(b, 1, 2) @ (w * r))[..., 0],
     )
-
-
-def _infinite_cost(views: BoardViews) -> _LensEquations:
-    """An impossible state: a corner behind the lens, or a negative focal length."""
-    v, p = views.seen.shape
-    nothing = np.zeros((v, p, 2)), np.zeros((9, 9)), np.zeros((v, 9, 6)), np.zeros((v, 6, 6))
-    return _LensEquations(np.inf, *nothing, np.zeros(9), np.zeros((v, 6)))
 
 
 def _schur_complement(at: _LensEquations, free: Index, damping: float) -> tuple[Array, Array]:

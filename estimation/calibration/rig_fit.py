@@ -18,16 +18,9 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from estimation import se3
+from estimation.calibration import lens_model
 from estimation.calibration.lens_fit import damped, huber, minimise
-from estimation.calibration.lens_model import (
-    CAMERA_PARAMETERS,
-    MODELS,
-    BoardViews,
-    KnownLenses,
-    given_prior,
-    lens_prior,
-    project_lens,
-)
+from estimation.calibration.lens_model import CAMERA_PARAMETERS, MODELS, BoardViews, KnownLenses
 from estimation.se3 import Array, Index, Mask
 
 MAX_INSTANT_GAP = 0.5  # s between instants, beyond which the motion is not interpolated: the board is taken to rest
@@ -98,23 +91,16 @@ def _lagrange(times: Array, at: Array) -> tuple[Array, Array]:
     return np.where(there, weight, 0.0), np.where(there, slope, 0.0)
 
 
-def _ad(xi: Array) -> Array:
-    out = np.zeros((*xi.shape[:-1], 6, 6))
-    out[..., :3, :3] = out[..., 3:, 3:] = se3.hat(xi[..., :3])
-    out[..., 3:, :3] = se3.hat(xi[..., 3:])
-    return out
-
-
 def _right(xi: Array) -> Array:
     """Right Jacobian (..., 6, 6) by its series: exact to 1e-6 up to 0.3 rad, more than a hand turns between frames."""
-    ad = _ad(xi)
+    ad = se3.small_adjoint(xi)
     two = ad @ ad
     return np.asarray(np.eye(6) - ad / 2 + two / 6 - two @ ad / 24 + two @ two / 120)
 
 
 def _right_inverse(xi: Array) -> Array:
     """Inverse of the right Jacobian (..., 6, 6), by its series."""
-    ad = _ad(xi)
+    ad = se3.small_adjoint(xi)
     two = ad @ ad
     return np.asarray(np.eye(6) + ad / 2 + two / 12 - two @ two / 720)
 
@@ -234,7 +220,7 @@ def _equations(problem: RigProblem, state: RigState) -> _RigEquations:
         state = replace(state, lens=np.maximum(state.lens, [1, 1, *[-np.inf] * 7]))
     infinite = bool((points[..., 2][seen] < 1.0).any()) or bool((state.lens[:, :2] <= 1).any())
     points[..., 2] = np.where(seen & (points[..., 2] >= 1.0), points[..., 2], 1.0)
-    pixels, by_lens, by_point = project_lens(state.lens[camera][:, None], points)
+    pixels, by_lens, by_point = lens_model.project_lens(state.lens[camera][:, None], points)
     residuals = np.where(seen[..., None], pixels - np.nan_to_num(views.pixels), 0.0)
     cost, weight = huber((residuals**2).sum(-1) / views.sigma[:, None] ** 2)
     weight = weight * seen / views.sigma[:, None] ** 2
@@ -284,9 +270,9 @@ def _assemble(
     slope[offsets] += mean + state.offset / OFFSET_SIGMA**2
     for c in range(cameras):
         lens = slice(CAMERA_PARAMETERS * c, CAMERA_PARAMETERS * c + 9)
-        priors = [lens_prior(views.sizes[c], state.lens[c])]
+        priors = [lens_model.lens_prior(views.sizes[c], state.lens[c])]
         if problem.known is not None:
-            priors.append(given_prior(problem.known, c, state.lens[c]))
+            priors.append(lens_model.given_prior(problem.known, c, state.lens[c]))
         for prior in priors:
             matrix[lens, lens] += prior.information
             slope[lens] += prior.slope

@@ -12,17 +12,9 @@ import numpy as np
 from scipy.special import ndtr
 
 from estimation import se3
+from estimation.calibration import lens_model
 from estimation.calibration.lens_fit import LensFit, first_lens, fit_lens, fit_poses
-from estimation.calibration.lens_model import (
-    CAMERA_PARAMETERS,
-    MODELS,
-    BoardViews,
-    Implausible,
-    KnownLenses,
-    check_lens,
-    lens_of,
-    project_lens,
-)
+from estimation.calibration.lens_model import CAMERA_PARAMETERS, MODELS, BoardViews, Implausible, KnownLenses
 from estimation.calibration.rig_fit import RigState, fit_rig
 from estimation.rig import Rig
 from estimation.se3 import Array, Index, Mask
@@ -63,10 +55,7 @@ class LensChoice:
 
 
 def choose_model(views: BoardViews) -> LensChoice:
-    """The usual model, or one that is clearly better on held-out views; of one camera's views.
-
-    Models with an implausible fit are left out, unless all are.
-    """
+    """One camera's usual model, or one clearly better on held-out views; of plausible ones, if there are any."""
     folds = folds_of(len(views))
     fits = _fits(views)
     errors = {model: _fold_errors(views, fits[model], folds) for model in MODELS}
@@ -85,14 +74,14 @@ def choose_model(views: BoardViews) -> LensChoice:
 def doubt_given_lens(views: BoardViews, given: LensFit) -> LensChoice:
     """A given lens, with the probability that a lens fitted to these views would predict held-out ones better."""
     fits, folds = _fits(views), folds_of(len(views))
-    kept = _squares(views, given.residuals)
-    rivals = [_score(model, _fold_errors(views, fits[model], folds), kept) for model in (USUAL_MODEL, RICHEST_MODEL)]
+    errors = _squares(views, given.residuals)
+    rivals = [_score(model, _fold_errors(views, fits[model], folds), errors) for model in (USUAL_MODEL, RICHEST_MODEL)]
     return LensChoice(given, (), RICHEST_MODEL, max(score.chance for score in rivals))
 
 
 def _is_possible(views: BoardViews, lens: Array) -> bool:
     try:
-        check_lens("", views.sizes[int(views.camera[0])], lens)
+        lens_model.check_lens("", views.sizes[int(views.camera[0])], lens)
     except Implausible:
         return False
     return True
@@ -117,9 +106,9 @@ def _fold_errors(views: BoardViews, whole: LensFit, folds: Index) -> Array:
     """(V,) mean squared error, px^2, of each view under the lens fitted outside its fold; whole: the fit to all."""
     out = np.zeros(len(views))
     for fold in range(folds.max() + 1):
-        kept, held = folds != fold, folds == fold
-        lens = fit_lens(views.only(kept), whole.model, (whole.lens, whole.camera_from_board[kept]), FOLD_MIN_GAIN).lens
-        rest = views.only(held)
+        held, rest = folds == fold, views.only(folds == fold)
+        begin = whole.lens, whole.camera_from_board[~held]
+        lens = fit_lens(views.only(~held), whole.model, begin, FOLD_MIN_GAIN).lens
         out[held] = _squares(rest, fit_poses(rest, lens, whole.camera_from_board[held], FOLD_MIN_GAIN)[1])
     return out
 
@@ -139,10 +128,7 @@ def _score(model: str, errors: Array, usual: Array) -> ModelScore:
 def held_out_residuals(
     views: BoardViews, state: RigState, free: Mask, jitter: float, known: KnownLenses | None = None
 ) -> Array:
-    """Residuals (V, P, 2) px of every view under the rig of the other folds; nan where those do not determine it.
-
-    state, free, jitter, known: of the fit to all views.
-    """
+    """Residuals (V, P, 2) px of every view under the rig of the other folds, nan where undetermined; state: of all."""
     out = np.full(views.pixels.shape, np.nan)
     folds = folds_of(len(state.base_from_board))[views.instant]
     for fold in range(folds.max() + 1):
@@ -156,9 +142,9 @@ def held_out_residuals(
     return out
 
 
-def _state_of(views: BoardViews, state: RigState, kept: Mask) -> RigState:
-    boards = state.base_from_board[np.unique(views.instant[kept])]
-    return replace(state, jitter=state.jitter[kept], base_from_board=boards)
+def _state_of(views: BoardViews, state: RigState, rows: Mask) -> RigState:
+    boards = state.base_from_board[np.unique(views.instant[rows])]
+    return replace(state, jitter=state.jitter[rows], base_from_board=boards)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,7 +183,7 @@ def volume_error(rig: Rig, covariance: Array, points: Array, speed: float = 0.0)
         inside = se3.transform_points(camera_from_base, points)
         front = inside[:, 2] > 1.0
         inside[:, 2] = np.where(front, inside[:, 2], 1.0)
-        pixels, by_lens, by_place = project_lens(lens_of(camera), inside)
+        pixels, by_lens, by_place = lens_model.project_lens(lens_model.lens_of(camera), inside)
         visible = front & (pixels >= 0).all(1) & (pixels <= np.array(camera.size) - 1).all(1)
         rows, columns = slice(2 * c, 2 * c + 2), CAMERA_PARAMETERS * c
         by_point[:, rows] = np.where(visible[:, None, None], by_place @ camera_from_base[:3, :3], 0.0)

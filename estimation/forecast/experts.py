@@ -106,9 +106,10 @@ class Experts:
         draw = np.random.default_rng(FEATURE_SEED)
         self.count, self._horizons = len(EXPERT_SPECS), horizons
         self._waves = [_waves(spec, draw) for spec in EXPERT_SPECS]
-        self._models = [
-            Regression(_input_count(spec), 6 * horizons, SAMPLE_RATE_HZ * spec.memory) for spec in EXPERT_SPECS
-        ]
+        self._models = []
+        for spec in EXPERT_SPECS:
+            count = 1 + 6 + 6 * len(LINEAR_LAGS) + spec.waves + 6 * len(GRADED_LAGS) * spec.graded  # of `inputs`
+            self._models.append(Regression(count, 6 * horizons, SAMPLE_RATE_HZ * spec.memory))
         self._turn, self._count = 0, 0
         self._move = 0.0  # mm^2, mean square of half-second shifts
         self._bend = np.zeros(2)  # mm, mean change of shift from one tenth of a second to the next: now, usually
@@ -124,7 +125,9 @@ class Experts:
         move = float(np.sqrt(self._move))
         shifts = past[1:, 3:] / (move or 1.0)
         linear = np.concatenate([[move], twist / SAMPLE_RATE_HZ, past[: len(LINEAR_LAGS)].ravel()])
-        graded = self._liveliness() * past[GRADED_LAGS].ravel()
+        now, usual = np.maximum(self._bend, 1e-12)
+        liveliness = float(np.clip(np.log(now / usual), -1.0, 3.0))  # how rough the motion is now, beside what is usual
+        graded = liveliness * past[GRADED_LAGS].ravel()
         out = []
         for spec, (directions, phases) in zip(EXPERT_SPECS, self._waves, strict=True):
             angles = shifts.ravel()[: len(directions)] @ directions + phases
@@ -139,16 +142,8 @@ class Experts:
         bend = float(np.linalg.norm((past[LAG_TENTH + 1] - 2 * past[LAG_TENTH])[3:]))
         self._bend += (bend - self._bend) / np.minimum(self._count, [QUICK_MEMORY, SLOW_MEMORY])
 
-    def _liveliness(self) -> float:
-        """Logarithm of how rough the motion is just now beside what is usual."""
-        now, usual = np.maximum(self._bend, 1e-12)
-        return float(np.clip(np.log(now / usual), -1.0, 3.0))
-
     def learn(self, inputs: list[Array], experts: Array, moved: Array) -> None:
-        """Take a sample's inputs, what constant velocity and the experts expected (H, 1 + M, 6), and the truth (H, 6).
-
-        One expert's coefficients are brought up to date at a time, so that no step is long.
-        """
+        """Take a sample: inputs, expectations of constant velocity and experts (H, 1 + M, 6), and the truth (H, 6)."""
         errors = np.sqrt(((moved[:, None] - experts[:, 1:]) ** 2).sum(2)).T  # (M, H)
         middle = errors[:, self._horizons // 2]
         if not self._noise.any():
@@ -159,7 +154,7 @@ class Experts:
         target = (moved - experts[:, 0]).ravel()
         for model, x, weight in zip(self._models, inputs, weights.tolist(), strict=True):
             model.learn(x, target, weight)
-        self._turn = (self._turn + 1) % self.count
+        self._turn = (self._turn + 1) % self.count  # one expert is solved at a time, so that no step is long
         self._models[self._turn].solve(max(NOISE_RIDGE * float(self._noise[self._turn]), 1e-12))
 
 
@@ -170,15 +165,8 @@ def _waves(spec: ExpertSpec, draw: np.random.Generator) -> tuple[Array, Array]:
     return directions, draw.uniform(0, 2 * np.pi, spec.waves)
 
 
-def _input_count(spec: ExpertSpec) -> int:
-    return 1 + 6 + 6 * len(LINEAR_LAGS) + spec.waves + 6 * len(GRADED_LAGS) * spec.graded
-
-
 class ExpertStack:
-    """Weights (H, E) of E experts for each of H horizons, by ridge regression over their recent errors.
-
-    This is stacking (Breiman 1996), made recursive.
-    """
+    """Weights (H, E) of E experts for H horizons, by recursive ridge regression: stacking (Breiman 1996)."""
 
     def __init__(self, horizons: int, prior: Array) -> None:
         """prior: (E,) the weights beforehand."""

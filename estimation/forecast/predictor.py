@@ -1,22 +1,25 @@
-"""Where the surface will be in the next half second, learned from its own motion while it is followed.
+"""Forecast of the surface's motion over the next half second, learned online from its past motion.
 
 Experts (hold, constant velocity and the learned `Experts`) each predict it; the `ExpertStack` weighs them by their
 delayed errors, and the `IntervalCalibration` gives the covariance. All are trained directly for each horizon, at
 samples SAMPLE_INTERVAL_S apart that are interpolated from the poses as they come: the camera's rate and its jitter do
 not matter. Nobody learns from what the `InnovationGate` sets aside: no forecast could have known it.
+
+The error of a forecast is learned when its time has come, a tenth of a second later at the soonest. A patient who
+coughs has moved by millimetres then. So a pose that is off the forecast of the one before, by more than poses usually
+are and by more than the forecast's covariance allows, shows a new motion. Its displacement is set aside with a velocity
+of its own, which widens the covariance; the known motion goes on underneath, until the surface moves by that alone.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from estimation import se3
 from estimation.forecast.experts import LAGS, TURN_LEVER_MM, Experts, ExpertStack, IntervalCalibration
-from estimation.forecast.innovation_gate import InnovationGate, WarmupForecast
 from estimation.pose import Forecast, SurfacePose, body_rate, prepare
 from estimation.runtime import CONTIGUOUS, compiled
 from estimation.se3 import Array
@@ -34,59 +37,62 @@ STAMP_TOLERANCE_S = 1e-3  # of stamps that are equal but for rounding
 MIN_TURN_COSINE = -0.9  # of a turn: beyond, its axis is lost in rounding
 MIN_POSE_GAP_S = 0.01  # poses nearer to the one before replace it, so that a faster camera keeps no shorter memory
 
+# a pose is set aside where it is off its forecast by more than both of:
+NOISE_RATIO = 5.0  # times the usual innovation
+CLAIM_SIGMAS = 3.0  # times the sigma for the first horizon, if it went on like that
+INNOVATION_MEMORY_S = 4.0  # over which the usual innovation is learned
+UNKNOWN_DECAY_S = 0.012  # of the covariance of the new velocity
+DRIFT_DECAY_S = 0.1  # of the velocity of what was set aside: what suddenly moves a surface as suddenly stops
+END_AFTER_S = 0.1  # without an innovation until all is as before
+ACCEPT_AFTER_S = 2.0  # after which what goes on surprising is usual
+PSD_GROWTH_S = 1.0  # in which the kept density grows by e: what goes on for longer is the surface's own
+
 
 class PoseHistory:
-    """A window of poses over `span` s, of bounded memory: one pose in each APART s at most."""
+    """A window of poses over `span` s, of bounded memory: one pose in each MIN_POSE_GAP_S at most."""
 
     def __init__(self, span: float) -> None:
         self._span = span
-        self._room = int(span / MIN_POSE_GAP_S) + 4
-        self._stamps, self._poses = np.zeros(2 * self._room), np.zeros((2 * self._room, 4, 4))
-        self._first = self._end = 0
+        self.clear()
 
     def clear(self) -> None:
         """Forget all."""
-        self._first = self._end = 0
+        self._stamps, self._poses = np.zeros(0), np.zeros((0, 4, 4))
 
     def add(self, stamp: float, pose: Array) -> None:
         """Take a pose (4, 4) newer than all before."""
-        stamps = self._stamps
-        if self._end - self._first > 1 and stamp - stamps[self._end - 2] < MIN_POSE_GAP_S:
-            self._end -= 1
-        if self._end == 2 * self._room:
-            count = self._end - self._first
-            stamps[:count], self._poses[:count] = stamps[self._first :].copy(), self._poses[self._first :].copy()
-            self._first, self._end = 0, count
-        stamps[self._end], self._poses[self._end] = stamp, pose
-        self._end += 1
-        while self._end - self._first > 2 and stamps[self._first + 1] <= stamp - self._span:
-            self._first += 1
+        end = len(self._stamps)
+        if end > 1 and stamp - self._stamps[-2] < MIN_POSE_GAP_S:
+            end -= 1
+        stamps = np.append(self._stamps[:end], stamp)
+        # one pose of before the span is kept, and two poses at least
+        first = max(min(int(np.searchsorted(stamps, stamp - self._span, "right")) - 1, len(stamps) - 2), 0)
+        self._stamps, self._poses = stamps[first:], np.concatenate([self._poses[first:end], pose[None]])
 
     @property
     def reach(self) -> float:
         """s from the oldest pose to the newest."""
-        return float(self._stamps[self._end - 1] - self._stamps[self._first]) if self._end > self._first else 0.0
+        return float(self._stamps[-1] - self._stamps[0]) if len(self._stamps) else 0.0
 
     def carry(self, moved: Array) -> None:
         """Put all poses where they are carried by `moved` (4, 4), in the base frame."""
-        own = slice(self._first, self._end)
-        self._poses[own] = moved @ self._poses[own]
+        self._poses = moved @ self._poses
 
     @property
     def newest(self) -> Array:
         """The last pose (4, 4); only where there is one."""
-        return np.asarray(self._poses[self._end - 1])
+        return np.asarray(self._poses[-1])
 
     def increments(self, poses: Array, stamps: Array) -> Array:
         """Tangent vectors (N, 6) from poses (N, 4, 4), or one (4, 4) for all, to where the surface was at stamps (N,).
 
         Between two poses of the window the increment is taken as linear; outside, its end counts.
         """
-        own = self._stamps[self._first : self._end]
+        own = self._stamps
         after = np.clip(np.searchsorted(own, stamps), 1, len(own) - 1)
         before = after - 1
         share = np.clip((stamps - own[before]) / (own[after] - own[before]), 0.0, 1.0)[:, None]
-        ends = self._poses[self._first + np.stack([before, after])]  # (2, N, 4, 4)
+        ends = self._poses[np.stack([before, after])]  # (2, N, 4, 4)
         vectors = _increments(np.broadcast_to(poses, (len(stamps), 4, 4)), ends)
         return np.asarray((1 - share) * vectors[0] + share * vectors[1])
 
@@ -127,6 +133,98 @@ def _short_increments(a: Array, b: Array) -> tuple[Array, bool]:
             out[4] = shift[1] - v / 2 + bend * (z * u - x * w)
             out[5] = shift[2] - w / 2 + bend * (x * v - y * u)
     return vectors, within
+
+
+class InnovationGate:
+    """Watches how far each pose is off the forecast of the one before it; in mm, turns at a lever."""
+
+    def __init__(self) -> None:
+        self._usual, self._learned = 0.0, 0.0  # mm^2, and s over which it was learned
+        self._left = 0.0  # s until all is as before, if nothing surprises any more
+        self._lasted, self._squares = 0.0, 0.0  # s since the first innovation, and their mean square since, mm^2
+        self.drift = np.zeros(6)  # mm/s, of what was set aside
+        self.unknown = np.zeros((6, 6))  # mm^2/s^2, covariance of that velocity
+
+    @property
+    def active(self) -> bool:
+        """Whether something is set aside."""
+        return self._left > 0
+
+    def forget(self) -> None:
+        """Set nothing aside any more; what is usual is kept."""
+        self._left = self._lasted = self._squares = 0.0
+        self.drift = np.zeros(6)
+
+    def ahead(self, seconds: Array) -> tuple[Array, Array]:
+        """How far, (H, 6) mm, what was set aside moves on in `seconds` (H,), and its covariances (H, 6, 6)."""
+        goes = DRIFT_DECAY_S * (1 - np.exp(-seconds / DRIFT_DECAY_S))
+        stops = np.outer(self.drift, self.drift)
+        doubt = seconds[:, None, None] ** 2 * self.unknown + (seconds - goes)[:, None, None] ** 2 * stops
+        return goes[:, None] * self.drift, doubt
+
+    def __call__(self, off: Array, seconds: float, ahead: float, claim: Array) -> bool:
+        """Whether a pose is set aside from the known motion.
+
+        off: (6,) mm, from the forecast of the known motion `seconds` s before. claim: (6, 6) mm^2, covariance of that
+        forecast `ahead` s ahead, as learned from earlier errors.
+        """
+        new = off - self.drift * seconds
+        square, known, allowed = float(new @ new), NOISE_RATIO**2 * self._usual, CLAIM_SIGMAS**2 * np.trace(claim)
+        self.unknown *= np.exp(-seconds / UNKNOWN_DECAY_S)
+        if 0 < known < square and square * (ahead / seconds) ** 2 > allowed:
+            self._left = END_AFTER_S
+        elif self.active and self.drift @ self.drift * ahead**2 < allowed:
+            self._left -= seconds
+        if not self.active:
+            self._learned = min(self._learned + seconds, INNOVATION_MEMORY_S)
+            self._usual += seconds / self._learned * ((min(square, known) if known else square) - self._usual)
+        if self._lasted > ACCEPT_AFTER_S:
+            self._usual, self._left = self._squares, 0.0
+        if not self.active:
+            self.forget()
+            return False
+        self.unknown += np.outer(new, new) / seconds**2
+        self.drift, self._lasted = off / seconds, self._lasted + seconds
+        self._squares += (square - self._squares) * seconds / self._lasted
+        return True
+
+
+class WarmupForecast:
+    """Constant velocity before any forecast is learned, with covariances that one push does not widen for long.
+
+    A pose's own covariance knows how lively the surface was in the last second, with whatever struck it. The calmer
+    motion before goes on: the least density of late is kept, and trusted less as time goes by.
+
+    twist: (6,) rad/s and mm/s, the velocity used. calmer: whether the covariance is less than the pose's own.
+    """
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self.twist, self.calmer = np.zeros(6), False
+        self._known, self._psd = np.zeros((6, 6)), np.full(6, np.inf)
+
+    def __call__(self, pose: SurfacePose, seconds: float, aside: Array | None, ahead: Array) -> Array:
+        """Covariances (H, 6, 6) `ahead` (H,) s after a pose, `seconds` s newer than the last.
+
+        aside: (6,) the velocity without what was set aside, None where nothing is. Afterwards what was known of it
+        counts until the pose itself knows the velocity better.
+        """
+        grown = pose.twist_covariance
+        if self.calmer or aside is not None:
+            grown = self._known + seconds * np.diag(self._psd)
+        if aside is not None:
+            self.twist, self._known, self.calmer = aside, grown, True
+        else:
+            self._psd = np.minimum(pose.acceleration_psd, self._psd * np.exp(seconds / PSD_GROWTH_S))
+            self.calmer = self.calmer and bool((self._psd < pose.acceleration_psd).any())
+            if not self.calmer or np.trace(pose.twist_covariance[3:, 3:]) <= np.trace(grown[3:, 3:]):
+                self.twist, grown = pose.twist, pose.twist_covariance
+            self._known = grown
+        span = ahead[:, None, None]
+        return np.asarray(span**2 * self._known + span**3 / 3 * np.diag(self._psd))
 
 
 @dataclass(slots=True)
@@ -188,7 +286,8 @@ class Predictor:
         self._history.add(pose.stamp, pose.base_from_surface)
         if self._history.reach < SAMPLE_INTERVAL_S / 2:
             return None
-        due = self._due(pose.stamp)
+        waiting = ((s, k) for s in self._samples for k in range(s.known, len(HORIZONS)))
+        due = [(s, k) for s, k in waiting if s.stamp + HORIZONS[k] <= pose.stamp + STAMP_TOLERANCE_S]
         ends, now = [s.stamp + HORIZONS[k] for s, k in due], np.broadcast_to(pose.base_from_surface, (len(LAGS), 4, 4))
         starts = np.concatenate([np.array([s.pose for s, _ in due]).reshape(-1, 4, 4), now])
         moved = self._history.increments(starts, np.concatenate([ends, pose.stamp - LAGS])) * TANGENT_SCALE
@@ -207,10 +306,7 @@ class Predictor:
         return self._with_drift(replace(forecast, covariances=claims + pose.covariance))
 
     def _known_twist(self, pose: SurfacePose) -> Array:
-        """The twist (6,) of the known motion: what suddenly moves the surface is set aside.
-
-        The past poses are shifted along with it, as if the surface had been there all the time.
-        """
+        """The twist (6,) without sudden motion. The past is shifted as if the surface had always been there."""
         if self._last is None:
             return pose.twist
         (forecast, claim), seconds = self._last, pose.stamp - self._before
@@ -228,17 +324,9 @@ class Predictor:
         return body_rate(step, rate)
 
     def _bounded(self, step: Array, rate: Array, seconds: float) -> tuple[Array, Array]:
-        """A step (6,) of `seconds` s, and its rate, no faster than the surface lately was.
-
-        While motion is set aside, forecasts feed on forecasts: a young regression may run away.
-        """
+        """A step (6,) of `seconds` s and its rate, no faster than of late: forecasts of forecasts may run away."""
         faster = max(_size(step) / seconds, _size(rate)) / max(self._fastest, 1e-9)
         return (step, rate) if faster <= 1 else (step / faster, rate / faster)
-
-    def _due(self, now: float) -> list[tuple[_Sample, int]]:
-        """The samples and horizons whose time has come."""
-        waiting = ((s, k) for s in self._samples for k in range(s.known, len(HORIZONS)))
-        return [(s, k) for s, k in waiting if s.stamp + HORIZONS[k] <= now + STAMP_TOLERANCE_S]
 
     def _forecast(self, pose: SurfacePose, twist: Array, past: Array, lasting: Array) -> Forecast | None:
         twist = twist * TANGENT_SCALE
@@ -253,7 +341,12 @@ class Predictor:
             self._samples.append(_Sample(pose.stamp, pose.base_from_surface, inputs, experts, expected, claimed))
         if self._judged < MIN_JUDGED_SAMPLES:
             return None
-        covariances = spread / np.outer(TANGENT_SCALE, TANGENT_SCALE) + lasting + self._unseen(pose)
+        # added while few errors are known, fading with the first breaths: white noise on acceleration, since errors of
+        # one phase of a breath say little of others
+        young = max(0.0, 1 - self._judged * SAMPLE_INTERVAL_S / YOUNG_FORECASTS_S)
+        span = HORIZONS[:, None, None]
+        unseen = young**2 * (span**2 * pose.twist_covariance + span**3 / 3 * np.diag(pose.acceleration_psd))
+        covariances = spread / np.outer(TANGENT_SCALE, TANGENT_SCALE) + lasting + unseen
         known = Forecast(HORIZONS, expected / TANGENT_SCALE, covariances)
         self._last = known, spread[0] + lasting * np.outer(TANGENT_SCALE, TANGENT_SCALE)
         return self._with_drift(known)
@@ -264,23 +357,14 @@ class Predictor:
         covariances = known.covariances + doubt / np.outer(TANGENT_SCALE, TANGENT_SCALE)
         return Forecast(HORIZONS, known.increments + sudden / TANGENT_SCALE, covariances)
 
-    def _unseen(self, pose: SurfacePose) -> Array:
-        """Covariances (H, 6, 6) added while few errors are known, fading as the first breaths are seen.
-
-        That is white noise on acceleration: errors of one phase of a breath say little of others.
-        """
-        young = max(0.0, 1 - self._judged * SAMPLE_INTERVAL_S / YOUNG_FORECASTS_S)
-        ahead = HORIZONS[:, None, None]
-        return young**2 * (ahead**2 * pose.twist_covariance + ahead**3 / 3 * np.diag(pose.acceleration_psd))
-
     def _learn(self, due: list[tuple[_Sample, int]], moved: Array) -> None:
         """Compare what was expected with what came, (K, 6), horizon by horizon as its time comes."""
         for (sample, j), vector in zip(due, moved, strict=True):
             sample.moved[j], sample.known = vector, j + 1
         fair = [(sample, k) for sample, k in due if not sample.spoilt]
         for batch in _once_each(fair):
-            samples, k = [fair[i][0] for i in batch], np.array([fair[i][1] for i in batch])
-            pairs = list(zip(samples, k.tolist(), strict=True))
+            pairs = [fair[i] for i in batch]
+            k = np.array([j for _, j in pairs])
             truth = np.stack([sample.moved[j] for sample, j in pairs])
             self._stack.learn(k, np.stack([sample.experts[j] for sample, j in pairs]), truth)
             error = truth - np.stack([sample.expected[j] for sample, j in pairs])
@@ -297,7 +381,7 @@ def _size(vector: Array) -> float:
     return float(np.linalg.norm(vector * TANGENT_SCALE))
 
 
-def _once_each(due: list[tuple[_Sample, int]]) -> Iterator[list[int]]:
+def _once_each(due: list[tuple[_Sample, int]]) -> list[list[int]]:
     """The places in `due` in batches, of which each has a horizon once at most, older samples first."""
     batches: list[list[int]] = []
     for i, (_, k) in enumerate(due):
@@ -306,4 +390,4 @@ def _once_each(due: list[tuple[_Sample, int]]) -> Iterator[list[int]]:
             free[0].append(i)
         else:
             batches.append([i])
-    yield from batches
+    return batches

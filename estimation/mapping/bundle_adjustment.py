@@ -21,7 +21,7 @@ from estimation.online.pose_solver import PointTracks, PoseFit, project, solve_p
 from estimation.rig import Rig
 from estimation.runtime import trim_heap
 from estimation.se3 import Array, Index, Mask
-from estimation.surface_map import SurfaceMap, motion_of
+from estimation.surface_map import SurfaceMap
 
 MIN_SIGHTINGS = 3
 MIN_KEYFRAMES_TO_REJECT = 6  # fewer cannot tell a stray landmark from a bent map; a rejected one never comes back
@@ -123,7 +123,7 @@ def without_frame(covariance: Array, points: Array) -> Array:
     Each point counts by its own precision. Counted alike, a point of a single camera, unknown by centimetres along its
     ray, was measured to add a tenth of a millimetre to each of two hundred others.
     """
-    motion = motion_of(points) * [0.01, 0.01, 0.01, 1, 1, 1]  # of about one size
+    motion = se3.point_jacobians(points).reshape(-1, 6) * [0.01, 0.01, 0.01, 1, 1, 1]  # of about one size
     worth = 1 / np.maximum(np.repeat(np.diag(covariance).reshape(-1, 3).sum(1), 3), MIN_DRIFT[3] ** 2)
     held = motion.T * worth
     of_frame = motion @ np.linalg.solve(held @ motion, held)
@@ -133,7 +133,7 @@ def without_frame(covariance: Array, points: Array) -> Array:
 
 def of_frame(points: Array, covariance: Array) -> Array:
     """Covariance (3N, 3N) of points (N, 3) by that of their frame's place alone, (6, 6)."""
-    motion = motion_of(points)
+    motion = se3.point_jacobians(points).reshape(-1, 6)
     return np.asarray(motion @ covariance @ motion.T)
 
 
@@ -201,11 +201,8 @@ def _graph(
         for c, row, pixel, sigma in zip(seen.camera, seen.track, seen.pixels, seen.sigma, strict=True):
             if int(row) in rows:
                 noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(2, float(sigma)))
-                graph.add(
-                    gtsam.GenericProjectionFactorCal3_S2(
-                        pixel, noise, _camera_key(int(c), i), gtsam.symbol("l", int(row)), lenses[c], sensors[c]
-                    )
-                )
+                keys = _camera_key(int(c), i), gtsam.symbol("l", int(row))
+                graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, noise, *keys, lenses[c], sensors[c]))
     held = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
     graph.add(gtsam.PriorFactorPose3(gtsam.symbol("x", 0), values.atPose3(gtsam.symbol("x", 0)), held))
     far = gtsam.noiseModel.Isotropic.Sigma(3, FREE_SIGMA_MM)
@@ -248,8 +245,7 @@ def _agreement(rig: Rig, points: Array, keyframes: list[KeyFrame], solved: gtsam
             pose = se3.inverse(solved.atPose3(_camera_key(int(c), i)).matrix())
             predicted = project(rig, seen.camera[mine], pose, points[seen.track[mine]])[0]
             away = np.linalg.norm(predicted - seen.pixels[mine], axis=1)
-            np.add.at(
-                fits, seen.track[mine], away < np.maximum(4 * CAUCHY_SIGMAS * seen.sigma[mine], MAX_REPROJECTION_PX)
-            )
+            limit = np.maximum(4 * CAUCHY_SIGMAS * seen.sigma[mine], MAX_REPROJECTION_PX)
+            np.add.at(fits, seen.track[mine], away < limit)
             np.add.at(total, seen.track[mine], 1)
     return np.asarray((total < MIN_SIGHTINGS) | (fits >= 0.5 * total))

@@ -63,26 +63,25 @@ def meet_rays(points: Array, covariance: Array, origins: Array, directions: Arra
     if len(points) < MIN_SURFACE_POINTS or not count:
         nothing = origins.copy(), -directions, np.full(count, np.inf), np.zeros((3 * count, 3 * count))
         return RaySurfaceHits(*nothing, np.zeros(count, bool))
-    fits = _fits(points, _own(covariance), _nearest(points, origins, directions), -directions)
-    places = np.stack([((origins - fits.centres)[:, None] * fits.frames).sum(2), _turned(fits.frames, directions)], 1)
+    each = len(points)
+    own_covariance = np.einsum("ninj->nij", covariance.reshape(each, 3, each, 3))
+    fits = _fits(points, own_covariance, _nearest(points, origins, directions), -directions)
+    turned = np.einsum("mki,mi->mk", fits.frames, directions)
+    places = np.stack([((origins - fits.centres)[:, None] * fits.frames).sum(2), turned], 1)
     u, v, good = _crossing(fits.coefficients, places)
     at, slopes = _basis(u, v), _slopes(fits.coefficients, u, v)
     up = np.stack([-slopes[0], -slopes[1], np.ones(count)], -1)
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     height = np.einsum("mp,mp->m", at, fits.coefficients)
-    met = fits.centres + np.einsum("mk,mki->mi", np.stack([u, v, height], -1), fits.frames)
+    hits = fits.centres + np.einsum("mk,mki->mi", np.stack([u, v, height], -1), fits.frames)
     normals = np.einsum("mk,mki->mi", up, fits.frames)
-    good &= (np.einsum("mi,mi->m", normals, directions) < -MIN_RAY_COSINE) & np.isfinite(met).all(1)
-    heights = _heights(fits, at, met, covariance) * up[:, 2:] * up[:, 2]  # across the surface, not along the fit's up
-    shift, depth = foot_jacobians(met - origins, normals)
-    side = (np.linalg.norm(met - origins, axis=1) * angle)[:, None, None] ** 2 * shift @ np.swapaxes(shift, 1, 2)
+    good &= (np.einsum("mi,mi->m", normals, directions) < -MIN_RAY_COSINE) & np.isfinite(hits).all(1)
+    heights = _heights(fits, at, hits, covariance) * up[:, 2:] * up[:, 2]  # across the surface, not along the fit's up
+    shift, depth = foot_jacobians(hits - origins, normals)
+    side = (np.linalg.norm(hits - origins, axis=1) * angle)[:, None, None] ** 2 * shift @ np.swapaxes(shift, 1, 2)
     joint = np.einsum("mi,mn,nj->minj", depth, heights, depth)
     joint[np.arange(count), :, np.arange(count)] += side
-    return RaySurfaceHits(met, normals, np.sqrt(np.diag(heights)), joint.reshape(3 * count, -1), good)
-
-
-def _turned(frames: Array, directions: Array) -> Array:
-    return np.asarray(np.einsum("mki,mi->mk", frames, directions))
+    return RaySurfaceHits(hits, normals, np.sqrt(np.diag(heights)), joint.reshape(3 * count, -1), good)
 
 
 def smooth_normals(points: Array, outward: Array) -> Array:
@@ -99,17 +98,8 @@ def smooth_normals(points: Array, outward: Array) -> Array:
     return np.asarray(np.einsum("mk,mki->mi", up / np.linalg.norm(up, axis=1, keepdims=True), fits.frames))
 
 
-def _own(covariance: Array) -> Array:
-    """Each point's own covariance (N, 3, 3), of the joint one (3N, 3N)."""
-    count = len(covariance) // 3
-    return np.asarray(np.einsum("ninj->nij", covariance.reshape(count, 3, count, 3)))
-
-
 def _fits(points: Array, own_covariance: Array, near: Index, outward: Array) -> _Fits:
-    """A fit (M) to each set of neighbours, rows near (M, K) of the points (N, 3), each known to (N, 3, 3) mm^2.
-
-    outward: (M, 3), the side on which up is.
-    """
+    """M fits to rows near (M, K) of points (N, 3) with covariances (N, 3, 3) mm^2; up is on the outward (M, 3) side."""
     own = points[near]  # (M, K, 3)
     centres = own.mean(1)
     spread = own - centres[:, None]
@@ -131,9 +121,8 @@ def _fits(points: Array, own_covariance: Array, near: Index, outward: Array) -> 
         free = np.maximum(weight.sum(1) - np.einsum("mkp,mpk->m", design, maps), 1.0)
         variance = (weight * (off**2 - known)).sum(1) / free
         scatter = np.sqrt(np.maximum(variance, MIN_SCATTER_MM**2))
-        weight = np.minimum(
-            1.0, OUTLIER_SCATTERS * np.sqrt(scatter[:, None] ** 2 + known) / np.maximum(np.abs(off), 1e-9)
-        )
+        limit = OUTLIER_SCATTERS * np.sqrt(scatter[:, None] ** 2 + known)
+        weight = np.minimum(1.0, limit / np.maximum(np.abs(off), 1e-9))
     freedom = np.maximum(free, 3.0)
     scatter = scatter * np.sqrt(freedom / (freedom - 2))  # known from few neighbours: Student's t
     return _Fits(near, frames, centres, maps, coefficients, doubt, scatter, reach)
@@ -176,8 +165,8 @@ def _crossing(coefficients: Array, places: Array) -> tuple[Array, Array, Mask]:
     return u, v, np.asarray(np.abs(step) < 1e-3)
 
 
-def _heights(fits: _Fits, at: Array, met: Array, covariance: Array) -> Array:
-    """Covariance (M, M) mm^2 of the heights at `met`, the sum of three parts.
+def _heights(fits: _Fits, at: Array, hits: Array, covariance: Array) -> Array:
+    """Covariance (M, M) mm^2 of the heights at `hits`, the sum of three parts.
 
     The surface's own scatter, anew at each place; the neighbours' scatter and errors, by their weights in the fits; and
     the remaining doubt about the coefficients, shared by places that lie close together.
@@ -190,5 +179,5 @@ def _heights(fits: _Fits, at: Array, met: Array, covariance: Array) -> Array:
     by_point = (lever[..., None] * fits.frames[:, 2][:, None]).reshape(len(at), -1)  # (M, 3N)
     shared = rough @ rough.T + by_point @ covariance @ by_point.T
     unseen = np.sqrt(np.maximum(np.einsum("mp,mpq,mq->m", at, fits.doubt, at) - np.diag(shared), 0.0))
-    apart = np.linalg.norm(met[:, None] - met, axis=2) / np.median(fits.reach)
+    apart = np.linalg.norm(hits[:, None] - hits, axis=2) / np.median(fits.reach)
     return np.asarray(shared + np.outer(unseen, unseen) * np.exp(-0.5 * apart**2) + np.diag(fits.scatter**2))

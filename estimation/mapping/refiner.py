@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, Future
+from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -100,14 +101,12 @@ class Refiner:
         self._delays = Delays(np.zeros(len(rig)), np.zeros((len(rig),) * 2))  # as known now
         self._doubt = np.inf  # s, of them at the last adjustment
 
-    def begin(
-        self, surface_map: SurfaceMap, stamp: float, base_from_surface: Array, observations: Observations
-    ) -> None:
+    def begin(self, surface_map: SurfaceMap, stamp: float, pose: Array, observations: Observations) -> None:
         """The first map and the frame set that it was made from, whose pose defines the surface frame."""
         self._map, self._frames, self._stamps, self._anchors = surface_map, [], [], None
         self._work.cancel()
         self._due, self._confirmed = False, None
-        self._keep(stamp, base_from_surface, observations, np.zeros(6))
+        self._keep(stamp, pose, observations, np.zeros(6))
 
     def speed(self, fit: FrameFit) -> Array:
         """The twist (6,) from the first key frame's pose to a fit."""
@@ -115,10 +114,7 @@ class Refiner:
         return np.asarray(moved / (fit.stamp - self._stamps[0]))
 
     def confirm(self, fit: FrameFit, observations: Observations, delays: Delays) -> AdjustedMap | None:
-        """The second frame set: what it shows of the motion corrects the first map, on the spot.
-
-        Until then a surface that moved between the cameras' instants looks nearer or farther than it is.
-        """
+        """Correct the first map at once by the second frame set: motion between exposures had looked like depth."""
         assert self._map is not None
         first, pose, twist = self._frames[0], fit.solution.base_from_surface, self.speed(fit)
         second = KeyFrame(pose, _inliers(self._rig, self._map, pose, observations), twist)
@@ -182,14 +178,12 @@ class Refiner:
         fit, observations, twist = self._offered
         self._offered = None
         pose = fit.solution.base_from_surface
-        self.took_keyframe = not self._alike(pose).any() or self._is_steady(fit.stamp, pose)
+        alike = int(self._alike(pose).sum())
+        again = alike < MAX_SAME_VIEW and fit.stamp - self._stamps[-1] > SAME_VIEW_INTERVAL_S
+        self.took_keyframe = not alike or again
         if self.took_keyframe:
             self._keep(fit.stamp, pose, observations, twist)
             self._due = True
-
-    def _is_steady(self, stamp: float, pose: Array) -> bool:
-        """Whether another look at a known view is due."""
-        return int(self._alike(pose).sum()) < MAX_SAME_VIEW and stamp - self._stamps[-1] > SAME_VIEW_INTERVAL_S
 
     def _alike(self, pose: Array) -> Mask:
         """Which key frames (K,) show about what is seen at `pose`."""
@@ -244,10 +238,7 @@ class Refiner:
         return AdjustedMap(SurfaceMap(points, normals, covariance), agrees)
 
     def poll(self) -> AdjustedMap | None:
-        """A refined map that is due now, or None; the next adjustment begins when key frames call for it.
-
-        To be called once a frame set, when its pose is handed over.
-        """
+        """A refined map that is due now, or None. Call it once a frame set, when its pose is handed over."""
         self._choose()
         self._due |= self._delays.sigma < READJUST_SIGMA_RATIO * self._doubt
         result = self._work.poll()
@@ -264,12 +255,9 @@ class Refiner:
 
 
 def _inliers(rig: Rig, surface_map: SurfaceMap, near: Array, observations: Observations) -> Observations:
-    """The tracks that agree with the rest of their own camera.
-
-    The joint fit leaves room for late cameras, and in it for wrong matches too.
-    """
+    """Tracks that agree with the rest of their camera: in the joint fit, room for late cameras hides wrong matches."""
     sigma = np.maximum(observations.sigma, MIN_TRACK_SIGMA_PX)
-    seen = Observations(observations.stamp, observations.camera, observations.track, observations.pixels, sigma)
+    seen = replace(observations, sigma=sigma)
     keep = np.zeros(len(seen), bool)
     for c in np.unique(seen.camera):
         mine = seen.camera == c

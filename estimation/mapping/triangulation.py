@@ -74,11 +74,8 @@ class TriangulatedMap:
 
 
 def triangulated_map(rig: Rig, seen: Observations) -> TriangulatedMap:
-    """The map of all landmarks that two cameras or more see alike, with the covariance that the pixels give.
-
-    The surface frame has its origin in the landmarks' middle and z out of the surface, as without a scan.
-    """
-    ids, point, count = np.unique(seen.track, return_inverse=True, return_counts=True)
+    """The map of landmarks that two cameras or more see alike, in a frame in their middle, z out of the surface."""
+    _, point, count = np.unique(seen.track, return_inverse=True, return_counts=True)
     several = count[point] > 1
     ids, point = np.unique(seen.track[several], return_inverse=True)
     camera, pixels, sigma = seen.camera[several], seen.pixels[several], seen.sigma[several]
@@ -87,11 +84,8 @@ def triangulated_map(rig: Rig, seen: Observations) -> TriangulatedMap:
     good = np.isfinite(points).all(1) & (off < MAX_RESIDUAL_SIGMAS**2)
     widest = np.zeros(len(ids))
     np.maximum.at(widest, point, sigma)
-    return _in_own_frame(rig, points[good], (covariance * widest[:, None, None] ** 2)[good], ids[good])
-
-
-def _in_own_frame(rig: Rig, points: Array, covariance: Array, tracks: Index) -> TriangulatedMap:
-    """The map in its own frame."""
+    points, covariance = points[good], (covariance * widest[:, None, None] ** 2)[good]
+    # in its own frame
     poses = np.stack([c.base_from_camera for c in rig.cameras])
     base_from_surface = surface_frame(points, poses[:, :3, 3].mean(0), poses[:, :3, 0].mean(0))
     turn = base_from_surface[:3, :3].T
@@ -100,16 +94,11 @@ def _in_own_frame(rig: Rig, points: Array, covariance: Array, tracks: Index) -> 
     joint[np.arange(len(own)), :, np.arange(len(own))] = turn @ covariance @ turn.T
     normals = local_normals(own, np.array([0.0, 0.0, 1.0]))
     whole = SurfaceMap(own, normals, joint.reshape(3 * len(own), -1))
-    return TriangulatedMap(whole, base_from_surface, tracks)
+    return TriangulatedMap(whole, base_from_surface, ids[good])
 
 
 def updated_by_looks(
-    surface_map: SurfaceMap,
-    track: Index,
-    residuals: Array,
-    jacobians: Array,
-    sigma: Array,
-    pose_covariance: Array,
+    surface_map: SurfaceMap, track: Index, residuals: Array, jacobians: Array, sigma: Array, pose_covariance: Array
 ) -> tuple[SurfaceMap, Mask]:
     """The map after a look at some of its landmarks from known poses, and which looks (M,) agree with it.
 
@@ -127,16 +116,10 @@ def updated_by_looks(
     noise = by_pose @ pose_covariance @ by_pose.T + np.diag(np.repeat(sigma**2, 2))
     across = surface_map.covariance @ design.T
     spread = design @ across + noise
-    agrees = _agreeing(residuals, spread)
+    own = np.einsum("minj->mnij", spread.reshape(looks, 2, looks, 2))[np.arange(looks), np.arange(looks)]
+    agrees = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(own), residuals) < MAX_LOOK_CHI2
     rows = np.repeat(agrees, 2)
     gain = np.linalg.solve(spread[np.ix_(rows, rows)], across[:, rows].T).T
     covariance = surface_map.covariance - gain @ across[:, rows].T
     points = surface_map.points - (gain @ residuals[agrees].ravel()).reshape(-1, 3)
     return SurfaceMap(points, surface_map.normals, (covariance + covariance.T) / 2), agrees
-
-
-def _agreeing(residuals: Array, spread: Array) -> Mask:
-    """Which residuals (M, 2) px their own covariance, blocks of `spread` (2M, 2M), explains."""
-    count = len(residuals)
-    own = np.einsum("minj->mnij", spread.reshape(count, 2, count, 2))[np.arange(count), np.arange(count)]
-    return np.asarray(np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(own), residuals) < MAX_LOOK_CHI2)

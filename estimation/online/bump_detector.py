@@ -1,4 +1,4 @@
-"""Whether a camera was bumped a little, or its lens turned: found in all of its tracks together, against the others.
+"""Small bumps of a camera and turned lenses, detected in all of its tracks together, against the other cameras.
 
 A single frame set hardly shows a bump of half a millimetre, and the pose absorbs a part of it. So four numbers are
 estimated for each camera: shift (2), roll and scale of its picture, with the pose marginalised. They are averaged over
@@ -29,20 +29,14 @@ MIN_CAMERA_TRACKS = 8  # of a camera, to estimate its four numbers
 MIN_OBSERVABLE_SHARE = 0.03  # of a number's information: where the pose leaves less of it, the number is held at zero
 LOOK_INTERVAL_S = 0.06  # every other frame set of 30 a second; all of them while a camera is bumped
 OUTLIER_PX = 6.0  # px beside the median of its camera at which a track counts for nothing
-
-
-@dataclass(frozen=True, slots=True)
-class BumpSettings:
-    """When a change is a bump."""
-
-    quick: float = 0.4  # s over which the change is averaged
-    usual: float = 20.0  # s over which the usual values are learned
-    warm: float = 3.0  # s of a run, and of a camera's pictures, before it is judged; half of it before it is compared
-    limit: float = 0.25  # px, root mean square over the tracks: the smallest bump,
-    spread: float = 5.0  # and at least so many times the usual change
-    sure: float = 1.2  # times what the next camera explains
-    lasts: float = 0.2  # s that it must last,
-    calm: float = 0.06  # and s that single looks must be below half the limit until it is over
+CHANGE_MEMORY_S = 0.4  # over which the change is averaged
+USUAL_MEMORY_S = 20.0  # over which the usual values are learned
+WARMUP_S = 3.0  # of a run, and of a camera's pictures, before it is judged; half of it before it is compared
+MIN_BUMP_PX = 0.25  # root mean square over the tracks: the smallest bump,
+USUAL_CHANGE_RATIO = 5.0  # and at least so many times the usual change
+NEXT_CAMERA_RATIO = 1.2  # times what the next camera explains
+BUMP_LASTS_S = 0.2  # that a change must last
+BUMP_OVER_S = 0.06  # that single looks must be below half the limit until it is over
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,58 +67,52 @@ class ReducedEquations:
 class BumpDetector:
     """Remembers of each camera the usual and the recent shift, roll and scale of its picture."""
 
-    def __init__(self, names: Sequence[str], settings: BumpSettings | None = None) -> None:
-        self.settings, self._names = settings or BumpSettings(), tuple(names)
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = tuple(names)
         self.begin()
 
     def begin(self) -> None:
         """Forget everything, as for a new map."""
         count = len(self._names)
         self.bumped: dict[int, str] = {}  # cameras, and the text about each
-        self._quick, self._usual = (
-            [ReducedEquations.nothing(PICTURE_DOF)] * count,
-            ReducedEquations.nothing(PICTURE_DOF * count),
-        )
+        self._quick = [ReducedEquations.nothing(PICTURE_DOF)] * count
+        self._usual = ReducedEquations.nothing(PICTURE_DOF * count)
         self._spread, self._looks = np.zeros(count), np.zeros(count)  # px^2, usual mean square change; looks taken
         self._since = np.full(count, np.nan)  # s, since when a camera looks bumped, or well again
         self._learned = np.zeros(count)  # s in which a camera's usual values were learned
         self._first, self._stamp, self._count = np.nan, np.nan, 0
-        self._odd: frozenset[int] = frozenset()
+        self._outliers: frozenset[int] = frozenset()
 
     @property
     def messages(self) -> dict[int, str]:
-        """Bumped cameras and a text about each, without those whose last look showed them where they stood.
-
-        Learning still waits until they have stood there for `calm`; the pose's state has a delay of its own.
-        """
+        """The texts of bumped cameras, without those that the last look showed in place (`bumped` keeps these)."""
         return {c: text for c, text in self.bumped.items() if np.isnan(self._since[c])}
 
     def update(
-        self, rig: Rig, seen: Observations, points: Array, exposed: Array, jacobians: Array, odd: frozenset[int]
+        self, rig: Rig, seen: Observations, points: Array, exposed: Array, jacobians: Array, outliers: frozenset[int]
     ) -> None:
         """Take an accepted frame set.
 
         points: (N, 3) mm, surface, of the tracks. exposed: (C, 4, 4) base_from_surface when each camera exposed.
-        jacobians: (N, 2, 6) px by the pose. odd: cameras so far off that the pose is without them; their change is
+        jacobians: (N, 2, 6) px by the pose. outliers: cameras so far off that the pose is without them; their change is
         forgotten once they are back.
         """
         if seen.stamp - self._stamp < LOOK_INTERVAL_S and not self.bumped:
             return
-        self._forget(self._odd - odd)
-        self._odd = odd
+        self._forget(self._outliers - outliers)
+        self._outliers = outliers
         parts = camera_equations(rig, seen, points, exposed, jacobians)
         if np.isnan(self._first):
             self._first = self._stamp = seen.stamp
         step, self._stamp = max(seen.stamp - self._stamp, 0.0), seen.stamp
         self._count += 1
-        warm = self.settings.warm
-        if young := seen.stamp - self._first < warm:
+        if young := seen.stamp - self._first < WARMUP_S:
             self._learn(parts, step, 1 / self._count)
         usual = self._usual.numbers().reshape(-1, PICTURE_DOF)
-        known = {c: part.without(usual[c]) for c, part in parts.items() if self._learned[c] + step >= warm / 2}
-        self._judge(known, step, [c for c in known if not young and self._learned[c] + step >= warm])
-        if not (young or self.bumped or odd):
-            self._learn(parts, step, min(1.0, step / self.settings.usual))
+        known = {c: part.without(usual[c]) for c, part in parts.items() if self._learned[c] + step >= WARMUP_S / 2}
+        self._judge(known, step, [c for c in known if not young and self._learned[c] + step >= WARMUP_S])
+        if not (young or self.bumped or outliers):
+            self._learn(parts, step, min(1.0, step / USUAL_MEMORY_S))
 
     def _learn(self, parts: dict[int, CameraEquations], step: float, share: float) -> None:
         """Mix what the cameras show into the usual values."""
@@ -133,24 +121,24 @@ class BumpDetector:
 
     def _judge(self, parts: dict[int, CameraEquations], step: float, ripe: Collection[int]) -> None:
         """Update each camera's recent change, and decide on the `ripe` ones: those known for long enough."""
-        steady, now = parts.keys() - self.bumped.keys() - self._odd, {}
+        steady, now = parts.keys() - self.bumped.keys() - self._outliers, {}
         for camera in parts:
             reduced = reduced_alone(parts, camera, steady)
-            self._quick[camera] = self._quick[camera].mixed(reduced, min(1.0, step / self.settings.quick))
+            self._quick[camera] = self._quick[camera].mixed(reduced, min(1.0, step / CHANGE_MEMORY_S))
             now[camera] = parts[camera].moved(reduced.numbers())
         changes = {c: self._quick[c].numbers() for c in parts}
         moved = {c: parts[c].moved(v) for c, v in changes.items()}
         gains = {c: float(v @ self._quick[c].pull) for c, v in changes.items()}
         for camera in ripe:
             others = [g for c, g in gains.items() if c != camera and c not in self.bumped]
-            clear = gains[camera] > self.settings.sure * max(others, default=0.0)
+            clear = gains[camera] > NEXT_CAMERA_RATIO * max(others, default=0.0)
             self._decide(camera, now[camera] if camera in self.bumped else moved[camera], clear)
             if camera in self.bumped:
                 self.bumped[camera] = _bump_text(changes[camera], parts[camera], moved[camera])
         if not self.bumped:
             for camera in parts:
                 self._looks[camera] += 1
-                share = min(1.0, step / self.settings.usual) if camera in ripe else 1 / self._looks[camera]
+                share = min(1.0, step / USUAL_MEMORY_S) if camera in ripe else 1 / self._looks[camera]
                 self._spread[camera] += share * (moved[camera] ** 2 - self._spread[camera])
 
     def _forget(self, cameras: frozenset[int]) -> None:
@@ -162,17 +150,17 @@ class BumpDetector:
 
     def _decide(self, camera: int, moved: float, clear: bool) -> None:
         """Whether a camera counts as bumped from now on. moved: px. clear: whether it explains more than the others."""
-        s, known = self.settings, camera in self.bumped
-        limit = max(s.limit, s.spread * float(np.sqrt(self._spread[camera])))
+        known = camera in self.bumped
+        limit = max(MIN_BUMP_PX, USUAL_CHANGE_RATIO * float(np.sqrt(self._spread[camera])))
         off = moved > limit / 2 if known else moved > limit and clear
         if off == known:
             self._since[camera] = np.nan
         elif np.isnan(self._since[camera]):
             self._since[camera] = self._stamp
         lasted = self._stamp - self._since[camera]  # nan where nothing changes
-        if off and not known and lasted >= s.lasts:
+        if off and not known and lasted >= BUMP_LASTS_S:
             self.bumped[camera] = ""
-        elif known and not off and lasted >= s.calm:
+        elif known and not off and lasted >= BUMP_OVER_S:
             self._forget(frozenset([camera]))
 
 
@@ -220,8 +208,8 @@ def camera_equations(
 def reduced_alone(parts: dict[int, CameraEquations], camera: int, others: Collection[int]) -> ReducedEquations:
     """The equations of this camera's numbers, with the pose determined by it and by these others."""
     mine = parts[camera]
-    taken = _pose_share([mine, *(p for c, p in parts.items() if c in others and c != camera)], mine.cross)
-    return ReducedEquations(mine.own - mine.cross @ taken[:, :-1], mine.pull - mine.cross @ taken[:, -1], mine.own)
+    share = _pose_share([mine, *(p for c, p in parts.items() if c in others and c != camera)], mine.cross)
+    return ReducedEquations(mine.own - mine.cross @ share[:, :-1], mine.pull - mine.cross @ share[:, -1], mine.own)
 
 
 def reduced_together(parts: dict[int, CameraEquations], count: int) -> ReducedEquations:
@@ -231,8 +219,8 @@ def reduced_together(parts: dict[int, CameraEquations], count: int) -> ReducedEq
     for camera, part in parts.items():
         at = slice(PICTURE_DOF * camera, PICTURE_DOF * (camera + 1))
         fixed[at, at], cross[at], pull[at] = part.own, part.cross, part.pull
-    taken = _pose_share(list(parts.values()), cross)
-    return ReducedEquations(fixed - cross @ taken[:, :-1], pull - cross @ taken[:, -1], fixed)
+    share = _pose_share(list(parts.values()), cross)
+    return ReducedEquations(fixed - cross @ share[:, :-1], pull - cross @ share[:, -1], fixed)
 
 
 def _pose_share(parts: Sequence[CameraEquations], cross: Array) -> Array:
@@ -252,9 +240,6 @@ def _picture_jacobian(rig: Rig, camera: int, pixels: Array) -> Array:
 
 
 def _bump_text(change: Array, part: CameraEquations, moved: float) -> str:
-    by_scale = float(np.sqrt(np.mean(((part.slopes[..., 3] * change[3]) ** 2).sum(-1))))
-    rest = np.append(change[:3], 0.0)
-    by_rest = float(np.sqrt(np.mean(((part.slopes @ rest) ** 2).sum(-1))))
-    if by_scale > by_rest:
+    if part.moved(change * [0, 0, 0, 1]) > part.moved(change * [1, 1, 1, 0]):  # by scale more than by shift and roll
         return f"shows all {100 * abs(change[3]):.1f} % {'larger' if change[3] > 0 else 'smaller'}: its lens was turned"
     return f"was bumped: its picture stands {moved:.1f} px off where it stood"

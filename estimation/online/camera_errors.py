@@ -13,7 +13,7 @@ correcting it would carry the pose away from the map (measured: 0.04 mm on a sur
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -45,7 +45,7 @@ class VarianceEstimate:
     PRIOR_VALUES, RECENT = 3.0, 100  # values that the initial belief is worth; known values over which it is forgotten
 
     def __init__(self, first: float, least: float, clearest: float) -> None:
-        """All one standard deviation. first: believed at first. least: the smallest. clearest: never known better."""
+        """All one sigma: first, the initial belief; least, the smallest; clearest, no value is known better."""
         self._unit, self._least, self._clearest = first**2, least**2, clearest**2
         self._weight = self.PRIOR_VALUES  # one value known exactly, against a variance of `first`, weighs 1
         self._sum = self.PRIOR_VALUES * self._unit  # weighted, of d^2 - e
@@ -68,11 +68,11 @@ class VarianceEstimate:
 class CameraErrors:
     """Offsets and shifts of all cameras, with their joint covariance."""
 
-    OFFSET, SHIFT = 0.01, 0.5  # s and px, one standard deviation at first: webcams, and a usual calibration
+    INITIAL_OFFSET_S, INITIAL_SHIFT_PX = 0.01, 0.5  # one sigma: webcams, and a usual calibration
     CHANCE_CHI2, CERTAIN_CHI2 = 2.0, 8.0  # mean squared sigmas at which chance explains the offsets, or does not
-    WANDER = 2e-5, 5e-3  # s and px per root second: quartz differs by 50 ppm at most; lenses warm up
-    CAREFUL = 3.0  # unmodelled errors are alike in frame after frame, so each counts so much less for what stays
-    CLEAR = 0.8  # of the squared velocity: where more of it is noise, nothing is learned of delays
+    DRIFT_RATE = 2e-5, 5e-3  # s and px per root second: quartz differs by 50 ppm at most; lenses warm up
+    INFORMATION_DIVISOR = 3.0  # unmodelled errors repeat from frame to frame: each fit counts so much less
+    MIN_SIGNAL_SHARE = 0.8  # of the squared velocity: where more of it is noise, nothing is learned of delays
     MAX_DELAY = 0.1  # s: a longer one is a wrong pose
 
     def __init__(self, cameras: int) -> None:
@@ -80,20 +80,14 @@ class CameraErrors:
         self._free = np.eye(3 * n)  # takes out what all clocks have in common
         self._free[:n, :n] -= 1 / n
         self._mean = np.zeros(3 * n)  # delays s, shifts right px, shifts down px
-        start = np.diag(np.repeat([self.OFFSET**2, self.SHIFT**2, self.SHIFT**2], n))
+        start = np.diag(np.repeat([self.INITIAL_OFFSET_S**2, self.INITIAL_SHIFT_PX**2, self.INITIAL_SHIFT_PX**2], n))
         self._covariance = self._free @ start @ self._free
-        self._offset = np.zeros(n)
-        self._delays: Delays | None = None  # as of the last `learn`; read many times a frame set
+        # (C,) s, how much later than stamped each camera exposes; zero until offsets are clear: many cameras are
+        # triggered together, and a correction by chance would only move the pose about
+        self.offset = np.zeros(n)
         self._jitter = VarianceEstimate(0.005, 3e-4, 1e-3)  # s: USB cameras; no stamp is better
         self._unrest = VarianceEstimate(0.05, 0.005, 0.01)  # px, of a camera's shift from frame to frame
-
-    @property
-    def offset(self) -> Array:
-        """How much later than stamped each camera exposes (C,), s; zero until offsets are clearly there.
-
-        Many cameras are triggered together, and correcting by chance would only move the pose about.
-        """
-        return self._offset
+        self.delays = self._expected_delays()  # of the next frame set
 
     @property
     def offset_sigma(self) -> Array:
@@ -105,13 +99,9 @@ class CameraErrors:
         """Shift of each camera's image from where it should be (C, 2), px, without what the pose explains."""
         return self._mean[self._count :].reshape(2, -1).T.copy()
 
-    @property
-    def delays(self) -> Delays:
-        """What is expected of the next frame set."""
-        if self._delays is None:
-            n = self._count
-            self._delays = Delays(self.offset, self._covariance[:n, :n] + self._jitter.value * np.eye(n))
-        return self._delays
+    def _expected_delays(self) -> Delays:
+        n = self._count
+        return Delays(self.offset, self._covariance[:n, :n] + self._jitter.value * np.eye(n))
 
     @property
     def unrest(self) -> float:
@@ -127,40 +117,34 @@ class CameraErrors:
         """Shared errors that the next fit has to expect beyond `offset`, at a velocity (6,)."""
         return SharedErrors(twist, self.delays.covariance, np.full(self._count, self.unrest))
 
-    def learn(self, fit: SharedFit, seconds: float, clear: float = 1.0) -> None:
+    def learn(self, fit: SharedFit, seconds: float, signal_share: float = 1.0) -> None:
         """Take a fit's shared errors, beyond the offsets that it was corrected by, `seconds` after the last one.
 
-        clear: the part of the squared velocity that is not its own noise. Noise in a regressor makes the slope too
-        small (errors in variables; Fuller 1987, 1.1), so delays are learned only where there is little of it.
+        signal_share: the part of the squared velocity that is not its own noise. Noise in a regressor makes the slope
+        too small (errors in variables; Fuller 1987, 1.1), so delays are learned only where there is little of it.
         """
-        fit = self._beyond_mean(fit, clear)
         n, eye = self._count, np.eye(3 * self._count)
-        wander = np.repeat(self.WANDER, [n, 2 * n]) ** 2 * seconds
-        self._covariance = self._covariance + self._free * wander
+        # about the known shifts and offsets; without information on delays where the velocity is not clear
+        information, pull = fit.information.copy(), fit.pull.copy()
+        pull -= information[:, n:] @ self._mean[n:] + information[:, :n] @ (self._mean[:n] - self.offset)
+        if signal_share < self.MIN_SIGNAL_SHARE:
+            information[:n] = information[:, :n] = pull[:n] = 0.0
+        fit = SharedFit(information, pull)
+        drift = np.repeat(self.DRIFT_RATE, [n, 2 * n]) ** 2 * seconds
+        self._covariance = self._covariance + self._free * drift
         self._learn_variances(fit)
         # Kalman update in information form; the jitter and unrest of this frame set blur what stays
         new = np.repeat([self._jitter.value, self._unrest.value], [n, 2 * n])
         blurred = np.linalg.inv(eye + new[:, None] * fit.information)
-        information = fit.information @ blurred / self.CAREFUL
+        information = fit.information @ blurred / self.INFORMATION_DIVISOR
         gain = self._covariance @ np.linalg.inv(eye + information @ self._covariance)
-        self._mean = self._free @ (self._mean + gain @ (blurred.T @ fit.pull) / self.CAREFUL)
+        self._mean = self._free @ (self._mean + gain @ (blurred.T @ fit.pull) / self.INFORMATION_DIVISOR)
         self._covariance = self._free @ ((gain + gain.T) / 2) @ self._free
-        self._offset, self._delays = self._clear_offset(), None
-
-    def _clear_offset(self) -> Array:
-        """The offsets (C,), s, as far as chance does not explain them."""
-        n = self._count
+        # the offsets as far as chance does not explain them
         mean, known = self._mean[:n], np.linalg.pinv(self._covariance[:n, :n], hermitian=True)
         apart = float(mean @ known @ mean) / max(1, n - 1)
-        return mean * min(1.0, max(0.0, (apart - self.CHANCE_CHI2) / (self.CERTAIN_CHI2 - self.CHANCE_CHI2)))
-
-    def _beyond_mean(self, fit: SharedFit, clear: float) -> SharedFit:
-        """A fit about the known shifts and offsets; without information on delays where the velocity is not clear."""
-        n, information, pull = self._count, fit.information.copy(), fit.pull.copy()
-        pull -= information[:, n:] @ self._mean[n:] + information[:, :n] @ (self._mean[:n] - self.offset)
-        if clear < self.CLEAR:
-            information[:n] = information[:, :n] = pull[:n] = 0.0
-        return replace(fit, information=information, pull=pull)
+        self.offset = mean * min(1.0, max(0.0, (apart - self.CHANCE_CHI2) / (self.CERTAIN_CHI2 - self.CHANCE_CHI2)))
+        self.delays = self._expected_delays()
 
     def _learn_variances(self, fit: SharedFit) -> None:
         n = self._count
@@ -191,7 +175,7 @@ class CameraErrors:
 
 
 class CameraErrorHistory:
-    """What was known of the cameras some seconds ago: a deformation that begins is first taken for late cameras."""
+    """Camera errors as known some seconds ago: a deformation that begins is first taken for late cameras."""
 
     INTERVAL_S = 2.0  # a deformation is seen within one
 
@@ -199,11 +183,11 @@ class CameraErrorHistory:
         self._before, self._last, self._stamp = copy.deepcopy(cameras), copy.deepcopy(cameras), -np.inf
 
     def keep(self, stamp: float, cameras: CameraErrors) -> None:
-        """Remember it as it is at `stamp`, s, from time to time."""
+        """Take the errors as known at `stamp`, s, every INTERVAL_S."""
         if stamp - self._stamp >= self.INTERVAL_S:
             self._before, self._last, self._stamp = self._last, copy.deepcopy(cameras), stamp
 
     @property
     def before(self) -> CameraErrors:
-        """What was known INTERVAL_S ago or earlier."""
+        """As known INTERVAL_S ago or earlier."""
         return copy.deepcopy(self._before)

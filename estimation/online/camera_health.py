@@ -1,4 +1,4 @@
-"""Which cameras can be relied on: those that deliver nothing new, see nothing, or disagree with the others are named.
+"""Health of the cameras: which deliver nothing new, see nothing, or disagree with the others, and outliers among them.
 
 Single wrong tracks are rejected one by one. A camera that was bumped, swapped or frozen is wrong in all of its tracks
 at once, and they agree with each other. So cameras are left out in turn: the outlier is the camera without which the
@@ -27,29 +27,23 @@ MAX_OUTLIERS = 2  # cameras that may be wrong at once: exchanged cables
 MIN_DISORDER_PX = 1.5  # median residual; below, it is not asked how much of it a camera's own motion explains
 RAYLEIGH_MEDIAN = 1.18  # median length of a vector whose two entries are normal, in their sigmas
 MAX_MOTION_SIGMAS = 3.0  # beyond, a pose contradicts the motion; also by how much an outlier must be the clearest
-
-
-@dataclass(frozen=True, slots=True)
-class HealthSettings:
-    """Thresholds: `out_ratio` ends a camera's part in the pose, `back_ratio` begins it."""
-
-    min_shift: float = 0.25  # px by which lens, map and extrinsics may move all tracks of a camera, at least
-    memory: float = 2.0  # s over which it is learned what is usual for a camera
-    out_ratio: float = 4.0  # of the allowed offset: cameras that stand farther off are left out
-    back_ratio: float = 2.0  # and come back below this,
-    back_looks: int = 2  # in so many frame sets one after the other
-    max_gap: float = 0.08  # s, and also two frame sets, that a camera may miss: drivers drop frames every day
-    leave_share: float = 0.3  # of the tracks a camera usually has: with fewer it is missed
-    least_share: float = 0.15  # where no camera has as many, the few may be what covers the rest: no measurement
-    whole_share: float = 0.8  # of all its usual tracks: of a blurred picture half of them are found
-    enter_share: float = 1.5  # times what is asked of a camera that counts is asked of one that is to count again
+MIN_SHIFT_PX = 0.25  # by which lens, map and extrinsics may move all tracks of a camera, at least
+USUAL_MEMORY_S = 2.0  # over which it is learned what is usual for a camera
+OUTLIER_RATIO = 4.0  # of the allowed offset: cameras that stand farther off are left out
+READMIT_RATIO = 2.0  # and come back below this,
+READMIT_SETS = 2  # in so many frame sets one after the other
+MAX_GAP_S = 0.08  # and also two frame sets, that a camera may miss: drivers drop frames every day
+MIN_USUAL_SHARE = 0.3  # of the tracks a camera usually has: with fewer it is missed
+HIDDEN_SHARE = 0.15  # where no camera has as many, the few may be what covers the rest: no measurement
+SHARP_SHARE = 0.8  # of all its usual tracks: of a blurred picture half of them are found
+RETURN_RATIO = 1.5  # times what is asked of a camera that counts is asked of one that is to count again
 
 
 class CameraHealth:
-    """Remembers, per camera, when it last carried the pose and whether it is left out."""
+    """Remembers of each camera when it last carried the pose and whether it is left out as an outlier."""
 
-    def __init__(self, names: Sequence[str], settings: HealthSettings | None = None) -> None:
-        self.settings, self._names = settings or HealthSettings(), tuple(names)
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = tuple(names)
         self.bumps = BumpDetector(names)
         self._fresh = frozenset(range(len(self._names)))  # cameras with a new picture; all until `set_pictures`
         self._repeated: frozenset[int] = frozenset()
@@ -61,7 +55,7 @@ class CameraHealth:
         self.bumps.begin()
         self.left_out: frozenset[int] = frozenset()
         self._usual, self._tracks = np.zeros(count), np.zeros(count)  # px off, and tracks
-        self._off = np.zeros(count)  # px, how far a camera that is left out stands off
+        self._offsets = np.zeros(count)  # px, how far a camera that is left out stands off
         self._carried = np.full(count, np.nan)  # s, stamp; nan: never
         self._missed = np.zeros(count, np.int64)  # frame sets in a row
         self._agreed = np.zeros(count, np.int64)
@@ -75,75 +69,71 @@ class CameraHealth:
 
     def allowed(self, moved: Array) -> Array:
         """How far each camera may stand off, px, one sigma (C,). moved: (C,) px between the cameras' instants."""
-        return np.asarray(np.hypot(np.maximum(self._usual, self.settings.min_shift), moved))
+        return np.asarray(np.hypot(np.maximum(self._usual, MIN_SHIFT_PX), moved))
 
     def hidden(self, used: Index) -> bool:
         """Whether every camera shows so much less than usual that these (C,) tracks prove nothing."""
-        return bool((used < self.settings.least_share * self._tracks)[self._tracks > 0].all() and self._tracks.any())
+        return bool((used < HIDDEN_SHARE * self._tracks)[self._tracks > 0].all() and self._tracks.any())
 
-    def readmit_all(self) -> None:
-        """No camera is left out any more."""
-        self.left_out = frozenset()
-
-    def clear(self, used: Index) -> bool:
+    def has_usual_tracks(self, used: Index) -> bool:
         """Whether two cameras, or all that there are, carry a pose with these (C,) tracks about as they usually do."""
         known = self._tracks > 0
-        clear = (used >= self.settings.leave_share * self._tracks) & known
+        clear = (used >= MIN_USUAL_SHARE * self._tracks) & known
         return int(clear.sum()) >= min(2, int(known.sum()))
 
-    def blur_offsets(self, off: Array, allowed: Array, odd: Collection[int]) -> Array:
+    def blur_offsets(self, offsets: Array, allowed: Array, outliers: Collection[int]) -> Array:
         """How far, px, each camera (C,) stands off where all stand off together; else zeros.
 
         Blurred or covered images match at random near where they were searched, so no camera is the outlier and the
-        number of tracks shows no error. off, allowed: (C,) px, nan in `off` where nothing is seen. odd: left out.
+        number of tracks shows no error. offsets, allowed: (C,) px, nan in `offsets` where nothing is seen.
         """
-        seen = np.isfinite(off) & ~np.isin(np.arange(len(off)), list(odd))
-        together = bool(seen.any() and (off > self.settings.back_ratio * allowed)[seen].all())
-        return np.where(seen & together, off, 0.0)
+        seen = np.isfinite(offsets) & ~np.isin(np.arange(len(offsets)), list(outliers))
+        together = bool(seen.any() and (offsets > READMIT_RATIO * allowed)[seen].all())
+        return np.where(seen & together, offsets, 0.0)
 
-    def blurred(self, used: Index, off: Array, allowed: Array, odd: Collection[int]) -> bool:
+    def blurred(self, used: Index, offsets: Array, allowed: Array, outliers: Collection[int]) -> bool:
         """Whether all cameras stand off together, with fewer tracks than usual: a surface that bends keeps its tracks.
 
         used: (C,) tracks that carry the pose. The rest as for `blur_offsets`.
         """
-        fewer = used.sum() < self.settings.whole_share * self._tracks.sum()
-        return bool(fewer and self.blur_offsets(off, allowed, odd).any())
+        fewer = used.sum() < SHARP_SHARE * self._tracks.sum()
+        return bool(fewer and self.blur_offsets(offsets, allowed, outliers).any())
 
-    def update(self, stamp: float, used: Index, least: float, off: Array, allowed: Array, odd: Collection[int]) -> None:
+    def update(
+        self, stamp: float, used: Index, least: float, offsets: Array, allowed: Array, outliers: Collection[int]
+    ) -> None:
         """Take a frame set.
 
         used: (C,) tracks that carry the pose, zero where nothing was measured. least: tracks below which a camera says
-        nothing. off: (C,) px of each from the pose of the others, nan where unseen. allowed: as `allowed` gives. odd:
-        cameras that were left out of this pose.
+        nothing. offsets: (C,) px of each from the pose of the others, nan where unseen. allowed: as `allowed` gives.
+        outliers: cameras that were left out of this pose.
         """
-        required = np.maximum(least, self.settings.leave_share * self._tracks)
-        carrying = used >= required * np.where(self._missed > 0, self.settings.enter_share, 1.0)
+        required = np.maximum(least, MIN_USUAL_SHARE * self._tracks)
+        carrying = used >= required * np.where(self._missed > 0, RETURN_RATIO, 1.0)
         self._missed = np.where(carrying, 0, self._missed + 1)
         self._carried[carrying] = stamp
         # running means of offset and tracks, of the cameras that carry the pose
-        share = min(1.0, (stamp - self._stamp) / self.settings.memory) if np.isfinite(self._stamp) else 1.0
+        share = min(1.0, (stamp - self._stamp) / USUAL_MEMORY_S) if np.isfinite(self._stamp) else 1.0
         self._stamp = stamp
-        known = carrying & np.isfinite(off)
-        self._usual[known] += share * (np.minimum(off, 2 * allowed)[known] - self._usual[known])
+        known = carrying & np.isfinite(offsets)
+        self._usual[known] += share * (np.minimum(offsets, 2 * allowed)[known] - self._usual[known])
         self._tracks[carrying] += share * (used[carrying] - self._tracks[carrying])
         # which cameras stay left out
-        agrees = off < self.settings.back_ratio * allowed  # false where unknown
+        agrees = offsets < READMIT_RATIO * allowed  # false where unknown
         self._agreed = np.where(agrees, self._agreed + 1, 0)
-        self._apart = off > self.settings.out_ratio * allowed
-        self._blurred = bool(self.blur_offsets(off, allowed, odd).any())
-        self._off = np.where(np.isfinite(off), off, self._off)
-        self.left_out = frozenset(c for c in odd if self._agreed[c] < self.settings.back_looks)
+        self._apart = offsets > OUTLIER_RATIO * allowed
+        self._blurred = bool(self.blur_offsets(offsets, allowed, outliers).any())
+        self._offsets = np.where(np.isfinite(offsets), offsets, self._offsets)
+        self.left_out = frozenset(c for c in outliers if self._agreed[c] < READMIT_SETS)
 
     def trouble(self, stamp: float, at_once: bool = False) -> str:
         """Which cameras are missed, or that all look odd, and why; or ''. at_once: also those that only just failed."""
-        reasons = [f"{self._names[c]} {self._why(c)}" for c in self._troubled(stamp, at_once)]
-        return ", ".join(reasons or ["no camera shows the surface as usual"] * self._blurred)
-
-    def _troubled(self, stamp: float, at_once: bool) -> list[int]:
-        late = (self._missed >= 2) & (stamp - self._carried > self.settings.max_gap)
+        late = (self._missed >= 2) & (stamp - self._carried > MAX_GAP_S)
         named = (self._missed > 0) & np.isfinite(self._carried) & (late | at_once)
         off = self.left_out | self.bumps.messages.keys()
-        return [c for c in range(len(self._names)) if named[c] or c in off or self._apart[c]]
+        troubled = (c for c in range(len(self._names)) if named[c] or c in off or self._apart[c])
+        reasons = [f"{self._names[c]} {self._why(c)}" for c in troubled]
+        return ", ".join(reasons or ["no camera shows the surface as usual"] * self._blurred)
 
     def _why(self, camera: int) -> str:
         if camera in self._repeated:
@@ -153,7 +143,7 @@ class CameraHealth:
         if camera in self.bumps.messages:
             return self.bumps.messages[camera]
         if camera in self.left_out or self._apart[camera]:
-            return f"stands {self._off[camera]:.1f} px off the others"
+            return f"stands {self._offsets[camera]:.1f} px off the others"
         return "hardly sees the surface"
 
 
@@ -180,10 +170,7 @@ class FrameTracks:
         return PoseFit(fit.base_from_surface, fit.information, residuals, weights, jacobians, fit.scale, fit.shared)
 
     def offsets(self, fit: PoseFit) -> Array:
-        """How far, px, each camera stands off a pose: (C,), nan with fewer tracks than `min_tracks`.
-
-        That is the median of its tracks' residuals, less what their noise alone makes of it.
-        """
+        """Offsets (C,) px of the cameras from a pose: median residual less its noise, nan below `min_tracks` tracks."""
         away = np.linalg.norm(fit.residuals, axis=1)
         off = np.full(len(self.rig), np.nan)
         for c in range(len(self.rig)):
@@ -204,12 +191,12 @@ class FrameTracks:
         present = [int(c) for c in np.unique(self.seen.camera) if c not in left_out]
         for size in range(1, min(MAX_OUTLIERS, len(present) - stay) + 1):
             fits: list[tuple[float, frozenset[int], PoseFit]] = []
-            for odd in combinations(present, size):
-                without = frozenset(left_out) | set(odd)
+            for outliers in combinations(present, size):
+                without = frozenset(left_out) | set(outliers)
                 fit = self.fit(expected.base_from_surface, (4.0, 1.0), without)
                 apart = self.offsets(fit) / allowed
-                others = [apart[c] for c in present if c not in odd and np.isfinite(apart[c])]
-                if others and max(others) <= 1.0 and all(apart[c] > 1.0 for c in odd):
+                others = [apart[c] for c in present if c not in outliers and np.isfinite(apart[c])]
+                if others and max(others) <= 1.0 and all(apart[c] > 1.0 for c in outliers):
                     fits.append((motion_sigmas(fit, expected), without, fit))
             fits.sort(key=lambda one: one[0])
             if fits:
@@ -217,18 +204,18 @@ class FrameTracks:
                 return fits[0][1:] if sure and fits[0][0] <= within else None
         return None
 
-    def weak_fit_reason(self, fit: PoseFit, odd: Collection[int], torn: bool, expected: SurfacePose) -> str:
+    def weak_fit_reason(self, fit: PoseFit, outliers: Collection[int], torn: bool, expected: SurfacePose) -> str:
         """What speaks against a fit that stands on little, or ''.
 
-        odd: cameras that are left out. torn: whether few tracks are left, and even they stand off. Of a covered surface
-        a tenth of the landmarks is matched by chance, anywhere within the search. The covariance of such tracks is so
-        wide that no motion contradicts it: accepted as a pose, they set it 3.7 mm off, and its prediction 16 mm.
+        outliers: cameras that are left out. torn: whether few tracks are left, and even they stand off. Of a covered
+        surface a tenth of the landmarks is matched by chance, anywhere within the search. The covariance of such tracks
+        is so wide that no motion contradicts it: accepted as a pose, they set it 3.7 mm off, and its prediction 16 mm.
         """
         if torn:
             return "few tracks, against each other"
-        if not odd:
+        if not outliers:
             return ""
-        out = np.isin(np.unique(self.seen.camera), list(odd))
+        out = np.isin(np.unique(self.seen.camera), list(outliers))
         alone = bool(out.any() and (~out).sum() == 1)
         if not alone or expected.state is TrackState.LOST or motion_sigmas(fit, expected) <= MAX_MOTION_SIGMAS:
             return ""

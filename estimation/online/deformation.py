@@ -77,7 +77,9 @@ def modes_from_map(surface_map: SurfaceMap) -> WarpModes:
     known = np.diag(surface_map.covariance).reshape(-1, 3).mean(1)
     weights = 1 / np.maximum(known, WELL_KNOWN_MM**2)
     weights = weights / weights.sum()
-    control = _control_points(points, weights)
+    best = points[weights >= np.median(weights)]  # the half that is known best
+    first = int(np.argmin(np.linalg.norm(best - weights @ points, axis=1)))
+    control = best[farthest_points(best, first, min(CONTROL_POINTS, len(best)))]
     apart = np.linalg.norm(control[:, None] - control, axis=-1) + np.diag(np.full(len(control), np.inf))
     reach = BELL_OVERLAP * float(apart.min(1).mean())
     own = bells(control, control, reach) + BELL_JITTER * np.eye(len(control))
@@ -99,13 +101,6 @@ def _displacements(points: Array, control: Array, reach: float, fields: Array) -
     return np.asarray((np.kron(bells(points, control, reach), np.eye(3)) @ fields).reshape(len(points), 3, -1))
 
 
-def _control_points(points: Array, weights: Array) -> Array:
-    """Up to CONTROL_POINTS points (K, 3), far from each other, of the half that is known best."""
-    known = points[weights >= np.median(weights)]
-    first = int(np.argmin(np.linalg.norm(known - weights @ points, axis=1)))
-    return np.asarray(known[farthest_points(known, first, min(CONTROL_POINTS, len(known)))])
-
-
 class WarpFilter:
     """Follows the deformation of one surface."""
 
@@ -119,34 +114,16 @@ class WarpFilter:
         if self._modes is not None:
             self._covariance[count:, count:] = _map_mode_covariance(self._modes, surface_map)
         self._stamp: float | None = None
-        self._rate, self._doubt = (
-            0.0,
-            0.0,
-        )  # liveliness of the last second, mm^2/s, signed, and the variance of one look at it
-        self._liveliness = self._liveliest = 0.0
-        self._warp: Warp | None = None
-
-    @property
-    def warp(self) -> Warp | None:
-        """The deformation at the last frame set; None while there is none."""
-        return self._warp
-
-    @property
-    def liveliness(self) -> float:
-        """How fast the square of the deformation grows by itself, mm^2/s; 0 on a rigid surface.
-
-        A chest rests after each breath and is as lively in the next one: only over some breaths is it forgotten.
-        """
-        return self._liveliness
-
-    @property
-    def _clear(self) -> float:
-        """The liveliness of the last second, 0 where chance explains it."""
-        return self._rate if self._rate > CHANCE_SIGMAS * float(np.sqrt(self._doubt)) else 0.0
+        # liveliness of the last second, mm^2/s, signed, and the variance of one look at it
+        self._rate = self._rate_variance = 0.0
+        # how fast the square of the deformation grows by itself, mm^2/s; 0 on a rigid surface. A chest rests after each
+        # breath and is as lively in the next one: only over some breaths is it forgotten
+        self.liveliness = self._liveliest = 0.0
+        self.warp: Warp | None = None  # the deformation at the last frame set; None while there is none
 
     def points(self, surface_map: SurfaceMap) -> Array:
         """The landmarks (N, 3) mm, surface frame, where the deformation puts them."""
-        if self._warp is None or self._modes is None:
+        if self.warp is None or self._modes is None:
             return surface_map.points
         return np.asarray(surface_map.points + self._modes.landmarks @ self._state[: len(self._modes.share)])
 
@@ -155,7 +132,7 @@ class WarpFilter:
 
         track: (N,) rows of the map. weighted: (N, 2, 6) Jacobians times weights. by_point: (N, 2, 3) px per mm.
         """
-        if self._warp is None or self._modes is None:
+        if self.warp is None or self._modes is None:
             return np.zeros((6, 6))
         count = len(self._modes.share)
         moved = by_point @ self._modes.landmarks[track]  # (N, 2, M)
@@ -171,21 +148,15 @@ class WarpFilter:
             count, before = len(self._modes.share), len(self._points)
             change = self._modes.modes_of(surface_map.points[:before] - self._points)
             if right:
-                self._set_map_error(change, _map_mode_covariance(self._modes, surface_map))
+                # the map's error was `change`; the sum of both vectors was observed, so the rest was deformation
+                total = self._state[:count] + self._state[count:]
+                spread, rest = _sum_covariance(self._covariance, count), _map_mode_covariance(self._modes, surface_map)
+                self._state = np.concatenate([total - change, change])
+                self._covariance = np.block([[spread + rest, -rest], [-rest, rest]])
             self._state[count:] -= change
             if len(surface_map) > before:
                 self._modes = self._modes.extended(surface_map.points[before:])
         self._points = surface_map.points
-
-    def _set_map_error(self, error: Array, doubt: Array) -> None:
-        """The map's error was `error` (M,), and what is left of it is known to `doubt` (M, M).
-
-        The sum of both vectors is what was observed, so the rest of it was deformation.
-        """
-        count = len(error)
-        total, spread = self._state[:count] + self._state[count:], _sum_covariance(self._covariance, count)
-        self._state = np.concatenate([total - error, error])
-        self._covariance = np.block([[spread + doubt, -doubt], [-doubt, doubt]])
 
     def learn(self, observations: Observations, fit: PoseFit, sigma: Array, twist: Array, skew: float) -> None:
         """Take the residuals of a fit to `points`. sigma: (N,) px.
@@ -198,10 +169,15 @@ class WarpFilter:
             return
         information, gradient = _mode_evidence(self._modes, observations, fit, sigma, twist, skew, self._state)
         self._predict(dt, information, gradient)
-        self._update(information, gradient)
+        # Kalman update by information and gradient on the sum of both vectors, about the predicted one
         count = len(self._modes.share)
-        if self.liveliness > 0 or self._warp is not None:
-            self._warp = self._modes.warp(self._state[:count], self._covariance[:count, :count], self.liveliness)
+        across = self._covariance[:, :count] + self._covariance[:, count:]  # (2M, M)
+        gain = across @ np.linalg.inv(np.eye(count) + information @ _sum_covariance(self._covariance, count))
+        self._state = self._state + gain @ gradient
+        covariance = self._covariance - gain @ information @ across.T
+        self._covariance = (covariance + covariance.T) / 2
+        if self.liveliness > 0 or self.warp is not None:
+            self.warp = self._modes.warp(self._state[:count], self._covariance[:count, :count], self.liveliness)
 
     def _predict(self, dt: float, information: Array, gradient: Array) -> None:
         """Let the deformation wander for dt s, with the liveliness learned from this frame set too."""
@@ -217,31 +193,22 @@ class WarpFilter:
         if looks > 0:
             rate = (float(gradient @ (share * gradient)) - expected) / (looks * dt)
             self._rate += recent * (rate - self._rate)
-            self._doubt = recent / (looks * dt**2)
-            now = max(self._clear, self._liveliness * float(np.exp(-dt / DECAY_S)))
+            self._rate_variance = recent / (looks * dt**2)
+            clear = self._rate if self._rate > CHANCE_SIGMAS * float(np.sqrt(self._rate_variance)) else 0.0
+            now = max(clear, self.liveliness * float(np.exp(-dt / DECAY_S)))
             self._liveliest = max(self._liveliest, now)
-            self._liveliness = now if now > RIGID_SHARE * self._liveliest else 0.0
+            self.liveliness = now if now > RIGID_SHARE * self._liveliest else 0.0
         wander = self.liveliness * dt * share
         self._covariance[:count, :count] += np.diag(wander)
         self._state = keep * self._state
-
-    def _update(self, information: Array, gradient: Array) -> None:
-        """Kalman update by information (M, M) and gradient (M,) on the sum of both vectors, about the predicted one."""
-        count = len(information)
-        across = self._covariance[:, :count] + self._covariance[:, count:]  # (2M, M)
-        gain = across @ np.linalg.inv(np.eye(count) + information @ _sum_covariance(self._covariance, count))
-        self._state = self._state + gain @ gradient
-        covariance = self._covariance - gain @ information @ across.T
-        self._covariance = (covariance + covariance.T) / 2
 
 
 def _map_mode_covariance(modes: WarpModes, surface_map: SurfaceMap) -> Array:
     """Covariance (M, M), mm^2, of the modes in a map's error."""
     known = 3 * len(modes.weights)
     fields = (modes.landmarks * modes.weights[:, None, None]).reshape(known, -1)
-    return np.asarray(
-        fields.T @ surface_map.covariance[:known, :known] @ fields + MAP_MODE_SIGMA_MM**2 * np.eye(len(modes.share))
-    )
+    joint = fields.T @ surface_map.covariance[:known, :known] @ fields
+    return np.asarray(joint + MAP_MODE_SIGMA_MM**2 * np.eye(len(modes.share)))
 
 
 def _sum_covariance(covariance: Array, count: int) -> Array:
@@ -256,14 +223,12 @@ def _mode_evidence(
     """Information (M, M) and gradient (M,) of both vectors' sum about the predicted one, pose and delays solved for."""
     count, cameras = len(modes.share), int(observations.camera.max()) + 1
     root = np.sqrt(fit.weights) / (sigma * fit.scale)
-    row, camera = (
-        np.require(observations.track, np.int64, CONTIGUOUS),
-        np.require(observations.camera, np.int64, CONTIGUOUS),
-    )
+    row = np.require(observations.track, np.int64, CONTIGUOUS)
+    camera = np.require(observations.camera, np.int64, CONTIGUOUS)
     fitted = np.require(fit.jacobians, float, CONTIGUOUS), np.require(fit.residuals, float, CONTIGUOUS)
     # the fit's points hold the deformation, but not the map's error
     fields = np.require(modes.landmarks, float, CONTIGUOUS)
-    whole = rows_of_modes(cameras, camera, row, *fitted, root, fields, state[count:].copy(), twist)
+    whole = rows_of_modes(camera, row, *fitted, root, fields, state[count:].copy(), twist)
     normal = whole.T @ whole
     own, other = slice(0, count), slice(count, count + 6 + cameras)
     held = normal[other, other] + np.diag([1e-9] * 6 + [1 / max(skew, 1e-4) ** 2] * cameras)
@@ -275,32 +240,20 @@ def _mode_evidence(
     return np.asarray((information + information.T) / 2), np.asarray(dull @ gradient)
 
 
-def warped_points(surface_map: SurfaceMap, warp: WarpFilter | None) -> Array:
-    """Points (N, 3), mm, of a map in the surface frame, as a warp has moved them; without one, as they were mapped."""
-    return surface_map.points if warp is None else warp.points(surface_map)
-
-
-@compiled("f8[:,::1](i8, i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[::1], f8[::1])")
+@compiled("f8[:,::1](i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[::1], f8[::1])")
 def rows_of_modes(
-    cameras: int,
-    camera: Index,
-    landmark: Index,
-    jacobian: Array,
-    residual: Array,
-    root: Array,
-    modes: Array,
-    error: Array,
-    twist: Array,
+    camera: Index, track: Index, jacobian: Array, residual: Array, root: Array, modes: Array, error: Array, twist: Array
 ) -> Array:
     """Rows (2N, M + 6 + C + 1) of the regression on modes, pose and delays, each times its track's `root` (N,), px^-1.
 
-    modes: (L, 3, M) mm of each landmark, rows `landmark` (N,). error: (M,), modes that the residuals (N, 2) px hold and
+    modes: (L, 3, M) mm of each landmark, rows `track` (N,). error: (M,), modes that the residuals (N, 2) px hold and
     the points do not. The last column is what is left. The rest as in `gram_by_camera`.
     """
+    cameras = camera.max() + 1
     count = modes.shape[2]
     rows = np.zeros((2 * len(camera), count + 7 + cameras))
     for i in range(len(camera)):
-        own = modes[landmark[i]]
+        own = modes[track[i]]
         for k in range(2):
             row, along, left = rows[2 * i + k], 0.0, -residual[i, k]
             for m in range(count):

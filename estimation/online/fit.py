@@ -1,4 +1,4 @@
-"""The fit to one frame set: its pose, what its covariance is made of, and whether it counts as a measurement."""
+"""The fit to one frame set: its pose, the parts of its covariance, and whether it counts as a measurement."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from estimation.runtime import compiled
 from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap
 
-PRIOR_RESIDUALS = 20.0  # residuals as which the sigmas claimed count
+PRIOR_RESIDUALS = 20.0  # for which the stated sigmas count when the scatter is estimated
 MIN_WEIGHT_SLOPE = 0.1  # of the weights' sum: with less of it most tracks are outliers, and the rest tells nothing
 UNCERTAIN_MM = 0.3  # along some direction: landmarks of two cameras are better known, those of one alone are not
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitCovariance:
-    """The parts of a fit's covariance, all of the right perturbation, and what they follow from."""
+    """The parts of a fit's covariance, all of the right perturbation, and the sensitivities they follow from."""
 
     noise: Array  # (6, 6), new in every frame set: tracks and shifts of whole images
     smear: Array  # (6, 6), new in every frame set: late exposures of a moving surface
     lasting: Array  # (6, 6), the same for many frame sets: errors of map and deformation
-    scatter: float  # variance of the tracks, in parts of what is claimed of them
-    tracks: Array  # (6, 6), the tracks' part of `noise`, as claimed
-    late: Array  # (6, C), change of the pose by a second's delay of each camera
-    bias: Array  # (6, 2C), change of the pose by a pixel's shift of each image: right and down of camera 0, 1, ...
+    scatter: float  # variance of the tracks over their stated variance
+    tracks: Array  # (6, 6), the tracks' part of `noise`, by their stated sigmas
+    by_delay: Array  # (6, C), change of the pose by a second's delay of each camera
+    by_shift: Array  # (6, 2C), change of the pose by a pixel's shift of each image: right and down of camera 0, 1, ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,9 +43,9 @@ class FrameFit:
     inlier: Mask  # (N,) tracks
     used: Index  # (C,) inliers
     reason: str  # why it is no measurement, or ''
-    off: Array  # (C,) px by which each camera stands off the pose, nan where it does not see the surface
+    offsets: Array  # (C,) px by which each camera stands off the pose, nan where it does not see the surface
     allowed: Array  # (C,) px, one sigma of that
-    odd: frozenset[int] = frozenset()  # cameras that were left out
+    outliers: frozenset[int] = frozenset()  # cameras that were left out
 
     @property
     def measured(self) -> bool:
@@ -58,7 +58,7 @@ class FrameFit:
         return self.parts.noise + self.parts.smear
 
     @property
-    def clear(self) -> float:
+    def signal_share(self) -> float:
         """The part, 0 to 1, of the squared velocity in the images that is not the velocity's own noise."""
         weighted = self.solution.jacobians * np.sqrt(self.solution.weights)[:, None, None]
         noise = float((weighted**2).sum((0, 1)) @ self.twist_variance)
@@ -66,44 +66,48 @@ class FrameFit:
         return max(0.0, 1 - noise / whole) if whole > 0 else 0.0
 
 
-def failed_fit(seen: Observations, start: Array, cameras: int, reason: str, odd: frozenset[int]) -> FrameFit:
+def failed_fit(seen: Observations, start: Array, cameras: int, reason: str, outliers: frozenset[int]) -> FrameFit:
     """No measurement of what was `seen` by a rig of so many cameras: the pose stays `start` (4, 4)."""
-    count, zero, off = len(seen), np.zeros((6, 6)), np.full(cameras, np.nan)
-    late, bias = np.zeros((6, cameras)), np.zeros((6, 2 * cameras))
+    count, zero, unknown = len(seen), np.zeros((6, 6)), np.full(cameras, np.nan)
+    by_delay, by_shift = np.zeros((6, cameras)), np.zeros((6, 2 * cameras))
     return FrameFit(
-        seen.stamp,
-        PoseFit(start, zero, np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2, 6)), 1.0),
-        FitCovariance(np.full((6, 6), np.inf), zero, zero, scatter=1.0, tracks=zero, late=late, bias=bias),
+        stamp=seen.stamp,
+        solution=PoseFit(start, zero, np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2, 6)), 1.0),
+        parts=FitCovariance(np.full((6, 6), np.inf), zero, zero, 1.0, zero, by_delay, by_shift),
         twist=np.zeros(6),
         twist_variance=np.zeros(6),
         inlier=np.zeros(count, bool),
         used=np.zeros(cameras, np.int64),
         reason=reason,
-        off=off,
-        allowed=off,
-        odd=odd,
+        offsets=unknown,
+        allowed=unknown,
+        outliers=outliers,
     )
 
 
 class MapError:
-    """The part of a map's joint covariance that the tracks in use touch.
+    """A map's joint covariance: as it reaches the pose, and as it widens the sigmas of single tracks.
 
-    The whole is megabytes, and reading it every frame took longer than the fit. The landmarks in use change slowly.
+    The whole is megabytes, and reading it every frame took longer than the fit. The landmarks in use change slowly, so
+    a block of theirs is kept.
     """
 
-    ROOM = 1.5  # times the landmarks in use, that may be held before the block is cut anew
+    MAX_BLOCK_RATIO = 1.5  # times the landmarks in use, that the block may hold before it is cut anew
 
     def __init__(self, surface_map: SurfaceMap) -> None:
         count = len(surface_map)
         self._whole = surface_map.covariance.reshape(count, 3, count, 3)
-        self._position = np.full(count, -1)
+        self._position = np.full(count, -1)  # of each landmark in the block
         self._block = np.zeros((0, 0))
+        own = np.einsum("ninj->nij", self._whole)
+        self._uncertain = np.linalg.eigvalsh(own)[:, -1] > UNCERTAIN_MM**2
+        self._own = np.where(self._uncertain[:, None, None], own, 0.0)
 
-    def through(self, rows: Index, pull: Array) -> Array:
+    def reaching_pose(self, rows: Index, pull: Array) -> Array:
         """Covariance (6, 6) of the sum of the landmarks' pulls (6, K, 3), of rows (K,), ascending."""
-        if (self._position[rows] < 0).any() or len(self._block) > 3 * self.ROOM * len(rows):
+        if (self._position[rows] < 0).any() or len(self._block) > 3 * self.MAX_BLOCK_RATIO * len(rows):
             held = np.union1d(rows, np.flatnonzero(self._position >= 0))
-            held = held if len(held) < self.ROOM * len(rows) else rows
+            held = held if len(held) < self.MAX_BLOCK_RATIO * len(rows) else rows
             self._position[:] = -1
             self._position[held] = np.arange(len(held))
             self._block = self._whole[held][:, :, held].reshape(3 * len(held), -1)
@@ -112,37 +116,28 @@ class MapError:
         flat = spread.reshape(6, -1)
         return np.asarray(flat @ self._block @ flat.T)
 
-
-class LandmarkUncertainty:
-    """Adds the doubt about single landmarks of one map to the sigmas of their tracks.
-
-    A landmark that one camera alone has seen lies exactly on that camera's ray, and anywhere along it. In that camera
-    it counts in full, in another next to nothing until it is known better.
-    """
-
-    def __init__(self, surface_map: SurfaceMap) -> None:
-        count = len(surface_map)
-        blocks = np.einsum("ninj->nij", surface_map.covariance.reshape(count, 3, count, 3))
-        self._vague = np.linalg.eigvalsh(blocks)[:, -1] > UNCERTAIN_MM**2
-        self._blocks = np.where(self._vague[:, None, None], blocks, 0.0)
-
     def widened(self, sigma: Array, track: Index, jacobians: Array) -> Array:
-        """The sigmas (N,) px with it. track: (N,) rows of the map. jacobians: (N, 2, 6) px by the pose."""
-        rows = np.flatnonzero(self._vague[track])
+        """Sigmas (N,) px of tracks with the error of their own landmark, where that is UNCERTAIN_MM or more.
+
+        A landmark that one camera alone has seen lies exactly on that camera's ray, and anywhere along it. In that
+        camera it counts in full, in another next to nothing until it is known better. track: (N,) rows of the map.
+        jacobians: (N, 2, 6) px by the pose.
+        """
+        rows = np.flatnonzero(self._uncertain[track])
         if not len(rows):
             return sigma
         by_point, wide = jacobians[rows, :, 3:], sigma.copy()
-        square = np.einsum("mki,mij,mkj->m", by_point, self._blocks[track[rows]], by_point) / 2  # of one axis
+        square = np.einsum("mki,mij,mkj->m", by_point, self._own[track[rows]], by_point) / 2  # of one axis
         wide[rows] = np.sqrt(sigma[rows] ** 2 + square)
         return wide
 
 
 def residual_scatter(seen: Observations, solution: PoseFit) -> float:
-    """Variance of the tracks in parts of what is claimed of them, by the residuals of one fit.
+    """Variance of the tracks over their stated variance, estimated from the residuals of one fit.
 
-    The variance of the estimating equations over their slope (Huber 1981, 6.8), as a part of its value for normal
-    errors of the size claimed. Tracks of clean pictures are two or three times better than they claim. Where some are
-    worse without being outliers, the weights alone would say too little. The claim counts as PRIOR_RESIDUALS.
+    The variance of the estimating equations over their slope (Huber 1981, 6.8), relative to its value for normal errors
+    of the stated size, which counts as PRIOR_RESIDUALS. Tracks of clean pictures are two or three times better than
+    stated. Where some are worse without being outliers, the weights alone would show too little of it.
     """
     root = seen.sigma * solution.scale
     square = (solution.residuals**2).sum(1) / root**2
@@ -160,7 +155,7 @@ def residual_scatter(seen: Observations, solution: PoseFit) -> float:
 
 
 def fit_covariance(
-    seen: Observations, solution: PoseFit, shared: SharedErrors, map_error: MapError, warp: WarpFilter | None
+    seen: Observations, solution: PoseFit, shared: SharedErrors, map_error: MapError, warp: WarpFilter
 ) -> FitCovariance:
     """The covariance of a pose that was fitted to what was `seen`, by its parts."""
     information = solution.information + 1e-9 * np.eye(6) * np.trace(solution.information)
@@ -170,24 +165,18 @@ def fit_covariance(
     cameras = len(shared.shift)
     camera = np.ascontiguousarray(seen.camera)
     by_landmark, by_camera = pose_pulls(cameras, len(rows), camera, landmark, solution.jacobians, weight, shared.twist)
-    lasting = map_error.through(rows, by_landmark)
-    if warp is not None:
-        weighted = solution.jacobians * weight[:, None, None]
-        lasting = lasting + warp.pull(seen.track, weighted, solution.jacobians[:, :, 3:])
-    late, bias = noise @ by_camera[:, 0], noise @ by_camera[:, 1:].swapaxes(1, 2).reshape(6, -1)
-    new, stays = noise + (bias * np.repeat(shared.shift, 2)) @ bias.T, noise @ lasting @ noise
-    return FitCovariance(new, late @ shared.delay @ late.T, stays, residual_scatter(seen, solution), noise, late, bias)
+    weighted = solution.jacobians * weight[:, None, None]
+    lasting = map_error.reaching_pose(rows, by_landmark)
+    lasting = lasting + warp.pull(seen.track, weighted, solution.jacobians[:, :, 3:])
+    by_delay, by_shift = noise @ by_camera[:, 0], noise @ by_camera[:, 1:].swapaxes(1, 2).reshape(6, -1)
+    new = noise + (by_shift * np.repeat(shared.shift, 2)) @ by_shift.T
+    smear, scatter = by_delay @ shared.delay @ by_delay.T, residual_scatter(seen, solution)
+    return FitCovariance(new, smear, noise @ lasting @ noise, scatter, noise, by_delay, by_shift)
 
 
 @compiled("Tuple((f8[:,:,::1], f8[:,:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[::1], f8[::1])")
 def pose_pulls(
-    cameras: int,
-    landmarks: int,
-    camera: Index,
-    landmark: Index,
-    jacobian: Array,
-    weight: Array,
-    twist: Array,
+    cameras: int, landmarks: int, camera: Index, landmark: Index, jacobian: Array, weight: Array, twist: Array
 ) -> tuple[Array, Array]:
     """How each landmark (6, L, 3), px^-2 per mm, and each camera's delay and shifts (6, 3, C) pull at the pose.
 

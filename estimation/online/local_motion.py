@@ -87,9 +87,7 @@ class LocalMotion:
             return
         change = points[:known] - self._points
         other = np.linalg.norm(change, axis=1) > MIN_DISPLACEMENT_MM / 2
-        if (
-            known and np.linalg.norm(change.mean(0)) > MIN_DISPLACEMENT_MM / 4
-        ):  # the pose took a part of that error for a shift
+        if known and np.linalg.norm(change.mean(0)) > MIN_DISPLACEMENT_MM / 4:  # which the pose had taken for a shift
             other[:] = True
         self._normal[other], self._right[other], self._looks[other] = 0.0, 0.0, 0.0
         self._points, further = points, len(points) - known
@@ -106,17 +104,14 @@ class LocalMotion:
     def _landmarks(self, seen: Observations, fit: FrameFit, sigma: Array) -> tuple[Array, Array, Array, Array]:
         """Each landmark's displacement: normal equations (N, 3, 3) and (N, 3), weight (N,), right sides less usual."""
         precision = (sigma * fit.solution.scale) ** -2.0
-        for camera in fit.odd:
+        for camera in fit.outliers:
             precision[seen.camera == camera] = 0.0
-        row, jacobian = (
-            np.require(seen.track, np.int64, CONTIGUOUS),
-            np.require(fit.solution.jacobians, float, CONTIGUOUS),
-        )
+        row = np.require(seen.track, np.int64, CONTIGUOUS)
+        jacobian = np.require(fit.solution.jacobians, float, CONTIGUOUS)
         residual = np.require(fit.solution.residuals, float, CONTIGUOUS)
         normal, right, square, views = displacement_sums(len(self._points), row, jacobian, residual, precision)
-        plain, about, explained = unusual_displacements(
-            normal, right, square, self._normal + DISPLACEMENT_RIDGE * np.eye(3), self._right
-        )
+        usual = self._normal + DISPLACEMENT_RIDGE * np.eye(3)
+        plain, about, explained = unusual_displacements(normal, right, square, usual, self._right)
         agree = about - explained < MAX_VIEW_SIGMAS**2 * (2 * views - 3) + NONLINEAR_SHARE * about
         capped = np.minimum(1.0, MAX_LANDMARK_SIGMAS / np.sqrt(np.maximum(explained, 1e-9)))
         return normal, right, np.where((views >= MIN_VIEWS) & agree, capped, 0.0), plain
@@ -148,10 +143,7 @@ class LocalMotion:
 
 
 def bell_centres(points: Array, centres: Array) -> Array:
-    """The given centres and more (C, 3), MAX_BELLS at most, so that one is within BELL_SIGMA_MM of every point (N, 3).
-
-    Each new one is the point farthest from those before.
-    """
+    """The centres (C, 3) and further farthest points (N, 3), until one is near each point or there are MAX_BELLS."""
     away = np.full(len(points), np.inf)
     for centre in centres:
         away = np.minimum(away, np.linalg.norm(points - centre, axis=1))

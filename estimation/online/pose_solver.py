@@ -23,6 +23,12 @@ from estimation.se3 import Array, Index, Mask
 
 TRACK_COLUMNS = 10  # of a track's row: six of the pose, its camera's delay and two shifts, its residual
 CHI2_MEDIAN = 1.386  # of the squared length of two normal entries, in their variance
+GATE = 3.0  # residual in sigmas at which a track's weight has fallen to a quarter
+# What the weights, at that gate, take from the information of Gaussian noise beyond what the estimate itself loses
+# (Huber 1981, 4.6, integrated over two dimensions): the weights' mean is 0.72, the estimate is worth 0.89
+EFFICIENCY = 1.235
+INLIER_WEIGHT = 0.2  # from there on a track agrees with the fit
+CONVERGED_CHI2 = 1e-3  # squared sigmas of the pose: a last step as small as that leaves a hundredth of a sigma to go
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,26 +69,23 @@ class SharedErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedFit:
-    """What the tracks alone say of the shared errors, with the pose marginalised: information @ effect = pull.
+    """Normal equations of the shared errors, the pose marginalised: information @ effect = pull."""
 
-    effect: (3C,), delays (C,) s, then shifts px: (C,) right, (C,) down.
-    """
-
-    information: Array  # (3C, 3C)
+    information: Array  # (3C, 3C) of the effect: delays (C,) s, shifts right (C,) px, shifts down (C,) px
     pull: Array  # (3C,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseFit:
-    """A pose, and how the tracks agree with it."""
+    """A pose fitted to N tracks."""
 
     base_from_surface: Array  # (4, 4)
     information: Array  # (6, 6) of its right perturbation
-    residuals: Array  # (N, 2) px, predicted minus seen, without the shared errors
+    residuals: Array  # (N, 2) px, predicted minus observed, without the shared errors
     weights: Array  # (N,) in [0, 1], one for a track that fits
     jacobians: Array  # (N, 2, 6) px per rad and mm
     scale: float  # robust size of the residuals, in sigmas
-    shared: SharedFit | None = None  # where it was asked for
+    shared: SharedFit | None = None  # only of a fit with shared errors
 
 
 def project(rig: Rig, camera: Index, base_from_surface: Array, points: Array) -> tuple[Array, Array, Array]:
@@ -94,32 +97,26 @@ def project(rig: Rig, camera: Index, base_from_surface: Array, points: Array) ->
     return project_tracks(rig.camera_from_base @ base_from_surface, rig.matrices, camera, points)
 
 
-# What the weights, at a gate of 3, take from the information of Gaussian noise beyond what the estimate itself
-# loses (Huber 1981, 4.6, integrated over two dimensions): the weights' mean is 0.72, the estimate is worth 0.89.
-EFFICIENCY = 1.235
-GATE = 3.0  # residual in sigmas at which a track's weight has fallen to a quarter
-INLIER_WEIGHT = 0.2  # from there on a track agrees with the fit
-CONVERGED_CHI2 = 1e-3  # squared sigmas of the pose: a last step as small as that leaves a hundredth of a sigma to go
-
-
 def solve_pose(
     rig: Rig,
     tracks: PointTracks,
     start: Array,
     *,
-    gate: float = GATE,
     scales: tuple[float, ...] = (1.0,),
     prior: Array | None = None,
     iterations: int = 8,
     tolerance: float = 1e-4,
     shared: SharedErrors | None = None,
 ) -> PoseFit:
-    """Fit base_from_surface to tracks, from `start` (4, 4).
+    """Fit base_from_surface to tracks, from `start` (4, 4), by iteratively reweighted Gauss-Newton steps.
 
-    gate: residual in sigmas at which a weight is a quarter. scales: factors of the gate, from coarse to fine. The unit
-    of residuals grows to the tracks' own median, so that tracks worse than they claim are averaged. prior: (6, 6)
-    information that holds `start`. iterations: at the last scale, three at those before. tolerance: rad and mm, largest
-    entry of the last step. shared: expected size of the cameras' shared errors.
+    The unit of residuals grows to the tracks' own median, so that tracks worse than they claim are averaged.
+
+    scales: factors of GATE, from coarse to fine.
+    prior: (6, 6) information about `start`.
+    iterations: at the last scale; three at those before.
+    tolerance: rad and mm, largest entry of the last step.
+    shared: expected size of the errors that all tracks of a camera share.
     """
     pose, unit, precision = start, 1.0, np.require(1 / tracks.sigma**2, float, CONTIGUOUS)
     camera, points = np.require(tracks.camera, np.int64, CONTIGUOUS), np.require(tracks.points, float, CONTIGUOUS)
@@ -132,7 +129,7 @@ def solve_pose(
     for widening in scales:
         for iteration in range(iterations if widening == scales[-1] else 3):
             # robust weights; the unit of residuals is estimated anew in the first three iterations
-            weight, unit = weights_of(residual, precision, depth, gate * widening, 0.0 if iteration < 3 else unit)
+            weight, unit = weights_of(residual, precision, depth, GATE * widening, 0.0 if iteration < 3 else unit)
             # normal equations (information, gradient), damped
             if common is None:
                 whole = gram_by_camera(len(rig), camera, jacobian, residual, weight * precision, np.zeros(6)).sum(0)

@@ -1,12 +1,12 @@
-"""Reported covariance: window marginal + lasting errors + smear, corrected by what was learned since the start.
+"""Reported covariance of a pose: window marginal + map error + calibration error + smear, refined while running.
 
 The estimator's own decisions (which camera is an outlier, where a landmark is searched, what enters the window) use
 covariances from the first frame set on, when little is known of the cameras: wide, and good for deciding. The reported
-covariance learns:
+covariance is refined:
 
 - the error of the first pose and the window's marginal shrink once images are known to rest and tracks to scatter less;
 - the lasting part of the tracks' errors, and the drift of the images' shifts, are added;
-- after trouble the wide covariance is reported again until all has been well for a second.
+- after trouble the wide covariance is reported again, until a second has passed without any.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ class _TrackResiduals:
 
 
 class TrackNoise:
-    """How much of the tracks' noise is drawn anew with each frame set, and how much lasts, as shares of its variance.
+    """Which share of the variance of the tracks' noise is new in each frame set, and which lasts.
 
-    The window averages what is new, not what lasts: where between pixels a landmark lies, how its patch is seen from
-    here. Both show in the change of a track's residual: the first from one frame set to the next, the second over
+    The window averages new noise, not lasting errors: where between pixels a landmark lies, from which side its patch
+    is seen. The change of a track's residual shows both: new noise from one frame set to the next, lasting errors over
     seconds. What never changes is the map's error, or was in the first pose, too.
     """
 
@@ -61,15 +61,15 @@ class TrackNoise:
         self._sums = PRIOR_TRACKS * np.array([1.0, 1.0, 0.0, 0.0])
 
     @property
-    def anew(self) -> float:
-        """The share that is drawn anew with each frame set."""
+    def new(self) -> float:
+        """The share that is new in each frame set."""
         return float(np.clip(self._sums[1] / self._sums[0], MIN_NEW_SHARE, 1.0))
 
     @property
     def lasting(self) -> float:
-        """The share that is alike from one frame set to the next, and another after seconds."""
+        """The share that stays from one frame set to the next and changes within seconds."""
         whole, changed = self._sums[2:]
-        return float(np.clip(changed / max(whole, PRIOR_TRACKS) - self.anew, 0.0, 1.0 - self.anew))
+        return float(np.clip(changed / max(whole, PRIOR_TRACKS) - self.new, 0.0, 1.0 - self.new))
 
     def learn(self, seen: Observations, solution: PoseFit, sigma: Array) -> None:
         """Take the residuals of one fit. sigma: (N,) px as claimed."""
@@ -95,10 +95,10 @@ def _squared_changes(now: _TrackResiduals, then: _TrackResiduals) -> Array:
 
 
 class WindowNoise:
-    """The window's marginal of one pose, to be rescaled by what is known of tracks and images later on.
+    """The window's marginal of one pose, to be rescaled when tracks' and images' noise are known better.
 
-    The window uses the tracks' and images' noise as believed at first. In the axes in which the two are independent,
-    its marginal is a part of the fit's covariance whatever their sizes, so each axis is rescaled by itself.
+    The window uses both noises as assumed at first. In the axes in which the two are independent its marginal is a part
+    of the fit's covariance whatever their sizes, so each axis is rescaled by itself.
     """
 
     def __init__(self, window: Array, fit: FrameFit, unrest: float) -> None:
@@ -116,7 +116,7 @@ class WindowNoise:
     def covariance(self, tracks: TrackNoise, unrest: float) -> Array:
         """(6, 6), by what is known of the tracks now, and of the images' unrest, px^2."""
         by_images = (1 - self._by_tracks) * (unrest / self._unrest)
-        scaled = self._axes * np.sqrt(self._by_tracks * (tracks.anew * self._scatter) + by_images)
+        scaled = self._axes * np.sqrt(self._by_tracks * (tracks.new * self._scatter) + by_images)
         return np.asarray(scaled @ self._window @ scaled.T)
 
 
@@ -131,7 +131,7 @@ class FrameOriginError:
         """window: (6, 6), the window's marginal, with `fit` the newest of the fits averaged there."""
         self._averaged = WindowNoise(window, fit, cameras.unrest)
         self._tracks = fit.parts.scatter * fit.parts.tracks
-        self._late, self._corrected = fit.parts.late, cameras.offset
+        self._late, self._corrected = fit.parts.by_delay, cameras.offset
 
     def covariance(self, cameras: CameraErrors, tracks: TrackNoise) -> Array:
         """(6, 6) of the error, by what is known of cameras and tracks now."""
@@ -141,24 +141,20 @@ class FrameOriginError:
 
 
 class ImageShiftDrift:
-    """How far the images' shifts have drifted since the first pose, as patches are seen from elsewhere: a mean square.
+    """Mean squared drift of the images' shifts since the first pose, as patches are seen from other directions.
 
     Only shifts that a fit shows clearly count. The pose absorbs the others: that is the covariance to be reported.
     """
 
     def __init__(self) -> None:
         self._start: tuple[Array, Array] | None = None  # shifts (2C,) px, and the information (2C, 2C) of a fit of them
-        self._variance, self._since = 0.0, 0  # px^2; frame sets of which it is the mean
-
-    @property
-    def variance(self) -> float:
-        """px^2 per axis; zero before there is a first pose."""
-        return self._variance
+        self.variance = 0.0  # px^2 per axis; zero before there is a first pose
+        self._count = 0  # frame sets of which it is the mean
 
     def start(self, fit: SharedFit, shift: Array) -> None:
         """Remember the shifts (C, 2), px, and how clearly a fit shows them, with the first pose that is given out."""
         self._start = shift.T.ravel(), _shift_information(fit)
-        self._variance, self._since = 0.0, 0
+        self.variance, self._count = 0.0, 0
 
     def learn(self, fit: SharedFit, shift: Array, alike: float) -> None:
         """Take the shifts (C, 2), px, after one more fit.
@@ -170,8 +166,8 @@ class ImageShiftDrift:
         before, then = self._start
         both = np.linalg.inv(np.linalg.inv(_shift_information(fit)) + np.linalg.inv(then))
         both = both / max(alike, MIN_LASTING_SHARE)
-        self._since = min(self._since + 1, DRIFT_MEMORY_SETS)
-        self._variance += (_mean_square(both, shift.T.ravel() - before) - self._variance) / self._since
+        self._count = min(self._count + 1, DRIFT_MEMORY_SETS)
+        self.variance += (_mean_square(both, shift.T.ravel() - before) - self.variance) / self._count
 
 
 def _shift_information(fit: SharedFit) -> Array:
@@ -194,32 +190,29 @@ def _mean_square(information: Array, shift: Array) -> float:
 
 
 class CalibrationError:
-    """What imperfect lenses do to the pose, since the first pose.
-
-    The map was made through the same lenses, so at the start they do nothing: what counts is the change since then.
-    """
+    """The pose's error by imperfect lenses: the change of their effect since the map was made through them."""
 
     def __init__(self) -> None:
         self._first: Array | None = None  # (6, 2C), effect of the images' shifts on the first pose
 
     def covariance(self, fit: FrameFit, cameras: CameraErrors) -> Array:
-        """(6, 6) of it, at an accepted fit."""
+        """(6, 6) at an accepted fit."""
         if self._first is None:
-            self._first = fit.parts.bias
-        change = fit.parts.bias - self._first
+            self._first = fit.parts.by_shift
+        change = fit.parts.by_shift - self._first
         size = 2 * np.mean(cameras.shift**2)  # px^2: of six shifts of three cameras the pose takes up about half
         return np.asarray(size * change @ change.T)
 
 
 class ReportedCovariance:
-    """The covariances of the poses of one map, as they are given out."""
+    """The reported covariances of the poses of one map."""
 
     def __init__(self, cameras: int) -> None:
         self._tracks, self._drift = TrackNoise(cameras), ImageShiftDrift()
-        self._first: tuple[FrameOriginError, Array] | None = None  # its covariance (6, 6) as believed at once
+        self._first: tuple[FrameOriginError, Array] | None = None  # its covariance (6, 6) as assumed at the start
         self._usual = np.zeros(2)  # tracks that carry the pose; their scatter
-        self._stamp, self._trouble = -np.inf, -np.inf  # s, of the last pose, and of the last that was not plain
-        self._more = np.zeros((6, 6))
+        self._stamp, self._trouble = -np.inf, -np.inf  # s, of the last pose, and of the last with trouble
+        self._added = np.zeros((6, 6))  # the last pose's lasting errors beyond its own covariance
 
     def learn(self, seen: Observations, fit: FrameFit, cameras: CameraErrors) -> None:
         """Take the residuals of an accepted fit, after the cameras did. seen.sigma: as claimed."""
@@ -230,37 +223,35 @@ class ReportedCovariance:
     def measured(
         self, pose: SurfacePose, fit: FrameFit, cameras: CameraErrors, first: Array | None, averaged: Array
     ) -> SurfacePose:
-        """The pose of an accepted fit as it is given out.
+        """The pose of an accepted fit with its reported covariance.
 
-        first: (6, 6), as believed of the first pose at once. averaged: (6, 6), the window's part of `pose.covariance`.
+        first: (6, 6) covariance of the first pose as it was assumed then. averaged: (6, 6), the window's part of
+        `pose.covariance`.
         """
         self._watch(pose, fit)
         if self._first is None and first is not None:
-            self._begin(first, fit, cameras)
+            assert fit.solution.shared is not None
+            self._first = FrameOriginError(first - fit.parts.smear, fit, cameras), first
+            self._drift.start(fit.solution.shared, cameras.shift)
+            self._trouble = fit.stamp
         # added: lasting part of the tracks' errors, drift of the shifts, clock offsets that are not corrected yet
         parts = fit.parts
         late = cameras.beyond(cameras.offset) - cameras.delays.covariance
-        drifted = self._drift.variance * parts.bias @ parts.bias.T
-        more = self._tracks.lasting * parts.scatter * parts.tracks + drifted + parts.late @ late @ parts.late.T
-        self._more = (more + more.T) / 2
+        drifted = self._drift.variance * parts.by_shift @ parts.by_shift.T
+        more = self._tracks.lasting * parts.scatter * parts.tracks + drifted + parts.by_delay @ late @ parts.by_delay.T
+        self._added = (more + more.T) / 2
         if self._first is None or pose.stamp - self._trouble < CALM_BEFORE_NARROWING_S:  # or it is the first pose
-            return widened(pose, self._more)
-        # subtracted: what the first pose's error and the window's marginal were assumed too large by
-        known, believed = self._first
-        first_less = known.covariance(cameras, self._tracks) - believed
-        window_less = WindowNoise(averaged, fit, cameras.unrest).covariance(self._tracks, cameras.unrest) - averaged
-        return widened(pose, self._more + first_less + window_less)
+            return widened(pose, self._added)
+        # subtracted: by how much the first pose's error and the window's marginal were assumed too large
+        error, assumed = self._first
+        first_change = error.covariance(cameras, self._tracks) - assumed
+        window_change = WindowNoise(averaged, fit, cameras.unrest).covariance(self._tracks, cameras.unrest) - averaged
+        return widened(pose, self._added + first_change + window_change)
 
     def missed(self, pose: SurfacePose) -> SurfacePose:
-        """A pose that is only predicted, as it is given out."""
+        """A pose that is only predicted, with its reported covariance."""
         self._trouble = pose.stamp
-        return widened(pose, self._more)
-
-    def _begin(self, believed: Array, fit: FrameFit, cameras: CameraErrors) -> None:
-        assert fit.solution.shared is not None
-        self._first = FrameOriginError(believed - fit.parts.smear, fit, cameras), believed
-        self._drift.start(fit.solution.shared, cameras.shift)
-        self._trouble = fit.stamp
+        return widened(pose, self._added)
 
     def _watch(self, pose: SurfacePose, fit: FrameFit) -> None:
         """Note trouble: a reason, a state below TRACKING, or fewer or worse tracks than usual."""

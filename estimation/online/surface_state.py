@@ -27,47 +27,31 @@ REST_POSES = 32  # a second of three cameras, whose mean is the place of rest
 BLOCK_POSES = 8  # a part of them, whose mean must lie near that of all
 MIN_SIGMA_SHARE = 0.01  # of what must be flagged: no pose is known better
 ONSET_HISTORY = 4 * REST_POSES  # poses in which the onset is searched
-
-
-@dataclass(frozen=True, slots=True)
-class MotionSettings:
-    """What counts as a movement, and how sure it must be.
-
-    A movement beyond chance is flagged from half of `moved` or `turned` on, which leaves the other half for noise. The
-    surface is at rest when a second's poses stay within an eighth.
-    """
-
-    moved: float = 0.3  # mm, thesis 1.3
-    turned: float = float(np.deg2rad(0.1))  # rad, thesis 1.3
-    flagged: float = 0.5  # of both
-    settled: float = 0.125  # of both
-    chance: float = 31.0  # chi-square of three degrees of freedom: 8e-7 a look, half a look an hour
-    agree: float = 0.4  # of their mean: so far both halves of the poses must have gone, or it was a glitch
-    memory: float = 1800.0  # poses, a minute, over which the noise is learned
-    steady: float = 300.0  # poses, ten seconds: what is slower is no noise, but drift
+# What counts as a movement: beyond chance it is flagged from half of these on, which leaves the other half for noise
+MOVEMENT_MM, MOVEMENT_RAD = 0.3, float(np.deg2rad(0.1))  # thesis 1.3
+FLAGGED_SHARE = 0.5
+SETTLED_SHARE = 0.125  # the surface is at rest when a second's poses stay within that
+MOTION_CHI2 = 31.0  # three degrees of freedom: 8e-7 a look, half a look an hour
+MIN_HALF_SHARE = 0.4  # of their mean: so far both halves of the poses must have gone, or it was a glitch
+NOISE_MEMORY_POSES = 1800.0  # a minute, over which the noise is learned
+DRIFT_MEMORY_POSES = 300.0  # ten seconds: what is slower is no noise, but drift
 
 
 class MotionDetector:
     """Watches the measured poses of one surface; one call a pose, about 0.2 ms."""
 
-    def __init__(self, centre: Array, settings: MotionSettings | None = None) -> None:
+    def __init__(self, centre: Array) -> None:
         """centre: (3,) mm, surface frame, the place whose shift counts."""
-        self.settings = settings or MotionSettings()
         self._centre, self._at_centre = centre.copy(), np.hstack([-se3.hat(centre), np.eye(3)])
-        self._wanted = np.array([self.settings.turned, self.settings.moved])
-        self._least = (MIN_SIGMA_SHARE * self._wanted[:, None, None]) ** 2 * np.eye(3)
+        self._movement = np.array([MOVEMENT_RAD, MOVEMENT_MM])
+        self._least = (MIN_SIGMA_SHARE * self._movement[:, None, None]) ** 2 * np.eye(3)
         self._anchor: Array | None = None  # the first base_from_surface, from which turns and shifts are counted
         self._stamps: deque[float] = deque(maxlen=ONSET_HISTORY)
-        self._states = _PoseBuffer()  # turn, rad, and shift, mm
-        self._covariances = _PoseBuffer(3)  # (2, 3, 3) covariances of them
+        self._states: deque[Array] = deque(maxlen=ONSET_HISTORY)  # (2, 3) each: turn, rad, and shift, mm
+        self._covariances: deque[Array] = deque(maxlen=REST_POSES)  # (2, 3, 3) each, of them
         self._rest: Array | None = None  # (2, 3)
-        self._noise = _RestNoise(self.settings)
-        self._motion = MotionState()
-
-    @property
-    def motion(self) -> MotionState:
-        """The last answer."""
-        return self._motion
+        self._noise = _RestNoise()
+        self.motion = MotionState()  # after the last pose
 
     def __call__(self, stamp: float, base_from_surface: Array, covariance: Array) -> MotionState:
         """The surface's motion after a measured pose (4, 4) with covariance (6, 6) at `stamp`, s.
@@ -77,58 +61,51 @@ class MotionDetector:
         """
         if self._anchor is None:
             self._anchor = base_from_surface.copy()
+        # turn and shift of the centre since the anchor, in the anchor's axes, and their covariances
+        anchor, axes = self._anchor, self._anchor[:3, :3].T
+        turn = se3.log(se3.inverse(anchor) @ base_from_surface)[:3]
+        there, here = (t[:3, :3] @ self._centre + t[:3, 3] for t in (anchor, base_from_surface))
+        turned = axes @ base_from_surface[:3, :3]
+        both = np.stack([covariance[:3, :3], self._at_centre @ covariance @ self._at_centre.T])
         self._stamps.append(stamp)
-        self._states.append(self._turn_and_shift(self._anchor, base_from_surface))
-        self._covariances.append(self._turn_and_shift_covariances(self._anchor, base_from_surface, covariance))
-        if self._motion.moving:
+        self._states.append(np.stack([turn, axes @ (here - there)]))
+        self._covariances.append(turned @ both @ turned.T + self._least)
+        if self.motion.moving:
             self._settle()
         else:
             self._watch()
-        return self._motion
-
-    def _turn_and_shift(self, anchor: Array, base_from_surface: Array) -> Array:
-        """Turn and shift of the centre (2, 3) since the anchor, in the anchor's own axes."""
-        back = anchor[:3, :3].T
-        turn = se3.log(se3.inverse(anchor) @ base_from_surface)[:3]
-        there, here = (t[:3, :3] @ self._centre + t[:3, 3] for t in (anchor, base_from_surface))
-        return np.stack([turn, back @ (here - there)])
-
-    def _turn_and_shift_covariances(self, anchor: Array, base_from_surface: Array, covariance: Array) -> Array:
-        """Covariances (2, 3, 3) of turn and shift, by that of the pose."""
-        turn = anchor[:3, :3].T @ base_from_surface[:3, :3]
-        both = np.stack([covariance[:3, :3], self._at_centre @ covariance @ self._at_centre.T])
-        return np.asarray(turn @ both @ turn.T + self._least)
+        return self.motion
 
     def _sizes(self, states: Array) -> Array:
         """Lengths (..., 2) of turns and shifts (..., 2, 3), in parts of what must be flagged."""
-        return np.asarray(np.sqrt((states * states).sum(-1)) / self._wanted)
+        return np.asarray(np.sqrt((states * states).sum(-1)) / self._movement)
 
     # -- moving: until it settles
 
     def _settle(self) -> None:
         """At rest again once the means of the last second's blocks stay together."""
         if len(self._covariances) < REST_POSES:
-            return self._set_motion(moving=True, onset=self._motion.onset)
-        newest = self._states.newest(REST_POSES)
-        claimed = self._covariances.newest(REST_POSES).mean(0)
+            return self._set_motion(moving=True, onset=self.motion.onset)
+        newest = _newest(self._states, REST_POSES)
+        claimed = np.array(self._covariances).mean(0)
         rest = newest.mean(0)
         away = newest.reshape(-1, BLOCK_POSES, 2, 3).mean(1) - rest
         white = self._noise.white(newest, claimed)
         spread = 3.5 * np.sqrt(white * np.trace(claimed, axis1=1, axis2=2) / BLOCK_POSES)
-        allowed = np.maximum(self.settings.settled, spread / self._wanted)
+        allowed = np.maximum(SETTLED_SHARE, spread / self._movement)
         if (self._sizes(away).max(0) > allowed).any():
-            return self._set_motion(moving=True, onset=self._motion.onset)
+            return self._set_motion(moving=True, onset=self.motion.onset)
         self._rest = rest
         self._noise.begin(newest, claimed, white)
-        return self._set_motion(moving=False, onset=self._motion.onset)
+        return self._set_motion(moving=False, onset=self.motion.onset)
 
     # -- at rest: until it moves
 
     def _watch(self) -> None:
         assert self._rest is not None
-        newest = self._states.newest(REST_POSES)
-        claimed = self._covariances.newest(AVERAGED_POSES[0]).mean(0)
-        away = self._sizes(newest[-AVERAGED_POSES[0] :].mean(0) - self._rest) > self.settings.flagged
+        newest = _newest(self._states, REST_POSES)
+        claimed = _newest(self._covariances, AVERAGED_POSES[0]).mean(0)
+        away = self._sizes(newest[-AVERAGED_POSES[0] :].mean(0) - self._rest) > FLAGGED_SHARE
         looks = [(count, self._rest, self._noise.variance(count)) for count in AVERAGED_POSES]
         for count, since, variance in [*looks, (AVERAGED_POSES[0], _mean_before(newest), self._noise.step)]:
             part = newest[-count:] - since
@@ -137,7 +114,7 @@ class MotionDetector:
                 self._covariances.clear()  # rest is a second of poses that are all later
                 return self._set_motion(moving=True, onset=self._onset(since, part.mean(0), kind))
         self._noise.learn(newest, claimed)
-        return self._set_motion(moving=False, onset=self._motion.onset)
+        return self._set_motion(moving=False, onset=self.motion.onset)
 
     def _moved(self, part: Array, claimed: Array, variance: Array) -> int | None:
         """0 where the newest poses' mean has turned, 1 where it has shifted, None where it is at rest.
@@ -146,26 +123,26 @@ class MotionDetector:
         """
         count, mean = len(part), part.mean(0)
         sizes = self._sizes(mean)
-        for kind in np.flatnonzero(sizes > self.settings.flagged):
+        for kind in np.flatnonzero(sizes > FLAGGED_SHARE):
             spread = claimed[kind] * variance[kind]
             halves = part[:, kind].reshape(2, -1, 3).sum(1) / (count / 2)
             along = halves @ mean[kind] / (mean[kind] @ mean[kind])
-            least = min(self.settings.agree, self.settings.flagged / sizes[kind])
-            if along.min() >= least and mean[kind] @ np.linalg.solve(spread, mean[kind]) > self.settings.chance:
+            least = min(MIN_HALF_SHARE, FLAGGED_SHARE / sizes[kind])
+            if along.min() >= least and mean[kind] @ np.linalg.solve(spread, mean[kind]) > MOTION_CHI2:
                 return int(kind)
         return None
 
     def _onset(self, since: Array, moved: Array, kind: int) -> float:
         """Stamp of the first pose from which on all have gone a quarter of the way; the newest one's if it is back."""
-        along = (self._states.newest(ONSET_HISTORY)[:, kind] - since[kind]) @ moved[kind] / (moved[kind] @ moved[kind])
+        along = (np.array(self._states)[:, kind] - since[kind]) @ moved[kind] / (moved[kind] @ moved[kind])
         before = np.flatnonzero(along < 0.25)
         return self._stamps[min(int(before[-1]) + 1, len(along) - 1) if len(before) else 0]
 
     def _set_motion(self, moving: bool, onset: float) -> None:
         since = np.zeros((2, 3)) if self._rest is None else self._rest
-        newest = self._states.newest(AVERAGED_POSES[0]).mean(0) - since
+        newest = _newest(self._states, AVERAGED_POSES[0]).mean(0) - since
         turned, moved = np.linalg.norm(newest, axis=1).tolist()
-        self._motion = MotionState(moving, onset, moved, turned)
+        self.motion = MotionState(moving, onset, moved, turned)
 
 
 def _mean_before(newest: Array) -> Array:
@@ -173,43 +150,21 @@ def _mean_before(newest: Array) -> Array:
     return np.asarray(newest[-POSES_BEFORE - AVERAGED_POSES[0] : -AVERAGED_POSES[0]].mean(0))
 
 
-class _PoseBuffer:
-    """The newest ONSET_HISTORY arrays (2, 3), or of more axes, in one piece."""
-
-    def __init__(self, *more: int) -> None:
-        """more: lengths of the axes after those."""
-        self._room = np.empty((8 * ONSET_HISTORY, 2, 3, *more))
-        self._count = 0
-
-    def __len__(self) -> int:
-        return self._count
-
-    def clear(self) -> None:
-        self._count = 0
-
-    def append(self, row: Array) -> None:
-        if self._count == len(self._room):
-            self._room[:ONSET_HISTORY] = self._room[-ONSET_HISTORY:]
-            self._count = ONSET_HISTORY
-        self._room[self._count] = row
-        self._count += 1
-
-    def newest(self, count: int) -> Array:
-        """The last `count` (M, 2, 3, ...), or as many as there are."""
-        return self._room[max(self._count - min(count, ONSET_HISTORY), 0) : self._count]
+def _newest(rows: deque[Array], count: int) -> Array:
+    """The last `count` (M, ...), or as many as there are."""
+    return np.array(list(rows)[-count:])
 
 
 class _RestNoise:
     """The variance of means of poses at rest, in parts of one pose's claimed covariance; turn and shift apart."""
 
-    COUNTS = (*AVERAGED_POSES, REST_POSES)
+    POSE_COUNTS = (*AVERAGED_POSES, REST_POSES)
     FIRST_WEIGHT = 60.0  # poses that the first second's scatter is worth
     MIN_SHARE = 0.01  # of the variance claimed; no covariance is wider than that
     MAX_RISE = 4.0  # times the noise known: a movement that is not yet flagged must not pass for noise
 
-    def __init__(self, settings: MotionSettings) -> None:
-        self._settings = settings
-        self._sum = np.ones((len(self.COUNTS), 2)) / np.array(self.COUNTS)[:, None]
+    def __init__(self) -> None:
+        self._sum = np.ones((len(self.POSE_COUNTS), 2)) / np.array(self.POSE_COUNTS)[:, None]
         self._step = np.full(2, 1 / AVERAGED_POSES[0] + 1 / POSES_BEFORE)  # of the newest poses' mean since just before
         self._weight = 0.0
         self._mean = np.zeros((2, 3))  # of the last seconds: noise is counted from here, not from the place of rest
@@ -225,24 +180,24 @@ class _RestNoise:
         if self._weight:
             return
         both = np.maximum(white, self._parts(states - self._mean, claimed))
-        self._sum = np.maximum(both, self.MIN_SHARE) / np.array(self.COUNTS)[:, None]
+        self._sum = np.maximum(both, self.MIN_SHARE) / np.array(self.POSE_COUNTS)[:, None]
         self._step = np.maximum(both, self.MIN_SHARE) * (1 / AVERAGED_POSES[0] + 1 / POSES_BEFORE)
         self._weight = self.FIRST_WEIGHT
 
     def learn(self, newest: Array, claimed: Array) -> None:
         """Take the newest poses (REST_POSES, 2, 3) at rest."""
-        self._mean = self._mean + (newest[-1] - self._mean) / self._settings.steady
-        away = np.stack([newest[-count:].sum(0) / count for count in self.COUNTS]) - self._mean
+        self._mean = self._mean + (newest[-1] - self._mean) / DRIFT_MEMORY_POSES
+        away = np.stack([newest[-count:].sum(0) / count for count in self.POSE_COUNTS]) - self._mean
         square = np.einsum("nki,kij,nkj->nk", away, np.linalg.inv(claimed), away) / 3
         square = np.minimum(square, self.MAX_RISE * self._sum)
-        self._weight = min(self._weight + 1, self._settings.memory)
+        self._weight = min(self._weight + 1, NOISE_MEMORY_POSES)
         self._sum = self._sum + (square - self._sum) / self._weight
         step = self._parts((newest[-AVERAGED_POSES[0] :].mean(0) - _mean_before(newest))[None], claimed)
         self._step = self._step + (np.minimum(step, self.MAX_RISE * self._step) - self._step) / self._weight
 
     def variance(self, count: int) -> Array:
         """(2,) of a mean of `count` poses against the place of rest, in parts of one pose's claimed covariance."""
-        return np.asarray(self._sum[self.COUNTS.index(count)] + self._sum[-1])
+        return np.asarray(self._sum[self.POSE_COUNTS.index(count)] + self._sum[-1])
 
     @property
     def step(self) -> Array:

@@ -1,10 +1,10 @@
 """The sliding window of poses and twists: GTSAM's fixed-lag smoother, rebuilt when it breaks.
 
-One factor per frame set: the Gauss-Newton pose with its information. Measured with 120 landmarks this is as accurate
-as keeping every landmark in the window (0.024 mm), at a thirtieth of the time. Between poses stands GTSAM's prior of
-white noise on acceleration (`WnoaMotionFactorPose3`; Barfoot 2017, 11.1). The window holds base_from_surface, not its
-inverse: the twist is then the surface's own velocity about its own origin, and the prior does not couple turns with
-the far-away base. The prior's density follows the surface's recent motion, axis by axis (`AccelerationPsd`).
+Each frame set adds one factor: its Gauss-Newton pose with the information. With 120 landmarks this was measured to be
+as accurate as keeping every landmark in the window (0.024 mm), at a thirtieth of the time. Between poses stands GTSAM's
+prior of white noise on acceleration (`WnoaMotionFactorPose3`; Barfoot 2017, 11.1), whose density follows the recent
+motion axis by axis (`AccelerationPsd`). The window holds base_from_surface, not its inverse: the twist is then the
+surface's velocity about its own origin, and the prior does not couple rotations with the far-away base.
 """
 
 from __future__ import annotations
@@ -62,24 +62,15 @@ class AccelerationPsd:
             self._var = np.tile(variance[:, None], (1, self._grid.shape[1]))
         filters = self._off, self._rate, self._var, self._cross, self._rate_var
         keep = float(np.exp(-seconds / PSD_MEMORY_S))
-        _update_filters(self._grid, self._score, *filters, moved, variance.copy(), float(seconds), keep)
+        _update_filters(self._grid, self._score, filters, moved, variance.copy(), float(seconds), keep)
 
 
-@compiled(f"void({', '.join(['f8[:,::1]'] * 7)}, f8[::1], f8[::1], f8, f8)")
+@compiled("void(f8[:,::1], f8[:,::1], UniTuple(f8[:,::1], 5), f8[::1], f8[::1], f8, f8)")
 def _update_filters(
-    grid: Array,
-    score: Array,
-    off: Array,
-    rate: Array,
-    var: Array,
-    cross: Array,
-    rate_var: Array,
-    moved: Array,
-    variance: Array,
-    dt: float,
-    keep: float,
+    grid: Array, score: Array, filters: tuple[Array, ...], moved: Array, variance: Array, dt: float, keep: float
 ) -> None:
     """Predict all filters (6, K) by dt, s, score them by the pose that was measured, and update them, in place."""
+    off, rate, var, cross, rate_var = filters
     for i in range(grid.shape[0]):
         for k in range(grid.shape[1]):
             q = grid[i, k]
@@ -131,12 +122,7 @@ class Smoother:
         parameters.findUnusedFactorSlots = True
         self._window = gtsam.IncrementalFixedLagSmoother(WINDOW_LAG_S, parameters)
         self._key = 0
-        self._newest: WindowEstimate | None = None
-
-    @property
-    def newest(self) -> WindowEstimate | None:
-        """The last estimate, or None before the first measurement."""
-        return self._newest
+        self.newest: WindowEstimate | None = None  # the last estimate; None before the first measurement
 
     def reset(self) -> None:
         """Forget everything, as after an outage longer than the window."""
@@ -147,29 +133,29 @@ class Smoother:
     def add(self, measured: MeasuredPose) -> WindowEstimate:
         """Take one measurement, newer than the ones before, and give the estimate at its stamp."""
         assert np.isfinite(measured.pose).all() and np.isfinite(measured.covariance).all()
-        measured = replace(measured, covariance=_floored_covariance(measured.covariance))
-        before = self._newest
-        if before is not None and measured.stamp - before.stamp > WINDOW_LAG_S:
+        # no direction surer than 1e-6 rad or mm: GTSAM accepts a worse covariance and fails later
+        values, vectors = np.linalg.eigh(_symmetric(measured.covariance))
+        measured = replace(measured, covariance=(vectors * np.maximum(values, 1e-12)) @ vectors.T)
+        if self.newest is not None and measured.stamp - self.newest.stamp > WINDOW_LAG_S:
             self.reset()
         if self._last is not None:
             moved = se3.log(se3.inverse(self._last.pose) @ measured.pose)
             self._motion.add(moved, measured.stamp - self._last.stamp, np.diag(measured.covariance))
         self._last, self._psd = measured, self._motion.psd
         try:
-            self._newest = self._extend(measured)
-        except (RuntimeError, IndexError, ValueError):
-            self._newest = self._rebuild(measured)
-        return self._newest
+            self.newest = self._extend(measured)
+        except (RuntimeError, IndexError, ValueError):  # GTSAM's smoother cannot be used after it has thrown
+            self.restarts += 1
+            self._clear()
+            self.newest = self._extend(measured)
+        return self.newest
 
     def _density(self, measured: MeasuredPose) -> Array:
-        """Density (6,) of the acceleration since the last pose: the recent motion's, or more if need be.
-
-        A jerk of the hand loosens the prior at once: where motion is not smooth it must not drag the pose.
-        """
-        assert self._newest is not None
-        psd, dt = self._psd.copy(), measured.stamp - self._newest.stamp
-        off = se3.log(se3.inverse(self._newest.pose @ se3.exp(self._newest.twist * dt)) @ measured.pose)
-        expected = self._newest.covariance + measured.covariance + dt**2 * self._newest.twist_covariance
+        """Density (6,) of the acceleration since the last pose: the recent motion's, or that of a sudden jerk."""
+        assert self.newest is not None
+        psd, dt = self._psd.copy(), measured.stamp - self.newest.stamp
+        off = se3.log(se3.inverse(self.newest.pose @ se3.exp(self.newest.twist * dt)) @ measured.pose)
+        expected = self.newest.covariance + measured.covariance + dt**2 * self.newest.twist_covariance
         variance = np.diag(expected) + psd * dt**3 / 3
         for group in (slice(0, 3), slice(3, 6)):
             if np.mean(off[group] ** 2 / variance[group]) > MAX_PRIOR_CHI2:
@@ -181,13 +167,13 @@ class Smoother:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         pose, twist = gtsam.symbol("x", self._key), gtsam.symbol("v", self._key)
         start = np.zeros(6)
-        if self._newest is None:
+        if self.newest is None:
             wide = gtsam.noiseModel.Diagonal.Sigmas(np.array([2.0] * 3 + [300.0] * 3))
             graph.add(gtsam.PriorFactorVector(twist, start, wide))
         else:
-            start = self._newest.twist
+            start = self.newest.twist
             old_pose, old_twist = gtsam.symbol("x", self._key - 1), gtsam.symbol("v", self._key - 1)
-            before = gtsam.StateData(old_pose, old_twist, self._newest.stamp)
+            before = gtsam.StateData(old_pose, old_twist, self.newest.stamp)
             now = gtsam.StateData(pose, twist, measured.stamp)
             graph.add(gtsam.WnoaMotionFactorPose3(before, now, self._density(measured)))
         noise = gtsam.noiseModel.Gaussian.Covariance(_symmetric(measured.covariance))
@@ -209,18 +195,6 @@ class Smoother:
         if not all(np.isfinite(part).all() for part in parts):
             raise ValueError("the window's estimate is not finite")
         return window
-
-    def _rebuild(self, newest: MeasuredPose) -> WindowEstimate:
-        """A fresh window from the newest measurement alone: GTSAM's smoother cannot be used after it has thrown."""
-        self.restarts += 1
-        self._clear()
-        return self._extend(newest)
-
-
-def _floored_covariance(covariance: Array) -> Array:
-    """The covariance with no direction surer than 1e-6 rad or mm: GTSAM accepts a worse one and fails later."""
-    values, vectors = np.linalg.eigh(_symmetric(covariance))
-    return np.asarray((vectors * np.maximum(values, 1e-12)) @ vectors.T)
 
 
 def _symmetric(matrix: Array) -> Array:

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from estimation import se3
-from estimation.scans.observability import Observability, observability_of, without_free
 from estimation.scans.scan import Scan, ScanIndex
 from estimation.se3 import Array, Index
 from estimation.surface_map import farthest_points
@@ -27,6 +26,20 @@ ROUGH_STARTS = 80  # starts that are refined roughly
 FINE_STARTS = 6  # and of these, those refined with exact nearest points
 FINAL_STARTS = 3  # and of these, those refined with all points: more than one, to see whether the best is alone
 COARSE_SAMPLES = 4000  # of the scan: enough to lay a part of it under the points
+
+FREE_STD = 0.3  # mm: a direction known no better is called free; three times the error that is wanted
+FREE_SLOPE = 0.012  # mm of distance per mm of motion (0.7 degrees): below, errors of the scan's own shape decide
+SLIDE_TURN_SHARE = 0.2  # of turning, below which a motion is called a slide
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observability:
+    """Which motions are determined and which are free."""
+
+    directions: Array  # (K, 6) free right perturbations, rad and mm, that move the points by about 1 mm
+    names: tuple[str, ...]  # one each
+    covariance: Array  # (6, 6), as wide as the scan along them
+    weakest: float  # mm, one standard deviation of the worst direction that is determined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,12 +113,14 @@ def _judge(fits: list[_Candidate], points: Array, sigma: float) -> Registration:
         words.append(f"poor fit: {best.rms:.3g} mm rms, {sigma:.3g} mm expected")
     if best.share < 0.7:
         words.append(f"poor fit: only {best.share:.0%} of the points lie on the scan")
-    rival = _rival(fits, points, sigma)
+    # another pose that fits as well as the best, within what chance explains
+    bound, near = max(best.cost, sigma**2) * (1 + 4 * np.sqrt(2 / len(points))), 0.1 * _radius(points)
+    rivals = (f for f in fits[1:] if f.cost < bound and _apart(f.pose, best.pose, points) > near)
+    rival = next(rivals, None)
     if rival is not None and not len(free.directions):
         away = _apart(best.pose, rival.pose, points)
-        words.append(
-            f"ambiguous: a pose {away:.3g} mm away fits as well ({rival.rms:.3g} against {best.rms:.3g} mm rms)"
-        )
+        fits_as_well = f"fits as well ({rival.rms:.3g} against {best.rms:.3g} mm rms)"
+        words.append(f"ambiguous: a pose {away:.3g} mm away {fits_as_well}")
     if len(free.directions):
         words.append("free: " + "; ".join(free.names))
     verdict = ". ".join(words) or f"found: {best.rms:.3g} mm rms, weakest direction good to {free.weakest:.2g} mm"
@@ -116,17 +131,8 @@ def _judge(fits: list[_Candidate], points: Array, sigma: float) -> Registration:
 def _no_registration(index: ScanIndex, count: int) -> Registration:
     size = float(np.ptp(index.samples, axis=0).max())
     covariance = np.diag([np.pi**2] * 3 + [size**2] * 3)
-    return Registration(
-        np.eye(4), np.inf, covariance, np.eye(6), False, f"{count} points, {MIN_REGISTRATION_POINTS} needed"
-    )
-
-
-def _rival(fits: list[_Candidate], points: Array, sigma: float) -> _Candidate | None:
-    """Another pose that fits as well as the best, within what chance explains."""
-    bound = max(fits[0].cost, sigma**2) * (1 + 4 * np.sqrt(2 / len(points)))
-    near = 0.1 * _radius(points)
-    others = [f for f in fits[1:] if f.cost < bound and _apart(f.pose, fits[0].pose, points) > near]
-    return others[0] if others else None
+    verdict = f"{count} points, {MIN_REGISTRATION_POINTS} needed"
+    return Registration(np.eye(4), np.inf, covariance, np.eye(6), False, verdict)
 
 
 def _refine(
@@ -143,9 +149,8 @@ def _refine(
         jacobian = np.concatenate([np.cross(inner, pull), pull], axis=1)  # -d offset / d xi
         weighted = jacobian * weight[:, None]
         information = weighted.T @ jacobian
-        step = np.linalg.solve(
-            information + 1e-6 * np.diag(np.diag(information)) + 1e-9 * np.eye(6), weighted.T @ offset
-        )
+        damped = information + 1e-6 * np.diag(np.diag(information)) + 1e-9 * np.eye(6)
+        step = np.linalg.solve(damped, weighted.T @ offset)
         step = without_free(inner, pull, step) if held else step
         pose = pose @ se3.exp(step)
         spread = 1.4826 * float(np.median(np.abs(offset)))
@@ -171,10 +176,7 @@ def _measure(
 
 
 def _pull(index: ScanIndex, pose: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Directions (N, 3) and offsets (N,), mm, of points from the scan, and the points (N, 3), in the surface frame.
-
-    The direction is the surface's normal; beside the scan's rim it is the way back to it.
-    """
+    """Surface normals (beside the rim: the way back) (N, 3), offsets (N,) mm and points (N, 3), surface frame."""
     inner = se3.transform_points(se3.inverse(pose), points)
     near = index.closest(inner)
     gap = inner - near.points
@@ -221,10 +223,8 @@ def _starts(points: Array, outward: Array, index: ScanIndex) -> Array:
     places = samples[_spread_out(samples, MAX_PLACES, 0.5 * radius)]
     yaws = se3.exp_rotation(np.arange(YAW_STARTS)[:, None] * [0.0, 0.0, 2 * np.pi / YAW_STARTS])
     turned = base_from_cap @ se3.make(yaws, np.zeros(3))  # (Y, 4, 4)
-    poses = []
-    for near in cKDTree(samples).query_ball_point(places, 1.6 * radius):
-        poses.append(turned @ se3.inverse(_cap(samples[near], normals[near].mean(0))))
-    return np.concatenate(poses)
+    neighbours = cKDTree(samples).query_ball_point(places, 1.6 * radius)
+    return np.concatenate([turned @ se3.inverse(_cap(samples[n], normals[n].mean(0))) for n in neighbours])
 
 
 def _cap(points: Array, outward: Array) -> Array:
@@ -266,3 +266,64 @@ def _spread_out(points: Array, count: int, nearest: float = 0.0) -> Index:
     """Rows of up to `count` points (N, 3) as far apart as can be, from the centre on, none nearer than `nearest` mm."""
     first = int(np.argmin(np.linalg.norm(points - points.mean(0), axis=1)))
     return farthest_points(points, first, count, nearest)
+
+
+def observability_of(points: Array, normals: Array, sigma: float, index: ScanIndex) -> Observability:
+    """What point-to-plane distances, `sigma` mm each, determine: at points (N, 3) with normals, surface frame."""
+    size = float(np.ptp(index.samples, axis=0).max())
+    if not len(points):
+        return Observability(np.eye(6), ("everything",), np.diag([np.pi**2] * 3 + [size**2] * 3), np.inf)
+    centre, radius = _middle(points)
+    slope, vectors = _slopes(points, normals)
+    std = sigma / np.maximum(slope * np.sqrt(len(points)), 1e-12)
+    free = (slope < FREE_SLOPE) | (std > FREE_STD)
+    perturbation = _perturbation(centre, radius)
+    spread = perturbation @ vectors @ np.diag(np.where(free, size, np.minimum(std, size)))
+    motions = vectors[:, free].T
+    if len(motions):  # as pure slides, as far as there are any, then by how much they turn
+        motions = (np.linalg.svd(motions[:, :3])[0].T @ motions)[::-1]
+    names = tuple(_name(m, centre, radius) for m in motions)
+    weakest = float(std[~free].max(initial=0.0))
+    return Observability(motions @ perturbation.T, names, spread @ spread.T, weakest)
+
+
+def without_free(points: Array, normals: Array, step: Array) -> Array:
+    """A right perturbation (6,) without motions that hardly change distances at points with normals (N, 3)."""
+    slope, vectors = _slopes(points, normals)
+    held = vectors[:, slope >= FREE_SLOPE]
+    perturbation = _perturbation(*_middle(points))
+    return np.asarray(perturbation @ held @ held.T @ np.linalg.solve(perturbation, step))
+
+
+def _middle(points: Array) -> tuple[Array, float]:
+    return points.mean(0), max(_radius(points), 1e-6)
+
+
+def _slopes(points: Array, normals: Array) -> tuple[Array, Array]:
+    """Change of distance per mm of motion (6,), least first, along six motions (6, 6), in columns."""
+    centre, radius = _middle(points)
+    jacobian = np.concatenate([np.cross(points - centre, normals) / radius, normals], axis=1)
+    values, vectors = np.linalg.eigh(jacobian.T @ jacobian / len(points))
+    return np.sqrt(np.maximum(values, 0)), vectors
+
+
+def _perturbation(centre: Array, radius: float) -> Array:
+    """(6, 6) right perturbation, rad and mm, by a motion with turns about `centre`, in mm at `radius` to compare."""
+    out = np.zeros((6, 6))
+    out[:3, :3], out[3:, 3:] = np.eye(3) / radius, np.eye(3)
+    out[3:, :3] = se3.hat(centre) / radius
+    return out
+
+
+def _name(motion: Array, centre: Array, radius: float) -> str:
+    turn, move = motion[:3] / radius, motion[3:]
+    if np.linalg.norm(motion[:3]) < SLIDE_TURN_SHARE:
+        return f"slide along {_vector(move / np.linalg.norm(move), 2)}"
+    axis = turn / np.linalg.norm(turn)
+    through = centre + np.cross(turn, move) / (turn @ turn)
+    return f"turn about {_vector(axis, 2)} through {_vector(through, 1)} mm"
+
+
+def _vector(v: Array, digits: int) -> str:
+    v = v * (1 if v[np.argmax(np.abs(v))] > 0 or digits == 1 else -1)
+    return "(" + " ".join(f"{x + 0.0:.{digits}f}" for x in np.round(v, digits)) + ")"

@@ -13,6 +13,7 @@ from estimation.se3 import Array, Index, Mask, inverse, transform_points
 MIN_INCIDENCE = 0.1  # cosine of ray and normal: no landmark is seen more from the side
 _EDGE_SLACK = 1e-9  # barycentric, so that no ray slips through between two triangles
 SAMPLE_COUNT = 15_000  # about so many spread over the scan; a 100 x 100 mm scan gets one every 0.8 mm
+CANDIDATE_SAMPLES = 8  # whose triangles may hold the nearest point
 _MAX_DIVISIONS = 24  # of a triangle's side
 
 
@@ -88,11 +89,11 @@ def _vertex_normals(points: Array, faces: Index) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """Where rays first meet the scan. points, normals: (N, 3), surface frame, mm; NaN where hit (N,) is False."""
+    """Where N rays first meet the scan."""
 
-    points: Array
-    normals: Array
-    hit: Mask
+    points: Array  # (N, 3) mm, surface frame; NaN without a hit
+    normals: Array  # (N, 3) unit, likewise
+    hit: Mask  # (N,)
 
 
 def cast_rays(scan: Scan, surface_from_camera: Array, directions: Array) -> Hits:
@@ -112,8 +113,8 @@ def cast_rays(scan: Scan, surface_from_camera: Array, directions: Array) -> Hits
     first_ray, first = np.unique(ray[keep], return_index=True)
     chosen = keep[first]
     points, normals = miss, miss.copy()
-    met = depth[chosen, None] * directions[first_ray]
-    points[first_ray] = transform_points(surface_from_camera, met)
+    hits = depth[chosen, None] * directions[first_ray]
+    points[first_ray] = transform_points(surface_from_camera, hits)
     normals[first_ray] = normals_at(scan, triangle[chosen], weights[chosen])
     return Hits(points, normals, np.isfinite(points[:, 0]))
 
@@ -130,10 +131,8 @@ def foot_jacobians(rays: Array, normals: Array) -> tuple[Array, Array]:
 
 
 def _meet(corners: Array, directions: Array) -> tuple[Array, Array]:
-    """Distances (M,) to triangles (M, 3, 3), in lengths of `directions` (M, 3), NaN for a miss; barycentric weights.
-
-    Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997.
-    """
+    """Distances (M,) to triangles (M, 3, 3), in lengths of `directions` (M, 3), NaN for a miss; barycentric weights."""
+    # Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997
     a = corners[:, 0]
     ab, ac = corners[:, 1] - a, corners[:, 2] - a
     p, q = np.cross(directions, ac), np.cross(-a, ab)
@@ -180,33 +179,32 @@ def _across(directions: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosestPoints:
-    """Nearest points of a scan. points, normals: (N, 3), surface frame, mm. rim: (N,) whether on an open edge."""
+    """Nearest points of a scan."""
 
-    points: Array
-    normals: Array
-    rim: Mask
+    points: Array  # (N, 3) mm, surface frame
+    normals: Array  # (N, 3) unit
+    rim: Mask  # (N,) whether on an open edge
 
 
 class ScanIndex:
     """A scan made ready for many queries, by samples spread over its triangles, at least one on each."""
 
-    # samples, normals: (S, 3) mm, surface frame. triangle: (S,) that each lies on. spacing: mm, about the largest
-
     def __init__(self, scan: Scan) -> None:
-        self.scan = scan
-        areas = face_areas(scan)
-        self.spacing = float(np.sqrt(areas.sum() / SAMPLE_COUNT))
-        self.triangle, weights = _spread(scan, self.spacing)
-        self._corners = scan.corners
-        self.samples = np.einsum("sk,ski->si", weights, self._corners[self.triangle])
-        self.normals = normals_at(scan, self.triangle, weights)
+        self.scan, self._corners, areas = scan, scan.corners, face_areas(scan)
+        spacing = float(np.sqrt(areas.sum() / SAMPLE_COUNT))
+        self.spacing = max(spacing, float(np.sqrt(np.quantile(areas, 0.9))))  # mm, about the largest between samples
+        self.triangle, weights = _spread(scan, spacing)  # (S,) that each sample lies on
+        self.samples = np.einsum("sk,ski->si", weights, self._corners[self.triangle])  # (S, 3) mm, surface frame
+        self.normals = normals_at(scan, self.triangle, weights)  # (S, 3)
         self.tree = cKDTree(self.samples)
-        self.spacing = max(self.spacing, float(np.sqrt(np.quantile(areas, 0.9))))
-        self._open = _open_sides(scan)
+        # (T, 3) whether the side opposite each corner is an open edge
+        sides = np.sort(scan.triangles[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
+        edges, count = open_edges(scan), len(scan.vertices)
+        self._open = np.isin(sides[..., 0] * count + sides[..., 1], edges[:, 0] * count + edges[:, 1])
 
-    def closest(self, points: Array, candidates: int = 8) -> ClosestPoints:
+    def closest(self, points: Array) -> ClosestPoints:
         """Nearest points of the scan to points (N, 3), on the triangles of the nearest samples."""
-        count = min(candidates, len(self.samples))
+        count = min(CANDIDATE_SAMPLES, len(self.samples))
         _, near = self.tree.query(points, k=count)
         triangle = self.triangle[near.reshape(len(points), count)]  # (N, K)
         corners = self._corners[triangle.ravel()]
@@ -261,11 +259,3 @@ def _spread(scan: Scan, spacing: float) -> tuple[Index, Array]:
         triangles.append(np.repeat(some, len(uv)))
         weights.append(np.tile(np.column_stack([1 - uv.sum(1), uv]), (len(some), 1)))
     return np.concatenate(triangles), np.concatenate(weights)
-
-
-def _open_sides(scan: Scan) -> Mask:
-    """(T, 3) whether the side opposite each corner is an open edge."""
-    sides = np.sort(scan.triangles[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
-    keys = sides[..., 0] * len(scan.vertices) + sides[..., 1]
-    edges = open_edges(scan)
-    return np.asarray(np.isin(keys, edges[:, 0] * len(scan.vertices) + edges[:, 1]))

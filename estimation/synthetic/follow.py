@@ -15,7 +15,6 @@ from estimation.mapping.refiner import Refiner
 from estimation.mapping.triangulation import TriangulatedMap, triangulated_map
 from estimation.observations import Observations
 from estimation.online.estimator import Estimator
-from estimation.online.fit import FrameFit
 from estimation.online.pose_solver import project
 from estimation.online.surface_state import StateSettings
 from estimation.pose import SurfacePose, TrackState
@@ -80,41 +79,30 @@ class Follower:
         """The pose at `seen.stamp` from this frame set and the ones before."""
         estimator, seen = self.estimator, self.of_map(seen)
         fit = estimator.fit(seen, estimator.predict(seen.stamp))
+        refiner, refined = self.refiner, None
         if not estimator.confirmed:
             if len(estimator.carrying_cameras(fit)) < 2:
                 return estimator.hold(seen.stamp, fit.reason or "one camera sees the surface")
-            refined = None if self.refiner is None else self.refiner.confirm(fit, seen, estimator.cameras.delays)
-            if self.refiner is not None and refined is not None:
-                self._take(refined)
-                estimator.set_twist(self.refiner.speed(fit))
-                fit = self._again(fit, seen)
-        elif self.refiner is not None and fit.measured and not fit.odd and estimator.too_fast_for_map(fit):
-            refined = self.refiner.rebuild(fit, seen, estimator.cameras.delays)
-            if refined is not None:
-                self._take(refined)
-                fit = self._again(fit, seen)
+            refined = None if refiner is None else refiner.confirm(fit, seen, estimator.cameras.delays)
+            if refiner is not None and refined is not None:
+                estimator.set_twist(refiner.speed(fit))
+        elif refiner is not None and fit.measured and not fit.outliers and estimator.too_fast_for_map(fit):
+            refined = refiner.rebuild(fit, seen, estimator.cameras.delays)
+        if refined is not None:
+            self._take(refined)
+            refit = estimator.fit(seen, fit.solution.base_from_surface)
+            fit = refit if refit.measured else fit
         if not fit.measured:
             return estimator.coast(fit)
         pose = estimator.accept(fit, seen)
-        if self.refiner is not None:
-            self.refiner.offer(fit, seen, pose.twist, estimator.cameras.delays)
+        if refiner is not None:
+            refiner.offer(fit, seen, pose.twist, estimator.cameras.delays)
         return pose
-
-    def _again(self, fit: FrameFit, seen: Observations) -> FrameFit:
-        """The fit to a corrected map, if that is a measurement."""
-        refit = self.estimator.fit(seen, fit.solution.base_from_surface)
-        return refit if refit.measured else fit
 
     def idle(self) -> None:
         """Take over a refined map that is ready; called between frame sets."""
-        refined = None if self.refiner is None else self.refiner.poll()
-        if refined is not None:
+        if self.refiner is not None and (refined := self.refiner.poll()) is not None:
             self._take(refined)
-
-    @property
-    def offsets(self) -> Array:
-        """Estimated exposure offset of each camera after its stamps, (C,) s."""
-        return self.estimator.cameras.offset
 
     def of_map(self, seen: Observations) -> Observations:
         """The observations of landmarks in the map that agree with it, numbered by the map's rows."""
@@ -218,12 +206,12 @@ def follow_steps(
     first = next(seen)
     follower = Follower(world.rig, first, first_map(world, first, mapping), refine=mapping == "seen")
     assert follower.estimator.pose is not None
-    yield FollowStep(follower.estimator.pose, first, 0.0, follower.offsets)
+    yield FollowStep(follower.estimator.pose, first, 0.0, follower.estimator.cameras.offset)
     for observations in seen:
         follower.idle()
         start = clock()
         pose = follower(observations)
-        yield FollowStep(pose, observations, clock() - start, follower.offsets)
+        yield FollowStep(pose, observations, clock() - start, follower.estimator.cameras.offset)
 
 
 def follow(world: World, mapping: Mapping = "told", clock: Callable[[], float] = lambda: 0.0) -> FollowResult:

@@ -21,12 +21,12 @@ from estimation.synthetic.waveforms import (
     PULSE_BUMPS,
     WALK_SECONDS,
     BandNoise,
+    Bump,
     Cycles,
     Sine,
     StepWave,
     Walk,
     Waveform,
-    breath_bumps,
 )
 
 FRAMES_PER_S = 29.91  # of the camera above the thesis's shaking table (thesis 4.6)
@@ -86,31 +86,28 @@ class ComposedMotion:
 
     def __call__(self, times: ArrayLike) -> Array:
         """rest_from_surface (..., 4, 4), mm, at times (...), s."""
-        flat, shape = _flat(times)
+        times = np.asarray(times, float)
+        flat = times.reshape(-1)
         out = np.broadcast_to(np.eye(4), (len(flat), 4, 4))
         for part in self.parts:
             out = out @ _transform(part.coordinates(flat), part.pivot)
-        return np.array(out).reshape(*shape, 4, 4)
+        return np.array(out).reshape(*times.shape, 4, 4)
 
     def twist(self, times: ArrayLike) -> Array:
         """Exact body velocity (..., 6) of the surface, rad/s and mm/s, at times (...), s."""
-        flat, shape = _flat(times)
+        times = np.asarray(times, float)
+        flat = times.reshape(-1)
         out = np.zeros((len(flat), 6))
         for part in self.parts:
             coordinates = part.coordinates(flat)
             carry = se3.adjoint(se3.inverse(_transform(coordinates, part.pivot)))
             out = (carry @ out[..., None])[..., 0] + _body_twist(coordinates, part.rates(flat), part.pivot)
-        return out.reshape(*shape, 6)
+        return out.reshape(*times.shape, 6)
 
 
 def weighted_sum(values: Array, directions: Array) -> Array:
     """values (N, W) @ directions (W, 6), summed in one order whatever N is: one instant alone gives the same bits."""
     return np.asarray((values[:, :, None] * directions).sum(axis=1))
-
-
-def _flat(times: ArrayLike) -> tuple[Array, tuple[int, ...]]:
-    array = np.asarray(times, float)
-    return array.reshape(-1), array.shape
 
 
 def _transform(coordinates: Array, pivot: Array) -> Array:
@@ -146,7 +143,7 @@ class BreathingSpec:
 
     period: float = 4.0  # s
     inspiration: float = 0.4  # share of the period
-    exponent: float = 4.0  # of the shape, see `breath_bumps`
+    exponent: float = 4.0  # of sin, the shape of a breath
     period_spread: float = 0.10  # relative standard deviation per breath
     depth_spread: float = 0.15  # relative standard deviation per breath
     sighs_per_min: float = 0.0
@@ -165,7 +162,8 @@ def draw_breathing(spec: BreathingSpec, rng: np.random.Generator) -> Cycles:
     lengths = np.where(sighs, SIGH_LENGTH * lengths, lengths)
     depths = np.where(sighs, spec.sigh_factor * depths, depths)
     starts = np.concatenate([[0.0], np.cumsum(lengths + np.where(pauses, spec.pause, 0.0))])
-    return Cycles(starts, lengths, depths, breath_bumps(spec.inspiration, spec.exponent))
+    # sin^exponent is cos^2n of Lujan et al., Med Phys 26:715 (1999), with two halves of unequal length
+    return Cycles(starts, lengths, depths, (Bump(0.0, spec.inspiration, 1.0, spec.exponent),))
 
 
 def draw_pulse(rate_hz: float, rate_spread: float, depth_spread: float, rng: np.random.Generator) -> Cycles:

@@ -60,9 +60,7 @@ class Conditions:
     views: int | None = None  # number of cameras that ever find a landmark, at random; None: all that see it
     offsets: tuple[float, ...] = ()  # s: delay of each camera's true instant after its stamp; not in the rig
     jitter: float = 0.0  # s: standard deviation of each camera's instant from frame to frame
-    calibration: float = (
-        0.0  # px: RMS distance between the given rig's image of the landmarks and the true one, at rest
-    )
+    calibration: float = 0.0  # px: RMS distance of the landmarks' images by the given rig from the true ones, at rest
     map_error: float = 0.0  # mm: standard deviation per axis of the map's landmarks; the map's covariance states it
     correlated: float = 0.0  # px: standard deviation of an error that lasts for `correlated_seconds`; not stated
     correlated_seconds: float = 2.0  # s: time constant of that error
@@ -136,18 +134,15 @@ def project_landmarks(rig: Rig, points: Array, poses: Array, normals: Array | No
     rig: without distortion for the pixels of Observations. poses: (C, 4, 4) base_from_surface at each camera's instant.
     normals: (N, 3); without them all points face all cameras.
     """
-    pixels, seen = zip(*(_project(rig.cameras[c], points, pose, normals) for c, pose in enumerate(poses)), strict=True)
-    return np.stack(pixels), np.stack(seen)
-
-
-def _project(camera: Camera, points: Array, pose: Array, normals: Array | None) -> tuple[Array, Mask]:
-    points_base = se3.transform_points(pose, points)
-    pixels, depth = pixels_from_points(camera, points_base)
-    seen = (depth > MIN_CAMERA_DEPTH) & (pixels > 0).all(1) & (pixels < np.array(camera.size) - 1).all(1)
-    if normals is not None:
-        to_camera = camera.base_from_camera[:3, 3] - points_base
-        facing = ((normals @ pose[:3, :3].T) * to_camera).sum(1)
-        seen &= facing > MIN_FACING_COSINE * np.linalg.norm(to_camera, axis=1)
+    pixels, seen = np.empty((len(poses), len(points), 2)), np.empty((len(poses), len(points)), bool)
+    for c, pose in enumerate(poses):
+        camera, points_base = rig.cameras[c], se3.transform_points(pose, points)
+        pixels[c], depth = pixels_from_points(camera, points_base)
+        seen[c] = (depth > MIN_CAMERA_DEPTH) & ((pixels[c] > 0) & (pixels[c] < np.array(camera.size) - 1)).all(1)
+        if normals is not None:
+            to_camera = camera.base_from_camera[:3, 3] - points_base
+            facing = ((normals @ pose[:3, :3].T) * to_camera).sum(1)
+            seen[c] &= facing > MIN_FACING_COSINE * np.linalg.norm(to_camera, axis=1)
     return pixels, seen
 
 
@@ -257,9 +252,9 @@ class World:
         """The true pose (..., 4, 4), mm, at times (...), s."""
         return np.asarray(self.rest @ self.motion(times))
 
-    def twists(self, times: Array, step: float = 1e-4) -> Array:
-        """The true body velocity (..., 6), rad/s and mm/s, at times (...), s, by differences over `step` s."""
-        times = np.asarray(times, float)
+    def twists(self, times: Array) -> Array:
+        """The true body velocity (..., 6), rad/s and mm/s, at times (...), s, by differences over 0.2 ms."""
+        times, step = np.asarray(times, float), 1e-4
         before, after = (self.base_from_surface(times + s) for s in (-step, step))
         return np.asarray(se3.log(se3.inverse(before) @ after) / (2 * step))
 
@@ -327,9 +322,9 @@ def synthetic_world(
     _check_world(given, rig, seconds, rate, count)
     stamps = np.arange(max(1, round(seconds * rate))) / rate
     streams = [np.random.default_rng([seed, stream]) for stream in range(TRACK_STREAM)]
-    motion = (
-        _by_name(movement, MOVEMENTS, "movement")(streams[MOTION_STREAM]) if isinstance(movement, str) else movement
-    )
+    motion = movement
+    if isinstance(motion, str):
+        motion = _by_name(motion, MOVEMENTS, "movement")(streams[MOTION_STREAM])
     spans = _life_spans(count, float(stamps[-1]), given.churn, streams[LANDMARK_STREAM])
     landmarks = _by_name(surface, SURFACES, "surface")(len(spans), streams[LANDMARK_STREAM])
     true_rig = undistorting(rig)

@@ -16,8 +16,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.calibration.arm_fit import ArmFit, ArmUnknowns, fit_arm
-from estimation.calibration.arm_model import ArmParameters, Kinematics, SetPoint, Sightings, predict
-from estimation.calibration.arm_start import first_pose
+from estimation.calibration.arm_model import ArmParameters, Kinematics, SetPoint, Sightings, first_pose, predict
 from estimation.calibration.camera_rig import Calibration, calibrate
 from estimation.calibration.lens_model import BoardViews, lens_of, matrix_of, project_lens
 from estimation.rig import Camera, Rig, pixels_from_points

@@ -26,12 +26,12 @@ from typing import Any
 import numpy as np
 
 from estimation import se3, smooth
-from estimation.batch import priors
+from estimation.batch import smoothed
 from estimation.batch.initialisation import TrackArrays, pack_tracks, rough_start
 from estimation.batch.normal_equations import BatchProblem, Estimate, NoiseModel
 from estimation.batch.smooth import FREE_LANDMARK_MM
 from estimation.batch.smoothed import Smoothed
-from estimation.batch.solve import HELD_POSE_SIGMA, NormalEquations, Priors, shared_step
+from estimation.batch.solve import HELD_POSE_SIGMA, NormalEquations, Priors
 from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
@@ -199,22 +199,22 @@ def adjust_ours(rig: Rig, data: TrackArrays, poses: Array, points: Array) -> Adj
     """By our own elimination."""
     clock = ProcessorClock()
     start = clock.now()
-    cameras, rest = priors.cameras_of(rig), np.zeros((len(poses), 6))
-    none = priors.correction_sigmas(priors.CalibrationPrior(clock=0.0), len(rig))
+    cameras, rest = smoothed.cameras_of(rig), np.zeros((len(poses), 6))
+    none = smoothed.correction_sigmas(smoothed.CalibrationPrior(clock=0.0), len(rig))
     known = Priors(
-        cameras, priors.prior_information(none, len(rig)), points, np.eye(points.size) / FREE_LANDMARK_MM**2,
+        cameras, smoothed.prior_information(none, len(rig)), points, np.eye(points.size) / FREE_LANDMARK_MM**2,
         poses[0], 0, HELD_POSE_SIGMA, np.tile(NO_MOTION_PRIOR, (len(poses) - 1, 1)),
     )  # fmt: skip
     problem = BatchProblem(data, np.zeros(0, np.int64))
     noise = NoiseModel(np.ones(len(rig)), *NO_JITTER, gate=UNGATED)
-    estimate, costs = Estimate(priors.States(poses, rest, rest), cameras, points), list[float]()
+    estimate, costs = Estimate(smoothed.States(poses, rest, rest), cameras, points), list[float]()
     while len(costs) < MAX_STEPS:
         equations = NormalEquations(problem, estimate, known, noise)
         whole = equations.eliminate(no_progress)
         costs.append(whole.cost)
         if len(costs) > 1 and costs[-2] - costs[-1] < COST_TOLERANCE * costs[-1]:
             break
-        step = shared_step(whole)
+        step = whole.shared_step()
         estimate = estimate.moved(equations.eliminate(no_progress, step).chain.steps(), step, problem.free)
     spent = clock.now() - start
     return AdjustedBundle(residual_rms(rig, data, estimate.states.poses, estimate.points), spent, len(costs) - 1)
@@ -371,7 +371,7 @@ def _late_figures(options: argparse.Namespace) -> list[Figure]:
     for seed in range(options.seeds):
         conditions: dict[str, Any] = {"seed": seed, "offsets": CAMERA_OFFSETS, "calibration": 0.3}
         world = synthetic_world("lively", options.seconds, count=options.count, **conditions)
-        result = smooth(world.rig, list(world), prior=priors.REFINED_PRIOR)
+        result = smooth(world.rig, list(world), prior=smoothed.REFINED_PRIOR)
         errors.append(_off(result.states.poses, world.truth.base_from_surface))
         offsets.append(result.offsets - np.array(CAMERA_OFFSETS))
     name = "lively, cameras 16 ms apart, calibrated to 0.3 px"

@@ -15,8 +15,18 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.calibration.arm_fit import ArmFit, ArmUnknowns, cross_validate, fit_arm, jackknife
-from estimation.calibration.arm_model import ArmParameters, Kinematics, SetPoint, Sightings, predict, tip_positions
-from estimation.calibration.arm_start import check_latency, check_places, check_turns, first_pose
+from estimation.calibration.arm_model import (
+    ArmParameters,
+    Kinematics,
+    SetPoint,
+    Sightings,
+    check_latency,
+    check_places,
+    check_turns,
+    first_pose,
+    predict,
+    tip_positions,
+)
 from estimation.calibration.lens_model import CAMERA_PARAMETERS
 from estimation.errors import InputError
 from estimation.rig import Rig

@@ -20,9 +20,8 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from estimation.batch.priors import REFINED_PRIOR, CalibrationPrior
 from estimation.batch.smooth import smooth
-from estimation.batch.smoothed import Smoothed
+from estimation.batch.smoothed import REFINED_PRIOR, CalibrationPrior, Smoothed
 from estimation.errors import InputError, StillbedError
 from hardware.files.folder_tables import write_tum
 from hardware.files.rig_file import write_rig

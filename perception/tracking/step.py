@@ -196,7 +196,7 @@ class TrackingStep:
                 reason = f"the first map waits for a second look by two cameras ({fit.reason or 'one sees it'})"
                 return estimator.hold(stamp, reason), tracked.observations, fit.used
             tracked = self._mapping.confirm(tracked)
-        elif fit.measured and not fit.odd and estimator.too_fast_for_map(fit):
+        elif fit.measured and not fit.outliers and estimator.too_fast_for_map(fit):
             tracked = self._mapping.rebuild(tracked)
 
         # the pose
@@ -205,7 +205,7 @@ class TrackingStep:
             self._searched = {c: pyramids[c] for c in self._lost_cameras(tracked)}
             self._absent = 0
             pose = estimator.accept(fit, observations)
-            if not fit.odd:
+            if not fit.outliers:
                 self._mapping.offer(tracked, pose.twist)
             matcher.remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)
         else:
