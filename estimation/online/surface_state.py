@@ -254,9 +254,9 @@ class PoseStateMachine:
         self._poses = 0
         return self.state, "a first map, to be confirmed"
 
-    def measured(self, stamp: float, seen: Measurement) -> tuple[TrackState, str]:
+    def measured(self, stamp: float, basis: Measurement) -> tuple[TrackState, str]:
         """State and reason of a measured pose."""
-        fault = self._fault(seen)
+        fault = self._fault(basis)
         if fault:
             self._bad_stamp = stamp
         elif stamp - self._bad_stamp < self.settings.settle:
@@ -269,21 +269,21 @@ class PoseStateMachine:
         self.state = TrackState.DEGRADED if fault else TrackState.TRACKING
         return self.state, fault
 
-    def _fault(self, seen: Measurement) -> str:
+    def _fault(self, basis: Measurement) -> str:
         """What speaks against TRACKING, or ''."""
         s, inside = self.settings, self.state is TrackState.TRACKING
-        if len(seen.cameras) < s.enter_cameras:
-            alone = f"one camera alone carries the pose: {', '.join(seen.cameras) or 'none clearly'}"
-            return f"{alone}; {seen.trouble}" if seen.trouble else alone
-        if seen.sigma > (s.leave_sigma if inside else s.enter_sigma):
-            return f"the pose is uncertain to {seen.sigma:.1f} mm"
-        if seen.tracks < (s.leave_tracks if inside else s.enter_tracks):
-            return f"{seen.tracks} tracks carry the pose, {s.enter_tracks} wanted"
-        if seen.trouble:
-            return seen.trouble
-        if seen.deformation > (s.leave_deformation if inside else s.enter_deformation):
-            return f"the surface is deformed by {seen.deformation:.2f} mm"
-        return seen.caveat
+        if len(basis.cameras) < s.enter_cameras:
+            alone = f"one camera alone carries the pose: {', '.join(basis.cameras) or 'none clearly'}"
+            return f"{alone}; {basis.trouble}" if basis.trouble else alone
+        if basis.sigma > (s.leave_sigma if inside else s.enter_sigma):
+            return f"the pose is uncertain to {basis.sigma:.1f} mm"
+        if basis.tracks < (s.leave_tracks if inside else s.enter_tracks):
+            return f"{basis.tracks} tracks carry the pose, {s.enter_tracks} wanted"
+        if basis.trouble:
+            return basis.trouble
+        if basis.deformation > (s.leave_deformation if inside else s.enter_deformation):
+            return f"the surface is deformed by {basis.deformation:.2f} mm"
+        return basis.caveat
 
     def missed(self, stamp: float, why: str) -> tuple[TrackState, str]:
         """State and reason of a pose that is only predicted."""
