@@ -38,21 +38,21 @@ def learned(new: float, slow: float, fixed: float, seconds: float = 8.0) -> Trac
 
 def test_white_noise_is_all_new() -> None:
     noise = learned(0.1, 0.0, 0.0)
-    assert noise.anew == pytest.approx(1.0, abs=0.03) and noise.lasting < 0.03
+    assert noise.new == pytest.approx(1.0, abs=0.03) and noise.lasting < 0.03
 
 
 def test_what_changes_over_seconds_lasts() -> None:
     noise = learned(0.05, 0.1, 0.0)
-    assert 0.2 < noise.anew < 0.4 and noise.anew + noise.lasting == pytest.approx(1.0, abs=0.15)
+    assert 0.2 < noise.new < 0.4 and noise.new + noise.lasting == pytest.approx(1.0, abs=0.15)
 
 
 def test_what_never_changes_is_neither() -> None:
     noise = learned(0.05, 0.0, 0.1)
-    assert noise.anew == pytest.approx(0.2, abs=0.05) and noise.lasting < 0.05
+    assert noise.new == pytest.approx(0.2, abs=0.05) and noise.lasting < 0.05
 
 
 def test_before_anything_is_seen_all_is_new() -> None:
-    assert (TrackNoise(CAMERAS).anew, TrackNoise(CAMERAS).lasting) == (1.0, 0.0)
+    assert (TrackNoise(CAMERAS).new, TrackNoise(CAMERAS).lasting) == (1.0, 0.0)
 
 
 @pytest.mark.parametrize("size", [0.1, 0.3, 1.0])
