@@ -1,11 +1,11 @@
-"""Images with their stamps, the sets of frames that belong together, and what the arm tells of its print head.
+"""Images with their stamps, the sets of frames that belong together, and the print head as the arm reports it.
 
 Light to import: the motion process needs the tool's profile, and must not load OpenCV.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal, TypeVar
@@ -17,49 +17,58 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 
 Image = NDArray[np.uint8]
-StampedBy = Literal["", "driver", "stream", "arrival"]  # who told a live frame's instant; "" where it was recorded
+StampedBy = Literal["", "driver", "stream", "arrival"]  # source of a live frame's stamp; "" of a recorded one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One image. camera: number in the rig. stamp: s, middle of the exposure. image: (H, W) grey or (H, W, 3) BGR.
+    """One image of one camera."""
 
-    by: who told the stamp of a live frame.
-    """
-
-    camera: int
-    stamp: float
-    image: Image
+    camera: int  # number in the rig
+    stamp: float  # s, middle of the exposure
+    image: Image  # (H, W) grey or (H, W, 3) BGR
     by: StampedBy = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrintHead:
-    """What the arm knows of itself. base_from_nozzle: (4, 4), z from the tip up into the head. extruding: ink flows."""
+    """Where the print head is, by the arm."""
 
-    base_from_nozzle: Array
-    extruding: bool
+    base_from_nozzle: Array  # (4, 4) mm, z from the tip up into the head
+    extruding: bool  # whether ink flows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
-    """The frames of one instant, at most one per camera, in the rig's order; a camera may be missing. stamp: s.
+    """The frames of one instant, at most one per camera, in the rig's order; a camera may be missing."""
 
-    head: the print head at that instant, where an arm is known.
-    """
-
-    stamp: float
+    stamp: float  # s
     frames: tuple[Frame, ...]
-    head: PrintHead | None = None
+    head: PrintHead | None = None  # the print head at that instant, where an arm is known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Roi:
-    """Where the surface is in one image. camera: number in the rig. stamp: s. polygon: (N, 2) px, may lie outside."""
+    """Region of interest: where the surface is in one image."""
 
-    camera: int
-    stamp: float
-    polygon: Array
+    camera: int  # number in the rig
+    stamp: float  # s
+    polygon: Array  # (N, 2) px, may reach beyond the image
+
+
+def region_polygons(roi: Sequence[Roi], frames: FrameSet, sizes: Sequence[tuple[int, int]]) -> dict[int, Array] | str:
+    """The region of interest (N, 2) px in each image of the set, by camera, or why it is not known yet.
+
+    Without any the whole images are taken. sizes: (W, H) px by camera.
+    """
+    if not roi:
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+        return {f.camera: corners * sizes[f.camera] for f in frames.frames}
+    start = max(r.stamp for r in roi)
+    if frames.stamp < start - 0.1:
+        return f"waiting for the region of interest at {start:.3f} s"
+    cameras = {f.camera for f in frames.frames}
+    return {r.camera: r.polygon for r in sorted(roi, key=lambda r: r.camera) if r.camera in cameras}
 
 
 COMPARED_ROW_STEP = 16  # rows: noise makes two pictures differ in the first rows compared
@@ -74,8 +83,8 @@ class DuplicateFilter:
     def __call__(self, camera: int, image: Image) -> bool:
         """Whether a camera's image (H, W) differs from its last one in a single bit.
 
-        A sensor's noise never repeats. A picture without noise of a scene at rest passes for a repeated one, too: that
-        nothing moves cannot be told from that nothing comes.
+        A sensor's noise never repeats. A picture without noise of a scene at rest counts as repeated, too: a scene that
+        stands still and a camera that hangs then look the same.
         """
         last = self._last.get(camera)
         self._last[camera] = image

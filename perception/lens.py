@@ -58,17 +58,17 @@ class Lenses:
         camera: of all of them, or of each (...).
         """
         tangent = (ideal - self._centre[camera]) / self._focal[camera]
-        imaged, seen = self.bend(camera, tangent[..., 0], tangent[..., 1], depth)
-        return np.moveaxis(imaged, 0, -1), seen
+        imaged, visible = self.bend(camera, tangent[..., 0], tangent[..., 1], depth)
+        return np.moveaxis(imaged, 0, -1), visible
 
     def bend(
         self, camera: int | NDArray[np.int64], x: Array, y: Array, depth: Array
     ) -> tuple[Array, NDArray[np.bool_]]:
         """As `image`, of tangents x, y (...) of the angles to the axis; pixels (2, ...). camera: broadcast to them."""
         r2 = x * x + y * y
-        seen = (depth > 1.0) & (r2 < self.radius[camera] ** 2)
-        if not seen.all():
-            x, y, r2 = x * seen, y * seen, r2 * seen
+        visible = (depth > 1.0) & (r2 < self.radius[camera] ** 2)
+        if not visible.all():
+            x, y, r2 = x * visible, y * visible, r2 * visible
         k1, k2, p1, p2, k3 = np.moveaxis(self._bends[camera], -1, 0)
         radial, xy = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * x * y
         imaged = np.empty((2, *r2.shape))
@@ -77,7 +77,7 @@ class Lenses:
         for axis in (0, 1):
             imaged[axis] *= self._focal[camera, axis]
             imaged[axis] += self._centre[camera, axis]
-        return imaged, seen
+        return imaged, visible
 
 
 BILATERAL_DIAMETER, BILATERAL_SIGMA_GREY, BILATERAL_SIGMA_PX = 10, 75.0, 750.0  # thesis Appendix A
@@ -85,9 +85,8 @@ BILATERAL_DIAMETER, BILATERAL_SIGMA_GREY, BILATERAL_SIGMA_PX = 10, 75.0, 750.0  
 
 def bilateral(image: Image) -> Image:
     """The picture, its reflections filtered out and its contours kept (thesis 4.6, Fig. 4.9)."""
-    return np.asarray(
-        cv2.bilateralFilter(image, BILATERAL_DIAMETER, BILATERAL_SIGMA_GREY, BILATERAL_SIGMA_PX), np.uint8
-    )
+    smooth = cv2.bilateralFilter(image, BILATERAL_DIAMETER, BILATERAL_SIGMA_GREY, BILATERAL_SIGMA_PX)
+    return np.asarray(smooth, np.uint8)
 
 
 def unfiltered(image: Image) -> Image:

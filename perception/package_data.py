@@ -24,6 +24,6 @@ def named_path(text: str) -> Path:
     path = Path(text)
     if path.parts[:1] == ("data",) and len(path.parts) > 2 and not path.exists():
         for place in (CLONE_DATA, INSTALLED_DATA):
-            if (found := place.joinpath(*path.parts[1:])).is_file():
-                return found
+            if (shipped := place.joinpath(*path.parts[1:])).is_file():
+                return shipped
     return path

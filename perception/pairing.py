@@ -121,10 +121,12 @@ class Pairing:
     def add(self, frame: Frame, now: float) -> list[FrameSet]:
         """The sets that can be given out once a frame has arrived; now: s, rising from call to call."""
         self._last_stamp[frame.camera], self._last_arrival[frame.camera] = frame.stamp, now
-        if self._last_set is not None and self._last_set.should_have_held(frame, self._tolerance):
+        last = self._last_set
+        belongs_to_last = last is not None and last.takes(frame, self._tolerance)
+        if last is not None and (belongs_to_last or frame.stamp <= last.last):
             self.late += 1
-            if self._last_set.takes(frame, self._tolerance):
-                self._add_delay(frame.camera, now - self._last_set.arrived)
+            if belongs_to_last:
+                self._add_delay(frame.camera, now - last.arrived)
         else:
             self._place(frame, now)
         return self.due(now)
@@ -132,18 +134,15 @@ class Pairing:
     def due(self, now: float) -> list[FrameSet]:
         """The sets that are complete, or must not be waited for any longer, at `now`, s."""
         self._last_arrival = [now if arrival is None else arrival for arrival in self._last_arrival]
-        count = 0
-        for i, group in enumerate(self._open, 1):
-            if self._is_finished(group, now):
-                count = i  # and all before it, so that stamps rise
+        # with a set that is finished all before it are given out, so that stamps rise
+        count = max((i for i, group in enumerate(self._open, 1) if self._is_finished(group, now)), default=0)
         out, self._open = self._open[:count], self._open[count:]
         if out:
             self._last_set = out[-1]
         return [frame_set(list(group.frames.values())) for group in out]
 
     def _add_delay(self, camera: int, delay: float) -> None:
-        """A frame came `delay` s after the first one of its set. A single delay is an accident, most of the last
-        DELAY_SAMPLES are the camera's nature."""
+        """Take a frame's delay, s, behind the first one of its set; a camera's usual delay is the median of them."""
         self._delays[camera].append(delay)
         usual = [float(np.median(d)) for d in self._delays if len(d) == DELAY_SAMPLES]
         longest = min(max(usual, default=0.0), self._period)
@@ -193,7 +192,3 @@ class _OpenSet:
         """Whether a frame belongs here: its camera is not there yet, and no two stamps are further than `tolerance`."""
         near = max(frame.stamp, self.last) - min(frame.stamp, self.first) <= tolerance
         return near and frame.camera not in self.frames
-
-    def should_have_held(self, frame: Frame, tolerance: float) -> bool:
-        """Whether a frame belongs here or is older."""
-        return frame.stamp <= self.last or self.takes(frame, tolerance)

@@ -24,7 +24,7 @@ from hardware.simulator.scene.scene import Scene, rois
 from perception.lens import Lenses
 from perception.mapping.first_map import FirstMap, build_first_map, in_frame
 from perception.matching.features import grey, polygon_mask
-from perception.matching.patches import Pyramid, pyramid
+from perception.matching.patches import Pyramid
 from planning.command import Hold, Move
 from planning.robot.kinematics import nozzle_from_axes
 from tests.linked import linked
@@ -43,7 +43,7 @@ def look(
     """Images and polygons by camera."""
     images = pictures(scene, cameras.cameras, pose, np.random.default_rng(seed))
     return (
-        {c: pyramid(grey(image)) for c, image in enumerate(images)},
+        {c: Pyramid(grey(image)) for c, image in enumerate(images)},
         {roi.camera: roi.polygon for roi in rois(scene, cameras, pose, 0.0, 0.75)},
     )
 
@@ -180,9 +180,9 @@ def test_one_camera_gives_a_reason() -> None:
 @pytest.mark.parametrize(
     ("shown", "shift", "reason"),
     [
-        (lambda c: pyramid(np.full((480, 640), 0, np.uint8)), 0.0, "matched"),
-        (lambda c: pyramid(np.full((480, 640), 120, np.uint8)), 0.0, "matched"),
-        (lambda c: pyramid(np.random.default_rng(c).integers(0, 255, (480, 640), np.uint8)), 0.0, ""),
+        (lambda c: Pyramid(np.full((480, 640), 0, np.uint8)), 0.0, "matched"),
+        (lambda c: Pyramid(np.full((480, 640), 120, np.uint8)), 0.0, "matched"),
+        (lambda c: Pyramid(np.random.default_rng(c).integers(0, 255, (480, 640), np.uint8)), 0.0, ""),
         (lambda c: look(patch(10 + c))[0][c], 0.0, ""),
         (lambda c: look()[0][c], 5000.0, ""),
     ],

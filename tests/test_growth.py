@@ -29,7 +29,7 @@ from perception.lens import Lenses
 from perception.mapping.first_map import FirstMap, build_first_map
 from perception.mapping.growth import NewLandmarks, Probation, SurfaceSnapshot, between_known
 from perception.matching.features import MAX_DESCRIPTORS, Relocaliser, grey
-from perception.matching.patches import Pyramid, pyramid
+from perception.matching.patches import Pyramid
 from perception.tracking.step import TrackingStep
 from tests.synthetic import frame_sets, patch, pictures
 
@@ -120,7 +120,7 @@ MOVED = BASE_FROM_REST @ se3.exp([0.02, 0.01, 0.0, 8.0, 3.0, 2.0])
 @cache
 def images(moved: bool) -> dict[int, Pyramid]:
     taken = pictures(SMALL, WIDE_RIG.cameras, MOVED if moved else BASE_FROM_REST, np.random.default_rng(int(moved)))
-    return {c: pyramid(grey(i)) for c, i in enumerate(taken)}
+    return {c: Pyramid(grey(i)) for c, i in enumerate(taken)}
 
 
 @cache
@@ -134,7 +134,7 @@ def first() -> FirstMap:
 
 def waiting(amid_others: bool = False) -> Probation:
     start = first().base_from_surface
-    look = SurfaceSnapshot({}, start, dict.fromkeys(range(3), start), np.zeros((6, 6)), no_observations(0.0), {}, {})
+    look = SurfaceSnapshot({}, start, dict.fromkeys(range(3), start), np.zeros((6, 6)), no_observations(0.0), {})
     count = len(first().map)
     level = np.full(count, np.inf)
     return Probation(NewLandmarks(look, first().map, first().templates, level, {}), np.full(count, amid_others))

@@ -25,6 +25,7 @@ from perception.matching.patches import (
     RELIEF_PX,
     Alignment,
     Projection,
+    Pyramid,
     Templates,
     align,
     align_in,
@@ -34,7 +35,6 @@ from perception.matching.patches import (
     normalise,
     project_into,
     project_squares,
-    pyramid,
 )
 from tests.synthetic import LOOK, WIDE, patch, pictures
 
@@ -56,7 +56,7 @@ def true_pixels(pose: Array, camera: int = 0) -> Array:
 
 @pytest.fixture(scope="module")
 def templates() -> Templates:
-    return cut_templates(LENSES, pyramid(picture(BASE_FROM_REST)), 0, BASE_FROM_REST, POINTS, NORMALS)
+    return cut_templates(LENSES, Pyramid(picture(BASE_FROM_REST)), 0, BASE_FROM_REST, POINTS, NORMALS)
 
 
 def find(
@@ -69,7 +69,7 @@ def find(
 ) -> tuple[Alignment, Projection]:
     """Look for the patches in an image where the predicted pose puts them, or from `begin` (N, 2) px."""
     where = project_squares(LENSES, camera, predicted, POINTS, NORMALS, templates.axes)
-    return align(templates, pyramid(image), where, where.centre if begin is None else begin, coarse=coarse), where
+    return align(templates, Pyramid(image), where, where.centre if begin is None else begin, coarse=coarse), where
 
 
 def errors(found: Alignment, pose: Array, camera: int = 0) -> Array:
@@ -126,7 +126,7 @@ def test_the_claimed_error_is_of_the_true_ones_size(templates: Templates) -> Non
 @pytest.mark.parametrize("coarse", [True, False])
 def test_cameras_aligned_together_stand_where_each_does_alone(templates: Templates, coarse: bool) -> None:
     pose = BASE_FROM_REST @ se3.exp(np.array([0.004, 0, 0.004, 0.3, -0.2, 0]))
-    images = [pyramid(picture(BASE_FROM_REST, camera=c)) for c in range(3)]
+    images = [Pyramid(picture(BASE_FROM_REST, camera=c)) for c in range(3)]
     whole = project_into(LENSES, range(3), np.stack([pose] * 3), POINTS, NORMALS, templates.axes)
     count = [len(POINTS)] * 3
     together = align_in(join([templates] * 3), images, count, whole, whole.centre, coarse=coarse)
@@ -220,7 +220,7 @@ def test_a_square_is_about_a_pixel_a_sample_in_its_own_camera(templates: Templat
 
 def test_a_template_is_its_own_best_match(templates: Templates) -> None:
     where = project_squares(LENSES, 0, BASE_FROM_REST, POINTS, NORMALS, templates.axes)
-    images = pyramid(picture(BASE_FROM_REST))
+    images = Pyramid(picture(BASE_FROM_REST))
     itself = align(templates, images, where, where.centre, coarse=False)
     assert np.abs(itself.pixels - where.centre)[itself.found].max() < 0.05 and itself.score[itself.found].min() > 0.999
     here = coarse_score(templates, images, where, where.centre)

@@ -26,7 +26,7 @@ from perception.mapping.dense_matching import DenseMatch, match_near
 from perception.mapping.first_map import FirstMap, build_first_map, in_frame
 from perception.mapping.scan_map import MIN_SCAN_SIGMA_MM, ScanPlacing, as_at_one_instant, landmarks_on_scan
 from perception.matching.features import grey
-from perception.matching.patches import pyramid
+from perception.matching.patches import Pyramid
 from tests import scans
 from tests.synthetic import LOOK, SCAN_FROM_SURFACE, WIDE, pictures
 
@@ -167,7 +167,7 @@ def seen(kind: str) -> tuple[dict[int, Image], dict[int, Array]]:
 @cache
 def first(kind: str) -> FirstMap:
     images, polygons = seen(kind)
-    found = build_first_map(LENSES, {c: pyramid(i) for c, i in images.items()}, polygons)
+    found = build_first_map(LENSES, {c: Pyramid(i) for c, i in images.items()}, polygons)
     assert not isinstance(found, str), found
     return found
 

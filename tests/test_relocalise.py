@@ -25,7 +25,7 @@ from perception.lens import Lenses
 from perception.mapping.first_map import FirstMap, build_first_map
 from perception.matching.features import Relocaliser, grey
 from perception.matching.matcher import Matcher
-from perception.matching.patches import pyramid
+from perception.matching.patches import Pyramid
 from perception.tracking.reobservation import KnownMotion, ReferencePictures, Reobserver
 from tests.synthetic import AWAY, WIDE, frame_sets, patch, pictures
 
@@ -37,7 +37,7 @@ MAP = SurfaceMap(SCENE.shape.points(FLAT), SCENE.shape.normals(FLAT), np.zeros((
 
 def look(pose: Array, scene: Scene = SCENE, seed: int = 0) -> dict[int, tuple[Image, Image]]:
     images = pictures(scene, RIG.cameras, pose, np.random.default_rng(seed))
-    return {c: pyramid(grey(image)) for c, image in enumerate(images)}
+    return {c: Pyramid(grey(image)) for c, image in enumerate(images)}
 
 
 def learned(cameras: Rig = RIG) -> Relocaliser:
@@ -103,13 +103,13 @@ def test_another_surface_is_not_this_one(search: Relocaliser) -> None:
 
 @pytest.mark.parametrize("level", [0, 128])
 def test_nothing_is_found_in_even_images(search: Relocaliser, level: int) -> None:
-    blank = pyramid(np.full((720, 1280), level, np.uint8))
+    blank = Pyramid(np.full((720, 1280), level, np.uint8))
     assert search.find(dict.fromkeys(range(3), blank)) is None
     assert search.find({}) is None
 
 
 def test_a_blind_camera_does_not_hide_what_the_others_see(search: Relocaliser) -> None:
-    images = {**look(BASE_FROM_REST, seed=4), 1: pyramid(np.zeros((720, 1280), np.uint8))}
+    images = {**look(BASE_FROM_REST, seed=4), 1: Pyramid(np.zeros((720, 1280), np.uint8))}
     found = search.find(images)
     assert found is not None and 1 not in found.single and off(found.base_from_surface, BASE_FROM_REST)[0] < 1.5
 
@@ -168,7 +168,7 @@ class Case:
 def case() -> Case:
     sets = list(frame_sets(RELINKING_SCENE, RELINKING_RIG, moving, STAMPS, np.random.default_rng(0)))
     lenses = Lenses(RELINKING_RIG)
-    pyramids = [{f.camera: pyramid(grey(f.image)) for f in frames.frames} for frames in sets]
+    pyramids = [{f.camera: Pyramid(grey(f.image)) for f in frames.frames} for frames in sets]
     polygons = {roi.camera: roi.polygon for roi in rois(RELINKING_SCENE, RELINKING_RIG, moving(0.0), 0.0)}
     first = build_first_map(lenses, pyramids[0], polygons)
     assert isinstance(first, FirstMap)

@@ -31,7 +31,7 @@ from hardware.simulator.scene.shape import Shape, Wound, body, cylinder, flat, w
 from perception.frames import Frame, FrameSet, Image
 from perception.lens import Lenses
 from perception.matching.features import grey
-from perception.matching.patches import RELIEF_PX, align, cut_templates, project_squares, pyramid
+from perception.matching.patches import RELIEF_PX, Pyramid, align, cut_templates, project_squares
 from perception.tracking.step import TrackingStep
 
 SCAN_SPACING = 1.0  # mm between the vertices of a scan, as handheld scanners give them
@@ -317,11 +317,11 @@ def track_pictures(name: str, stamps: Array) -> tuple[Array, Array]:
         (image,) = render(scene, rig.cameras[1:2], [state], Sensor(), [rng])
         return grey(image)
 
-    templates = cut_templates(lenses, pyramid(picture(0.0)), 1, BASE_FROM_REST, points, normals)
+    templates = cut_templates(lenses, Pyramid(picture(0.0)), 1, BASE_FROM_REST, points, normals)
     where = project_squares(lenses, 1, BASE_FROM_REST, points, normals, templates.axes)
     pixels, sigmas = np.full((len(stamps), len(points), 2), np.nan), np.full((len(stamps), len(points)), np.nan)
     for i, stamp in enumerate(stamps.tolist()):
-        found = align(templates, pyramid(picture(stamp)), where, where.centre, coarse=False)
+        found = align(templates, Pyramid(picture(stamp)), where, where.centre, coarse=False)
         pixels[i, found.found], sigmas[i, found.found] = found.pixels[found.found], found.sigma[found.found]
     return pixels, sigmas
 

@@ -159,13 +159,7 @@ def _measure_tip(change: Light, behind: Light, tip: Array, towards: Array) -> Ti
 
 
 def _tip(
-    along: Array,
-    across: Array,
-    amount: Array,
-    inner: NDArray[np.bool_],
-    tip: Array,
-    towards: Array,
-    contrast: float,
+    along: Array, across: Array, amount: Array, inner: NDArray[np.bool_], tip: Array, towards: Array, contrast: float
 ) -> Tip | None:
     profile = amount.sum(1)[inner] * SAMPLE_STEP
     line = np.polyval(np.polyfit(along[inner], profile, 1), along[inner])

@@ -40,29 +40,27 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DenseMatch:
-    """What a lattice's nodes turned out to be. points: (H, W, 3) mm, base frame; sure: (H, W) whether to believe it."""
+    """The surface at the nodes of a lattice."""
 
-    points: Array
-    sure: NDArray[np.bool_]
+    points: Array  # (H, W, 3) mm, base frame
+    sure: NDArray[np.bool_]  # (H, W) whether to believe it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LatticeImage:
-    """One camera's picture on the lattice. even: (H, W) uint8, evened out; pixels: (H, W, 2) ideal; seen: (H, W)."""
+    """One camera's picture on the lattice."""
 
-    even: Image
-    pixels: Array
-    seen: NDArray[np.bool_]
+    even: Image  # (H, W) brightness and contrast evened out
+    pixels: Array  # (H, W, 2) px, ideal
+    visible: NDArray[np.bool_]  # (H, W)
 
 
 def node_size(lenses: Lenses, cameras: list[int], centre: Array) -> float:
     """A good distance, mm, between nodes about `centre` (3,), base frame: what the sharpest camera resolves."""
-    sizes = []
-    for c in cameras:
-        lens = lenses.rig.cameras[c]
-        away = float(np.linalg.norm(centre - lens.base_from_camera[:3, 3]))
-        sizes.append(NODE_PIXELS * away / float(lens.matrix[[0, 1], [0, 1]].mean()))
-    return min(sizes)
+    own = [lenses.rig.cameras[c] for c in cameras]
+    away = [float(np.linalg.norm(centre - camera.base_from_camera[:3, 3])) for camera in own]
+    focal = [float(camera.matrix[[0, 1], [0, 1]].mean()) for camera in own]
+    return min(NODE_PIXELS * a / f for a, f in zip(away, focal, strict=True))
 
 
 def match_near(
@@ -70,25 +68,25 @@ def match_near(
 ) -> DenseMatch | None:
     """Where the surface near `nodes` (H, W, 3), base frame, really is; None where no two cameras see any of it.
 
-    Each node's ray in the reference camera is met with those of the other cameras at the places that look like it.
-    every: only each so manieth row and column of nodes is given, (H', W', 3).
+    Each node's ray in the reference camera is intersected with those of the other cameras at the places that match.
+    every: step in rows and columns between the nodes given, (H', W', 3).
     """
     towards = _normals(nodes)
     first = _lattice_image(lenses, reference, images[reference], nodes, towards)
     flow = _flow()
-    pixels, camera, used = [first.pixels], [reference], [first.seen]
+    pixels, camera, used = [first.pixels], [reference], [first.visible]
     for c in sorted(set(images) - {reference}):
         other = _lattice_image(lenses, c, images[c], nodes, towards)
-        found, alike = _shifted(flow, first, other)
-        pixels.append(found)
+        matches, correlation = _matched(flow, first, other)
+        pixels.append(matches)
         camera.append(c)
-        used.append(first.seen & other.seen & (alike > MIN_MATCH_CORRELATION))
+        used.append(first.visible & other.visible & (correlation > MIN_MATCH_CORRELATION))
     if len(used) < 2:
         return None
     chosen = (slice(None), slice(None, None, every), slice(None, None, every))
-    seen, where = np.stack(used)[chosen], np.stack(pixels)[chosen]
-    both = np.asarray(seen[1:].any(axis=0), bool)
-    return _triangulated(lenses, nodes[chosen[1:]], where, np.array(camera), seen & both, both) if both.any() else None
+    looks, where = np.stack(used)[chosen], np.stack(pixels)[chosen]
+    both = np.asarray(looks[1:].any(axis=0), bool)
+    return _triangulated(lenses, nodes[chosen[1:]], where, np.array(camera), looks & both, both) if both.any() else None
 
 
 def middle_camera(lenses: Lenses, cameras: list[int], centre: Array) -> int:
@@ -110,14 +108,13 @@ def _triangulated(
     number = np.cumsum(both.ravel()).reshape(both.shape) - 1
     which, row, column = np.nonzero(used)
     point = number[row, column]
-    found, _, residual = triangulate(
-        lenses.rig, point, camera[which], pixels[which, row, column], int(both.sum()), iterations=2
-    )
-    aside = np.zeros(len(found))
+    looks = pixels[which, row, column]
+    met, _, residual = triangulate(lenses.rig, point, camera[which], looks, int(both.sum()), iterations=2)
+    aside = np.zeros(len(met))
     np.maximum.at(aside, point, np.linalg.norm(residual, axis=1))
     points, sure = nodes.copy(), both.copy()
-    points[both] = found
-    sure[both] = (aside < max(MAX_EPIPOLAR_ERROR_PX, 3 * float(np.median(aside)))) & np.isfinite(found).all(1)
+    points[both] = met
+    sure[both] = (aside < max(MAX_EPIPOLAR_ERROR_PX, 3 * float(np.median(aside)))) & np.isfinite(met).all(1)
     return DenseMatch(points, sure)
 
 
@@ -130,23 +127,18 @@ def _normals(nodes: Array) -> Array:
 def _lattice_image(lenses: Lenses, camera: int, image: Image, nodes: Array, normals: Array) -> _LatticeImage:
     lens = lenses.rig.cameras[camera]
     ideal, depth = ideal_pixels(lens, nodes.reshape(-1, 3))
-    imaged, seen = lenses.image(camera, ideal, depth)
+    imaged, in_lens = lenses.image(camera, ideal, depth)
     view = lens.base_from_camera[:3, 3] - nodes
     facing = np.abs(np.einsum("hwi,hwi->hw", view, normals)) / np.linalg.norm(view, axis=2)
-    inside = seen & ((imaged > 1) & (imaged < np.array(lens.size) - 2)).all(1)
-    x, y = imaged.astype(np.float32).reshape(*nodes.shape[:2], 2).transpose(2, 0, 1)
-    laid = cv2.remap(image, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_CUBIC)
+    inside = in_lens & ((imaged > 1) & (imaged < np.array(lens.size) - 2)).all(1)
     shape = nodes.shape[:2]
-    return _LatticeImage(
-        _even_out(np.asarray(laid)), ideal.reshape(*shape, 2), inside.reshape(shape) & (facing > MIN_NODE_FACING)
-    )
-
-
-def _even_out(image: Image) -> Image:
-    grey = image.astype(np.float32)
+    x, y = imaged.astype(np.float32).reshape(*shape, 2).transpose(2, 0, 1)
+    laid = cv2.remap(image, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_CUBIC)
+    grey = np.asarray(laid).astype(np.float32)
     centred = grey - cv2.GaussianBlur(grey, (0, 0), EVENING_SIGMA_NODES)
     spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), EVENING_SIGMA_NODES))
-    return np.asarray(np.clip(np.rint(128 + EVENED_CONTRAST * centred / (spread + 2.0)), 0, 255), np.uint8)
+    even = np.clip(np.rint(128 + EVENED_CONTRAST * centred / (spread + 2.0)), 0, 255).astype(np.uint8)
+    return _LatticeImage(even, ideal.reshape(*shape, 2), inside.reshape(shape) & (facing > MIN_NODE_FACING))
 
 
 def _flow() -> cv2.DISOpticalFlow:
@@ -162,27 +154,19 @@ def _flow() -> cv2.DISOpticalFlow:
     return flow
 
 
-def _shifted(flow: cv2.DISOpticalFlow, first: _LatticeImage, other: _LatticeImage) -> tuple[Array, Float32]:
-    """Ideal pixels (H, W, 2) in the other camera of what the first sees at each node, and how alike they look."""
+def _matched(flow: cv2.DISOpticalFlow, first: _LatticeImage, other: _LatticeImage) -> tuple[Array, Float32]:
+    """Ideal pixels (H, W, 2) in the other camera of what the first sees at each node, and their correlation (H, W)."""
     still = np.zeros((*first.even.shape, 2), np.float32)
     shift = np.asarray(flow.calc(first.even, other.even, still))
     y, x = np.mgrid[: shift.shape[0], : shift.shape[1]].astype(np.float32)
     x, y = x + shift[..., 0], y + shift[..., 1]
-    found = cv2.remap(other.pixels.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    there = cv2.remap(other.even, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found, float), _correlation(first.even, np.asarray(there))
-
-
-def _correlation(a: Image, b: Image) -> Float32:
-    """Correlation (H, W) of two evened pictures about each node."""
-    here, there = a.astype(np.float32) - 128, b.astype(np.float32) - 128
-
-    def mean(product: Float32) -> Float32:
-        return np.asarray(cv2.GaussianBlur(product, (0, 0), EVENING_SIGMA_NODES / 2), np.float32)
-
-    return np.asarray(
-        mean(here * there) / (np.sqrt(mean(here * here) * mean(there * there)) + MIN_EVENED_VARIANCE), np.float32
+    pixels, picture = (
+        np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+        for values in (other.pixels.astype(np.float32), other.even)
     )
+    a, b = first.even.astype(np.float32) - 128, picture.astype(np.float32) - 128
+    ab, aa, bb = (cv2.GaussianBlur(product, (0, 0), EVENING_SIGMA_NODES / 2) for product in (a * b, a * a, b * b))
+    return pixels.astype(float), np.asarray(ab / (np.sqrt(aa * bb) + MIN_EVENED_VARIANCE), np.float32)
 
 
 GUESS_SIGMA_MM = 6.0  # mm over which landmarks are averaged for the first guess: about the distance between them
@@ -203,25 +187,21 @@ def relief_points(lenses: Lenses, images: dict[int, Image], first: FirstMap, pol
     finest = node_size(lenses, cameras, centre)
     points = first.map.points
     low, high = np.percentile(points[:, :2], [1, 99], axis=0) + np.array([[-LATTICE_MARGIN_MM], [LATTICE_MARGIN_MM]])
-    heights, found, sure = None, np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
+    heights, relief, sure = _initial_heights(points, low, high), np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
     for width in NODE_WIDTHS:
         flat = _lattice(low, high, width * finest)
-        heights = (
-            _initial_heights(points, low, high, flat.shape[:2])
-            if heights is None
-            else _resized(heights, flat.shape[:2])
-        )
-        nodes = np.dstack([flat, heights.astype(float)])
-        matched = match_near(lenses, images, _transformed(first.base_from_surface, nodes), reference)
-        if matched is None:
+        size = flat.shape[1], flat.shape[0]
+        resized = np.asarray(cv2.resize(heights, size, interpolation=cv2.INTER_CUBIC), np.float32)
+        nodes = np.dstack([flat, resized.astype(float)])
+        match = match_near(lenses, images, _transformed(first.base_from_surface, nodes), reference)
+        if match is None:
             return np.zeros((0, 3))
-        found, sure = matched.points, matched.sure
-        inner = _transformed(se3.inverse(first.base_from_surface), found)
+        relief, sure = match.points, match.sure
+        inner = _transformed(se3.inverse(first.base_from_surface), relief)
         heights = _corrected(nodes, inner, sure, width * finest)
-    sure &= _inside(lenses, reference, found, polygons)
-    return np.asarray(
-        found[::POINT_SPACING_NODES, ::POINT_SPACING_NODES][sure[::POINT_SPACING_NODES, ::POINT_SPACING_NODES]]
-    )
+    sure &= _inside(lenses, reference, relief, polygons)
+    every = slice(None, None, POINT_SPACING_NODES)
+    return np.asarray(relief[every, every][sure[every, every]])
 
 
 def _lattice(low: Array, high: Array, step: float) -> Array:
@@ -229,39 +209,32 @@ def _lattice(low: Array, high: Array, step: float) -> Array:
     return np.stack(np.meshgrid(x, y), -1)
 
 
-def _initial_heights(points: Array, low: Array, high: Array, shape: tuple[int, ...]) -> Float32:
-    """Heights on the lattice by a plane through the landmarks (N, 3) around each node, the nearer the more."""
+def _initial_heights(points: Array, low: Array, high: Array) -> Float32:
+    """Heights on a coarse lattice by a plane through the landmarks (N, 3) around each node, the nearer the more."""
     flat = _lattice(low, high, GUESS_SIGMA_MM / 2)
     away = points[None, :, :2] - flat.reshape(-1, 1, 2)
     weight = np.exp(-(away**2).sum(2) / (2 * GUESS_SIGMA_MM**2)) + 1e-6
     design = np.concatenate([np.ones((*away.shape[:2], 1)), away / GUESS_SIGMA_MM], 2)
     normal = np.einsum("nmi,nm,nmj->nij", design, weight, design, optimize=True) + 1e-4 * np.eye(3)
     right = np.einsum("nmi,nm->ni", design, weight * points[:, 2])
-    rough = np.linalg.solve(normal, right[..., None])[:, 0, 0].reshape(flat.shape[:2])
-    return _resized(rough.astype(np.float32), shape)
-
-
-def _resized(heights: Float32, shape: tuple[int, ...]) -> Float32:
-    return np.asarray(cv2.resize(heights, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC), np.float32)
+    return np.linalg.solve(normal, right[..., None])[:, 0, 0].reshape(flat.shape[:2]).astype(np.float32)
 
 
 def _transformed(transform: Array, nodes: Array) -> Array:
     return se3.transform_points(transform, nodes.reshape(-1, 3)).reshape(nodes.shape)
 
 
-def _corrected(nodes: Array, found: Array, sure: NDArray[np.bool_], step: float) -> Float32:
-    """New heights (H, W) from where the nodes (H, W, 3) were found, in the surface frame."""
-    heights, off = nodes[..., 2], found - nodes
+def _corrected(nodes: Array, matches: Array, sure: NDArray[np.bool_], step: float) -> Float32:
+    """New heights (H, W) from the points (H, W, 3) matched at the nodes (H, W, 3), in the surface frame."""
+    heights, off = nodes[..., 2], matches - nodes
     down, right = np.gradient(heights, step)
     up = (off[..., 2] - right * off[..., 0] - down * off[..., 1]).astype(np.float32)
     up = np.where(sure, up, 0).astype(np.float32)
     around = np.asarray(cv2.medianBlur(up, 5))
     up = np.where(np.abs(up - around) < MAX_JUMP_MM, up, around)
     weight = sure.astype(np.float32) + 1e-6
-    mean = cv2.GaussianBlur(up * weight, (0, 0), CORRECTION_SIGMA_NODES) / cv2.GaussianBlur(
-        weight, (0, 0), CORRECTION_SIGMA_NODES
-    )
-    return np.asarray(heights + mean, np.float32)
+    total, weights = (cv2.GaussianBlur(values, (0, 0), CORRECTION_SIGMA_NODES) for values in (up * weight, weight))
+    return np.asarray(heights + total / weights, np.float32)
 
 
 def _inside(lenses: Lenses, camera: int, points: Array, polygons: dict[int, Array]) -> NDArray[np.bool_]:

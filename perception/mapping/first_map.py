@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
 from estimation import se3
@@ -26,6 +27,7 @@ from perception.matching.features import Features, ImageMask, corners, match, po
 from perception.matching.masks import trackable
 from perception.matching.patches import (
     MIN_PATCH_CONTRAST,
+    Projection,
     Pyramid,
     Templates,
     align,
@@ -43,11 +45,11 @@ TARGET_LANDMARKS = 240  # in all: more cost time and gain nothing (the map's own
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FirstMap:
-    """base_from_surface (4, 4) and the map at the first instant, with the reference pictures of its landmarks."""
+    """The map at the first instant."""
 
-    base_from_surface: Array
-    map: SurfaceMap
-    templates: Templates
+    base_from_surface: Array  # (4, 4)
+    map: SurfaceMap  # surface frame
+    templates: Templates  # reference pictures of its landmarks
 
 
 def in_frame(first: FirstMap, base_from_new: Array) -> FirstMap:
@@ -59,13 +61,13 @@ def in_frame(first: FirstMap, base_from_new: Array) -> FirstMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
-    """Matches between cameras a and b: ideal pixels (N, 2) in each, points (N, 3) in the base frame."""
+    """Matches between cameras a and b."""
 
     a: int
     b: int
-    pixels_a: Array
-    pixels_b: Array
-    points: Array
+    pixels_a: Array  # (N, 2) px, ideal
+    pixels_b: Array  # (N, 2) px, ideal
+    points: Array  # (N, 3) mm, base frame
 
 
 def consensus(
@@ -117,15 +119,12 @@ def find_seeds(lenses: Lenses, a: int, b: int, features: dict[int, Features], rn
     if len(pairs) < MIN_SEEDS:
         return None
     both = np.concatenate([features[a][0][pairs[:, 0]], features[b][0][pairs[:, 1]]], 1)
-    _, first = np.unique(
-        np.round(both / SAME_SPOT_PX), axis=0, return_index=True
-    )  # one spot was found under several tilts
+    _, first = np.unique(np.round(both / SAME_SPOT_PX), axis=0, return_index=True)  # several tilts show one spot
     pixels_a, pixels_b = undistort(cameras[a], both[first, :2]), undistort(cameras[b], both[first, 2:])
     distance = epipolar_distance(lenses.rig, a, b, pixels_a, pixels_b)
     good = consensus(pixels_b, distance, MAX_EPIPOLAR_OFFSET_PX, 2.0, rng)
     points, _, _ = _pair_points(lenses.rig, a, b, pixels_a[good], pixels_b[good])
-    depth_a = ideal_pixels(cameras[a], points)[1]
-    depth_b = ideal_pixels(cameras[b], points)[1]
+    depth_a, depth_b = (ideal_pixels(cameras[c], points)[1] for c in (a, b))
     plausible = (depth_a > 20) & (depth_b > 20) & np.isfinite(points).all(1)
     plausible[plausible] &= _smooth(points[plausible])
     if plausible.sum() < MIN_SEEDS:
@@ -134,11 +133,10 @@ def find_seeds(lenses: Lenses, a: int, b: int, features: dict[int, Features], rn
 
 
 def _pair_points(rig: Rig, a: int, b: int, pixels_a: Array, pixels_b: Array) -> tuple[Array, Array, Array]:
+    """Triangulated points (N, 3), covariances (N, 3, 3) and residuals (2 N, 2), of pixels (N, 2) of two cameras."""
     n = len(pixels_a)
-    point = np.tile(np.arange(n), 2)
-    camera = np.repeat([a, b], n)
-    points, covariance, residual = triangulate(rig, point, camera, np.concatenate([pixels_a, pixels_b]), n)
-    return points, covariance, residual
+    point, camera = np.tile(np.arange(n), 2), np.repeat([a, b], n)
+    return triangulate(rig, point, camera, np.concatenate([pixels_a, pixels_b]), n)
 
 
 def _meet_seed_surface(
@@ -146,81 +144,82 @@ def _meet_seed_surface(
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """Where rays of pixels (N, 2) meet the seeds' surface: points (N, 3) and normals (N, 3), base frame.
 
-    With them the mean offset (N, 2), px, of nearby seeds in the other camera from where their own rays and depths would
-    put them, and whether seeds are near (N,).
+    With them the mean offset (N, 2), px, in the other camera of nearby seeds from the projection of their own rays'
+    points, and whether seeds are near (N,).
     """
     own, other = (seeds.pixels_a, seeds.pixels_b) if camera == seeds.a else (seeds.pixels_b, seeds.pixels_a)
     target = seeds.b if camera == seeds.a else seeds.a
     tree = cKDTree(own)
-    k = min(6, len(own))
-    gap, near = tree.query(pixels, k=k)
+    gap, near = tree.query(pixels, k=min(6, len(own)))
     spacing = np.median(tree.query(own, k=min(4, len(own)))[0][:, -1])
     normals = local_normals(seeds.points, outward)[near].mean(1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    which = np.full(len(pixels), camera)
-    origins, directions = rays(rig, which, pixels)
+    origins, directions = rays(rig, np.full(len(pixels), camera), pixels)
     anchor = seeds.points[near].mean(1)
     slope = np.einsum("ni,ni->n", directions, normals)
     safe = np.where(np.abs(slope) < 0.05, -0.05, slope)
     reach = np.einsum("ni,ni->n", anchor - origins, normals) / safe
     points = origins + reach[:, None] * directions
-    seed_origins, seed_directions = rays(rig, np.full(len(own), camera), own)
-    along = np.einsum("ni,ni->n", seeds.points - seed_origins, seed_directions)
-    on_ray = seed_origins + along[:, None] * seed_directions
+    on_ray = on_rays(rig, camera, own, seeds.points)
     offset = (other - ideal_pixels(rig.cameras[target], on_ray)[0])[near].mean(1)
     return points, normals, offset, (gap[:, 0] < 3 * spacing + 10) & (np.abs(slope) > 0.05)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
-    """Candidates of one reference camera: its pixels (N, 2) and those in the other camera, ideal; points, normals."""
+    """Candidates of one reference camera, each matched in another."""
 
     camera: int
     other: int
-    pixels: Array
-    pixels_other: Array
-    points: Array
-    normals: Array
+    pixels: Array  # (N, 2) px, ideal
+    pixels_other: Array  # (N, 2) px, ideal, in the other camera
+    points: Array  # (N, 3) mm, base frame
+    normals: Array  # (N, 3), base frame
 
 
 def find_landmarks(
     lenses: Lenses, pyramids: dict[int, Pyramid], mask: NDArray[np.uint8], seeds: Seeds, camera: int, count: int
 ) -> Landmarks | None:
-    """Corners of one camera, found in the other: first on the seeds' surface, then by a sweep along their rays."""
+    """Corners of one camera, matched in the other: first on the seeds' surface, then by a sweep along their rays."""
     rig = lenses.rig
     other = seeds.b if camera == seeds.a else seeds.a
+    pair = _CameraPair(lenses, pyramids, camera, other)
     outward = rig.cameras[camera].base_from_camera[:3, 3] - seeds.points.mean(0)
     pixels = undistort(rig.cameras[camera], corners(pyramids[camera][0], mask, count))
     if len(pixels) < 4:
         return None
+
+    # on the seeds' surface
     points, normals, offset, near = _meet_seed_surface(rig, seeds, camera, pixels, outward)
-    found, good = _align_in_other(lenses, pyramids, camera, other, points, normals, offset, least=0.8)
+    matches, good = pair.align(points, normals, offset, least=0.8)
     good &= near
     if good.sum() >= 4:
-        surface = _pair_points(rig, camera, other, pixels[good], found[good])[0]
+        surface = _pair_points(rig, camera, other, pixels[good], matches[good])[0]
         normals[~good] = local_normals(np.concatenate([surface, seeds.points]), outward).mean(0)
+
+    # where that fails, along the rays
     missing = np.nonzero(~good)[0]
     if len(missing):
-        swept, sure = _sweep(lenses, pyramids, camera, other, pixels[missing], normals[missing], seeds, offset[missing])
-        again, back = _align_in_other(
-            lenses, pyramids, camera, other, swept, normals[missing], offset[missing], least=0.85
-        )
-        found[missing], good[missing] = again, back & sure
+        swept, sure = pair.sweep(pixels[missing], normals[missing], offset[missing], seeds)
+        matches[missing], aligned = pair.align(swept, normals[missing], offset[missing], least=0.85)
+        good[missing] = aligned & sure
+
+    # twice without outliers, on the surface of what is left
     for _ in range(2):
-        pixels, found = pixels[good], found[good]
+        pixels, matches = pixels[good], matches[good]
         if len(pixels) < 6:
             return None
-        points, _, residual = _pair_points(rig, camera, other, pixels, found)
+        points, _, residual = _pair_points(rig, camera, other, pixels, matches)
         keep = _smooth(points) & _affine_consistent(pixels, residual.reshape(2, -1, 2)[1])
-        pixels, found, points = pixels[keep], found[keep], points[keep]
+        pixels, matches, points = pixels[keep], matches[keep], points[keep]
         if len(pixels) < 6:
             return None
         normals = smooth_normals(points, outward)
         on_ray = on_rays(rig, camera, pixels, points)
-        offset = found - ideal_pixels(rig.cameras[other], on_ray)[0]
-        found, good = _align_in_other(lenses, pyramids, camera, other, on_ray, normals, offset, least=0.8)
-    points = _pair_points(rig, camera, other, pixels[good], found[good])[0]
-    return Landmarks(camera, other, pixels[good], found[good], points, normals[good])
+        offset = matches - ideal_pixels(rig.cameras[other], on_ray)[0]
+        matches, good = pair.align(on_ray, normals, offset, least=0.8)
+    points = _pair_points(rig, camera, other, pixels[good], matches[good])[0]
+    return Landmarks(camera, other, pixels[good], matches[good], points, normals[good])
 
 
 def best_landmarks(
@@ -230,7 +229,7 @@ def best_landmarks(
     counts: dict[int, int],
     seeds_between: Callable[[int, int], Seeds | None],
 ) -> list[Landmarks]:
-    """The landmarks of each reference camera, each with the partner in which most of its corners are found.
+    """The landmarks of each reference camera, with the partner in which most of its corners are matched.
 
     counts: corners by camera, in ascending order of cameras; one with none is no reference.
     """
@@ -246,56 +245,48 @@ def best_landmarks(
     return [best[c] for c in sorted(best)]
 
 
-def _align_in_other(
-    lenses: Lenses,
-    pyramids: dict[int, Pyramid],
-    camera: int,
-    other: int,
-    points: Array,
-    normals: Array,
-    offset: Array,
-    least: float,
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Ideal pixels (N, 2) in the other camera where the patches of points (N, 3), base frame, fit, and whether."""
-    templates = cut_templates(lenses, pyramids[camera], camera, np.eye(4), points, normals)
-    where = project_squares(lenses, other, np.eye(4), points, normals, templates.axes)
-    start = where.centre + offset
-    result = align(templates, pyramids[other], where, start, least)
-    near = np.linalg.norm(result.pixels - start, axis=1) < 10
-    return undistort(lenses.rig.cameras[other], result.pixels), result.found & near & (
-        templates.contrast > MIN_PATCH_CONTRAST
-    )
+@dataclass(frozen=True, slots=True, eq=False)
+class _CameraPair:
+    """Images (by camera) of a reference camera and of another one, in which its patches are looked for."""
 
+    lenses: Lenses
+    pyramids: dict[int, Pyramid]
+    camera: int
+    other: int
 
-def _sweep(
-    lenses: Lenses,
-    pyramids: dict[int, Pyramid],
-    camera: int,
-    other: int,
-    pixels: Array,
-    normals: Array,
-    seeds: Seeds,
-    offset: Array,
-    steps: int = 48,
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Points (N, 3), base frame, on the rays of pixels (N, 2) at the depth where the patch fits best, and whether one
-    depth stands out (N,). Depths: the seeds' own range and a fifth more, even in inverse depth."""
-    rig = lenses.rig
-    origins, directions = rays(rig, np.full(len(pixels), camera), pixels)
-    reach = np.linalg.norm(seeds.points - rig.cameras[camera].base_from_camera[:3, 3], axis=1)
-    inverse = np.linspace(1 / (reach.max() * 1.2), 1 / (reach.min() * 0.8), steps)
-    scores = np.full((len(pixels), steps), -1.0)
-    for k, value in enumerate(inverse):
-        points = origins + directions / value
-        templates = cut_templates(lenses, pyramids[camera], camera, np.eye(4), points, normals)
-        where = project_squares(lenses, other, np.eye(4), points, normals, templates.axes)
-        current = coarse_score(templates, pyramids[other], where, where.centre + offset)
-        scores[:, k] = np.where(where.visible, current, -1.0)
-    best = scores.argmax(1)
-    beside = np.abs(np.arange(steps) - best[:, None]) <= 3
-    rival = np.where(beside, -1.0, scores).max(1)
-    peak = scores[np.arange(len(pixels)), best]
-    return origins + directions / inverse[best][:, None], (peak > 0.7) & (rival < peak - 0.1)
+    def _cut(self, points: Array, normals: Array) -> tuple[Templates, Projection]:
+        """The patches of points (N, 3), base frame, and where they fall in the other camera."""
+        templates = cut_templates(self.lenses, self.pyramids[self.camera], self.camera, np.eye(4), points, normals)
+        return templates, project_squares(self.lenses, self.other, np.eye(4), points, normals, templates.axes)
+
+    def align(self, points: Array, normals: Array, offset: Array, least: float) -> tuple[Array, NDArray[np.bool_]]:
+        """Ideal pixels (N, 2) in the other camera where the patches of points (N, 3), base frame, fit, and whether."""
+        templates, where = self._cut(points, normals)
+        start = where.centre + offset
+        result = align(templates, self.pyramids[self.other], where, start, least)
+        near = np.linalg.norm(result.pixels - start, axis=1) < 10
+        good = result.found & near & (templates.contrast > MIN_PATCH_CONTRAST)
+        return undistort(self.lenses.rig.cameras[self.other], result.pixels), good
+
+    def sweep(
+        self, pixels: Array, normals: Array, offset: Array, seeds: Seeds, steps: int = 48
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Points (N, 3), base frame, on the rays of pixels (N, 2) at the depth where the patch fits best, and whether
+        one depth stands out (N,). Depths: the seeds' own range and a fifth more, even in inverse depth."""
+        rig = self.lenses.rig
+        origins, directions = rays(rig, np.full(len(pixels), self.camera), pixels)
+        reach = np.linalg.norm(seeds.points - rig.cameras[self.camera].base_from_camera[:3, 3], axis=1)
+        inverse = np.linspace(1 / (reach.max() * 1.2), 1 / (reach.min() * 0.8), steps)
+        scores = np.full((len(pixels), steps), -1.0)
+        for k, value in enumerate(inverse):
+            templates, where = self._cut(origins + directions / value, normals)
+            current = coarse_score(templates, self.pyramids[self.other], where, where.centre + offset)
+            scores[:, k] = np.where(where.visible, current, -1.0)
+        best = scores.argmax(1)
+        beside = np.abs(np.arange(steps) - best[:, None]) <= 3
+        rival = np.where(beside, -1.0, scores).max(1)
+        peak = scores[np.arange(len(pixels)), best]
+        return origins + directions / inverse[best][:, None], (peak > 0.7) & (rival < peak - 0.1)
 
 
 def on_rays(rig: Rig, camera: int, pixels: Array, points: Array) -> Array:
@@ -325,15 +316,12 @@ def build_first_map(
     pyramids: by camera, the images. polygons: by camera, (N, 2) px as imaged; at least two cameras. heads: by camera,
     where the print head is.
     """
-    heads = heads or {}
-    rig = lenses.rig
-    rng = np.random.default_rng(0)
+    rig, rng = lenses.rig, np.random.default_rng(0)
     cameras = sorted(set(pyramids) & set(polygons))
     if len(cameras) < 2:
         return "the surface must be seen by two cameras to be mapped"
-    masks = {
-        c: trackable(pyramids[c][0], polygon_mask(rig.cameras[c].size, polygons[c]), heads.get(c)) for c in cameras
-    }
+    regions = {c: polygon_mask(rig.cameras[c].size, polygons[c]) for c in cameras}
+    masks = {c: trackable(pyramids[c][0], regions[c], (heads or {}).get(c)) for c in cameras}
     features = {c: sift(pyramids[c][0], masks[c], 1000, tilted=True) for c in cameras}
     counts = dict.fromkeys(cameras, TARGET_LANDMARKS // len(cameras))
     parts = best_landmarks(lenses, pyramids, masks, counts, lambda a, b: find_seeds(lenses, a, b, features, rng))
@@ -355,20 +343,13 @@ def assemble(
     points = se3.transform_points(surface_from_base, points_base)
     outward = np.mean([rig.cameras[p.camera].base_from_camera[:3, 3] for p in parts], axis=0) - points_base.mean(0)
     normals = smooth_normals(points, surface_from_base[:3, :3] @ outward)
-    first = np.cumsum([0] + [len(p.points) for p in parts])
-    templates = join(
-        [
-            cut_templates(lenses, pyramids[p.camera], p.camera, base_from_surface, points[i:j], normals[i:j])
-            for p, i, j in zip(parts, first[:-1], first[1:], strict=True)
-        ]
-    )
-    covariance = np.zeros((3 * len(points), 3 * len(points)))
-    for p, i in zip(parts, first[:-1], strict=True):
-        blocks = _pair_points(rig, p.camera, p.other, p.pixels, p.pixels_other)[1]
-        turned = surface_from_base[:3, :3] @ blocks @ surface_from_base[:3, :3].T * 0.2**2
-        for j, block in enumerate(turned):
-            at = 3 * (i + j)
-            covariance[at : at + 3, at : at + 3] = block
+    pictures, blocks = list[Templates](), list[Array]()
+    for p, (i, j) in zip(parts, pairwise(np.cumsum([0, *(len(p.points) for p in parts)])), strict=True):
+        images = pyramids[p.camera]
+        pictures.append(cut_templates(lenses, images, p.camera, base_from_surface, points[i:j], normals[i:j]))
+        own = _pair_points(rig, p.camera, p.other, p.pixels, p.pixels_other)[1]
+        blocks.extend(surface_from_base[:3, :3] @ own @ surface_from_base[:3, :3].T * 0.2**2)
+    templates, covariance = join(pictures), block_diag(*blocks)
     good = templates.contrast > MIN_PATCH_CONTRAST
     rows = np.repeat(good, 3)
     surface_map = SurfaceMap(points[good], normals[good], covariance[np.ix_(rows, rows)])

@@ -29,7 +29,7 @@ from estimation.surface_map import SurfaceMap, Warp, joined_map
 from perception.frames import Image
 from perception.lens import Lenses, undistort
 from perception.mapping.first_map import Landmarks, Seeds, assemble, best_landmarks, find_seeds
-from perception.mapping.scan_map import as_at_one_instant
+from perception.mapping.scan_map import REFERENCE_SIGMA_PX, as_at_one_instant
 from perception.matching.features import Features, ImageMask, corners, sift
 from perception.matching.masks import trackable
 from perception.matching.matcher import Matcher
@@ -40,79 +40,12 @@ from perception.matching.patches import (
     cut_templates,
     join,
     project_squares,
-    pyramid,
     square_axes,
 )
 
-MIN_MATCHING_FACING = 0.35  # cosine of the viewing angle, from which two cameras match, and tell more than one
+MIN_MATCHING_FACING = 0.35  # cosine of the viewing angle, from which two cameras can match
 MIN_SPACING_PX = 8  # px between landmarks
 MAX_PLACE_SIGMA_MM = 2.0  # mm across the surface: a place less certain than this is none
-REFERENCE_SIGMA_PX = 0.2  # px, of a landmark's place in its reference picture
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NewPart:
-    """New landmarks found in one way, surface frame."""
-
-    map: SurfaceMap
-    templates: Templates
-    sigma: Array  # (N,) mm across the surface, where neighbours tell the place; inf where two cameras do
-
-
-def find_monocular_landmarks(
-    lenses: Lenses,
-    pyramids: dict[int, Pyramid],
-    camera: int,
-    others: list[int],
-    mask: ImageMask,
-    taken: Array,
-    count: int,
-    known: SurfaceMap,
-    base_from_surface: Array,
-) -> NewPart | None:
-    """Up to `count` corners of one camera that none of the `others` sees well, on the surface through `known`.
-
-    mask: (H, W), where they are sought. taken: (N, 2) px as imaged, where there are new landmarks already. known: the
-    map, surface frame. base_from_surface: (4, 4), where it is.
-    """
-    mask = mask.copy()
-    for spot in np.round(taken).astype(np.int32):
-        cv2.circle(mask, spot.tolist(), MIN_SPACING_PX, 0, -1)
-    rig = lenses.rig
-    pixels = undistort(rig.cameras[camera], corners(pyramids[camera][0], mask, count))
-    origins, directions = rays(rig, np.full(len(pixels), camera), pixels)
-    surface_from_base = se3.inverse(base_from_surface)
-    angle = np.full(len(pixels), REFERENCE_SIGMA_PX / float(rig.cameras[camera].matrix[0, 0]))
-    met = meet_rays(
-        known.points,
-        known.covariance,
-        se3.transform_points(surface_from_base, origins),
-        directions @ surface_from_base[:3, :3].T,
-        angle,
-    )
-    good = np.flatnonzero(met.good & (met.sigma < MAX_PLACE_SIGMA_MM))
-    points, normals = met.points[good], met.normals[good]
-    good = good[~_visible_to_others(lenses, others, base_from_surface, camera, points, normals)]
-    points, normals = met.points[good], met.normals[good]
-    if not len(good):
-        return None
-    templates = cut_templates(lenses, pyramids[camera], camera, base_from_surface, points, normals)
-    sharp = templates.contrast > MIN_PATCH_CONTRAST
-    rows = (3 * good[sharp][:, None] + np.arange(3)).ravel()
-    found = SurfaceMap(points[sharp], normals[sharp], met.covariance[np.ix_(rows, rows)])
-    return NewPart(found, templates.take(sharp), met.sigma[good[sharp]])
-
-
-def _visible_to_others(
-    lenses: Lenses, others: list[int], base_from_surface: Array, camera: int, points: Array, normals: Array
-) -> NDArray[np.bool_]:
-    """Which points (N, 3) one of the other cameras sees well enough for a match."""
-    seen = np.zeros(len(points), bool)
-    axes = square_axes(lenses, camera, base_from_surface, points, normals)
-    for other in others if len(points) else []:
-        where = project_squares(lenses, other, base_from_surface, points, normals, axes)
-        seen |= where.visible & (where.facing > MIN_MATCHING_FACING)
-    return seen
 
 
 WANTED_PER_CAMERA = 120  # landmarks that a camera should see at least
@@ -135,8 +68,7 @@ class SurfaceSnapshot:
     base_from_surface: Array  # (4, 4), of all cameras together
     single: dict[int, Array]  # (4, 4) at each camera's own exposure
     covariance: Array  # (6, 6) of base_from_surface
-    seen: Observations  # inliers
-    wanted: dict[int, int]  # landmarks by camera
+    tracks: Observations  # inliers
     heads: dict[int, ImageMask]  # the print head's masks by camera
     warp: Warp | None = None  # of the surface at that instant
 
@@ -148,33 +80,47 @@ class NewLandmarks:
     snapshot: SurfaceSnapshot
     map: SurfaceMap
     templates: Templates
-    level: Array  # (N,) mm across the surface, where neighbours tell the place; inf where two cameras do
+    level: Array  # (N,) mm across the surface, where neighbours give the place; inf where two cameras do
     features: dict[int, Features]  # of the part of each image that they are in
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class NewPart:
+    """New landmarks by one method, surface frame."""
+
+    map: SurfaceMap
+    templates: Templates
+    sigma: Array  # (N,) mm, as `NewLandmarks.level`
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GrowthSearch:
+    """One frame set that is searched for new landmarks."""
+
+    lenses: Lenses  # of the rig as it stands to the surface at one instant
+    snapshot: SurfaceSnapshot
+    map: SurfaceMap  # known, surface frame, warped as the surface is
+    pyramids: dict[int, Pyramid]  # images by camera
+    masks: dict[int, ImageMask]  # (H, W) by camera, where new landmarks may be
+
+
 def find_new_landmarks(rig: Rig, snapshot: SurfaceSnapshot, surface_map: SurfaceMap) -> NewLandmarks | None:
-    """Landmarks beside those seen, by two cameras or, where one alone sees the surface, on it; None if hardly any."""
+    """Landmarks beside the known ones: by two cameras, or on the surface where one alone sees it; None if too few."""
     if snapshot.warp is not None:  # as it is now
         surface_map = replace(surface_map, points=snapshot.warp.apply(surface_map.points))
     lenses = Lenses(as_at_one_instant(rig, snapshot.base_from_surface, snapshot.single))
-    pyramids = {c: pyramid(image) for c, image in snapshot.images.items()}
-    lacking = {c: snapshot.wanted[c] - int((snapshot.seen.camera == c).sum()) for c in sorted(pyramids)}
-    masks = {
-        c: trackable(pyramids[c][0], _unmapped_mask(lenses, c, snapshot, surface_map), snapshot.heads.get(c))
-        for c in lacking
-    }
+    pyramids = {c: Pyramid(image) for c, image in snapshot.images.items()}
+    lacking = {c: WANTED_PER_CAMERA - int((snapshot.tracks.camera == c).sum()) for c in sorted(pyramids)}
+    masks = {c: trackable(pyramids[c][0], _unmapped_mask(lenses, c, snapshot), snapshot.heads.get(c)) for c in lacking}
+    search = GrowthSearch(lenses, snapshot, surface_map, pyramids, masks)
     features = {c: sift(pyramids[c][0], masks[c], GROWTH_FEATURES, tilted=True) for c in lacking}
     counts = {c: count if count >= MIN_NEW_LANDMARKS else 0 for c, count in lacking.items()}
-
-    def seeds(a: int, b: int) -> Seeds | None:
-        return _seeds(lenses, a, b, snapshot, surface_map, features)
-
-    parts = best_landmarks(lenses, pyramids, masks, counts, seeds)
+    parts = best_landmarks(lenses, pyramids, masks, counts, lambda a, b: _seeds(search, a, b, features))
     new = list[NewPart]()
     if sum(len(p.points) for p in parts) >= MIN_NEW_LANDMARKS:
         grown = assemble(lenses, pyramids, parts, snapshot.base_from_surface)
         new.append(NewPart(grown.map, grown.templates, np.full(len(grown.map), np.inf)))
-    new += _monocular_parts(lenses, pyramids, snapshot, surface_map, masks, lacking, parts)
+    new += _monocular_parts(search, lacking, parts)
     if sum(len(part.map) for part in new) < MIN_NEW_LANDMARKS:
         return None
     whole = reduce(joined_map, [part.map for part in new])
@@ -184,40 +130,73 @@ def find_new_landmarks(rig: Rig, snapshot: SurfaceSnapshot, surface_map: Surface
     return NewLandmarks(snapshot, SurfaceMap(points, whole.normals, joint), templates, level, features)
 
 
-def _monocular_parts(
-    lenses: Lenses,
-    pyramids: dict[int, Pyramid],
-    snapshot: SurfaceSnapshot,
-    surface_map: SurfaceMap,
-    masks: dict[int, ImageMask],
-    lacking: dict[int, int],
-    parts: list[Landmarks],
-) -> list[NewPart]:
+def _monocular_parts(search: GrowthSearch, lacking: dict[int, int], parts: list[Landmarks]) -> list[NewPart]:
     """Landmarks that one camera alone sees, camera by camera."""
-    sighted = [c for c in sorted(pyramids) if (snapshot.seen.camera == c).sum() >= MIN_NEW_LANDMARKS]
+    lenses, tracks = search.lenses, search.snapshot.tracks
+    sighted = [c for c in sorted(search.pyramids) if (tracks.camera == c).sum() >= MIN_NEW_LANDMARKS]
     matched = np.concatenate([np.zeros((0, 3)), *[p.points for p in parts]])
     new = []
     for c in sighted:
-        rig, others = lenses.rig, [o for o in sighted if o != c]
-        taken, _ = lenses.image(c, *ideal_pixels(rig.cameras[c], matched))
-        inside = ((taken > 0) & (taken < rig.cameras[c].size)).all(1)
+        occupied, _ = lenses.image(c, *ideal_pixels(lenses.rig.cameras[c], matched))
+        inside = ((occupied > 0) & (occupied < lenses.rig.cameras[c].size)).all(1)
         more = lacking[c] - int(inside.sum())
         if more >= MIN_NEW_LANDMARKS:
-            known = surface_map, snapshot.base_from_surface
-            part = find_monocular_landmarks(lenses, pyramids, c, others, masks[c], taken[inside], more, *known)
+            part = _monocular_landmarks(search, c, [o for o in sighted if o != c], occupied[inside], more)
             if part is not None:
                 new.append(part)
     return new
 
 
-def _unmapped_mask(lenses: Lenses, camera: int, snapshot: SurfaceSnapshot, surface_map: SurfaceMap) -> ImageMask:
-    """Where in an image the surface may go on without landmarks: around and between those seen."""
+def _monocular_landmarks(
+    search: GrowthSearch, camera: int, others: list[int], occupied: Array, count: int
+) -> NewPart | None:
+    """Up to `count` corners of one camera that none of the `others` sees well, on the surface through the known map.
+
+    occupied: (N, 2) px as imaged, where there are new landmarks already.
+    """
+    mask = search.masks[camera].copy()
+    for spot in np.round(occupied).astype(np.int32):
+        cv2.circle(mask, spot.tolist(), MIN_SPACING_PX, 0, -1)
+    lenses, known, pose = search.lenses, search.map, search.snapshot.base_from_surface
+    lens, images = lenses.rig.cameras[camera], search.pyramids[camera]
+    pixels = undistort(lens, corners(images[0], mask, count))
+    origins, directions = rays(lenses.rig, np.full(len(pixels), camera), pixels)
+    surface_from_base = se3.inverse(pose)
+    origins, directions = se3.transform_points(surface_from_base, origins), directions @ surface_from_base[:3, :3].T
+    angle = np.full(len(pixels), REFERENCE_SIGMA_PX / float(lens.matrix[0, 0]))
+    met = meet_rays(known.points, known.covariance, origins, directions, angle)
+    good = np.flatnonzero(met.good & (met.sigma < MAX_PLACE_SIGMA_MM))
+    good = good[~_visible_to_others(lenses, others, pose, camera, met.points[good], met.normals[good])]
+    points, normals = met.points[good], met.normals[good]
+    if not len(good):
+        return None
+    templates = cut_templates(lenses, images, camera, pose, points, normals)
+    sharp = templates.contrast > MIN_PATCH_CONTRAST
+    rows = (3 * good[sharp][:, None] + np.arange(3)).ravel()
+    new = SurfaceMap(points[sharp], normals[sharp], met.covariance[np.ix_(rows, rows)])
+    return NewPart(new, templates.take(sharp), met.sigma[good[sharp]])
+
+
+def _visible_to_others(
+    lenses: Lenses, others: list[int], base_from_surface: Array, camera: int, points: Array, normals: Array
+) -> NDArray[np.bool_]:
+    """Which points (N, 3) one of the other cameras sees well enough for a match."""
+    visible = np.zeros(len(points), bool)
+    axes = square_axes(lenses, camera, base_from_surface, points, normals)
+    for other in others if len(points) else []:
+        where = project_squares(lenses, other, base_from_surface, points, normals, axes)
+        visible |= where.visible & (where.facing > MIN_MATCHING_FACING)
+    return visible
+
+
+def _unmapped_mask(lenses: Lenses, camera: int, snapshot: SurfaceSnapshot) -> ImageMask:
+    """Where in an image the surface may go on without landmarks: around and between those tracked."""
     size = lenses.rig.cameras[camera].size
     mask = np.zeros((size[1], size[0]), np.uint8)
-    mine = snapshot.seen.camera == camera
+    mine = snapshot.tracks.camera == camera
     if mine.sum() < 6:
         return mask
-    imaged, _ = lenses.image(camera, snapshot.seen.pixels[mine], np.full(int(mine.sum()), 1e3))
+    imaged, _ = lenses.image(camera, snapshot.tracks.pixels[mine], np.full(int(mine.sum()), 1e3))
     spots = np.round(imaged).astype(np.int32)
     cv2.fillConvexPoly(mask, cv2.convexHull(spots), 255)
     across = float(np.sqrt(cv2.countNonZero(mask)))
@@ -228,29 +207,18 @@ def _unmapped_mask(lenses: Lenses, camera: int, snapshot: SurfaceSnapshot, surfa
     return mask
 
 
-def _seeds(
-    lenses: Lenses, a: int, b: int, snapshot: SurfaceSnapshot, surface_map: SurfaceMap, features: dict[int, Features]
-) -> Seeds | None:
+def _seeds(search: GrowthSearch, a: int, b: int, features: dict[int, Features]) -> Seeds | None:
     """What is known of the surface between two cameras: landmarks that both see, and matches in the unknown part."""
-    fresh = find_seeds(lenses, a, b, features, np.random.default_rng(0))
-    in_a, in_b = snapshot.seen.camera == a, snapshot.seen.camera == b
-    rows, at_a, at_b = np.intersect1d(snapshot.seen.track[in_a], snapshot.seen.track[in_b], return_indices=True)
-    known = Seeds(
-        a,
-        b,
-        snapshot.seen.pixels[in_a][at_a],
-        snapshot.seen.pixels[in_b][at_b],
-        se3.transform_points(snapshot.base_from_surface, surface_map.points[rows]),
-    )
+    fresh = find_seeds(search.lenses, a, b, features, np.random.default_rng(0))
+    tracks = search.snapshot.tracks
+    in_a, in_b = tracks.only(tracks.camera == a), tracks.only(tracks.camera == b)
+    rows, at_a, at_b = np.intersect1d(in_a.track, in_b.track, return_indices=True)
+    pixels_a, pixels_b = in_a.pixels[at_a], in_b.pixels[at_b]
+    points = se3.transform_points(search.snapshot.base_from_surface, search.map.points[rows])
     if fresh is None:
-        return known if len(rows) >= 6 else None
-    return Seeds(
-        a,
-        b,
-        np.concatenate([known.pixels_a, fresh.pixels_a]),
-        np.concatenate([known.pixels_b, fresh.pixels_b]),
-        np.concatenate([known.points, fresh.points]),
-    )
+        return Seeds(a, b, pixels_a, pixels_b, points) if len(rows) >= 6 else None
+    pixels_a, pixels_b = np.concatenate([pixels_a, fresh.pixels_a]), np.concatenate([pixels_b, fresh.pixels_b])
+    return Seeds(a, b, pixels_a, pixels_b, np.concatenate([points, fresh.points]))
 
 
 @dataclass(slots=True, eq=False)
@@ -260,9 +228,9 @@ class Probation:
     new: NewLandmarks
     between_known: NDArray[np.bool_]  # (N,)
     map: SurfaceMap = field(init=False)  # of the new landmarks, as known by now
-    moved: NDArray[np.int64] = field(init=False)  # found where the surface's motion puts it, far from its rest position
-    stayed: NDArray[np.int64] = field(init=False)  # found where the motion puts it, near its rest position
-    missed: NDArray[np.int64] = field(init=False)  # not found
+    moved: NDArray[np.int64] = field(init=False)  # measured where the surface's motion puts it, far from its rest place
+    stayed: NDArray[np.int64] = field(init=False)  # measured where the motion puts it, near its rest place
+    missed: NDArray[np.int64] = field(init=False)  # not measured there
 
     def __post_init__(self) -> None:
         self.map = self.new.map
@@ -276,33 +244,30 @@ class Probation:
         single: dict[int, Array],
         covariance: Array | None = None,
     ) -> None:
-        """Look for them again at each camera's own pose of the surface, known to a covariance (6, 6).
+        """Measure them again at each camera's own pose of the surface, known to a covariance (6, 6).
 
-        What one camera alone sees is known better by it: where the surface has turned, its depth.
+        Landmarks of one camera alone are improved by it: where the surface has turned, in depth.
         """
         matcher = Matcher(lenses, self.map, self.new.templates)
-        seen = matcher.align(stamp, pyramids, single)
-        where, rest = np.zeros((2, len(seen), 2))
-        jacobians = np.zeros((len(seen), 2, 6))
-        for c in np.unique(seen.camera):
-            mine = seen.camera == c
-            points = self.map.points[seen.track[mine]]
+        tracks = matcher.align(stamp, pyramids, single)
+        where, rest = np.zeros((2, len(tracks), 2))
+        jacobians = np.zeros((len(tracks), 2, 6))
+        for c in np.unique(tracks.camera):
+            mine = tracks.camera == c
+            points = self.map.points[tracks.track[mine]]
             before = self.new.snapshot.single.get(int(c), self.new.snapshot.base_from_surface)
-            where[mine], _, jacobians[mine] = project(lenses.rig, seen.camera[mine], single[int(c)], points)
-            rest[mine] = project(lenses.rig, seen.camera[mine], before, points)[0]
-        good = np.linalg.norm(seen.pixels - where, axis=1) < MAX_NEW_RESIDUAL_PX
-        lone = good & np.isfinite(self.new.level[seen.track])
+            where[mine], _, jacobians[mine] = project(lenses.rig, tracks.camera[mine], single[int(c)], points)
+            rest[mine] = project(lenses.rig, tracks.camera[mine], before, points)[0]
+        good = np.linalg.norm(tracks.pixels - where, axis=1) < MAX_NEW_RESIDUAL_PX
+        lone = good & np.isfinite(self.new.level[tracks.track])
         if covariance is not None and lone.any():
-            sigma = np.maximum(seen.sigma[lone], MIN_TRACK_SIGMA_PX)
-            away = where[lone] - seen.pixels[lone]
-            self.map, good[lone] = updated_by_looks(
-                self.map, seen.track[lone], away, jacobians[lone], sigma, covariance
-            )
+            looks, away = tracks.only(lone), where[lone] - tracks.pixels[lone]
+            sigma = np.maximum(looks.sigma, MIN_TRACK_SIGMA_PX)
+            self.map, good[lone] = updated_by_looks(self.map, looks.track, away, jacobians[lone], sigma, covariance)
         far = np.linalg.norm(rest - where, axis=1) > MIN_PROOF_MOTION_PX
-        np.add.at(self.moved, seen.track[good & far], 1)
-        np.add.at(self.stayed, seen.track[good & ~far], 1)
-        lacking = np.setdiff1d(np.arange(len(self.missed)), seen.track[good])
-        self.missed[lacking] += 1
+        np.add.at(self.moved, tracks.track[good & far], 1)
+        np.add.at(self.stayed, tracks.track[good & ~far], 1)
+        self.missed[np.setdiff1d(np.arange(len(self.missed)), tracks.track[good])] += 1
 
     @property
     def level(self) -> Array:
@@ -320,19 +285,19 @@ class Probation:
 
     @property
     def over(self) -> bool:
-        """Whether no more is to be learned of them by waiting."""
+        """Whether each is either proven or missed too often."""
         return bool((self.proven | (self.missed >= MAX_MISSES)).all())
 
 
-def between_known(found: NewLandmarks, surface_map: SurfaceMap, distance: float) -> NDArray[np.bool_]:
+def between_known(new: NewLandmarks, surface_map: SurfaceMap, distance: float) -> NDArray[np.bool_]:
     """Which new landmarks (N,) lie between known ones and on their surface. distance: mm to the cameras.
 
-    None that was put there, since one camera alone sees it.
+    Only of those that two cameras see: the others were put on that surface.
     """
-    away = found.map.points[:, None] - surface_map.points
+    away = new.map.points[:, None] - surface_map.points
     gap = np.linalg.norm(away, axis=2)
     near = np.argsort(gap, axis=1)[:, :4]
     rows = np.arange(len(near))[:, None]
     height = np.abs(np.einsum("nki,nki->nk", away[rows, near], surface_map.normals[near])).min(1)
     there = (gap[rows, near].max(1) < MAX_GAP_SHARE * distance) & (height < MAX_HEIGHT_SHARE * distance)
-    return np.asarray(there & ~np.isfinite(found.level))
+    return np.asarray(there & ~np.isfinite(new.level))

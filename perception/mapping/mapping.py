@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.mapping.bundle_adjustment import AdjustedMap, single_fit
@@ -17,10 +16,10 @@ from estimation.online.estimator import Estimator
 from estimation.online.fit import FrameFit
 from estimation.pose import SurfacePose
 from estimation.scans.registration import Registration
-from estimation.scans.scan import Scan
+from estimation.scans.scan import Index, Scan
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, joined_map, moved_map
-from perception.frames import FrameSet, Roi
+from perception.frames import FrameSet, Roi, region_polygons
 from perception.lens import Lenses
 from perception.mapping.first_map import FirstMap, build_first_map, in_frame
 from perception.mapping.growth import (
@@ -35,21 +34,21 @@ from perception.mapping.growth import (
 )
 from perception.mapping.scan_map import ScanPlacing, as_at_one_instant, landmarks_on_scan
 from perception.matching.features import Relocaliser
-from perception.matching.masks import TrackingMasks, patch_reach
+from perception.matching.masks import Ink, TrackingMasks, patch_reach
 from perception.matching.matcher import Matcher
 from perception.matching.patches import Pyramid
 
 EAGER_TRIES = 5  # tries for a first map, 0.5 s and more each, before only every tenth frame set is tried
 RETRY_INTERVAL_SETS = 10  # frame sets from one try to the next after those
 MAX_LANDMARKS = 600  # those out of view are kept, and cost little
-MIN_SHOWN_SHARE = 0.5  # of the landmarks in a camera's view; fewer are found where its image is blurred or covered
-FIRST_MAP_REFINEMENTS = 6  # after these, two of them the confirmation, a bent look is no fault of the first map
+MIN_SHOWN_SHARE = 0.5  # of the landmarks in a camera's view; fewer are measured where its image is blurred or covered
+FIRST_MAP_REFINEMENTS = 6  # after these, two of them the confirmation, deformation is no error of the first map
 CONFIRMATION_TIMEOUT_S = 2.0  # after which an unconfirmed first map is dropped, and the next images are tried
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedSet:
-    """One frame set as it was tracked."""
+    """One frame set as it was tracked: the landmarks measured in its images, and the pose fitted to them."""
 
     fit: FrameFit
     observations: Observations  # tracks are rows of the map
@@ -59,7 +58,7 @@ class TrackedSet:
 class Mapping:
     """Makes and keeps the map of one surface; every change is handed to the matcher and the estimator."""
 
-    _matcher: Matcher  # from `begin` on
+    _matcher: Matcher  # of the map since the last `start`
 
     def __init__(
         self,
@@ -71,10 +70,9 @@ class Mapping:
         executor: Executor | None = None,
         scan: Scan | None = None,
     ) -> None:
-        """Nothing is mapped yet.
+        """roi: where the surface is when it first comes into view. search: learns each view that is mapped.
 
-        roi: where the surface is when it first comes into view. search: learns each view that is mapped. masks: where
-        no landmark may begin. executor: where the map is refined. scan: its frame is the surface frame.
+        masks: where no landmark may begin. executor: where the map is refined. scan: its frame is the surface frame.
         """
         self._lenses, self._roi, self._search = lenses, tuple(roi), search
         self._estimator, self._masks = estimator, masks
@@ -84,17 +82,37 @@ class Mapping:
         self._cameras = np.mean([c.base_from_camera[:3, 3] for c in lenses.rig.cameras], axis=0)
         self._tries, self._failure = 0, ""  # to make a first map, and why the last one failed
         self._mapped = 0.0  # s, stamp of the first map
-        self._caveat = ""
+        self._caveat = ""  # of every pose on this map, in words
         self._refinements = 0  # of this map
         self._seemed_bent = False  # whether the surface seemed to deform while the first map could be the cause
         self._growth: DelayedJob[NewLandmarks] = DelayedJob(executor)
         self._probation: Probation | None = None
-        self._wanted: dict[int, int] = {}  # landmarks by camera
         self._offered: tuple[TrackedSet, bool] | None = None  # the last frame set, and whether the map may learn of it
 
-    def first_map(self, frames: FrameSet, pyramids: dict[int, Pyramid]) -> FirstMap | str:
-        """A first map of what these images (by camera) show, or the reason why there is none yet."""
-        polygons = self._polygons(frames)
+    def start(self, frames: FrameSet, pyramids: dict[int, Pyramid]) -> tuple[Matcher, SurfacePose, TrackedSet] | str:
+        """Begin with a first map of what these images (by camera) show; or the reason why there is none yet.
+
+        Its matcher, its pose, and the frame set as it is tracked with it.
+        """
+        first = self._first_map(frames, pyramids)
+        if isinstance(first, str):
+            return first
+        stamp, start = frames.stamp, first.base_from_surface
+        self._mapped, self._masks.ink = stamp, Ink()
+        self._matcher = Matcher(self._lenses, first.map, first.templates, self._masks)
+        pose = self._estimator.begin(stamp, start, first.map, self._caveat)
+        tracked = self.align_and_fit(stamp, pyramids, dict.fromkeys(pyramids, start), start)
+        self._refiner.begin(first.map, stamp, start, tracked.observations)
+        self._growth.cancel()
+        self._probation = self._offered = None
+        self._refinements, self._seemed_bent = 0, False
+        self._matcher.remember(pyramids, tracked.observations, tracked.fit.inlier, start)
+        for camera, images in pyramids.items():
+            self._search.learn(camera, images[0], start, first.map)
+        return self._matcher, pose, tracked
+
+    def _first_map(self, frames: FrameSet, pyramids: dict[int, Pyramid]) -> FirstMap | str:
+        polygons = region_polygons(self._roi, frames, [camera.size for camera in self._lenses.rig.cameras])
         if isinstance(polygons, str):
             return polygons
         self._tries += 1
@@ -112,22 +130,12 @@ class Mapping:
         self._set_caveat(self._place)
         return in_frame(first, self._place.base_from_surface)
 
-    def begin(
-        self, stamp: float, first: FirstMap, matcher: Matcher, pyramids: dict[int, Pyramid]
-    ) -> tuple[SurfacePose, TrackedSet]:
-        """Take a first map and its matcher into use: its pose, and what the images it was made of show of it."""
-        start, self._mapped, self._matcher = first.base_from_surface, stamp, matcher
-        pose = self._estimator.begin(stamp, start, first.map, self._caveat)
-        observations = matcher.align(stamp, pyramids, dict.fromkeys(pyramids, start), coarse=True)
-        fit = self._estimator.fit(observations, start)
-        self._refiner.begin(first.map, stamp, start, observations)
-        self._growth.cancel()
-        self._probation = self._offered = None
-        self._refinements, self._seemed_bent = 0, False
-        matcher.remember(pyramids, observations, fit.inlier, start)
-        for camera, images in pyramids.items():
-            self._search.learn(camera, images[0], start, first.map)
-        return pose, TrackedSet(fit, observations, pyramids)
+    def align_and_fit(
+        self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array], start: Array
+    ) -> TrackedSet:
+        """Align images (by camera) from far, each from a pose (4, 4) of its own, and fit from `start` (4, 4)."""
+        observations = self._matcher.align(stamp, pyramids, poses, coarse=True)
+        return TrackedSet(self._estimator.fit(observations, start), observations, pyramids)
 
     def expired(self, stamp: float) -> bool:
         """Whether a first map that is still not confirmed at `stamp` should be dropped."""
@@ -142,7 +150,6 @@ class Mapping:
             self._take(refined)
             self._estimator.set_twist(self._refiner.speed(tracked.fit))
             tracked = self._realigned(tracked)
-        self._wanted = dict.fromkeys(range(len(self._lenses.rig)), WANTED_PER_CAMERA)
         return tracked if self._placing is None else self._put_on_scan(self._placing, tracked)
 
     def rebuild(self, tracked: TrackedSet) -> TrackedSet:
@@ -159,9 +166,9 @@ class Mapping:
 
     def _realigned(self, tracked: TrackedSet) -> TrackedSet:
         """The frame set aligned and fitted again with a corrected map; as it was where that is no measurement."""
-        again = self._matcher.align(tracked.fit.stamp, tracked.pyramids, self._camera_poses(tracked), coarse=True)
-        refit = self._estimator.fit(again, tracked.fit.solution.base_from_surface)
-        return TrackedSet(refit, again, tracked.pyramids) if refit.measured else tracked
+        stamp, start = tracked.fit.stamp, tracked.fit.solution.base_from_surface
+        again = self.align_and_fit(stamp, tracked.pyramids, self._camera_poses(tracked), start)
+        return again if again.fit.measured else tracked
 
     def offer(self, tracked: TrackedSet, twist: Array) -> None:
         """A measured frame set, by which the map may be refined or grow. twist: (6,), the surface's."""
@@ -186,20 +193,18 @@ class Mapping:
         (tracked, _), self._offered = self._offered, None
         if not self._refiner.took_keyframe:
             return
+        few = any(tracked.fit.used[c] < GROWTH_SHARE * WANTED_PER_CAMERA for c in tracked.pyramids)
         if self._probation is not None:
             self._prove(self._probation, tracked)
-        elif not self._growth.busy and len(self._matcher.map) < MAX_LANDMARKS and self._lacks_landmarks(tracked):
+        elif few and not self._growth.busy and len(self._matcher.map) < MAX_LANDMARKS:
             self._growth.delay = sets_until_ready(self._refiner.interval)
             self._growth.submit(find_new_landmarks, self._lenses.rig, self._snapshot(tracked), self._matcher.map)
 
     def _enough_shown(self, tracked: TrackedSet) -> bool:
-        """Whether a camera shows most of what it has in view: few tracks are no fault where little is to be seen."""
+        """Whether a camera shows most of the landmarks in its view: where few are in view, few tracks are no fault."""
         view = self._matcher.in_view(list(tracked.pyramids), tracked.fit.solution.base_from_surface)
         least = {c: max(MIN_NEW_LANDMARKS, MIN_SHOWN_SHARE * min(n, WANTED_PER_CAMERA)) for c, n in view.items()}
         return any(tracked.fit.used[c] >= count for c, count in least.items())
-
-    def _lacks_landmarks(self, tracked: TrackedSet) -> bool:
-        return any(tracked.fit.used[c] < GROWTH_SHARE * self._wanted[c] for c in tracked.pyramids)
 
     def _snapshot(self, tracked: TrackedSet) -> SurfaceSnapshot:
         fit, pose = tracked.fit, self._estimator.pose
@@ -209,7 +214,6 @@ class Mapping:
             self._camera_poses(tracked),
             fit.covariance + fit.parts.lasting,
             tracked.observations.only(fit.inlier),
-            self._wanted,
             self._masks.print_head,
             None if pose is None else pose.warp,
         )
@@ -217,22 +221,22 @@ class Mapping:
     def _camera_poses(self, tracked: TrackedSet) -> dict[int, Array]:
         """Where the surface was (4, 4) at each camera's own exposure."""
         pose, points, rig = tracked.fit.solution.base_from_surface, self._matcher.map.points, self._lenses.rig
-        seen = tracked.observations
-        return {c: single_fit(rig, points, seen, c, pose).base_from_surface for c in tracked.pyramids}
+        tracks = tracked.observations
+        return {c: single_fit(rig, points, tracks, c, pose).base_from_surface for c in tracked.pyramids}
 
     def _prove(self, waiting: Probation, tracked: TrackedSet) -> None:
         """Align the new landmarks again; those that move with the surface join the map."""
         fit, single = tracked.fit, self._camera_poses(tracked)
         waiting.look(self._lenses, fit.stamp, tracked.pyramids, single, fit.covariance + fit.parts.lasting)
         points, reach = waiting.map.points, patch_reach(waiting.new.templates.axes)
-        proven = waiting.proven & ~self._masks.ink.covers(points, reach, fit.stamp)
-        if proven.sum() >= MIN_NEW_LANDMARKS:
-            self._join(waiting, proven)
-        if proven.sum() >= MIN_NEW_LANDMARKS or waiting.over:
+        proven = np.flatnonzero(waiting.proven & ~self._masks.ink.covers(points, reach, fit.stamp))
+        if len(proven) >= MIN_NEW_LANDMARKS:
+            self._join(waiting, proven[: MAX_LANDMARKS - len(self._matcher.map)])
+        if len(proven) >= MIN_NEW_LANDMARKS or waiting.over:
             self._probation = None
 
-    def _join(self, waiting: Probation, proven: NDArray[np.bool_]) -> None:
-        chosen = np.flatnonzero(proven)[: MAX_LANDMARKS - len(self._matcher.map)]
+    def _join(self, waiting: Probation, chosen: Index) -> None:
+        """Add the chosen ones of new landmarks (by row) to the map, the matcher, the estimator and the search."""
         rows = (3 * chosen[:, None] + np.arange(3)).ravel()
         new, part = waiting.new, waiting.map
         part = SurfaceMap(part.points[chosen], part.normals[chosen], part.covariance[np.ix_(rows, rows)])
@@ -270,17 +274,7 @@ class Mapping:
     def _take(self, refined: AdjustedMap, bends: bool = False) -> None:
         self._refinements += 1
         crooked = self._refinements <= FIRST_MAP_REFINEMENTS and not bends
-        # a bent look now may be the first map's fault; seen again with a better map, it is the surface's
+        # deformation now may be an error of the first map; if it persists with a better map, it is the surface's
         self._seemed_bent |= crooked and self._estimator.deforms
         self._estimator.replace_map(refined.map, crooked, bends)
         self._matcher.take(refined.map, refined.agrees)
-
-    def _polygons(self, frames: FrameSet) -> dict[int, Array] | str:
-        """Where the surface is in these images, by camera, or why that is not known yet."""
-        if not self._roi:
-            corners, cameras = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), self._lenses.rig.cameras
-            return {f.camera: corners * cameras[f.camera].size for f in frames.frames}
-        start = max(r.stamp for r in self._roi)
-        if frames.stamp < start - 0.1:
-            return f"waiting for the region of interest at {start:.3f} s"
-        return {r.camera: r.polygon for r in self._roi if any(f.camera == r.camera for f in frames.frames)}

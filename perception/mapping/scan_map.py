@@ -53,9 +53,9 @@ class ScanPlacing:
         if not len(points):
             points = se3.transform_points(first.base_from_surface, first.map.points)
         outward = first.base_from_surface[:3, 2]
-        found = register(points[:: max(1, len(points) // SEARCH_POINTS)], RELIEF_SIGMA_MM, self.scan, outward)
-        self._nodes = self._lattice(lenses, sorted(images), points, outward, found.base_from_surface)
-        return self.refine(lenses, images, found)
+        place = register(points[:: max(1, len(points) // SEARCH_POINTS)], RELIEF_SIGMA_MM, self.scan, outward)
+        self._nodes = self._lattice(lenses, sorted(images), points, outward, place.base_from_surface)
+        return self.refine(lenses, images, place)
 
     def refine(self, lenses: Lenses, images: dict[int, Image], near: Registration) -> Registration:
         """A place known to a millimetre, refined on pictures of one instant; what was ambiguous before stays so."""
@@ -70,18 +70,18 @@ class ScanPlacing:
         return replace(best, rival=near.rival, sure=False, verdict=f"{near.verdict}; {best.verdict}")
 
     def _settled(self, lenses: Lenses, images: dict[int, Image], near: Registration) -> Registration:
-        found = near
+        """Matched on the scan where it lies, and registered again, repeatedly."""
+        place, on_scan = near, np.isfinite(self._nodes[..., 0])
         for _ in range(REFINEMENT_ROUNDS):
-            pose = found.base_from_surface
-            on_scan = np.isfinite(self._nodes[..., 0])
+            pose = place.base_from_surface
             nodes = se3.transform_points(pose, np.nan_to_num(self._nodes).reshape(-1, 3)).reshape(self._nodes.shape)
             reference = middle_camera(lenses, sorted(images), nodes[on_scan].mean(0)) if on_scan.any() else 0
             matched = match_near(lenses, images, nodes, reference, MATCH_SPACING_NODES) if on_scan.any() else None
             if matched is None:
                 return replace(near, sure=False, verdict=f"{near.verdict}; no two cameras see the scan there")
             sure = matched.sure & on_scan[::MATCH_SPACING_NODES, ::MATCH_SPACING_NODES]
-            found = register_near(matched.points[sure], MATCH_SIGMA_MM, SHARED_ERROR_FACTOR, self._index, pose)
-        return found
+            place = register_near(matched.points[sure], MATCH_SIGMA_MM, SHARED_ERROR_FACTOR, self._index, pose)
+        return place
 
     def _lattice(self, lenses: Lenses, cameras: list[int], points: Array, outward: Array, pose: Array) -> Array:
         """Nodes (H, W, 3), surface frame, on the part of the scan under points (N, 3), base frame; NaN beside it."""
@@ -108,11 +108,8 @@ def as_at_one_instant(rig: Rig, pose: Array, single: dict[int, Array]) -> Rig:
     Cameras that are not exposed together see a moving surface at different places; moved by the difference they all
     look at the same one.
     """
-    cameras = tuple(
-        replace(camera, base_from_camera=pose @ se3.inverse(single.get(c, pose)) @ camera.base_from_camera)
-        for c, camera in enumerate(rig.cameras)
-    )
-    return Rig(cameras)
+    moved = [pose @ se3.inverse(single.get(c, pose)) @ lens.base_from_camera for c, lens in enumerate(rig.cameras)]
+    return Rig(tuple(replace(lens, base_from_camera=m) for lens, m in zip(rig.cameras, moved, strict=True)))
 
 
 REFERENCE_SIGMA_PX = 0.2  # px, of a landmark's place in its reference picture
@@ -145,9 +142,8 @@ def landmarks_on_scan(
         on = hits.hit & (np.abs(off) < MAX_SCAN_DISTANCE_SIGMAS * np.sqrt(own + across**2))
         mine, rays = mine[on], inner[on] @ surface_from_camera[:3, :3].T
         points[mine], normals[mine], sigma[mine] = hits.points[on], hits.normals[on], across
-        blocks[mine] = _intersection_covariances(
-            rays, hits.normals[on], across, REFERENCE_SIGMA_PX / float(lens.matrix[0, 0])
-        )
+        angle = REFERENCE_SIGMA_PX / float(lens.matrix[0, 0])
+        blocks[mine] = _intersection_covariances(rays, hits.normals[on], across, angle)
     covariance = np.zeros((len(points), 3, len(points), 3))
     covariance[np.arange(len(points)), :, np.arange(len(points))] = blocks
     whole = covariance.reshape(3 * len(points), -1) + of_frame(points, frame)
@@ -158,7 +154,5 @@ def _intersection_covariances(rays: Array, normals: Array, across: float, angle:
     """Covariances (N, 3, 3) mm^2 of where rays (N, 3), from the camera, each known to `angle` rad, meet planes with
     `normals` (N, 3), each known to `across` mm."""
     shift, depth = foot_jacobians(rays, normals)
-    return np.asarray(
-        (np.linalg.norm(rays, axis=1) * angle)[:, None, None] ** 2 * shift @ np.swapaxes(shift, 1, 2)
-        + across**2 * depth[:, :, None] * depth[:, None]
-    )
+    sideways = (np.linalg.norm(rays, axis=1) * angle)[:, None, None] ** 2 * shift @ np.swapaxes(shift, 1, 2)
+    return np.asarray(sideways + across**2 * depth[:, :, None] * depth[:, None])

@@ -26,7 +26,7 @@ MIN_VARIANCE = 1e-6  # grey levels squared: no contrast at all
 
 
 @compiled("void(u1[:,::1], f8, f8, f8[:,::1], f8, f4[::1])")
-def _sample_clamped(image: Image, x: float, y: float, per_sample: Array, scale: float, seen: Float32) -> None:
+def _sample_clamped(image: Image, x: float, y: float, per_sample: Array, scale: float, levels: Float32) -> None:
     """Grey levels (S,) of the grid about x, y px, bilinear; outside the image its border's."""
     right, low = image.shape[1] - 1, image.shape[0] - 1
     k = 0
@@ -38,12 +38,12 @@ def _sample_clamped(image: Image, x: float, y: float, per_sample: Array, scale: 
             i1, j1 = min(i + 1, right), min(j + 1, low)
             above = image[j, i] + (u - i) * (float(image[j, i1]) - image[j, i])
             below = image[j1, i] + (u - i) * (float(image[j1, i1]) - image[j1, i])
-            seen[k] = above + (v - j) * (below - above)
+            levels[k] = above + (v - j) * (below - above)
             k += 1
 
 
 @compiled("b1(u1[:,::1], f8, f8, f8[:,::1], f8, f4[::1])")
-def _sample_inside(image: Image, x: float, y: float, per_sample: Array, scale: float, seen: Float32) -> bool:
+def _sample_inside(image: Image, x: float, y: float, per_sample: Array, scale: float, levels: Float32) -> bool:
     """`_sample_clamped` at half the time where the whole grid is inside the image; whether it is.
 
     Single precision from the nearest whole pixel on, and unsigned indices, which numba need not check for a sign.
@@ -67,13 +67,13 @@ def _sample_inside(image: Image, x: float, y: float, per_sample: Array, scale: f
             above, below = np.float32(image[m, n]), np.float32(image[m + np.uint64(1), n])
             above += a * (np.float32(image[m, n + np.uint64(1)]) - above)
             below += a * (np.float32(image[m + np.uint64(1), n + np.uint64(1)]) - below)
-            seen[k] = above + b * (below - above)
+            levels[k] = above + b * (below - above)
             k += 1
     return True
 
 
 @compiled("f8[::1](f4[::1], f4[::1], f4[:,::1])", reordered=True)
-def _sums(seen: Float32, picture: Float32, steepest: Float32) -> Array:
+def _sums(levels: Float32, picture: Float32, steepest: Float32) -> Array:
     """Sums over a patch of its grey levels, of their squares, and of them times picture (S,) and steepest (2, S).
 
     Levels count from the middle of their range: so the squares' sum keeps its digits, and pictures have no mean.
@@ -81,7 +81,7 @@ def _sums(seen: Float32, picture: Float32, steepest: Float32) -> Array:
     total, squares = np.float32(0), np.float32(0)
     alike, across, down = np.float32(0), np.float32(0), np.float32(0)
     for k in range(PATCH_SAMPLES):
-        level = seen[k] - np.float32(128)
+        level = levels[k] - np.float32(128)
         total += level
         squares += level * level
         alike += level * picture[k]
@@ -93,11 +93,11 @@ def _sums(seen: Float32, picture: Float32, steepest: Float32) -> Array:
 @compiled("f4[:,::1](u1[:,::1], f8[:,::1], f8[:,:,::1], f8)")
 def sample_grids(image: Image, centre: Array, per_sample: Array, scale: float) -> Float32:
     """Grey levels (N, S) of grids at centres (N, 2) px, per_sample (N, 2, 2) px a step, times `scale`."""
-    seen: Float32 = np.empty((len(centre), PATCH_SAMPLES), np.float32)
+    levels: Float32 = np.empty((len(centre), PATCH_SAMPLES), np.float32)
     for n in range(len(centre)):
-        if not _sample_inside(image, centre[n, 0], centre[n, 1], per_sample[n], scale, seen[n]):
-            _sample_clamped(image, centre[n, 0], centre[n, 1], per_sample[n], scale, seen[n])
-    return seen
+        if not _sample_inside(image, centre[n, 0], centre[n, 1], per_sample[n], scale, levels[n]):
+            _sample_clamped(image, centre[n, 0], centre[n, 1], per_sample[n], scale, levels[n])
+    return levels
 
 
 @compiled(
@@ -107,7 +107,7 @@ def descend(
     image: Image,
     start: Array,
     per_sample: Array,
-    wanted: NDArray[np.bool_],
+    chosen: NDArray[np.bool_],
     picture: Float32,
     steepest: Float32,
     inverse_hessian: Array,
@@ -116,36 +116,36 @@ def descend(
     spacing: float,
     rounds: int,
 ) -> Array:
-    """Gauss-Newton on the shifts (N, 2), samples, in place, of those wanted (N,).
+    """Gauss-Newton on the shifts (N, 2), samples, in place, of those chosen (N,).
 
     start: (N, 2) px of this image. per_sample: (N, 2, 2) px of the full image a sample; scale: of this image to it.
     spacing: samples from one of the grid's to the next. The steepest descent pictures are free of brightness and
     contrast, so the image need not be. Answers (N, 3): score and contrast, grey levels, at the place looked at last,
     and what it would still have moved, samples.
     """
-    ended = np.zeros((len(start), 3))
-    seen: Float32 = np.empty(PATCH_SAMPLES, np.float32)
+    outcome = np.zeros((len(start), 3))
+    levels: Float32 = np.empty(PATCH_SAMPLES, np.float32)
     for n in range(len(start)):
-        if not wanted[n]:
+        if not chosen[n]:
             continue
         step = per_sample[n]
         for left in range(rounds - 1, -1, -1):
             x = start[n, 0] + scale * (step[0, 0] * shift[n, 0] + step[0, 1] * shift[n, 1])
             y = start[n, 1] + scale * (step[1, 0] * shift[n, 0] + step[1, 1] * shift[n, 1])
-            if not _sample_inside(image, x, y, step, scale * spacing, seen):
-                _sample_clamped(image, x, y, step, scale * spacing, seen)
-            total, squares, alike, across, down = _sums(seen, picture[n], steepest[n])
+            if not _sample_inside(image, x, y, step, scale * spacing, levels):
+                _sample_clamped(image, x, y, step, scale * spacing, levels)
+            total, squares, alike, across, down = _sums(levels, picture[n], steepest[n])
             mean = total / PATCH_SAMPLES
             contrast = np.sqrt(max(squares / PATCH_SAMPLES - mean * mean, MIN_VARIANCE))
-            ended[n, 0], ended[n, 1] = alike / (PATCH_SAMPLES * contrast), contrast
+            outcome[n, 0], outcome[n, 1] = alike / (PATCH_SAMPLES * contrast), contrast
             dx = -(inverse_hessian[n, 0, 0] * across + inverse_hessian[n, 0, 1] * down) / contrast
             dy = -(inverse_hessian[n, 1, 0] * across + inverse_hessian[n, 1, 1] * down) / contrast
             length = np.sqrt(dx * dx + dy * dy)
-            ended[n, 2] = 0.0 if length < CONVERGED_STEP else length
+            outcome[n, 2] = 0.0 if length < CONVERGED_STEP else length
             if left or spacing > 1 or length <= MAX_UNCHECKED_STEP:
                 stride = spacing * min(1.0, MAX_STEP / max(length, 1e-9))
                 shift[n, 0] += stride * dx
                 shift[n, 1] += stride * dy
             if length < CONVERGED_STEP:
                 break
-    return ended
+    return outcome

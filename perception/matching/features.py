@@ -55,10 +55,8 @@ def corners(image: Image, mask: ImageMask, count: int, border: int = 16) -> Arra
     if area == 0:
         return np.zeros((0, 2))
     spread = max(4.0, 0.55 * np.sqrt(area / count))
-    found = cv2.goodFeaturesToTrack(image, count, 0.005, spread, mask=inner, blockSize=7)
-    if found is None:
-        return np.zeros((0, 2))
-    return np.asarray(found, np.float64).reshape(-1, 2)
+    places = cv2.goodFeaturesToTrack(image, count, 0.005, spread, mask=inner, blockSize=7)
+    return np.zeros((0, 2)) if places is None else np.asarray(places, np.float64).reshape(-1, 2)
 
 
 def sift(image: Image, mask: ImageMask | None = None, count: int = 1500, tilted: bool = False) -> Features:
@@ -93,9 +91,8 @@ def match(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float = 0.8) ->
     """
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), np.int64)
-    first, second, best, back = (
-        _by_trees(a, b) if len(a) * len(b) > MAX_BRUTE_FORCE_DISTANCES else _by_all_distances(a, b)
-    )
+    nearest = _by_trees if len(a) * len(b) > MAX_BRUTE_FORCE_DISTANCES else _by_all_distances
+    first, second, best, back = nearest(a, b)
     rows = np.arange(len(a))
     good = (first < ratio**2 * second) & (back[best] == rows)
     return np.stack([rows[good], best[good]], -1).astype(np.int64)
@@ -131,22 +128,21 @@ MIN_MATCHES = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelocalisedPose:
-    """A relocalised pose. base_from_surface: (4, 4), of all cameras together. single: by camera, its own, since cameras
-    are seldom exposed together. matches: how many features agree."""
+    """Where the surface was found again."""
 
-    base_from_surface: Array
-    single: dict[int, Array]
-    matches: int
+    base_from_surface: Array  # (4, 4), of all cameras together
+    single: dict[int, Array]  # (4, 4) by camera, its own: cameras are seldom exposed together
+    matches: int  # features that agree
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMatches:
-    """Features of one camera: points (N, 3) in the surface frame, ideal pixels (N, 2), the pose they give alone."""
+    """The features of one camera that match known ones."""
 
     camera: int
-    points: Array
-    pixels: Array
-    alone: Array | None
+    points: Array  # (N, 3) mm, surface frame
+    pixels: Array  # (N, 2) px, ideal
+    alone: Array | None  # (4, 4) base_from_surface by this camera alone
 
 
 class Relocaliser:
@@ -154,18 +150,18 @@ class Relocaliser:
 
     def __init__(self, lenses: Lenses) -> None:
         self.lenses = lenses
-        self._descriptors = np.zeros((0, 128), np.float32)
+        self.descriptors = np.zeros((0, 128), np.float32)  # (N, 128) of the features kept
         self._points = np.zeros((0, 3))
         self._view = np.zeros(0, np.int64)  # (N,) which view each is from
 
     def learn(self, camera: int, image: Image, base_from_surface: Array, surface_map: SurfaceMap) -> None:
         """Add the features of one image in which the surface's pose is known: each is put on the landmarks' surface."""
         lens = self.lenses.rig.cameras[camera]
-        _, imaged, seen = self._landmark_pixels(camera, base_from_surface, surface_map)
-        if seen.sum() < 8:
+        _, imaged, visible = self._landmark_pixels(camera, base_from_surface, surface_map)
+        if visible.sum() < 8:
             return
         mask = np.zeros((lens.size[1], lens.size[0]), np.uint8)
-        hull = cv2.convexHull(imaged[seen].astype(np.float32)).reshape(-1, 2)
+        hull = cv2.convexHull(imaged[visible].astype(np.float32)).reshape(-1, 2)
         cv2.fillConvexPoly(mask, np.round(hull).astype(np.int32), 255)
         mask = np.asarray(cv2.dilate(mask, np.ones((9, 9), np.uint8)), np.uint8)
         self.add(camera, sift(image, mask, 500, tilted=True), base_from_surface, surface_map)
@@ -175,16 +171,16 @@ class Relocaliser:
 
         Each view keeps its best: an equal share of what there is room for, so that no new one drives out an old one.
         """
-        ideal, _, seen = self._landmark_pixels(camera, base_from_surface, surface_map)
+        ideal, _, visible = self._landmark_pixels(camera, base_from_surface, surface_map)
         keypoints, descriptors = features
-        if not len(keypoints) or seen.sum() < 8:
+        if not len(keypoints) or visible.sum() < 8:
             return
         pixels = undistort(self.lenses.rig.cameras[camera], keypoints)
-        points = self._on_surface(camera, pixels, base_from_surface, surface_map, ideal, seen)
+        points = self._on_surface(camera, pixels, base_from_surface, surface_map, ideal, visible)
         near = np.isfinite(points).all(1)
         view = np.full(int(near.sum()), self._view.max(initial=-1) + 1)
         self._points = np.concatenate([self._points, points[near]])
-        self._descriptors = np.concatenate([self._descriptors, descriptors[near]])
+        self.descriptors = np.concatenate([self.descriptors, descriptors[near]])
         self._view = np.concatenate([self._view, view])
         self._make_room()
 
@@ -194,8 +190,8 @@ class Relocaliser:
         """Ideal and imaged pixels (N, 2) of the landmarks, and which are in the image (N,)."""
         lens = self.lenses.rig.cameras[camera]
         ideal, depth = ideal_pixels(lens, se3.transform_points(base_from_surface, surface_map.points))
-        imaged, seen = self.lenses.image(camera, ideal, depth)
-        return ideal, imaged, seen & ((imaged >= 0) & (imaged < lens.size)).all(1)
+        imaged, visible = self.lenses.image(camera, ideal, depth)
+        return ideal, imaged, visible & ((imaged >= 0) & (imaged < lens.size)).all(1)
 
     def _make_room(self) -> None:
         counts = np.bincount(self._view)
@@ -203,13 +199,8 @@ class Relocaliser:
         while np.minimum(counts, most).sum() > MAX_DESCRIPTORS:
             most -= 1 + most // 100
         rank = np.concatenate([np.arange(n) for n in counts]) if len(counts) else np.zeros(0, int)
-        kept = rank < most
-        self._points, self._descriptors, self._view = self._points[kept], self._descriptors[kept], self._view[kept]
-
-    @property
-    def descriptors(self) -> NDArray[np.float32]:
-        """Descriptors (N, 128) of what would be found again."""
-        return self._descriptors
+        keep = rank < most
+        self._points, self.descriptors, self._view = self._points[keep], self.descriptors[keep], self._view[keep]
 
     def reframe(self, new_from_old: Array) -> None:
         """The surface frame is another from now on: new_from_old (4, 4)."""
@@ -222,10 +213,10 @@ class Relocaliser:
         base_from_surface: Array,
         surface_map: SurfaceMap,
         landmark_pixels: Array,
-        seen: NDArray[np.bool_],
+        visible: NDArray[np.bool_],
     ) -> Array:
         """Points (N, 3), surface frame, where rays meet the mean plane of the six nearest landmarks; nan if steep."""
-        index = np.nonzero(seen)[0]
+        index = np.nonzero(visible)[0]
         gap = ((pixels[:, None] - landmark_pixels[index]) ** 2).sum(2)
         near = index[np.argsort(gap, axis=1)[:, :6]]
         normal = surface_map.normals[near].mean(1)
@@ -246,44 +237,42 @@ class Relocaliser:
         """
         if len(self._points) < MIN_MATCHES:
             return None
-        seen = [self._look(c, images, half) for c, images in pyramids.items()]
-        return self._agree([s for s in seen if s is not None])
+        views = [self._match_view(c, images, half) for c, images in pyramids.items()]
+        return self._joint_pose([view for view in views if view is not None])
 
-    def _look(self, camera: int, images: Pyramid, half: bool) -> CameraMatches | None:
-        """What one camera shows of the surface, and the pose it gives alone."""
+    def _match_view(self, camera: int, images: Pyramid, half: bool) -> CameraMatches | None:
         lens = self.lenses.rig.cameras[camera]
         keypoints, descriptors = sift(images[1] if half else images[0], count=600 if half else 1500)
         if half:
             keypoints = 2 * keypoints
-        pairs = match(descriptors, self._descriptors, 0.85)
+        pairs = match(descriptors, self.descriptors, 0.85)
         if len(pairs) < MIN_MATCHES:
             return None
         points, pixels = self._points[pairs[:, 1]], undistort(lens, keypoints[pairs[:, 0]])
         alone = _pnp(points, pixels, lens.matrix)
         return CameraMatches(camera, points, pixels, None if alone is None else lens.base_from_camera @ alone)
 
-    def _agree(self, seen: list[CameraMatches]) -> RelocalisedPose | None:
-        if not any(s.alone is not None for s in seen):
+    def _joint_pose(self, views: list[CameraMatches]) -> RelocalisedPose | None:
+        """The pose, of those begun at each camera's own, with which most features agree; None where too few do."""
+        single = {view.camera: view.alone for view in views if view.alone is not None}
+        if not single:
             return None
         rig = self.lenses.rig
-        camera = np.concatenate([np.full(len(s.points), s.camera) for s in seen])
-        points = np.concatenate([s.points for s in seen])
-        pixels = np.concatenate([s.pixels for s in seen])
+        camera = np.concatenate([np.full(len(view.points), view.camera) for view in views])
+        points = np.concatenate([view.points for view in views])
+        pixels = np.concatenate([view.pixels for view in views])
         sigma = np.full(len(camera), 3.0)  # px: SIFT on half-size images, cameras not exposed together
-        best: RelocalisedPose | None = None
         tracks = PointTracks(camera, points, pixels, sigma)
-        for start in (s.alone for s in seen if s.alone is not None):
+        best, most = np.eye(4), MIN_MATCHES - 1
+        for start in single.values():
             pose = solve_pose(rig, tracks, start, scales=(4.0, 2.0)).base_from_surface
             away = np.linalg.norm(project(rig, camera, pose, points)[0] - pixels, axis=1)
-            agreed = int((away < 4 * sigma).sum())
-            if agreed >= MIN_MATCHES and (best is None or agreed > best.matches):
-                best = RelocalisedPose(pose, {}, agreed)
-        if best is None:
+            agreeing = int((away < 4 * sigma).sum())
+            if agreeing > most:
+                best, most = pose, agreeing
+        if most < MIN_MATCHES:
             return None
-        near = {
-            s.camera: s.alone for s in seen if s.alone is not None and _same_surface(s.alone, best.base_from_surface)
-        }
-        return RelocalisedPose(best.base_from_surface, near, best.matches)
+        return RelocalisedPose(best, {c: pose for c, pose in single.items() if _same_surface(pose, best)}, most)
 
 
 def _same_surface(a: Array, b: Array) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -57,7 +58,7 @@ class Ink:
 
 
 def near_bead(points: Array, bead: Array, reach: Array) -> NDArray[np.bool_]:
-    """Which points (N, 3) lie within REACH and their own reach (N,) of a bead's points (M, 3), all mm."""
+    """Which points (N, 3) lie within BEAD_REACH_MM and their own reach (N,) of a bead's points (M, 3), all mm."""
     away = np.linalg.norm(points[:, None] - bead, axis=2).min(1)
     return np.asarray(away < BEAD_REACH_MM + reach)
 
@@ -68,9 +69,9 @@ MIN_DRAWN_DEPTH_MM = 20.0  # mm: what is nearer to a lens than that is not drawn
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tool:
-    """profile: (K, 2) mm, K > 1, height above the tip along the nozzle's z, rising, and radius there."""
+    """The print head's shape, round about the nozzle's z."""
 
-    profile: Array
+    profile: Array  # (K, 2) mm, K > 1: height above the tip, rising, and radius there
 
     def __post_init__(self) -> None:
         check_profile("tool", "profile", self.profile)
@@ -83,17 +84,16 @@ class Tool:
         heights = self.profile[:, 0] + np.r_[-margin, np.zeros(len(self.profile) - 2), margin]
         radii = self.profile[:, 1] + margin
         ring = np.stack([np.cos(RING_ANGLES), np.sin(RING_ANGLES)], -1)
-        rings = np.concatenate(
-            [radii[:, None, None] * ring, np.broadcast_to(heights[:, None, None], (len(radii), len(RING_ANGLES), 1))],
-            -1,
-        )
+        levels = np.broadcast_to(heights[:, None, None], (len(radii), len(RING_ANGLES), 1))
+        rings = np.concatenate([radii[:, None, None] * ring, levels], -1)
         camera_from_nozzle = lenses.rig.camera_from_base[camera] @ base_from_nozzle
         x, y, depth = np.moveaxis(se3.transform_points(camera_from_nozzle, rings.reshape(-1, 3)), -1, 0)
         safe = np.maximum(depth, MIN_DRAWN_DEPTH_MM)
-        imaged, seen = lenses.bend(camera, x / safe, y / safe, depth)
-        seen = (seen & (depth > MIN_DRAWN_DEPTH_MM)).reshape(len(radii), -1)
+        imaged, visible = lenses.bend(camera, x / safe, y / safe, depth)
+        visible = (visible & (depth > MIN_DRAWN_DEPTH_MM)).reshape(len(radii), -1)
         spots = imaged.T.reshape(len(radii), -1, 2)
-        parts = (np.concatenate([spots[i][seen[i]], spots[i + 1][seen[i + 1]]]) for i in range(len(radii) - 1))
+        drawn = [ring_spots[shown] for ring_spots, shown in zip(spots, visible, strict=True)]
+        parts = (np.concatenate(pair) for pair in pairwise(drawn))
         return [cv2.convexHull(p.astype(np.float32))[:, 0].astype(float) for p in parts if len(p) >= 3]
 
 
@@ -121,9 +121,7 @@ class TrackingMasks:
 
     def __init__(self, lenses: Lenses, tool: Tool | None = None) -> None:
         self._lenses, self._tool = lenses, tool or Tool(SYRINGE)
-        self.print_head: dict[
-            int, ImageMask
-        ] = {}  # by camera, SCALE times its image's size, 255 where the print head is
+        self.print_head: dict[int, ImageMask] = {}  # by camera, 255 on the head, MASK_SCALE times the image's size
         self.ink = Ink()
 
     def set_print_head(self, head: PrintHead | None, cameras: Iterable[int]) -> None:

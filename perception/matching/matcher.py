@@ -21,13 +21,13 @@ from perception.matching.features import bounding_box
 from perception.matching.masks import TrackingMasks, near_bead, patch_reach
 from perception.matching.patches import Pyramid, Templates, align_in, join, project_into
 
-FLOW_WINDOW_PX = 21  # px
-MIN_WINDOW_SPREAD = 2.0  # grey levels, below which a window tells no gain
+FLOW_WINDOW_PX = 21
+MIN_WINDOW_SPREAD = 2.0  # grey levels: a flatter window gives no gain
 MIN_GAIN_WINDOWS = 8  # for a median
-MIN_WINDOW_CORRELATION = 0.7  # of a window before and after, to be alike
-MIN_ALIKE_SHARE = 0.35  # of alike windows, for the flow to be believed
-CHECKED_TRACKS = 40  # tracks, about
-MIN_GAIN_CHANGE = 0.08  # of brightness; flow bears smaller ones
+MIN_WINDOW_CORRELATION = 0.7  # of a window before and after, from which it counts as similar
+MIN_SIMILAR_SHARE = 0.35  # of similar windows, from which the flow is believed
+CHECKED_TRACKS = 40  # about
+MIN_GAIN_CHANGE = 0.08  # of brightness; flow tolerates smaller ones
 GAIN_RANGE = 0.4, 2.5  # beyond which it is another picture
 MAX_RETURN_ERROR_PX = 1.0  # px from where a track began to where it ends when it is followed back
 FLOW_MARGIN_PX = 48.0  # px around the tracks: flow sees that far beyond them
@@ -36,16 +36,16 @@ FLOW_MARGIN_PX = 48.0  # px around the tracks: flow sees that far beyond them
 def optical_flow(
     previous: Image, current: Image, pixels: Array, guess: Array, levels: int = 4
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Where pixels (N, 2) of the previous image stand in the current one (N, 2), and whether they were found (N,).
+    """Where pixels (N, 2) of the previous image stand in the current one (N, 2), and whether they were tracked (N,).
 
     guess: (N, 2) px, where to begin. Pyramidal Lucas-Kanade (thesis 4.4, Eq. 4.7-4.10) on the box around the tracks. It
-    takes brightness as constant, and was measured to fail where that jumps by a quarter: where most of what it finds
-    does not look like what it sought, it is tried again with the jump taken back, and the better of the two is kept.
-    What does not come back to where it began when it is followed the other way is not found (Kalal et al. 2010).
+    takes brightness as constant, and was measured to fail where that jumps by a quarter: where most windows look
+    different afterwards, it is tried again with the jump taken back, and the better of the two is kept.
+    A track that is followed backwards must end where it began (forward-backward error, Kalal et al. 2010).
     """
-    first = _there_and_back(previous, current, pixels, guess, levels)
-    alike = _alike(previous, current, pixels, *first)
-    if alike >= MIN_ALIKE_SHARE:
+    first = _forward_backward(previous, current, pixels, guess, levels)
+    similar = _similar_share(previous, current, pixels, *first)
+    if similar >= MIN_SIMILAR_SHARE:
         return first
     gain, offset = _brightness(previous, current, pixels, guess)
     if not GAIN_RANGE[0] < gain < GAIN_RANGE[1] or (
@@ -53,17 +53,17 @@ def optical_flow(
     ):
         return first
     relit = np.asarray(cv2.addWeighted(current, 1 / gain, current, 0.0, -offset / gain), np.uint8)
-    second = _there_and_back(previous, relit, pixels, guess, levels)
-    return second if _alike(previous, relit, pixels, *second) > alike else first
+    second = _forward_backward(previous, relit, pixels, guess, levels)
+    return second if _similar_share(previous, relit, pixels, *second) > similar else first
 
 
-def _there_and_back(
+def _forward_backward(
     previous: Image, current: Image, pixels: Array, guess: Array, levels: int
 ) -> tuple[Array, NDArray[np.bool_]]:
-    there, found = _lucas_kanade(previous, current, pixels, guess, levels)
-    there[~found] = guess[~found]
-    back, returned = _lucas_kanade(current, previous, there, pixels + there - guess, levels)
-    return there, found & returned & (np.linalg.norm(back - pixels, axis=1) < MAX_RETURN_ERROR_PX)
+    forward, tracked = _lucas_kanade(previous, current, pixels, guess, levels)
+    forward[~tracked] = guess[~tracked]
+    back, returned = _lucas_kanade(current, previous, forward, pixels + forward - guess, levels)
+    return forward, tracked & returned & (np.linalg.norm(back - pixels, axis=1) < MAX_RETURN_ERROR_PX)
 
 
 def _lucas_kanade(
@@ -74,7 +74,7 @@ def _lucas_kanade(
     x0, y0, x1, y1 = bounding_box(np.clip(reach, 0, [w, h]), (w, h), FLOW_MARGIN_PX)
     corner = np.array([x0, y0], float)
     begin = np.ascontiguousarray((guess - corner)[:, None], np.float32)
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
         np.ascontiguousarray(previous[y0:y1, x0:x1]),
         np.ascontiguousarray(current[y0:y1, x0:x1]),
         np.ascontiguousarray((pixels - corner)[:, None], np.float32),
@@ -85,37 +85,34 @@ def _lucas_kanade(
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=1e-4,
     )
-    moved = np.asarray(found, np.float64)[:, 0]
-    return moved + corner, (np.asarray(status).ravel() > 0) & np.isfinite(moved).all(1)
+    places = np.asarray(moved, np.float64)[:, 0]
+    return places + corner, (np.asarray(status).ravel() > 0) & np.isfinite(places).all(1)
 
 
-def _alike(previous: Image, current: Image, pixels: Array, moved: Array, found: NDArray[np.bool_]) -> float:
-    """Share of the tracks that look where they were found (N,) as they did before, whatever the brightness."""
-    asked = np.arange(0, len(pixels), max(1, len(pixels) // CHECKED_TRACKS))  # a few dozen tell it as well as all
-    kept = asked[found[asked]]
-    if not len(kept):
+def _similar_share(previous: Image, current: Image, pixels: Array, moved: Array, tracked: NDArray[np.bool_]) -> float:
+    """Share of the tracks, `tracked` (N,), whose window looks as it did before, whatever the brightness."""
+    checked = np.arange(0, len(pixels), max(1, len(pixels) // CHECKED_TRACKS))  # a few dozen serve as well as all
+    rows = checked[tracked[checked]]
+    if not len(rows):
         return 0.0
-    before, now = _around(previous, pixels[kept]), _around(current, moved[kept])
+    before, now = _windows(previous, pixels[rows]), _windows(current, moved[rows])
     before, now = before - before.mean(1, keepdims=True), now - now.mean(1, keepdims=True)
-    product = (before * now).sum(1)
-    return float(np.sum(product > MIN_WINDOW_CORRELATION * np.sqrt((before**2).sum(1) * (now**2).sum(1))) / len(asked))
+    product, squares = (before * now).sum(1), (before**2).sum(1) * (now**2).sum(1)
+    return float(np.sum(product > MIN_WINDOW_CORRELATION * np.sqrt(squares)) / len(checked))
 
 
 def _brightness(previous: Image, current: Image, pixels: Array, guess: Array) -> tuple[float, float]:
-    """Gain and offset, grey levels, from the previous image to the current one: the median over the tracks.
-
-    Each track tells them by mean and spread of the few pixels around it, there and here.
-    """
-    before, now = _around(previous, pixels), _around(current, guess)
+    """Gain and offset, grey levels, from the previous image to the current one: the median over the tracks' windows."""
+    before, now = _windows(previous, pixels), _windows(current, guess)
     spread = before.std(1)
-    told = spread > MIN_WINDOW_SPREAD
-    if told.sum() < MIN_GAIN_WINDOWS:
+    textured = spread > MIN_WINDOW_SPREAD
+    if textured.sum() < MIN_GAIN_WINDOWS:
         return 1.0, 0.0
-    gain = float(np.median(now[told].std(1) / spread[told]))
+    gain = float(np.median(now[textured].std(1) / spread[textured]))
     return gain, float(np.median(now.mean(1) - gain * before.mean(1)))
 
 
-def _around(image: Image, pixels: Array) -> Array:
+def _windows(image: Image, pixels: Array) -> Array:
     """Grey levels (N, K) at every third pixel of a window around each of pixels (N, 2)."""
     step = np.arange(-FLOW_WINDOW_PX // 2 + 2, FLOW_WINDOW_PX // 2, 3)
     h, w = image.shape[:2]
@@ -124,23 +121,22 @@ def _around(image: Image, pixels: Array) -> Array:
     return np.asarray(image[rows[:, :, None], columns[:, None, :]].reshape(len(pixels), -1), float)
 
 
-CAMERA_POSE_PRIOR = np.diag(
-    [1 / 0.02**2] * 3 + [1 / 5.0**2] * 3
-)  # how far one camera's own pose may stray from the joint one
+# information of one camera's own pose about the joint one: 0.02 rad and 5 mm, one sigma
+CAMERA_POSE_PRIOR = np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3)
 MAX_FLOW_TRACKS = 80  # a camera: enough for a start, and flow is only that
-UNCERTAINTY_LANDMARKS = 8  # landmarks of a camera that tell how uncertain all of them are
-COMPLETE_SHARE = 0.8  # of a camera's landmarks: fewer found may be the fault of where they were sought
+UNCERTAINTY_LANDMARKS = 8  # landmarks of a camera by which the uncertainty of all is judged
+COMPLETE_SHARE = 0.8  # of a camera's landmarks: where fewer are measured, the start may have been wrong
 FLOW_POSE_TOLERANCE = 1e-3  # rad, mm: a start for the alignment need not be better
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedView:
-    """What one camera last saw: its image, where landmarks (rows) stood in it, ideal pixels, and the pose then."""
+    """What one camera last saw of the landmarks."""
 
     image: Image
-    rows: NDArray[np.int64]
-    pixels: Array
-    base_from_surface: Array
+    rows: NDArray[np.int64]  # (N,) of the map
+    pixels: Array  # (N, 2) px, ideal, where the landmarks stood
+    base_from_surface: Array  # (4, 4)
 
 
 def spread_order(points: Array) -> NDArray[np.int64]:
@@ -205,16 +201,16 @@ class Matcher:
         return len(self._views[camera].rows) if camera in self._views else 0
 
     def in_view(self, cameras: Sequence[int], base_from_surface: Array) -> dict[int, int]:
-        """How many landmarks each camera would see at a pose (4, 4), were nothing before them."""
+        """How many landmarks each camera would see at a pose (4, 4) without occlusion."""
         rows = np.nonzero(self.agrees)[0]
         poses, axes = np.broadcast_to(base_from_surface, (len(cameras), 4, 4)), self.templates.axes[rows]
         where = project_into(self.lenses, cameras, poses, self.map.points[rows], self.map.normals[rows], axes)
         return dict(zip(cameras, where.visible.reshape(len(cameras), -1).sum(1).tolist(), strict=True))
 
     def image_sigma(self, base_from_surface: Array, covariance: Array) -> float:
-        """How far off, px, one standard deviation, a pose with a covariance (6, 6) puts the landmarks in the images.
+        """Standard deviation, px, of where a pose with a covariance (6, 6) puts the landmarks in the images.
 
-        The worst of a few landmarks, a camera each in turn; infinite where no camera knows the surface.
+        The worst of a few landmarks of each camera; infinite where no camera has seen the surface.
         """
         ready = sorted(c for c in self._views if self.last_count(c) >= 6)
         if not ready:
@@ -225,16 +221,16 @@ class Matcher:
         return float(np.sqrt(((jacobian @ covariance) * jacobian).sum(2).max()))
 
     def is_complete(self, observations: Observations, cameras: Iterable[int]) -> bool:
-        """Whether each camera found most of what it last saw."""
-        found = np.bincount(observations.camera, minlength=len(self.rig))
-        return all(found[c] >= COMPLETE_SHARE * self.last_count(c) for c in cameras)
+        """Whether most landmarks that each camera last saw are measured again."""
+        counts = np.bincount(observations.camera, minlength=len(self.rig))
+        return all(counts[c] >= COMPLETE_SHARE * self.last_count(c) for c in cameras)
 
     def flow(self, pyramids: dict[int, Pyramid], guess: Array) -> tuple[Array, dict[int, Array]]:
         """The joint pose by optical flow, and each camera's own: cameras are seldom exposed at the same instant."""
         points = self.map.points
         ready = [c for c in pyramids if self.last_count(c) >= 6]
-        found = parallel_map(lambda c: self._flow_one(c, pyramids[c][0], guess), ready)
-        moved = dict(zip(ready, found, strict=True))
+        flows = parallel_map(lambda c: self._flow_one(c, pyramids[c][0], guess), ready)
+        moved = dict(zip(ready, flows, strict=True))
         single = dict.fromkeys(pyramids, guess)
         if sum(len(rows) for rows, _ in moved.values()) < 6:
             return guess, single
@@ -266,8 +262,8 @@ class Matcher:
         pixels, _ = self.lenses.image(camera, ideal, np.full(len(rows), np.inf))
         before = self._imaged(camera, view.base_from_surface, rows)
         after = self._imaged(camera, guess, rows)
-        found, ok = optical_flow(view.image, image, pixels, pixels + after - before)
-        return rows[ok], undistort(self.rig.cameras[camera], found[ok])
+        moved, tracked = optical_flow(view.image, image, pixels, pixels + after - before)
+        return rows[tracked], undistort(self.rig.cameras[camera], moved[tracked])
 
     def _imaged(self, camera: int, base_from_surface: Array, rows: NDArray[np.int64]) -> Array:
         """Where landmarks (rows) fall in a camera's image, (N, 2) px."""
@@ -282,9 +278,10 @@ class Matcher:
         coarse: bool = False,
         most: int | None = None,
     ) -> Observations:
-        """Measure the landmarks in every camera, begun where the camera's own pose puts them; coarse: from afar.
+        """Measure the landmarks in every camera, begun where the camera's own pose puts them.
 
-        most: landmarks of a camera, spread over the surface and the same from frame set to frame set; all without.
+        coarse: begin on the half-size images, which reaches farther. most: landmarks of a camera, spread over the
+        surface and the same from frame set to frame set; all without.
         """
         cameras = [c for c in pyramids if c in poses]
         if not cameras:
@@ -296,24 +293,24 @@ class Matcher:
         centres = where.centre.reshape(len(cameras), -1, 2)
         hidden = np.concatenate([self._masks.hides(c, at) for c, at in zip(cameras, centres, strict=True)])
         visible = where.visible & ~hidden
-        seen = np.nonzero(visible if most is None else self._some(visible, rows, most))[0]
-        position, row = np.divmod(seen, len(rows))
-        where, row = where.take(seen), rows[row]
+        chosen = np.nonzero(visible if most is None else self._some(visible, rows, most))[0]
+        position, row = np.divmod(chosen, len(rows))
+        where, row = where.take(chosen), rows[row]
         counts = np.bincount(position, minlength=len(cameras))
         images = [pyramids[c] for c in cameras]
         result = align_in(self._pictures(row), images, counts.tolist(), where, where.centre, coarse=coarse)
-        kept = result.found
-        camera = np.array(cameras, np.int64)[position[kept]]
-        pixels = self._ideal(camera, result.pixels[kept])
-        return Observations(stamp, camera, row[kept], pixels, result.sigma[kept])
+        fits = result.found
+        camera = np.array(cameras, np.int64)[position[fits]]
+        pixels = self._ideal(camera, result.pixels[fits])
+        return Observations(stamp, camera, row[fits], pixels, result.sigma[fits])
 
     def _some(self, visible: NDArray[np.bool_], rows: NDArray[np.int64], most: int) -> NDArray[np.bool_]:
         """Of what is visible (C * N,), at most so many landmarks of each camera: the first in the order of spread."""
         rank = np.argsort(self._order)[rows]
         some = np.zeros_like(visible).reshape(-1, len(rows))
         for mine, chosen in zip(visible.reshape(some.shape), some, strict=True):
-            found = np.nonzero(mine)[0]
-            chosen[found[np.argsort(rank[found])[:most]]] = True
+            index = np.nonzero(mine)[0]
+            chosen[index[np.argsort(rank[index])[:most]]] = True
         return some.ravel()
 
     def _ideal(self, camera: NDArray[np.int64], pixels: Array) -> Array:

@@ -43,29 +43,19 @@ class Pyramid:
         return self._half
 
 
-def pyramid(image: Image) -> Pyramid:
-    """The image and its half-size version, as alignment takes them."""
-    return Pyramid(image)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Templates:
-    """Reference pictures as parallel arrays, one per landmark.
+    """Reference pictures as parallel arrays, one per landmark; coarse_*: the same at twice the spacing."""
 
-    camera: (N,) that took it. axes: (N, 3, 2) mm per sample, the square's two sides in the surface frame. picture:
-    (N, S) of zero mean and unit contrast. steepest: (N, 2, S) its gradient a sample, freed of brightness and contrast.
-    inverse_hessian: (N, 2, 2). coarse_*: the same at twice the spacing. contrast: (N,) grey levels.
-    """
-
-    camera: NDArray[np.int64]
-    axes: Array
-    picture: Float32
-    steepest: Float32
-    inverse_hessian: Array
+    camera: NDArray[np.int64]  # (N,) that took it
+    axes: Array  # (N, 3, 2) mm per sample, the square's two sides in the surface frame
+    picture: Float32  # (N, S) of zero mean and unit contrast
+    steepest: Float32  # (N, 2, S) its gradient a sample, freed of brightness and contrast
+    inverse_hessian: Array  # (N, 2, 2)
     coarse_picture: Float32
     coarse_steepest: Float32
     coarse_inverse_hessian: Array
-    contrast: Array
+    contrast: Array  # (N,) grey levels
 
     def __len__(self) -> int:
         return len(self.camera)
@@ -83,7 +73,7 @@ def join(parts: list[Templates]) -> Templates:
 def sample(image: Image, centre: Array, per_sample: Array, spacing: float = 1.0, half: bool = False) -> Float32:
     """Grey levels (N, S) of the grid laid at centres (N, 2) px with per_sample (N, 2, 2) px a step.
 
-    spacing: steps from sample to sample. half: the image is the half-size one of `pyramid`. Bilinear; outside the image
+    spacing: steps from sample to sample. half: the image is the half-size one of a Pyramid. Bilinear; outside the image
     the border's value.
     """
     scale = (0.5 if half else 1.0) * spacing
@@ -107,15 +97,12 @@ def normalise(pictures: Float32) -> tuple[Float32, Float32]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """Where squares fall in one camera, or in several one after the other.
+    """Where squares fall in one camera, or in several one after the other."""
 
-    centre: (N, 2) px as imaged. per_sample: (N, 2, 2) px. visible: (N,). facing: (N,) cosine of the viewing angle.
-    """
-
-    centre: Array
-    per_sample: Array
-    visible: NDArray[np.bool_]
-    facing: Array
+    centre: Array  # (N, 2) px as imaged
+    per_sample: Array  # (N, 2, 2) px
+    visible: NDArray[np.bool_]  # (N,)
+    facing: Array  # (N,) cosine of the viewing angle
 
     def take(self, index: NDArray[np.int64]) -> Projection:
         """The chosen ones."""
@@ -143,7 +130,7 @@ def project_into(
     in_camera = camera_from_surface[:, :3, :3] @ corners.T + camera_from_surface[:, :3, 3:]  # (C, 3, 3N)
     x, y, depth = in_camera.reshape(count, 3, 3, -1).swapaxes(0, 1)  # each (C, 3, N)
     inverse_depth = 1 / np.where(np.abs(depth) < 1e-6, 1e-6, depth)
-    imaged, seen = lenses.bend(which[:, None, None], x * inverse_depth, y * inverse_depth, depth)  # (2, C, 3, N)
+    imaged, in_lens = lenses.bend(which[:, None, None], x * inverse_depth, y * inverse_depth, depth)  # (2, C, 3, N)
     per_sample = (imaged[:, :, 1:] - imaged[:, :, :1]) / step  # (2, C, 2, N)
     turned = camera_from_surface[:, :3, :3] @ normals.T  # (C, 3, N)
     from_eye = in_camera[:, :, : len(points)]
@@ -151,7 +138,7 @@ def project_into(
     reach = PATCH_RADIUS * np.abs(per_sample).sum(2) + 2
     centre = imaged[:, :, 0]
     limit = lenses.sizes[which].T[..., None] - 1 - reach
-    visible = seen.all(1) & ((centre >= reach) & (centre < limit)).all(0) & (facing > 0.15)
+    visible = in_lens.all(1) & ((centre >= reach) & (centre < limit)).all(0) & (facing > 0.15)
     return Projection(
         np.ascontiguousarray(centre.reshape(2, -1).T),
         np.ascontiguousarray(per_sample.transpose(1, 3, 0, 2).reshape(-1, 2, 2)),
@@ -204,13 +191,12 @@ MAX_COARSE_STEPS, MAX_FINE_STEPS = 4, 6  # on the half-size image and the full o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """Where landmarks were found in one image: pixels (N, 2) as imaged, sigma (N,) px, score (N,) correlation in
-    [-1, 1], found (N,)."""
+    """Where templates fit in one image, or in several one after the other."""
 
-    pixels: Array
-    sigma: Array
-    score: Array
-    found: NDArray[np.bool_]
+    pixels: Array  # (N, 2) px as imaged
+    sigma: Array  # (N,) px
+    score: Array  # (N,) correlation in [-1, 1]
+    found: NDArray[np.bool_]  # (N,)
 
 
 def align(
@@ -239,19 +225,14 @@ def align_in(
     shift, ended = np.zeros((len(templates), 2)), np.zeros((len(templates), 3))  # shifts in samples of the template
 
     def in_one(images: Pyramid, mine: slice) -> None:
-        t, steps, visible = templates, per_sample[mine], where.visible[mine]
+        t, at, steps, visible = templates, begin[mine], per_sample[mine], where.visible[mine]
         if coarse:
-            picture, steepest, inverse = t.coarse_picture[mine], t.coarse_steepest[mine], t.coarse_inverse_hessian[mine]
-            at = on_level(begin[mine], True)
-            descend(images[1], at, steps, visible, picture, steepest, inverse, shift[mine], 0.5, 2.0, MAX_COARSE_STEPS)
-        picture, steepest, inverse = t.picture[mine], t.steepest[mine], t.inverse_hessian[mine]
-        at = begin[mine]
-        ended[mine] = descend(
-            images[0], at, steps, visible, picture, steepest, inverse, shift[mine], 1.0, 1.0, MAX_FINE_STEPS
-        )
+            looks = t.coarse_picture[mine], t.coarse_steepest[mine], t.coarse_inverse_hessian[mine]
+            descend(images[1], on_level(at, True), steps, visible, *looks, shift[mine], 0.5, 2.0, MAX_COARSE_STEPS)
+        looks = t.picture[mine], t.steepest[mine], t.inverse_hessian[mine]
+        ended[mine] = descend(images[0], at, steps, visible, *looks, shift[mine], 1.0, 1.0, MAX_FINE_STEPS)
 
-    ends = np.cumsum([0, *counts])
-    parts = [slice(first, last) for first, last in pairwise(ends.tolist())]
+    parts = [slice(first, last) for first, last in pairwise(np.cumsum([0, *counts]).tolist())]
     if len(parts) > 1:
         parallel_map(in_one, images, parts)
     else:

@@ -1,8 +1,8 @@
-"""Landmarks found again in the pictures of a recording whose map and motion are known: before they joined the map, in
+"""Landmarks observed anew in the pictures of a recording whose map and motion are known: before they joined the map, in
 frame sets that were not tracked, and where the surface was lost.
 
-A landmark's picture is cut where it was first seen, and searched wherever it should be in view. Where the motion is not
-known, the surface is followed backwards from where it is known, as a causal run follows it forwards. Earlier
+A landmark's picture is cut where it was first observed, and looked for wherever it should be in view. Where the motion
+is not known, the surface is followed backwards from where it is known, as a causal run follows it forwards. Earlier
 observations stay as they are.
 """
 
@@ -29,38 +29,36 @@ from perception.lens import Lenses
 from perception.mapping.first_map import on_rays
 from perception.matching.features import grey
 from perception.matching.matcher import Matcher
-from perception.matching.patches import MIN_PATCH_CONTRAST, Pyramid, Templates, cut_templates, join, pyramid
+from perception.matching.patches import MIN_PATCH_CONTRAST, Pyramid, Templates, cut_templates, join
 from perception.pairing import frame_period, pairing_tolerance
 from perception.tracking.step import COARSE_REACH_PX, FINE_REACH_PX, ROUGH_START_SCALES
 
 STAMP_TOLERANCE_S = 1e-6  # s: stamps of one frame set, as stored and as read again
-MIN_OWN_TRACKS = 8  # landmarks that tell where the surface was at a camera's own instant
+MIN_OWN_TRACKS = 8  # landmarks of a camera that give the pose at its own exposure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExpectedSurface:
-    """The surface at one instant: base_from_surface (4, 4), its covariance (6, 6) and twist (6,), and where it is when
-    each camera exposes, (C, 4, 4).
-    """
+    """The surface at one instant."""
 
-    base_from_surface: Array
-    covariance: Array
-    twist: Array
-    exposed: Array
+    base_from_surface: Array  # (4, 4)
+    covariance: Array  # (6, 6)
+    twist: Array  # (6,)
+    exposed: Array  # (C, 4, 4), base_from_surface when each camera exposes
 
 
 class KnownMotion:
-    """Map and poses of a recording, and what was seen of them; tracks of `seen` (K) count rows of `map`."""
+    """Map and poses of a recording, and its observations by frame set (K); their tracks are rows of `map`."""
 
     def __init__(self, rig: Rig, smoothed: Smoothed, observations: Sequence[Observations]) -> None:
-        """rig: as it was told to whoever undistorted the observations. observations: those that were smoothed."""
+        """rig: by which the observations were undistorted. observations: those that were smoothed."""
         self.rig, self.smoothed = rig, smoothed
         points = smoothed.map.points
         eyes = np.mean([camera.base_from_camera[:3, 3] for camera in rig.cameras], axis=0)
         outward = se3.transform_points(se3.inverse(smoothed.states.poses[0]), eyes) - points.mean(0)
         self.map = SurfaceMap(points, smooth_normals(points, outward), smoothed.map.covariance)
-        there = [seen for seen in observations if smoothed.stamps[0] <= seen.stamp <= smoothed.stamps[-1]]
-        self.seen = [_with_map_rows(seen, smoothed.tracks) for seen in there]
+        first, last = smoothed.stamps[[0, -1]]
+        self.observations = [_with_map_rows(o, smoothed.tracks) for o in observations if first <= o.stamp <= last]
         self._own = np.einsum("ninj->nij", self.map.covariance.reshape(len(points), 3, len(points), 3))  # (L, 3, 3)
         self._covariance = smoothed.covariance[:, :6, :6]
         self._apart = pairing_tolerance(frame_period([smoothed.stamps]))
@@ -71,18 +69,18 @@ class KnownMotion:
         return k if abs(self.smoothed.stamps[k] - stamp) < STAMP_TOLERANCE_S else None
 
     def is_in_other_set(self, stamp: float) -> bool:
-        """Whether pictures of `stamp` were put into sets of other stamps: a live run pairs them as they come."""
+        """Whether the pictures of `stamp` are in frame sets of other stamps: a live run pairs them as they come."""
         return self.row(stamp) is None and bool(abs(self.smoothed.stamps[self._nearest(stamp)] - stamp) < self._apart)
 
-    def seen_at(self, stamp: float) -> Observations:
+    def observed_at(self, stamp: float) -> Observations:
         """The observations at `stamp`, s."""
         k = self.row(stamp)
-        return no_observations(stamp) if k is None else self.seen[k]
+        return no_observations(stamp) if k is None else self.observations[k]
 
-    def unseen(self, stamp: float) -> NDArray[np.bool_]:
-        """(C, L), landmarks that each camera was not said to see then."""
-        out, seen = np.ones((len(self.rig), len(self.map)), bool), self.seen_at(stamp)
-        out[seen.camera, seen.track] = False
+    def unobserved(self, stamp: float) -> NDArray[np.bool_]:
+        """(C, L), landmarks of which each camera has no observation then."""
+        out, tracks = np.ones((len(self.rig), len(self.map)), bool), self.observed_at(stamp)
+        out[tracks.camera, tracks.track] = False
         return out
 
     def at(self, stamp: float) -> ExpectedSurface | None:
@@ -99,18 +97,19 @@ class KnownMotion:
         return int(np.abs(self.smoothed.stamps - stamp).argmin())
 
     def _exposed(self, pose: Array, covariance: Array, twist: Array) -> ExpectedSurface:
-        """At each camera's exposure, with cameras as smoothing corrected them, for pixels of the given rig."""
+        """The surface with its poses at each camera's exposure, cameras corrected by smoothing, for the given rig."""
         moved = pose @ se3.exp(self.smoothed.offsets[:, None] * twist)
-        corrected = np.stack([camera.base_from_camera for camera in self.smoothed.rig.cameras])
-        given = np.stack([camera.base_from_camera for camera in self.rig.cameras])
+        corrected, given = (
+            np.stack([c.base_from_camera for c in rig.cameras]) for rig in (self.smoothed.rig, self.rig)
+        )
         return ExpectedSurface(pose, covariance, twist, given @ se3.inverse(corrected) @ moved)
 
-    def poses(self, expected: ExpectedSurface, seen: Observations) -> Array:
-        """(C, 4, 4), where the surface was at each camera's own instant: by its own tracks where it has enough."""
+    def poses(self, expected: ExpectedSurface, tracks: Observations) -> Array:
+        """(C, 4, 4), base_from_surface at each camera's exposure: by its own tracks where it has enough."""
         out = expected.exposed.copy()
         for c in range(len(out)):
-            if (seen.camera == c).sum() >= MIN_OWN_TRACKS:
-                out[c] = single_fit(self.rig, self.map.points, seen, c, out[c]).base_from_surface
+            if (tracks.camera == c).sum() >= MIN_OWN_TRACKS:
+                out[c] = single_fit(self.rig, self.map.points, tracks, c, out[c]).base_from_surface
         return out
 
     def image_sigmas(self, expected: ExpectedSurface) -> tuple[Array, float]:
@@ -124,16 +123,16 @@ class KnownMotion:
         return np.sqrt(by_pose + by_place).reshape(cameras, count), float(np.sqrt(np.median(by_pose)))
 
 
-def _with_map_rows(seen: Observations, tracks: NDArray[np.int64]) -> Observations:
-    """With the landmarks' rows in place of the ids that they bear, tracks (L,) rising; without those that have none."""
-    row = np.minimum(np.searchsorted(tracks, seen.track), len(tracks) - 1)
-    return replace(seen, track=row).only(tracks[row] == seen.track)
+def _with_map_rows(observations: Observations, ids: NDArray[np.int64]) -> Observations:
+    """With the landmarks' rows in place of their ids (L,), rising; without those that are not in the map."""
+    row = np.minimum(np.searchsorted(ids, observations.track), len(ids) - 1)
+    return replace(observations, track=row).only(ids[row] == observations.track)
 
 
-MAX_RESIDUAL = 2.0  # px beside where the motion puts it, and as often in sigmas: what is farther off is another spot
-MIN_REOBSERVATION_SIGMA_PX = 0.1  # px: alignment claims less on clean images
+MAX_RESIDUAL = 2.0  # px from the projection, and as many sigmas: what is farther off is another spot
+MIN_REOBSERVATION_SIGMA_PX = 0.1  # px: alignment reports less on clean images
 MIN_VIEW_SHARE = 0.2  # of a camera's landmarks in view: another surface has a twentieth by chance
-MIN_POSE_LANDMARKS, MIN_AGREEING_SHARE = 10, 0.4  # of a pose, and of those found: as many as a causal run needs
+MIN_POSE_LANDMARKS, MIN_AGREEING_SHARE = 10, 0.4  # of a pose, and of those measured: as many as a causal run needs
 MAX_WAITING_SETS = 60  # frame sets that are followed backwards: so many pictures are held
 
 
@@ -151,22 +150,22 @@ class ReferencePictures:
         return self.motion.smoothed.stamps[sorted({k for k, _ in self._first})]
 
     def cut(self, frames: FrameSet) -> None:
-        """Keep the pictures of the landmarks whose first good look is in this frame set."""
+        """Keep the pictures of the landmarks whose first good observation is in this frame set."""
         motion, k, expected = self.motion, self.motion.row(frames.stamp), self.motion.at(frames.stamp)
         for frame in frames.frames if k is not None else ():
             first = self._first.get((k or 0, frame.camera))
             if first is None or expected is None:
                 continue
-            pose = motion.poses(expected, motion.seen_at(frames.stamp))[frame.camera]
-            there = se3.transform_points(pose, motion.map.points[first.track])
-            spots = on_rays(motion.rig, frame.camera, first.pixels, there)  # the very spots that the tracks are of
+            pose = motion.poses(expected, motion.observed_at(frames.stamp))[frame.camera]
+            points = se3.transform_points(pose, motion.map.points[first.track])
+            spots = on_rays(motion.rig, frame.camera, first.pixels, points)  # exactly those of the tracks
             points, normals = se3.transform_points(se3.inverse(pose), spots), motion.map.normals[first.track]
-            found = cut_templates(self.lenses, pyramid(grey(frame.image)), frame.camera, pose, points, normals)
-            sharp = found.contrast > MIN_PATCH_CONTRAST
-            self._cut.append((first.track[sharp], found.take(sharp)))
+            pictures = cut_templates(self.lenses, Pyramid(grey(frame.image)), frame.camera, pose, points, normals)
+            sharp = pictures.contrast > MIN_PATCH_CONTRAST
+            self._cut.append((first.track[sharp], pictures.take(sharp)))
 
     def matcher(self) -> tuple[NDArray[np.int64], Matcher] | None:
-        """The rows (M,) of the landmarks whose pictures were cut, and what finds them; None without any."""
+        """The rows (M,) of the landmarks whose pictures were cut, and a matcher of them; None without any."""
         rows = np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in self._cut)])
         if not len(rows):
             return None
@@ -183,138 +182,136 @@ class Reobserver:
         self._motion, self._rows, self._matcher = motion, rows, matcher
         self._place_of = np.full(len(motion.map), -1)
         self._place_of[rows] = np.arange(len(rows))
-        self._apart = np.zeros((len(motion.rig), len(motion.map), 3))  # px of pictures off tracks, summed; and looks
+        self._apart = np.zeros((len(motion.rig), len(motion.map), 3))  # px from tracks to pictures, summed; and count
         self._is_new = DuplicateFilter()
         self._waiting: deque[tuple[float, dict[int, Pyramid]]] = deque(maxlen=MAX_WAITING_SETS)
 
     def __call__(self, frames: FrameSet) -> list[Observations]:
-        """What is found anew in this frame set, and in those that waited for one where the surface is known; by stamp.
+        """New observations in this frame set, and in those that waited for one where the surface is known; by stamp.
 
         Tracks count rows of the motion's map.
         """
         motion = self._motion
-        stamp = motion.seen_at(frames.stamp).stamp  # to its last bit
+        stamp = motion.observed_at(frames.stamp).stamp  # to its last bit
         images = {f.camera: grey(f.image) for f in frames.frames}
-        pyramids = {c: pyramid(image) for c, image in images.items() if self._is_new(c, image)}
+        pyramids = {c: Pyramid(image) for c, image in images.items() if self._is_new(c, image)}
         if motion.is_in_other_set(stamp) or not pyramids:
             return []
         expected = motion.at(stamp)
         if expected is None or motion.image_sigmas(expected)[1] > COARSE_REACH_PX:
             self._waiting.append((stamp, pyramids))
             return []
-        found = self._unseen_landmarks(stamp, pyramids, expected)
-        out = self._backwards(stamp, pyramids, expected, joined_observations(motion.seen_at(stamp), found))
-        return [part for part in (*out, found) if len(part)]
+        new = self._new_observations(stamp, pyramids, expected)
+        out = self._backwards(stamp, pyramids, expected, joined_observations(motion.observed_at(stamp), new))
+        return [part for part in (*out, new) if len(part)]
 
-    def as_tracks(self, found: Observations) -> Observations:
-        """What was found, as looks at the very spots that the tracks are of, which bear the ids of the tracks.
+    def as_tracks(self, new: Observations) -> Observations:
+        """New observations with the ids of the recording's tracks, corrected to exactly the tracks' spots.
 
-        A track is of the picture that the run had. Where one and the same frame set has both, what lies between them
-        is seen, and without it a landmark would jump where one takes over from the other.
+        A track is of the picture that the run had, which shows the landmark a little beside the one cut here. The
+        offset is known where a frame set has both; without it a landmark would jump where one takes over.
         """
-        apart = self._apart[found.camera, found.track]
-        pixels = found.pixels - apart[:, :2] / np.maximum(apart[:, 2:], 1.0)
-        return replace(found, pixels=pixels, track=self._motion.smoothed.tracks[found.track])
+        apart = self._apart[new.camera, new.track]
+        pixels = new.pixels - apart[:, :2] / np.maximum(apart[:, 2:], 1.0)
+        return replace(new, pixels=pixels, track=self._motion.smoothed.tracks[new.track])
 
-    def _unseen_landmarks(self, stamp: float, pyramids: dict[int, Pyramid], expected: ExpectedSurface) -> Observations:
+    def _new_observations(self, stamp: float, pyramids: dict[int, Pyramid], expected: ExpectedSurface) -> Observations:
+        """Of the landmarks without an observation in this frame set, whose place in it is known well enough."""
         motion, matcher = self._motion, self._matcher
-        seen, sigma = motion.seen_at(stamp), motion.image_sigmas(expected)[0]
-        poses = motion.poses(expected, seen)
-        wanted = (sigma < COARSE_REACH_PX) & motion.unseen(stamp)
-        wanted[[c for c in range(len(wanted)) if c not in pyramids]] = False
-        self._search(np.ones(len(self._rows), bool))
-        coarse = bool(wanted.any()) and float(np.median(sigma[wanted])) > FINE_REACH_PX
-        found = self._of_motion(matcher.align(stamp, pyramids, {c: poses[c] for c in pyramids}, coarse=coarse))
-        self._compare(seen, found)
-        put = project(motion.rig, found.camera, poses, motion.map.points[found.track])[0]
-        near = np.linalg.norm(found.pixels - put, axis=1) < MAX_RESIDUAL * (1 + sigma[found.camera, found.track])
-        found = found.only(near & wanted[found.camera, found.track])
-        whole = joined_observations(self._of_matcher(seen), found)
-        return found.only(np.isin(found.camera, self._showing_cameras(pyramids, expected.base_from_surface, whole)))
+        tracks, sigma = motion.observed_at(stamp), motion.image_sigmas(expected)[0]
+        poses = motion.poses(expected, tracks)
+        missing = (sigma < COARSE_REACH_PX) & motion.unobserved(stamp)
+        missing[[c for c in range(len(missing)) if c not in pyramids]] = False
+        coarse = bool(missing.any()) and float(np.median(sigma[missing])) > FINE_REACH_PX
+        new = self._of_motion(matcher.align(stamp, pyramids, {c: poses[c] for c in pyramids}, coarse=coarse))
+        self._add_offsets(tracks, new)
+        projected = project(motion.rig, new.camera, poses, motion.map.points[new.track])[0]
+        near = np.linalg.norm(new.pixels - projected, axis=1) < MAX_RESIDUAL * (1 + sigma[new.camera, new.track])
+        new = new.only(near & missing[new.camera, new.track])
+        whole = joined_observations(self._of_matcher(tracks), new)
+        return new.only(np.isin(new.camera, self._showing_cameras(pyramids, expected.base_from_surface, whole)))
 
-    def _compare(self, seen: Observations, found: Observations) -> None:
-        """How far the pictures of landmarks are `found` from where the tracks have `seen` them."""
+    def _add_offsets(self, tracks: Observations, new: Observations) -> None:
+        """Take how far, px, observations of landmarks' pictures lie from the tracks of the same frame set."""
         known = np.full(self._apart.shape[:2] + (2,), np.nan)
-        known[seen.camera, seen.track] = seen.pixels
-        off = found.pixels - known[found.camera, found.track]
+        known[tracks.camera, tracks.track] = tracks.pixels
+        off = new.pixels - known[new.camera, new.track]
         both = np.linalg.norm(off, axis=1) < MAX_RESIDUAL  # not where one is unknown
-        self._apart[found.camera[both], found.track[both]] += np.c_[off[both], np.ones(both.sum())]
+        self._apart[new.camera[both], new.track[both]] += np.c_[off[both], np.ones(both.sum())]
 
-    def _showing_cameras(self, pyramids: dict[int, Pyramid], pose: Array, seen: Observations) -> list[int]:
-        """The cameras in which enough is `seen` of what is in view at a pose (4, 4) for the surface to be there."""
-        self._search(np.ones(len(self._rows), bool))
+    def _showing_cameras(self, pyramids: dict[int, Pyramid], pose: Array, observed: Observations) -> list[int]:
+        """The cameras with enough observations, of what is in view at a pose (4, 4), for the surface to be there."""
         view = self._matcher.in_view(list(pyramids), pose)
-        counts = np.bincount(seen.camera, minlength=len(self._motion.rig))
+        counts = np.bincount(observed.camera, minlength=len(self._motion.rig))
         return [c for c, count in view.items() if counts[c] >= MIN_VIEW_SHARE * count]
 
-    def _search(self, rows: NDArray[np.bool_]) -> None:
-        """Only these (M,) are looked for from now on."""
-        self._matcher.take(self._matcher.map, rows)
-
     def _backwards(
-        self, stamp: float, pyramids: dict[int, Pyramid], expected: ExpectedSurface, seen: Observations
+        self, stamp: float, pyramids: dict[int, Pyramid], expected: ExpectedSurface, observed: Observations
     ) -> list[Observations]:
-        """What those show that waited, followed from the frame set after them, of which `seen` is known; by stamp."""
+        """New observations of the sets that waited, followed backwards from the set after them; by stamp.
+
+        observed: the observations of that set, at `stamp`, s.
+        """
         matcher, rig = self._matcher, self._motion.rig
         pose, twist, out = expected.base_from_surface, expected.twist, list[Observations]()
-        seen = self._of_matcher(seen)
-        agrees = np.ones(len(seen), bool)
+        tracks = self._of_matcher(observed)
+        agrees = np.ones(len(tracks), bool)
         while self._waiting:
-            matcher.remember(pyramids, seen, agrees, pose)
+            matcher.remember(pyramids, tracks, agrees, pose)
             before, pyramids = self._waiting.pop()
             joint, single = matcher.flow(pyramids, pose @ se3.exp((before - stamp) * twist))
-            seen = matcher.align(before, pyramids, single, coarse=True)
-            if len(seen) < MIN_POSE_LANDMARKS:
+            tracks = matcher.align(before, pyramids, single, coarse=True)
+            if len(tracks) < MIN_POSE_LANDMARKS:
                 break
-            sigma, points = np.maximum(seen.sigma, MIN_REOBSERVATION_SIGMA_PX), matcher.map.points[seen.track]
-            fit = solve_pose(
-                rig, PointTracks(seen.camera, points, seen.pixels, sigma), joint, scales=ROUGH_START_SCALES
-            )
+            sigma, points = np.maximum(tracks.sigma, MIN_REOBSERVATION_SIGMA_PX), matcher.map.points[tracks.track]
+            measured = PointTracks(tracks.camera, points, tracks.pixels, sigma)
+            fit = solve_pose(rig, measured, joint, scales=ROUGH_START_SCALES)
             agrees = fit.weights > 0.2
-            agrees &= np.isin(seen.camera, self._showing_cameras(pyramids, fit.base_from_surface, seen.only(agrees)))
-            if agrees.sum() < max(MIN_POSE_LANDMARKS, MIN_AGREEING_SHARE * len(seen)):
+            showing = self._showing_cameras(pyramids, fit.base_from_surface, tracks.only(agrees))
+            agrees &= np.isin(tracks.camera, showing)
+            if agrees.sum() < max(MIN_POSE_LANDMARKS, MIN_AGREEING_SHARE * len(tracks)):
                 break
             twist = se3.log(se3.inverse(fit.base_from_surface) @ pose) / (stamp - before)
             pose, stamp = fit.base_from_surface, before
-            new = self._of_motion(seen.only(agrees))
-            out.append(new.only(self._motion.unseen(before)[new.camera, new.track]))
+            new = self._of_motion(tracks.only(agrees))
+            out.append(new.only(self._motion.unobserved(before)[new.camera, new.track]))
         self._waiting.clear()
         return out[::-1]
 
-    def _of_motion(self, seen: Observations) -> Observations:
+    def _of_motion(self, observations: Observations) -> Observations:
         """Rows of the matcher's map as the motion's."""
-        return replace(seen, track=self._rows[seen.track])
+        return replace(observations, track=self._rows[observations.track])
 
-    def _of_matcher(self, seen: Observations) -> Observations:
+    def _of_matcher(self, observations: Observations) -> Observations:
         """Rows of the motion's map as the matcher's, those that it has."""
-        seen = seen.only(self._place_of[seen.track] >= 0)
-        return replace(seen, track=self._place_of[seen.track])
+        observations = observations.only(self._place_of[observations.track] >= 0)
+        return replace(observations, track=self._place_of[observations.track])
 
 
 def _first_views(motion: KnownMotion) -> dict[tuple[int, int], Observations]:
-    """By frame set and camera, the looks at which landmarks' pictures are to be cut.
+    """By frame set and camera, the observations at which landmarks' pictures are to be cut.
 
-    Of each landmark it is the first that is where the motion puts it, in the camera that sees it most squarely.
+    Of each landmark it is the first that lies where the motion puts it, in the camera that sees it most squarely.
     """
     whole, out = motion.map, dict[tuple[int, int], Observations]()
-    open_ = np.ones(len(whole), bool)
+    uncut = np.ones(len(whole), bool)
     eyes = np.stack([camera.base_from_camera[:3, 3] for camera in motion.rig.cameras])
-    for k, all_seen in enumerate(motion.seen):
-        seen = all_seen.only(open_[all_seen.track])
-        expected = motion.at(seen.stamp)
-        if not len(seen) or expected is None:
+    for k, every in enumerate(motion.observations):
+        tracks = every.only(uncut[every.track])
+        expected = motion.at(tracks.stamp)
+        if not len(tracks) or expected is None:
             continue
-        poses = motion.poses(expected, all_seen)
-        put = project(motion.rig, seen.camera, poses, whole.points[seen.track])[0]
-        seen = seen.only(np.linalg.norm(seen.pixels - put, axis=1) < MAX_RESIDUAL)
-        away = se3.transform_points(se3.inverse(expected.base_from_surface), eyes)[seen.camera]
-        away = away - whole.points[seen.track]
-        squarely = (away * whole.normals[seen.track]).sum(1) / np.linalg.norm(away, axis=1)
-        order = np.lexsort((-squarely, seen.track))
-        best = np.zeros(len(seen), bool)
-        best[order[np.unique(seen.track[order], return_index=True)[1]]] = True
-        out |= {(k, int(c)): seen.only(best & (seen.camera == c)) for c in np.unique(seen.camera[best])}
-        open_[seen.track] = False
+        poses = motion.poses(expected, every)
+        projected = project(motion.rig, tracks.camera, poses, whole.points[tracks.track])[0]
+        tracks = tracks.only(np.linalg.norm(tracks.pixels - projected, axis=1) < MAX_RESIDUAL)
+        away = se3.transform_points(se3.inverse(expected.base_from_surface), eyes)[tracks.camera]
+        away = away - whole.points[tracks.track]
+        squarely = (away * whole.normals[tracks.track]).sum(1) / np.linalg.norm(away, axis=1)
+        order = np.lexsort((-squarely, tracks.track))
+        best = np.zeros(len(tracks), bool)
+        best[order[np.unique(tracks.track[order], return_index=True)[1]]] = True
+        out |= {(k, int(c)): tracks.only(best & (tracks.camera == c)) for c in np.unique(tracks.camera[best])}
+        uncut[tracks.track] = False
     return out
 
 

@@ -1,8 +1,8 @@
 """TrackingStep: one frame set in, one surface pose out; no I/O and no clock of its own.
 
-The motion model predicts where each landmark is; where it is too uncertain, optical flow from the last images does.
-Alignment with the landmark's reference picture measures it, and the estimator fits the pose. A camera that finds too
-few landmarks is relocalised by SIFT features.
+The motion model predicts where each landmark is in the images; where it is too uncertain, optical flow from the last
+images does. Alignment with the landmark's reference picture measures it, and the estimator fits the pose to all. A
+camera with too few measured landmarks is relocalised by SIFT features.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from perception.frames import DuplicateFilter, FrameSet, Image, Roi, parallel_ma
 from perception.lens import Lenses, unfiltered
 from perception.mapping.mapping import Mapping, TrackedSet
 from perception.matching.features import Relocaliser, grey
-from perception.matching.masks import Ink, Tool, TrackingMasks
+from perception.matching.masks import Tool, TrackingMasks
 from perception.matching.matcher import Matcher
-from perception.matching.patches import Pyramid, pyramid
+from perception.matching.patches import Pyramid
 
 STAGES = ("prepare", "flow", "align", "pose", "search")
-# Of a camera: at 0.2 px they tell a pose to 0.01 mm, and more landmarks do not reduce the errors that they share.
+# Of a camera: at 0.2 px they give a pose to 0.01 mm, and more landmarks do not reduce the errors that they share.
 MAX_ALIGNED_LANDMARKS = 120
 ROUGH_START_SCALES = 4.0, 1.0  # of a fit whose start may be pixels off
-# One sigma of the prediction: three of it are what alignment reaches on the full image, and on the half-size one.
+# One sigma of the prediction, px: alignment reaches three of it, on the full image and on the half-size one.
 FINE_REACH_PX, COARSE_REACH_PX = 0.8, 2.5
 FULL_SEARCH_INTERVAL = 10  # frame sets of an absent surface between searches at full size: a far one needs it
 
@@ -55,7 +55,12 @@ def report_without_offsets(observations: Observations, used: NDArray[np.int64], 
     return StepReport(observations, used, seconds, np.zeros(len(used)), np.full(len(used), np.nan))
 
 
-_StepResult = tuple[SurfacePose, Observations, NDArray[np.int64]]  # pose, what was seen, tracks that carry it (C,)
+def empty_report(stamp: float, cameras: int, seconds: Array) -> StepReport:
+    """The report of a step that measured nothing."""
+    return report_without_offsets(no_observations(stamp), np.zeros(cameras, np.int64), seconds)
+
+
+_StepResult = tuple[SurfacePose, Observations, NDArray[np.int64]]  # pose, tracks, how many of each camera carry it (C,)
 
 
 class TrackingStep:
@@ -103,7 +108,7 @@ class TrackingStep:
         self._spent = np.zeros(len(STAGES))
         self._lap = self._clock()
         last = self._estimator.pose
-        if last is not None and frames.stamp <= last.stamp:  # the same instant again tells nothing new
+        if last is not None and frames.stamp <= last.stamp:  # the same instant again
             self.last = self._report(no_observations(frames.stamp), np.zeros(len(self.rig), np.int64))
             return last
         self._check(frames)
@@ -144,10 +149,10 @@ class TrackingStep:
                 raise InputError(f"camera {camera.name}", "image size", f"{w} x {h}", "{} x {} px".format(*camera.size))
 
     def _pyramids(self, frames: FrameSet) -> dict[int, Pyramid]:
-        """The new pictures by camera; a repeated one would say that the surface stands still."""
+        """The new pictures by camera; with a repeated one the surface would seem to stand still."""
         greys = parallel_map(lambda image: self._prefilter(grey(image)), [f.image for f in frames.frames])
         images = {f.camera: image for f, image in zip(frames.frames, greys, strict=True)}
-        fresh = {c: pyramid(image) for c, image in images.items() if self._is_new(c, image)}
+        fresh = {c: Pyramid(image) for c, image in images.items() if self._is_new(c, image)}
         self._estimator.health.set_pictures(fresh, images.keys() - fresh.keys())
         return fresh
 
@@ -159,15 +164,12 @@ class TrackingStep:
     # -- the first map
 
     def _initialise(self, frames: FrameSet, pyramids: dict[int, Pyramid]) -> _StepResult:
-        first = self._mapping.first_map(frames, pyramids)
+        started = self._mapping.start(frames, pyramids)
         self._add_time("search")
-        if isinstance(first, str):
+        if isinstance(started, str):
             nothing = no_observations(frames.stamp), np.zeros(len(self.rig), np.int64)
-            return identity_pose(frames.stamp, first), *nothing
-        self._matcher = Matcher(self._lenses, first.map, first.templates, self._masks)
-        self._masks.ink = Ink()
-        pose, tracked = self._mapping.begin(frames.stamp, first, self._matcher, pyramids)
-        self._add_time("search")
+            return identity_pose(frames.stamp, started), *nothing
+        self._matcher, pose, tracked = started
         return pose, tracked.observations, tracked.fit.used
 
     # -- every frame set after it
@@ -218,19 +220,18 @@ class TrackingStep:
     def _measure(
         self, matcher: Matcher, expected: SurfacePose, pyramids: dict[int, Pyramid]
     ) -> tuple[Array, Observations, tuple[float, ...]]:
-        """A start for the fit (4, 4), the landmarks found in the images, and the fit's first and last scales.
+        """A start for the fit (4, 4), the landmarks measured in the images, and the fit's scales, from coarse to fine.
 
         Alignment begins at the predicted pose where that is known to COARSE_REACH_PX, on the half-size images unless it
-        is known to FINE_REACH_PX. Optical flow gives the start where the prediction is less certain, and where
-        alignment finds fewer landmarks than in the last images.
+        is known to FINE_REACH_PX. Optical flow gives the start where the prediction is less certain, and where fewer
+        landmarks are measured than in the last images.
         """
         stamp, predicted, observations = expected.stamp, expected.base_from_surface, None
         late = self._estimator.cameras.delays.sigma * expected.twist  # (6,) by which an exposure may be off
-        seen = self._estimator.as_exposed(predicted, expected.twist)
         sigma = matcher.image_sigma(predicted, expected.covariance + np.outer(late, late))
         if sigma < COARSE_REACH_PX:
-            starts = {c: seen[c] for c in pyramids}
-            coarse = sigma > FINE_REACH_PX
+            exposed = self._estimator.as_exposed(predicted, expected.twist)
+            starts, coarse = {c: exposed[c] for c in pyramids}, sigma > FINE_REACH_PX
             observations = matcher.align(stamp, pyramids, starts, coarse=coarse, most=MAX_ALIGNED_LANDMARKS)
             self._add_time("align")
             if matcher.is_complete(observations, pyramids):
@@ -256,8 +257,8 @@ class TrackingStep:
         first map does not wait for that: it is worth little until two cameras have seen it again.
         """
         tracked = self._realign(tracked, tracked.fit.solution.base_from_surface if tracked.fit.measured else predicted)
-        cameras = len(tracked.pyramids)
-        if not self._estimator.confirmed and len(self._carrying_cameras(tracked)) < min(2, cameras):
+        needed = min(2, len(tracked.pyramids))
+        if not self._estimator.confirmed and len(self._carrying_cameras(tracked)) < needed:
             place = self._search.find(tracked.pyramids)
             if place is not None:
                 tracked = self._realign(tracked, place.base_from_surface, place.single)
@@ -265,32 +266,28 @@ class TrackingStep:
 
     def _realign(self, tracked: TrackedSet, start: Array, single: dict[int, Array] | None = None) -> TrackedSet:
         """Align and fit again from a start (4, 4), or by camera from `single`; the better of both fits."""
-        assert self._matcher is not None
-        pyramids = tracked.pyramids
-        starts = {c: (single or {}).get(c, start) for c in pyramids}
-        again = self._matcher.align(tracked.fit.stamp, pyramids, starts, coarse=True)
-        refit = self._estimator.fit(again, start)
-        better = refit.measured and (not tracked.fit.measured or refit.used.sum() > tracked.fit.used.sum())
-        return TrackedSet(refit, again, pyramids) if better else tracked
+        starts = {c: (single or {}).get(c, start) for c in tracked.pyramids}
+        again = self._mapping.align_and_fit(tracked.fit.stamp, tracked.pyramids, starts, start)
+        more = not tracked.fit.measured or again.fit.used.sum() > tracked.fit.used.sum()
+        return again if again.fit.measured and more else tracked
 
     def _carrying_cameras(self, tracked: TrackedSet) -> list[int]:
         """The cameras that carry a fit as they carried the last one."""
-        carrying = self._estimator.carrying_cameras(tracked.fit).tolist()
-        return sorted(set(carrying) - set(self._lost_cameras(tracked)))
+        return sorted(set(self._estimator.carrying_cameras(tracked.fit).tolist()) - set(self._lost_cameras(tracked)))
 
     def _relocalise(self) -> None:
         """Search the last images by SIFT for cameras that have lost the surface, so that the next flow begins there."""
         pyramids, self._searched = self._searched, {}
         if not pyramids or self._matcher is None:
             return
-        turn = sorted(pyramids)[self._absent % len(pyramids)]  # one camera a frame set: the next is soon there
-        place = self._search.find({turn: pyramids[turn]}, half=self._absent % FULL_SEARCH_INTERVAL != 0)
+        camera = sorted(pyramids)[self._absent % len(pyramids)]  # one a frame set: the next set comes soon
+        place = self._search.find({camera: pyramids[camera]}, half=self._absent % FULL_SEARCH_INTERVAL != 0)
         if place is None:
             return
         pose = place.base_from_surface
         starts = {c: place.single.get(c, pose) for c in pyramids}
-        again = self._matcher.align(self.last.observations.stamp, pyramids, starts, coarse=True)
-        fit = self._estimator.fit(again, pose)
-        if fit.measured:
-            self._matcher.remember(pyramids, again, fit.inlier, fit.solution.base_from_surface)
-            self._relocalised = fit.solution.base_from_surface if self._absent else None
+        again = self._mapping.align_and_fit(self.last.observations.stamp, pyramids, starts, pose)
+        if again.fit.measured:
+            pose = again.fit.solution.base_from_surface
+            self._matcher.remember(pyramids, again.observations, again.fit.inlier, pose)
+            self._relocalised = pose if self._absent else None

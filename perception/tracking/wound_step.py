@@ -9,13 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.mapping.refiner import DelayedJob
-from estimation.observations import no_observations
 from estimation.pose import SurfacePose, identity_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.frames import FrameSet, Image, Roi
-from perception.tracking.step import STAGES, StepReport, TrackingStep, report_without_offsets
+from perception.tracking.step import STAGES, StepReport, TrackingStep, empty_report
 from perception.wound.segmentation import (
     Box,
     Segmentation,
@@ -29,14 +28,14 @@ from perception.wound.segmentation import (
 )
 
 SAME_WOUND_OVERLAP = 0.3  # intersection over union of two boxes: a wound moves little between looks
-MAX_MISSED_LOOKS = 3  # looks without it, after which a wound is no longer believed in
+MAX_MISSED_LOOKS = 3  # looks without it, after which a wound is dropped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WoundEstimate:
     """One camera's wound, filtered over time."""
 
-    mask: WoundMask  # (H, W) bool, of its largest part, as last seen
+    mask: WoundMask  # (H, W) of its largest part, as last seen
     box: Box | None  # round the mask; None: no wound
     roi: Box  # where to look for it now
     centroid: Array  # (2,) px
@@ -55,28 +54,22 @@ class WoundFilter:
         self._elsewhere: Box | None = None  # where another place was seen once
         self._missed = 0
 
-    def take(self, seen: Segmentation) -> WoundEstimate:
-        """Add one look. A wound that jumps is believed at the second look that shows it there; one that is not seen
+    def take(self, look: Segmentation) -> WoundEstimate:
+        """Add one look. A wound that jumps is accepted at the second look that shows it there; one that is not seen
         stays for a few looks; the region holds both where it is and where it was (thesis Fig. 3.4)."""
         before = self._box
-        mask = largest_part(seen.mask)
+        mask = largest_part(look.mask)
         box = box_of(mask)
-        if box is None or not self._believed(box):
+        known = [place for place in (before, self._elsewhere) if place is not None]
+        if box is None or (before is not None and all(overlap(box, place) <= SAME_WOUND_OVERLAP for place in known)):
             self._missed += 1
             if self._missed > MAX_MISSED_LOOKS:
                 self._box, self._mask = None, np.zeros_like(self._mask)
         else:
             self._box, self._mask, self._missed = box, mask, 0
         self._elsewhere = box
-        roi = region(self._box, before, self._size) if not self._missed else region(None, before, self._size)
-        return WoundEstimate(self._mask, self._box, roi, centroid(self._mask), seen.confidence, self._missed)
-
-    def _believed(self, box: Box) -> bool:
-        if self._box is None:
-            return True
-        return overlap(box, self._box) > SAME_WOUND_OVERLAP or (
-            self._elsewhere is not None and overlap(box, self._elsewhere) > SAME_WOUND_OVERLAP
-        )
+        roi = region(None if self._missed else self._box, before, self._size)
+        return WoundEstimate(self._mask, self._box, roi, centroid(self._mask), look.confidence, self._missed)
 
 
 def overlap(a: Box, b: Box) -> float:
@@ -90,27 +83,26 @@ SEGMENTATION_DELAY_SETS = 3  # until a result counts: three cameras take 60 ms o
 
 
 class AsyncSegmentation:
-    """Looks for the wound at its own pace.
+    """Segments pictures beside the tracker.
 
     A result counts a fixed number of frame sets after its pictures, however soon it was ready: a recording gives the
-    same every time. Pictures that come while a job is under way are let go; the next job takes the newest.
+    same every time. Pictures that come while a job is under way are skipped; the next job takes the newest.
     """
 
     def __init__(
         self, rig: Rig, segmenter: Segmenter, executor: Executor | None = None, delay: int = SEGMENTATION_DELAY_SETS
     ) -> None:
-        """executor: one thread (onnxruntime lets go of the interpreter); without one the work is done when due."""
-        self._segmenter, self._delay = segmenter, delay
-        self._watches = [WoundFilter(camera.size) for camera in rig.cameras]
+        """executor: one thread (onnxruntime releases the GIL); without one the work is done when due."""
+        self._segmenter = segmenter
+        self._filters = [WoundFilter(camera.size) for camera in rig.cameras]
         self._job: DelayedJob[dict[int, Segmentation]] = DelayedJob(executor, delay)
         self._stamp = float("nan")
 
     def __call__(self, frames: FrameSet) -> tuple[float, dict[int, WoundEstimate]] | None:
         """Once a frame set: what is due, as the stamp of the pictures and what each camera sees; None: nothing is."""
-        found = self._job.poll()
-        due = None
-        if found is not None:
-            due = self._stamp, {camera: self._watches[camera].take(seen) for camera, seen in found.items()}
+        looks, due = self._job.poll(), None
+        if looks is not None:
+            due = self._stamp, {camera: self._filters[camera].take(look) for camera, look in looks.items()}
         if not self._job.busy and frames.frames:
             self._stamp = frames.stamp
             self._job.submit(segment_all, self._segmenter, {f.camera: f.image for f in frames.frames})
@@ -149,9 +141,7 @@ class WoundTrackingStep:
         if self._step is None:
             self._step = self._start(frames)
         if self._step is None:
-            self.last = report_without_offsets(
-                no_observations(frames.stamp), np.zeros(len(self._rig), np.int64), np.zeros(len(STAGES))
-            )
+            self.last = empty_report(frames.stamp, len(self._rig), np.zeros(len(STAGES)))
             return identity_pose(frames.stamp, "the wound is being looked for")
         pose = self._step(frames)
         self.last = self._step.last
@@ -189,9 +179,9 @@ class WoundTrackingStep:
 
     def _rois(self, stamp: float, sights: dict[int, WoundEstimate]) -> tuple[Roi, ...]:
         """Round each camera's wound; the whole picture of a camera that sees none."""
-        found = []
+        rois = []
         for camera, sight in sights.items():
             size = self._rig.cameras[camera].size
             side = 0 if sight.box is None else max(sight.box[2] - sight.box[0], sight.box[3] - sight.box[1])
-            found.append(Roi(camera, stamp, polygon(region(sight.box, None, size, SKIN_MARGIN_SHARE * side))))
-        return tuple(found)
+            rois.append(Roi(camera, stamp, polygon(region(sight.box, None, size, SKIN_MARGIN_SHARE * side))))
+        return tuple(rois)
