@@ -10,8 +10,7 @@ import numpy as np
 from estimation.se3 import Array
 
 MIN_FEED = 1.0  # mm/s, or degrees/s: where the arm is off by rounding or a lost frame, it must not take for ever
-# of a tick in which a move is made: what a stall that nobody saw has queued is worked off in the rest
-TICK_FRACTION = 0.98
+TICK_FRACTION = 0.98  # of a tick for a move; in the rest the arm works off what queued up in an unnoticed stall
 MIN_TRAVEL = 1e-3  # mm: a shorter move only turns; the arm gets its axes as binary32, good to 6e-5 mm at 1 m
 
 

@@ -38,8 +38,7 @@ class NoGo:
         depth = float((self.offsets - self.normals @ place).min())
         if np.isinf(self.radius):
             return depth
-        start, along = self._axis()
-        return min(depth, self.radius - float(np.linalg.norm(np.cross(place - start, along))))
+        return min(depth, self.radius - float(np.linalg.norm(self._flat(place))))
 
     def depth_along(self, start: Array, end: Array) -> float:
         """Depth of the straight way between two places (3,), mm: at its end, or in the middle of its part inside."""
@@ -51,17 +50,13 @@ class NoGo:
                 return 0.0
             low, high = (max(low, gap / more), high) if more < 0 else (low, min(high, gap / more) if more else high)
         if np.isfinite(self.radius):
-            low, high = _within(*self._flat(start, end), self.radius, low, high)
+            low, high = _within(self._flat(start), self._flat(end), self.radius, low, high)
         return max(self.depth(start + (low + high) / 2 * (end - start)), 0.0) if low < high else 0.0
 
-    def _axis(self) -> tuple[Array, Array]:
+    def _flat(self, place: Array) -> Array:
+        """A place (3,) projected along the cylinder's axis, relative to it, turned by a right angle."""
         along = self.axis[1] - self.axis[0]
-        return self.axis[0], along / np.linalg.norm(along)
-
-    def _flat(self, start: Array, end: Array) -> tuple[Array, Array]:
-        """Two places (3,) projected along the cylinder's axis, relative to it."""
-        origin, along = self._axis()
-        return np.cross(start - origin, along), np.cross(end - origin, along)
+        return np.cross(place - self.axis[0], along / np.linalg.norm(along))
 
 
 def half_space(name: str, normal: Array, place: Array) -> NoGo:

@@ -54,18 +54,24 @@ def check_path(
     """The path itself if it can be printed; else InputError names the first checkpoint that cannot.
 
     where, lines: the file, and each checkpoint's line in it, for the message; without lines, checkpoints count from 0.
-    columns: of `speed` and `temperature` the file's column and each checkpoint's word there, for the message as well.
+    columns: of `speed` and `temperature` the file's column and each checkpoint's text there, for the message as well.
     Refused are fewer than two checkpoints, columns of unequal length, transforms that are no rigid motion, places,
     speeds and temperatures out of range, and two successive checkpoints at one place.
     """
-    _check_lengths(path, where)
+    count = len(path.surface_from_nozzle)
+    if count < 2:
+        raise InputError(where, "checkpoints", count, "2 or more")
+    own = {f.name: getattr(path, f.name) for f in fields(path) if f.name != "extra"}
+    for column, values in (own | dict(path.extra)).items():
+        if len(values) != count:
+            raise InputError(where, column, f"{len(values)} values", f"{count}, one for each checkpoint")
 
     def name(i: int) -> str:
         return f"checkpoint {i}" if lines is None else f"line {lines[i]}"
 
     def wrong(i: int, value: str, got: object, allowed: str) -> InputError:
-        column, words = (columns or {}).get(value, (value, None))
-        return InputError(where, f"{name(i)}: {column}", got if words is None else words[i], allowed)
+        header, texts = (columns or {}).get(value, (value, None))
+        return InputError(where, f"{name(i)}: {header}", got if texts is None else texts[i], allowed)
 
     if (i := _first(~_rigid(path.surface_from_nozzle))) is not None:
         transform = path.surface_from_nozzle[i].tolist()
@@ -101,16 +107,6 @@ def lengths_from(moves: Array, turns: Array) -> Array:
     return np.asarray(np.maximum(np.linalg.norm(moves, axis=1), LEVER_ARM * np.linalg.norm(turns, axis=1)))
 
 
-def _check_lengths(path: Path, where: object) -> None:
-    count = len(path.surface_from_nozzle)
-    if count < 2:
-        raise InputError(where, "checkpoints", count, "2 or more")
-    columns = {f.name: getattr(path, f.name) for f in fields(path) if f.name != "extra"} | dict(path.extra)
-    for name, column in columns.items():
-        if len(column) != count:
-            raise InputError(where, name, f"{len(column)} values", f"{count}, one for each checkpoint")
-
-
 def _first(wrong: NDArray[np.bool_]) -> int | None:
     indices = np.flatnonzero(wrong)
     return int(indices[0]) if len(indices) else None
@@ -122,5 +118,5 @@ def _rigid(transforms: Array) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore"):  # where a number is not finite, isfinite decides
         off = np.abs(r @ np.swapaxes(r, -1, -2) - np.eye(3)).max((1, 2))
         last = np.abs(transforms[:, 3] - [0, 0, 0, 1]).max(1)
-        ok = np.isfinite(transforms).all((1, 2)) & (off < 1e-5) & (last < 1e-5) & (np.linalg.det(r) > 0)
-    return np.asarray(ok)
+        rigid = np.isfinite(transforms).all((1, 2)) & (off < 1e-5) & (last < 1e-5) & (np.linalg.det(r) > 0)
+    return np.asarray(rigid)

@@ -20,12 +20,11 @@ from estimation.se3 import Array
 from hardware.cli.main import main
 from hardware.files.ply_file import write_ply
 from planning.fill.bead import Pattern
-from planning.layers.bumps import BumpLayer, BumpPassing, bumps_in
 from planning.layers.checkpoints import CheckpointSettings, ToolLimits, tilt_field, tool_rotations
 from planning.layers.grid import grid_over, unroll
 from planning.layers.plan import Plan, PlanOrder, make_plan
 from planning.layers.repair import repair_mesh
-from planning.layers.slicing import LAYER_MODES, LayerMode, Tissue, layer_stack, slabs
+from planning.layers.slicing import LAYER_MODES, BumpLayer, BumpPassing, LayerMode, Tissue, bumps_in, layer_stack, slabs
 from planning.layers.wound import WoundVolume, find_wound
 from tests.scans import height_field
 from tests.wounds import SKIN, scan_of, sheet, wound_of

@@ -17,11 +17,10 @@ from hardware.files.mesh_file import in_mm, read_raw_mesh
 from hardware.files.path_file import read_contour
 from planning.fill import PatternKind
 from planning.fill.bead import Pattern
-from planning.layers.bumps import BumpPassing
 from planning.layers.checkpoints import CheckpointSettings, ToolLimits
 from planning.layers.plan import PlanOrder, flat_wound
 from planning.layers.repair import Repairs, repair_mesh
-from planning.layers.slicing import LayerMode, Tissue
+from planning.layers.slicing import BumpPassing, LayerMode, Tissue
 from planning.layers.wound import WoundVolume, find_wound
 from planning.path import MAX_SPEED, MAX_TEMPERATURE, MIN_TEMPERATURE
 

@@ -29,8 +29,8 @@ from planning.fill.spiral import BeadRun, nest_rings, order_runs, separate_rings
 from planning.fill.zigzag import Boundary, raster_lines, region_boundary, zigzag_lines
 
 MAX_CUTS = 4  # each halves the turns: a reversal is smooth after four
-SHARP_MARGIN = 0.95  # of SHARP_TURN, so that rounding decides nothing
-RIM_OVERLAP = 0.1  # spacings by which lines run into the rim of hybrid; their round ends would leave gaps there
+SHARP_MARGIN = 0.95  # of SHARP_TURN, so that rounding has no effect
+RIM_OVERLAP = 0.1  # spacings by which lines run into the rim of hybrid; else their round ends leave gaps there
 CORNER_CUT = 0.05  # spacings by which corners are cut: that leaves less than a hundredth of a bead open
 MIN_ROUGHNESS = 0.001  # of the area, lost in corners of the contour: below, gaps come to half a percent at most
 DOUBLE_WEIGHT = 5  # mm2 laid twice that count as one left open, by the limits of both: 5 and 1 % of a wound
@@ -119,7 +119,7 @@ def _corner(region: Region, pattern: Pattern) -> Array:
 
 
 def _nest_run(nest: list[Bead], lost: float, pattern: Pattern, pace: PrintPace) -> BeadRun:
-    """A nest's lines one by one or joined: by the pattern, or whichever is faster and fills as well."""
+    """A nest's lines one by one (contour) or joined (spiral), else whichever is faster and fills as well."""
     start = np.array(pattern.start)
     if pattern.kind != "spiral":
         closed = [_printed_bead(bead, pattern) for bead in separate_rings(nest, start, pattern.seam)]
@@ -181,6 +181,7 @@ def _line_beads(spaced: tuple[list[Array], float], pattern: Pattern, corner: Arr
 
 
 def _angles(pattern: Pattern) -> list[float]:
+    """The angles to try, rad."""
     if pattern.angle == "shorter":
         return [0.0, np.pi / 2]
     if pattern.angle == "fastest":

@@ -19,15 +19,15 @@ from planning.fill.spiral import BeadRun
 NEIGHBOUR_DISTANCE = 0.8  # spacings from a line's middle to a gap that it can widen into
 GAP_SPACING = 0.15  # spacings from point to point along a gap
 MAX_WIDENING = 0.5  # spacings by which a line widens at most: a corner of 50 degrees is that deep
-DEPTH_SAMPLES = 8  # places across that depth at which it is asked whether the corner lies open
+DEPTH_SAMPLES = 8  # places across that depth at which the corner is tested for being open
 SMOOTHING_ROUNDS = 2  # roundings of width and way, each over two points: else the way turns sharply
 MIN_WIDENING = 0.01  # spacings: less is no widening
 DOT_HALF_LENGTH = 0.05  # spacings to either side of a dot's middle: the nozzle hardly moves
-MAX_GAP_DEPTH = 0.2  # spacings beyond a bead's edge up to which it is asked whether it lies open
+MAX_GAP_DEPTH = 0.2  # spacings beyond a bead's edge up to which gaps are looked for
 GAP_SAMPLES = 12  # places in that
 MIN_GAP = 0.0015  # spacings squared: a smaller gap is none
-MAX_DOUBLE = 0.045  # of the area: a tenth under the 5 % that may be laid twice, as it is told from the gaps alone
-# gap worth widening over what is covered already, by area: the next if it is more
+MAX_DOUBLE = 0.045  # of the area: a tenth under the 5 % that may be laid twice, as it is estimated from the gaps alone
+# gap area that an area laid twice is worth; each is tried where with the one before too much is laid twice
 OVERLAP_PRICES = (0.0, 0.25, 0.5, 1.0, 2.0)
 SMOOTHING_KERNEL = np.array([1.0, 2.0, 1.0]) / 4  # weights over neighbours: else the way turns sharply
 
@@ -41,45 +41,34 @@ def widen_ring(ring: Bead, gaps: NDArray[np.object_], fit: BeadFit) -> Bead:
     if not len(near):
         return ring
     ring = densify(ring, near, spacing)
-    inward = _inward(ring.points)
+    inward = -_left(ring.points)  # offsets run clockwise round what they fill
     depths = (np.arange(DEPTH_SAMPLES) + 0.5) * deepest / DEPTH_SAMPLES
     sounded = ring.points[:, None] + inward[:, None] * (ring.width[:, None] / 2 + depths)[..., None]  # (N, S, 2)
     open_there = shapely.contains_xy(prepared_union(near), sounded[..., 0], sounded[..., 1])
     more: Array = open_there.sum(axis=1) * (deepest / DEPTH_SAMPLES)
     more[np.abs(ring.width - spacing) > 1e-9] = 0.0
     more = _smooth_closed(more[:, None], np.ones(len(more)))[:, 0]
-    points = _smooth_closed(
-        ring.points + inward * (more / 2)[:, None], np.asarray(more > MIN_WIDENING * spacing, float)
-    )
+    widened = np.asarray(more > MIN_WIDENING * spacing, float)
+    points = _smooth_closed(ring.points + inward * (more / 2)[:, None], widened)
     line = shapely.linestrings(np.column_stack([points, ring.width + more]))
-    lines = shapely.get_coordinates(
-        shapely.simplify(line, MIN_WIDENING * spacing, preserve_topology=False), include_z=True
-    )
+    simple = shapely.simplify(line, MIN_WIDENING * spacing, preserve_topology=False)
+    lines = shapely.get_coordinates(simple, include_z=True)
     return Bead(lines[:, :2], lines[:, 2])
 
 
 def prepared_union(shapes: NDArray[np.object_]) -> BaseGeometry:
-    """Polygons (G,) as one, made ready for many questions."""
+    """Polygons (G,) as one, prepared for many queries."""
     whole = shapely.multipolygons(shapes)
     shapely.prepare(whole)
     return whole
-
-
-def _inward(points: Array) -> Array:
-    """Unit normals (N, 2) of a closed line (N, 2) to its right; offsets run clockwise round what they fill."""
-    step = np.diff(points, axis=0, prepend=points[-2:-1], append=points[1:2])
-    step /= np.maximum(np.linalg.norm(step, axis=1), 1e-9)[:, None]
-    along = step[:-1] + step[1:]
-    along /= np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
-    return np.stack([along[:, 1], -along[:, 0]], axis=1)
 
 
 def _smooth_closed(values: Array, where: Array) -> Array:
     """Values (N, D) along a closed line, smoothed where `where` (N,) is 1."""
     values, weight = values[:-1], where[:-1, None] / 4
     for _ in range(SMOOTHING_ROUNDS):
-        round_ = np.concatenate([values[-1:], values, values[:1]])
-        values = values + weight * (round_[:-2] - 2 * values + round_[2:])
+        wrapped = np.concatenate([values[-1:], values, values[:1]])
+        values = values + weight * (wrapped[:-2] - 2 * values + wrapped[2:])
     return np.concatenate([values, values[:1]])
 
 
@@ -92,10 +81,8 @@ def densify(ring: Bead, near: NDArray[np.object_], spacing: float) -> Bead:
     (x, y, _), reach = at.T, NEIGHBOUR_DISTANCE * spacing
     across, upwards = (x > left - reach) & (x < right + reach), (y > low - reach) & (y < high + reach)
     beside = (across & upwards).any(axis=0)
-    every = np.unique(np.concatenate([along, extra[beside]]))
-    return Bead(
-        np.stack([np.interp(every, along, v) for v in ring.points.T], axis=1), np.interp(every, along, ring.width)
-    )
+    lines = ring.at(np.unique(np.concatenate([along, extra[beside]])))
+    return Bead(lines[:, :2], lines[:, 2])
 
 
 def dot_beads(gaps: NDArray[np.object_], fit: BeadFit) -> list[Bead]:
@@ -136,7 +123,7 @@ def fill_gaps(runs: Sequence[BeadRun], region: Region, fit: BeadFit) -> list[Bea
 
 
 def _over(bead: Bead, gaps: NDArray[np.object_], fit: BeadFit, price: float) -> Bead:
-    """A bead widened to either side where a gap begins at its edge; its ends stay. price: as in PRICES."""
+    """A bead widened to either side where a gap begins at its edge; its ends stay. price: one of OVERLAP_PRICES."""
     if not len(gaps):
         return bead
     bead = densify(bead, gaps, fit.spacing)

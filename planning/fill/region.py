@@ -68,11 +68,6 @@ def areas(shape: BaseGeometry) -> list[Polygon]:
     return [part for part in parts if isinstance(part, Polygon) and not part.is_empty]
 
 
-def points_of(ring: BaseGeometry) -> Array:
-    """Points (N, 2) of a line or ring."""
-    return np.asarray(shapely.get_coordinates(ring))
-
-
 def difference(a: BaseGeometry, b: BaseGeometry) -> BaseGeometry:
     """What lies in a and not in b, also where simplified outlines cross themselves by a micrometre."""
     try:

@@ -22,14 +22,13 @@ from shapely.geometry.base import BaseGeometry
 from estimation.se3 import Array
 from planning.fill.bead import Bead, BeadFit, even_bead
 from planning.fill.gap_fill import dot_beads, widen_ring
-from planning.fill.region import Region, covered_area, difference, points_of, union_of
+from planning.fill.region import Region, covered_area, difference, union_of
 
-# mm per mm by which the radius may grow along the axis: cos 67.5 degrees, as Kuipers et al. 2020
-MAX_RADIUS_SLOPE = 0.38
-MIN_LENGTH = 0.1  # spacings: a shorter line is a dot
+MAX_RADIUS_SLOPE = 0.38  # mm per mm, of the radius along the axis: cos 67.5 degrees, as Kuipers et al. 2020
+MIN_BEAD_LENGTH = 0.1  # spacings: a shorter line is a dot
 POINT_SPACING = 0.25  # spacings from point to point
 END_CLEARANCE = 0.5  # of the radius at a wide end, by which a bead stays away from the line that turns there
-WIDE_END = 0.9  # of the widest: an end at least that wide lies before such a turn
+WIDE_END_SHARE = 0.9  # of the widest: an end at least that wide lies before such a turn
 AXIS_SMOOTHING = 4  # roundings, each over two points
 BOUNDARY_SPACING = 0.25  # spacings from point to point of the boundary whose medial axis is sought
 CORNER_RADIUS = 0.15  # spacings: radius of corners, so that none stops the nozzle
@@ -45,11 +44,11 @@ MIN_GAP_AREA = 0.04  # spacings squared: of a gap worth filling, as in a corner 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MedialAxis:
-    """Middles (V, 2) mm and radii (V,) mm of inscribed discs; edges (E, 2) join them."""
+    """Inscribed discs and which of them are joined."""
 
-    middles: Array
-    radii: Array
-    edges: NDArray[np.intp]
+    middles: Array  # (V, 2) mm
+    radii: Array  # (V,) mm
+    edges: NDArray[np.intp]  # (E, 2) rows of discs
 
 
 EMPTY_AXIS = MedialAxis(np.empty((0, 2)), np.empty(0), np.empty((0, 2), np.intp))
@@ -57,7 +56,9 @@ EMPTY_AXIS = MedialAxis(np.empty((0, 2)), np.empty(0), np.empty((0, 2), np.intp)
 
 def medial_axis(region: Region, step: float) -> MedialAxis:
     """The medial axis of a region whose boundary is sampled every `step` mm."""
-    sites = _sites(region, step)
+    rings = shapely.segmentize(shapely.get_rings(shapely.get_parts(region)), step)
+    points, ring = shapely.get_coordinates(rings, return_index=True)
+    sites = points[np.diff(ring, prepend=-1) == 0]  # a ring repeats its first point
     if len(sites) < 4:
         return EMPTY_AXIS
     try:
@@ -78,13 +79,6 @@ def medial_axis(region: Region, step: float) -> MedialAxis:
     radii = np.zeros(len(used))
     radii[edges] = radius[inside]
     return MedialAxis(diagram.vertices[used], radii, edges)
-
-
-def _sites(region: Region, step: float) -> Array:
-    points, ring = shapely.get_coordinates(
-        shapely.segmentize(shapely.get_rings(shapely.get_parts(region)), step), return_index=True
-    )
-    return np.asarray(points[np.diff(ring, prepend=-1) == 0])  # a ring repeats its first point
 
 
 def graph_paths(edges: NDArray[np.intp]) -> list[list[int]]:
@@ -134,8 +128,9 @@ def thin_beads(axis: MedialAxis, edge: BaseGeometry, fit: BeadFit, levels: int |
 
 def _clear(bead: Bead, fit: BeadFit) -> Bead | None:
     """What stays of a bead once it keeps clear of the closed lines that turn round where it is widest."""
-    start, end = (END_CLEARANCE * fit.two if width > WIDE_END * 2 * fit.two else 0.0 for width in bead.width[[0, -1]])
-    if bead.length - start - end < MIN_LENGTH * fit.spacing:
+    wide = bead.width[[0, -1]] > WIDE_END_SHARE * 2 * fit.two
+    start, end = np.where(wide, END_CLEARANCE * fit.two, 0.0).tolist()
+    if bead.length - start - end < MIN_BEAD_LENGTH * fit.spacing:
         return None
     return bead.between(start, bead.length - end)
 
@@ -143,7 +138,7 @@ def _clear(bead: Bead, fit: BeadFit) -> Bead | None:
 def _smooth(points: Array, spacing: float) -> Array:
     """The same line (N, 2) without the Voronoi diagram's jitter; none where it is too short to be one."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    if along[-1] < MIN_LENGTH * spacing:
+    if along[-1] < MIN_BEAD_LENGTH * spacing:
         return points[:0]
     at = np.linspace(0, along[-1], max(2, int(np.ceil(along[-1] / (POINT_SPACING * spacing))) + 1))
     line = np.stack([np.interp(at, along, v) for v in points.T], axis=1)
@@ -165,7 +160,10 @@ def ring_levels(region: Region, lost: float, fit: BeadFit, most: int | None = No
 
     lost: the region's roughness for one spacing.
     """
-    fit = _following(lost, fit)
+    # the outermost line is made so narrow that it follows the contour's corners: what they lose when they are rounded
+    # grows with the square of the radius
+    share = math.sqrt(MAX_CORNER_LOSS / max(lost, MAX_CORNER_LOSS))
+    fit = replace(fit, outermost=max(share * fit.spacing, 2 * fit.one))
     axis = medial_axis(region, BOUNDARY_SPACING * fit.spacing)
     thin = thin_beads(axis, shapely.boundary(region), fit, most)
     levels: list[RingLevel] = []
@@ -178,22 +176,13 @@ def ring_levels(region: Region, lost: float, fit: BeadFit, most: int | None = No
         gaps = _gaps(left, middle, own, spacing)
         own += dot_beads(gaps, here)
         if levels and len(gaps):
-            outer = levels[-1]
-            before = fit.at(len(levels) - 1)
+            outer, before = levels[-1], fit.at(len(levels) - 1)
             levels[-1] = RingLevel([widen_ring(ring, gaps, before) for ring in outer.rings], outer.single)
         between = _between(axis, float(fit.outside(len(levels))), here)
         rings = shapely.get_rings(shapely.get_parts(_simple(middle, spacing)))
         levels.append(RingLevel([_shared(ring, between, here) for ring in rings], own))
         left = _simple(shapely.buffer(left, -spacing, quad_segs=ARC_SEGMENTS), spacing)
     return levels, left
-
-
-def _following(lost: float, fit: BeadFit) -> BeadFit:
-    """The fit whose outermost line is so narrow that it follows a contour in whose corners so much is lost."""
-    share = math.sqrt(
-        MAX_CORNER_LOSS / max(lost, MAX_CORNER_LOSS)
-    )  # what rounded corners lose grows with the square of their radius
-    return replace(fit, outermost=max(share * fit.spacing, 2 * fit.one))
 
 
 def _simple(region: Region, spacing: float) -> Region:
@@ -207,9 +196,8 @@ def _middle(left: Region, single: list[Bead], fit: BeadFit, radius: float) -> Re
     middle = shapely.buffer(shapely.buffer(left, -spacing / 2 - radius, quad_segs=ARC_SEGMENTS), radius, quad_segs=4)
     if single:
         lean = max(fit.two - spacing / 2, radius)
-        wide = shapely.buffer(
-            shapely.buffer(middle, -lean, quad_segs=ARC_SEGMENTS), lean + MIN_OPENING * spacing, quad_segs=ARC_SEGMENTS
-        )  # not edge upon edge: that is slow
+        core = shapely.buffer(middle, -lean, quad_segs=ARC_SEGMENTS)
+        wide = shapely.buffer(core, lean + MIN_OPENING * spacing, quad_segs=ARC_SEGMENTS)  # edge upon edge is slow
         rest = shapely.get_parts(difference(middle, wide))
         lines = shapely.multilinestrings([shapely.linestrings(bead.points) for bead in single])
         shapely.prepare(lines)
@@ -222,9 +210,7 @@ def _middle(left: Region, single: list[Bead], fit: BeadFit, radius: float) -> Re
 def _gaps(left: Region, middle: Region, single: list[Bead], spacing: float) -> NDArray[np.object_]:
     """What a level leaves open between the line outside it and its own."""
     reached = shapely.buffer(middle, (0.5 + MIN_OPENING) * spacing, quad_segs=4)
-    beyond = (
-        MIN_OPENING * spacing * reached.length
-    )  # by so much its area is larger than the beads' own (Steiner's formula)
+    beyond = MIN_OPENING * spacing * reached.length  # its area beyond that of the beads (Steiner's formula)
     if left.area - reached.area + beyond < MIN_GAP_AREA * spacing**2:
         return np.empty(0, object)
     gaps = _large(difference(left, reached), spacing)
@@ -253,7 +239,7 @@ def _between(axis: MedialAxis, outside: float, fit: BeadFit) -> MedialAxis:
 def _shared(ring: BaseGeometry, between: MedialAxis, fit: BeadFit) -> Bead:
     """A closed line, moved and widened where only two fit between the lines outside it."""
     spacing = fit.spacing
-    points = points_of(shapely.segmentize(ring, spacing))
+    points = shapely.get_coordinates(shapely.segmentize(ring, spacing))
     if not len(between.radii):
         return even_bead(points, spacing)
     far, near = cKDTree(between.middles).query(points, distance_upper_bound=0.8 * spacing)

@@ -20,7 +20,7 @@ from planning.fill.bead import POINT_TOLERANCE, Bead
 
 BeadRun = list[Bead]  # beads that follow one another
 MAX_IMPROVEMENTS = 300  # improvements: a bound on time, reached by no layer that a wound was seen to need
-MIN_GAIN = 1e-6  # mm: a smaller gain is none
+MIN_TRAVEL_GAIN = 1e-6  # mm: a smaller gain is none
 RAMP_LENGTH = 2.2  # spacings along which a line leads over to the next: 24 degrees, no sharp turn
 JOIN_DISTANCE = 1.6  # spacings: a line farther from the one outside it is not joined to it
 RAMP_POINTS = 6  # points of a ramp
@@ -83,7 +83,7 @@ def _turned(tour: Tour, ends: Array, start: Array) -> Tour | None:
     gain = into + out - hop[:, None] - np.append(hop[1:], 0.0)
     gain[np.tri(len(tour), k=-1, dtype=bool)] = 0.0
     i, j = divmod(int(gain.argmin()), len(tour))
-    if gain[i, j] > -MIN_GAIN:
+    if gain[i, j] > -MIN_TRAVEL_GAIN:
         return None
     better = tour.copy()
     better[i : j + 1] = tour[i : j + 1][::-1]
@@ -99,7 +99,7 @@ def _moved(tour: Tour, ends: Array, start: Array) -> Tour | None:
     hop = np.linalg.norm(entry - leave[:-1], axis=1)
     skip = np.append(np.linalg.norm(entry[1:] - leave[:-2], axis=1), 0.0)  # from before i to what follows it
     saved = hop + np.append(hop[1:], 0.0) - skip
-    best, move = -MIN_GAIN, None
+    best, move = -MIN_TRAVEL_GAIN, None
     for flip in (0, 1):
         first, last = (leave[1:], entry) if flip else (entry, leave[1:])
         into = np.linalg.norm(leave[None] - first[:, None], axis=2)  # (i, place): after `place` runs
@@ -124,24 +124,22 @@ def nest_rings(levels: list[list[Bead]], spacing: float) -> list[list[Bead]]:
     open_nests: list[tuple[list[Bead], BaseGeometry]] = []
     done: list[list[Bead]] = []
     for rings in levels:
-        lines = [shapely.linestrings(ring.points) for ring in rings]
-        outer = np.array([nest[1] for nest in open_nests], dtype=object)
-        inside: list[list[int]] = [[] for _ in open_nests]
-        alone = []
-        for i in range(len(lines)):
-            far = shapely.distance(outer, shapely.points(rings[i].points[0])) if len(outer) else np.empty(0)
+        outer = np.array([line for _, line in open_nests], dtype=object)
+        inside: list[list[Bead]] = [[] for _ in open_nests]
+        following = []
+        for ring in rings:
+            far = shapely.distance(outer, shapely.points(ring.points[0])) if len(outer) else np.empty(0)
             if len(far) and far.min() < JOIN_DISTANCE * spacing:
-                inside[int(far.argmin())].append(i)
+                inside[int(far.argmin())].append(ring)
             else:
-                alone.append(i)
-        following = [([rings[i]], lines[i]) for i in alone]
-        for nest, within in zip(open_nests, inside, strict=True):
+                following.append([ring])
+        for (nest, _), within in zip(open_nests, inside, strict=True):
             if len(within) == 1:
-                following.append((nest[0] + [rings[within[0]]], lines[within[0]]))
+                following.append([*nest, within[0]])
             else:
-                done.append(nest[0])
-                following += [([rings[i]], lines[i]) for i in within]
-        open_nests = following
+                done.append(nest)
+                following += [[ring] for ring in within]
+        open_nests = [(nest, shapely.linestrings(nest[-1].points)) for nest in following]
     return done + [nest for nest, _ in open_nests]
 
 
@@ -150,14 +148,14 @@ def separate_rings(nest: list[Bead], start: Array, seam: float) -> BeadRun:
 
     seam: share of the outermost line by which the run begins later.
     """
-    return _begun(nest, _inwards(nest, _wanted(nest[0], start, seam)))
+    return _begun(nest, _inwards(nest, _seam_place(nest[0], start, seam)))
 
 
 def spiral_runs(nest: list[Bead], spacing: float, start: Array, seam: float) -> BeadRun:
     """The same lines joined inwards wherever one begins beside the one before."""
     turned = separate_rings(nest, start, seam)
     if any(_far(outer, inner, spacing) for outer, inner in pairwise(turned)):
-        turned = _begun(nest, _outwards(nest, _wanted(nest[0], start, seam), spacing))
+        turned = _begun(nest, _outwards(nest, _seam_place(nest[0], start, seam), spacing))
     runs: list[list[Bead]] = [[turned[0]]]
     closing: list[Bead] = []  # what the last line of a run lacks beside the ramp that led to it
     for outer, inner in pairwise(turned):
@@ -170,17 +168,16 @@ def spiral_runs(nest: list[Bead], spacing: float, start: Array, seam: float) -> 
         runs[-1] += [_ramp(outer, inner, ramp), inner.between(ramp, inner.length)]
         closing = [inner.between(0.0, ramp)]
     runs[-1] += closing
-    return [_chained(run) for run in runs]
+    joined = []
+    for run in runs:  # beads that follow one another without a step, as one
+        points, width = np.concatenate([b.points for b in run]), np.concatenate([b.width for b in run])
+        distinct = np.append(True, np.abs(np.diff(points, axis=0)).max(axis=1) > POINT_TOLERANCE)
+        joined.append(Bead(points[distinct], width[distinct]))
+    return joined
 
 
-def _chained(run: list[Bead]) -> Bead:
-    """Beads that follow one another without a step, as one."""
-    points, width = np.concatenate([b.points for b in run]), np.concatenate([b.width for b in run])
-    distinct = np.append(True, np.abs(np.diff(points, axis=0)).max(axis=1) > POINT_TOLERANCE)
-    return Bead(points[distinct], width[distinct])
-
-
-def _wanted(ring: Bead, start: Array, seam: float) -> Array:
+def _seam_place(ring: Bead, start: Array, seam: float) -> Array:
+    """Where on the outermost line the run should begin, (2,)."""
     first = int((ring.points @ start).argmax())
     along = ring.steps[:first].sum() + seam * ring.length
     return ring.at(np.array([along % ring.length]))[0, :2]
@@ -191,17 +188,17 @@ def _far(outer: Bead, inner: Bead, spacing: float) -> bool:
     return math.dist(outer.points[0], inner.points[0]) > JOIN_DISTANCE * spacing
 
 
-def _inwards(nest: list[Bead], wanted: Array) -> list[float]:
-    """Where along each line it begins, mm: nearest to `wanted` (2,), or to where the one before begins."""
+def _inwards(nest: list[Bead], place: Array) -> list[float]:
+    """Where along each line it begins, mm: nearest to `place` (2,), or to where the one before begins."""
     arcs = []
     for ring in nest:
-        arcs.append(float(shapely.line_locate_point(shapely.linestrings(ring.points), shapely.points(wanted))))
-        wanted = ring.at(np.array(arcs[-1:]))[0, :2]
+        arcs.append(float(shapely.line_locate_point(shapely.linestrings(ring.points), shapely.points(place))))
+        place = ring.at(np.array(arcs[-1:]))[0, :2]
     return arcs
 
 
-def _outwards(nest: list[Bead], wanted: Array, spacing: float) -> list[float]:
-    """The same, so that each begins beside the one within it, the outermost as near to `wanted` as that allows."""
+def _outwards(nest: list[Bead], seam: Array, spacing: float) -> list[float]:
+    """The same, so that each begins beside the one within it, the outermost as near to `seam` (2,) as that allows."""
     inmost = nest[-1]
     place = inmost.at(np.linspace(0, inmost.length, START_CANDIDATES, endpoint=False))[:, :2]
     arcs, far = [], np.zeros(START_CANDIDATES)
@@ -211,7 +208,7 @@ def _outwards(nest: list[Bead], wanted: Array, spacing: float) -> list[float]:
         far += np.linalg.norm(outer - place, axis=1) > JOIN_DISTANCE * spacing
         place = outer
         arcs.append(arc)
-    best = int((np.linalg.norm(place - wanted, axis=1) + 1e6 * far).argmin())
+    best = int((np.linalg.norm(place - seam, axis=1) + 1e6 * far).argmin())
     return [float(arc[best]) for arc in arcs[::-1]]
 
 

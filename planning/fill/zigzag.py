@@ -87,9 +87,9 @@ def _line_crossings(boundary: Boundary, low: float, step: float, lines: int) -> 
     ring = ring_start[edge[along]]
     closes = np.append(np.flatnonzero(ring[1:] != ring[:-1]), len(ring) - 1)
     opens = np.concatenate([[0], closes[:-1] + 1])
-    nxt, prv = np.arange(1, len(ring) + 1), np.arange(-1, len(ring) - 1)
-    nxt[closes], prv[opens] = opens, closes
-    after[along], before[along] = along[nxt], along[prv]
+    onwards, backwards = np.arange(1, len(ring) + 1), np.arange(-1, len(ring) - 1)
+    onwards[closes], backwards[opens] = opens, closes
+    after[along], before[along] = along[onwards], along[backwards]
     # in the order of the lines
     order = np.lexsort([points[:, 0], line])
     place = np.empty(len(order), np.intp)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import shapely
@@ -20,8 +20,7 @@ from planning.path import MIN_SPACING, Path
 Index = NDArray[np.int64]
 MIN_SPACING_SHARE = 0.25  # of the spacing: nearer checkpoints than that are not set for the surface's sake
 SMOOTHING_RADII = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # mm: by the first that holds the limit the normals are smoothed
-# mm around the way of the tip that a travel looks for higher ground: a fine nozzle's outer radius
-TRAVEL_CLEARANCE = 1.0
+TRAVEL_CLEARANCE = 1.0  # mm around the tip's way, over whose highest ground a travel goes: a fine nozzle's outer radius
 TRAVEL_SPACING = 3.0  # mm between the checkpoints of a travel: follows a limb's roundness to 0.05 mm
 MIN_LIFT = 0.3  # mm of lift even for the shortest travel: clears a bead just laid
 
@@ -37,8 +36,7 @@ class BeadPoints:
     @property
     def steps(self) -> Array:
         """Length (N,), mm, of the way to each point; 0 at the first of each bead."""
-        step = np.r_[0.0, np.hypot(*np.diff(self.points, axis=0).T)]
-        return np.where(self.first, 0.0, step)
+        return np.where(self.first, 0.0, np.r_[0.0, np.hypot(*np.diff(self.points, axis=0).T)])
 
     @property
     def first(self) -> NDArray[np.bool_]:
@@ -54,11 +52,8 @@ class BeadPoints:
 def bead_points(beads: Sequence[Bead], chord: float) -> BeadPoints:
     """Beads without the points that neither the line nor the half width to its edges needs, to `chord` mm each."""
     count = np.array([len(bead.points) for bead in beads])
-    every = BeadPoints(
-        np.concatenate([bead.points for bead in beads]),
-        np.concatenate([bead.width for bead in beads]),
-        np.repeat(np.arange(len(beads)), count),
-    )
+    points, width = np.concatenate([b.points for b in beads]), np.concatenate([b.width for b in beads])
+    every = BeadPoints(points, width, np.repeat(np.arange(len(beads)), count))
     even = np.array([np.ptp(bead.width) < 1e-9 for bead in beads], bool)
     # points kept for the line cut the stretches found for the width, and the other way round: twice as far off at most
     within = np.where(even, chord, chord / 2)
@@ -140,7 +135,9 @@ def tilt_field(grid: Grid, heights: Array, inside: Mask, limits: ToolLimits) -> 
     true = _tilts(gradient(grid, heights))
     chosen, used = true, 0.0
     for used in SMOOTHING_RADII:
-        chosen = _clipped(_tilts(gradient(grid, smoothed(grid, heights, used))), limits.tilt)
+        chosen = _tilts(gradient(grid, smoothed(grid, heights, used)))
+        size = np.linalg.norm(chosen, axis=-1, keepdims=True)
+        chosen = chosen * np.minimum(1.0, limits.tilt / np.maximum(size, 1e-12))
         rate = _rate(grid, chosen, inside)
         if rate <= limits.turning:
             break
@@ -152,11 +149,6 @@ def tilt_field(grid: Grid, heights: Array, inside: Mask, limits: ToolLimits) -> 
 def _tilts(slopes: Array) -> Array:
     steep = np.linalg.norm(slopes, axis=-1, keepdims=True)
     return np.asarray(slopes * np.arctan(steep) / np.maximum(steep, 1e-12))
-
-
-def _clipped(values: Array, most: float) -> Array:
-    size = np.linalg.norm(values, axis=-1, keepdims=True)
-    return np.asarray(values * np.minimum(1.0, most / np.maximum(size, 1e-12)))
 
 
 def _rate(grid: Grid, values: Array, inside: Mask) -> float:
@@ -248,18 +240,13 @@ def checkpoints_on(ground: TipSurface, beads: Sequence[Bead], layer_of: Index, w
     height = stack.bead_heights(xy, layer) * interpolate(ground.chart.grid, ground.chart.cosine, xy)
     area = (runs.width + np.r_[runs.width[:1], runs.width[:-1]]) / 2 * runs.steps
     volume = area * (height + np.r_[height[:1], height[:-1]]) / 2
-    speed = _speeds(runs, np.array([s.slab.tissue.speed for s in stack.layers])[layer], way)
+    # the slower of what both ends of the way to each point allow
+    full = np.array([s.slab.tissue.speed for s in stack.layers])[layer]
+    allowed = np.maximum(np.minimum(full, np.sqrt(way.sideways * bend_radii(runs))), way.slowest * full)
+    speed = np.where(runs.first, way.travel, np.minimum(allowed, np.r_[allowed[:1], allowed[:-1]]))
     wait = np.zeros(len(tip))
     printed = Checkpoints(tip, tilt, speed, ~runs.first, runs.width, height, volume, layer, runs.bead, wait)
     return _with_travels(ground, printed, runs, way)
-
-
-def _speeds(runs: BeadPoints, full: Array, way: CheckpointSettings) -> Array:
-    """mm/s (N,) of the way to each point: the slower of what its two ends allow."""
-    allowed = np.minimum(full, np.sqrt(way.sideways * bend_radii(runs)))
-    allowed = np.maximum(allowed, way.slowest * full)
-    before = np.r_[allowed[:1], allowed[:-1]]
-    return np.where(runs.first, way.travel, np.minimum(allowed, before))
 
 
 def _with_travels(ground: TipSurface, printed: Checkpoints, runs: BeadPoints, way: CheckpointSettings) -> Checkpoints:
@@ -279,10 +266,16 @@ def _with_travels(ground: TipSurface, printed: Checkpoints, runs: BeadPoints, wa
     tip, tilt = _over(ground, printed, a[of], b[of], part, lift[of])
     wait = np.where(new_layer[of] & (k == 0), way.wait, 0.0)
     none, zero = np.zeros(len(of), bool), np.zeros(len(of))
-    travels = Checkpoints(
-        tip, tilt, np.full(len(of), way.travel), none, zero, zero, zero, printed.layer[b[of]], printed.bead[b[of]], wait
-    )
-    return _with_exit(_merged(travels, b[of], printed), way)
+    layer, bead, speed = printed.layer[b[of]], printed.bead[b[of]], np.full(len(of), way.travel)
+    travels = Checkpoints(tip, tilt, speed, none, zero, zero, zero, layer, bead, wait)
+    # each travel before the checkpoint it leads to, and a last checkpoint, lifted off the last bead
+    order = np.argsort(np.r_[b[of] - 0.5, np.arange(len(printed.speed))], kind="stable")
+    up = printed.tip[-1:] + way.lift * tool_rotations(printed.tilt[-1:], 0.0)[:, :, 2]
+    tilt, layer, bead = printed.tilt[-1:], printed.layer[-1:], printed.bead[-1:]
+    zero, none, speed = np.zeros(1), np.zeros(1, bool), np.array([way.travel])
+    last = Checkpoints(up, tilt, speed, none, zero, zero, zero, layer, bead, zero)
+    columns = [[getattr(part, f.name) for part in (travels, printed, last)] for f in fields(Checkpoints)]
+    return Checkpoints(*(np.concatenate([np.concatenate([a, b])[order], c]) for a, b, c in columns))
 
 
 def _over(
@@ -292,32 +285,11 @@ def _over(
     tilt = printed.tilt[a] + part[:, None] * (printed.tilt[b] - printed.tilt[a])
     foot = printed.tip[a] + part[:, None] * (printed.tip[b] - printed.tip[a])
     inner = (part > 0) & (part < 1)
-    top = np.maximum(
-        interpolate(ground.stack.grid, ground.ceiling, foot[:, :2]), ground.stack.tops(foot[:, :2], printed.layer[b])
-    )
+    highest = interpolate(ground.stack.grid, ground.ceiling, foot[:, :2])
+    top = np.maximum(highest, ground.stack.tops(foot[:, :2], printed.layer[b]))
     foot[inner, 2] = np.maximum(foot[inner, 2], top[inner])
     up = tool_rotations(tilt, 0.0)[:, :, 2]
     return foot + lift[:, None] * up, tilt
-
-
-def _merged(travels: Checkpoints, before: Index, printed: Checkpoints) -> Checkpoints:
-    """Both in order: each travel before the checkpoint (M,) it leads to."""
-    order = np.argsort(np.r_[before - 0.5, np.arange(len(printed.speed))], kind="stable")
-    return Checkpoints(
-        *(np.concatenate([getattr(travels, n), getattr(printed, n)])[order] for n in Checkpoints.__dataclass_fields__)
-    )
-
-
-def _with_exit(all_of: Checkpoints, way: CheckpointSettings) -> Checkpoints:
-    """With a last checkpoint, lifted off the last bead."""
-    up = all_of.tip[-1:] + way.lift * tool_rotations(all_of.tilt[-1:], 0.0)[:, :, 2]
-    zero, none = np.zeros(1), np.zeros(1, bool)
-    last = Checkpoints(
-        up, all_of.tilt[-1:], np.array([way.travel]), none, zero, zero, zero, all_of.layer[-1:], all_of.bead[-1:], zero
-    )
-    return Checkpoints(
-        *(np.concatenate([getattr(all_of, n), getattr(last, n)]) for n in Checkpoints.__dataclass_fields__)
-    )
 
 
 def path_from(points: Checkpoints, ground: TipSurface, spin: float) -> Path:
@@ -326,6 +298,8 @@ def path_from(points: Checkpoints, ground: TipSurface, spin: float) -> Path:
     apart = np.r_[True, np.linalg.norm(np.diff(points.tip, axis=0), axis=1) >= 2 * MIN_SPACING]
     tissues = [layer.slab.tissue for layer in ground.stack.layers]
     layer = points.layer[apart]
+    extra = [("wait_s", points.wait, 3), ("width_mm", points.width, 3), ("height_mm", points.height, 3)]
+    extra += [("volume_mm3", points.volume, 4), ("run", points.bead.astype(float), 0)]
     return Path(
         surface_from_nozzle=ground.surface_from_plane @ plane_from_nozzle[apart],
         speed=points.speed[apart],
@@ -333,13 +307,7 @@ def path_from(points: Checkpoints, ground: TipSurface, spin: float) -> Path:
         temperature=np.array([t.temperature for t in tissues])[layer],
         layer=layer,
         extrude=points.extrude[apart],
-        extra={
-            "wait_s": _number_texts(points.wait[apart]),
-            "width_mm": _number_texts(points.width[apart]),
-            "height_mm": _number_texts(points.height[apart]),
-            "volume_mm3": _number_texts(points.volume[apart], 4),
-            "run": _number_texts(points.bead[apart].astype(float), 0),
-        },
+        extra={name: _number_texts(values[apart], digits) for name, values, digits in extra},
     )
 
 
@@ -349,10 +317,9 @@ def _materials(names: Sequence[str], layer: Index) -> NDArray[np.int64] | NDArra
     return np.array(names)[layer]
 
 
-def _number_texts(values: Array, digits: int = 3) -> NDArray[np.str_]:
+def _number_texts(values: Array, digits: int) -> NDArray[np.str_]:
     """Numbers as text of so many digits; each different one is written once."""
     scale = 10**digits
     whole, number = np.unique(np.rint(values * scale).astype(np.int64), return_inverse=True)
-    return np.array([f"{v / scale:.{digits}f}".rstrip("0").rstrip(".") if digits else str(v) for v in whole.tolist()])[
-        number
-    ]
+    texts = [f"{v / scale:.{digits}f}".rstrip("0").rstrip(".") if digits else str(v) for v in whole.tolist()]
+    return np.array(texts)[number]

@@ -18,6 +18,7 @@ from shapely import MultiPolygon
 
 from estimation.se3 import Array
 
+Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 MAX_CANDIDATES = 2_000_000  # nodes tried against triangles at once: 100 MB
 ZERO_BAND = 1e-9  # values nearer to 0 than this are moved off it, so that no crossing falls on a node
@@ -98,7 +99,7 @@ def filled(values: Array, valid: Mask) -> Array:
     return np.asarray(values[tuple(nearest)])
 
 
-def topmost(points: Array, triangles: NDArray[np.int64], grid: Grid) -> Array:
+def topmost(points: Array, triangles: Index, grid: Grid) -> Array:
     """Height (H, W) of the topmost of triangles (T, 3) of points (V, 3) over each node; -inf where there is none."""
     heights = np.full(grid.shape[0] * grid.shape[1], -np.inf)
     corners = points[triangles]
@@ -108,21 +109,14 @@ def topmost(points: Array, triangles: NDArray[np.int64], grid: Grid) -> Array:
     high = np.minimum(np.floor(u.max(axis=1) + 1e-9), np.array(grid.shape[::-1]) - 1).astype(np.int64)
     counts = np.prod(np.maximum(high - low + 1, 0), axis=1)
     keep = np.flatnonzero(counts)
-    for part in _parts(keep, counts[keep]):
+    total = np.cumsum(counts[keep])
+    cuts = np.searchsorted(total, np.arange(MAX_CANDIDATES, total[-1] if len(total) else 0, MAX_CANDIDATES))
+    for part in np.split(keep, cuts):
         _raise(heights, u[part], corners[part, :, 2], low[part], high[part], counts[part], grid.shape[1])
     return heights.reshape(grid.shape)
 
 
-def _parts(keep: NDArray[np.int64], counts: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    total = np.cumsum(counts)
-    cuts = np.searchsorted(total, np.arange(MAX_CANDIDATES, total[-1] if len(total) else 0, MAX_CANDIDATES))
-    return [part for part in np.split(keep, cuts) if len(part)]
-
-
-def _raise(
-    heights: Array, u: Array, z: Array, low: NDArray[np.int64], high: NDArray[np.int64],
-    counts: NDArray[np.int64], columns: int,
-) -> None:  # fmt: skip
+def _raise(heights: Array, u: Array, z: Array, low: Index, high: Index, counts: Index, columns: int) -> None:
     """Raise `heights` (H * W,) to triangles u (T, 3, 2) in nodes, z (T, 3), in their boxes from low to high (T, 2)."""
     which = np.repeat(np.arange(len(u)), counts)
     k = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -140,9 +134,6 @@ def _raise(
     np.maximum.at(heights, y[inside] * columns + x[inside], height)
 
 
-Index = NDArray[np.int64]
-
-
 def positive_region(grid: Grid, values: Array, least: float, slack: float) -> MultiPolygon:
     """Where values (H, W), linear between nodes, are positive, in mm.
 
@@ -151,7 +142,8 @@ def positive_region(grid: Grid, values: Array, least: float, slack: float) -> Mu
     rings = [ring for ring in _rings(grid, values) if abs(_area(ring)) >= least]
     if not rings:
         return MultiPolygon()
-    polygons = shapely.build_area(shapely.multilinestrings([shapely.linestrings(_closed(r)) for r in rings]))
+    closed = [shapely.linestrings(np.concatenate([ring, ring[:1]])) for ring in rings]
+    polygons = shapely.build_area(shapely.multilinestrings(closed))
     return as_multi(shapely.make_valid(shapely.simplify(polygons, slack)), least)
 
 
@@ -160,10 +152,6 @@ def as_multi(shape: shapely.Geometry, least: float = 0.0) -> MultiPolygon:
     parts = [p for p in shapely.get_parts(shapely.get_parts(shape)) if isinstance(p, shapely.Polygon)]
     parts = [p for p in parts if not p.is_empty and p.area >= least]
     return MultiPolygon(sorted(parts, key=lambda p: (-p.area, p.bounds)))
-
-
-def _closed(ring: Array) -> Array:
-    return np.concatenate([ring, ring[:1]])
 
 
 def _area(ring: Array) -> float:

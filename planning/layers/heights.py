@@ -20,8 +20,7 @@ from estimation.se3 import Array, Index
 from planning.layers.grid import Grid, Mask, filled, grid_over, interpolate, smoothed, topmost
 
 MAX_NODES = 400_000  # of a grid: 3 MB a layer
-# mm of smoothing for each mm of noise: leaves a tenth of it on a scan of 0.5 mm between points
-SMOOTHING_PER_NOISE = 8.0
+SMOOTHING_PER_NOISE = 8.0  # mm for each mm of noise: leaves a tenth of it on a scan of 0.5 mm between points
 MAX_SMOOTHING = 1.0  # mm: more would round the wound's rim away
 MIN_NOISE = 0.01  # mm: noise below is not worth smoothing
 CLOSING_RADII = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # nodes: how far each round of closing holes looks

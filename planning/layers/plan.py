@@ -16,7 +16,6 @@ from estimation.se3 import Array
 from planning.fill.bead import SHARP_TURN, Bead, Pattern, PrintPace
 from planning.fill.fill import fill, settle_angle
 from planning.fill.region import FillCoverage, fill_coverage, region_of
-from planning.layers.bumps import BumpPassing
 from planning.layers.checkpoints import (
     Checkpoints,
     CheckpointSettings,
@@ -28,16 +27,15 @@ from planning.layers.checkpoints import (
     tilt_field,
 )
 from planning.layers.grid import Chart, as_multi, flat_chart, grid_over, unroll
-from planning.layers.slicing import Layer, LayerMode, LayerStack, Tissue, layer_stack
+from planning.layers.slicing import BumpPassing, Layer, LayerMode, LayerStack, Tissue, layer_stack
 from planning.layers.wound import WoundFindings, WoundVolume, nodes_within
 from planning.path import Path
 
 Report = Callable[[int, int], None]  # (layers done, layers)
 SHARP_TURN_TIME = 0.05  # s for each sharp turn, as other planners' times are counted
-# of a closed line's length, by which the seam moves from layer to layer: keeps seams apart for the most layers, by the
-# three-distance theorem
+# of a closed line's length, from layer to layer: keeps seams apart for the most layers, by the three-distance theorem
 SEAM_SHIFT = 0.6180339887498949
-DISC_AREA = 0.75  # widths squared: a part of less area holds no disc of that width, which has pi / 4 of them
+MIN_DISC_AREA = 0.75  # widths squared: a part of less area holds no disc of that width, which has pi / 4 of them
 GRID_STEP, GRID_MARGIN = 1.0, 5.0  # mm: a plane needs no fine grid
 MAX_GRID_NODES = 1000.0  # nodes along a side
 
@@ -90,28 +88,23 @@ def make_plan(
     """The plan of a wound; InputError where no bead finds room in it."""
     stack = layer_stack(wound, order.tissues, order.mode, order.pattern.width, order.passing)
     chart = flat_chart(wound.grid) if order.mode == "horizontal" else unroll(wound.grid, wound.skin)
-    order = replace(order, pattern=_with_angle(stack, chart, order))
+    if isinstance(order.pattern.angle, str):  # one for all layers: the best for the largest
+        largest = max(stack.layers, key=lambda layer: layer.region.area)
+        pattern = settle_angle(_in_chart(largest.region, chart), order.pattern, _pace(largest, order))
+        order = replace(order, pattern=pattern)
     planned = []
     for i, layer in enumerate(stack.layers):
         planned.append(_planned_layer(layer, chart, order))
         report(i + 1, len(stack.layers))
     beads = [bead for layer in planned for bead in layer.beads]
     if not beads:
-        wider = f"a wound wider than {order.pattern.width:g} mm, or finer beads"
-        raise InputError(where, "beads", "none has room", wider)
+        allowed = f"a wound wider than {order.pattern.width:g} mm, or finer beads"
+        raise InputError(where, "beads", "none has room", allowed)
     layer_of = np.repeat([p.layer.number for p in planned], [len(p.beads) for p in planned])
     ground = _tip_surface(wound, stack, chart, order.way)
     points = checkpoints_on(ground, beads, layer_of, order.way)
     path = path_from(points, ground, order.way.tool.spin)
     return Plan(path, points, wound, stack, chart, ground, tuple(planned), order)
-
-
-def _with_angle(stack: LayerStack, chart: Chart, order: PlanOrder) -> Pattern:
-    """The pattern with a number as angle: of all layers, the best for the largest."""
-    if not isinstance(order.pattern.angle, str):
-        return order.pattern
-    layer = max(stack.layers, key=lambda layer: layer.region.area)
-    return settle_angle(_in_chart(layer.region, chart), order.pattern, _pace(layer, order))
 
 
 def _in_chart(shape: MultiPolygon, chart: Chart) -> MultiPolygon:
@@ -161,18 +154,18 @@ class LayerFigures:
 
 @dataclass(frozen=True, slots=True)
 class PlanTotal:
-    """All layers together. covered, over, double: shares of their area. volume: mm^3 by material."""
+    """All layers together."""
 
-    area: float
-    covered: float
-    over: float
-    double: float
-    gap: float
-    bead_gap: float
-    printed: float
-    travelled: float
+    area: float  # mm^2
+    covered: float  # share of the area, as in FillCoverage
+    over: float  # the same
+    double: float  # the same
+    gap: float  # mm^2
+    bead_gap: float  # mm^2
+    printed: float  # mm
+    travelled: float  # mm
     seconds: float
-    volume: tuple[tuple[str, float], ...]
+    volume: tuple[tuple[str, float], ...]  # mm^3 by material
 
 
 def seconds_to(points: Checkpoints) -> Array:
@@ -189,7 +182,7 @@ def seconds_to(points: Checkpoints) -> Array:
     return np.asarray(np.cumsum(durations))
 
 
-def figures_of(plan: Plan, report: Callable[[int, int], None] = lambda done, total: None) -> list[LayerFigures]:
+def figures_of(plan: Plan, report: Report = lambda done, total: None) -> list[LayerFigures]:
     """The figures of each layer that has beads. One thread a core: GEOS, which unites the beads, releases the GIL."""
     moments = seconds_to(plan.points)
     printed_layers = [layer for layer in plan.layers if layer.beads]
@@ -208,12 +201,12 @@ def _figures(plan: Plan, layer: PlannedLayer, moments: Array) -> LayerFigures:
     points, number = plan.points, layer.layer.number
     own = points.layer == number
     step = np.r_[0.0, np.linalg.norm(np.diff(points.tip, axis=0), axis=1)]
-    taken = np.diff(moments, prepend=0.0)
+    durations = np.diff(moments, prepend=0.0)
     result, tissue = layer.coverage, layer.layer.slab.tissue
     half, whole = (_wide_area(result.gaps, part * plan.order.pattern.width) for part in (0.5, 1.0))
     return LayerFigures(
         number, tissue.name, tissue.material, float(layer.region.area), len(layer.beads), int(own.sum()),
-        float(step[own & points.extrude].sum()), float(step[own & ~points.extrude].sum()), float(taken[own].sum()),
+        float(step[own & points.extrude].sum()), float(step[own & ~points.extrude].sum()), float(durations[own].sum()),
         float(points.volume[own].sum()), result, float(result.gaps.area), half, whole,
     )  # fmt: skip
 
@@ -221,7 +214,7 @@ def _figures(plan: Plan, layer: PlannedLayer, moments: Array) -> LayerFigures:
 def _wide_area(gaps: shapely.MultiPolygon, width: float) -> float:
     """Area, mm^2, of the parts of gaps into which a disc `width` mm wide fits."""
     parts = shapely.get_parts(gaps)
-    large = shapely.multipolygons(parts[shapely.area(parts) > DISC_AREA * width**2])
+    large = shapely.multipolygons(parts[shapely.area(parts) > MIN_DISC_AREA * width**2])
     core = shapely.buffer(large, -width / 2)
     return float(shapely.intersection(shapely.buffer(core, width / 2), large).area) if not core.is_empty else 0.0
 

@@ -14,8 +14,7 @@ from estimation.scans.scan import Scan, scan_from_triangles
 from estimation.se3 import Array
 
 Index = NDArray[np.int64]
-# mm: vertices nearer than this are one; scanners resolve a hundredth, and float32 a hundred-thousandth
-MERGE_DISTANCE = 1e-4
+MERGE_DISTANCE = 1e-4  # mm: nearer vertices are one; scanners resolve a hundredth, and float32 a hundred-thousandth
 MIN_ISLAND_SHARE = 0.05  # of the whole area: smaller pieces are dirt, a table behind the limb, or a hair
 SPIKE_SIGMAS, SPIKE_EDGES = 6.0, 0.75  # a vertex is a spike when it stands out by so many deviations, and so many edges
 SPIKE_ROUNDS = 3  # a spike may hide the one beside it
@@ -42,7 +41,7 @@ class Repairs:
     holes: int
 
     def rows(self) -> list[tuple[str, int]]:
-        """What was found and done, in words, and how often."""
+        """Defects and repairs, in words, and how often."""
         return [
             ("vertices read", self.vertices),
             ("triangles read", self.triangles),
@@ -66,7 +65,8 @@ def repair_mesh(vertices: ArrayLike, triangles: ArrayLike, where: object, flip: 
     """
     points, faces = np.asarray(vertices, float).reshape(-1, 3), np.asarray(triangles, np.int64).reshape(-1, 3)
     read = len(points), len(faces)
-    faces = faces[_usable(points, faces)]
+    finite = np.r_[np.isfinite(points).all(axis=1), False]
+    faces = faces[finite[np.where((faces >= 0) & (faces < len(points)), faces, -1)].all(axis=1)]
     broken = read[1] - len(faces)
     _enough(faces, where, read[1])
     points, faces, merged = _merged(points, faces)
@@ -99,9 +99,8 @@ def mean_normal(points: Array, faces: Index, where: object) -> Array:
     z = crosses.sum(axis=0) / np.linalg.norm(crosses, axis=1).sum()
     facing = float(np.linalg.norm(z))
     if not facing >= MIN_MEAN_NORMAL:
-        allowed = (
-            f"{MIN_MEAN_NORMAL:g} or more: the skin around the wound seen from one side; cut it out of the whole body"
-        )
+        side = "the skin around the wound seen from one side; cut it out of the whole body"
+        allowed = f"{MIN_MEAN_NORMAL:g} or more: {side}"
         raise InputError(where, "length of the mean normal", round(facing, 3), allowed)
     return np.asarray(z / facing)
 
@@ -110,12 +109,6 @@ def _enough(faces: Index, where: object, read: int) -> None:
     if len(faces) < MIN_TRIANGLES:
         got = f"{len(faces)} triangles that can be used of {read}"
         raise InputError(where, "scan", got, f"{MIN_TRIANGLES} or more: scan the wound again")
-
-
-def _usable(points: Array, faces: Index) -> NDArray[np.bool_]:
-    there = (faces >= 0) & (faces < len(points))
-    finite = np.r_[np.isfinite(points).all(axis=1), False]
-    return np.asarray(finite[np.where(there, faces, -1)].all(axis=1))
 
 
 def _merged(points: Array, faces: Index) -> tuple[Array, Index, int]:
@@ -201,11 +194,9 @@ def _against(points: Array, faces: Index) -> NDArray[np.bool_]:
     """
     a, b, same = _pairs(faces)
     count = len(faces)
-    other = np.where(same, b, b + count)
-    mirrored = np.where(same, b + count, b)
-    graph = coo_array(
-        (np.ones(2 * len(a)), (np.r_[a, a + count], np.r_[other, mirrored])), shape=(2 * count, 2 * count)
-    )
+    other, mirrored = np.where(same, b, b + count), np.where(same, b + count, b)
+    edges = np.r_[a, a + count], np.r_[other, mirrored]
+    graph = coo_array((np.ones(2 * len(a)), edges), shape=(2 * count, 2 * count))
     _, side = connected_components(graph, directed=False)
     one_sided = side[:count] == side[count:]  # as a Moebius strip: no way to face
     first = side[:count] < side[count:]

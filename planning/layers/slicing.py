@@ -6,6 +6,9 @@ by a share from 0 to 1.
     horizontal   flat, from the deepest point of the bed to the highest of the skin
     skin         parallel to the restored skin
     conformal    the first follows the bed, the last is the restored skin, those between blend from one into the other
+
+Bumps of the scanned bed that stand over a layer: low ones are gone over, high ones round (thesis 5.2, Fig. 5.5). What
+joins the skin around the wound is its wall and no bump: a layer ends there anyway.
 """
 
 from __future__ import annotations
@@ -16,14 +19,105 @@ from typing import Literal, get_args
 
 import numpy as np
 import shapely
+from scipy.ndimage import label
 from shapely import MultiPolygon
 
 from estimation.errors import InputError
 from estimation.se3 import Array, Index
 from planning.fill.region import without_bumps
-from planning.layers.bumps import DEFAULT_PASSING, BumpLayer, BumpPassing, Bumps, bumps_in, nodes_in_outline
 from planning.layers.grid import Grid, Mask, as_multi, interpolate, positive_region, smoothed
 from planning.layers.wound import OUTLINE_TOLERANCE, WoundVolume, nodes_within
+
+EIGHT_NEIGHBOURS = np.ones((3, 3), int)  # nodes joined across corners too, so that no outline runs between them
+# of a layer's height that a bump may stand over its top: the layer over it keeps three tenths of its own there,
+# at most: a fifth, the thinnest bead
+DEFAULT_BUMP_LIMIT, MAX_BUMP_LIMIT = 0.5, 0.6
+DEFAULT_CLEARANCE = 0.5  # of a bead's width: a needle is about twice as thick as its bead (22 G: 0.41 in, 0.72 mm out)
+
+
+@dataclass(frozen=True, slots=True)
+class BumpPassing:
+    """How bumps are passed."""
+
+    over: float | None = None  # mm above a layer's top up to which one is gone over; None: DEFAULT_BUMP_LIMIT
+    clearance: float | None = None  # mm kept around a higher one; None: DEFAULT_CLEARANCE
+
+    def limit(self, height: float) -> float:
+        """mm above the top of a layer `height` mm high."""
+        return DEFAULT_BUMP_LIMIT * height if self.over is None else min(self.over, MAX_BUMP_LIMIT * height)
+
+    def clear(self, width: float) -> float:
+        """mm around bumps, for beads `width` mm wide."""
+        return DEFAULT_CLEARANCE * width if self.clearance is None else self.clearance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bumps:
+    """The bumps of one layer, in the plane, mm."""
+
+    over: MultiPolygon  # where the bed is over the layer's middle and gone over
+    around: MultiPolygon  # where it stands too high above the layer's top
+    highest: float  # mm above the top, of all; 0 where there is none
+
+
+@dataclass(frozen=True, slots=True)
+class BumpLayer:
+    """A layer that bumps may stand over."""
+
+    height: float  # mm
+    limit: float  # mm above its top up to which a bump is gone over
+    level: bool  # it does not follow the bed by itself
+
+
+DEFAULT_PASSING = BumpPassing()
+NO_BUMPS = Bumps(MultiPolygon(), MultiPolygon(), 0.0)
+
+
+def bumps_in(grid: Grid, inside: Mask, rise: Array, step: BumpLayer, slack: float) -> Bumps:
+    """The bumps of a layer over whose top the bed rises by `rise` (H, W) mm.
+
+    inside: where bumps are looked for. slack: mm, of outlines.
+    """
+    grid, inside, rise = _window(grid, inside, rise)
+    low, peaks = _bumps(rise > -step.height / 2, inside, rise, step.limit if step.level else -np.inf)
+    high, tops = _bumps(rise > step.limit, inside, rise, np.inf)
+    if not len(peaks) and not len(tops):
+        return NO_BUMPS
+    over = _shapes(grid, low, rise + step.height / 2, slack)
+    return Bumps(over, _shapes(grid, high, rise - step.limit, slack), float(np.concatenate([peaks, tops]).max()))
+
+
+def _window(grid: Grid, inside: Mask, values: Array) -> tuple[Grid, Mask, Array]:
+    """The part of a grid that holds all nodes inside and one more around."""
+    rows, columns = (np.flatnonzero(inside.any(axis=k)) for k in (1, 0))
+    top, left = max(rows[0] - 1, 0), max(columns[0] - 1, 0)
+    part = slice(top, rows[-1] + 2), slice(left, columns[-1] + 2)
+    inside, values = inside[part], values[part]
+    return Grid(grid.step, grid.origin + grid.step * np.array([left, top]), inside.shape), inside, values
+
+
+def _bumps(raised: Mask, inside: Mask, rise: Array, limit: float) -> tuple[Mask, Array]:
+    """The nodes (H, W) of joined raised ones that stay in the wound and rise to `limit` at most; the peaks (K,)."""
+    if not (raised & inside).any():
+        return np.zeros_like(raised), np.empty(0)
+    pieces, count = label(raised, EIGHT_NEIGHBOURS)
+    walls = np.zeros(count + 1, bool)
+    walls[pieces[~inside]] = True
+    peaks = np.full(count + 1, -np.inf)
+    np.maximum.at(peaks, pieces.ravel(), rise.ravel())
+    chosen = (peaks <= limit) & ~walls
+    chosen[0] = False  # what is not raised
+    return chosen[pieces], peaks[chosen]
+
+
+def _shapes(grid: Grid, own: Mask, values: Array, slack: float) -> MultiPolygon:
+    """Where values (H, W) are positive at the nodes `own` and beside them."""
+    if not own.any():
+        return MultiPolygon()
+    shape = positive_region(grid, np.where(own | (values <= 0), values, -np.abs(values)), 0.0, slack)
+    shapely.prepare(shape)
+    return shape
+
 
 MAX_LAYERS = 400  # a wound of 40 mm in layers of 0.1 mm
 MIN_BLENDED_HEIGHT = 0.6  # of a layer's height: where blended layers would be thinner, every second one is left out
@@ -176,36 +270,34 @@ class LayerStack:
         """The layer (N,) under each of layers (N,), where the wound has `part` (N,) of its greatest depth."""
         if self.mode != "conformal":
             return np.asarray(number - 1)
-        stride = _stride(part)
+        # how many blended layers one replaces (N,)
+        stride = 2.0 ** np.clip(np.ceil(np.log2(MIN_BLENDED_HEIGHT / np.maximum(part, 1e-9)) - 1e-9), 0, 40)
         return np.where(number + 1 < (1 + MIN_REPLACED) * stride, -1, number - stride).astype(np.int64)
 
 
 def layer_stack(
     wound: WoundVolume, tissues: Sequence[Tissue], mode: LayerMode, width: float, passing: BumpPassing = DEFAULT_PASSING
-) -> LayerStack:  # fmt: skip
-    """The layers of a wound. width: mm of a bead: what is smaller in the bed is not followed, nor laid.
-
-    passing: how bumps of the bed are passed.
-    """
+) -> LayerStack:
+    """The layers of a wound. width: mm of a bead: what is smaller in the bed is not followed, nor laid."""
     inside = nodes_within(wound.grid, wound.outline)
     lowest, highest = _ends(wound, inside, mode, width)
     whole = float((highest - lowest)[inside].max())
     cut = slabs(tissues, whole)
-    hollow = nodes_in_outline(wound.grid, wound.outline)
+    hull = shapely.union_all([shapely.Polygon(part.exterior) for part in wound.outline.geoms])  # islands of skin too
+    shapely.prepare(hull)
+    hollow: Mask = shapely.contains_xy(hull, wound.grid.nodes[..., 0], wound.grid.nodes[..., 1])
     layers = []
     for k, slab in enumerate(cut):
-        shape = positive_region(
-            wound.grid, _presence(wound, lowest, highest, cut, k, mode), width**2, OUTLINE_TOLERANCE
-        )
+        presence = _presence(wound, lowest, highest, cut, k, mode)
+        shape = positive_region(wound.grid, presence, width**2, OUTLINE_TOLERANCE)
         height, rise = slab.high - slab.low, wound.bed - lowest - slab.high / whole * (highest - lowest)
-        bumps = bumps_in(
-            wound.grid, hollow, rise, BumpLayer(height, passing.limit(height), mode != "conformal"), OUTLINE_TOLERANCE
-        )
+        step = BumpLayer(height, passing.limit(height), mode != "conformal")
+        bumps = bumps_in(wound.grid, hollow, rise, step, OUTLINE_TOLERANCE)
         if not bumps.over.is_empty:
             shape = shape.union(bumps.over.buffer(OUTLINE_TOLERANCE))  # not edge upon edge: that leaves threads
         shape = without_bumps(shape.intersection(wound.outline), bumps.around, passing.clear(width))
         layers.append(Layer(k, slab, slab.high / whole, as_multi(shape, width**2), bumps))
-    if not any(not layer.region.is_empty for layer in layers):
+    if all(layer.region.is_empty for layer in layers):
         raise InputError("plan", "layers", "none with room for a bead", f"a wound wider than {width:g} mm, finer beads")
     missing = tuple(t.name for t in tissues if all(slab.tissue is not t for slab in cut))
     return LayerStack(mode, wound.grid, lowest, highest, wound.bed, tuple(layers), missing)
@@ -223,24 +315,14 @@ def _ends(wound: WoundVolume, inside: Mask, mode: LayerMode, width: float) -> tu
 
 def _presence(
     wound: WoundVolume, lowest: Array, highest: Array, cut: Sequence[Slab], number: int, mode: LayerMode
-) -> Array:  # fmt: skip
+) -> Array:
     """Positive (H, W) where a layer is laid: by its middle, which lies over the bed and under the skin."""
     slab = cut[number]
     if mode == "conformal":
-        depth = highest - lowest
-        return np.asarray(depth - _least_part(number, len(cut)) * slab.whole)
+        # from a part of the greatest depth on; of the layers over it, every second, fourth ...
+        above = len(cut) - 1 - number
+        doubled = (above & -above).bit_length() - 1 if above else 60
+        doubled = min(doubled, int(np.floor(np.log2((number + 1) / MIN_REPLACED))))
+        return np.asarray(highest - lowest - float(MIN_BLENDED_HEIGHT / 2**doubled) * slab.whole)
     middle = lowest + slab.middle / slab.whole * (highest - lowest)
     return np.asarray(np.minimum(middle - wound.bed, wound.skin - middle))
-
-
-def _least_part(number: int, count: int) -> float:
-    """From which part of the greatest depth on a blended layer is laid: of those over it, every second, fourth ..."""
-    above = count - 1 - number
-    doubled = (above & -above).bit_length() - 1 if above else 60
-    doubled = min(doubled, int(np.floor(np.log2((number + 1) / MIN_REPLACED))))
-    return float(MIN_BLENDED_HEIGHT / 2**doubled)
-
-
-def _stride(part: Array) -> Array:
-    """How many blended layers one replaces, (N,), where the wound has `part` (N,) of its greatest depth."""
-    return np.asarray(2.0 ** np.clip(np.ceil(np.log2(MIN_BLENDED_HEIGHT / np.maximum(part, 1e-9)) - 1e-9), 0, 40))

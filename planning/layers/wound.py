@@ -54,9 +54,8 @@ class WoundVolume:
     def rim(self) -> Array:
         """Points (N, 3) mm, scan frame, around the largest piece of the outline, on the scan."""
         xy = shapely.get_coordinates(self.outline.geoms[0].exterior)[:-1]
-        return se3.transform_points(
-            self.surface_from_plane, np.column_stack([xy, interpolate(self.grid, self.bed, xy)])
-        )
+        points = np.column_stack([xy, interpolate(self.grid, self.bed, xy)])
+        return se3.transform_points(self.surface_from_plane, points)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,16 +85,15 @@ def find_wound(
     flipped: whether the scan was turned over, as a refusal says then. InputError where there is none, or where the scan
     does not hold it.
     """
-    first = height_map(scan, _first_plane(scan, where), SEARCH_STEP)
+    axes = _axes(mean_normal(scan.vertices, scan.triangles, where), np.eye(3)[0])
+    first = height_map(scan, se3.make(axes, scan.vertices.mean(axis=0)), SEARCH_STEP)
     if outline is None:
         first_outline, others = _searched(first, where, flipped)
     else:
         first_outline, others = _given(outline, first.surface_from_plane, where), 0
     surface_from_plane = _plane_over(first, first_outline)
     turn = se3.inverse(surface_from_plane) @ first.surface_from_plane
-    corners = shapely.get_coordinates(first_outline)
-    corners = np.column_stack([corners, interpolate(first.grid, first.heights, corners)])
-    flat = se3.transform_points(turn, corners)[:, :2]
+    flat = _moved(shapely.get_coordinates(first_outline), first, turn)
     box = np.array([flat.min(axis=0) - SURROUND_WIDTH, flat.max(axis=0) + SURROUND_WIDTH])
     fine = height_map(scan, surface_from_plane, step, box)
     if outline is None:
@@ -109,14 +107,9 @@ def find_wound(
 
 
 def _moved(xy: Array, first: HeightMap, turn: Array) -> Array:
-    return np.asarray(
-        se3.transform_points(turn, np.column_stack([xy, interpolate(first.grid, first.heights, xy)]))[:, :2]
-    )
-
-
-def _first_plane(scan: Scan, where: object) -> Array:
-    z = mean_normal(scan.vertices, scan.triangles, where)
-    return se3.make(_axes(z, np.eye(3)[0]), scan.vertices.mean(axis=0))
+    """Points (N, 2) of a plane's outline, on the scan, in the plane turned by `turn` (4, 4)."""
+    points = np.column_stack([xy, interpolate(first.grid, first.heights, xy)])
+    return np.asarray(se3.transform_points(turn, points)[:, :2])
 
 
 def _axes(z: Array, x: Array) -> Array:
@@ -156,16 +149,14 @@ def _searched(first: HeightMap, where: object, flipped: bool) -> tuple[MultiPoly
     if not len(volumes) or volumes.max() < MIN_VOLUME_RATIO * raised.max(initial=0.0):
         _refuse(depth[first.known], where, flipped)
     deepest = int(np.argmax(volumes)) + 1
-    outline_first = positive_region(
-        first.grid, np.where(pieces == deepest, depth - level, -level), MIN_PIECE, OUTLINE_TOLERANCE
-    )
-    return outline_first, int(np.sum(volumes > 0.1 * volumes.max())) - 1
+    inside = np.where(pieces == deepest, depth - level, -level)
+    outline = positive_region(first.grid, inside, MIN_PIECE, OUTLINE_TOLERANCE)
+    return outline, int(np.sum(volumes > 0.1 * volumes.max())) - 1
 
 
 def _depressions(grid: Grid, depth: Array, level: float) -> tuple[Index, Array]:
     """Pieces (H, W) deeper than `level`, numbered from 1, and the volume (K,) of each; those that are small are 0."""
-    labelled: tuple[Index, int] = label(depth > level)
-    pieces, count = labelled
+    pieces, count = label(depth > level)
     if not count:
         return pieces, np.empty(0)
     area = np.bincount(pieces.ravel(), minlength=count + 1)[1:] * grid.step**2
@@ -219,32 +210,30 @@ def _skin_beside(fine: HeightMap, outline: MultiPolygon) -> tuple[Array, float]:
 
 
 def _refined(
-    fine: HeightMap, found: MultiPolygon, where: object, flipped: bool
+    fine: HeightMap, outline: MultiPolygon, where: object, flipped: bool
 ) -> tuple[MultiPolygon, Array, float, float]:
-    """Outline, restored skin, its scatter and the level of the rim."""
+    """Outline, restored skin, its scatter and the level of the rim, from a first outline."""
     skin, scatter, level = fine.heights, 0.0, MIN_RIM_LEVEL
     for _ in range(OUTLINE_ROUNDS):
-        skin, scatter = _skin_beside(fine, found)
+        skin, scatter = _skin_beside(fine, outline)
         depth = np.where(fine.known, skin - fine.heights, -1.0)
-        inside = nodes_within(fine.grid, found)
-        level = max(
-            MIN_RIM_LEVEL, RIM_LEVEL_SHARE * float(np.percentile(depth[inside], 95)), RIM_NOISE_SIGMAS * fine.noise
-        )
+        inside = nodes_within(fine.grid, outline)
+        deep = float(np.percentile(depth[inside], 95))
+        level = max(MIN_RIM_LEVEL, RIM_LEVEL_SHARE * deep, RIM_NOISE_SIGMAS * fine.noise)
         pieces, _ = label(depth > level)
         share = np.bincount(pieces[inside], minlength=2)
         if len(share) < 2 or not share[1:].any():
             _refuse(depth[fine.known], where, flipped)
         own = pieces == int(np.argmax(share[1:])) + 1
-        wider = positive_region(
-            fine.grid, np.where(own | ~(depth > level), depth - level, -level), MIN_PIECE, OUTLINE_TOLERANCE
-        )
+        rise = np.where(own | ~(depth > level), depth - level, -level)
+        wider = positive_region(fine.grid, rise, MIN_PIECE, OUTLINE_TOLERANCE)
         opened = as_multi(shapely.buffer(shapely.buffer(wider, -OPENING_RADIUS), OPENING_RADIUS), MIN_PIECE)
         if opened.is_empty:
             _refuse(depth[fine.known], where, flipped)
-        before, found = found, as_multi(shapely.simplify(opened, OUTLINE_TOLERANCE))
-        if shapely.symmetric_difference(before, found).area < 0.01 * found.area:
+        before, outline = outline, as_multi(shapely.simplify(opened, OUTLINE_TOLERANCE))
+        if shapely.symmetric_difference(before, outline).area < 0.01 * outline.area:
             break
-    return found, skin, scatter, level
+    return outline, skin, scatter, level
 
 
 def _checked_wound(
@@ -281,9 +270,8 @@ def _hidden(scan: Scan, fine: HeightMap, shape: MultiPolygon) -> float:
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1) / 2
     middle = corners.mean(axis=1)
-    below = (
-        interpolate(fine.grid, fine.heights, middle[:, :2]) - middle[:, 2] > 1.0
-    )  # mm: more than any wall under smoothing
+    under = interpolate(fine.grid, fine.heights, middle[:, :2]) - middle[:, 2]
+    below = under > 1.0  # mm: more than any wall under smoothing
     away = cross[:, 2] < MIN_UPWARD * 2 * area
     there = shapely.contains_xy(shape, middle[:, 0], middle[:, 1])
     return float(area[there & (below | away)].sum())

@@ -21,14 +21,14 @@ from planning.motion.follow import LOOKAHEAD
 from planning.path import LEVER_ARM, MIN_SPACING, lengths_from, moves_and_turns, way_lengths
 
 BLEND_TOLERANCE = 1e-9  # mm: this near its ends a blend has begun; its ends are known no better
-MIN_HORIZON = 1.0  # mm: within it any printing speed can be stopped
+MIN_HORIZON = 1.0  # mm: long enough to stop from any printing speed
 MIN_BLEND = 1e-9  # mm: half length of a blend that is none, where nothing changes at a checkpoint
 HORIZON_POINTS = 30  # evenly spread grid points of one horizon: some 15 us for each
 APPROACH_HEIGHT = 10.0  # mm above the surface, along the nozzle, on the way to and from the path
 APPROACH_SPEED = 20.0  # mm/s on that way, slow enough for a person to step in
 DIRECT_DISTANCE = 2.0  # mm: from here the nozzle goes straight to its place, without going up first
 CORNER_TOLERANCE = 0.05  # mm by which corners are cut: an eighth of a thin bead
-# mm/s: a velocity change in less than LOOKAHEAD is cut by LOOKAHEAD / 8 of it, which is CORNER_TOLERANCE once more
+# mm/s: a velocity change in less than LOOKAHEAD cuts the corner by LOOKAHEAD / 8 of it: CORNER_TOLERANCE once more
 CORNER_SPEED_CHANGE = 8 * CORNER_TOLERANCE / LOOKAHEAD
 
 
@@ -105,8 +105,8 @@ def curve_through(surface_from_nozzle: Array, speed: Array, tolerance: float, sw
     bend[1:-1], swing[1:-1] = np.diff(direction, axis=0), np.diff(spin, axis=0)
     turned = np.maximum(np.linalg.norm(bend, axis=1), LEVER_ARM * np.linalg.norm(swing, axis=1))
     half = np.zeros(len(points))
-    wanted = 4 * tolerance / np.maximum(turned[1:-1], 1e-9)  # the curve passes a corner at |bend| * half / 4
-    half[1:-1] = np.where(turned[1:-1] > 1e-9, np.minimum(wanted, np.minimum(length[:-1], length[1:]) / 2), 0.0)
+    longest = 4 * tolerance / np.maximum(turned[1:-1], 1e-9)  # the curve passes a corner at |bend| * half / 4
+    half[1:-1] = np.where(turned[1:-1] > 1e-9, np.minimum(longest, np.minimum(length[:-1], length[1:]) / 2), 0.0)
     knots, due = (np.concatenate([[0.0], np.cumsum(along)]) for along in (length, length / speed))
     corner = np.where(half > 0, swerve / np.maximum(turned, 1e-9), np.inf)
     quarter = np.where(half > 0, 0.25 / np.where(half > 0, half, 1.0), 0.0)[:, None]
@@ -188,30 +188,20 @@ def entry_curve(surface_from_nozzle: Array, goal: Array, speed: float) -> PathCu
     outwards, place = goal[:3, 2], surface_from_nozzle[:3, 3]
     lift = max(0.0, float((goal[:3, 3] + APPROACH_HEIGHT * outwards - place) @ outwards))
     lifted = se3.make(surface_from_nozzle[:3, :3], place + lift * outwards)
-    over, before = (
-        se3.make(goal[:3, :3], goal[:3, 3] + height * outwards) for height in (APPROACH_HEIGHT, DIRECT_DISTANCE)
-    )
+    above = [se3.make(goal[:3, :3], goal[:3, 3] + h * outwards) for h in (APPROACH_HEIGHT, DIRECT_DISTANCE)]
     near = np.linalg.norm(place - goal[:3, 3]) < DIRECT_DISTANCE
-    return _through([surface_from_nozzle, goal] if near else [surface_from_nozzle, lifted, over, before, goal], speed)
+    return _through([surface_from_nozzle, goal] if near else [surface_from_nozzle, lifted, *above, goal], speed)
 
 
 def point_above(surface_from_nozzle: Array) -> Array:
     """The nozzle (4, 4) straight above where it is now, where it touches nothing."""
-    return se3.make(
-        surface_from_nozzle[:3, :3], surface_from_nozzle[:3, 3] + APPROACH_HEIGHT * surface_from_nozzle[:3, 2]
-    )
+    rotation, place = surface_from_nozzle[:3, :3], surface_from_nozzle[:3, 3]
+    return se3.make(rotation, place + APPROACH_HEIGHT * rotation[:, 2])
 
 
 def straight_curve(surface_from_nozzle: Array, goal: Array) -> PathCurve | None:
     """From the nozzle (4, 4) to `goal` (4, 4); None if there."""
     return _through([surface_from_nozzle, goal], APPROACH_SPEED)
-
-
-def exit_curve(surface_from_nozzle: Array) -> PathCurve:
-    """From the nozzle (4, 4) straight up."""
-    curve = straight_curve(surface_from_nozzle, point_above(surface_from_nozzle))
-    assert curve is not None
-    return curve
 
 
 def _through(poses: list[Array], last_speed: float) -> PathCurve | None:

@@ -34,7 +34,7 @@ class AxisFollower:
         return not self.velocity.any() and not self.acceleration.any()
 
     def rest(self, axes: Array | None = None) -> None:
-        """Set the motion to rest, at `axes` (6,) if given: something else stopped the arm."""
+        """Set the motion to rest, at `axes` (6,) if given: the arm was stopped by others."""
         self.position = self.position if axes is None else axes.copy()
         self.velocity, self.acceleration = np.zeros(6), np.zeros(6)
 
@@ -45,9 +45,9 @@ class AxisFollower:
         """
         start = np.stack([self.position, self.velocity, self.acceleration])
         controls = _quintic(start, np.stack([position, velocity, acceleration]))
-        smooth = np.ones(6, bool)
-        for bound, limit in zip(controls[1:], (self._speed, self._acceleration, self._jerk), strict=True):
-            smooth &= (np.abs(bound) <= limit).all(axis=0)
+        limits = self._speed, self._acceleration, self._jerk
+        within = [(np.abs(c) <= limit).all(axis=0) for c, limit in zip(controls[1:], limits, strict=True)]
+        smooth = np.all(within, axis=0)  # (6,) axes whose quintic keeps the limits
         state = np.stack([_bezier(control, self._tick / LOOKAHEAD) for control in controls[:3]])
         if not smooth.all():
             request = self._request()

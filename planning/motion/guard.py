@@ -1,7 +1,7 @@
 """The guard: the last check of each command, with arithmetic of its own. It refuses and never clamps.
 
-It keeps the last axes that it let through and the last instant with a trusted pose, and judges itself whether a pose is
-trusted. Without one only a stop may follow: no extrusion, and at rest within stop_time and stop_distance.
+It remembers the last axes that it let through and the last instant with a trusted pose, and decides by itself whether a
+pose is trusted. Without one only a stop may follow: no extrusion, and at rest within stop_time and stop_distance.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Guard:
         return self._axes
 
     def stands(self, axes: Array) -> None:
-        """Take note that the arm is at `axes` (6,), mm and rad: moves beyond were called back."""
+        """Note that the arm is at `axes` (6,), mm and rad: moves beyond were called back."""
         self._axes = axes.copy()
 
     def __call__(self, command: Command, pose: SurfacePose | None, now: float) -> Command:
@@ -84,9 +84,8 @@ class Guard:
             return Breach(code, move.feed, limit if move.feed > 0 else 0.0, text)
         for i, (value, low, high) in enumerate(zip(move.axes, self._limits.low, self._limits.high, strict=True)):
             if not low <= value <= high:
-                text = (
-                    f"{AXIS_NAMES[i]} = {_axis_text(i, value)}, allowed {_axis_text(i, low)} to {_axis_text(i, high)}"
-                )
+                allowed = f"{_axis_text(i, low)} to {_axis_text(i, high)}"
+                text = f"{AXIS_NAMES[i]} = {_axis_text(i, value)}, allowed {allowed}"
                 return Breach(RefusalCode.WORKSPACE, value, low if value < low else high, text)
         return None
 
@@ -155,11 +154,9 @@ class Guard:
         if not 0 <= (age := now - pose.stamp) <= limits.pose_age:
             limit = limits.pose_age if age > 0 else 0.0
             return Breach(RefusalCode.POSE_AGE, age, limit, f"the pose is {age:.3f} s old, limit {limits.pose_age:g} s")
-        place = self._place(pose)
-        return self._fast(pose, place) or self._uncertain(pose, place, age)
-
-    def _fast(self, pose: SurfacePose, place: Array) -> Breach | None:
-        limits = self._limits
+        # the zone's place (3,) nearest to the nozzle, surface frame, mm: its speed, the surface's turn, its error
+        nozzle = np.append(nozzle_from_axes(self._arm, self._axes)[:3, 3], 1.0)
+        place: Array = np.clip(se3.inverse(pose.base_from_surface)[:3] @ nozzle, *self._zone)
         speed = math.hypot(*(pose.twist[3:] + np.cross(pose.twist[:3], place)))
         if speed > (limit := limits.surface_speed):
             text = f"the surface moves at {speed:.2f} mm/s, limit {limit:g} mm/s"
@@ -167,20 +164,11 @@ class Guard:
         if (turn := math.hypot(*pose.twist[:3])) > (limit := limits.surface_turn):
             text = f"the surface turns at {np.rad2deg(turn):.2f} degrees/s, limit {np.rad2deg(limit):g}"
             return Breach(RefusalCode.SURFACE_TURN, turn, limit, text)
+        error = _error(pose, place, age + self._tick + self._lag)
+        if not error <= (limit := limits.pose_error):
+            text = f"the place under the nozzle is known to {error:.3f} mm, limit {limit:g} mm"
+            return Breach(RefusalCode.POSE_ERROR, error, limit, text)
         return None
-
-    def _uncertain(self, pose: SurfacePose, place: Array, age: float) -> Breach | None:
-        error, limit = _error(pose, place, age + self._tick + self._lag), self._limits.pose_error
-        if error <= limit:
-            return None
-        text = f"the place under the nozzle is known to {error:.3f} mm, limit {limit:g} mm"
-        return Breach(RefusalCode.POSE_ERROR, error, limit, text)
-
-    def _place(self, pose: SurfacePose) -> Array:
-        """The zone's place (3,) nearest to the nozzle, surface frame, mm."""
-        nozzle = nozzle_from_axes(self._arm, self._axes)[:3, 3]
-        place: Array = np.clip(se3.inverse(pose.base_from_surface)[:3] @ np.append(nozzle, 1.0), *self._zone)
-        return place
 
 
 class Breach(NamedTuple):

@@ -29,7 +29,6 @@ from planning.motion.curve import (
     PathCurve,
     curve_through,
     entry_curve,
-    exit_curve,
     gridpoints_on,
     point_above,
     straight_curve,
@@ -41,12 +40,11 @@ from planning.progress import PrintPhase, PrintProgress, check_start
 from planning.robot.kinematics import SimpleArm, axes_from_nozzle, axis_limits, joints_from_axes, nozzle_from_axes
 
 HORIZON_TIME = 1.0  # s of path timed at once: any speed can be stopped in it
-# s left of a horizon when the next is timed: it ends at rest, and the surface is predicted for half a second
-RENEW_BEFORE_END = 0.5
-PATH_END_TOLERANCE = 1e-3  # mm of a path that count as none: along 20 nm, where a stop once left it, no timing exists
+RENEW_BEFORE_END = 0.5  # s left of a horizon when the next is timed: the surface is predicted for half a second
+PATH_END_TOLERANCE = 1e-3  # mm of a path that count as none: along 20 nm, as a stop once left, no timing exists
 PAUSED = "paused"
 STALL_TICKS = 3.0  # ticks without a call after which the arm has come to rest by itself
-SENT_MOVES = 64  # moves kept: a second of them, more than an arm is sent before they are called back
+MAX_SENT_MOVES = 64  # moves kept: a second of them, more than an arm is sent before they are called back
 POSE_LIMIT_FRACTION = 0.98  # of the guard's limits for a pose: the planner brakes before the guard would refuse
 
 
@@ -84,7 +82,7 @@ class Planner:
         self.paused = False  # go up from the surface and stand there, until this is no longer set
         self._pause_pose: Array | None = None  # surface_from_nozzle (4, 4) where it stands in a pause
         self._retreated = False
-        self._sent: deque[tuple[Array, float]] = deque(maxlen=SENT_MOVES)  # goal (3,), mm, and the place printed then
+        self._sent: deque[tuple[Array, float]] = deque(maxlen=MAX_SENT_MOVES)  # goal (3,), mm, and the place then
 
     def __call__(self, pose: SurfacePose | None, now: float) -> Command:
         """The command of the tick at `now`, s: its axes are reached one tick later. pose: the newest, if any."""
@@ -97,10 +95,12 @@ class Planner:
             return self._stop(now, "no pose yet")
         if reason := self._pose_fault(pose, now):
             return self._stop(now, reason)
-        pose = _delayed(pose, self._lag)
+        if self._lag:  # as the arm, late by the lag, will meet it, under its own stamp
+            pose = replace(pose.predict(pose.stamp + self._lag), stamp=pose.stamp)
         if self.paused:
             return self._retreat(pose, now)
-        self._resume()
+        if self._pause_pose is not None:  # after a pause the way back to the path begins anew
+            self._pause_pose, self._retreated, self._segment = None, False, None
         if reason := self._keep_segment(pose, now):
             return self._stop(now, reason)
         if self._finished:
@@ -108,13 +108,13 @@ class Planner:
         return self._follow(pose, now)
 
     def refused(self, axes: Array) -> None:
-        """Take note that the last move was not sent: the arm is at `axes` (6,), and the segment begins anew."""
+        """Note that the last move was not sent: the arm is at `axes` (6,), and the segment begins anew."""
         self._follower.rest(axes)
         self._segment = None
         self._sent.clear()
 
     def recalled(self, place: Array, stands: Array) -> None:
-        """Take note that moves were called back: the arm stopped at `place` (6,) on its way and is at `stands` (6,).
+        """Note that moves were called back: the arm stopped at `place` (6,) on its way and is at `stands` (6,).
 
         The path goes on where the last moves passed `place`.
         """
@@ -125,13 +125,8 @@ class Planner:
     @property
     def progress(self) -> PrintProgress:
         """How far the print is."""
-        phase = (
-            PrintPhase.FINISHED
-            if self._finished
-            else PrintPhase.WAITING
-            if self._segment is None
-            else self._segment.phase
-        )
+        phase = PrintPhase.WAITING if self._segment is None else self._segment.phase
+        phase = PrintPhase.FINISHED if self._finished else phase
         fraction = float(np.interp(self._place, self._curve.knots, np.arange(len(self._path))))
         return PrintProgress(phase, self._checkpoint(), len(self._path), self._place, self._curve.length, fraction)
 
@@ -191,7 +186,9 @@ class Planner:
         nozzle = self._nozzle(pose, now)
         if self._place > self._curve.length - PATH_END_TOLERANCE:
             self._place = self._curve.length
-            return self._start(pose, PrintPhase.LEAVING, exit_curve(nozzle), 0.0, now + LOOKAHEAD)
+            up = straight_curve(nozzle, point_above(nozzle))
+            assert up is not None
+            return self._start(pose, PrintPhase.LEAVING, up, 0.0, now + LOOKAHEAD)
         goal = self._curve.poses(np.array([self._place]))[0]
         way = entry_curve(nozzle, goal, float(self._path.speed[self._checkpoint()]))
         if way is None:
@@ -220,11 +217,6 @@ class Planner:
             return self._stop(now, f"{PAUSED}; {reason}")
         return self._follow(pose, now)
 
-    def _resume(self) -> None:
-        """After a pause: the way back to the path begins anew."""
-        if self._pause_pose is not None:
-            self._pause_pose, self._retreated, self._segment = None, False, None
-
     def _next(self, pose: SurfacePose, phase: PrintPhase, now: float) -> str:
         """Begin the segment after one of `phase`; why that cannot be, or ""."""
         if phase is PrintPhase.ENTERING:
@@ -246,14 +238,17 @@ class Planner:
         if reason := self._unreachable(derivatives.axes[:, :6]):
             self._segment = None
             return reason
-        timing = self._timed(grid, derivatives, 0.0, begin)
+        self.horizons += 1
+        timing = retime(grid, derivatives, 0.0, begin, self._bounds)
         self._segment = None if isinstance(timing, str) else Segment(phase, curve, timing)
         return timing if isinstance(timing, str) else ""
 
     def _renew(self, pose: SurfacePose, segment: Segment, now: float) -> str:
         """Time the next horizon from the present place and speed; if that fails, the old one ends at rest."""
         place = float(segment.timing.at(np.array([now]))[0])
-        timing = self._timed(*self._horizon(pose, segment.curve, place, now), segment.timing.speed_at(now), now)
+        grid, derivatives = self._horizon(pose, segment.curve, place, now)
+        self.horizons += 1
+        timing = retime(grid, derivatives, segment.timing.speed_at(now), now, self._bounds)
         if isinstance(timing, str):
             return timing if now >= segment.timing.end else ""
         self._segment = replace(segment, timing=timing)
@@ -266,10 +261,6 @@ class Planner:
         """The next horizon's grid points from `place`, mm, passed at `begin`, s, and the axes' derivatives there."""
         grid = gridpoints_on(curve, place, curve.after(place, HORIZON_TIME))
         return grid, axis_derivatives(self._arm, pose, curve, grid, begin)
-
-    def _timed(self, grid: Gridpoints, derivatives: AxisDerivatives, speed: float, begin: float) -> Timing | str:
-        self.horizons += 1
-        return retime(grid, derivatives, speed, begin, self._bounds)
 
     # -- the motion
 
@@ -326,22 +317,23 @@ class Planner:
 
         Axes keep AXIS_MARGIN from their bounds; an arm that stands nearer already must not go nearer still.
         """
-        stands = self._follower.position
-        low = np.minimum(self._limits.low + AXIS_MARGIN, stands)
-        high = np.maximum(self._limits.high - AXIS_MARGIN, stands)
-        rows, columns = np.nonzero(~((axes >= low) & (axes <= high)))  # NaN is outside
-        if len(rows):
-            return self._reach_text("XYZABC"[columns[0]], axes[rows[0], columns[0]], low[columns[0]], high[columns[0]])
-        if (model := self._arm.jointed) is None:
-            return ""
-        joints, own = joints_from_axes(model, axes), joints_from_axes(model, stands)
+        here = self._follower.position
+        low = np.minimum(self._limits.low + AXIS_MARGIN, here)
+        high = np.maximum(self._limits.high - AXIS_MARGIN, here)
+        reason = self._outside("XYZABC", axes, low, high)
+        if reason or (model := self._arm.jointed) is None:
+            return reason
+        joints, own = joints_from_axes(model, axes), joints_from_axes(model, here)
         low, high = np.fmin(model.low + JOINT_MARGIN, own), np.fmax(model.high - JOINT_MARGIN, own)
-        rows, columns = np.nonzero(~((joints >= low) & (joints <= high)))
+        return self._outside([f"J{i + 1}" for i in range(6)], joints, low, high)
+
+    def _outside(self, names: Sequence[str], values: Array, lows: Array, highs: Array) -> str:
+        """The first of values (M, 6) that is not between bounds (6,), in words; "" if there is none."""
+        rows, columns = np.nonzero(~((values >= lows) & (values <= highs)))  # NaN is outside
         if not len(rows):
             return ""
-        return self._reach_text(f"J{columns[0] + 1}", joints[rows[0], columns[0]], low[columns[0]], high[columns[0]])
-
-    def _reach_text(self, axis: str, got: float, low: float, high: float) -> str:
+        i = columns[0]
+        axis, got, low, high = names[i], values[rows[0], i], lows[i], highs[i]
         where = f"checkpoint {self._checkpoint()} is out of reach"
         if not np.isfinite(got):
             return f"{where}: the arm has no such posture"
@@ -364,11 +356,6 @@ def place_passed(sent: Sequence[tuple[Array, float]], where: Array) -> float:
     off = np.linalg.norm(ends[:-1] + shares[:, None] * ways - where, axis=1)
     last = int(np.flatnonzero(off <= off.min() + 1e-6)[-1])
     return float(places[last] + shares[last] * (places[last + 1] - places[last]))
-
-
-def _delayed(pose: SurfacePose, lag: float) -> SurfacePose:
-    """The pose as an arm that is late by `lag` s will find it, under its own stamp."""
-    return replace(pose.predict(pose.stamp + lag), stamp=pose.stamp) if lag else pose
 
 
 def _finite(pose: SurfacePose) -> bool:

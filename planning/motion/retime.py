@@ -107,23 +107,21 @@ class Timing:
 
     def at(self, t: Array) -> Array:
         """Places (N,), mm, at instants (N,), s; before the start and after the end it rests."""
-        t = np.clip(t, self.times[0], self.times[-1])
-        i = self._interval(t)
-        dt = t - self.times[i]
-        return np.asarray(self.places[i] + dt * (self.speeds[i] + 0.5 * dt * self._rate(i)))
+        i, dt, rate = self._interval(np.clip(t, self.times[0], self.times[-1]))
+        return np.asarray(self.places[i] + dt * (self.speeds[i] + 0.5 * dt * rate))
 
     def speed_at(self, t: float) -> float:
         """Speed, mm/s, at the instant t, s; 0 outside."""
         if not self.times[0] <= t <= self.times[-1]:
             return 0.0
-        i = self._interval(np.array([t]))
-        return float((self.speeds[i] + (t - self.times[i]) * self._rate(i))[0])
+        i, dt, rate = self._interval(np.array([t]))
+        return float((self.speeds[i] + dt * rate)[0])
 
-    def _interval(self, t: Array) -> NDArray[np.intp]:
-        return np.clip(np.searchsorted(self.times, t, "right") - 1, 0, len(self.times) - 2)
-
-    def _rate(self, i: NDArray[np.intp]) -> Array:
-        return np.asarray((self.speeds[i + 1] - self.speeds[i]) / (self.times[i + 1] - self.times[i]))
+    def _interval(self, t: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """The interval (N,) of instants (N,), the time since its start, s, and the change of speed in it, mm/s^2."""
+        i = np.clip(np.searchsorted(self.times, t, "right") - 1, 0, len(self.times) - 2)
+        rate = (self.speeds[i + 1] - self.speeds[i]) / (self.times[i + 1] - self.times[i])
+        return i, t - self.times[i], rate
 
 
 def retime(
@@ -139,7 +137,10 @@ def retime(
     change = grid.cruise / RISE_TIME
     left = _path_share(limits[1], derivatives.acceleration, PATH_ACCELERATION_SHARE)
     axes = _axis_speed(derivatives, _path_share(limits[0], derivatives.speed, PATH_SPEED_SHARE), left)
-    bounds = _speed_bounds(grid, axes, carried, float(change.min()))
+    # the bounds fall below the start speed no faster than the allowed change of speed
+    fall = 2 * BRAKING_FRACTION * float(change.min()) * (grid.places - grid.places[0])
+    braking = np.sqrt(np.maximum(carried**2 - fall, 0.0))
+    bounds = np.minimum(grid.allowed, np.maximum(axes, braking / START_SPEED_FRACTION))
     start, end = grid.places[[0, -1]]
     unit = end - start
     constraints = [_Speed(bounds / unit, change / unit), *_acceleration(derivatives, left, bounds, change, unit)]
@@ -153,25 +154,16 @@ def retime(
     return Timing(times, grid.places, np.asarray(unit * speeds))
 
 
-def _path_share(limit: Array, taken: Array, most: float) -> Array:
+def _path_share(limit: Array, used: Array, most: float) -> Array:
     """What the surface, which takes (M, D) of limits (D,), leaves to the path: (M, D), `most` of the limits at most."""
-    return np.clip(LIMIT_SHARE * limit - taken, MIN_PATH_SHARE * limit, most * limit)
+    return np.clip(LIMIT_SHARE * limit - used, MIN_PATH_SHARE * limit, most * limit)
 
 
 def _axis_speed(derivatives: AxisDerivatives, speed: Array, acceleration: Array) -> Array:
     """Speed (M,), mm/s, at which no axis exceeds the path's share (M, D) of the limits, on straights and in corners."""
     straight = speed / np.maximum(np.abs(derivatives.first), 1e-12)
-    within, at_once = (
-        acceleration / np.maximum(derivatives.bend, 1e-12),
-        acceleration / np.maximum(derivatives.swerve, 1e-12),
-    )
+    within, at_once = (acceleration / np.maximum(change, 1e-12) for change in (derivatives.bend, derivatives.swerve))
     return np.asarray(np.minimum(straight, np.maximum(np.sqrt(within), DIFFERENCE_TIME * at_once)).min(axis=1))
-
-
-def _speed_bounds(grid: Gridpoints, axes: Array, carried: float, change: float) -> Array:
-    """Speed bounds (M,), mm/s, of tool and axes; below `carried` they fall no faster than `change`, mm/s^2."""
-    braking = np.sqrt(np.maximum(carried**2 - 2 * BRAKING_FRACTION * change * (grid.places - grid.places[0]), 0.0))
-    return np.asarray(np.minimum(grid.allowed, np.maximum(axes, braking / START_SPEED_FRACTION)))
 
 
 def _acceleration(

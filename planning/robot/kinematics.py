@@ -74,14 +74,11 @@ class JointModel:
         for word, words in zip(self.posture, (SHOULDERS, ELBOWS, WRISTS), strict=True):
             if word not in words:
                 raise InputError("kinematics", "posture", word, " or ".join(words))
-        if not self._solvable():
-            raise InputError("kinematics", "dh", self.dh.tolist(), ELBOW_ARM_LAYOUT)
-
-    def _solvable(self) -> bool:
         a, alpha, d, _ = self.dh.T
         turns = np.abs(np.abs(alpha) - np.pi / 2 * np.array([1, 0, 1, 1, 1, 0])).max() < 1e-9
         wrist = not np.abs([*a[3:], d[4]]).max() > 1e-9
-        return bool(turns and wrist and a[1] > 0 and np.hypot(a[2], d[3]) > 0)
+        if not (turns and wrist and a[1] > 0 and np.hypot(a[2], d[3]) > 0):
+            raise InputError("kinematics", "dh", self.dh.tolist(), ELBOW_ARM_LAYOUT)
 
     @property
     def signs(self) -> Array:
@@ -99,6 +96,12 @@ def link_transform(model: JointModel, i: int, angle: Array) -> Array:
     out[..., 1, 0], out[..., 1, 1], out[..., 1, 2], out[..., 1, 3] = s, c * ca, -c * sa, a * s
     out[..., 2, 1], out[..., 2, 2], out[..., 2, 3], out[..., 3, 3] = sa, ca, d, 1.0
     return out
+
+
+def _links(model: JointModel, first: int, angles: Array) -> Array:
+    """Transform (..., 4, 4) over the three links from `first` on, their joints at `angles` (..., 3), theta added."""
+    a, b, c = (link_transform(model, first + i, angles[..., i]) for i in range(3))
+    return np.asarray(a @ b @ c)
 
 
 def link_chain(model: JointModel, joints: Array) -> Array:
@@ -125,16 +128,13 @@ def jacobian(model: JointModel, joints: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointDistance:
-    """Distances (...) of joints from the ends of their ranges and from singularities; 0 or less: there, or beyond.
-
-    manipulability: Yoshikawa's, sqrt(det(J J^T)), tip speeds relative to the arm's size (a2 + |a3, d4|).
-    """
+    """Distances (...) of joints from the ends of their ranges and from singularities; 0 or less: there, or beyond."""
 
     bound: Array  # rad to the nearest end of a joint's range
     wrist: Array  # rad of joint 5 from where axes 4 and 6 are one line
     elbow: Array  # rad from where the arm is stretched out or folded
     shoulder: Array  # mm of the wrist from the plane of the first axis and a line along the second
-    manipulability: Array  # 0 in a singularity
+    manipulability: Array  # Yoshikawa's, sqrt(det(J J^T)), tip speeds relative to the arm's size (a2 + |a3, d4|)
 
 
 def joint_distance(model: JointModel, joints: Array) -> JointDistance:
@@ -143,17 +143,13 @@ def joint_distance(model: JointModel, joints: Array) -> JointDistance:
     bend = joints[..., 2] + theta[2] + np.arctan2(-np.sign(alpha[2]) * d[3], a[2])
     forearm = np.hypot(a[2], d[3])
     upper = joints[..., 1] + theta[1]
-    shoulder = np.abs(a[0] + a[1] * np.cos(upper) + forearm * np.cos(upper + bend))
+    ahead = a[0] + a[1] * np.cos(upper) + forearm * np.cos(upper + bend)
     matrix = jacobian(model, joints) * np.repeat([1.0, 1 / (a[1] + forearm)], 3)[:, None]
     with np.errstate(invalid="ignore"):  # of joints that are NaN
         manipulability = np.abs(np.linalg.det(matrix))
-    return JointDistance(
-        np.minimum(joints - model.low, model.high - joints).min(axis=-1),
-        np.abs(np.arcsin(np.sin(joints[..., 4] + theta[4]))),
-        np.abs(np.arcsin(np.sin(bend))),
-        shoulder,
-        manipulability,
-    )
+    bound = np.minimum(joints - model.low, model.high - joints).min(axis=-1)
+    wrist, elbow = (np.abs(np.arcsin(np.sin(angle))) for angle in (joints[..., 4] + theta[4], bend))
+    return JointDistance(bound, wrist, elbow, np.abs(ahead), manipulability)
 
 
 def joints_from_nozzle(model: JointModel, arm_from_nozzle: Array, signs: Array | None = None) -> Array:
@@ -177,12 +173,7 @@ def joints_from_tip(model: JointModel, tip: Array, wrist: Array) -> Array:
     foot_from_arm = se3.inverse(model.arm_from_foot)
     place = tip @ foot_from_arm[:3, :3].T + foot_from_arm[:3, 3]
     angles = wrist + model.dh[3:, 3]
-    rest = (
-        link_transform(model, 3, angles[..., 0])
-        @ link_transform(model, 4, angles[..., 1])
-        @ link_transform(model, 5, angles[..., 2])
-    )
-    in_forearm = _in_link_3(model, (rest @ model.flange_from_nozzle)[..., :3, 3])
+    in_forearm = _in_link_3(model, (_links(model, 3, angles) @ model.flange_from_nozzle)[..., :3, 3])
     solution = np.full((*wrist.shape[:-1], 6), np.nan)
     for shoulder, elbow in product([1.0, -1.0], repeat=2):  # of the triangle with the tip; the posture is the wrist's
         joints = _wrapped(model, np.concatenate([_triangle(model, place, in_forearm, shoulder, elbow), angles], -1))
@@ -223,23 +214,16 @@ def _posture(model: JointModel, joints: Array) -> Array:
     a, alpha, _, theta = model.dh.T
     x, y, _ = _centre_in_forearm(model)
     upper, bend = joints[..., 1] + theta[1], joints[..., 2] + theta[2] + np.arctan2(y, x)
-    ahead = a[0] + a[1] * np.cos(upper) + np.hypot(x, y) * np.cos(upper + bend)
-    shoulder = np.sign(ahead)
+    shoulder = np.sign(a[0] + a[1] * np.cos(upper) + np.hypot(x, y) * np.cos(upper + bend))
     return np.stack([shoulder, -np.sign(alpha[0]) * shoulder * np.sign(np.sin(bend))], -1)
 
 
 def _wrist(model: JointModel, first: Array, foot_from_flange: Array, sign: float) -> Array:
     """The table's angles (..., 3) of the wrist for the rotation (..., 3, 3), the first three being `first` (..., 3)."""
     fourth_side, fifth_side = np.sign(model.dh[3:5, 1])
-    foot_from_forearm = (
-        link_transform(model, 0, first[..., 0])
-        @ link_transform(model, 1, first[..., 1])
-        @ link_transform(model, 2, first[..., 2])
-    )
-    turn = np.swapaxes(foot_from_forearm[..., :3, :3], -1, -2) @ foot_from_flange
-    axis = turn[..., 2]
+    turn = np.swapaxes(_links(model, 0, first)[..., :3, :3], -1, -2) @ foot_from_flange
+    axis, up = turn[..., 2], fifth_side * sign
     fifth = sign * np.arctan2(np.hypot(axis[..., 0], axis[..., 1]), -fourth_side * fifth_side * axis[..., 2])
-    up = fifth_side * sign
     fourth = np.arctan2(up * axis[..., 1], up * axis[..., 0])
     bent = (link_transform(model, 3, fourth) @ link_transform(model, 4, fifth))[..., :3, :3]
     spun = np.swapaxes(bent, -1, -2) @ turn
@@ -262,17 +246,14 @@ class AngleMode(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimpleArm:
-    """An arm that is sent the pose of its tool.
-
-    tool_offset: the tip's true position in the nozzle frame that the arm assumes; the tip is off by it.
-    """
+    """An arm that is sent the pose of its tool."""
 
     arm_from_base: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) mm
     arm_from_upright: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) of the nozzle at A = B = C = 0
     home: Array = field(default_factory=lambda: np.array([202.5, 225, 113, 0, 0, 0]))  # (6,) mm and rad; thesis 6.3
     joints: JointModel | None = None
     angles: AngleMode = AngleMode.SURFACE  # what A B C are
-    tool_offset: Array = field(default_factory=lambda: np.zeros(3))  # (3,) mm
+    tool_offset: Array = field(default_factory=lambda: np.zeros(3))  # (3,) mm, the true tip in the assumed nozzle frame
 
     def __post_init__(self) -> None:
         if not se3.is_transform(self.arm_from_base):
@@ -328,10 +309,7 @@ def joints_from_axes(model: JointModel, axes: Array) -> Array:
 
 
 def limited_axes(arm: SimpleArm, base_from_nozzle: Array) -> Array:
-    """The numbers (..., D) with limits of speed and acceleration, at base_from_nozzle (..., 4, 4).
-
-    The machine axes; with joints, J1 to J3 after them, which nothing else limits.
-    """
+    """What has limits of speed and acceleration (..., D): the machine axes and, with joints, J1 to J3 after them."""
     if arm.jointed is None:
         return axes_from_nozzle(arm, base_from_nozzle)
     arm_from_nozzle = _offset_tool(arm, arm.arm_from_base @ base_from_nozzle, -1.0)
@@ -342,9 +320,8 @@ def limited_axes(arm: SimpleArm, base_from_nozzle: Array) -> Array:
 def max_axis_change(arm: SimpleArm, limited: Array) -> tuple[Array, Array]:
     """Largest change of each of `limited_axes` (..., D) as the tip moves, per mm, and as it turns, per rad."""
     if arm.jointed is None:
-        steep = 1 / np.maximum(
-            np.abs(np.cos(limited[..., 4:5])), SINGULAR_REGULARISATION
-        )  # of A and C, as B nears the gimbal lock
+        # of A and C, as B nears the gimbal lock
+        steep = 1 / np.maximum(np.abs(np.cos(limited[..., 4:5])), SINGULAR_REGULARISATION)
         none, one = np.zeros_like(steep), np.ones_like(steep)
         moved = np.broadcast_to([1.0, 1, 1, 0, 0, 0], limited.shape)
         turned = np.concatenate([none, none, none, steep, one, steep], axis=-1)
@@ -361,7 +338,6 @@ def max_axis_change(arm: SimpleArm, limited: Array) -> tuple[Array, Array]:
 
 def axis_limits(arm: SimpleArm, limits: MotionLimits) -> tuple[Array, Array]:
     """Limits of speed and acceleration (D,) of `limited_axes`."""
-    if arm.jointed is None:
+    if (model := arm.jointed) is None:
         return limits.speed, limits.acceleration
-    model = arm.jointed
     return np.append(limits.speed, model.speed[:3]), np.append(limits.acceleration, model.acceleration[:3])

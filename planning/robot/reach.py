@@ -16,18 +16,16 @@ from estimation.se3 import Array
 from planning.path import Path, way_lengths
 from planning.robot.kinematics import POSTURES, JointDistance, JointModel, jacobian, joint_distance, joints_from_nozzle
 
-MIN_SINGULAR_ANGLE = float(
-    np.deg2rad(5)
-)  # rad from a singular wrist or elbow: there joints turn ten times as fast as the tool
+# rad from a singular wrist or elbow: there joints turn ten times as fast as the tool
+MIN_SINGULAR_ANGLE = float(np.deg2rad(5))
 # mm of the wrist from the first axis: as near, joint 1 turns a whole degree for a third of a millimetre
 MIN_SHOULDER_DISTANCE = 20.0
 SPIN_CANDIDATES = 24  # candidates all round: 15 degrees apart
 REACHABLE = "ok"
 REASONS = (REACHABLE, "too far", "joint range", "singular", "joint speed")
-UNREACHABLE_COST = 1e3  # of cost: no smoothness is worth a checkpoint that cannot be printed
-# of cost, for a spin by one candidate from one checkpoint to the next: what a turn on the spot is worth
-SPIN_STEP_COST = 1.0
-RANGE_END_COST = 1.0  # of cost per rad that a joint is nearer than RANGE_END_ANGLE to the end of its range
+UNREACHABLE_COST = 1e3  # no smoothness is worth a checkpoint that cannot be printed
+SPIN_STEP_COST = 1.0  # of a spin by one candidate from one checkpoint to the next
+RANGE_END_COST = 1.0  # per rad that a joint is nearer than RANGE_END_ANGLE to the end of its range
 RANGE_END_ANGLE = float(np.deg2rad(30))
 
 
@@ -74,16 +72,12 @@ class Reach:
 def reach_of(
     model: JointModel, arm_from_surface: Array, path: Path, motion: SurfaceMotion, signs: Array | None = None
 ) -> Reach:
-    """What the path asks of the arm where the surface rests at arm_from_surface (4, 4), in the posture `signs`.
-
-    Without signs in the model's own.
-    """
-    joints = [
-        joints_from_nozzle(model, arm_from_surface @ moved @ path.surface_from_nozzle, signs) for moved in motion.places
-    ]
-    far = [joint_distance(model, at) for at in joints]
+    """The reach where the surface rests at arm_from_surface (4, 4), in the posture `signs` or the model's own."""
+    moved = [arm_from_surface @ place @ path.surface_from_nozzle for place in motion.places]
+    joints = [joints_from_nozzle(model, poses, signs) for poses in moved]
+    distances = [joint_distance(model, at) for at in joints]
     bound, wrist, elbow, shoulder, manipulability = (
-        np.stack([getattr(at, f.name) for at in far]).min(axis=0) for f in fields(JointDistance)
+        np.stack([getattr(d, f.name) for d in distances]).min(axis=0) for f in fields(JointDistance)
     )
     speed = _speed(model, joints[0], arm_from_surface, path, motion)
     with np.errstate(invalid="ignore"):
@@ -114,13 +108,8 @@ def spin_path(path: Path, spin: Array) -> Array:
 def _speed(model: JointModel, joints: Array, arm_from_surface: Array, path: Path, motion: SurfaceMotion) -> Array:
     """Share (N,) of the joints' speeds that the way to each checkpoint (or from the first) and the surface take."""
     poses = arm_from_surface @ path.surface_from_nozzle
-    step = np.concatenate(
-        [
-            se3.log_rotation(poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], -1, -2)),
-            np.diff(poses[:, :3, 3], axis=0),
-        ],
-        axis=1,
-    )
+    turns = se3.log_rotation(poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], -1, -2))
+    step = np.concatenate([turns, np.diff(poses[:, :3, 3], axis=0)], axis=1)
     along = step * (path.speed[1:] / way_lengths(path.surface_from_nozzle))[:, None]  # (N - 1, 6): turn and tip, per s
     along = np.concatenate([along[:1], along])
     inverse = np.full((len(path), 6, 6), np.nan)
@@ -160,13 +149,12 @@ def best_spin(model: JointModel, arm_from_surface: Array, path: Path, motion: Su
 def reach_at_spin(
     model: JointModel, arm_from_surface: Array, path: Path, motion: SurfaceMotion, spin: Array | float
 ) -> Reach:
-    """What the path asks with its tool turned by `spin`, rad, one for all or (N,)."""
+    """The reach with the tool turned by `spin`, rad, one for all or (N,)."""
     spins = np.broadcast_to(np.asarray(spin, float), len(path))
     turned = replace(path, surface_from_nozzle=spin_path(path, spins))
     return replace(reach_of(model, arm_from_surface, turned, motion), spin=spins)
 
 
-def _cost(found: Reach) -> Array:
-    return np.where(
-        found.feasible, RANGE_END_COST * np.maximum(RANGE_END_ANGLE - np.nan_to_num(found.bound), 0.0), UNREACHABLE_COST
-    )
+def _cost(reach: Reach) -> Array:
+    near_end = np.maximum(RANGE_END_ANGLE - np.nan_to_num(reach.bound), 0.0)
+    return np.where(reach.feasible, RANGE_END_COST * near_end, UNREACHABLE_COST)
