@@ -53,7 +53,7 @@ class Lenses:
         self._bends = np.array([c.distortion for c in rig.cameras], float)
 
     def image(self, camera: int | NDArray[np.int64], ideal: Array, depth: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Imaged pixels (..., 2) of ideal ones and whether each is in front of and inside the lens's field (...).
+        """Imaged pixels (..., 2) of ideal ones, and whether each is in front of and inside the lens's field (...).
 
         camera: of all of them, or of each (...).
         """

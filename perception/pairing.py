@@ -13,7 +13,7 @@ import numpy as np
 from estimation.se3 import Array
 from perception.frames import Frame, FrameSet
 
-DEFAULT_PERIOD = 1 / 30  # s: the rate of the thesis's cameras, where no camera has two frames to tell its own
+DEFAULT_PERIOD = 1 / 30  # s, of the thesis's cameras: for recordings in which no camera has two frames
 TOLERANCE_PERIODS = 0.5  # see `pairing_tolerance`
 DELAY_SAMPLES = 5  # frames of a camera, whose median delay behind the first one of their sets is its usual delay
 SILENT_PERIODS = 5.0  # without a frame, after which no set waits for a camera: four lost in a row are rare
@@ -95,9 +95,9 @@ class Pairing:
     """Frame sets from live frames, which arrive in any order between cameras, some late, some never.
 
     A set is complete when every camera that is alive is in it, or has since delivered a younger frame. An incomplete
-    set is given out `patience` after its first arrival. That is half a period; where a camera's frames usually come
-    later, it is that delay more, but at most a period: stamps need not tell when a camera exposed, and the frames of a
-    camera that is always late would never be used. A camera that is silent for SILENT_PERIODS is not waited for.
+    set is given out `patience` s after the arrival of its first frame. The patience is half a period. Where a camera's
+    usual delay is longer, it is added, at most one period: else the frames of a camera that is always late would never
+    be used. A camera that is silent for SILENT_PERIODS is not waited for.
 
     Sets come out in order of stamp; a frame that is too late for that is dropped and counted in `late`. The frames of
     one camera are assumed to arrive in order.

@@ -22,9 +22,15 @@ from hardware.simulator.scene.scene import Scene, rois
 from hardware.simulator.scene.shape import Shape, Wound, body, cylinder, flat, with_wound
 from perception.frames import Image
 from perception.lens import Lenses
-from perception.mapping.dense_matching import DenseMatch, match_near
 from perception.mapping.first_map import FirstMap, build_first_map, in_frame
-from perception.mapping.scan_map import MIN_SCAN_SIGMA_MM, ScanPlacing, as_at_one_instant, landmarks_on_scan
+from perception.mapping.scan_map import (
+    MIN_SCAN_SIGMA_MM,
+    DenseMatch,
+    ScanPlacing,
+    as_at_one_instant,
+    landmarks_on_scan,
+    match_near,
+)
 from perception.matching.features import grey
 from perception.matching.patches import Pyramid
 from tests import scans

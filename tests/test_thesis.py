@@ -15,16 +15,22 @@ from estimation.se3 import Array
 from estimation.synthetic.world import WOUND_CENTRE, arc_rig
 from perception.frames import Image
 from perception.thesis.camera import (
+    REGION_BORDER_PX,
+    Corners,
+    Finder,
     FlatView,
     GaussianState,
+    KeyPoints,
+    Pairs,
+    corners_of,
     displacement,
     initial_velocity,
     predict,
     turn,
+    united,
     update,
     update_velocity,
 )
-from perception.thesis.features import REGION_BORDER_PX, Corners, Finder, KeyPoints, Pairs, corners_of, united
 from perception.thesis.step import assign_axes, unmeasured
 
 seeds = st.integers(0, 10_000)

@@ -26,7 +26,7 @@ from hardware.offline.track import TRACKING_METHODS
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet, Roi
-from perception.thesis.features import Corners, KeyPoints
+from perception.thesis.camera import Corners, KeyPoints
 from perception.thesis.step import ThesisStep
 from tests.slowly import slowly
 from tests.synthetic import WIDE, Motion, frame_sets, patch, write_session

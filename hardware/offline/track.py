@@ -70,7 +70,7 @@ def step_by(
         with tracker(rig, roi, surface, now, tool, prefilter) as step:
             yield step
         return
-    from perception.thesis.features import Corners, KeyPoints
+    from perception.thesis.camera import Corners, KeyPoints
     from perception.thesis.step import ThesisStep
 
     with ThreadPoolExecutor(len(rig)) as threads:

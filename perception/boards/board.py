@@ -16,11 +16,8 @@ from estimation.se3 import Array
 from perception.frames import Image
 
 BOARD_KINDS = ("charuco", "chessboard")
-DICTIONARIES = {
-    f"{n}X{n}_{count}": getattr(cv2.aruco, f"DICT_{n}X{n}_{count}")
-    for n in (4, 5, 6, 7)
-    for count in (50, 100, 250, 1000)
-}  # OpenCV's names without DICT_
+_NAMES = [f"{n}X{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)]
+DICTIONARIES = {name: getattr(cv2.aruco, f"DICT_{name}") for name in _NAMES}  # OpenCV's names without DICT_
 THUMBNAIL_QUALITY = 80  # of the JPEG, 0 to 100
 
 
@@ -62,16 +59,13 @@ class Board:
 def charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
     """OpenCV's own record of a ChArUco board."""
     dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[board.dictionary])
-    made = cv2.aruco.CharucoBoard(board.squares, board.square, board.marker * board.square, dictionary)
-    made.setLegacyPattern(board.legacy)
-    return made
+    charuco = cv2.aruco.CharucoBoard(board.squares, board.square, board.marker * board.square, dictionary)
+    charuco.setLegacyPattern(board.legacy)
+    return charuco
 
 
 def ink_cells(board: Board) -> tuple[NDArray[np.bool_], float]:
-    """The print as a grid of cells, True where there is ink (H, W), and the edge of a cell, mm.
-
-    The grid is as coarse as squares and markers allow, as `cells_per_square` tells.
-    """
+    """The print as a grid of cells (see `cells_per_square`), True where there is ink (H, W), and a cell's edge, mm."""
     per_square = cells_per_square(board)
     columns, rows = board.squares
     y, x = np.indices((rows, columns))

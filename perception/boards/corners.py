@@ -26,7 +26,7 @@ BLURRED_STEP_SLOPE = 2.5066  # sqrt(2 pi): a step blurred by sigma has a slope o
 MAX_BLUR = 4.0  # px, one sigma of an edge: beyond it the edges of two corners overlap
 MAX_BLUR_RATIO, MIN_BLUR_LIMIT = 2.5, 1.5  # a view is blurred beyond so many times the camera's median, and so many px
 MIN_CORNER_SPREAD = 0.02  # ratio of the corners' spread across and along: collinear ones fix no plane
-MOST_INSTANTS = 250  # taken evenly from longer recordings: more would cost minutes and add nothing
+MAX_INSTANTS = 250  # taken evenly from longer recordings: more would cost minutes and add nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,23 +94,17 @@ def _marker_size(board: Board, pixels: Array, squares: object) -> float:
 def _chessboard(board: Board, grey: Image) -> Array:
     """Corners (P, 2) of a chessboard without markers, or nan; numbered by the colours of the squares."""
     columns, rows = board.squares[0] - 1, board.squares[1] - 1
-    ok, found = cv2.findChessboardCornersSB(grey, (columns, rows), flags=cv2.CALIB_CB_ACCURACY)
+    ok, corners = cv2.findChessboardCornersSB(grey, (columns, rows), flags=cv2.CALIB_CB_ACCURACY)
     if not ok:
         return np.full((columns * rows, 2), np.nan)
-    grid = np.asarray(found, float).reshape(rows, columns, 2)
+    grid = np.asarray(corners, float).reshape(rows, columns, 2)
     along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if along[0] * down[1] - along[1] * down[0] < 0:
         grid = grid[:, ::-1]  # a board is never seen from behind
-    if not _first_is_dark(grey, grid):
-        grid = grid[::-1, ::-1]
-    return grid.reshape(-1, 2)
-
-
-def _first_is_dark(grey: Image, grid: Array) -> bool:
-    """Whether the square right and below of the first inner corner is darker than the next one."""
-    centres = np.stack([grid[:2, k : k + 2].mean((0, 1)) for k in (0, 1)])
-    levels = [float(cv2.getRectSubPix(grey, (5, 5), tuple(map(float, c))).mean()) for c in centres]
-    return levels[0] < levels[1]
+    # the square right and below of the first inner corner is darker than the next one
+    centres = [grid[:2, k : k + 2].mean((0, 1)) for k in (0, 1)]
+    first, second = (float(cv2.getRectSubPix(grey, (5, 5), tuple(map(float, c))).mean()) for c in centres)
+    return (grid if first < second else grid[::-1, ::-1]).reshape(-1, 2)
 
 
 def _refine(board: Board, grey: Image, pixels: Array) -> tuple[Array, int]:
@@ -137,8 +131,8 @@ def _refine(board: Board, grey: Image, pixels: Array) -> tuple[Array, int]:
         pull = np.einsum("np,npi,np->ni", weight, slopes, (slopes * (places - at[:, None])).sum(-1))
         step = np.linalg.solve(tensor, pull[..., None])[..., 0]
         at = at + step
-        kept = np.linalg.norm(at - pixels[seen], axis=1) < max(half / 2, 1.5)
-        seen, at, turn, step = seen[kept], at[kept], turn[kept], step[kept]
+        near_start = np.linalg.norm(at - pixels[seen], axis=1) < max(half / 2, 1.5)
+        seen, at, turn, step = seen[near_start], at[near_start], turn[near_start], step[near_start]
         if np.abs(step).max(initial=0.0) < REFINE_TOLERANCE:
             break
     out[seen] = at
@@ -180,8 +174,7 @@ def _squares_from_pixels(board: Board, pixels: Array) -> Array:
 def _spacing(board: Board, pixels: Array) -> float:
     """Least distance, px, between neighbouring corners."""
     grid = pixels.reshape(board.squares[1] - 1, board.squares[0] - 1, 2)
-    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
-    lengths = np.concatenate(steps)
+    lengths = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])
     lengths = lengths[np.isfinite(lengths)]
     return float(lengths.min()) if len(lengths) else float(HALF_WINDOWS[0]) / EDGE_REACH
 
@@ -260,10 +253,10 @@ def usable_views(
 ) -> tuple[BoardViews, Counter[tuple[str, str]]]:
     """The views that are good enough, and the number of others by camera and reason."""
     reasons = [_reason(table, row) for row in range(len(table))]
-    kept = np.array([not reason for reason in reasons], bool)
+    usable = np.array([not reason for reason in reasons], bool)
     dropped = Counter((names[c], reason) for c, reason in zip(table.camera, reasons, strict=True) if reason)
-    chosen = thin_instants(table.instant, kept)
-    dropped.update((names[c], "more than are needed") for c in table.camera[kept & ~chosen])
+    chosen = thin_instants(table.instant, usable)
+    dropped.update((names[c], "more than are needed") for c in table.camera[usable & ~chosen])
     points, sigma = board.corners, np.maximum(table.sigma, 1e-3)
     views = BoardViews(names, sizes, points, table.camera, table.instant, table.stamp, table.pixels, sigma)
     return views.only(chosen), dropped
@@ -284,11 +277,10 @@ def _reason(table: CornerTable, row: int) -> str:
     return ""
 
 
-def thin_instants(instant: NDArray[np.int64], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(V,) the rows of at most MOST_INSTANTS of the instants kept: runs of neighbours, which show the motion."""
-    there = np.unique(instant[kept])
-    if len(there) <= MOST_INSTANTS:
-        return kept
-    runs = np.array_split(there, MOST_INSTANTS // 10)
-    chosen = np.concatenate([run[:10] for run in runs])
-    return np.asarray(kept & np.isin(instant, chosen))
+def thin_instants(instant: NDArray[np.int64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(V,) the rows of at most MAX_INSTANTS of the usable instants: runs of neighbours, which show the motion."""
+    instants = np.unique(instant[usable])
+    if len(instants) <= MAX_INSTANTS:
+        return usable
+    chosen = np.concatenate([run[:10] for run in np.array_split(instants, MAX_INSTANTS // 10)])
+    return np.asarray(usable & np.isin(instant, chosen))

@@ -34,10 +34,9 @@ STRIP_HALF_WIDTH = 5.0  # px on either side of the axis
 SAMPLE_STEP = 0.25  # px
 MIN_COLOUR_CONTRAST = 0.3  # of the contrast, between needle and background: below, brightness is used
 MAX_BRIGHTNESS_CHANGE = 0.35  # of the brightness along the needle, from a straight line: else it is no needle
-_TO_LIGHT = np.where((grey := np.arange(256) / 255.0) <= 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4).astype(
-    np.float32
-)  # IEC 61966-2-1, which cameras' pictures follow
-
+_GREY = np.arange(256) / 255.0
+# IEC 61966-2-1, which cameras' pictures follow
+_TO_LIGHT = np.where(_GREY <= 0.04045, _GREY / 12.92, ((_GREY + 0.055) / 1.055) ** 2.4).astype(np.float32)
 _WEAK_PRIOR = np.array([0.02, 1.0, 0.0, 0.02])  # information on level, taper and blur, in samples of the profile
 
 
@@ -126,13 +125,8 @@ def _thin_end(mask: Mask, radius: int) -> tuple[Array, Array] | None:
         length = float(np.linalg.norm(tip - root))
         if length >= MIN_NEEDLE_LENGTH and (best is None or length > best[0]):
             best = length, tip, (root - tip) / length
-    return None if best is None or _at_border(best[1], mask) else best[1:]
-
-
-def _at_border(pixel: Array, mask: Mask) -> bool:
-    h, w = mask.shape
-    margin = END_BEYOND + STRIP_HALF_WIDTH
-    return not (margin <= pixel[0] <= w - 1 - margin and margin <= pixel[1] <= h - 1 - margin)
+    low, high = END_BEYOND + STRIP_HALF_WIDTH, np.array(mask.shape[::-1]) - 1 - END_BEYOND - STRIP_HALF_WIDTH
+    return best[1:] if best is not None and ((low <= best[1]) & (best[1] <= high)).all() else None
 
 
 def _measure_tip(change: Light, behind: Light, tip: Array, towards: Array) -> Tip | None:
@@ -178,10 +172,8 @@ def _strip(change: Light, behind: Light, tip: Array, towards: Array) -> tuple[Ar
     A round needle has one colour, but is bright on one side and dark on the other: its share is the loss of the
     background light that its own colour does not contain. Without a colour difference brightness is used.
     """
-    along, across = (
-        np.arange(-END_BEYOND - 2, AXIS_LENGTH + SAMPLE_STEP, SAMPLE_STEP),
-        np.arange(-STRIP_HALF_WIDTH, STRIP_HALF_WIDTH + SAMPLE_STEP, SAMPLE_STEP),
-    )
+    along = np.arange(-END_BEYOND - 2, AXIS_LENGTH + SAMPLE_STEP, SAMPLE_STEP)
+    across = np.arange(-STRIP_HALF_WIDTH, STRIP_HALF_WIDTH + SAMPLE_STEP, SAMPLE_STEP)
     side = np.array([-towards[1], towards[0]])
     at = tip + along[:, None, None] * towards + across[None, :, None] * side
     x, y = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)

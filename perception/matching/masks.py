@@ -97,18 +97,6 @@ class Tool:
         return [cv2.convexHull(p.astype(np.float32))[:, 0].astype(float) for p in parts if len(p) >= 3]
 
 
-def draw(mask: ImageMask, polygons: list[Array], scale: float, border: int) -> None:
-    """Set a mask, `scale` times the image's size, to 255 inside polygons (M, 2) px of the image and `border` px around.
-
-    border: of the mask.
-    """
-    for polygon in polygons:
-        outline = np.round(polygon * scale).astype(np.int32)
-        cv2.fillConvexPoly(mask, outline, 255)
-        if border:
-            cv2.polylines(mask, [outline], True, 255, 2 * border)
-
-
 MASK_SCALE = 0.25  # of the masks to the images: to a landmark's patch four pixels are nothing
 PRINT_HEAD_MARGIN_MM = 1.5  # mm: to which an arm is registered to the cameras, and its lag known
 HIGHLIGHT_GREY = 250  # grey levels, at which a pixel is taken for a highlight,
@@ -129,11 +117,14 @@ class TrackingMasks:
         self.print_head = {}
         if head is None:
             return
+        border = 2 * int(np.ceil(PATCH_RADIUS * MASK_SCALE))  # of the mask: patches that overlap the head are left out
         for camera in cameras:
-            polygons = self._tool.silhouette(self._lenses, camera, head.base_from_nozzle, PRINT_HEAD_MARGIN_MM)
             w, h = self._lenses.rig.cameras[camera].size
             mask = np.zeros((int(np.ceil(h * MASK_SCALE)), int(np.ceil(w * MASK_SCALE))), np.uint8)
-            draw(mask, polygons, MASK_SCALE, int(np.ceil(PATCH_RADIUS * MASK_SCALE)))
+            for polygon in self._tool.silhouette(self._lenses, camera, head.base_from_nozzle, PRINT_HEAD_MARGIN_MM):
+                outline = np.round(polygon * MASK_SCALE).astype(np.int32)
+                cv2.fillConvexPoly(mask, outline, 255)
+                cv2.polylines(mask, [outline], True, 255, border)
             if mask.any():
                 self.print_head[camera] = mask
 

@@ -119,10 +119,7 @@ def project_squares(
 def project_into(
     lenses: Lenses, cameras: Sequence[int], base_from_surface: Array, points: Array, normals: Array, axes: Array
 ) -> Projection:
-    """Project the squares into several cameras, each with its own base_from_surface (C, 4, 4).
-
-    Row c N + i of the answer is square i in cameras[c].
-    """
+    """Squares projected into cameras, each with its base_from_surface (C, 4, 4); row c N + i: square i of camera c."""
     which = np.asarray(cameras, np.int64)
     camera_from_surface = lenses.rig.camera_from_base[which] @ base_from_surface
     count, step = len(which), 2.0  # samples: wide enough that the difference is the patch's own scale, not rounding

@@ -1,19 +1,166 @@
-"""One camera's part: its region tracked from picture to picture, that region's motion, and its Kalman filter."""
+"""One camera's part: its region tracked from picture to picture, that region's motion, and its Kalman filter.
+
+Features are followed in one of two ways: SIFT with FLANN, or corners with optical flow.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from estimation.rig import Camera
 from estimation.se3 import Array
 from perception.frames import Image
-from perception.lens import undistort
-from perception.matching.features import grey
-from perception.thesis.features import Finder, Pairs, corners_of, united
+from perception.lens import bilateral, undistort
+from perception.matching.features import FLANN_KD_TREE, bounding_box, grey
+
+Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px, the last two excluded
+
+REGION_BORDER_PX = 5.0  # px around the region, Appendix A
+
+
+def corners_of(polygon: Array, size: tuple[int, int]) -> Array:
+    """Lowest and highest x and y (2, 2) px of a polygon (N, 2) px, as far as an image of `size` (W, H) shows it."""
+    shown = np.clip(polygon, 0.0, np.array(size) - 1.0)
+    return np.stack([shown.min(0), shown.max(0)])
+
+
+def united(before: Array, now: Array, size: tuple[int, int]) -> Box:
+    """The box around where the region was and where it is, corners (2, 2) px each, and the border (thesis Fig. 3.4)."""
+    return bounding_box(np.concatenate([before, now]), size, REGION_BORDER_PX)
+
+
+def cropped(view: Image, box: Box) -> Image:
+    """The box of a picture, its reflections filtered out and its contours kept (thesis Fig. 4.9)."""
+    x0, y0, x1, y1 = box
+    return bilateral(np.ascontiguousarray(view[y0:y1, x0:x1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """The same features in two pictures: source (N, 2) px in the one before, destination (N, 2) px in this one.
+
+    Both count from the corner of the box looked at. In Appendix A each counts from the corner of its own picture's
+    box, so whenever the box changes its corner's move is taken for the surface's; that is a slip and not repeated.
+    """
+
+    source: Array
+    destination: Array
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+
+class Finder(Protocol):
+    """Remembers the features of one picture and finds them again in the next."""
+
+    def begin(self, view: Image, box: Box) -> Array:
+        """Remember the features in a box of a picture; their pixels (N, 2) there."""
+
+    def find(self, view: Image, box: Box) -> Pairs:
+        """The remembered features in the next picture, within `box`, which holds both places of the region."""
+
+    def keep(self) -> None:
+        """Remember the picture last looked at instead; not called where it gave no motion."""
+
+
+NO_PAIRS = Pairs(np.zeros((0, 2)), np.zeros((0, 2)))
+
+
+SIFT_FEATURES = 100  # SIFT is configured to find, 4.6
+FLANN_TREES, FLANN_CHECKS = 4, 10  # 4.6
+LOWE_RATIO = 0.8  # of the nearest descriptor's distance to the next one's, Appendix A
+
+Descriptors = NDArray[np.float32]
+
+
+class KeyPoints:
+    """The key points of one picture, found again in the next by their descriptors.
+
+    Each picture's are extracted once and used twice, as thesis 4.3 and Fig. 4.17 (b) have it.
+    """
+
+    def __init__(self) -> None:
+        self._sift = cv2.SIFT.create(nfeatures=SIFT_FEATURES)
+        index: dict[str, bool | int | float | str] = {"algorithm": FLANN_KD_TREE, "trees": FLANN_TREES}
+        self._flann = cv2.FlannBasedMatcher(index, {"checks": FLANN_CHECKS})
+        self._before: tuple[Array, Descriptors] = np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+        self._now = self._before
+
+    def begin(self, view: Image, box: Box) -> Array:
+        """Remember the key points in a box of a picture; their pixels (N, 2) there."""
+        self._before = self._now = self._extract(view, box)
+        return self._before[0]
+
+    def find(self, view: Image, box: Box) -> Pairs:
+        """The remembered key points in the next picture: thesis Eq. 4.11 and the ratio test."""
+        self._now = self._extract(view, box)
+        (points_before, before), (points_now, now) = self._before, self._now
+        if len(before) < 2 or len(now) < 2:
+            return NO_PAIRS
+        cv2.setRNGSeed(0)  # of this thread: the trees are built by chance, and the same pictures must match alike
+        nearest = [two for two in self._flann.knnMatch(before, now, k=2) if len(two) == 2]
+        good = [m for m, n in nearest if m.distance < LOWE_RATIO * n.distance]
+        corner = np.array(box[:2], float)
+        source, destination = [m.queryIdx for m in good], [m.trainIdx for m in good]
+        return Pairs(points_before[source] - corner, points_now[destination] - corner)
+
+    def keep(self) -> None:
+        """Remember the key points of the picture last looked at."""
+        self._before = self._now
+
+    def _extract(self, view: Image, box: Box) -> tuple[Array, Descriptors]:
+        points, descriptors = self._sift.detectAndCompute(cropped(view, box), None)
+        if not points:
+            return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+        return np.array([point.pt for point in points]) + box[:2], np.asarray(descriptors, np.float32)
+
+
+MAX_CORNERS, CORNER_QUALITY, CORNER_SPACING_PX = 30, 0.3, 1.0  # at most, of the best one's quality, px between two: 4.6
+
+
+class Corners:
+    """The corners of one picture, followed into the next one: thesis Eq. 4.7-4.10 as calcOpticalFlowPyrLK solves them.
+
+    They are chosen anew in each picture: followed on, fewer and fewer would be left, and the thesis tells no limit.
+    """
+
+    def __init__(self) -> None:
+        self._before: Image | None = None
+        self._now: Image | None = None
+
+    def begin(self, view: Image, box: Box) -> Array:
+        """Remember a picture; the corners (N, 2) px in a box of it."""
+        self._before = self._now = view
+        return self._corners(cropped(view, box)) + box[:2]
+
+    def find(self, view: Image, box: Box) -> Pairs:
+        """The corners of the remembered picture in the next one, those that the flow lost left out."""
+        self._now = view
+        assert self._before is not None
+        before, now = cropped(self._before, box), cropped(view, box)
+        source = self._corners(before)
+        if not len(source):
+            return NO_PAIRS
+        start = source.astype(np.float32).reshape(-1, 1, 2)
+        moved, status, _ = cv2.calcOpticalFlowPyrLK(before, now, start, np.empty_like(start))
+        tracked = np.asarray(status).reshape(-1) == 1
+        return Pairs(source[tracked], np.asarray(moved, float).reshape(-1, 2)[tracked])
+
+    def keep(self) -> None:
+        """Remember the picture last looked at."""
+        self._before = self._now
+
+    @staticmethod
+    def _corners(inside: Image) -> Array:
+        corners = cv2.goodFeaturesToTrack(inside, MAX_CORNERS, CORNER_QUALITY, CORNER_SPACING_PX)
+        return np.zeros((0, 2)) if corners is None else np.asarray(corners, float).reshape(-1, 2)
+
 
 MIN_PAIRS = 4  # pairs that a homography takes
 MAX_REPROJECTION_PX = 3.0  # px, of RANSAC, Appendix A
@@ -41,26 +188,22 @@ def turn(pairs: Pairs) -> float | None:
     if len(pairs) < MIN_PAIRS:
         return None
     homography, _ = cv2.findHomography(pairs.source, pairs.destination, cv2.RANSAC, MAX_REPROJECTION_PX)
-    if homography is None:
-        return None
-    return float(np.arctan2(homography[1, 0], homography[0, 0]))
+    return None if homography is None else float(np.arctan2(homography[1, 0], homography[0, 0]))
 
 
-ACCELERATION_SIGMA = np.array(
-    [500.0, 500.0, 2.5]
-)  # px/s^2 and rad/s^2: 50 px/s, or 15 deg/s, within a tenth of a second
+# px/s^2 and rad/s^2: 50 px/s, or 15 deg/s, within a tenth of a second
+ACCELERATION_SIGMA = np.array([500.0, 500.0, 2.5])
 MOVE_SIGMA = np.array([0.15, 0.15, 5e-3])  # px and rad, of one measured move: some twenty matches, each to half a px
-INITIAL_VELOCITY_SIGMA = np.array(
-    [300.0, 300.0, 1.5]
-)  # px/s and rad/s, of a surface just found: any that could be printed on
+# px/s and rad/s, at the start: of any surface that could be printed on
+INITIAL_VELOCITY_SIGMA = np.array([300.0, 300.0, 1.5])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianState:
-    """A state (n,) as it is believed and its covariance (n, n): X and P of the thesis."""
+    """The estimate of a state: X and P of the thesis."""
 
-    mean: Array
-    covariance: Array
+    mean: Array  # (n,)
+    covariance: Array  # (n, n)
 
 
 def predict(belief: GaussianState, transition: Array, noise: Array) -> GaussianState:
@@ -80,7 +223,7 @@ def update(belief: GaussianState, measured: Array, observation: Array, noise: Ar
 
 
 def initial_velocity() -> GaussianState:
-    """What is believed of the image velocity (3,), px/s, px/s, rad/s, of a surface just found."""
+    """The image velocity (3,), px/s, px/s, rad/s, before the first measurement."""
     return GaussianState(np.zeros(3), np.diag(INITIAL_VELOCITY_SIGMA**2))
 
 
@@ -107,8 +250,8 @@ class FlatView:
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
-        found, _ = cv2.getOptimalNewCameraMatrix(camera.matrix, camera.distortion, camera.size, 1)
-        self.matrix = np.asarray(found, np.float64)
+        matrix, _ = cv2.getOptimalNewCameraMatrix(camera.matrix, camera.distortion, camera.size, 1)
+        self.matrix = np.asarray(matrix, np.float64)
         self._maps = cv2.initUndistortRectifyMap(
             camera.matrix, camera.distortion, np.eye(3), self.matrix, camera.size, cv2.CV_16SC2
         )
@@ -170,12 +313,12 @@ class CameraTrack:
         """The first picture at `stamp`, s, and the region in it, (N, 2) px as imaged."""
         size = self.view.camera.size
         self._corners = corners_of(self.view.pixels(np.clip(polygon, 0, np.array(size) - 1.0)), size)
-        found = self._finder.begin(self.view.flatten(image), united(self._corners, self._corners, size))
+        features = self._finder.begin(self.view.flatten(image), united(self._corners, self._corners, size))
         self._seen, self._sum = stamp, np.zeros(3)
         self._velocity = initial_velocity()
         self.motion, self.covariance, self.measured = self._sum, np.zeros((3, 3)), True
         self.velocity = self._velocity
-        self.pixels = self.view.ideal(found)
+        self.pixels = self.view.ideal(features)
 
     def __call__(self, stamp: float, image: Image | None) -> None:
         """The next picture, at `stamp`, s; None where this camera has none."""

@@ -12,11 +12,10 @@ from estimation.observations import Observations, no_observations
 from estimation.pose import SurfacePose, TrackState, identity_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
-from perception.frames import FrameSet, Image, Roi
+from perception.frames import FrameSet, Image, Roi, region_polygons
 from perception.lens import undistort
-from perception.thesis.camera import MAX_COAST_S, CameraTrack
-from perception.thesis.features import Finder, KeyPoints
-from perception.tracking.step import STAGES, StepReport, report_without_offsets
+from perception.thesis.camera import MAX_COAST_S, CameraTrack, Finder, KeyPoints
+from perception.tracking.step import STAGES, StepReport, empty_report, report_without_offsets
 
 MIN_AXIS_SHARE = np.cos(np.pi / 4)  # a camera measures along or about what it sees more of than it misses
 
@@ -77,14 +76,14 @@ def unmeasured(shares: Mapping[int, Array]) -> str:
 
 MIN_COVARIANCE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: what is taken for none, with an inverse all the same
 CAMERA_FROM_SURFACE_AXES = np.diag([1.0, -1.0, -1.0])  # the top camera from the surface: z out of it, to the camera
-FEATURE_SIGMA_PX = 1.0  # px, told of each feature's place: the thesis states none
+FEATURE_SIGMA_PX = 1.0  # px, reported for each feature's place: the thesis states none
 
 
 class ThesisStep:
     """Follows one surface through frame sets; deterministic, causal.
 
-    Covariances are what the thesis claims, next to nothing: the filter of 4.4 knows how sure it is of a velocity and of
-    a prediction, but the sum of the measured moves is taken for exact, and what no camera measures for still.
+    Covariances are the thesis's, next to nothing: the filter of 4.4 has one of the velocity and of a prediction, but
+    the sum of the measured moves counts as exact, and what no camera measures as still.
     """
 
     last: StepReport
@@ -117,10 +116,8 @@ class ThesisStep:
         """The pose at `frames.stamp` from this frame set and the ones before."""
         self._spent, start = np.zeros(len(STAGES)), self._clock()
         last = self._pose
-        if last is not None and frames.stamp <= last.stamp:  # the same instant again tells nothing new
-            self.last = report_without_offsets(
-                no_observations(frames.stamp), np.zeros(len(self.rig), np.int64), self._spent
-            )
+        if last is not None and frames.stamp <= last.stamp:  # the same instant again
+            self.last = empty_report(frames.stamp, len(self.rig), self._spent)
             return last
         images = {f.camera: f.image for f in frames.frames}
         pose = self._begin(frames, images) if last is None else self._follow(last, frames.stamp, images)
@@ -138,10 +135,9 @@ class ThesisStep:
 
     def _begin(self, frames: FrameSet, images: dict[int, Image]) -> SurfacePose:
         """Where the surface is, and which axis is whose; until that is known, INITIALISING and why."""
-        start = max((r.stamp for r in self.roi), default=-np.inf)
-        if frames.stamp < start - 0.1:
-            return identity_pose(frames.stamp, f"waiting for the region of interest at {start:.3f} s")
-        polygons = {c: p for c, p in self._polygons().items() if c in images}
+        polygons = region_polygons(self.roi, frames, [camera.size for camera in self.rig.cameras])
+        if isinstance(polygons, str):
+            return identity_pose(frames.stamp, polygons)
         if len(polygons) < 2:
             return identity_pose(frames.stamp, "fewer than two cameras show the surface")
         middle = self._middle(polygons)
@@ -156,14 +152,7 @@ class ThesisStep:
         for camera, track in self._tracks.items():
             track.begin(frames.stamp, images[camera], polygons[camera])
         towards = rotations[next(iter(rotations))] @ CAMERA_FROM_SURFACE_AXES
-        return self._taken(frames.stamp, se3.make(towards, middle))
-
-    def _polygons(self) -> dict[int, Array]:
-        """The region (N, 2) px in each camera that has one, in the rig's order."""
-        if not self.roi:
-            corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
-            return {c: corners * camera.size for c, camera in enumerate(self.rig.cameras)}
-        return {r.camera: r.polygon for r in sorted(self.roi, key=lambda r: r.camera)}
+        return self._with_covariance(frames.stamp, se3.make(towards, middle))
 
     def _middle(self, polygons: dict[int, Array]) -> Array:
         """The point (3,) mm, base frame, nearest to the rays through the middles of the regions: the surface's origin.
@@ -189,10 +178,10 @@ class ThesisStep:
         more, self._moved = moved - self._moved, moved
         before = last.base_from_surface
         turned = se3.exp_rotation(more[:3]) @ before[:3, :3]  # small: the order of Eq. 5.1-5.3 does not matter
-        return self._taken(stamp, se3.make(turned, before[:3, 3] + more[3:]))
+        return self._with_covariance(stamp, se3.make(turned, before[:3, 3] + more[3:]))
 
-    def _taken(self, stamp: float, base_from_surface: Array) -> SurfacePose:
-        """The pose with all that is claimed of it, remembered."""
+    def _with_covariance(self, stamp: float, base_from_surface: Array) -> SurfacePose:
+        """The pose with its state, covariance and twist; it is remembered."""
         state, reason = self._state(stamp)
         turned = np.kron(np.eye(2), base_from_surface[:3, :3])  # base axes from surface axes, (6, 6)
         covariance, twist, spread = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
@@ -201,9 +190,8 @@ class ThesisStep:
             covariance += own @ track.covariance @ own.T
             twist += own @ track.velocity.mean
             spread += own @ track.velocity.covariance @ own.T
-        self._pose = SurfacePose(
-            stamp, base_from_surface, covariance + MIN_COVARIANCE, twist, state, spread, reason=reason
-        )
+        covariance = covariance + MIN_COVARIANCE
+        self._pose = SurfacePose(stamp, base_from_surface, covariance, twist, state, spread, reason=reason)
         return self._pose
 
     def _state(self, stamp: float) -> tuple[TrackState, str]:

@@ -99,9 +99,8 @@ class KnownMotion:
     def _exposed(self, pose: Array, covariance: Array, twist: Array) -> ExpectedSurface:
         """The surface with its poses at each camera's exposure, cameras corrected by smoothing, for the given rig."""
         moved = pose @ se3.exp(self.smoothed.offsets[:, None] * twist)
-        corrected, given = (
-            np.stack([c.base_from_camera for c in rig.cameras]) for rig in (self.smoothed.rig, self.rig)
-        )
+        rigs = self.smoothed.rig, self.rig
+        corrected, given = (np.stack([camera.base_from_camera for camera in rig.cameras]) for rig in rigs)
         return ExpectedSurface(pose, covariance, twist, given @ se3.inverse(corrected) @ moved)
 
     def poses(self, expected: ExpectedSurface, tracks: Observations) -> Array:
@@ -187,10 +186,7 @@ class Reobserver:
         self._waiting: deque[tuple[float, dict[int, Pyramid]]] = deque(maxlen=MAX_WAITING_SETS)
 
     def __call__(self, frames: FrameSet) -> list[Observations]:
-        """New observations in this frame set, and in those that waited for one where the surface is known; by stamp.
-
-        Tracks count rows of the motion's map.
-        """
+        """New observations of rows of the motion's map in this frame set, and in those that waited for it; by stamp."""
         motion = self._motion
         stamp = motion.observed_at(frames.stamp).stamp  # to its last bit
         images = {f.camera: grey(f.image) for f in frames.frames}

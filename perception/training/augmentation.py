@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.training.dataset import Labelled
+from perception.wound.network import box_round
 
 
 def relight(picture: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -19,7 +20,11 @@ def relight(picture: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.
     if rng.random() < 0.25:
         seen = seen + rng.normal(0, rng.uniform(2, 10), seen.shape).astype(np.float32)
     exposed = np.clip(seen, 0, 255).astype(np.uint8)
-    return _compressed(exposed, int(rng.integers(25, 80))) if rng.random() < 0.1 else exposed
+    if rng.random() >= 0.1:
+        return exposed
+    written, data = cv2.imencode(".jpg", exposed, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 80))])
+    assert written
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
 
 
 def _coloured(picture: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.float32]:
@@ -46,12 +51,6 @@ def _shaded(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArray[n
     across, down = rng.normal(0, 0.25, 2)
     slope = 1 + down * np.linspace(-1, 1, height)[:, None] + across * np.linspace(-1, 1, width)[None]
     return picture * np.clip(slope, 0.2, 2).astype(np.float32)[..., None]
-
-
-def _compressed(picture: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
-    written, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    assert written
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
 
 
 def cover_sample(
@@ -91,9 +90,8 @@ def _shape(wound: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uin
         _fill(drawn, place + radius[:, None] * np.column_stack([np.cos(turns), np.sin(turns)]))
     else:
         depth = rng.uniform(0.1, 1.0) * side
-        _fill(
-            drawn, place + along[None] * depth / 2 + _rectangle(along, depth, rng.uniform(0.3, 2) * side, shift=False)
-        )
+        corners = _rectangle(along, depth, rng.uniform(0.3, 2) * side, shift=False)
+        _fill(drawn, place + along[None] * depth / 2 + corners)
     return drawn
 
 
@@ -124,12 +122,11 @@ def _surface(side: int, texture: NDArray[np.uint8], rng: np.random.Generator) ->
 
 @dataclass(frozen=True, slots=True)
 class SamplePyramid:
-    """A picture (H, W, 3) uint8 RGB and its wound (H, W) uint8 0/255 at full, half and quarter size, and the box
-    [top, left, bottom, right] round the wound at full size (None: no wound)."""
+    """A picture and its wound at full, half and quarter size."""
 
-    pictures: tuple[NDArray[np.uint8], ...]
-    wounds: tuple[NDArray[np.uint8], ...]
-    box: NDArray[np.float64] | None
+    pictures: tuple[NDArray[np.uint8], ...]  # (H, W, 3) RGB
+    wounds: tuple[NDArray[np.uint8], ...]  # (H, W) 0/255
+    box: NDArray[np.float64] | None  # [top, left, bottom, right] round the wound at full size; None: no wound
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +151,7 @@ def sample_pyramid(labelled: Labelled) -> SamplePyramid:
         size = (max(1, width // 2), max(1, height // 2))
         for planes in (pictures, wounds):
             planes.append(np.asarray(cv2.resize(planes[-1], size, interpolation=cv2.INTER_AREA), np.uint8))
-    return SamplePyramid(tuple(pictures), tuple(wounds), _box(labelled.wound))
+    return SamplePyramid(tuple(pictures), tuple(wounds), box_round(labelled.wound))
 
 
 def draw_sample(
@@ -166,11 +163,6 @@ def draw_sample(
     if rng.random() < how.cover:
         picture, wound = cover_sample(picture, wound, other.pictures[1], rng)
     return relight(picture, rng), wound
-
-
-def _box(wound: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-    rows, columns = (np.flatnonzero(wound.any(axis)) for axis in (1, 0))
-    return np.array([rows[0], columns[0], rows[-1] + 1, columns[-1] + 1], np.float64) if len(rows) else None
 
 
 def _draw_view(source: SamplePyramid, how: Augmentation, rng: np.random.Generator) -> tuple[float, NDArray[np.float64]]:

@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from estimation.errors import InputError
 from perception.wound.segmentation import picture_box
@@ -24,12 +25,11 @@ PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 
 @dataclass(frozen=True, slots=True)
 class Labelled:
-    """One picture and the wounds in it: name "folder/file", picture (H, W, 3) uint8 RGB, wound (H, W) bool; the
-    black padding that some sets carry is cut off both."""
+    """One picture and the wounds in it; the black padding that some sets carry is cut off both."""
 
-    name: str
-    picture: NDArray[np.uint8]
-    wound: NDArray[np.bool_]
+    name: str  # "folder/file"
+    picture: NDArray[np.uint8]  # (H, W, 3) RGB
+    wound: NDArray[np.bool_]  # (H, W)
 
 
 def read_dataset(folder: Path, seen: Callable[[int, int], None] = lambda done, of: None) -> list[Labelled]:
@@ -39,9 +39,8 @@ def read_dataset(folder: Path, seen: Callable[[int, int], None] = lambda done, o
     """
     files = [file for file in _listed(folder / "images") if file.suffix.lower() in PICTURE_SUFFIXES]
     if not files:
-        raise InputError(
-            str(folder / "images"), "pictures", "none", f"one at least, ending in {', '.join(PICTURE_SUFFIXES)}"
-        )
+        allowed = f"one at least, ending in {', '.join(PICTURE_SUFFIXES)}"
+        raise InputError(str(folder / "images"), "pictures", "none", allowed)
     masks = {file.stem: file for file in _listed(folder / "labels")}
     labelled = []
     for file in files:
@@ -99,10 +98,12 @@ def picture_groups(pictures: Sequence[Labelled]) -> NDArray[np.intp]:
     likeness = np.max([copies @ _turned(copies, turn).T for turn in range(8)], axis=0)
     joined = likeness > MIN_COPY_CORRELATION
     features = [_features(each.picture) for each in pictures]
-    for first, second in _candidates(likeness):
+    nearest = np.argsort(-likeness, axis=1, kind="stable")[:, : MAX_CANDIDATES + 1]
+    pairs = {(min(a, b), max(a, b)) for a, row in enumerate(nearest.tolist()) for b in row if a != b}
+    for first, second in sorted(pairs):
         if not joined[first, second] and _one_scene(features[first], features[second]):
             joined[first, second] = True
-    return _components(joined | joined.T)
+    return connected_components(joined, directed=False)[1].astype(np.intp)
 
 
 def hold_out_groups(group: NDArray[np.intp], held_out: int, rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -117,9 +118,8 @@ def hold_out_groups(group: NDArray[np.intp], held_out: int, rng: np.random.Gener
 
 def _copy(picture: NDArray[np.uint8]) -> NDArray[np.float64]:
     """(3 * side^2,) a small square colour copy, centred and of unit length."""
-    small = cv2.resize(
-        cv2.cvtColor(picture, cv2.COLOR_RGB2LAB), (COPY_SIDE_PX, COPY_SIDE_PX), interpolation=cv2.INTER_AREA
-    )
+    lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)
+    small = cv2.resize(lab, (COPY_SIDE_PX, COPY_SIDE_PX), interpolation=cv2.INTER_AREA)
     centred = small.astype(np.float64) - small.mean((0, 1))
     return (centred / np.linalg.norm(centred)).ravel()
 
@@ -129,12 +129,6 @@ def _turned(copies: NDArray[np.float64], turn: int) -> NDArray[np.float64]:
     square = copies.reshape(-1, COPY_SIDE_PX, COPY_SIDE_PX, 3)
     mirrored = square[:, :, ::-1] if turn & 4 else square
     return np.rot90(mirrored, turn & 3, (1, 2)).reshape(len(copies), -1)
-
-
-def _candidates(likeness: NDArray[np.float64]) -> list[tuple[int, int]]:
-    nearest = np.argsort(-likeness, axis=1, kind="stable")[:, : MAX_CANDIDATES + 1]
-    pairs = {(min(a, b), max(a, b)) for a, row in enumerate(nearest.tolist()) for b in row if a != b}
-    return sorted(pairs)
 
 
 def _features(picture: NDArray[np.uint8]) -> Features:
@@ -158,22 +152,8 @@ def _one_scene(first: Features, second: Features) -> bool:
     _, inside = cv2.estimateAffinePartial2D(*places, method=cv2.RANSAC, ransacReprojThreshold=MAX_SCENE_RESIDUAL_PX)
     if inside is None or inside.sum() < MIN_SCENE_MATCHES:
         return False
-    return all(_spread(each[inside.ravel() > 0]) >= MIN_MATCH_SPREAD_PX for each in places)
-
-
-def _spread(places: NDArray[np.float32]) -> float:
-    """Standard deviation of (N, 2) places along their narrower direction, px."""
-    return float(np.sqrt(max(0.0, np.linalg.eigvalsh(np.cov(places.T))[0])))
-
-
-def _components(joined: NDArray[np.bool_]) -> NDArray[np.intp]:
-    number = np.arange(len(joined))
-    while True:
-        lowest = np.min(np.where(joined, number[None, :], len(joined)), axis=1)
-        spread = np.minimum(number, lowest)
-        if (spread == number).all():
-            return number
-        number = spread
+    variances = [np.linalg.eigvalsh(np.cov(each[inside.ravel() > 0].T))[0] for each in places]  # the narrower way
+    return all(float(np.sqrt(max(0.0, variance))) >= MIN_MATCH_SPREAD_PX for variance in variances)
 
 
 PIECE_SIDES_PX = (96, 224)  # px: less shows nothing, more nearly always holds the wound
@@ -184,14 +164,14 @@ TRIES_PER_PICTURE = 40  # places tried in each picture
 
 def healthy_pieces(pictures: Sequence[Labelled], rng: np.random.Generator, count: int) -> list[NDArray[np.uint8]]:
     """Up to `count` pieces (H, W, 3) uint8 RGB, one of each picture at most, in random order."""
-    found: list[NDArray[np.uint8]] = []
+    pieces: list[NDArray[np.uint8]] = []
     for number in rng.permutation(len(pictures)).tolist():
         piece = _piece(pictures[number], rng)
         if piece is not None:
-            found.append(piece)
-        if len(found) == count:
+            pieces.append(piece)
+        if len(pieces) == count:
             break
-    return found
+    return pieces
 
 
 def _piece(labelled: Labelled, rng: np.random.Generator) -> NDArray[np.uint8] | None:

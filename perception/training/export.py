@@ -94,11 +94,12 @@ def export(
     write_settings(file.with_suffix(".toml"), Settings(), digest)
     written = WoundNetwork(file)
     write_settings(file.with_suffix(".toml"), choose(written), digest)
-    alike = _agreement(network, written, pictures, looks)
+    runs = as_function(network), written
+    masks = [[wound_logits(each.picture, run, looks) > 0 for run in runs] for each in pictures]
+    alike = float(np.mean([dice(before, after) for before, after in masks]))
     if alike < MIN_AGREEMENT_DICE:
-        raise StillbedError(
-            f"{file}: its masks agree with torch's at a Dice of {alike:.3f}, allowed {MIN_AGREEMENT_DICE:g} or more"
-        )
+        agreement = f"its masks agree with torch's at a Dice of {alike:.3f}"
+        raise StillbedError(f"{file}: {agreement}, allowed {MIN_AGREEMENT_DICE:g} or more")
     return alike
 
 
@@ -121,19 +122,13 @@ def _write(network: nn.Module, file: Path) -> None:
 def _network_inputs(network: nn.Module, pictures: Sequence[Labelled], looks: Looks) -> list[Planes]:
     run, seen = as_function(network), list[Planes]()
 
-    def kept(planes: NDArray[np.float32]) -> NDArray[np.float32]:
+    def recorded(planes: NDArray[np.float32]) -> NDArray[np.float32]:
         seen.append(planes)
         return run(planes)
 
     for each in pictures:
-        wound_logits(each.picture, kept, looks)
+        wound_logits(each.picture, recorded, looks)
     return seen
-
-
-def _agreement(network: nn.Module, written: WoundNetwork, pictures: Sequence[Labelled], looks: Looks) -> float:
-    runs = as_function(network), written
-    masks = [[wound_logits(each.picture, run, looks) > 0 for run in runs] for each in pictures]
-    return float(np.mean([dice(ours, theirs) for ours, theirs in masks]))
 
 
 def write_settings(file: Path, settings: Settings, sha256: str) -> None:
@@ -146,97 +141,77 @@ def write_settings(file: Path, settings: Settings, sha256: str) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOutFigures:
-    """What was measured on pictures held out. dice: (N,) of each. empty: of them without a wound. silent_real,
-    silent_rendered: shares of pieces without a wound in which none is found. before, after: mean Dice on the open half
-    of a wound, uncovered and half covered."""
+    """What was measured on pictures held out."""
 
-    dice: Array
-    empty: int
-    silent_real: float
-    silent_rendered: float
-    before: float
-    after: float
+    dice: Array  # (N,) of each
+    empty: int  # of them without a wound
+    silent_real: float  # share of real pieces without a wound in which none is detected
+    silent_rendered: float  # the same of rendered ones
+    before: float  # mean Dice on the open half of a wound, uncovered
+    after: float  # the same, half covered
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkOrigin:
-    """How a network was made. schedule: in words. alike: mean Dice of its masks before and after whole numbers."""
+    """How a network was made."""
 
     name: str
     parameters: int
-    schedule: str
-    alike: float
+    schedule: str  # in words
+    alike: float  # mean Dice of its masks before and after the rounding to 8 bits
 
 
 def write_card(
-    file: Path, making: NetworkOrigin, data: Sequence[str], judged: HeldOutFigures, settings: Settings, sha256: str
+    file: Path, origin: NetworkOrigin, data: Sequence[str], figures: HeldOutFigures, settings: Settings, sha256: str
 ) -> None:
-    """The card as Markdown. data: what was trained on and judged by, in words."""
-    lines = [*_head(making, sha256), *_data(making.schedule, data), *_figures(judged), *_limits(settings)]
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _head(making: NetworkOrigin, sha256: str) -> list[str]:
-    return [
-        f"# {making.name}",
-        "",
-        "Finds open wounds in a colour picture; gives a logit for each pixel. Runs in `perception/wound/network.py`.",
-        "",
-        f"- {making.parameters / 1e6:.2f} million parameters, in 8 bits as are the activations, ONNX opset 17, any size"
-        " in steps of 32 px",
-        f"- sha256 `{sha256}`, checked whenever it is loaded",
-        f"- its masks agree with those before the rounding to 8 bits at a mean Dice of {making.alike:.3f}",
-        "",
-    ]
-
-
-def _data(schedule: str, data: Sequence[str]) -> list[str]:
-    return [
-        "## Data",
-        "",
-        *(f"- {line}" for line in data),
-        "",
-        f"{schedule} Thresholds were chosen on pictures that were neither trained on nor judged by.",
-        "",
-    ]
-
-
-def _figures(judged: HeldOutFigures) -> list[str]:
-    dice = judged.dice
+    """The card as Markdown. data: what was trained on and evaluated by, in words."""
+    dice = figures.dice
     quarter, median = np.percentile(dice, [25, 50])
-    return [
-        "## What it reaches, on pictures held out",
-        "",
-        "| figure | value |",
-        "|---|---|",
-        f"| pictures, of them without a wound | {len(dice)}, {judged.empty} |",
-        f"| Dice of each picture: mean | {dice.mean():.3f} |",
-        f"| median, lower quartile | {median:.3f}, {quarter:.3f} |",
-        f"| pictures below 0.1 | {(dice < 0.1).sum()} |",
-        f"| silent on pieces of healthy skin, real | {100 * judged.silent_real:.1f} % |",
-        f"| silent on healthy skin, rendered | {100 * judged.silent_rendered:.1f} % |",
-        f"| Dice on the open half: before it was half covered, after | {judged.before:.3f}, {judged.after:.3f} |",
-        "",
-    ]
+    sources = "\n".join(f"- {line}" for line in data)
+    card = f"""\
+# {origin.name}
 
+Finds open wounds in a colour picture; gives a logit for each pixel. Runs in `perception/wound/network.py`.
 
-def _limits(settings: Settings) -> list[str]:
-    return [
-        "## Limits",
-        "",
-        "- The pictures are of feet and lower legs, most of them taken in one clinic. Other places of the body, burns,"
-        " fresh surgical wounds and sutures are not among them.",
-        "- Views of one wound from quite other sides are not recognised as one group: the split is as strict as the"
-        " measure of likeness.",
-        f"- Wounds smaller than about 6 px of a picture made {settings.looks.long_side} px large are missed; several"
-        " wounds far apart are seen less sharply, as the second look must hold them all.",
-        f"- It says nothing where its confidence is below {settings.trust:.2f}. Confidence is calibrated on the same"
-        " kind of pictures, not on other ones.",
-        "- It is no medical device: it tells a tracker where to look, and no one what to treat.",
-        "",
-        "## Licences",
-        "",
-        "Foot Ulcer Segmentation Challenge 2021 (Wang et al., Sci Rep 10:21897): CC BY NC, as the challenge states."
-        " Medetec pictures as published with the challenge's predecessor. The weights are derived from these and so are"
-        " for research that is not commercial; the code is Apache-2.0.",
-    ]
+- {origin.parameters / 1e6:.2f} million parameters, in 8 bits as are the activations, ONNX opset 17, any size in steps\
+ of 32 px
+- sha256 `{sha256}`, checked whenever it is loaded
+- its masks agree with those before the rounding to 8 bits at a mean Dice of {origin.alike:.3f}
+
+## Data
+
+{sources}
+
+{origin.schedule} Thresholds were chosen on pictures that were neither trained on nor judged by.
+
+## What it reaches, on pictures held out
+
+| figure | value |
+|---|---|
+| pictures, of them without a wound | {len(dice)}, {figures.empty} |
+| Dice of each picture: mean | {dice.mean():.3f} |
+| median, lower quartile | {median:.3f}, {quarter:.3f} |
+| pictures below 0.1 | {(dice < 0.1).sum()} |
+| silent on pieces of healthy skin, real | {100 * figures.silent_real:.1f} % |
+| silent on healthy skin, rendered | {100 * figures.silent_rendered:.1f} % |
+| Dice on the open half: before it was half covered, after | {figures.before:.3f}, {figures.after:.3f} |
+
+## Limits
+
+- The pictures are of feet and lower legs, most of them taken in one clinic. Other places of the body, burns, fresh\
+ surgical wounds and sutures are not among them.
+- Views of one wound from quite other sides are not recognised as one group: the split is as strict as the measure of\
+ likeness.
+- Wounds smaller than about 6 px of a picture made {settings.looks.long_side} px large are missed; several wounds far\
+ apart are seen less sharply, as the second look must hold them all.
+- It says nothing where its confidence is below {settings.trust:.2f}. Confidence is calibrated on the same kind of\
+ pictures, not on other ones.
+- It is no medical device: it tells a tracker where to look, and no one what to treat.
+
+## Licences
+
+Foot Ulcer Segmentation Challenge 2021 (Wang et al., Sci Rep 10:21897): CC BY NC, as the challenge states. Medetec\
+ pictures as published with the challenge's predecessor. The weights are derived from these and so are for research\
+ that is not commercial; the code is Apache-2.0.
+"""
+    file.write_text(card, encoding="utf-8")

@@ -85,18 +85,18 @@ THESIS_SCHEDULE = Schedule(rounds=29, steps=100, batch=12, rate=1e-3, average=0.
 
 @dataclass(slots=True)
 class Curve:
-    """What each round reached: mean loss, and mean Dice of the averaged weights on the pictures kept for choosing."""
+    """What each round reached."""
 
-    loss: list[float] = field(default_factory=list)
-    dice: list[float] = field(default_factory=list)
+    loss: list[float] = field(default_factory=list)  # mean
+    dice: list[float] = field(default_factory=list)  # mean of the averaged weights on the pictures kept for choosing
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Pictures to draw samples from, and how often each is drawn relative to the others (N,)."""
+    """Pictures to draw samples from."""
 
     pyramids: Sequence[SamplePyramid]
-    weights: NDArray[np.float64]
+    weights: NDArray[np.float64]  # (N,) how often each is drawn relative to the others
 
 
 def train(
@@ -105,12 +105,12 @@ def train(
     chosen_on: Sequence[Labelled],
     schedule: Schedule,
     checkpoint: Path,
-    said: Callable[[int, int], None],
+    report: Callable[[int, int], None],
     recipe: Recipe,
 ) -> tuple[nn.Module, Curve]:
     """The network with averaged weights, and its curve; continues from `checkpoint` where there is one.
 
-    `said(done, of)` counts steps. Every round draws from its own generator, so that a run that was broken off and
+    `report(done, of)` counts steps. Every round draws from its own generator, so that a run that was broken off and
     continued is the run that was not.
     """
     torch.manual_seed(schedule.seed)
@@ -132,14 +132,11 @@ def train(
                 group["lr"] = rate_at(step, schedule)
             losses.append(_step(network, optimiser, recipe.loss, pictures, wounds))
             averaged.update_parameters(network)
-            said(step + 1, schedule.rounds * schedule.steps)
+            report(step + 1, schedule.rounds * schedule.steps)
         curve.loss.append(float(np.mean(losses)))
         curve.dice.append(mean_dice(averaged.module, chosen_on, recipe.looks))
-        state = {
-            "network": network.state_dict(),
-            "averaged": averaged.state_dict(),
-            "optimiser": optimiser.state_dict(),
-        }
+        parts = {"network": network, "averaged": averaged, "optimiser": optimiser}
+        state = {name: part.state_dict() for name, part in parts.items()}
         torch.save(state | {"curve": asdict(curve)}, checkpoint.with_suffix(".new"))
         checkpoint.with_suffix(".new").replace(checkpoint)
     return averaged.module, curve

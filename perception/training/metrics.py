@@ -38,11 +38,11 @@ def bgr(picture: NDArray[np.uint8]) -> Image:
 
 def scores(segmenter: Segmenter, pictures: Sequence[Labelled], seen: Callable[[int, int], None]) -> Array:
     """(N,) Dice of each picture; an empty truth scores 1 with an empty mask and 0 with any other."""
-    found = []
+    reached = []
     for each in pictures:
-        found.append(dice(segmenter(bgr(each.picture)).mask, each.wound))
-        seen(len(found), len(pictures))
-    return np.array(found)
+        reached.append(dice(segmenter(bgr(each.picture)).mask, each.wound))
+        seen(len(reached), len(pictures))
+    return np.array(reached)
 
 
 def silent_share(segmenter: Segmenter, pictures: Sequence[NDArray[np.uint8]]) -> float:
@@ -64,8 +64,8 @@ def dice_before_and_after_cover(
             continue
         covered, cover = half_covered(each, rng)
         opened = ~cover
-        for picture, kept in ((each.picture, before), (covered, after)):
-            kept.append(dice(segmenter(bgr(picture)).mask & opened, each.wound & opened))
+        for picture, reached in ((each.picture, before), (covered, after)):
+            reached.append(dice(segmenter(bgr(picture)).mask & opened, each.wound & opened))
     return float(np.mean(before or np.nan)), float(np.mean(after or np.nan))
 
 
@@ -129,24 +129,22 @@ def _trusting(
     """The logistic of the mean logit, and the confidence below which to keep silent."""
     levels, right, gains = [], [], []
     for seen, each in zip(logits, pictures, strict=True):
-        found = segmentation_from_logits(seen, settings).mask
-        if found.any():
-            levels.append(float(seen[found].mean()))
-            reached = dice(found, each.wound)
+        mask = segmentation_from_logits(seen, settings).mask
+        if mask.any():
+            levels.append(float(seen[mask].mean()))
+            reached = dice(mask, each.wound)
             right.append(reached > MIN_HIT_DICE)
             gains.append(reached - float(not each.wound.any()))
-    wrong = [
-        float(seen[found].mean()) for seen in empty if (found := segmentation_from_logits(seen, settings).mask).any()
-    ]
+    false_masks = [(seen, segmentation_from_logits(seen, settings).mask) for seen in empty]
+    wrong = [float(seen[mask].mean()) for seen, mask in false_masks if mask.any()]
     slope, offset = _logistic(np.array(levels + wrong), np.array(right + [False] * len(wrong), float))
     confidence = 1 / (1 + np.exp(-(slope * np.array(levels) + offset)))
     false = 1 / (1 + np.exp(-(slope * np.array(wrong) + offset)))
     trust, most = 0.5, -np.inf
     for level in np.arange(0.02, 0.99, 0.02):
         quiet = 1 - (false >= level).sum() / max(1, len(empty))
-        gain = float(np.array(gains)[confidence >= level].sum()) / len(pictures) - SILENCE_PRICE * max(
-            0.0, TARGET_SILENT_SHARE - quiet
-        )
+        price = SILENCE_PRICE * max(0.0, TARGET_SILENT_SHARE - quiet)
+        gain = float(np.array(gains)[confidence >= level].sum()) / len(pictures) - price
         if gain > most + 1e-9:
             trust, most = float(round(level, 2)), gain
     return Settings(settings.looks, settings.edge, settings.smallest, trust, slope, offset)
@@ -157,9 +155,8 @@ def _logistic(levels: Array, right: Array) -> tuple[float, float]:
 
     def cost(weights: Array) -> float:
         exponent = np.where(right > 0, -1, 1) * (weights[0] * levels + weights[1])
-        return float(
-            np.logaddexp(0, exponent).sum() + 0.5 * (np.array(LOGISTIC_PRIOR) * (weights - (1.0, 0.0)) ** 2).sum()
-        )
+        prior = 0.5 * (np.array(LOGISTIC_PRIOR) * (weights - (1.0, 0.0)) ** 2).sum()
+        return float(np.logaddexp(0, exponent).sum() + prior)
 
     slope, offset = minimize(cost, np.array([1.0, 0.0]), method="Nelder-Mead").x
     return float(slope), float(offset)
@@ -238,24 +235,22 @@ def _ranking(features: Array, reached: Array) -> Array:
     terms = products(features)
     middle, spread = terms.mean(0), terms.std(0) + 1e-9
     white = (terms - middle) / spread
-    weights = np.linalg.solve(
-        white.T @ white + RANK_RIDGE * np.eye(white.shape[1]), white.T @ (reached - reached.mean())
-    )
-    weights = weights / spread
+    normal = white.T @ white + RANK_RIDGE * np.eye(white.shape[1])
+    weights = np.linalg.solve(normal, white.T @ (reached - reached.mean())) / spread
     weights[0] += reached.mean() - middle @ weights  # the first product is one times one
     return np.asarray(weights)
 
 
 def _usual_outlines(pictures: Sequence[Labelled], rng: np.random.Generator) -> list[Contour]:
     """Outlines of wounds drawn at random, each by a few corners."""
-    found = []
+    outlines = []
     for number in rng.permutation(len(pictures)).tolist():
         outline = largest_outline(pictures[number].wound)
         if outline is not None and len(outline) > 4 * PATTERN_CORNERS:
-            found.append(outline[np.linspace(0, len(outline) - 1, PATTERN_CORNERS).astype(int)])
-        if len(found) == PATTERN_COUNT:
+            outlines.append(outline[np.linspace(0, len(outline) - 1, PATTERN_CORNERS).astype(int)])
+        if len(outlines) == PATTERN_COUNT:
             break
-    return found
+    return outlines
 
 
 def _filled(outline: Contour, shape: tuple[int, ...]) -> NDArray[np.bool_]:

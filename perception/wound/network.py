@@ -25,13 +25,12 @@ from perception.package_data import shipped_file
 
 Network = Callable[[NDArray[np.float32]], NDArray[np.float32]]  # (1, 3, H, W) RGB in 0..1 -> (1, 1, H, W) logits
 
-# The network halves its input five times.
-SIZE_STEP_PX = 32
+SIZE_STEP_PX = 32  # the network halves its input five times
 
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """How the two looks are taken; chosen on pictures that were neither trained on nor judged by."""
+    """How the two looks are taken; chosen on pictures that were neither trained on nor evaluated by."""
 
     long_side: int = 320  # px of the first look
     window: int = 192  # px, side of the second look; 0: there is none
@@ -43,8 +42,10 @@ class Looks:
 
 def wound_logits(picture: NDArray[np.uint8], network: Network, looks: Looks) -> NDArray[np.float32]:
     """(H, W) logits of "wound" for a picture (H, W, 3) RGB."""
-    first = _first_look(picture, network, looks)
-    box = _box_above(first, looks.found) if looks.window else None
+    scale = min(1.0, looks.long_side / max(picture.shape[:2]))  # a small piece, enlarged, is no whole picture
+    height, width = (max(SIZE_STEP_PX, SIZE_STEP_PX * round(side * scale / SIZE_STEP_PX)) for side in picture.shape[:2])
+    first = _look(picture, network, (height, width))
+    box = box_round(first > np.log(looks.found / (1 - looks.found))) if looks.window else None
     if box is None:
         return first
     rows, columns = window(box, picture.shape[:2], looks)
@@ -66,12 +67,6 @@ def window(box: NDArray[np.float64], size: tuple[int, int], looks: Looks) -> tup
     return spans[0], spans[1]
 
 
-def _first_look(picture: NDArray[np.uint8], network: Network, looks: Looks) -> NDArray[np.float32]:
-    scale = min(1.0, looks.long_side / max(picture.shape[:2]))  # a small piece, enlarged, is no whole picture
-    height, width = (max(SIZE_STEP_PX, SIZE_STEP_PX * round(side * scale / SIZE_STEP_PX)) for side in picture.shape[:2])
-    return _look(picture, network, (height, width))
-
-
 def _look(picture: NDArray[np.uint8], network: Network, size: tuple[int, int]) -> NDArray[np.float32]:
     """Logits at the picture's own size, seen at `size` (H, W)."""
     shrinks = picture.shape[0] > size[0]
@@ -81,10 +76,9 @@ def _look(picture: NDArray[np.uint8], network: Network, size: tuple[int, int]) -
     return np.asarray(cv2.resize(logits, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def _box_above(logits: NDArray[np.float32], probability: float) -> NDArray[np.float64] | None:
-    """Box [top, left, bottom, right] round everything above the probability; None where there is nothing."""
-    above = logits > np.log(probability / (1 - probability))
-    rows, columns = (np.flatnonzero(above.any(axis)) for axis in (1, 0))
+def box_round(mask: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+    """Box [top, left, bottom, right] round a mask (H, W); None where it is empty."""
+    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
     if len(rows) == 0:
         return None
     return np.array([rows[0], columns[0], rows[-1] + 1, columns[-1] + 1], np.float64)
@@ -99,19 +93,14 @@ OWN_NETWORK = "an ONNX file written by stillbed train"
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What was chosen with the network, on pictures it was not trained on and not judged by.
+    """What was chosen with the network, on pictures it was neither trained on nor evaluated by."""
 
-    looks: how it is shown a picture. edge: probability at a wound's edge. smallest: share of
-    the largest part's area below which another part is dropped. trust: confidence below which there is no wound.
-    slope, offset: of the logistic that turns the mean logit of the mask's pixels into a confidence.
-    """
-
-    looks: Looks = field(default_factory=Looks)
-    edge: float = 0.5
-    smallest: float = 0.02
-    trust: float = 0.5
-    slope: float = 1.0
-    offset: float = 0.0
+    looks: Looks = field(default_factory=Looks)  # how it is shown a picture
+    edge: float = 0.5  # probability at a wound's edge
+    smallest: float = 0.02  # share of the largest part's area below which another part is dropped
+    trust: float = 0.5  # confidence below which there is no wound
+    slope: float = 1.0  # of the logistic that turns the mean logit of the mask's pixels into a confidence
+    offset: float = 0.0  # of the same
 
 
 class WoundNetwork:
@@ -129,9 +118,7 @@ class WoundNetwork:
         try:
             self._session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's own classes share no base
-            raise InputError(
-                file, "network", str(error).splitlines()[0], "an ONNX file written by stillbed train"
-            ) from None
+            raise InputError(file, "network", str(error).splitlines()[0], OWN_NETWORK) from None
         self._input = self._session.get_inputs()[0].name
 
     def __call__(self, planes: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -144,16 +131,15 @@ def shipped_model(name: str = SHIPPED_MODEL, suffix: str = ".onnx") -> Path:
     return shipped_file("models", f"{name}{suffix}")
 
 
-def read_settings(file: Path, found: str) -> Settings:
-    """The settings of the network whose SHA-256 is `found`; InputError where they are missing or another network's."""
+def read_settings(file: Path, sha256: str) -> Settings:
+    """The settings of the network with this SHA-256; InputError where they are missing or another network's."""
     try:
         table = tomllib.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            file, "settings", str(error), "the TOML file that stillbed train writes beside a network"
-        ) from None
-    if table.get("sha256") != found:
-        raise InputError(file.with_suffix(".onnx"), "sha256", found, f"{table.get('sha256')}, as {file.name} says")
+        allowed = "the TOML file that stillbed train writes beside a network"
+        raise InputError(file, "settings", str(error), allowed) from None
+    if table.get("sha256") != sha256:
+        raise InputError(file.with_suffix(".onnx"), "sha256", sha256, f"{table.get('sha256')}, as {file.name} says")
     looks = Looks(**_checked_fields(file, Looks, table.get("looks", {})))
     plain = {key: value for key, value in table.items() if key not in ("sha256", "looks")}
     return Settings(looks=looks, **_checked_fields(file, Settings, plain))

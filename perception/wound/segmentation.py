@@ -18,10 +18,8 @@ from perception.lens import undistort
 from perception.wound.network import Network, Settings, wound_logits
 
 # A padded row is black but for what JPEG smears over its edge; a dark room still has sensor noise in most pixels.
-MAX_PADDING_GREY = 12
-MIN_LIT_SHARE = 0.02
-# What is left must still be a picture.
-MIN_PICTURE_SHARE = 0.3
+MAX_PADDING_GREY, MIN_LIT_SHARE = 12, 0.02
+MIN_PICTURE_SHARE = 0.3  # that must be left
 
 
 def picture_box(picture: NDArray[np.uint8]) -> tuple[slice, slice]:
@@ -48,12 +46,11 @@ WoundMask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segmentation:
-    """mask: (H, W) bool; all False where no wound was found. confidence: 0..1, that the mask is a wound; also where it
-    was too low for one. threshold: probability at which it was found, nan without."""
+    """The wound in one picture."""
 
-    mask: WoundMask
-    confidence: float
-    threshold: float
+    mask: WoundMask  # (H, W), all False where there is no wound
+    confidence: float  # 0..1, that the mask is a wound; also where it was too low for one
+    threshold: float  # probability by which it was segmented, nan without
 
     @property
     def found(self) -> bool:
@@ -89,10 +86,10 @@ class NetworkSegmenter:
 
 
 def segmentation_from_logits(logits: NDArray[np.float32], settings: Settings) -> Segmentation:
-    """The mask that (H, W) logits amount to.
+    """The wound by (H, W) logits.
 
     Where a threshold of 0.7, 0.6, ... 0.1 is first passed there is a wound, and it reaches as far as the probability
-    stays above `settings.edge` (or that threshold, if lower): the seed tells that there is one, not how large it is.
+    stays above `settings.edge` (or that threshold, if lower): the seed says that there is one, not how large it is.
     """
     for threshold in np.arange(MAX_THRESHOLD, MIN_THRESHOLD - THRESHOLD_STEP / 2, -THRESHOLD_STEP).tolist():
         seeds = logits > _logit(threshold)
@@ -101,9 +98,11 @@ def segmentation_from_logits(logits: NDArray[np.float32], settings: Settings) ->
         mask = seeded_parts(logits > _logit(min(threshold, settings.edge)), seeds, settings.smallest)
         if not mask.any():
             continue
-        confidence = confidence_of(logits, mask, settings)
-        kept = confidence >= settings.trust and mask.mean() <= MAX_WOUND_SHARE
-        return Segmentation(mask if kept else np.zeros_like(mask), confidence, threshold if kept else np.nan)
+        # a logistic of the mask's mean logit, fitted to pictures with and without a wound
+        mean = float(logits[mask].mean())
+        confidence = float(1 / (1 + np.exp(-(settings.slope * mean + settings.offset))))
+        accepted = confidence >= settings.trust and mask.mean() <= MAX_WOUND_SHARE
+        return Segmentation(mask if accepted else np.zeros_like(mask), confidence, threshold if accepted else np.nan)
     return Segmentation(np.zeros(logits.shape, bool), 0.0, np.nan)
 
 
@@ -115,20 +114,14 @@ def seeded_parts(mask: WoundMask, seeds: WoundMask, smallest: float) -> WoundMas
     seeded[0] = False
     if not seeded.any():
         return np.zeros_like(mask)
-    kept = seeded & (area >= max(MIN_PART_PIXELS, smallest * area[seeded].max()))
-    return np.asarray(kept[labels])
+    large = seeded & (area >= max(MIN_PART_PIXELS, smallest * area[seeded].max()))
+    return np.asarray(large[labels])
 
 
 def largest_part(mask: WoundMask) -> WoundMask:
     """The largest connected part of a mask (H, W)."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     return mask if count < 3 else np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])))
-
-
-def confidence_of(logits: NDArray[np.float32], mask: WoundMask, settings: Settings) -> float:
-    """0..1, that a mask is a wound: a logistic of its mean logit, fitted to pictures with and without one."""
-    mean = float(logits[mask].mean())
-    return float(1 / (1 + np.exp(-(settings.slope * mean + settings.offset))))
 
 
 def centroid(mask: WoundMask) -> Array:
@@ -148,33 +141,31 @@ def _logit(probability: float) -> float:
     return float(np.log(probability / (1 - probability)))
 
 
-def dice(found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
+def dice(mask: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
     """2 |A and B| / (|A| + |B|) of two masks (H, W); two empty masks agree: 1."""
-    total = int(found.sum()) + int(truth.sum())
-    return 2 * int((found & truth).sum()) / total if total else 1.0
+    total = int(mask.sum()) + int(truth.sum())
+    return 2 * int((mask & truth).sum()) / total if total else 1.0
 
 
 FOUND_COLOUR, TRUTH_COLOUR = (60, 220, 60), (255, 160, 40)  # BGR of the outlines
 TINT_SHARE = 0.25  # of the outline's colour inside it
 
 
-def draw_overlay(image: Image, found: Segmentation, truth: WoundMask | None = None, told: bool = True) -> Image:
-    """(H, W, 3) BGR: the wound's outline, the true outline where there is one, and in words how sure it is."""
+def draw_overlay(image: Image, wound: Segmentation, truth: WoundMask | None = None, captioned: bool = True) -> Image:
+    """(H, W, 3) BGR: the wound's outline, the true outline where there is one, and a caption with the confidence."""
     drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
-    inside = found.mask
+    inside = wound.mask
     drawn[inside] = ((1 - TINT_SHARE) * drawn[inside] + TINT_SHARE * np.array(FOUND_COLOUR)).astype(np.uint8)
     width = max(1, round(max(image.shape[:2]) / 500))
-    for mask, colour in ((truth, TRUTH_COLOUR), (found.mask, FOUND_COLOUR)):
+    for mask, colour in ((truth, TRUTH_COLOUR), (wound.mask, FOUND_COLOUR)):
         if mask is not None:
             outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
             cv2.drawContours(drawn, outlines, -1, colour, width)
-    if not told:
-        return np.asarray(drawn, np.uint8)
-    text = f"wound {found.confidence:.2f}" if found.found else f"no wound {found.confidence:.2f}"
-    scale = max(image.shape[:2]) / 1000
-    cv2.putText(
-        drawn, text, (8, int(8 + 28 * scale)), cv2.FONT_HERSHEY_SIMPLEX, scale, FOUND_COLOUR, max(1, round(2 * scale))
-    )
+    if captioned:
+        text = f"{'wound' if wound.found else 'no wound'} {wound.confidence:.2f}"
+        scale = max(image.shape[:2]) / 1000
+        place, weight = (8, int(8 + 28 * scale)), max(1, round(2 * scale))
+        cv2.putText(drawn, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, FOUND_COLOUR, weight)
     return np.asarray(drawn, np.uint8)
 
 
@@ -222,15 +213,14 @@ def area_on_plane(mask: WoundMask, camera: Camera, base_from_surface: Array) -> 
         places = _on_plane(contour.reshape(-1, 2).astype(float), camera, camera_from_surface)
         if not np.isfinite(places).all():
             return float("nan")
-        total += _enclosed(places) * _half_pixel(contour)
+        # the outline runs through the middles of the outermost pixels and leaves out half a pixel all round:
+        # by Pick's theorem, of a contour whose pixels are all listed, so much of its area
+        inner = cv2.contourArea(contour)
+        outer = inner + len(contour) / 2 + 1
+        x, y = places.T
+        area = float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)  # Gauss's formula
+        total += area * (outer / inner if inner else 1.0)
     return total
-
-
-def _half_pixel(contour: NDArray[np.int32]) -> float:
-    """What the outline through the outermost pixels' middles leaves out, as a factor: half a pixel all round."""
-    inner = cv2.contourArea(contour)
-    outer = inner + len(contour) / 2 + 1  # Pick's theorem: of a contour whose pixels are all listed
-    return outer / inner if inner else 1.0
 
 
 def _on_plane(pixels: Array, camera: Camera, camera_from_surface: Array) -> Array:
@@ -244,12 +234,6 @@ def _on_plane(pixels: Array, camera: Camera, camera_from_surface: Array) -> Arra
     return np.where(reach[:, None] > 0, origin[:2] + reach[:, None] * directions[:, :2], np.nan)
 
 
-def _enclosed(places: Array) -> float:
-    """Area of a closed polygon (N, 2) (Gauss's formula)."""
-    x, y = places.T
-    return float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)
-
-
 SHEET_COLUMNS = 8  # pictures a row; a row each of the best, the median and the worst
 SHEET_CELL_PX = 240  # px, side of a picture on the sheet
 SHEET_MARGIN_SHARE = 1.5  # of the wound's longer side that is shown beyond it on every side
@@ -257,11 +241,11 @@ SHEET_MARGIN_SHARE = 1.5  # of the wound's longer side that is shown beyond it o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedPicture:
-    """A picture (H, W, 3) BGR, what was found in it and the truth (H, W)."""
+    """A picture, the wound segmented in it and the true one."""
 
-    image: Image
+    image: Image  # (H, W, 3) BGR
     found: Segmentation
-    truth: WoundMask
+    truth: WoundMask  # (H, W)
 
     @property
     def dice(self) -> float:
@@ -274,11 +258,8 @@ def contact_sheet(shown: Sequence[JudgedPicture]) -> Image:
     order = sorted(shown, key=lambda each: -each.dice)
     middle = max(0, (len(order) - SHEET_COLUMNS) // 2)
     rows = (order[:SHEET_COLUMNS], order[middle : middle + SHEET_COLUMNS], order[-SHEET_COLUMNS:])
-    return np.vstack([np.hstack([_cell(each) for each in _padded(row)]) for row in rows])
-
-
-def _padded(row: Sequence[JudgedPicture]) -> list[JudgedPicture]:
-    return [*row, *[row[-1]] * (SHEET_COLUMNS - len(row))]
+    padded = [[*row, *[row[-1]] * (SHEET_COLUMNS - len(row))] for row in rows]
+    return np.vstack([np.hstack([_cell(each) for each in row]) for row in padded])
 
 
 def _cell(shown: JudgedPicture) -> Image:
@@ -292,13 +273,12 @@ def _cell(shown: JudgedPicture) -> Image:
 
 def _square(mask: WoundMask) -> tuple[slice, slice]:
     """Rows and columns of a square round a mask, inside the picture; of its middle where the mask is empty."""
-    least = min(mask.shape)
     rows, columns = np.nonzero(mask)
     if not len(rows):
-        rows, columns, extent = np.array([mask.shape[0] // 2]), np.array([mask.shape[1] // 2]), least
+        rows, columns, extent = np.array([mask.shape[0] // 2]), np.array([mask.shape[1] // 2]), min(mask.shape)
     else:
         extent = max(int(np.ptp(rows)), int(np.ptp(columns)), 16)
-    side = min(least, int((1 + 2 * SHEET_MARGIN_SHARE) * extent))
+    side = min(*mask.shape, int((1 + 2 * SHEET_MARGIN_SHARE) * extent))
     spans = []
     for places, full in ((rows, mask.shape[0]), (columns, mask.shape[1])):
         start = int(np.clip((places.min() + places.max()) // 2 - side // 2, 0, full - side))

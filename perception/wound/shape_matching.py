@@ -41,21 +41,19 @@ MAX_LOG_AREA_RATIO = 2.5  # the logarithm of two areas' ratio beyond which more 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmallPicture:
-    """A picture made small. lab: (H, W, 3) CIE Lab, blurred by a pixel. odds: (H, W) log odds of the wound's colours.
-    scale: px of it per px of the picture."""
+    """A picture made small."""
 
-    lab: NDArray[np.float32]
-    odds: NDArray[np.float32]
-    scale: float
+    lab: NDArray[np.float32]  # (H, W, 3) CIE Lab, blurred by a pixel
+    odds: NDArray[np.float32]  # (H, W) log odds of the wound's colours
+    scale: float  # px of it per px of the picture
 
 
 def small_picture(picture: NDArray[np.uint8], weights: Array) -> SmallPicture:
     """What outlines are looked for in. picture: (H, W, 3) RGB. weights: (COLOUR_TERMS,) of the log odds."""
     scale = min(1.0, SMALL_SIDE_PX / max(picture.shape[:2]))
-    seen = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    lab = np.asarray(
-        cv2.GaussianBlur(cv2.cvtColor(seen, cv2.COLOR_RGB2LAB).astype(np.float32), (0, 0), 1.0), np.float32
-    )
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    colours = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)
+    lab = np.asarray(cv2.GaussianBlur(colours, (0, 0), 1.0), np.float32)
     return SmallPicture(lab, np.asarray(colour_terms(lab) @ weights, np.float32), scale)
 
 
@@ -73,30 +71,26 @@ def find_outlines(scene: SmallPicture) -> list[Contour]:
     maps = [(scene.odds, ODDS_LEVELS)]
     for value, shares in ((red, REDNESS_PERCENTILES), (-light, DARKNESS_PERCENTILES), (yellow, YELLOWNESS_PERCENTILES)):
         maps.append((np.asarray(value), np.percentile(value, shares)))
-    found: list[Contour] = []
+    outlines: list[Contour] = []
     for value, levels in maps:
         for level in levels:
             above = (value > level).astype(np.uint8)
             for mask in (above, cv2.morphologyEx(above, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))):
-                seen, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-                found += [np.asarray(each, np.int32) for each in seen]
-    return [c for c in found if MIN_OUTLINE_AREA_PX <= cv2.contourArea(c) <= MAX_OUTLINE_SHARE * scene.odds.size]
+                contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+                outlines += [np.asarray(each, np.int32) for each in contours]
+    return [c for c in outlines if MIN_OUTLINE_AREA_PX <= cv2.contourArea(c) <= MAX_OUTLINE_SHARE * scene.odds.size]
 
 
 def outline_features(scene: SmallPicture, contour: Contour, patterns: Sequence[Contour], area: float | None) -> Array:
-    """(FEATURES,) colour inside and around, compactness, size, place, and how unlike the most alike pattern it is.
+    """(OUTLINE_FEATURES,) colour inside and around, compactness, size, place, and distances to the nearest pattern.
 
     area: px^2 of the picture that the wound should cover, None where nobody knows.
     """
     x, y, width, height = cv2.boundingRect(contour)
     reach = max(3, int(RING_SHARE * max(width, height)))
     rows, columns = scene.odds.shape
-    x0, y0, x1, y1 = (
-        max(0, x - reach),
-        max(0, y - reach),
-        min(columns, x + width + reach),
-        min(rows, y + height + reach),
-    )
+    x0, x1 = max(0, x - reach), min(columns, x + width + reach)
+    y0, y1 = max(0, y - reach), min(rows, y + height + reach)
     filled = np.zeros((y1 - y0, x1 - x0), np.uint8)
     cv2.drawContours(filled, [contour - np.array([[x0, y0]], np.int32)], -1, 1, -1)
     wide = np.asarray(cv2.dilate(filled, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)), np.uint8)
@@ -105,39 +99,27 @@ def outline_features(scene: SmallPicture, contour: Contour, patterns: Sequence[C
     hull = max(cv2.contourArea(cv2.convexHull(contour)), 1.0)
     cut = x <= 1 or y <= 1 or x + width >= columns - 1 or y + height >= rows - 1
     away = np.hypot((x + width / 2) / columns - 0.5, (y + height / 2) / rows - 0.5)
-    shape = (
-        covered / hull,
-        4 * np.pi * covered / max(length, 1.0) ** 2,
-        np.log(covered / scene.odds.size),
-        float(cut),
-        away,
-    )
-    size = (
-        0.0
-        if area is None
-        else np.clip(np.log(covered / (area * scene.scale**2)), -MAX_LOG_AREA_RATIO, MAX_LOG_AREA_RATIO)
-    )
-    return np.array(
-        [*inside, *ring, inside[0] - ring[0], *shape, *_shape_distances(contour, patterns), size, abs(size)]
-    )
+    compactness = 4 * np.pi * covered / max(length, 1.0) ** 2
+    shape = covered / hull, compactness, np.log(covered / scene.odds.size), float(cut), away
+    ratio = 0.0 if area is None else np.log(covered / (area * scene.scale**2))
+    size = np.clip(ratio, -MAX_LOG_AREA_RATIO, MAX_LOG_AREA_RATIO)
+    # the square root of the least distance to any pattern, by each of OpenCV's three measures of Hu moments
+    scores = [[cv2.matchShapes(contour, pattern, method, 0.0) for method in SHAPE_DISTANCES] for pattern in patterns]
+    least = np.min(scores, axis=0) if scores else np.full(3, MAX_SHAPE_DISTANCE)
+    distances = np.sqrt(np.minimum(least, MAX_SHAPE_DISTANCE))
+    return np.array([*inside, *ring, inside[0] - ring[0], *shape, *distances, size, abs(size)])
 
 
 def _means(
     scene: SmallPicture, part: tuple[slice, slice], inside: NDArray[np.uint8], ring: NDArray[np.uint8]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Mean log odds and mean colour inside an outline and in the ring around it."""
     odds, lab = scene.odds[part], scene.lab[part]
-    found = []
+    means = []
     for mask in (inside, ring if ring.any() else inside):
         level = cv2.mean(odds, mask)[0]
-        found.append((level, *(value / 64 - 2 for value in cv2.mean(lab, mask)[:3])))
-    return found[0], found[1]
-
-
-def _shape_distances(contour: Contour, patterns: Sequence[Contour]) -> Array:
-    """(3,) root of the least matchShapes score of any pattern, by each of OpenCV's three measures of Hu moments."""
-    scores = [[cv2.matchShapes(contour, pattern, method, 0.0) for method in SHAPE_DISTANCES] for pattern in patterns]
-    least = np.min(scores, axis=0) if scores else np.full(3, MAX_SHAPE_DISTANCE)
-    return np.asarray(np.sqrt(np.minimum(least, MAX_SHAPE_DISTANCE)))
+        means.append((level, *(value / 64 - 2 for value in cv2.mean(lab, mask)[:3])))
+    return means[0], means[1]
 
 
 THRESHOLD_BLOCK_PX, THRESHOLD_OFFSET = 11, 2  # of the adaptive threshold, thesis 3.2
@@ -150,15 +132,13 @@ RANK_TERMS = (OUTLINE_FEATURES + 1) * (OUTLINE_FEATURES + 2) // 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapeModel:
-    """What was learned from labelled pictures. colour: (COLOUR_TERMS,) log odds of the wound's colours. rank: (TERMS,)
-    expected Dice of an outline, by products of what describes it, against a scan's outline and size; rank_usual: the
-    same against usual shapes. trust: expected Dice below which there is no wound. patterns: the usual shapes."""
+    """What was learned from labelled pictures."""
 
-    colour: Array
-    rank: Array
-    rank_usual: Array
-    trust: float
-    patterns: tuple[Contour, ...]
+    colour: Array  # (COLOUR_TERMS,) weights of the log odds of the wound's colours
+    rank: Array  # (RANK_TERMS,) weights of the expected Dice of an outline, against a scan's outline and size
+    rank_usual: Array  # (RANK_TERMS,) the same, against usual shapes
+    trust: float  # expected Dice below which there is no wound
+    patterns: tuple[Contour, ...]  # the usual shapes
 
 
 class ShapeSegmenter:
@@ -176,29 +156,23 @@ class ShapeSegmenter:
         colour = rgb(image)
         box = picture_box(colour)
         scene = small_picture(colour[box], self._model.colour)
-        found = find_outlines(scene)
+        outlines = find_outlines(scene)
         mask = np.zeros(image.shape[:2], bool)
-        if not found:
+        if not outlines:
             return Segmentation(mask, 0.0, np.nan)
-        expected = expected_dice(
-            np.array([outline_features(scene, each, self._patterns, self._area) for each in found]), self._rank
-        )
+        features = [outline_features(scene, outline, self._patterns, self._area) for outline in outlines]
+        expected = products(np.array(features)) @ self._rank  # (N,) Dice
         best = int(np.argmax(expected))
         confidence = float(np.clip(expected[best], 0, 1))
         if confidence < self._model.trust:
             return Segmentation(mask, confidence, np.nan)
-        small = refine_outline(scene.lab, found[best])
+        small = refine_outline(scene.lab, outlines[best])
         mask[box] = cv2.resize(small.astype(np.float32), colour[box].shape[1::-1]) > 0.5
         return Segmentation(mask, confidence, np.nan)
 
 
-def expected_dice(features: Array, rank: Array) -> Array:
-    """(N,) expected Dice of outlines described by (N, FEATURES)."""
-    return np.asarray(products(features) @ rank)
-
-
 def products(features: Array) -> Array:
-    """(N, TERMS) all products of two of (N, FEATURES) features and one."""
+    """(N, RANK_TERMS) all products of two of (N, OUTLINE_FEATURES) features and one."""
     full = np.column_stack([np.ones(len(features)), features])
     first, second = np.triu_indices(full.shape[1])
     return np.asarray(full[:, first] * full[:, second])
@@ -217,9 +191,11 @@ def refine_outline(lab: NDArray[np.float32], contour: Contour) -> WoundMask:
         return filled > 0
     x, y, width, height = cv2.boundingRect(possible)
     part = np.s_[max(0, y - height) : y + 2 * height, max(0, x - width) : x + 2 * width]
-    seen, state = np.ascontiguousarray(np.clip(lab[part], 0, 255).astype(np.uint8)), np.ascontiguousarray(labels[part])
+    colours = np.ascontiguousarray(np.clip(lab[part], 0, 255).astype(np.uint8))
+    state = np.ascontiguousarray(labels[part])
     cv2.setRNGSeed(0)
-    cv2.grabCut(seen, state, (0, 0, 1, 1), np.zeros((1, 65)), np.zeros((1, 65)), GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
+    background, foreground = np.zeros((1, 65)), np.zeros((1, 65))  # colour models, filled by OpenCV
+    cv2.grabCut(colours, state, (0, 0, 1, 1), background, foreground, GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
     filled[part] = np.isin(state, (cv2.GC_FGD, cv2.GC_PR_FGD))
     return filled > 0
 
@@ -229,9 +205,9 @@ def thesis_mask(image: Image, pattern: Contour) -> WoundMask:
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     kind = cv2.ADAPTIVE_THRESH_GAUSSIAN_C
     threshold = cv2.adaptiveThreshold(grey, 255, kind, cv2.THRESH_BINARY, THRESHOLD_BLOCK_PX, THRESHOLD_OFFSET)
-    found, _ = cv2.findContours(threshold, cv2.RETR_TREE, cv2.CHAIN_APPROX_SIMPLE)
+    contours, _ = cv2.findContours(threshold, cv2.RETR_TREE, cv2.CHAIN_APPROX_SIMPLE)
     mask = np.zeros(grey.shape, np.uint8)
-    likely = [c for c in found if cv2.contourArea(c) > MIN_CONTOUR_AREA_PX]
+    likely = [c for c in contours if cv2.contourArea(c) > MIN_CONTOUR_AREA_PX]
     if likely:
         best = min(likely, key=lambda c: cv2.matchShapes(c, pattern, cv2.CONTOURS_MATCH_I1, 0.0))
         cv2.drawContours(mask, [best], -1, 1, -1)
@@ -240,8 +216,8 @@ def thesis_mask(image: Image, pattern: Contour) -> WoundMask:
 
 def largest_outline(mask: WoundMask) -> Contour | None:
     """The outline of the largest part of a mask (H, W); None of an empty one."""
-    found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return np.asarray(max(found, key=cv2.contourArea), np.int32) if found else None
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return np.asarray(max(contours, key=cv2.contourArea), np.int32) if contours else None
 
 
 def scan_outline(scan: Scan, layers: int = SCAN_LAYERS) -> tuple[Contour, float]:
