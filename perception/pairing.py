@@ -40,8 +40,7 @@ def frame_period(stamps: Sequence[Array]) -> float:
     The median tolerates the loss of fewer than half of a camera's frames, the minimum a camera that loses more or runs
     slower.
     """
-    steps = [float(np.median(np.diff(s))) for s in stamps if len(s) > 1]
-    return min(steps, default=DEFAULT_PERIOD)
+    return min((float(np.median(np.diff(s))) for s in stamps if len(s) > 1), default=DEFAULT_PERIOD)
 
 
 def pairing_tolerance(period: float) -> float:
@@ -162,9 +161,8 @@ class Pairing:
         self._open.sort(key=lambda group: group.first)
 
     def _is_finished(self, group: _OpenSet, now: float) -> bool:
-        return now >= group.until or not any(
-            self._may_come(group, camera, now) for camera in range(len(self._last_stamp)) if camera not in group.frames
-        )
+        missing = [camera for camera in range(len(self._last_stamp)) if camera not in group.frames]
+        return now >= group.until or not any(self._may_come(group, camera, now) for camera in missing)
 
     def _may_come(self, group: _OpenSet, camera: int, now: float) -> bool:
         arrival = self._last_arrival[camera]

@@ -103,8 +103,7 @@ def _smooth(points: Array, neighbours: int = 8) -> NDArray[np.bool_]:
         index = np.nonzero(keep)[0]
         if len(index) < neighbours + 2:
             return keep
-        tree = cKDTree(points[index])
-        distance, near = tree.query(points[index], k=neighbours + 1)
+        distance, near = cKDTree(points[index]).query(points[index], k=neighbours + 1)
         median = np.median(points[index][near[:, 1:]], axis=1)
         away = np.linalg.norm(points[index] - median, axis=1)
         limit = 3.0 * np.median(distance[:, -1]) + 1e-6

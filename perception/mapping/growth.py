@@ -248,8 +248,7 @@ class Probation:
 
         Landmarks of one camera alone are improved by it: where the surface has turned, in depth.
         """
-        matcher = Matcher(lenses, self.map, self.new.templates)
-        tracks = matcher.align(stamp, pyramids, single)
+        tracks = Matcher(lenses, self.map, self.new.templates).align(stamp, pyramids, single)
         where, rest = np.zeros((2, len(tracks), 2))
         jacobians = np.zeros((len(tracks), 2, 6))
         for c in np.unique(tracks.camera):

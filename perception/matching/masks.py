@@ -59,8 +59,7 @@ class Ink:
 
 def near_bead(points: Array, bead: Array, reach: Array) -> NDArray[np.bool_]:
     """Which points (N, 3) lie within BEAD_REACH_MM and their own reach (N,) of a bead's points (M, 3), all mm."""
-    away = np.linalg.norm(points[:, None] - bead, axis=2).min(1)
-    return np.asarray(away < BEAD_REACH_MM + reach)
+    return np.asarray(np.linalg.norm(points[:, None] - bead, axis=2).min(1) < BEAD_REACH_MM + reach)
 
 
 RING_ANGLES = np.linspace(0, 2 * np.pi, 13)[:-1]

@@ -127,8 +127,7 @@ def _copy(picture: NDArray[np.uint8]) -> NDArray[np.float64]:
 def _turned(copies: NDArray[np.float64], turn: int) -> NDArray[np.float64]:
     """The copies under one of the eight symmetries of the square."""
     square = copies.reshape(-1, COPY_SIDE_PX, COPY_SIDE_PX, 3)
-    mirrored = square[:, :, ::-1] if turn & 4 else square
-    return np.rot90(mirrored, turn & 3, (1, 2)).reshape(len(copies), -1)
+    return np.rot90(square[:, :, ::-1] if turn & 4 else square, turn & 3, (1, 2)).reshape(len(copies), -1)
 
 
 def _features(picture: NDArray[np.uint8]) -> Features:

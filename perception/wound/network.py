@@ -71,8 +71,7 @@ def _look(picture: NDArray[np.uint8], network: Network, size: tuple[int, int]) -
     """Logits at the picture's own size, seen at `size` (H, W)."""
     shrinks = picture.shape[0] > size[0]
     seen = cv2.resize(picture, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    planes = np.ascontiguousarray(seen.transpose(2, 0, 1)[None], np.float32) / np.float32(255)
-    logits = network(planes)[0, 0]
+    logits = network(np.ascontiguousarray(seen.transpose(2, 0, 1)[None], np.float32) / np.float32(255))[0, 0]
     return np.asarray(cv2.resize(logits, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 

@@ -105,8 +105,7 @@ def bend_radii(runs: BeadPoints) -> Array:
     into = np.r_[step[:1], step[:-1]]
     turn = np.abs(np.arctan2(into[:, 0] * step[:, 1] - into[:, 1] * step[:, 0], (into * step).sum(axis=1)))
     reach = (np.hypot(*into.T) + np.hypot(*step.T)) / 2
-    radius = reach / np.maximum(turn, 1e-9)
-    return np.where(runs.first | runs.last, np.inf, radius)
+    return np.where(runs.first | runs.last, np.inf, reach / np.maximum(turn, 1e-9))
 
 
 @dataclass(frozen=True, slots=True)

@@ -225,8 +225,7 @@ def _levelled(points: Array, faces: Index, normal: Array) -> tuple[Array, int]:
 
 def _around(heights: Array, start: Index, end: Index) -> tuple[Array, Array, Array]:
     """Second lowest, second highest and median height (V,) of each vertex's neighbours; its own where there are few."""
-    order = np.lexsort((heights[end], start))
-    sorted_heights = heights[end][order]
+    sorted_heights = heights[end][np.lexsort((heights[end], start))]
     count = np.bincount(start, minlength=len(heights))
     first = np.cumsum(count) - count
     many = count >= 4

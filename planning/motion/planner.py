@@ -44,7 +44,7 @@ RENEW_BEFORE_END = 0.5  # s left of a horizon when the next is timed: the surfac
 PATH_END_TOLERANCE = 1e-3  # mm of a path that count as none: along 20 nm, as a stop once left, no timing exists
 PAUSED = "paused"
 STALL_TICKS = 3.0  # ticks without a call after which the arm has come to rest by itself
-MAX_SENT_MOVES = 64  # moves kept: a second of them, more than an arm is sent before they are called back
+MAX_SENT_MOVES = 64  # a second of them, more than an arm is sent before they are called back
 POSE_LIMIT_FRACTION = 0.98  # of the guard's limits for a pose: the planner brakes before the guard would refuse
 
 
