@@ -90,9 +90,9 @@ class Mapping:
         self._offered: tuple[TrackedSet, bool] | None = None  # the last frame set, and whether the map may learn of it
 
     def start(self, frames: FrameSet, pyramids: dict[int, Pyramid]) -> tuple[Matcher, SurfacePose, TrackedSet] | str:
-        """Begin with a first map of what these images (by camera) show; or the reason why there is none yet.
+        """Begin with a first map of these images (by camera): its matcher, its pose, and the frame set tracked with it.
 
-        Its matcher, its pose, and the frame set as it is tracked with it.
+        A str says why there is no map yet.
         """
         first = self._first_map(frames, pyramids)
         if isinstance(first, str):
@@ -133,7 +133,7 @@ class Mapping:
     def align_and_fit(
         self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array], start: Array
     ) -> TrackedSet:
-        """Align images (by camera) from far, each from a pose (4, 4) of its own, and fit from `start` (4, 4)."""
+        """Align images (by camera), each begun at a pose (4, 4) of its own, coarsely first; fit from `start` (4, 4)."""
         observations = self._matcher.align(stamp, pyramids, poses, coarse=True)
         return TrackedSet(self._estimator.fit(observations, start), observations, pyramids)
 

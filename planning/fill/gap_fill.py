@@ -27,7 +27,7 @@ MAX_GAP_DEPTH = 0.2  # spacings beyond a bead's edge up to which gaps are looked
 GAP_SAMPLES = 12  # places in that
 MIN_GAP = 0.0015  # spacings squared: a smaller gap is none
 MAX_DOUBLE = 0.045  # of the area: a tenth under the 5 % that may be laid twice, as it is estimated from the gaps alone
-# gap area that an area laid twice is worth; each is tried where with the one before too much is laid twice
+# of area laid twice, in area of gaps; the next one is tried where with this one too much is laid twice
 OVERLAP_PRICES = (0.0, 0.25, 0.5, 1.0, 2.0)
 SMOOTHING_KERNEL = np.array([1.0, 2.0, 1.0]) / 4  # weights over neighbours: else the way turns sharply
 
