@@ -251,7 +251,7 @@ def test_extruding_without_a_target_is_told_and_not_near() -> None:
     path = straight()
     log = without_target(nozzle_log(path), slice(1000, 1100))
     _, figures = judged(log, path)
-    assert figures.untold == pytest.approx(0.1)
+    assert figures.without_target == pytest.approx(0.1)
     assert figures.near == pytest.approx(1 - 100 / len(log))
     assert figures.position.max < 1e-9
 

@@ -35,46 +35,39 @@ class Spread:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseErrors:
-    """Errors of the measured poses that have a true one beside them, under one constant surface transform.
+    """Errors of the measured poses that have a true one beside them, under one constant surface transform."""
 
-    truth_surface_from_estimated_surface: (4, 4). translation: (M,) mm, of the estimated surface's origin in base.
-    rotation: (M,) rad. nees: (M,) normalised estimation error squared; its mean is 6 for an honest covariance; NaN
-    where there is no finite covariance.
-    """
-
-    truth_surface_from_estimated_surface: Array
-    translation: Array
-    rotation: Array
-    nees: Array
+    truth_surface_from_estimated_surface: Array  # (4, 4)
+    translation: Array  # (M,) mm, of the estimated surface's origin in base
+    rotation: Array  # (M,) rad
+    nees: Array  # (M,) normalised estimation error squared, mean 6 for an honest covariance; NaN without a finite one
 
     @property
     def mean_nees(self) -> float:
         """Mean NEES of the poses that have a covariance; NaN without any."""
-        known = self.nees[np.isfinite(self.nees)]
-        return float(known.mean()) if len(known) else float("nan")
+        return float(self._finite_nees.mean()) if len(self._finite_nees) else float("nan")
 
     @property
     def nees_inside(self) -> float:
         """Share of those poses whose NEES is inside the 95 % bound; NaN without any."""
-        known = self.nees[np.isfinite(self.nees)]
-        return float(np.mean(known <= NEES_BOUND)) if len(known) else float("nan")
+        return float(np.mean(self._finite_nees <= NEES_BOUND)) if len(self._finite_nees) else float("nan")
+
+    @property
+    def _finite_nees(self) -> Array:
+        return self.nees[np.isfinite(self.nees)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """A run beside a truth. rows: (M,) of the run; expected: (M, 4, 4) the truth's poses there; both error kinds.
+    """A run beside a truth."""
 
-    exact: whether the truth is one (NEES means something) or a measured reference. off: measured rows in state TRACKING
-    whose start error passes MAX_TRACKING_ERROR_MM. stamp_gap: s, median distance of the associated stamps.
-    """
-
-    rows: NDArray[np.int64]
-    expected: Array
+    rows: NDArray[np.int64]  # (M,) of the run
+    expected: Array  # (M, 4, 4) the truth's poses there
     start: PoseErrors
     aligned: PoseErrors
-    exact: bool
-    off: NDArray[np.int64]
-    stamp_gap: float
+    exact: bool  # whether the truth is one (NEES means something) or a measured reference
+    off: NDArray[np.int64]  # measured rows in state TRACKING whose start error passes MAX_TRACKING_ERROR_MM
+    stamp_gap: float  # s, median distance of the associated stamps
 
 
 def spread(errors: Array) -> Spread:
@@ -116,15 +109,9 @@ def compare(table: PoseTable, truth: Trajectory) -> Comparison | None:
     first = int(np.argmax(tracking))  # 0 where none is
     start = errors_under(changes[first], expected, estimate, covariance)
     aligned = errors_under(best_constant(changes), expected, estimate, covariance)
-    return Comparison(
-        rows=rows,
-        expected=expected,
-        start=start,
-        aligned=aligned,
-        exact=truth.exact,
-        off=rows[tracking & (start.translation > MAX_TRACKING_ERROR_MM)],
-        stamp_gap=float(np.median(np.abs(table.stamps[rows] - truth.stamps[true_rows]))),
-    )
+    off = rows[tracking & (start.translation > MAX_TRACKING_ERROR_MM)]
+    stamp_gap = float(np.median(np.abs(table.stamps[rows] - truth.stamps[true_rows])))
+    return Comparison(rows, expected, start, aligned, truth.exact, off, stamp_gap)
 
 
 def best_constant(changes: Array) -> Array:
@@ -144,30 +131,22 @@ def errors_under(constant: Array, expected: Array, estimate: Array, covariance: 
     nees = np.full(len(estimate), np.nan)
     information = np.linalg.pinv(covariance[usable], hermitian=True)
     nees[usable] = np.einsum("ni,nij,nj->n", difference[usable], information, difference[usable])
-    return PoseErrors(
-        truth_surface_from_estimated_surface=constant,
-        translation=np.linalg.norm(estimate[:, :3, 3] - target[:, :3, 3], axis=-1),
-        rotation=np.linalg.norm(difference[:, :3], axis=-1),
-        nees=nees,
-    )
+    translation = np.linalg.norm(estimate[:, :3, 3] - target[:, :3, 3], axis=-1)
+    return PoseErrors(constant, translation, np.linalg.norm(difference[:, :3], axis=-1), nees)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Latency:
-    """Milliseconds per stage. stages: S + 1 names, the last "total". p50, p95, p99, max: (S + 1,) after initialisation.
+    """Milliseconds per stage."""
 
-    initialisation: ms of all frame sets up to and including the first that left INITIALISING; initial_sets: how many.
-    total: (N,) ms of each later frame set.
-    """
-
-    stages: tuple[str, ...]
-    p50: Array
+    stages: tuple[str, ...]  # S + 1 names, the last "total"
+    p50: Array  # (S + 1,) after initialisation, like the next three
     p95: Array
     p99: Array
     max: Array
-    initialisation: float
-    initial_sets: int
-    total: Array
+    initialisation: float  # ms of all frame sets up to and including the first that left INITIALISING
+    initial_sets: int  # how many those are
+    total: Array  # (N,) ms of each later frame set
 
 
 def latency(table: PoseTable) -> Latency:
@@ -193,22 +172,17 @@ def state_shares(table: PoseTable, since: float = -np.inf) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """All that the report says about one run.
+    """All that the report says about one run."""
 
-    title: the session's name. comparison: None without truth or reference. shares: per state, of the frame sets from
-    `since` (s) on. complete: whether the session was run to its end. damage: what was lost of its file, "" if nothing.
-    method: how it was tracked, a key of hardware.offline.track.TRACKING_METHODS or "truth", "" where that is not known.
-    """
-
-    title: str
+    title: str  # the session's name
     table: PoseTable
-    comparison: Comparison | None
+    comparison: Comparison | None  # None without truth or reference
     latency: Latency
-    shares: dict[str, float]
-    since: float
-    complete: bool
-    damage: str
-    method: str = ""
+    shares: dict[str, float]  # per state, of the frame sets from `since` on
+    since: float  # s
+    complete: bool  # whether the session was run to its end
+    damage: str  # what was lost of its file, "" if nothing
+    method: str = ""  # a key of hardware.offline.track.TRACKING_METHODS or "truth", "" where it is not known
 
 
 def evaluate(

@@ -64,7 +64,7 @@ def _tiles(result: Evaluation) -> str:
     return row_of_tiles(tiles)
 
 
-def _span(stamps: Array) -> tuple[float, float]:
+def time_range(stamps: Array) -> tuple[float, float]:
     """First and last of the stamps (s), never equal."""
     low, high = (float(stamps[0]), float(stamps[-1])) if len(stamps) else (0.0, 1.0)
     return low, high if high > low else low + 1.0
@@ -74,7 +74,7 @@ def _followed(result: Evaluation) -> tuple[float, float]:
     """First and last instant (s) from the first map on; of the whole run where there never was one."""
     stamps = result.table.stamps
     later = stamps[~result.table.is_state(TrackState.INITIALISING)]
-    return _span(later if len(later) else stamps)
+    return time_range(later if len(later) else stamps)
 
 
 def _states(result: Evaluation) -> str:
@@ -82,10 +82,9 @@ def _states(result: Evaluation) -> str:
     if not len(table):
         return section("States", "No frame set was given.", "")
     last = table.stamps[-1] + (np.median(np.diff(table.stamps)) if len(table) > 1 else 1.0)
-    edges = np.append(table.stamps, last)
     names = [state.value for state in table.states]
     titles = [f"{s:.2f} s: {n}. {why}" for s, n, why in zip(table.stamps, names, table.reasons, strict=True)]
-    strip = ribbon(edges, names, titles, _span(table.stamps), PAGE_CHART_WIDTH)
+    strip = ribbon(np.append(table.stamps, last), names, titles, time_range(table.stamps), PAGE_CHART_WIDTH)
     keys = [area_key(name, f"{name} {percent(share)}") for name, share in result.shares.items() if share > 0]
     text = "TRACKING and DEGRADED are measured, COASTING is predicted, LOST is of no use."
     if math.isfinite(result.since):
@@ -107,12 +106,6 @@ def _events(result: Evaluation) -> str:
     return f"<details><summary>{len(changes)} states in a row, and why</summary><table>{rows}</table>{rest}</details>"
 
 
-def _drawn(result: Evaluation) -> Array:
-    """(N,) 1 where a pose is worth drawing, NaN where it is not: before there is a map, and when lost."""
-    hidden = result.table.is_state(TrackState.INITIALISING) | result.table.is_state(TrackState.LOST)
-    return np.where(hidden, np.nan, 1.0)
-
-
 def components(poses: Array, origin: Array) -> Array:
     """(N, 6): x y z in base, mm, and the rotation vector against `origin` (4, 4), degrees."""
     turns = se3.log_rotation(origin[:3, :3].T @ poses[:, :3, :3])
@@ -129,35 +122,30 @@ def deviations(poses: Array, covariance: Array) -> Array:
 
 
 def _trajectory(result: Evaluation) -> str:
-    table = result.table
-    drawn = _drawn(result)
-    if not np.isfinite(drawn).any():
+    table, comparison = result.table, result.comparison
+    hidden = table.is_state(TrackState.INITIALISING) | table.is_state(TrackState.LOST)  # no map yet, or no use
+    if hidden.all():
         return ""
-    origin = table.base_from_surface[int(np.flatnonzero(np.isfinite(drawn))[0])]
-    values = components(table.base_from_surface, origin) * drawn[:, None]
-    sigma = 2 * deviations(table.base_from_surface, table.covariance) * drawn[:, None]
-    truth = None
-    if result.comparison is not None:
-        target = result.comparison.expected @ result.comparison.start.truth_surface_from_estimated_surface
-        truth = np.full((len(table), 6), np.nan)
-        truth[result.comparison.rows] = components(target, origin)
+    origin = table.base_from_surface[int(np.argmin(hidden))]
+    values = components(table.base_from_surface, origin)
+    sigma = 2 * deviations(table.base_from_surface, table.covariance)
+    values[hidden], sigma[hidden] = np.nan, np.nan
+    keys, truth = [line_key("estimate", "estimate, with two standard deviations")], np.full((len(table), 6), np.nan)
+    if comparison is not None:
+        target = comparison.expected @ comparison.start.truth_surface_from_estimated_surface
+        truth[comparison.rows] = components(target, origin)
+        keys.append(line_key("truth", "truth" if comparison.exact else "reference"))
     names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
     plots = []
-    for i, name in enumerate(names):
-        seen = [values[:, i]] if truth is None else [values[:, i], truth[:, i]]
-        plot = Plot(HALF_CHART_WIDTH, 165, _followed(result), spanning(seen, 0.12, 0.5), label=name)
-        plot.band(table.stamps, values[:, i] - sigma[:, i], values[:, i] + sigma[:, i], "spread")
-        if truth is not None:
-            plot.line(table.stamps, truth[:, i], "truth")
-        plot.line(table.stamps, values[:, i], "estimate")
+    for name, value, two_sigma, true_value in zip(names, values.T, sigma.T, truth.T, strict=True):
+        plot = Plot(HALF_CHART_WIDTH, 165, _followed(result), spanning([value, true_value], 0.12, 0.5), label=name)
+        plot.band(table.stamps, value - two_sigma, value + two_sigma, "spread")
+        plot.line(table.stamps, true_value, "truth")
+        plot.line(table.stamps, value, "estimate")
         plots.append(plot.svg())
-    pairs = [plots[i] for i in (0, 3, 1, 4, 2, 5)]
-    keys = [line_key("estimate", "estimate, with two standard deviations")]
-    if result.comparison is not None:
-        keys.append(line_key("truth", "truth" if result.comparison.exact else "reference"))
-    body = f'{legend(keys)}<div class="two">{"".join(pairs)}</div>'
+    pairs = "".join(plots[i] for i in (0, 3, 1, 4, 2, 5))
     text = "Position of the surface's origin in base, and its rotation since the first pose. Time in s."
-    return section("Trajectory", text, body)
+    return section("Trajectory", text, f'{legend(keys)}<div class="two">{pairs}</div>')
 
 
 def _motion(result: Evaluation) -> str:
@@ -189,16 +177,14 @@ def _errors(result: Evaluation) -> str:
         missing = "The session has neither truth.tum nor reference.tum, or no measured pose beside it."
         return section("Errors", missing, "")
     translation, rotation = comparison.start.translation, np.degrees(comparison.start.rotation)
-    plots = [
-        _error_plot(result, comparison, translation, "distance from the start on, mm", MAX_TRACKING_ERROR_MM),
-        _error_plot(result, comparison, rotation, "angle from the start on, °"),
-    ]
+    plots = _error_plot(result, comparison, translation, "distance from the start on, mm", MAX_TRACKING_ERROR_MM)
+    plots += _error_plot(result, comparison, rotation, "angle from the start on, °")
     text = (
         f"Against the {'exact truth' if comparison.exact else 'measured reference, whose own error is part of this'}, "
         f"at {len(comparison.rows)} measured poses. From the start: the constant transform between the two surface "
         "frames is taken at the first TRACKING pose, nothing is fitted. Aligned: the best constant over the run."
     )
-    return section("Errors", text, "".join(plots) + _error_table(comparison) + _consistency(comparison))
+    return section("Errors", text, plots + _error_table(comparison) + _consistency(comparison))
 
 
 def _error_plot(result: Evaluation, comparison: Comparison, errors: Array, label: str, limit: float = np.inf) -> str:
@@ -232,8 +218,7 @@ def _consistency(comparison: Comparison) -> str:
     text = (
         f"NEES / 6: {figure(start.mean_nees / 6)} from the start, with the first pose's own error in all poses, "
         f"and {figure(aligned.mean_nees / 6)} aligned. "
-        f"{inside} of the aligned poses have a NEES under {NEES_BOUND:.1f}, "
-        "where 95 % should be. "
+        f"{inside} of the aligned poses have a NEES under {NEES_BOUND:.1f}, where 95 % should be. "
     )
     if not comparison.exact:
         text += "It says little here: it holds the reference's own error against the tracker's covariance."
@@ -266,8 +251,8 @@ def _clocks(result: Evaluation) -> str:
     plot = Plot(PAGE_CHART_WIDTH, 150, _followed(result), limits, label="later than stamped, ms")
     for i, name in enumerate(table.cameras):
         plot.line(table.stamps, offsets[:, i], f"series c{i % 5}")
-        at_end = f"{1000 * table.offsets[-1, i]:+.1f} ± {sigmas[-1, i]:.1f} ms"
-        keys.append(line_key(f"series c{i % 5}", f"{name}, at the end {at_end}"))
+        final = f"{name}, at the end {1000 * table.offsets[-1, i]:+.1f} ± {sigmas[-1, i]:.1f} ms"
+        keys.append(line_key(f"series c{i % 5}", final))
     text = (
         "How much later than stamped each camera exposes, against the mean of all, and one standard deviation. It "
         "shows where the surface moves, and is corrected once it is clearly there."

@@ -13,7 +13,7 @@ import numpy as np
 from estimation.pose import TrackState
 from hardware.files.pose_file import PoseTable
 from hardware.files.session import damage_text
-from hardware.report.evaluation import MAX_TRACKING_ERROR_MM, Comparison, Evaluation, PoseErrors, Spread, spread
+from hardware.report.evaluation import MAX_TRACKING_ERROR_MM, Comparison, Evaluation, PoseErrors, spread
 
 
 def measured_share(result: Evaluation) -> float:
@@ -79,7 +79,7 @@ def as_dict(result: Evaluation) -> dict[str, Any]:
     """The summary as plain values, ready for JSON; a figure that does not exist is None."""
     late = result.latency
     percentiles = zip(late.stages, late.p50, late.p95, late.p99, late.max, strict=True)
-    summary = {
+    summary: dict[str, Any] = {
         "session": result.title,
         "method": result.method,
         "complete": result.complete,
@@ -89,46 +89,35 @@ def as_dict(result: Evaluation) -> dict[str, Any]:
         "states": result.shares,
         "measured_share": measured_share(result),
         "latency_ms": {name: {"p50": a, "p95": b, "p99": c, "max": d} for name, a, b, c, d in percentiles},
-        "clocks_ms": _clocks_dict(result.table),
+        "clocks_ms": None,
         "initialisation_ms": late.initialisation,
         "initialisation_frame_sets": late.initial_sets,
-        "errors": None if result.comparison is None else _comparison_dict(result.comparison),
+        "errors": None,
     }
+    if clocks_learned(table := result.table):
+        last = zip(table.cameras, 1000 * table.offsets[-1], 1000 * table.offset_sigmas[-1], strict=True)
+        summary["clocks_ms"] = {name: {"offset": offset, "sigma": sigma} for name, offset, sigma in last}
+    if (comparison := result.comparison) is not None:
+        summary["errors"] = {
+            "against": "truth" if comparison.exact else "reference",
+            "poses": len(comparison.rows),
+            "median_stamp_gap_s": comparison.stamp_gap,
+            "off_by_more_than_10_mm_while_tracking": len(comparison.off),
+            "start": _errors_dict(comparison.start),
+            "aligned": _errors_dict(comparison.aligned),
+        }
     cleaned: dict[str, Any] = finite(summary)
     return cleaned
 
 
-def _clocks_dict(table: PoseTable) -> dict[str, Any] | None:
-    if not clocks_learned(table):
-        return None
-    last = zip(table.cameras, 1000 * table.offsets[-1], 1000 * table.offset_sigmas[-1], strict=True)
-    return {name: {"offset": offset, "sigma": sigma} for name, offset, sigma in last}
-
-
-def _comparison_dict(comparison: Comparison) -> dict[str, Any]:
-    return {
-        "against": "truth" if comparison.exact else "reference",
-        "poses": len(comparison.rows),
-        "median_stamp_gap_s": comparison.stamp_gap,
-        "off_by_more_than_10_mm_while_tracking": len(comparison.off),
-        "start": _errors_dict(comparison.start),
-        "aligned": _errors_dict(comparison.aligned),
-    }
-
-
 def _errors_dict(errors: PoseErrors) -> dict[str, Any]:
     return {
-        "translation_mm": spread_dict(spread(errors.translation)),
-        "rotation_deg": spread_dict(spread(np.degrees(errors.rotation))),
+        "translation_mm": asdict(spread(errors.translation)),
+        "rotation_deg": asdict(spread(np.degrees(errors.rotation))),
         "nees_over_6": errors.mean_nees / 6,
         "nees_inside_95": errors.nees_inside,
         "truth_surface_from_estimated_surface": errors.truth_surface_from_estimated_surface.tolist(),
     }
-
-
-def spread_dict(value: Spread) -> dict[str, float]:
-    """The figures of a spread by name, in its own unit."""
-    return asdict(value)
 
 
 def finite(value: Any) -> Any:

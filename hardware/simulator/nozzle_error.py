@@ -17,7 +17,7 @@ from hardware.report.page import stretches
 from hardware.simulator.deposit import NozzleLog, PlannedLine, row_step
 
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")  # but not the 2 of a camera called cam2
-_ANY = "…"
+_VARYING_NUMBER = "…"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +47,8 @@ def hold_spans(stamps: Array, reason: NDArray[np.str_], step: float) -> list[Hol
     """
     if not len(reason):
         return []
-    words, index = np.unique(reason, return_inverse=True)
-    kinds = {kind: i for i, kind in enumerate(dict.fromkeys(_without_numbers(str(word)) for word in words))}
-    kind = np.array([kinds[_without_numbers(str(word))] for word in words])[index]
+    reasons, index = np.unique(reason, return_inverse=True)
+    kind = np.unique([_without_numbers(str(text)) for text in reasons], return_inverse=True)[1][index]
     changed = (np.diff(kind) != 0) | (np.diff(stamps) > 1.5 * step)
     starts = np.concatenate([[0], np.flatnonzero(changed) + 1])
     ends = np.append(starts[1:], len(reason)) - 1
@@ -65,23 +64,21 @@ def group_holds(spans: list[HoldSpan]) -> tuple[HoldGroup, ...]:
     groups: dict[str, list[HoldSpan]] = {}
     for span in spans:
         groups.setdefault(_without_numbers(span.reason), []).append(span)
-    kinds = [_hold_group(group) for group in groups.values()]
-    return tuple(sorted(kinds, key=lambda holds: (-holds.seconds, holds.first)))
-
-
-def _hold_group(group: list[HoldSpan]) -> HoldGroup:
-    lasted = [span.end - span.start for span in group]
-    reason = _common_reason([span.reason for span in group])
-    return HoldGroup(reason, len(group), float(sum(lasted)), max(lasted), group[0].start)
+    holds = []
+    for group in groups.values():
+        durations = [span.end - span.start for span in group]
+        reason = _common_reason([span.reason for span in group])
+        holds.append(HoldGroup(reason, len(group), float(sum(durations)), max(durations), group[0].start))
+    return tuple(sorted(holds, key=lambda hold: (-hold.seconds, hold.first)))
 
 
 def _without_numbers(reason: str) -> str:
-    return _NUMBER.sub(_ANY, reason)
+    return _NUMBER.sub(_VARYING_NUMBER, reason)
 
 
 def _common_reason(reasons: list[str]) -> str:
     columns = zip(*(_NUMBER.findall(reason) for reason in reasons), strict=True)
-    numbers = iter([column[0] if len(set(column)) == 1 else _ANY for column in columns])
+    numbers = iter([column[0] if len(set(column)) == 1 else _VARYING_NUMBER for column in columns])
     return _NUMBER.sub(lambda _: next(numbers), reasons[0])
 
 
@@ -103,23 +100,25 @@ def nozzle_lag(log: NozzleLog) -> NozzleLag:
     """The shift tau that minimises the mean of |nozzle(t) - target(t - tau)|^2 over the extruding rows, in base.
 
     This is their cross-correlation in least squares: the two differ by what does not depend on tau. It is searched for
-    by whole rows and refined by a parabola through the best three. Only rows count that have a target for SEARCH on
+    by whole rows and refined by a parabola through the best three. Only rows count that have a target for MAX_LAG on
     either side, without a gap in the stamps, so each shift is judged by the same rows. Nothing is fitted but tau: on a
-    surface at rest and a straight path an offset along the path is a lag, as no one can tell the two apart. NaN where
-    no row counts, the target moves slower than MIN_TARGET_SPEED, or the best shift is at the end of the search.
+    surface at rest and a straight path an offset along the path cannot be told from a lag. NaN where no row counts, the
+    target moves slower than MIN_TARGET_SPEED, or the best shift is at the end of the search.
     """
+    unknown = NozzleLag(float("nan"), np.empty(0), np.empty(0))
     if len(log) < 3:
-        return _unknown_lag()
+        return unknown
     step = row_step(log)
-    most, stride = round(MAX_LAG / step), max(1, round(COARSE_STEP / step))
-    rows = _rows(log, step, most)
+    max_shift, stride = round(MAX_LAG / step), max(1, round(COARSE_STEP / step))
+    rows = _comparable_rows(log, step, max_shift)
     nozzle, target = log.base_from_nozzle[:, :3, 3], log.base_from_target[:, :3, 3]
-    if not len(rows) or _speed(target, rows, step) < MIN_TARGET_SPEED:
-        return _unknown_lag()
-    tried = np.arange(-most, most + 1, stride)
+    velocity = (target[rows + 1] - target[rows - 1]) / (2 * step)
+    if not len(rows) or np.sqrt(np.mean(np.sum(velocity**2, axis=1))) < MIN_TARGET_SPEED:
+        return unknown
+    tried = np.arange(-max_shift, max_shift + 1, stride)
     squares = _squares(nozzle, target, rows, tried)
     best = int(tried[np.argmin(squares)])
-    near = np.arange(max(best - stride, -most), min(best + stride, most) + 1)
+    near = np.arange(max(best - stride, -max_shift), min(best + stride, max_shift) + 1)
     around = _squares(nozzle, target, rows, near)
     i = int(np.argmin(around))
     shifts, distance = np.asarray(tried * step), np.asarray(np.sqrt(squares))
@@ -131,28 +130,18 @@ def nozzle_lag(log: NozzleLog) -> NozzleLag:
     return NozzleLag(float((near[i] + part) * step), shifts, distance)
 
 
-def _unknown_lag() -> NozzleLag:
-    return NozzleLag(float("nan"), np.empty(0), np.empty(0))
-
-
-def _rows(log: NozzleLog, step: float, most: int) -> NDArray[np.int64]:
+def _comparable_rows(log: NozzleLog, step: float, max_shift: int) -> NDArray[np.int64]:
     known = np.isfinite(log.base_from_target[:, 0, 3])
     gaps = np.flatnonzero(np.abs(np.diff(log.stamps) - step) > 0.5 * step) + 1
     inside = np.zeros(len(log), bool)
     for first, last in zip([0, *gaps], [*gaps, len(log)], strict=True):
         for part in stretches(known[first:last]):
-            inside[first + part.start + most : max(first + part.stop - most, 0)] = True
+            inside[first + part.start + max_shift : max(first + part.stop - max_shift, 0)] = True
     return np.flatnonzero(inside & log.extrude)
 
 
-def _speed(target: Array, rows: NDArray[np.int64], step: float) -> float:
-    velocity = (target[rows + 1] - target[rows - 1]) / (2 * step)
-    return float(np.sqrt(np.mean(np.sum(velocity**2, axis=1))))
-
-
 def _squares(nozzle: Array, target: Array, rows: NDArray[np.int64], shifts: NDArray[np.int64]) -> Array:
-    there = nozzle[rows]
-    return np.array([np.mean(np.sum((there - target[rows - shift]) ** 2, axis=1)) for shift in shifts])
+    return np.array([np.mean(np.sum((nozzle[rows] - target[rows - shift]) ** 2, axis=1)) for shift in shifts])
 
 
 NEAR_ERROR = 0.5  # mm: what a thin bead forgives
@@ -178,29 +167,17 @@ def nozzle_errors(log: NozzleLog, line: PlannedLine) -> RowErrors:
     """The error in every row, each from nothing but its own row."""
     base_from_surface = log.base_from_surface[:, :3, :3]
     difference = log.base_from_nozzle[:, :3, 3] - log.base_from_target[:, :3, 3]
-    vector = _turned(base_from_surface, difference)
-    normal = log.base_from_target[:, :3, 2]
+    vector = np.einsum("nji,nj->ni", base_from_surface, difference)
+    axis, normal = log.base_from_nozzle[:, :3, 2], log.base_from_target[:, :3, 2]
     place = np.nan_to_num(log.place)
     direction = np.einsum("nij,nj->ni", base_from_surface, line.direction()[line.piece(place)])
-    along = _unit(direction - np.sum(direction * normal, axis=1, keepdims=True) * normal)
-    across = np.cross(normal, along)
-    split = np.einsum("nij,nj->ni", np.stack([along, across, normal], axis=1), difference)
-    angle = _between(log.base_from_nozzle[:, :3, 2], normal)
+    along = direction - np.sum(direction * normal, axis=1, keepdims=True) * normal
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    along = along / np.where(length > 1e-9, length, 1.0)
+    split = np.einsum("nij,nj->ni", np.stack([along, np.cross(normal, along), normal], axis=1), difference)
+    # the arc tangent is exact for small angles too
+    angle = np.arctan2(np.linalg.norm(np.cross(axis, normal), axis=1), np.sum(axis * normal, axis=1))
     return RowErrors(vector, split, angle, line.distance(log.surface_from_tip))
-
-
-def _turned(base_from_surface: Array, vectors: Array) -> Array:
-    return np.asarray(np.einsum("nji,nj->ni", base_from_surface, vectors))
-
-
-def _unit(vectors: Array) -> Array:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.asarray(vectors / np.where(length > 1e-9, length, 1.0))
-
-
-def _between(a: Array, b: Array) -> Array:
-    """Angles (N,), rad, between vectors (N, 3); exact for small ones too."""
-    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,7 +198,7 @@ class NozzleFigures:
     offset: Array  # (3,) mm, mean error in the surface frame
     near: float  # share of the extruding time with an error under NEAR_ERROR
     extruding: float  # s
-    untold: float  # s of it without a target, and so in no spread
+    without_target: float  # s of it without a target, and so in no spread
     printing: float  # s from the first extruding row until the path is finished, without planned travel
     duty: float  # extruding share of `printing`; NaN where nothing was due, 0 where nothing was extruded
     finished: bool  # whether the path was
@@ -236,7 +213,10 @@ def nozzle_figures(log: NozzleLog, line: PlannedLine, errors: RowErrors) -> Nozz
     with_target = log.extrude & np.isfinite(errors.distance)
     distance, split = errors.distance[with_target], np.abs(errors.split[with_target])
     printing, end, finished = _printing(log, line)
-    extruding, extruded = int(log.extrude.sum()), int((log.extrude & printing).sum())
+    extruding = int(log.extrude.sum())
+    duty = 0.0 if len(log) and line.printed.any() else float("nan")
+    if printing.any():
+        duty = int((log.extrude & printing).sum()) / int(printing.sum())
     spans = hold_spans(log.stamps[:end], log.reason[:end], step)
     return NozzleFigures(
         position=spread(distance),
@@ -248,20 +228,14 @@ def nozzle_figures(log: NozzleLog, line: PlannedLine, errors: RowErrors) -> Nozz
         offset=errors.vector[with_target].mean(axis=0) if with_target.any() else np.full(3, np.nan),
         near=float(np.sum(distance < NEAR_ERROR) / extruding) if extruding else float("nan"),
         extruding=extruding * step,
-        untold=float(extruding - with_target.sum()) * step,
+        without_target=float(extruding - with_target.sum()) * step,
         printing=float(printing.sum()) * step,
-        duty=_duty(extruded, int(printing.sum()), len(log), line),
+        duty=duty,
         finished=finished,
         lag=nozzle_lag(log),
         holds=group_holds(spans),
         spans=tuple(spans),
     )
-
-
-def _duty(extruded: int, printing: int, rows: int, line: PlannedLine) -> float:
-    if printing:
-        return extruded / printing
-    return 0.0 if rows and line.printed.any() else float("nan")
 
 
 def _printing(log: NozzleLog, line: PlannedLine) -> tuple[NDArray[np.bool_], int, bool]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -28,7 +27,7 @@ from hardware.report.page import (
     thinned,
     tile,
 )
-from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, sections
+from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, sections, time_range
 from hardware.report.summary import figure
 from hardware.simulator.deposit import HALF_BEAD, DepositMap, gaps_and_overlaps, row_step
 from hardware.simulator.nozzle_error import NEAR_ERROR, NozzleLag
@@ -48,7 +47,7 @@ PAGE_FOOTER = (
     "Lengths in mm, time in s of the simulation's own clock. The error is the nozzle's tip less the place on the true "
     "surface that was due at that instant, both known exactly; nothing in the loop sees either."
 )
-_MARKS = {True: '<span class="met">✓ met</span>', False: '<span class="missed">✗ missed</span>'}
+MET_MARKS = {True: '<span class="met">✓ met</span>', False: '<span class="missed">✗ missed</span>'}
 MAX_LAYERS = 6  # bead maps shown
 MAX_LINE_POINTS = 12_000  # of a log drawn as one line
 MAX_SHADED_SPANS = 1500  # stretches shaded in a chart: finer ones cannot be told apart
@@ -64,11 +63,11 @@ MIN_PICTURE_HEIGHT = 40.0  # px, the least height of a picture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TopView:
-    """A window onto the surface from above, y up. low, high: (2,) mm, its corners. width: px."""
+    """A window onto the surface from above, y up."""
 
-    low: Array
-    high: Array
-    width: float
+    low: Array  # (2,) mm, its corner of least x and y
+    high: Array  # (2,) mm, the opposite corner
+    width: float  # px
 
     @property
     def scale(self) -> float:
@@ -107,12 +106,12 @@ def bead_picture(result: NozzleResult, layer: int, width: float) -> str:
     times = max(1, -(-MIN_PICTURE_PX // max(planned.shape)))
     size = (planned.shape[1] * times, planned.shape[0] * times)
     planned, deposited = (cv2.resize(m, size, interpolation=cv2.INTER_LINEAR) for m in (planned, deposited))
-    encoded = base64.b64encode(_png(cell_kinds(planned, deposited), np.maximum(planned, deposited))).decode()
+    data = _data_url(_png(cell_kinds(planned, deposited), np.maximum(planned, deposited)))
     box = f'width="{view.width:g}" height="{view.scale * (view.high[1] - view.low[1]):.1f}"'
-    image = f'<image {box} preserveAspectRatio="none" href="data:image/png;base64,{encoded}"/>'
     plan = view.pixels(line.points)
     pieces = np.flatnonzero(line.printed & (line.layer == deposit.layers[layer]))
     seams = "".join(_polyline("seam", plan[i : i + 2]) for i in pieces)
+    image = f'<image {box} preserveAspectRatio="none" href="{data}"/>'
     return view.svg(image + seams, f"beads of layer {deposit.layers[layer]}")
 
 
@@ -147,8 +146,8 @@ def way_picture(result: NozzleResult, width: float) -> str:
         rows = np.append(np.arange(part.start, part.stop - 1, stride), part.stop - 1)
         worst = np.fmax.reduceat(distance, rows)[:-1] if len(rows) > 1 else np.empty(0)
         colour = np.searchsorted(ERROR_STEPS, np.nan_to_num(worst, nan=np.inf))
-        for piece in _equal_runs(colour):
-            lines.append(_polyline(f"e{colour[piece.start]}", tip[rows[piece.start : piece.stop + 1]]))
+        for start, end in pairwise(np.append(np.flatnonzero(np.diff(colour, prepend=-1)), len(colour))):
+            lines.append(_polyline(f"e{colour[start]}", tip[rows[start : end + 1]]))
     return view.svg("".join(lines), "the way of the nozzle by its error")
 
 
@@ -160,18 +159,8 @@ def way_legend() -> list[tuple[str, str]]:
     return [(f"e{i}", text) for i, text in enumerate(words)]
 
 
-def _equal_runs(values: NDArray[np.int64]) -> list[slice]:
-    edges = np.append(np.flatnonzero(np.diff(values, prepend=-1)), len(values))
-    return [slice(int(a), int(b)) for a, b in pairwise(edges)]
-
-
 def _polyline(style: str, points: Array) -> str:
     return f'<path class="{style}" d="M{"L".join(f"{x:.1f} {y:.1f}" for x, y in points)}"/>'
-
-
-def write_nozzle_report(path: Path, result: NozzleResult) -> None:
-    """Write the page to `path`."""
-    path.write_text(nozzle_page(result), encoding="utf-8")
 
 
 def nozzle_page(result: NozzleResult) -> str:
@@ -179,7 +168,13 @@ def nozzle_page(result: NozzleResult) -> str:
     parts = [_badge(result), _tiles(result), _figures(result)]
     if len(result.run.log):
         parts += [_over_time(result), _parts(result), _spread(result), _pictures(result)]
-    parts += [_holds(result), _camera_pictures(result), _tracking(result), _files(result)]
+    parts += [_holds(result), _camera_pictures(result)]
+    if result.run.tracking is not None:
+        parts.append('<h2 class="part">Tracking</h2>' + "\n".join(sections(result.run.tracking)))
+    if result.run.files:
+        links = (f'<a href="{escape(name)}">{escape(name)}</a> {escape(note)}' for name, note in result.run.files)
+        files = "".join(f"<span>{link}</span>" for link in links)
+        parts.append(section("Files", "Beside this page.", f'<div class="files">{files}</div>'))
     lead = " ".join(nozzle_verdict(result))
     return document(PAGE_KIND, result.run.title or "a print", lead, [part for part in parts if part], PAGE_FOOTER)
 
@@ -187,9 +182,8 @@ def nozzle_page(result: NozzleResult) -> str:
 def _badge(result: NozzleResult) -> str:
     if not result.verdicts:
         return ""
-    style = "met" if result.met else "missed"
-    words = "limits met" if result.met else "limits missed" if result.run.complete else "not complete"
-    return f'<div class="badge {style}">{words}</div>'
+    text = "limits met" if result.met else "limits missed" if result.run.complete else "not complete"
+    return f'<div class="badge {"met" if result.met else "missed"}">{text}</div>'
 
 
 def _tiles(result: NozzleResult) -> str:
@@ -222,41 +216,28 @@ def _figures(result: NozzleResult) -> str:
 
 
 def _limits(result: NozzleResult) -> str:
-    rows = [
-        (escape(v.bound.words), escape(reached_in_words(v)), escape(allowed_in_words(v)), _MARKS[v.met])
+    rows = "".join(
+        f"<tr><td>{escape(v.bound.words)}</td><td>{escape(reached_in_words(v))}</td>"
+        f"<td>{escape(allowed_in_words(v))}</td><td>{MET_MARKS[v.met]}</td></tr>"
         for v in result.verdicts
-    ]
-    return _table(("", "reached", "allowed", ""), rows)
-
-
-def _table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    head = "".join(f"<th>{cell}</th>" for cell in columns)
-    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _span(stamps: Array) -> tuple[float, float]:
-    low, high = float(stamps[0]), float(stamps[-1])
-    return low, high if high > low else low + 1.0
+    )
+    head = "<thead><tr><th></th><th>reached</th><th>allowed</th><th></th></tr></thead>"
+    return f"<table>{head}<tbody>{rows}</tbody></table>"
 
 
 def _shades(result: NozzleResult, plot: Plot) -> None:
-    log = result.run.log
+    log, spans = result.run.log, result.figures.nozzle.spans
     step = row_step(log)
-    parts = stretches(log.extrude)
-    start = np.array([log.stamps[part.start] for part in parts])
-    end = np.array([log.stamps[part.stop - 1] + step for part in parts])
-    longest = _longest(end - start)
-    plot.shade(start[longest], end[longest], "extruding")
-    spans = result.figures.nozzle.spans
-    start, end = np.array([s.start for s in spans]), np.array([s.end for s in spans])
-    longest = _longest(end - start)
-    titles = [f"{spans[i].start:.3f} s, for {spans[i].end - spans[i].start:.3f} s: {spans[i].reason}" for i in longest]
-    plot.shade(start[longest], end[longest], "holding", titles)
+    printing = [(log.stamps[part.start], log.stamps[part.stop - 1] + step) for part in stretches(log.extrude)]
+    _shade_longest(plot, "extruding", printing)
+    titles = [f"{span.start:.3f} s, for {span.end - span.start:.3f} s: {span.reason}" for span in spans]
+    _shade_longest(plot, "holding", [(span.start, span.end) for span in spans], titles)
 
 
-def _longest(lengths: Array) -> Array:
-    return np.sort(np.argsort(-lengths, kind="stable")[:MAX_SHADED_SPANS])
+def _shade_longest(plot: Plot, style: str, intervals: list[tuple[float, float]], titles: Sequence[str] = ()) -> None:
+    start, end = np.array(intervals).reshape(-1, 2).T
+    longest = np.sort(np.argsort(start - end, kind="stable")[:MAX_SHADED_SPANS])
+    plot.shade(start[longest], end[longest], style, [titles[i] for i in longest] if titles else ())
 
 
 def _draw_line(plot: Plot, stamps: Array, values: Array, style: str) -> None:
@@ -268,7 +249,7 @@ def _over_time(result: NozzleResult) -> str:
     log, distance = result.run.log, result.errors.distance
     top = result.figures.nozzle.position.max
     top = max(1.12 * top, 1.2 * NEAR_ERROR) if np.isfinite(top) else 2 * NEAR_ERROR
-    plot = Plot(PAGE_CHART_WIDTH, 260, _span(log.stamps), (0.0, top), label="error, mm")
+    plot = Plot(PAGE_CHART_WIDTH, 260, time_range(log.stamps), (0.0, top), label="error, mm")
     _shades(result, plot)
     _draw_line(plot, log.stamps, np.where(log.extrude, np.nan, distance), "aside")
     plot.level(NEAR_ERROR, f"{NEAR_ERROR:g} mm", "limit")
@@ -288,13 +269,14 @@ def _parts(result: NozzleResult) -> str:
     printed = np.where(log.extrude, 1.0, np.nan)
     values = [*(errors.split.T * printed), np.degrees(errors.angle) * printed]
     split = np.abs(errors.split[log.extrude])
-    most = max(float(np.nanmax(split)), 0.05) * 1.1 if np.isfinite(split).any() else 1.0
+    limit = max(float(np.nanmax(split)), 0.05) * 1.1 if np.isfinite(split).any() else 1.0
     angles = values[3][np.isfinite(values[3])]
     names = ("along the path, mm", "across the path, mm", "along the normal, mm", "angle, °")
     plots = []
     for i, (name, value) in enumerate(zip(names, values, strict=True)):
-        y = (-most, most) if i < 3 else (0.0, max(float(angles.max(initial=0)) * 1.1, 0.05))
-        plot = Plot(PAGE_CHART_WIDTH, 156 if i == 3 else 140, _span(log.stamps), y, label=name, x_ticks=i == 3)
+        y = (-limit, limit) if i < 3 else (0.0, max(float(angles.max(initial=0)) * 1.1, 0.05))
+        height = 156 if i == 3 else 140
+        plot = Plot(PAGE_CHART_WIDTH, height, time_range(log.stamps), y, label=name, x_ticks=i == 3)
         _draw_line(plot, log.stamps, value, f"series c{i}")
         plots.append(plot.svg())
     text = "Ahead, to the left and out of the surface are positive; the angle is that to the axis of the target."
@@ -315,12 +297,12 @@ def _spread(result: NozzleResult) -> str:
     bars.mark(f.position.median, "median", "median")
     bars.mark(f.position.p95, "95 %", "median")
     caption = '<div class="caption">% of the time it printed, by error in mm</div>'
-    drawn = f"<div>{caption}{bars.svg()}</div><div>{_lag(f.lag)}</div>"
+    charts = f"<div>{caption}{bars.svg()}</div><div>{_lag(f.lag)}</div>"
     text = (
         "Left: how often the error was how large. Right: how far the nozzle is from the target (RMS) if one is shifted "
         "against the other in time; where that is least is the lag, positive when the nozzle is late."
     )
-    return section("Spread and lag", text, f'<div class="two">{drawn}</div>')
+    return section("Spread and lag", text, f'<div class="two">{charts}</div>')
 
 
 def _lag(lag: NozzleLag) -> str:
@@ -340,7 +322,8 @@ def _pictures(result: NozzleResult) -> str:
     if not len(deposit.layers):
         return ""
     view = whole_map_view(deposit, 1.0)
-    wide = float((view.high - view.low)[0] / (view.high - view.low)[1]) > WIDE_ASPECT
+    extent = view.high - view.low
+    wide = float(extent[0] / extent[1]) > WIDE_ASPECT
     width = PAGE_CHART_WIDTH if wide else HALF_CHART_WIDTH
     maps = "".join(
         (f'<div class="caption">layer {number}</div>' if len(deposit.layers) > 1 else "")
@@ -365,36 +348,21 @@ def _holds(result: NozzleResult) -> str:
     holds = result.figures.nozzle.holds
     if not holds:
         return section("Holds", "The arm never held.", "")
-    rows = [(escape(h.reason), str(h.count), *(f"{v:.3f}" for v in (h.seconds, h.longest, h.first))) for h in holds]
+    rows = [(h.reason, str(h.count), *(f"{v:.3f}" for v in (h.seconds, h.longest, h.first))) for h in holds]
     text = "Why the arm stood still until the path was finished; … stands for a number that was not always the same."
-    return section("Holds", text, _table(("reason", "times", "in all, s", "longest, s", "first at, s"), rows))
+    return section("Holds", text, figures_table(("reason", "times", "in all, s", "longest, s", "first at, s"), rows))
 
 
 def _camera_pictures(result: NozzleResult) -> str:
     if not result.run.pictures:
         return ""
     figures = "".join(
-        f'<figure><img alt="{escape(name)}" src="{_data(data)}"/><figcaption>{escape(name)}</figcaption></figure>'
+        f'<figure><img alt="{escape(name)}" src="{_data_url(data)}"/><figcaption>{escape(name)}</figcaption></figure>'
         for name, data in result.run.pictures
     )
     return section("What the cameras saw", "One instant of the run.", f'<div class="pictures">{figures}</div>')
 
 
-def _data(data: bytes) -> str:
+def _data_url(data: bytes) -> str:
     kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
-
-
-def _tracking(result: NozzleResult) -> str:
-    if result.run.tracking is None:
-        return ""
-    return '<h2 class="part">Tracking</h2>' + "\n".join(sections(result.run.tracking))
-
-
-def _files(result: NozzleResult) -> str:
-    if not result.run.files:
-        return ""
-    links = "".join(
-        f'<span><a href="{escape(name)}">{escape(name)}</a> {escape(words)}</span>' for name, words in result.run.files
-    )
-    return section("Files", "Beside this page.", f'<div class="files">{links}</div>')

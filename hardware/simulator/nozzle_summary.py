@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from estimation.errors import InputError
 from hardware.process import checks
 from hardware.report.evaluation import Evaluation, Spread, spread
-from hardware.report.summary import figure, finite, percent, spread_dict
+from hardware.report.summary import figure, finite, percent
 from hardware.simulator.deposit import (
     DepositFigures,
     DepositMap,
@@ -31,11 +31,11 @@ from planning.path import Path
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunFigures:
-    """All that can be bounded. tracking: errors of the estimated surface, mm, from the start; None where not known."""
+    """All that can be bounded."""
 
     nozzle: NozzleFigures
     deposit: DepositFigures
-    tracking: Spread | None = None
+    tracking: Spread | None = None  # errors of the estimated surface, mm, from the start; None where not known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,16 +44,12 @@ class Bound:
 
     words: str  # what it is
     unit: str  # "" for a share
-    least: bool  # whether the bound must be reached; else it must not be passed
+    minimum: bool  # whether the bound must be reached; else it must not be passed
     of: Callable[[RunFigures], float]  # the figure in that unit
 
 
 def _tracking(part: str) -> Callable[[RunFigures], float]:
     return lambda f: math.nan if f.tracking is None else float(getattr(f.tracking, part))
-
-
-def _longest_hold(figures: RunFigures) -> float:
-    return max((holds.longest for holds in figures.nozzle.holds), default=0.0)
 
 
 BOUNDS = {  # key in [limits]: with its unit
@@ -69,7 +65,7 @@ BOUNDS = {  # key in [limits]: with its unit
     "angle_max_deg": Bound("angle, largest", "°", False, lambda f: math.degrees(f.nozzle.angle.max)),
     "near": Bound("extruding time within 0.5 mm", "", True, lambda f: f.nozzle.near),
     "duty": Bound("duty", "", True, lambda f: f.nozzle.duty),
-    "hold_s": Bound("longest hold", "s", False, _longest_hold),
+    "hold_s": Bound("longest hold", "s", False, lambda f: max((h.longest for h in f.nozzle.holds), default=0.0)),
     "lag_ms": Bound("lag", "ms", False, lambda f: 1000 * abs(f.nozzle.lag.seconds)),
     "coverage": Bound("coverage", "", True, lambda f: f.deposit.coverage),
     "gaps": Bound("gaps", "", False, lambda f: f.deposit.gaps),
@@ -81,21 +77,16 @@ BOUNDS = {  # key in [limits]: with its unit
 }
 
 
-@dataclass(frozen=True, slots=True)
-class RunLimits:
-    """The bounds of one scenario. names: keys of BOUNDS, in the file's order. allowed: one each, in the key's unit."""
-
-    names: tuple[str, ...] = ()
-    allowed: tuple[float, ...] = ()
+RunLimits = dict[str, float]  # the bounds of one scenario by their key in BOUNDS, each in the key's unit
 
 
 @dataclass(frozen=True, slots=True)
 class LimitVerdict:
-    """One limit and what came of it. name: key of BOUNDS. reached, allowed: in its unit. A NaN never meets a limit."""
+    """One limit and what came of it. A NaN never meets a limit."""
 
-    name: str
-    reached: float
-    allowed: float
+    name: str  # key of BOUNDS
+    reached: float  # in its unit
+    allowed: float  # in its unit
     met: bool
 
     @property
@@ -107,24 +98,21 @@ class LimitVerdict:
 def limits_from_table(where: object, table: checks.Table) -> RunLimits:
     """The limits in a table [limits] of the file `where`; InputError names the key that makes no sense."""
     checks.check_keys(where, "limits.", table, (), BOUNDS)
-    allowed = []
+    limits: RunLimits = {}
     for name, value in table.items():
-        number = checks.number(where, f"limits.{name}", value)
-        most = math.inf if BOUNDS[name].unit else 1.0
-        if not 0 <= number <= most:
-            allowed_range = "0 to 1" if most == 1 else f"0 {BOUNDS[name].unit} or more"
-            raise InputError(where, f"limits.{name}", value, allowed_range)
-        allowed.append(number)
-    return RunLimits(tuple(table), tuple(allowed))
+        limits[name], unit = checks.number(where, f"limits.{name}", value), BOUNDS[name].unit
+        if not 0 <= limits[name] <= (math.inf if unit else 1.0):
+            raise InputError(where, f"limits.{name}", value, f"0 {unit} or more" if unit else "0 to 1")
+    return limits
 
 
 def check_limits(limits: RunLimits, figures: RunFigures) -> list[LimitVerdict]:
     """A verdict for each limit, in the order in which they were given."""
     verdicts = []
-    for name, allowed in zip(limits.names, limits.allowed, strict=True):
-        bound = BOUNDS[name]
-        reached = bound.of(figures)
-        verdicts.append(LimitVerdict(name, reached, allowed, reached >= allowed if bound.least else reached <= allowed))
+    for name, allowed in limits.items():
+        reached = BOUNDS[name].of(figures)
+        met = reached >= allowed if BOUNDS[name].minimum else reached <= allowed
+        verdicts.append(LimitVerdict(name, reached, allowed, met))
     return verdicts
 
 
@@ -136,7 +124,7 @@ class NozzleRun:
     log: NozzleLog
     path: Path  # in the true surface frame
     bead: float  # width, mm
-    limits: RunLimits = field(default_factory=RunLimits)
+    limits: RunLimits = field(default_factory=dict)
     tracking: Evaluation | None = None  # of the surface, where known
     complete: bool = True  # whether it ran to its end
     pictures: tuple[tuple[str, bytes], ...] = ()  # of the cameras: name, and bytes of a JPEG or PNG
@@ -157,7 +145,7 @@ class NozzleResult:
     @property
     def met(self) -> bool:
         """Whether the run was complete, printed something, and that only where a target was, and met all its limits."""
-        printed = self.figures.nozzle.extruding > 0 and self.figures.nozzle.untold == 0
+        printed = self.figures.nozzle.extruding > 0 and self.figures.nozzle.without_target == 0
         return self.run.complete and printed and all(verdict.met for verdict in self.verdicts)
 
 
@@ -202,8 +190,8 @@ def nozzle_verdict(result: NozzleResult) -> list[str]:
     sentences.append(f"It printed for {share(f.duty)} of the time it had{'' if f.finished else ' and did not finish'}.")
     if math.isfinite(deposit.coverage):
         sentences.append(f"{share(deposit.coverage)} of the planned area got its material.")
-    if f.untold > 0:
-        sentences.append(f"For {f.untold:.3f} s material left the nozzle where nothing was due.")
+    if f.without_target > 0:
+        sentences.append(f"For {f.without_target:.3f} s material left the nozzle where nothing was due.")
     return sentences + _limits_in_words(result)
 
 
@@ -213,8 +201,8 @@ def _limits_in_words(result: NozzleResult) -> list[str]:
         return ["The scenario sets no limits."]
     if not missed:
         return [f"All {len(result.verdicts)} limits were met." if len(result.verdicts) > 1 else "Its limit was met."]
-    told = "; ".join(f"{v.bound.words} {reached_in_words(v)}, {allowed_in_words(v)}" for v in missed)
-    return [f"{len(missed)} of {len(result.verdicts)} limits missed: {told}."]
+    details = "; ".join(f"{v.bound.words} {reached_in_words(v)}, {allowed_in_words(v)}" for v in missed)
+    return [f"{len(missed)} of {len(result.verdicts)} limits missed: {details}."]
 
 
 def share(value: float) -> str:
@@ -223,19 +211,14 @@ def share(value: float) -> str:
 
 
 def reached_in_words(verdict: LimitVerdict) -> str:
-    """What was reached, with its unit."""
-    return with_unit(verdict.reached, verdict.bound.unit)
+    """What was reached, with its unit; a share, which has none, in percent."""
+    return f"{figure(verdict.reached)} {verdict.bound.unit}" if verdict.bound.unit else share(verdict.reached)
 
 
 def allowed_in_words(verdict: LimitVerdict) -> str:
     """The bound, with its unit and its side."""
     number = percent(verdict.allowed) if not verdict.bound.unit else f"{verdict.allowed:g} {verdict.bound.unit}"
-    return f"{'at least' if verdict.bound.least else 'at most'} {number}"
-
-
-def with_unit(value: float, unit: str) -> str:
-    """A figure with its unit; a share, which has none, in percent."""
-    return f"{figure(value)} {unit}" if unit else share(value)
+    return f"{'at least' if verdict.bound.minimum else 'at most'} {number}"
 
 
 def nozzle_dict(result: NozzleResult) -> dict[str, Any]:
@@ -249,12 +232,15 @@ def nozzle_dict(result: NozzleResult) -> dict[str, Any]:
         "limits": [
             {"name": v.name, "reached": v.reached, "allowed": v.allowed, "met": bool(v.met)} for v in result.verdicts
         ],
-        "errors": {key: _scaled(spread, scale) for _, key, spread, scale in rows_of_errors(result)},
+        "errors": {
+            key: {name: value * scale for name, value in asdict(spread).items()}
+            for _, key, spread, scale in rows_of_errors(result)
+        },
         "offset_mm": f.offset.tolist(),
         "near_mm": NEAR_ERROR,
         "near": f.near,
         "extruding_s": f.extruding,
-        "extruding_without_target_s": f.untold,
+        "extruding_without_target_s": f.without_target,
         "printing_s": f.printing,
         "duty": f.duty,
         "finished": f.finished,
@@ -273,14 +259,10 @@ def nozzle_dict(result: NozzleResult) -> dict[str, Any]:
             "outside": deposit.outside,
             "material": deposit.material,
         },
-        "tracking_mm": None if result.figures.tracking is None else spread_dict(result.figures.tracking),
+        "tracking_mm": None if result.figures.tracking is None else asdict(result.figures.tracking),
     }
     cleaned: dict[str, Any] = finite(summary)
     return cleaned
-
-
-def _scaled(spread: Spread, scale: float) -> dict[str, float]:
-    return {name: value * scale for name, value in spread_dict(spread).items()}
 
 
 def nozzle_text(summary: dict[str, Any]) -> str:
@@ -289,11 +271,10 @@ def nozzle_text(summary: dict[str, Any]) -> str:
     for key, figures in summary["errors"].items():
         name, _, unit = key.rpartition("_")
         lines.append(f"{f'{name}, {unit}':<26}" + "".join(f"{_number(figures[part]):>9}" for part in SPREAD_PARTS))
-    deposit = summary["deposit"]
-    lag = summary["lag_ms"]
+    deposit, lag = summary["deposit"], summary["lag_ms"]
     parts = [("duty", summary["duty"]), *((name, deposit[name]) for name in ("coverage", "gaps", "overlap", "outside"))]
-    told = [f"{name} {share(np.nan if value is None else value)}" for name, value in parts]
-    lines += ["", ", ".join([*told, f"lag {'–' if lag is None else f'{lag:.1f}'} ms"])]
+    shares = [f"{name} {share(np.nan if value is None else value)}" for name, value in parts]
+    lines += ["", ", ".join([*shares, f"lag {'–' if lag is None else f'{lag:.1f}'} ms"])]
     for hold in summary["holds"]:
         lines.append(f"held {hold['count']} x, {hold['total_s']:.2f} s in all: {hold['reason']}")
     for limit in summary["limits"]:

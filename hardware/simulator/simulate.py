@@ -42,7 +42,7 @@ from hardware.simulator.arm.ports import PtyLink
 from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, TrueCameras
 from hardware.simulator.deposit import join_logs, planned_line
-from hardware.simulator.nozzle_report import write_nozzle_report
+from hardware.simulator.nozzle_report import nozzle_page
 from hardware.simulator.nozzle_summary import NozzleRun, evaluate_run, nozzle_dict, nozzle_text
 from hardware.simulator.run_folder import RunFolder, clear_run
 from hardware.simulator.scenario import Scenario, read_scenario
@@ -295,7 +295,7 @@ def _write_results(
     result = evaluate_run(run)
     summary = nozzle_dict(result) | {"frame_sets_skipped": skipped, "faults": [str(f) for f in scenario.faults]}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    write_nozzle_report(out / "report.html", result)
+    (out / "report.html").write_text(nozzle_page(result), encoding="utf-8")
     folder.watch.finish(summary["verdict"][0])
     busy = f"{skipped} frame sets found the tracker busy and were left out\n" if skipped else ""
     return SimulationResult(f"{nozzle_text(summary)}\n{busy}report: {out / 'report.html'}", result.met)
