@@ -65,22 +65,21 @@ def draw_cover(image: Image, box: tuple[Array, Array], aside: float, rng: np.ran
     low, high = box
     angle = rng.uniform(0, 2 * np.pi)
     half = COVER_SCALE * (high - low) / 2
-    away = np.array([np.cos(angle), np.sin(angle)]) * (half + (high - low) / 2) * min(aside, 1.0)
-    middle = (low + high) / 2 + away * 1.45  # wholly beside the box at one, whatever the angle
+    shift = np.array([np.cos(angle), np.sin(angle)]) * (half + (high - low) / 2) * min(aside, 1.0)
+    middle = (low + high) / 2 + shift * 1.45  # wholly beside the box at one, whatever the angle
     if aside >= 1.0:
         return image
     h, w = image.shape
-    small = rng.normal(150, 28, (14, 18)).astype(np.float32)
+    blotches = rng.normal(150, 28, (14, 18)).astype(np.float32)
     size = tuple(np.maximum(np.round(2 * half), 8).astype(int).tolist())
-    cloth = cv2.resize(small, size, interpolation=cv2.INTER_CUBIC) + rng.normal(0, 6, size[::-1])
+    cover = cv2.resize(blotches, size, interpolation=cv2.INTER_CUBIC) + rng.normal(0, 6, size[::-1])
     corner = np.round(middle - half).astype(int)
     x0, y0 = np.clip(corner, 0, (w, h))
     x1, y1 = np.clip(corner + size, 0, (w, h))
-    out = image.copy()
-    if x1 > x0 and y1 > y0:
-        part = cloth[y0 - corner[1] : y1 - corner[1], x0 - corner[0] : x1 - corner[0]]
-        out[y0:y1, x0:x1] = np.clip(part, 0, 255).astype(np.uint8)
-    return out
+    covered = image.copy()
+    part = cover[y0 - corner[1] : y1 - corner[1], x0 - corner[0] : x1 - corner[0]]  # may be empty
+    covered[y0:y1, x0:x1] = np.clip(part, 0, 255).astype(np.uint8)
+    return covered
 
 
 def cover_wound(image: Image, camera: Camera, base_from_surface: Array, fault: Fault) -> Image:
@@ -99,8 +98,7 @@ def draw_glare(image: Image, box: tuple[Array, Array], share: float, rng: np.ran
         radius = (high - low) * np.sqrt(share / 3 / np.pi) * rng.uniform(0.8, 1.2)
         middle, axes = (tuple(np.round(v).astype(int).tolist()) for v in (centre, radius))
         cv2.ellipse(light, middle, axes, 0, 0, 360, 400.0, -1)
-    soft = cv2.GaussianBlur(light, (0, 0), 3.0)
-    return np.asarray(np.clip(image + soft, 0, 255), np.uint8)
+    return np.asarray(np.clip(image + cv2.GaussianBlur(light, (0, 0), 3.0), 0, 255), np.uint8)
 
 
 NOISE_STREAM, DAMAGE_STREAM = 5, 6  # streams of random numbers of one picture
@@ -110,22 +108,22 @@ class PictureRenderer:
     """Renders and encodes what was exposed.
 
     Exposed pictures wait until one of them is asked for; then all that wait are rendered, one of each camera at a time,
-    with the printed material as it was at the first of them (`lay`): what was laid while pictures travel is missing.
+    with the printed material as it was at the first of them: what was laid while pictures travel is missing.
     """
 
     def __init__(
         self,
         scene: Scene,
-        lenses: TrueCameras,
+        true_cameras: TrueCameras,
         sensor: Sensor,
         jpeg_quality: int | None,
         seed: int,
-        threads: int = 2,
-        lay: Callable[[float], None] = lambda until: None,
+        threads: int,
+        print_beads: Callable[[float], None] = lambda until: None,
     ) -> None:
-        """lenses: the true cameras. lay: brings the scene's printed material up to an instant, s."""
-        self._scene, self._lenses, self._sensor, self._quality = scene, lenses, sensor, jpeg_quality
-        self._seed, self._threads, self._lay = seed, threads, lay
+        """print_beads: brings the scene's printed material up to an instant, s."""
+        self._scene, self._true_cameras, self._sensor, self._quality = scene, true_cameras, sensor, jpeg_quality
+        self._seed, self._threads, self._print_beads = seed, threads, print_beads
         self._waiting: list[tuple[Shot, WorldState]] = []  # exposed and not yet rendered
         self._done: dict[tuple[int, int], tuple[str, bytes]] = {}
 
@@ -137,18 +135,15 @@ class PictureRenderer:
         """Format and bytes of a picture that was exposed; each once."""
         key = shot.camera, shot.number
         if key not in self._done:
-            self._develop()
+            self._print_beads(min(instant.stamp for _, instant in self._waiting))
+            while self._waiting:
+                batch = {pair[0].camera: pair for pair in reversed(self._waiting)}  # the first of each camera
+                self._waiting = [pair for pair in self._waiting if pair is not batch[pair[0].camera]]
+                self._render(*zip(*batch.values(), strict=True))
         return self._done.pop(key)
 
-    def _develop(self) -> None:
-        self._lay(min(instant.stamp for _, instant in self._waiting))
-        while self._waiting:
-            batch = {pair[0].camera: pair for pair in reversed(self._waiting)}  # the first of each camera
-            self._waiting = [pair for pair in self._waiting if pair is not batch[pair[0].camera]]
-            self._render(*zip(*batch.values(), strict=True))
-
     def _render(self, shots: Sequence[Shot], instants: Sequence[WorldState]) -> None:
-        cameras = [self._lenses(shot) for shot in shots]
+        cameras = [self._true_cameras(shot) for shot in shots]
         rngs = [self._rng(NOISE_STREAM, shot.camera, shot.picture) for shot in shots]
         images = render(self._scene, cameras, instants, self._sensor, rngs, self._threads)
         for i, (shot, camera, instant) in enumerate(zip(shots, cameras, instants, strict=True)):
@@ -254,26 +249,20 @@ class CameraPipeline:
             self._sink.picture(shot, kind, data)
             frame = replace(frame, image=image)
         self._take_sets(self._pairer.add(frame, now), now)
-        self._events.at(now + self._pairer.patience, ARRIVAL_EVENT, self._overdue)
-
-    def _overdue(self, now: float) -> None:
-        self._take_sets(self._pairer.due(now), now)
+        self._events.at(
+            now + self._pairer.patience, ARRIVAL_EVENT, lambda due: self._take_sets(self._pairer.due(due), due)
+        )
 
     def _take_sets(self, sets: Sequence[FrameSet], now: float) -> None:
         for frames in sets:
             if self._waiting is not None:
                 self.skipped += 1
-            self._waiting = self._with_head(frames)
+            self._waiting, head = frames, self._head(frames.stamp)
+            if head is not None:
+                self._sink.head(frames.stamp, head)  # even if the set is left out
+                self._waiting = replace(frames, head=head)
         if not self._busy and self._waiting is not None:
             self._track(now)
-
-    def _with_head(self, frames: FrameSet) -> FrameSet:
-        """The frame set with its print head, which the sink is told of even if the set is left out."""
-        head = self._head(frames.stamp)
-        if head is None:
-            return frames
-        self._sink.head(frames.stamp, head)
-        return replace(frames, head=head)
 
     def _track(self, now: float) -> None:
         assert self._waiting is not None
@@ -284,8 +273,8 @@ class CameraPipeline:
         self.tracked += 1
         self._sink.pose(frames, pose, self._step.last, spent)
         processing = self._scenario.tracking.processing
-        known = self._rates.done(now, spent if processing is None else processing)
-        self._events.at(known, POSE_EVENT, partial(self._deliver, pose, frames, self._step.last.observations))
+        delivery = self._rates.done(now, spent if processing is None else processing)
+        self._events.at(delivery, POSE_EVENT, partial(self._deliver, pose, frames, self._step.last.observations))
         self._step.idle()
 
     def _deliver(self, pose: SurfacePose, frames: FrameSet, observations: Observations, now: float) -> None:

@@ -73,8 +73,7 @@ def camera_settings_from_table(where: object, table: Table, names: Sequence[str]
         off=_outages(keys, names),
     )
     keys.done()
-    if settings.drop + settings.duplicate + settings.garble > 1:
-        total = settings.drop + settings.duplicate + settings.garble
+    if (total := settings.drop + settings.duplicate + settings.garble) > 1:
         raise InputError(where, "cameras.drop + duplicate + garble", total, "at most 1")
     return settings
 
@@ -148,29 +147,17 @@ class Shot:
     covered: Fault | None = None  # the fault that covers the wound
 
 
-@dataclass(frozen=True, slots=True)
-class _Draw:
-    """What chance decides of one frame: its lot in [0, 1), and s added to its stamp and to its way."""
-
-    lot: float
-    stamp: float
-    transport: float
-
-
 class SimulatedCameras:
     """The cameras of a rig in time. A frame's draws depend on seed, camera and number alone."""
 
     def __init__(self, settings: CameraSettings, seed: int, faults: Sequence[Fault] = ()) -> None:
         """seed: >= 0. faults: those of cameras and their clock count, and what covers the surface."""
         self.settings, self._seed = settings, seed
-        self._faults = [faults_striking(faults, FaultPart.CAMERA) for _ in settings.phases]
-        for camera, mine in enumerate(self._faults):
-            self._faults[camera] = [fault for fault in mine if fault.number == camera]
+        of_cameras = faults_striking(faults, FaultPart.CAMERA)
+        self._faults = [[f for f in of_cameras if f.number == camera] for camera in range(len(settings.phases))]
         self._swaps = faults_striking(faults, FaultPart.CAMERA, FaultKind.SWAP)
-        self._jumps, self._covers = (
-            faults_striking(faults, FaultPart.CLOCK),
-            faults_striking(faults, FaultPart.SURFACE, FaultKind.COVER),
-        )
+        self._jumps = faults_striking(faults, FaultPart.CLOCK)
+        self._covers = faults_striking(faults, FaultPart.SURFACE, FaultKind.COVER)
         rng = np.random.default_rng([seed, GAIN_STREAM])
         self._gain_phases = rng.uniform(0, 2 * math.pi, len(settings.phases)).tolist()
 
@@ -193,14 +180,15 @@ class SimulatedCameras:
         return settings.start + settings.phases[camera] + number * settings.every / settings.fps
 
     def _shot(self, camera: int, number: int, earliest: float) -> Shot:
-        settings, due, draw = self.settings, self.due(camera, number), self._draw(camera, number)
-        fate = self._fate(camera, number, draw.lot)
+        settings, due = self.settings, self.due(camera, number)
+        lot, stamp_jitter, transport_jitter = self._draw(camera, number)
+        fate = self._fate(camera, number, lot)
         picture = number
-        while picture and self._fate(camera, picture, self._draw(camera, picture).lot) is Fate.DUPLICATED:
+        while picture and self._fate(camera, picture, self._draw(camera, picture)[0]) is Fate.DUPLICATED:
             picture -= 1
         exposed = self.due(camera, picture)
         lens = self._lens(camera, exposed)
-        arrival = due + settings.exposure / 2 + settings.transport + draw.transport
+        arrival = due + settings.exposure / 2 + settings.transport + transport_jitter
         arrival += sum(fault.amount for fault in self._strike(camera, due, FaultKind.SLOW))
         jump = sum(fault.amount for fault in self._jumps if fault.covers(due))
         return Shot(
@@ -208,7 +196,7 @@ class SimulatedCameras:
             number=number,
             picture=picture,
             exposed=exposed,
-            stamp=due - settings.offsets[camera] + draw.stamp + jump,
+            stamp=due - settings.offsets[camera] + stamp_jitter + jump,
             arrival=max(arrival, earliest),
             exposure=settings.exposure,
             gain=self._gain(lens, exposed),
@@ -228,11 +216,12 @@ class SimulatedCameras:
                 camera = pair[1 - pair.index(camera)]
         return camera
 
-    def _draw(self, camera: int, number: int) -> _Draw:
+    def _draw(self, camera: int, number: int) -> tuple[float, float, float]:
+        """What chance decides of one frame: its lot in [0, 1), and s added to its stamp and to its transport."""
         rng = np.random.default_rng([self._seed, FATE_STREAM, camera, number])
         stamp = float(np.clip(rng.standard_normal(), -JITTER_LIMIT, JITTER_LIMIT)) * self.settings.jitter
         transport = min(rng.standard_exponential(), JITTER_LIMIT) * self.settings.transport_jitter
-        return _Draw(float(rng.random()), stamp, transport)
+        return float(rng.random()), stamp, transport
 
     def _fate(self, camera: int, number: int, lot: float) -> Fate:
         settings, due = self.settings, self.due(camera, number)
@@ -251,8 +240,8 @@ class SimulatedCameras:
         drift = math.sin(2 * math.pi * exposed / settings.gain_period + self._gain_phases[camera])
         light = math.sin(2 * math.pi * settings.flicker_hz * exposed) * np.sinc(settings.flicker_hz * settings.exposure)
         kinds = [fault.kind for fault in self._strike(camera, exposed, FaultKind.BLACK, FaultKind.FLASH)]
-        given = BLACK_GAIN if FaultKind.BLACK in kinds else FLASH_GAIN if FaultKind.FLASH in kinds else 1.0
-        return float((1 + settings.gain_drift * drift) * (1 + settings.flicker * light)) * given
+        fault_gain = BLACK_GAIN if FaultKind.BLACK in kinds else FLASH_GAIN if FaultKind.FLASH in kinds else 1.0
+        return float((1 + settings.gain_drift * drift) * (1 + settings.flicker * light)) * fault_gain
 
 
 def garble(data: bytes, rng: np.random.Generator) -> bytes:
@@ -260,22 +249,17 @@ def garble(data: bytes, rng: np.random.Generator) -> bytes:
 
     The header stays whole. Most JPEGs still decode, with a damaged part; some do not.
     """
-    first = _scan_start(data)
-    most = max(MIN_DAMAGE, int(MAX_DAMAGE_SHARE * len(data)))
-    length = int(np.exp(rng.uniform(np.log(MIN_DAMAGE), np.log(most + 1))))
+    marker, first = data.find(JPEG_SCAN), min(HEADER_BYTES, len(data) // 2)
+    if data[:2] == b"\xff\xd8" and marker >= 0:
+        first = min(marker + 2 + int.from_bytes(data[marker + 2 : marker + 4], "big"), len(data) - 1)
+    max_length = max(MIN_DAMAGE, int(MAX_DAMAGE_SHARE * len(data)))
+    length = int(np.exp(rng.uniform(np.log(MIN_DAMAGE), np.log(max_length + 1))))
     start = int(rng.integers(first, max(first + 1, len(data) - length)))
     end = min(start + length, len(data))
     if rng.random() < TRUNCATED_SHARE:
         return data[:start]
     stretch = (bytes(end - start), data[max(first, start - (end - start)) : start], b"")[int(rng.integers(3))]
     return data[:start] + stretch + data[end:]
-
-
-def _scan_start(data: bytes) -> int:
-    marker = data.find(JPEG_SCAN)
-    if data[:2] != b"\xff\xd8" or marker < 0:
-        return min(HEADER_BYTES, len(data) // 2)
-    return min(marker + 2 + int.from_bytes(data[marker + 2 : marker + 4], "big"), len(data) - 1)
 
 
 class TrueCameras:

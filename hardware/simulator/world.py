@@ -157,8 +157,8 @@ class SimulatedWorld:
             pictures = PictureRenderer(scene, TrueCameras(scenario.rig.cameras), *encoding, threads, self._print_beads)
         self._last_state: WorldState | None = None
         self._events = EventQueue()
-        looks = pictures, self._state_at, self._head
-        self.pipeline = CameraPipeline(scenario, self._events, step, exposures, sink, clock, self._on_pose, *looks)
+        views = pictures, self._state_at, self._head
+        self.pipeline = CameraPipeline(scenario, self._events, step, exposures, sink, clock, self._on_pose, *views)
         self._motion_stalls = faults_striking(scenario.faults, FaultPart.MOTION)
         self._pose: SurfacePose | None = None
         self._motion: MotionStep | None = None

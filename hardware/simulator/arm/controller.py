@@ -138,43 +138,46 @@ class FirstOrderLag:
 
 
 class Servo:
-    """Where the axes really are. most: (2,) greatest accelerations of X Y Z, mm/s^2, and A B C, rad/s^2, or None."""
+    """Where the axes really are."""
 
-    def __init__(self, line: Polyline, dead_time: float, tau: float, most: Array | None) -> None:
-        self._lag = FirstOrderLag(line, dead_time, tau)
-        self._most = most
+    def __init__(self, line: Polyline, dead_time: float, tau: float, accelerations: Array | None) -> None:
+        """accelerations: (2,) the greatest of X Y Z, mm/s^2, and of A B C, rad/s^2; None for no limit."""
+        self._lag, self._accelerations = FirstOrderLag(line, dead_time, tau), accelerations
         self._limited = Polyline(float(line.instants[0]), line.axes[0])
         self._steps = 0
         self._at, self._speed = line.axes[0].tolist(), [0.0] * AXIS_COUNT
 
     def at(self, instants: Array, now: float) -> Array:
         """Axes (N, 6) at instants (N,) up to `now`."""
-        if self._most is None:
+        if self._accelerations is None:
             return self._lag.at(instants, now)[0]
         while self._steps * SERVO_STEP < now:
             grid = np.arange(self._steps, self._steps + _STEPS_AT_ONCE, dtype=np.float64) * SERVO_STEP
             grid = grid[grid < now]
-            self._follow(grid, *self._lag.at(grid, now), self._most.tolist())
+            self._follow(grid, *self._lag.at(grid, now), *self._accelerations.tolist())
             self._steps += len(grid)
         return self._limited.at(instants)
 
-    def _follow(self, grid: Array, axes: Array, slopes: Array, most: list[float]) -> None:
+    def _follow(self, grid: Array, axes: Array, slopes: Array, acceleration: float, turn_acceleration: float) -> None:
         """Take the steps that begin at instants (N,), where the lag asks for these axes and slopes (N, 6)."""
         for instant, goal, slope in zip(grid.tolist(), axes.tolist(), slopes.tolist(), strict=True):
             before, at = self._speed, self._at
-            linear = _next_speed(at[:3], before[:3], goal[:3], slope[:3], most[0])
-            self._speed = linear + _next_speed(at[3:], before[3:], goal[3:], slope[3:], most[1])
+            linear = _next_speed(at[:3], before[:3], goal[:3], slope[:3], acceleration)
+            self._speed = linear + _next_speed(at[3:], before[3:], goal[3:], slope[3:], turn_acceleration)
             if self._speed != before:
                 self._limited.append(instant, np.array(at), np.array(self._speed))
             self._at = [p + v * SERVO_STEP for p, v in zip(at, self._speed, strict=True)]
 
 
-def _next_speed(at: list[float], speed: list[float], goal: list[float], slope: list[float], most: float) -> list[float]:
+def _next_speed(
+    at: list[float], speed: list[float], goal: list[float], slope: list[float], acceleration: float
+) -> list[float]:
     """The speed of the next step: that of the goal, and as much more as can be braked in time; change is limited."""
     gap = [g - p for g, p in zip(goal, at, strict=True)]
-    distance, step = math.hypot(*gap), most * SERVO_STEP
-    # braked by `step` a step, it ends at zero
-    closing = step * (math.sqrt(0.25 + 2 * distance / (step * SERVO_STEP)) - 0.5)
+    distance, step = math.hypot(*gap), acceleration * SERVO_STEP
+    closing = step * (
+        math.sqrt(0.25 + 2 * distance / (step * SERVO_STEP)) - 0.5
+    )  # braked by `step` a step, it ends at 0
     share = min(1 / SERVO_STEP, closing / distance) if distance else 0.0
     change = [s + share * g - v for s, g, v in zip(slope, gap, speed, strict=True)]
     size = math.hypot(*change)
@@ -211,7 +214,10 @@ class VirtualArm:
         self._rates = WorkRates(faults_striking(faults, FaultPart.ARM))
         self._answers = Telemetry(settings, baud, faults)
         self._setpoint = Polyline(0.0, home_axes)
-        self._servo = Servo(self._setpoint, settings.dead_time, settings.servo_lag, _acceleration_limits(settings))
+        accelerations = None
+        if settings.acceleration is not None:
+            accelerations = settings.acceleration * np.array([1.0, settings.top_turn / settings.top_speed])
+        self._servo = Servo(self._setpoint, settings.dead_time, settings.servo_lag, accelerations)
         self._target = home_axes.copy()  # machine coordinates, of the last command queued
         self._origin = np.zeros(3)
         self._fifo: deque[WorkStretches] = deque()  # of the commands in it
@@ -272,28 +278,31 @@ class VirtualArm:
         return self._line_in.struck
 
     def _take(self, instruction: Instruction) -> None:
-        if isinstance(instruction, G1 | G4):
-            if self.queued >= self._settings.fifo:
+        low, high = self._settings.low, self._settings.high
+        match instruction:
+            case G1() | G4() if self.queued >= self._settings.fifo:
                 self.ignored.append(self.now)
-            elif isinstance(instruction, G1):
-                self._move(instruction)
-            else:
+            case G1():
+                target = np.concatenate([instruction.axes[:3] + self._origin, instruction.axes[3:]])
+                if (target < low).any() or (target > high).any():
+                    self.refused.append(self.now)
+                else:
+                    self._queue(_duration(target - self._target, instruction.feed, self._settings), target)
+            case G4():
                 self._queue(instruction.duration, None)
-        elif isinstance(instruction, G54):
-            self._set_origin(instruction.origin)
-        elif isinstance(instruction, Mode):
-            self.mode = instruction.mode
-        else:
-            self._stop()
-            if isinstance(instruction, ControllerReset):
-                self._origin, self.mode = np.zeros(3), 0
-
-    def _move(self, move: G1) -> None:
-        target = np.concatenate([move.axes[:3] + self._origin, move.axes[3:]])
-        if (target < self._settings.low).any() or (target > self._settings.high).any():
-            self.refused.append(self.now)
-            return
-        self._queue(_duration(target - self._target, move.feed, self._settings), target)
+            case G54() if (instruction.origin < low[:3]).any() or (instruction.origin > high[:3]).any():
+                self.refused.append(self.now)
+            case G54():
+                self._origin = instruction.origin
+            case Mode():
+                self.mode = instruction.mode
+            case _:
+                self._setpoint.stop(self.now)
+                self._target = self._setpoint.axes[-1].copy()
+                self._fifo.clear()
+                self._free, self._flowing = self.now, False
+                if isinstance(instruction, ControllerReset):
+                    self._origin, self.mode = np.zeros(3), 0
 
     def _queue(self, work: float, target: Array | None) -> None:
         """Put a command behind the others: `work` s of motion to `target` (6,), or of pause."""
@@ -306,40 +315,19 @@ class VirtualArm:
         self._fifo.append(stretches)
         self.deepest, self.fullest = max(self.deepest, self.held), max(self.fullest, self.queued)
         if target is not None and self._free > begin and moving:
-            self._interpolate(stretches, (target - self._target) / work)
+            speed, axes = (target - self._target) / work, self._target
+            for begin, end, rate in stretches:
+                self._setpoint.append(begin, axes, rate * speed)
+                axes = axes + rate * speed * (end - begin)
             self._setpoint.append(self._free, target, np.zeros(AXIS_COUNT))
             self._target = target
-
-    def _interpolate(self, stretches: WorkStretches, speed: Array) -> None:
-        axes = self._target
-        for begin, end, rate in stretches:
-            self._setpoint.append(begin, axes, rate * speed)
-            axes = axes + rate * speed * (end - begin)
-
-    def _set_origin(self, origin: Array) -> None:
-        if (origin < self._settings.low[:3]).any() or (origin > self._settings.high[:3]).any():
-            self.refused.append(self.now)
-        else:
-            self._origin = origin
-
-    def _stop(self) -> None:
-        self._setpoint.stop(self.now)
-        self._target = self._setpoint.axes[-1].copy()
-        self._fifo.clear()
-        self._free, self._flowing = self.now, False
 
 
 def _duration(way: Array, feed: float, settings: ArmSettings) -> float:
     """Seconds that a move along `way` (6,), mm and rad, takes at `feed` mm/s, or degrees/s if it only turns."""
     length, turns = float(np.linalg.norm(way[:3])), np.abs(way[3:])
     if length > MIN_TRAVEL or not turns.any():
-        asked = length / min(feed, settings.top_speed)
+        duration = length / min(feed, settings.top_speed)
     else:
-        asked = max(float(np.linalg.norm(turns)) / float(np.deg2rad(feed)), length / settings.top_speed)
-    return max(asked, float(turns.max()) / settings.top_turn)
-
-
-def _acceleration_limits(settings: ArmSettings) -> Array | None:
-    if settings.acceleration is None:
-        return None
-    return settings.acceleration * np.array([1.0, settings.top_turn / settings.top_speed])
+        duration = max(float(np.linalg.norm(turns)) / float(np.deg2rad(feed)), length / settings.top_speed)
+    return max(duration, float(turns.max()) / settings.top_turn)

@@ -16,9 +16,10 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, TextIO
+from typing import Protocol
 
 import numpy as np
 import serial
@@ -207,14 +208,10 @@ class PtyLink:
         self.close()
 
 
-LOG_HEADER = "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg"
+_print_line = partial(print, flush=True)
 POLL_PERIOD = 0.002  # s between looks at the line; a frame takes 4 ms
 LOG_STEP = 0.001  # s
 _ROWS_AT_ONCE = 10_000  # of the log at once
-
-
-def _print_line(words: str) -> None:
-    print(words, flush=True)
 
 
 def run_virtual_arm(
@@ -263,35 +260,29 @@ def _motion_log(log: Path | None, arm: VirtualArm) -> Iterator[None]:
         try:
             yield
         finally:
-            _write_motion(file, arm)
-
-
-def _write_motion(file: TextIO, arm: VirtualArm) -> None:
-    units = np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
-    size = int(arm.now / LOG_STEP + 1e-6) + 1  # a whole number of steps may come out just below it
-    file.write(LOG_HEADER + "\n")
-    for start in range(0, size, _ROWS_AT_ONCE):
-        stamps = np.minimum(np.arange(start, min(start + _ROWS_AT_ONCE, size)) * LOG_STEP, arm.now)
-        rows = np.column_stack([stamps, arm.axes_at(stamps) * units])
-        np.savetxt(file, rows, ["%.3f"] + ["%.6f"] * 6, delimiter=",")
+            size = int(arm.now / LOG_STEP + 1e-6) + 1  # a whole number of steps may come out just below it
+            file.write("stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg\n")
+            for start in range(0, size, _ROWS_AT_ONCE):
+                stamps = np.minimum(np.arange(start, min(start + _ROWS_AT_ONCE, size)) * LOG_STEP, arm.now)
+                axes = arm.axes_at(stamps) * [1, 1, 1, *np.rad2deg([1.0, 1, 1])]
+                np.savetxt(file, np.column_stack([stamps, axes]), ["%.3f"] + ["%.6f"] * 6, delimiter=",")
 
 
 def run_summary(arm: VirtualArm) -> str:
     """What came over the line and what became of it, in a few lines."""
-    stray = sum(len(data) for _, data in arm.garbage)
-    lines = [
-        f"{arm.frames} frames in {arm.now:.1f} s",
-        f"{len(arm.ignored)} ignored, the queue was full",
-        f"{len(arm.refused)} refused, out of reach",
-        f"{len(arm.struck)} lost or garbled by a fault",
-        f"{len(arm.underruns)} underruns" + (f", the first at {arm.underruns[0]:.3f} s" if arm.underruns else ""),
-        f"{stray} bytes in no frame" + (f", the first {_hex_dump(*arm.garbage[0])}" if stray else ""),
-    ]
-    return "\n".join(lines)
-
-
-def _hex_dump(now: float, data: bytes) -> str:
-    return f"at {now:.3f} s: {data[:12].hex(' ')}" + (" ..." if len(data) > 12 else "")
+    underruns = f", the first at {arm.underruns[0]:.3f} s" if arm.underruns else ""
+    stray = ""
+    if arm.garbage:
+        now, data = arm.garbage[0]
+        stray = f", the first at {now:.3f} s: {data[:12].hex(' ')}" + (" ..." if len(data) > 12 else "")
+    return (
+        f"{arm.frames} frames in {arm.now:.1f} s\n"
+        f"{len(arm.ignored)} ignored, the queue was full\n"
+        f"{len(arm.refused)} refused, out of reach\n"
+        f"{len(arm.struck)} lost or garbled by a fault\n"
+        f"{len(arm.underruns)} underruns{underruns}\n"
+        f"{sum(len(data) for _, data in arm.garbage)} bytes in no frame{stray}"
+    )
 
 
 def _serve(port: int, arm: VirtualArm, rate: float, clock: Clock, stop: threading.Event) -> None:

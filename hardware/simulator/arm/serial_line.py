@@ -42,10 +42,6 @@ class SerialWire:
         return self._free
 
 
-_FRAME_BITS = 8 * FRAME_LENGTH
-_FRAME_FAULTS = (FaultKind.DROP, FaultKind.GARBLE)
-
-
 def unplugged(faults: Sequence[Fault], instant: float) -> bool:
     """Whether the line is cut at `instant`, s."""
     return any(fault.covers(instant) for fault in faults_striking(faults, FaultPart.ARM, FaultKind.UNPLUG))
@@ -77,19 +73,19 @@ class FaultyLine:
 
     def _begin(self, now: float) -> None:
         self._mask = bytes(FRAME_LENGTH)
-        for fault in faults_striking(self._faults, FaultPart.ARM, *_FRAME_FAULTS):
+        for fault in faults_striking(self._faults, FaultPart.ARM, FaultKind.DROP, FaultKind.GARBLE):
             once = fault.duration == 0
             if not (now >= fault.start if once else fault.covers(now)):
                 continue
             if once:
                 self._faults.remove(fault)
-            self._mask = None if fault.kind is FaultKind.DROP or self._mask is None else self._flips()
+            if fault.kind is FaultKind.DROP or self._mask is None:
+                self._mask = None
+            else:
+                bits = np.zeros(8 * FRAME_LENGTH, np.uint8)
+                bits[self._rng.choice(len(bits), self._rng.integers(1, 9), replace=False)] = 1
+                self._mask = np.packbits(bits).tobytes()
             self.struck.append(now)
-
-    def _flips(self) -> bytes:
-        bits = np.zeros(_FRAME_BITS, np.uint8)
-        bits[self._rng.choice(_FRAME_BITS, self._rng.integers(1, 9), replace=False)] = 1
-        return np.packbits(bits).tobytes()
 
 
 class Telemetry:
@@ -111,14 +107,14 @@ class Telemetry:
     def advance(self, now: float, axes_at: Callable[[Array], Array], origin: Array) -> None:
         """Send what is due up to `now`, s. axes_at: the executed axes (N, 6) at instants (N,). origin: (3,) mm."""
         due: list[float] = []
-        words: list[bytes] = []
+        replies: list[bytes] = []
         while self._mode is not ReplyMode.OFF and self._next <= now:
             due.append(self._next)
-            words.append(bytes([self._stray]))
+            replies.append(bytes([self._stray]))
             self._schedule()
         if due and self._mode is ReplyMode.STREAM:
-            words = [_encoded_replies(axes, origin) for axes in axes_at(np.array(due))]
-        for instant, data in zip(due, words, strict=True):
+            replies = [_encoded_replies(axes, origin) for axes in axes_at(np.array(due))]
+        for instant, data in zip(due, replies, strict=True):
             if self._wire.free <= instant and not unplugged(self._faults, instant):
                 self._under_way.extend(zip(self._wire.send(data, instant).tolist(), data, strict=True))
 

@@ -28,11 +28,12 @@ from estimation.se3 import Array
 from hardware.process import checks
 from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults, faults_from_texts
 
-ARM_KEYS = (
-    *("fifo", "dead_time_s", "servo_lag_s", "acceleration_mm_s2", "top_speed_mm_s", "top_turn_deg_s"),
-    *("low_mm_deg", "high_mm_deg", "replies", "reply_period_s", "seed"),
-)
-_UNITS = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])
+ARM_KEYS = {  # key in a table [arm]: field of ArmSettings
+    **{"fifo": "fifo", "dead_time_s": "dead_time", "servo_lag_s": "servo_lag", "acceleration_mm_s2": "acceleration"},
+    **{"top_speed_mm_s": "top_speed", "top_turn_deg_s": "top_turn", "low_mm_deg": "low", "high_mm_deg": "high"},
+    **{"replies": "replies", "reply_period_s": "reply_period", "seed": "seed"},
+}
+_RADIANS_AND_MM = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])  # of mm and degrees
 _REACH_LIMIT = np.array([1600.0] * 3 + [np.deg2rad(320.0)] * 3)  # a reply's int16 must hold a place less an origin
 
 
@@ -71,7 +72,11 @@ class ArmSettings:
         for name, low in (("fifo", 1), ("seed", 0)):
             checks.integer("arm", name, getattr(self, name), low)
         for name in ("dead_time", "servo_lag", "acceleration", "top_speed", "top_turn", "reply_period"):
-            self._check_positive(name, zero=name in ("dead_time", "servo_lag"))
+            number, zero = getattr(self, name), name in ("dead_time", "servo_lag")
+            if number is None and name == "acceleration":
+                continue
+            if not (np.isfinite(number) and (number > 0 or (zero and number == 0))):
+                raise InputError("arm", name, number, "a finite number >= 0" if zero else "a finite number > 0")
         for name in ("low", "high"):
             value = getattr(self, name)
             if np.shape(value) != (6,) or not (np.abs(value) <= _REACH_LIMIT).all():
@@ -79,48 +84,17 @@ class ArmSettings:
         if (self.low >= self.high).any():
             raise InputError("arm", "low", self.low.tolist(), f"below high, {self.high.tolist()}")
 
-    def _check_positive(self, name: str, zero: bool) -> None:
-        value = getattr(self, name)
-        if value is None and name == "acceleration":
-            return
-        if not (np.isfinite(value) and (value > 0 or (zero and value == 0))):
-            raise InputError("arm", name, value, "a finite number >= 0" if zero else "a finite number > 0")
-
 
 def arm_settings_from_table(where: object, table: checks.Table) -> ArmSettings:
     """The settings in a table [arm]; what it leaves out keeps its default. InputError names the key."""
     checks.check_keys(where, "arm.", table, (), ARM_KEYS)
     try:
-        return ArmSettings(**{_field(key): _value(where, key, value) for key, value in table.items()})
+        return ArmSettings(**{ARM_KEYS[key]: _value(where, key, value) for key, value in table.items()})
     except InputError as error:
         if error.where == str(where):
             raise
-        raise InputError(where, f"arm.{_key(str(error.what))}", error.got, error.allowed) from None
-
-
-def table_from_arm_settings(settings: ArmSettings) -> dict[str, Any]:
-    """The table [arm] that gives these settings; angles in degrees, as arrays where there are six numbers."""
-    table: dict[str, Any] = {}
-    for key in ARM_KEYS:
-        value = getattr(settings, _field(key))
-        if key.endswith("_mm_deg"):
-            value = value / _UNITS
-        elif key.endswith("_deg_s"):
-            value = float(np.rad2deg(value))
-        if value is not None:
-            table[key] = value.value if isinstance(value, ReplyMode) else value
-    return table
-
-
-def _field(key: str) -> str:
-    for unit in ("_mm_s2", "_mm_s", "_deg_s", "_mm_deg", "_s"):
-        if key.endswith(unit):
-            return key.removesuffix(unit)
-    return key
-
-
-def _key(name: str) -> str:
-    return next(key for key in ARM_KEYS if _field(key) == name)
+        key = next(key for key, name in ARM_KEYS.items() if name == str(error.what))
+        raise InputError(where, f"arm.{key}", error.got, error.allowed) from None
 
 
 def _value(where: object, key: str, value: object) -> Any:
@@ -133,7 +107,7 @@ def _value(where: object, key: str, value: object) -> Any:
             raise InputError(where, name, value, checks.one_of_text(str(value), words))
         return ReplyMode(value)
     if key.endswith("_mm_deg"):
-        return checks.numbers(where, name, value, (6,)) * _UNITS
+        return checks.numbers(where, name, value, (6,)) * _RADIANS_AND_MM
     number = checks.number(where, name, value)
     return float(np.deg2rad(number)) if key.endswith("_deg_s") else number
 
@@ -141,8 +115,13 @@ def _value(where: object, key: str, value: object) -> Any:
 def write_virtual_arm(file: Path, settings: ArmSettings, faults: tuple[Fault, ...]) -> None:
     """Write what `read_virtual_arm` reads back as the same."""
     lines = [f"faults = {json.dumps([str(fault) for fault in faults])}", "[arm]"]
-    for key, value in table_from_arm_settings(settings).items():
-        lines.append(f"{key} = {checks.toml_numbers(value) if isinstance(value, np.ndarray) else json.dumps(value)}")
+    for key, name in ARM_KEYS.items():
+        value = getattr(settings, name)
+        if key.endswith("_mm_deg"):
+            lines.append(f"{key} = {checks.toml_numbers(value / _RADIANS_AND_MM)}")
+        elif value is not None:
+            value = float(np.rad2deg(value)) if key.endswith("_deg_s") else value
+            lines.append(f"{key} = {json.dumps(value.value if isinstance(value, ReplyMode) else value)}")
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
