@@ -147,7 +147,9 @@ def deposit_map(log: NozzleLog, line: PlannedLine, bead: float) -> DepositMap:
     the straight line between the nozzle's two tips; it belongs to the layer of the path's piece.
     """
     cell = min(MAP_CELL, bead / MIN_CELLS_PER_BEAD)
-    planned, deposited = _planned_drops(line, cell), _deposited_drops(log, line, cell)
+    start, end = line.points[:-1, :2][line.printed], line.points[1:, :2][line.printed]
+    planned = _drops(start, end, np.linalg.norm(end - start, axis=1), line.layer[line.printed], cell)
+    deposited = _deposited_drops(log, line, cell)
     everything = np.concatenate([line.points[:, :2], deposited.places])
     margin = bead / 2 + 3 * cell  # of these, 2 for the bead's blurred edge
     low = everything.min(axis=0) - margin
@@ -167,40 +169,35 @@ def deposit_figures(thickness: DepositMap) -> DepositFigures:
     """The figures of a map."""
     planned, deposited = thickness.planned, thickness.deposited
     square = thickness.cell**2
-    wanted, got = np.minimum(planned, 1.0), np.minimum(deposited, 1.0)
-    area, cells = float(wanted.sum()) * square, int((planned >= HALF_BEAD).sum())
+    target, actual = np.minimum(planned, 1.0), np.minimum(deposited, 1.0)
+    area, cells = float(target.sum()) * square, int((planned >= HALF_BEAD).sum())
     if not cells:
         return DepositFigures(area, *[float("nan")] * 5)
-    lacking, double = gaps_and_overlaps(planned, deposited)
+    gaps, overlaps = gaps_and_overlaps(planned, deposited)
     return DepositFigures(
         area=area,
-        coverage=float(np.minimum(wanted, got).sum()) * square / area,
-        gaps=float(lacking.sum()) / cells,
-        overlap=float(double.sum()) / cells,
-        outside=float(np.maximum(got - wanted, 0.0).sum()) * square / area,
+        coverage=float(np.minimum(target, actual).sum()) * square / area,
+        gaps=float(gaps.sum()) / cells,
+        overlap=float(overlaps.sum()) / cells,
+        outside=float(np.maximum(actual - target, 0.0).sum()) * square / area,
         material=float(deposited.sum() / planned.sum()),
     )
 
 
 def gaps_and_overlaps(planned: Array, deposited: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which cells (...) are gaps and which overlap, as DepositFigures counts them, of thicknesses (...)."""
-    there = planned >= HALF_BEAD
-    gaps = there & (deposited <= np.minimum(planned, 1.0) - HALF_BEAD)
-    return gaps, there & (deposited > np.maximum(1.5 * planned, planned + HALF_BEAD))
+    in_plan = planned >= HALF_BEAD
+    gaps = in_plan & (deposited <= np.minimum(planned, 1.0) - HALF_BEAD)
+    return gaps, in_plan & (deposited > np.maximum(1.5 * planned, planned + HALF_BEAD))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Drops:
-    """Material in N small drops. places: (N, 2) mm. material: (N,) mm of bead. layer: (N,)."""
+    """Material in N small drops."""
 
-    places: Array
-    material: Array
-    layer: NDArray[np.int64]
-
-
-def _planned_drops(line: PlannedLine, cell: float) -> _Drops:
-    start, end = line.points[:-1, :2][line.printed], line.points[1:, :2][line.printed]
-    return _drops(start, end, np.linalg.norm(end - start, axis=1), line.layer[line.printed], cell)
+    places: Array  # (N, 2) mm
+    material: Array  # (N,) mm of bead
+    layer: NDArray[np.int64]  # (N,)
 
 
 def _deposited_drops(log: NozzleLog, line: PlannedLine, cell: float) -> _Drops:

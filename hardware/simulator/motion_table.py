@@ -20,34 +20,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from estimation.synthetic.movements import (
-    FRAMES_PER_S,
-    MAX_DRAW_SIGMAS,
-    BreathingSpec,
-    ComposedMotion,
-    MotionPart,
-    WaveformMotion,
-    draw_breathing,
-    draw_noise,
-    draw_pulse,
-    draw_walk,
-    shaking_amplitude,
-)
+from estimation.synthetic import movements
+from estimation.synthetic.movements import BreathingSpec, ComposedMotion, MotionPart, WaveformMotion
 from estimation.synthetic.waveforms import Levels, RoundedCorners, Sine, StepWave, Waveform, Zigzag
 from hardware.process.checks import Table
 from hardware.simulator.scenario_tables import TableReader
 from hardware.simulator.trace_file import played_trace, read_trace
 
 MOTION_STREAM = 21  # of the scenario's seed: no other draw of the simulator shares it
-SURFACE_NORMAL = (0.0, 0.0, 1.0)  # the surface's normal
+ZERO, SURFACE_NORMAL = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 THESIS_UNIT_MM = 100.0  # edge of the thesis's cube: 282 px at 400 mm before 1109 px of focal length are 102 mm
-MAX_SPREAD = 0.9 / MAX_DRAW_SIGMAS  # no breath and no beat may come out with no length
+MAX_SPREAD = 0.9 / movements.MAX_DRAW_SIGMAS  # no breath and no beat may come out with no length
 
 Generator = np.random.Generator
 
@@ -76,7 +66,7 @@ def _part(where: object, number: int, table: Table, folder: Path, seed: int) -> 
     keys = TableReader(where, f"motion[{number}].", table)
     kind = keys.word("kind", [*WAVE_KINDS, *PART_KINDS])
     rng = np.random.default_rng([seed, MOTION_STREAM, number])
-    pivot = keys.vector("pivot_mm", (0.0, 0.0, 0.0))
+    pivot = keys.vector("pivot_mm", ZERO)
     part = _driven(keys, kind, rng, pivot) if kind in WAVE_KINDS else PART_KINDS[kind](keys, rng, pivot, folder)
     keys.done()
     return part
@@ -84,13 +74,13 @@ def _part(where: object, number: int, table: Table, folder: Path, seed: int) -> 
 
 def _driven(keys: TableReader, kind: str, rng: Generator, pivot: Array) -> WaveformMotion:
     wave = WAVE_KINDS[kind](keys, rng)
-    direction, turn = keys.axis("direction", SURFACE_NORMAL), np.deg2rad(keys.vector("turn_deg", (0.0, 0.0, 0.0)))
+    direction, turn = keys.axis("direction", SURFACE_NORMAL), np.deg2rad(keys.vector("turn_deg", ZERO))
     name = "height_mm" if kind == "steps" else "amplitude_mm"
     if kind == "sine" and keys.has("mm_per_frame"):
         if keys.has(name):
             raise InputError(keys.where, keys.prefix + name, keys.table[name], "none beside mm_per_frame")
-        fps = keys.number("fps", FRAMES_PER_S, 0, open=True)
-        amplitude = shaking_amplitude(keys.number("mm_per_frame"), keys.number("rate_hz"), fps)
+        fps = keys.number("fps", movements.FRAMES_PER_S, 0, open=True)
+        amplitude = movements.shaking_amplitude(keys.number("mm_per_frame"), keys.number("rate_hz"), fps)
     else:
         amplitude = keys.number(name, 0.0 if turn.any() else None)
     return WaveformMotion((wave,), np.concatenate([turn, amplitude * direction])[None], pivot)
@@ -112,13 +102,13 @@ def _breathing(keys: TableReader, rng: Generator) -> Waveform:
         pauses_per_min=keys.number("pauses_per_min", usual.pauses_per_min, 0, 10),
         pause=keys.number("pause_s", usual.pause, 0, 60),
     )
-    return draw_breathing(spec, rng)
+    return movements.draw_breathing(spec, rng)
 
 
 def _pulse(keys: TableReader, rng: Generator) -> Waveform:
     rate = keys.number("rate_hz", 1.15, 0.2, 5)
-    spreads = [keys.number(name, 0.05, 0, MAX_SPREAD) for name in ("rate_spread", "depth_spread")]
-    return draw_pulse(rate, spreads[0], spreads[1], rng)
+    rate_spread, depth_spread = (keys.number(n, 0.05, 0, MAX_SPREAD) for n in ("rate_spread", "depth_spread"))
+    return movements.draw_pulse(rate, rate_spread, depth_spread, rng)
 
 
 def _sine(keys: TableReader, rng: Generator) -> Waveform:
@@ -132,19 +122,13 @@ def _steps(keys: TableReader, rng: Generator) -> Waveform:
     return StepWave(first, every, rise, keys.word("pattern", ["turns", "stairs"], "turns") == "stairs")
 
 
-def _tremor(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
-    return _noise(keys, rng, pivot, (8.0, 12.0), 0.0)
-
-
-def _hand(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
-    return _noise(keys, rng, pivot, (0.2, 3.0), 1.0)
-
-
-def _noise(keys: TableReader, rng: Generator, pivot: Array, band: tuple[float, float], tilt: float) -> WaveformMotion:
+def _noise(
+    keys: TableReader, rng: Generator, pivot: Array, folder: Path, band: tuple[float, float], tilt: float
+) -> WaveformMotion:
     """Six noises of their own; tilt: 1 for one speed at every frequency, as of a hand, counted from its start."""
     low, high = keys.band("band_hz", band)
     rms = _six(keys, "rms_mm", "rms_deg", 0.0)
-    waves = tuple(draw_noise(low, high, tilt, rng) for _ in range(6))
+    waves = tuple(movements.draw_noise(low, high, tilt, rng) for _ in range(6))
     return WaveformMotion(waves, np.diag(rms), pivot, from_start=tilt > 0)
 
 
@@ -152,19 +136,18 @@ def _six(keys: TableReader, shift: str, turn: str, low: float = -math.inf) -> Ar
     """Rotation and shift (6,), rad and mm, of two keys; one of them must be there."""
     if not keys.has(shift) and not keys.has(turn):
         raise InputError(keys.where, keys.prefix + shift, "missing", f"{shift} or {turn}, 3 numbers")
-    zero = (0.0, 0.0, 0.0)
-    return np.concatenate([np.deg2rad(keys.vector(turn, zero, low)), keys.vector(shift, zero, low)])
+    return np.concatenate([np.deg2rad(keys.vector(turn, ZERO, low)), keys.vector(shift, ZERO, low)])
 
 
 def _drift(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
-    speed = np.concatenate([np.deg2rad(keys.vector("speed_deg_s", (0, 0, 0))), keys.vector("speed_mm_s", (0, 0, 0))])
-    walk = np.concatenate([np.deg2rad(keys.vector("walk_deg", (0, 0, 0), 0)), keys.vector("walk_mm", (0, 0, 0), 0)])
+    speed = np.concatenate([np.deg2rad(keys.vector("speed_deg_s", ZERO)), keys.vector("speed_mm_s", ZERO)])
+    walk = np.concatenate([np.deg2rad(keys.vector("walk_deg", ZERO, 0)), keys.vector("walk_mm", ZERO, 0)])
     if not speed.any() and not walk.any():
         allowed = "speed_mm_s, speed_deg_s, walk_mm or walk_deg"
         raise InputError(keys.where, keys.prefix + "speed_mm_s", "missing", allowed)
     steady = RoundedCorners(np.zeros(1), np.ones(1), 1.0)  # from rest, at full speed after half a second
-    waves: list[Waveform] = [steady, *(draw_walk(rng) for _ in range(6))]
-    return WaveformMotion(tuple(waves), np.concatenate([speed[None], np.diag(walk)]), pivot)
+    waves: tuple[Waveform, ...] = (steady, *(movements.draw_walk(rng) for _ in range(6)))
+    return WaveformMotion(waves, np.concatenate([speed[None], np.diag(walk)]), pivot)
 
 
 def _ramp(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
@@ -173,15 +156,12 @@ def _ramp(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> Wave
     start = keys.number("start_s", 0.0)
     end = keys.number("end_s", math.inf, start + rounding)
     back = keys.flag("back", False)
-    if math.isinf(end):
-        if back:
-            raise InputError(keys.where, keys.prefix + "end_s", "missing", "this key, where back = true")
-        times, bends = [start], [1.0]
-    elif back:
-        times, bends = [start, end, 2 * end - start], [1.0, -2.0, 1.0]
-    else:
-        times, bends = [start, end], [1.0, -1.0]
-    return WaveformMotion((RoundedCorners(np.array(times), np.array(bends), rounding),), speed[None], pivot)
+    if math.isinf(end) and back:
+        raise InputError(keys.where, keys.prefix + "end_s", "missing", "this key, where back = true")
+    times, bends = [start, end, 2 * end - start], [1.0, -2.0 if back else -1.0, 1.0]
+    count = 1 if math.isinf(end) else 3 if back else 2
+    corners = RoundedCorners(np.array(times[:count]), np.array(bends[:count]), rounding)
+    return WaveformMotion((corners,), speed[None], pivot)
 
 
 def _constant_speed(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
@@ -224,5 +204,7 @@ WAVE_KINDS: dict[str, Callable[[TableReader, Generator], Waveform]] = dict(
     breathing=_breathing, pulse=_pulse, sine=_sine, steps=_steps
 )
 PART_KINDS: dict[str, Callable[[TableReader, Generator, Array, Path], MotionPart]] = dict(
-    tremor=_tremor, hand=_hand, drift=_drift, ramp=_ramp, constant=_constant_speed, turn=_turn, trace=_trace
+    tremor=partial(_noise, band=(8.0, 12.0), tilt=0.0),
+    hand=partial(_noise, band=(0.2, 3.0), tilt=1.0),
+    **dict(drift=_drift, ramp=_ramp, constant=_constant_speed, turn=_turn, trace=_trace),
 )

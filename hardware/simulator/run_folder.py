@@ -33,7 +33,7 @@ from hardware.recording.recorder import Recorder
 from hardware.recording.schemas import INFO, WARNING
 from hardware.simulator.cameras import JITTER_LIMIT, Shot
 from hardware.simulator.deposit import NozzleLog, PlannedLine
-from hardware.simulator.nozzle_error import RowErrors, nozzle_errors
+from hardware.simulator.nozzle_error import nozzle_errors
 from hardware.simulator.scenario import Scenario
 from perception.frames import FrameSet, Image, PrintHead, Roi
 from perception.tracking.step import STAGES, StepReport
@@ -105,7 +105,9 @@ class WatchPage:
             images = [f.image for f in frames.frames if f.camera == camera]
             if images:
                 self._draw(tile, images[0], camera, pose, line)
-            self._label(tile, self._rig.cameras[camera].name if images else "no picture")
+            label = self._rig.cameras[camera].name if images else "no picture"
+            for colour, width in (((20, 20, 20), 4), ((240, 240, 240), 1)):
+                cv2.putText(tile, label, (16, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, width, cv2.LINE_AA)
         cv2.rectangle(canvas, (0, 0), (canvas.shape[1] - 1, height - 1), STATE_BGR[pose.state], 6)
         return canvas
 
@@ -130,15 +132,12 @@ class WatchPage:
         pixels, depth = pixels_from_points(self._rig.cameras[camera], points)
         return pixels if (depth > 1).all() else None
 
-    def _label(self, tile: Image, text: str) -> None:
-        for colour, width in (((20, 20, 20), 4), ((240, 240, 240), 1)):
-            cv2.putText(tile, text, (16, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, width, cv2.LINE_AA)
 
-
-_NOZZLE = ("x_mm", "y_mm", "z_mm")
-_TARGET = ("target_x_mm", "target_y_mm", "target_z_mm")
-_ERROR = ("error_mm", "error_x_mm", "error_y_mm", "error_z_mm", "angle_deg", "path_error_mm")
-NOZZLE_HEADER = ("stamp_s", "extrude", *_NOZZLE, *_TARGET, *_ERROR, "place_mm", "checkpoint", "reason")
+NOZZLE_HEADER = (
+    *("stamp_s", "extrude", "x_mm", "y_mm", "z_mm", "target_x_mm", "target_y_mm", "target_z_mm"),
+    *("error_mm", "error_x_mm", "error_y_mm", "error_z_mm", "angle_deg", "path_error_mm"),
+    *("place_mm", "checkpoint", "reason"),
+)
 _ROW = "%.6f,%d" + ",%.6f" * 13 + ",%d,"
 
 
@@ -152,10 +151,13 @@ class NozzleWriter:
 
     def write(self, log: NozzleLog) -> None:
         """The rows that came since the last call."""
-        rows = _numbers(log, nozzle_errors(log, self._line)).tolist()
-        reasons = {word: _quoted(word) for word in np.unique(log.reason).tolist()}
-        for row, word in zip(rows, log.reason.tolist(), strict=True):
-            self._file.write((_ROW % tuple(row)).replace("nan", "") + reasons[word])
+        nozzle, target, errors = log.base_from_nozzle, log.base_from_target, nozzle_errors(log, self._line)
+        error = errors.distance, errors.vector, np.degrees(errors.angle), errors.path
+        places = nozzle[:, :3, 3], target[:, :3, 3]
+        rows = np.column_stack([log.stamps, log.extrude, *places, *error, log.place, log.checkpoint])
+        reasons = {reason: _quoted(reason) for reason in np.unique(log.reason).tolist()}
+        for row, reason in zip(rows.tolist(), log.reason.tolist(), strict=True):
+            self._file.write((_ROW % tuple(row)).replace("nan", "") + reasons[reason])
         self._file.flush()
 
     def __enter__(self) -> NozzleWriter:
@@ -165,15 +167,9 @@ class NozzleWriter:
         self._file.close()
 
 
-def _numbers(log: NozzleLog, errors: RowErrors) -> Array:
-    nozzle, target = log.base_from_nozzle[:, :3, 3], log.base_from_target[:, :3, 3]
-    error = [errors.distance, errors.vector, np.degrees(errors.angle), errors.path]
-    return np.column_stack([log.stamps, log.extrude, nozzle, target, *error, log.place, log.checkpoint])
-
-
-def _quoted(word: str) -> str:
+def _quoted(reason: str) -> str:
     """A last cell and its end of line, as csv.writer writes them; a line break becomes a blank."""
-    text = " ".join(word.split("\n"))
+    text = reason.replace("\n", " ")
     return ('"' + text.replace('"', '""') + '"' if any(c in text for c in ',"\r') else text) + "\n"
 
 
@@ -207,8 +203,8 @@ class RunFolder:
         self.logs: list[NozzleLog] = []
         self.pictures: dict[int, bytes] = {}  # per camera, the newest, if there is one the newest of the printing
         self.watch = WatchPage(out, scenario.known_rig, scenario.title)
-        self._shown: Array | None = None  # (N, 3) the line in the tracker's own surface frame
-        self._doing, self._printing, self._printed = "waiting for a surface to follow", False, False
+        self._line_points: Array | None = None  # (N, 3) mm, of the line in the tracker's own surface frame
+        self._activity, self._printing, self._printed = "waiting for a surface to follow", False, False
         self._state: TrackState | None = None
         self._reason = ""
         self._pending: list[Array] = []  # s, instants whose truth is still to be written
@@ -264,13 +260,17 @@ class RunFolder:
         if self._session is not None:
             self._session[1].write(report.observations)
             self._session[1].write(pose)
+            error, log = "not printing", self.logs[-1] if self.logs else None
+            if log is not None and log.extrude.any():
+                off = (log.base_from_nozzle - log.base_from_target)[log.extrude, :3, 3]
+                error = f"{np.linalg.norm(off, axis=1).mean():.3f} mm"
             time = f"{pose.stamp:.1f} of {self._seconds:g} s"
-            facts = [("time", time), ("arm", self._doing), ("error at the nozzle", self._error())]
-            self.watch.show(frames, pose, self._shown, facts)
+            facts = [("time", time), ("arm", self._activity), ("error at the nozzle", error)]
+            self.watch.show(frames, pose, self._line_points, facts)
 
     def registered(self, truth_from_estimate: Array) -> None:
         """The path was registered: truth_surface_from_estimated_surface (4, 4)."""
-        self._shown = se3.transform_points(se3.inverse(truth_from_estimate), self._line.points)
+        self._line_points = se3.transform_points(se3.inverse(truth_from_estimate), self._line.points)
 
     def command(self, command: Command, progress: PrintProgress, frame: bytes, received: bytes) -> None:
         """A command was sent, how far the print is by it, and what came from the arm since the last."""
@@ -287,7 +287,7 @@ class RunFolder:
         self._reason = reason
         self._printing = isinstance(command, Move) and command.extrude
         share = f"{progress.place:.0f} of {progress.length:.0f} mm"
-        self._doing = f"holds: {reason}" if reason else f"{progress.phase.value}, {share}"
+        self._activity = f"holds: {reason}" if reason else f"{progress.phase.value}, {share}"
 
     def rows(self, log: NozzleLog) -> None:
         """The next rows of the truth at the nozzle."""
@@ -300,13 +300,6 @@ class RunFolder:
         """Something that a person should know."""
         if self._session is not None:
             self._session[1].event(stamp, text, level, "simulation")
-
-    def _error(self) -> str:
-        log = self.logs[-1] if self.logs else None
-        if log is None or not log.extrude.any():
-            return "not printing"
-        off = (log.base_from_nozzle - log.base_from_target)[log.extrude, :3, 3]
-        return f"{np.linalg.norm(off, axis=1).mean():.3f} mm"
 
     def _write_truth(self, until: float) -> None:
         """Truth in the middle of each exposure and at each row, in order, up to `until`, s."""

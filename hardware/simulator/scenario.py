@@ -119,31 +119,32 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
     seed = checks.integer(path, "seed", table.get("seed", 1), 0)
     rig = _rig(path, parts["rig"])
     arm, profile, baud = _arm(path, parts["arm"])
-    rig_offset, arm_offset = _planted(path, parts["planted"])
+    planted, keys = parts["planted"], ("rig_offset_mm", "arm_offset_mm")
+    checks.check_keys(path, "planted.", planted, (), keys)
+    shifts = [checks.numbers(path, f"planted.{key}", planted.get(key, [0, 0, 0]), (3,), "mm") for key in keys]
+    rig_shift, arm_shift = (se3.make(np.eye(3), shift) for shift in shifts)
     quality = checks.integer(path, "sensor.jpeg_quality", parts["sensor"].pop("jpeg_quality", 90), 0)
     if quality > 100:
         raise InputError(path, "sensor.jpeg_quality", quality, "1 to 100, or 0 for lossless pictures")
-    known = replace(profile.arm, arm_from_base=profile.arm.arm_from_base @ se3.make(np.eye(3), arm_offset))
+    strain_rng = np.random.default_rng([seed, STRAIN_STREAM])
     return Scenario(
         file=path,
         title=checks.text(path, "title", table["title"]),
         seconds=_within(path, "seconds", table["seconds"], 0.1, MAX_SECONDS, "s"),
         seed=seed,
         path=path.parent / checks.text(path, "path", table["path"]),
-        clearance=None
-        if "clearance_mm" not in table
-        else _within(path, "clearance_mm", table["clearance_mm"], 0, 50, "mm"),
+        clearance=_within(path, "clearance_mm", table["clearance_mm"], 0, 50, "mm")
+        if "clearance_mm" in table
+        else None,
         bead=_within(path, "bead_mm", table.get("bead_mm", 1.0), 0.05, 20.0, "mm"),
         nozzle=_switch(path, "scene.nozzle", parts["scene"].pop("nozzle", True)),
         beads=_switch(path, "scene.beads", parts["scene"].pop("beads", True)),
         scene=parts["scene"],
         motion=motion_from_tables(path, table.get("motion", []), path.parent, seed),
-        strain=waveform_from_table(path, "strain", parts["strain"], np.random.default_rng([seed, STRAIN_STREAM]))
-        if parts["strain"]
-        else None,
+        strain=waveform_from_table(path, "strain", parts["strain"], strain_rng) if parts["strain"] else None,
         rest=BASE_FROM_REST,
         rig=rig,
-        known_rig=_shifted(rig, rig_offset),
+        known_rig=Rig(tuple(replace(c, base_from_camera=rig_shift @ c.base_from_camera) for c in rig.cameras)),
         cameras=camera_settings_from_table(path, parts["cameras"], [camera.name for camera in rig.cameras]),
         sensor=sensor_from_table(path, parts["sensor"]),
         jpeg_quality=quality or None,
@@ -152,7 +153,7 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
         faults=_faults(path, table.get("faults", []), len(rig)),
         true_arm=profile.arm,
         baud=baud,
-        profile=replace(profile, arm=known),
+        profile=replace(profile, arm=replace(profile.arm, arm_from_base=profile.arm.arm_from_base @ arm_shift)),
         limits=limits_from_table(path, parts["limits"]),
     )
 
@@ -194,18 +195,6 @@ def _rig(path: Path, table: Table) -> Rig:
     if "distortion" in table:
         given["distortion"] = tuple(checks.numbers(path, "rig.distortion", table["distortion"], (5,), "k1 k2 p1 p2 k3"))
     return arc_rig(**given)  # type: ignore[arg-type]
-
-
-def _shifted(rig: Rig, offset: Array) -> Rig:
-    shift = se3.make(np.eye(3), offset)
-    return Rig(tuple(replace(c, base_from_camera=shift @ c.base_from_camera) for c in rig.cameras))
-
-
-def _planted(path: Path, table: Table) -> tuple[Array, Array]:
-    keys = ("rig_offset_mm", "arm_offset_mm")
-    checks.check_keys(path, "planted.", table, (), keys)
-    rig, arm = (checks.numbers(path, f"planted.{key}", table.get(key, [0, 0, 0]), (3,), "mm") for key in keys)
-    return rig, arm
 
 
 def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:

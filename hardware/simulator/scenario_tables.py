@@ -34,7 +34,6 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from estimation.synthetic.world import BASE_FROM_REST
 from hardware.files.mesh_file import read_mesh
 from hardware.process import checks
 from hardware.process.checks import Table
@@ -57,43 +56,36 @@ from hardware.simulator.scene.shape import (
 
 @dataclass(slots=True)
 class TableReader:
-    """Takes values out of a table. where: the file. prefix: in front of each key in an error ("motion[0].").
+    """Takes values out of a table: a key without a default must be there, and `done` refuses every key not read."""
 
-    A key without a default must be there. `done` is called last: it refuses every key that was not asked for.
-    asked: so far, and whatever else may be there.
-    """
-
-    where: object
-    prefix: str
+    where: object  # the file
+    prefix: str  # in front of each key in an error ("motion[0].")
     table: Table
-    asked: list[str] = field(default_factory=list)
+    known_keys: list[str] = field(default_factory=list)  # read so far, and whatever else may be there
 
     def has(self, key: str) -> bool:
         """Whether the table has a key."""
-        self.asked.append(key)
+        self.known_keys.append(key)
         return key in self.table
 
     def number(
         self, key: str, default: float | None = None, low: float = -math.inf, high: float = math.inf, open: bool = False
     ) -> float:
         """A finite number from low (above it where `open`) to high."""
-        if not self._take(key, default is None):
-            assert default is not None
+        if not self.has(key) and default is not None:
             return default
-        value = checks.number(self.where, self.prefix + key, self.table[key])
+        value = checks.number(self.where, self.prefix + key, self._required(key))
         if not (low < value <= high or (value == low and not open)):
             raise self.wrong(key, _range(low, high, open))
         return value
 
     def whole(self, key: str, default: int, low: int) -> int:
         """A whole number from low."""
-        if not self._take(key, False):
-            return default
-        return checks.integer(self.where, self.prefix + key, self.table[key], low)
+        return checks.integer(self.where, self.prefix + key, self.table[key], low) if self.has(key) else default
 
-    def vector(self, key: str, default: Sequence[float] | None = None, low: float = -math.inf) -> Array:
+    def vector(self, key: str, default: Sequence[float], low: float = -math.inf) -> Array:
         """Three finite numbers, each at least `low`."""
-        if not self._take(key, default is None):
+        if not self.has(key):
             return np.array(default, float)
         value = checks.numbers(self.where, self.prefix + key, self.table[key], (3,))
         if (value < low).any():
@@ -119,7 +111,7 @@ class TableReader:
         self, key: str, default: tuple[float, float], low: float = -math.inf, high: float = math.inf
     ) -> tuple[float, float]:
         """Two finite numbers from low to high."""
-        if not self._take(key, False):
+        if not self.has(key):
             return default
         first, second = checks.numbers(self.where, self.prefix + key, self.table[key], (2,))
         if not (low <= min(first, second) and max(first, second) <= high):
@@ -128,7 +120,7 @@ class TableReader:
 
     def list_of_numbers(self, key: str, default: Sequence[float]) -> Array:
         """One finite number or more (N,)."""
-        if not self._take(key, False):
+        if not self.has(key):
             return np.array(default, float)
         value = checks.numbers(self.where, self.prefix + key, self.table[key], (None,))
         if not len(value):
@@ -137,41 +129,37 @@ class TableReader:
 
     def flag(self, key: str, default: bool) -> bool:
         """true or false."""
-        if not self._take(key, False):
-            return default
-        if not isinstance(self.table[key], bool):
+        value = self.table[key] if self.has(key) else default
+        if not isinstance(value, bool):
             raise self.wrong(key, "true or false")
-        return bool(self.table[key])
+        return value
 
     def word(self, key: str, allowed: Sequence[str], default: str | None = None) -> str:
         """One of several words."""
-        if not self._take(key, default is None):
-            assert default is not None
+        if not self.has(key) and default is not None:
             return default
-        value = self.table[key]
+        value = self._required(key)
         if not isinstance(value, str) or value not in allowed:
             raise self.wrong(key, checks.one_of_text(str(value), allowed))
         return value
 
     def text(self, key: str) -> str:
         """A string that is not empty."""
-        self._take(key, True)
-        return checks.text(self.where, self.prefix + key, self.table[key])
+        self.has(key)
+        return checks.text(self.where, self.prefix + key, self._required(key))
 
     def wrong(self, key: str, allowed: str) -> InputError:
         """The error that a key's value is not allowed."""
         return InputError(self.where, self.prefix + key, self.table.get(key, "missing"), allowed)
 
     def done(self) -> None:
-        """InputError for a key that nobody asked for."""
-        checks.check_keys(self.where, self.prefix, self.table, (), list(dict.fromkeys(self.asked)))
+        """InputError for a key that was not read."""
+        checks.check_keys(self.where, self.prefix, self.table, (), list(dict.fromkeys(self.known_keys)))
 
-    def _take(self, key: str, required: bool) -> bool:
-        if self.has(key):
-            return True
-        if required:
+    def _required(self, key: str) -> object:
+        if key not in self.table:
             raise InputError(self.where, self.prefix + key, "missing", "this key")
-        return False
+        return self.table[key]
 
 
 def _range(low: float, high: float, open: bool) -> str:
@@ -189,21 +177,27 @@ WOUND_SIZE_RANGE = (5.0, 80.0)  # mm across
 WOUND_DEPTH_RANGE = (0.0, 8.0)  # mm
 MIN_DRAPE_OPENING = 20.0  # mm, the least that a drape leaves open
 MAX_SCAN_SIZE = 400.0  # mm: a texture of 0.1 mm and rays for nodes 0.25 mm apart end there
-# taken out by whoever reads the scenario
-SCENARIO_ONLY_KEYS = {"scene": ("nozzle", "beads"), "sensor": ("jpeg_quality",)}
 
 
-def scene_from_table(
-    where: object, table: Table, folder: Path, seed: int, base_from_rest: Array = BASE_FROM_REST
-) -> Scene:
+def scene_from_table(where: object, table: Table, folder: Path, seed: int) -> Scene:
     """The scene that a [scene] table describes; files are relative to `folder`. InputError names the key."""
-    return Scene(*bare_scene(where, table, folder, seed), seed, base_from_rest)
+    return Scene(*bare_scene(where, table, folder, seed), seed)
 
 
 def bare_scene(where: object, table: Table, folder: Path, seed: int) -> tuple[Shape, Appearance, Deformation]:
     """Shape, look and deformation of the scene, for those who need no pictures: painting it takes seconds."""
-    keys = _reader(where, "scene", table)
-    look, wound, deformation = _appearance(keys), _wound(keys), _deformation(keys)
+    keys, usual, usual_wound = TableReader(where, "scene.", table, ["nozzle", "beads"]), Appearance(), Wound()
+    look = Appearance(
+        texel=keys.number("texel_mm", usual.texel, *TEXEL_RANGE),
+        tone=keys.number("tone", usual.tone, 0, 1),
+        wetness=keys.number("wetness", usual.wetness, 0, 1),
+        hair=keys.number("hair", usual.hair, 0, 4),
+        drape=keys.flag("drape", usual.drape),
+    )
+    size = keys.pair("wound_size_mm", usual_wound.size, *WOUND_SIZE_RANGE)
+    depth = keys.number("wound_depth_mm", usual_wound.depth, *WOUND_DEPTH_RANGE)
+    wound = Wound(size, depth) if keys.flag("wound", True) else None
+    deformation = _deformation(keys)
     kind = keys.word("body", tuple(BODIES), "forearm")
     scan = keys.text("scan") if keys.has("scan") else None
     keys.done()
@@ -214,15 +208,15 @@ def bare_scene(where: object, table: Table, folder: Path, seed: int) -> tuple[Sh
     else:
         shape = _scanned(folder / scan, wound, seed)
         if look.drape and min(shape.size) < 2 * DRAPE_MARGIN + MIN_DRAPE_OPENING:
-            size = f"{shape.size[0]:.1f} x {shape.size[1]:.1f} mm"
-            allowed = f"false for a scan of {size}: a drape needs {DRAPE_MARGIN:g} a side"
+            extent = f"{shape.size[0]:.1f} x {shape.size[1]:.1f} mm"
+            allowed = f"false for a scan of {extent}: a drape needs {DRAPE_MARGIN:g} a side"
             raise InputError(where, "scene.drape", True, allowed)
     return shape, look, deformation
 
 
 def sensor_from_table(where: object, table: Table) -> Sensor:
     """The sensor that a [sensor] table describes; InputError names the key."""
-    keys, usual = _reader(where, "sensor", table), Sensor()
+    keys, usual = TableReader(where, "sensor.", table, ["jpeg_quality"]), Sensor()
     sensor = Sensor(
         noise=keys.number("noise", usual.noise, 0, MAX_NOISE),
         vignetting=keys.number("vignetting", usual.vignetting, 0, MAX_VIGNETTING),
@@ -230,28 +224,6 @@ def sensor_from_table(where: object, table: Table) -> Sensor:
     )
     keys.done()
     return sensor
-
-
-def _reader(where: object, name: str, table: Table) -> TableReader:
-    return TableReader(where, f"{name}.", table, list(SCENARIO_ONLY_KEYS[name]))
-
-
-def _appearance(keys: TableReader) -> Appearance:
-    usual = Appearance()
-    return Appearance(
-        texel=keys.number("texel_mm", usual.texel, *TEXEL_RANGE),
-        tone=keys.number("tone", usual.tone, 0, 1),
-        wetness=keys.number("wetness", usual.wetness, 0, 1),
-        hair=keys.number("hair", usual.hair, 0, 4),
-        drape=keys.flag("drape", usual.drape),
-    )
-
-
-def _wound(keys: TableReader) -> Wound | None:
-    usual = Wound()
-    size = keys.pair("wound_size_mm", usual.size, *WOUND_SIZE_RANGE)
-    depth = keys.number("wound_depth_mm", usual.depth, *WOUND_DEPTH_RANGE)
-    return Wound(size, depth) if keys.flag("wound", True) else None
 
 
 def _deformation(scene: TableReader) -> Deformation:

@@ -70,27 +70,23 @@ class LandmarkTracker:
     last: StepReport
 
     def __init__(
-        self, true: Rig, known: Rig, truth: Truth, shape: Shape, taken: Callable[[int, float], Shot], seed: int
+        self, true: Rig, known: Rig, truth: Truth, shape: Shape, shot: Callable[[int, float], Shot], seed: int
     ) -> None:
-        """taken: the shot of a camera's frame with a stamp, s."""
+        """shot: that of a camera's frame with a stamp, s."""
         rng = np.random.default_rng([seed, 81])
         places = rng.uniform(-0.5, 0.5, (LANDMARK_COUNT, 2)) * np.minimum(LANDMARK_AREA, shape.size)
         self._points, self._normals = shape.points(places), shape.normals(places)
-        self._lenses, self._known_rig, self._truth, self._taken = (
-            TrueCameras(undistorting(true).cameras),
-            known,
-            truth,
-            taken,
-        )
-        self._rng, self._cameras = np.random.default_rng([seed, 82]), len(true)
+        self._true_cameras, self._cameras = TrueCameras(undistorting(true).cameras), len(true)
+        self._known_rig, self._truth, self._shot = known, truth, shot
+        self._rng = np.random.default_rng([seed, 82])
         self._follower: Follower | None = None
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
         """The pose at `frames.stamp`."""
-        seen = self._observe(frames)
-        pose = self._pose(seen)
-        used = np.bincount(seen.camera, minlength=self._cameras)
-        self.last = report_without_offsets(seen, used, np.zeros(len(STAGES)))
+        observations = self._observe(frames)
+        pose = self._pose(observations)
+        used = np.bincount(observations.camera, minlength=self._cameras)
+        self.last = report_without_offsets(observations, used, np.zeros(len(STAGES)))
         return pose
 
     def idle(self) -> None:
@@ -101,22 +97,22 @@ class LandmarkTracker:
             return self._follower(observations)
         if len(observations) < MIN_INITIAL_TRACKS:
             return identity_pose(observations.stamp, f"{len(observations)} tracks found, {MIN_INITIAL_TRACKS} needed")
-        known = SurfaceMap(self._points, self._normals, np.zeros((3 * LANDMARK_COUNT, 3 * LANDMARK_COUNT)))
-        place = self._truth.base_from_surface(np.array([observations.stamp]))[0]
-        start = TriangulatedMap(known, place, np.arange(LANDMARK_COUNT))
+        exact = SurfaceMap(self._points, self._normals, np.zeros((3 * LANDMARK_COUNT, 3 * LANDMARK_COUNT)))
+        base_from_surface = self._truth.base_from_surface(np.array([observations.stamp]))[0]
+        start = TriangulatedMap(exact, base_from_surface, np.arange(LANDMARK_COUNT))
         self._follower = Follower(self._known_rig, observations, start, refine=False)
         assert self._follower.estimator.pose is not None
         return self._follower.estimator.pose
 
     def _observe(self, frames: FrameSet) -> Observations:
-        views = [self._look(frame.camera, self._taken(frame.camera, frame.stamp)) for frame in frames.frames]
+        views = [self._view(frame.camera, self._shot(frame.camera, frame.stamp)) for frame in frames.frames]
         if not any(len(track) for _, track, _ in views):
             return no_observations(frames.stamp)
-        camera = np.concatenate([np.full(len(track), c) for c, track, _ in views])
-        track, pixels = np.concatenate([t for _, t, _ in views]), np.concatenate([p for _, _, p in views])
+        camera, track, pixels = (np.concatenate(parts) for parts in zip(*views, strict=True))
         return Observations(frames.stamp, camera, track, pixels, np.full(len(track), TRACK_SIGMA))
 
-    def _look(self, camera: int, shot: Shot) -> tuple[int, NDArray[np.int64], Array]:
+    def _view(self, camera: int, shot: Shot) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+        """Camera (N,), track (N,) and pixels (N, 2) of the landmarks that one picture shows."""
         rng, instant = self._rng, np.array([shot.exposed])
         chance = rng.random(LANDMARK_COUNT)
         other = shot.lens not in (None, camera) or shot.covered is not None  # nothing there looks as it did before
@@ -124,13 +120,13 @@ class LandmarkTracker:
         amount = np.broadcast_to(self._truth.amount(instant), LANDMARK_COUNT)
         points = self._points + self._truth.displacement(self._points, amount) if amount.any() else self._points
         pose = self._truth.base_from_surface(instant)
-        pixels, inside = project_landmarks(Rig((self._lenses(shot),)), points, pose, self._normals)
+        pixels, inside = project_landmarks(Rig((self._true_cameras(shot),)), points, pose, self._normals)
         noisy = pixels[0] + TRACK_SIGMA * rng.standard_normal((LANDMARK_COUNT, 2))
         stray = rng.random(LANDMARK_COUNT) < STRAY_SHARE
         noisy[stray] += rng.uniform(-STRAY_PX, STRAY_PX, (int(stray.sum()), 2))
         share = 0.0 if blind else DETECTED_SHARE * (DAMAGED_SHARE if shot.fate is Fate.GARBLED else 1.0)
         track = np.flatnonzero(inside[0] & (chance < share)).astype(np.int64)
-        return camera, track, noisy[track]
+        return np.full(len(track), camera), track, noisy[track]
 
 
 EXACT_COVARIANCE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: exact, but no matrix without an inverse
@@ -155,21 +151,15 @@ class OracleTracker:
         pose, twist = self._truth.base_from_surface(instant)[0], self._truth.twist(instant)[0]
         nothing, none = no_observations(frames.stamp), np.zeros(self._cameras, np.int64)
         self.last = report_without_offsets(nothing, none, np.zeros(len(STAGES)))
-        seen = SurfacePose(frames.stamp, self._offset @ pose, EXACT_COVARIANCE, twist, TrackState.TRACKING)
-        return replace(seen, forecast=self._predictor.add(seen))
+        measured = SurfacePose(frames.stamp, self._offset @ pose, EXACT_COVARIANCE, twist, TrackState.TRACKING)
+        return replace(measured, forecast=self._predictor.add(measured))
 
     def idle(self) -> None:
         """There is nothing else to do."""
 
 
-PICTURE_FAULTS = (
-    FaultKind.GARBLE,
-    FaultKind.SWAP,
-    FaultKind.BUMP,
-    FaultKind.BLACK,
-    FaultKind.FLASH,
-    FaultKind.COVER,
-)  # faults that pictures show
+# faults that pictures show
+PICTURE_FAULTS = (FaultKind.GARBLE, FaultKind.SWAP, FaultKind.BUMP, FaultKind.BLACK, FaultKind.FLASH, FaultKind.COVER)
 SCAN_MESH_STEP = 1.0  # mm between the vertices of a scan, as handheld scanners give them
 FILE_NOTES = (
     ("nozzle.csv", "where the nozzle was and should have been, every millisecond"),
@@ -194,10 +184,10 @@ class SimulationOptions:
 
 @dataclass(frozen=True, slots=True)
 class SimulationResult:
-    """What a run came to. text: for a terminal. met: whether it ran to its end and met its scenario's limits."""
+    """What a run came to."""
 
-    text: str
-    met: bool
+    text: str  # for a terminal
+    met: bool  # whether it ran to its end and met its scenario's limits
 
 
 def run_simulation(file: Path, out: Path, options: SimulationOptions | None = None) -> SimulationResult:
@@ -222,13 +212,13 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
     prepare_out(out, options.force)
     clear_run(out)
     truth = true_surface(scenario, scene)
-    around, scan = regions(scenario, scene, truth), _scan(scenario, scene, out)
-    folder = RunFolder(out, scenario, planned_line(path), around, truth.base_from_surface, scan)
+    wound_rois, scan = regions(scenario, scene, truth), _scan(scenario, scene, out)
+    folder = RunFolder(out, scenario, planned_line(path), wound_rois, truth.base_from_surface, scan)
     complete, skipped = False, 0
     try:
         with folder, ExitStack() as stack:
             exposures: Exposures = {}
-            step = stack.enter_context(_tracking(scenario, truth, scene.shape, around, scan, exposures))
+            step = stack.enter_context(_tracking(scenario, truth, scene.shape, wound_rois, scan, exposures))
             line = stack.enter_context(PtyLink()).transfer if options.pty else bytes
             progress = stack.enter_context(Progress("simulate", "frame sets", WallClock().now))
             print(f"watch: {folder.watch.page.resolve().as_uri()}", file=sys.stderr)
@@ -240,7 +230,7 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
                 skipped = world.pipeline.skipped
         complete = True
     finally:
-        outcome = _write_results(scenario, path, truth, folder, around, complete, skipped)
+        outcome = _write_results(scenario, path, truth, folder, wound_rois, complete, skipped)
     return outcome
 
 
@@ -281,17 +271,10 @@ def _write_results(
     if not folder.logs:
         return SimulationResult("nothing was simulated", False)
     tracking = _tracking_report(scenario, truth, out / "tracking", regions, complete)
-    run = NozzleRun(
-        title=scenario.title,
-        log=join_logs(folder.logs),
-        path=path,
-        bead=scenario.bead,
-        limits=scenario.limits,
-        tracking=tracking,
-        complete=complete,
-        pictures=tuple((scenario.rig.cameras[c].name, data) for c, data in sorted(folder.pictures.items())),
-        files=FILE_NOTES if scenario.tracking.pictures else tuple(f for f in FILE_NOTES if f[0] != "session"),
-    )
+    pictures = tuple((scenario.rig.cameras[c].name, data) for c, data in sorted(folder.pictures.items()))
+    files = tuple(f for f in FILE_NOTES if scenario.tracking.pictures or f[0] != "session")
+    print_settings = path, scenario.bead, scenario.limits
+    run = NozzleRun(scenario.title, join_logs(folder.logs), *print_settings, tracking, complete, pictures, files)
     result = evaluate_run(run)
     summary = nozzle_dict(result) | {"frame_sets_skipped": skipped, "faults": [str(f) for f in scenario.faults]}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
@@ -317,10 +300,10 @@ def _tracking_report(
 
 def regions(scenario: Scenario, scene: Scene, truth: Truth) -> tuple[Roi, ...]:
     """What an operator would draw around the wound in each camera's first picture."""
-    start = SimulatedCameras(scenario.cameras, scenario.seed, scenario.faults)
+    cameras = SimulatedCameras(scenario.cameras, scenario.seed, scenario.faults)
     polygons: list[Roi] = []
     for camera in range(len(scenario.rig)):
-        shot = next((s for s in start.shots(camera, scenario.seconds) if s.fate is not Fate.DROPPED), None)
+        shot = next((s for s in cameras.shots(camera, scenario.seconds) if s.fate is not Fate.DROPPED), None)
         if shot is not None:
             pose = truth.base_from_surface(np.array([shot.exposed]))[0]
             polygons += [r for r in rois(scene, scenario.rig, pose, shot.stamp) if r.camera == camera]

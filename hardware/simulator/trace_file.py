@@ -66,17 +66,14 @@ def read_trace(path: Path, unit: str | None = None, rate_hz: float | None = None
         poses = se3.make(se3.rotation_from_quaternion(rows[:, 4:]), rows[:, 1:4] * MM_PER_UNIT[unit or "mm"])
     stated = unit is not None or path.suffix.lower() == ".csv"
     _check(path, stamps, poses[:, :3, 3], MIN_SPAN_STATED if stated else MIN_SPAN)
-    return _from_start(path, stamps - stamps[0], poses, start_s)
-
-
-def _from_start(path: Path, stamps: Array, poses: Array, start_s: float) -> Trace:
+    stamps = stamps - stamps[0]
     first = int(np.searchsorted(stamps, start_s - 1e-9))
     if len(stamps) - first < 8:
         raise InputError(path, "start_s", start_s, f"8 poses or more after it; the trace lasts {stamps[-1]:g} s")
     return Trace(path, stamps[first:] - stamps[first], se3.inverse(poses[first]) @ poses[first:])
 
 
-def _check(path: Path, stamps: Array, places: Array, least: float) -> None:
+def _check(path: Path, stamps: Array, places: Array, min_span: float) -> None:
     steps = np.diff(stamps)
     if len(stamps) < 8:
         raise InputError(path, "poses", len(stamps), "8 or more")
@@ -88,8 +85,8 @@ def _check(path: Path, stamps: Array, places: Array, least: float) -> None:
         allowed = f"at most {MAX_TRACE_GAP:g} s (stamps in s)"
         raise InputError(path, f"gap after {stamps[k]:.10g} s", f"{steps[k]:g} s", allowed)
     span = float(np.ptp(places, axis=0).max())
-    if 0 < span < least:
-        allowed = f'{least:g} mm or more; if they are metres: unit = "m", columns tx_m'
+    if 0 < span < min_span:
+        allowed = f'{min_span:g} mm or more; if they are metres: unit = "m", columns tx_m'
         raise InputError(path, "places span", f"{span:g} mm", allowed)
     if span > MAX_SPAN:
         raise InputError(path, "places span", f"{span:g} mm", f"at most {MAX_SPAN:g} mm; are they mm, not metres?")
@@ -97,7 +94,10 @@ def _check(path: Path, stamps: Array, places: Array, least: float) -> None:
 
 def _from_csv(path: Path, rate_hz: float | None) -> tuple[Array, Array]:
     columns = _columns(path)
-    _check_units(path, columns)
+    for name in columns:
+        if name not in KNOWN_COLUMNS and (stem := name.rsplit("_", 1)[0].lower()) in COLUMN_STEMS:
+            others = checks.one_of_text(name, KNOWN_COLUMNS)
+            raise InputError(path, "header", name, f"{COLUMN_STEMS[stem]}, or that column in another unit: {others}")
     time = next((name for name in TIME_COLUMNS if name in columns), None)
     if time is None:
         raise InputError(path, "header", ",".join(columns)[:80], f"a column {', '.join(TIME_COLUMNS)}")
@@ -109,13 +109,6 @@ def _from_csv(path: Path, rate_hz: float | None) -> tuple[Array, Array]:
     if places is None:
         raise InputError(path, "header", ",".join(columns)[:80], "columns tx_mm, ty_mm, tz_mm")
     return stamps, se3.make(_rotations(path, columns, len(stamps)), places)
-
-
-def _check_units(path: Path, columns: dict[str, Array]) -> None:
-    for name in columns:
-        if name not in KNOWN_COLUMNS and (stem := name.rsplit("_", 1)[0].lower()) in COLUMN_STEMS:
-            others = checks.one_of_text(name, KNOWN_COLUMNS)
-            raise InputError(path, "header", name, f"{COLUMN_STEMS[stem]}, or that column in another unit: {others}")
 
 
 def _triple(columns: dict[str, Array], kinds: list[tuple[str, float]]) -> Array | None:
@@ -135,9 +128,9 @@ def _rotations(path: Path, columns: dict[str, Array], count: int) -> Array:
         if np.abs(lengths - 1).max() > 0.01:
             raise InputError(path, "length of qx qy qz qw", lengths[np.argmax(np.abs(lengths - 1))], "1 +- 0.01")
         return se3.rotation_from_quaternion(quaternions)
-    halves = [name for name in columns if name in KNOWN_COLUMNS and name[0] in "rq"]
-    if halves:
-        raise InputError(path, "header", ",".join(halves), "all three of rx_deg, ry_deg, rz_deg, all four of qx to qw")
+    if incomplete := [name for name in columns if name in KNOWN_COLUMNS and name[0] in "rq"]:
+        allowed = "all three of rx_deg, ry_deg, rz_deg, all four of qx to qw"
+        raise InputError(path, "header", ",".join(incomplete), allowed)
     return np.broadcast_to(np.eye(3), (count, 3, 3))
 
 
@@ -150,20 +143,21 @@ def _columns(path: Path) -> dict[str, Array]:
     for n, row in rows[1:]:
         if len(row) != len(header):
             raise InputError(path, f"line {n}", f"{len(row)} values", f"{len(header)}, as in the header")
-    numbers = {name: _column(path, rows[1:], i, name) for i, name in enumerate(header) if name in KNOWN_COLUMNS}
-    return {name: numbers.get(name, np.empty(0)) for name in header}
+    columns = {name: np.empty(0) for name in header}
+    for i, name in enumerate(header):
+        if name in KNOWN_COLUMNS:
+            columns[name] = np.array([_finite(path, f"line {n}: {name}", row[i]) for n, row in rows[1:]])
+    return columns
 
 
-def _column(path: Path, rows: list[tuple[int, list[str]]], index: int, name: str) -> Array:
-    values = []
-    for n, row in rows:
-        try:
-            values.append(float(row[index]))
-        except ValueError:
-            values.append(math.nan)
-        if not math.isfinite(values[-1]):
-            raise InputError(path, f"line {n}: {name}", row[index], "a finite number")
-    return np.array(values)
+def _finite(path: Path, what: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(path, what, text, "a finite number")
+    return value
 
 
 SMOOTH_STEPS = 5  # of the trace's own: periods below are taken away, on the 10 Hz chests 0.03-0.1 mm, their noise
@@ -182,25 +176,21 @@ class PlayedTrace:
 
     def coordinates(self, times: Array) -> Array:
         """Rotation vector and shift (N, 6), rad and mm."""
-        return np.asarray(self.spline(self._place(times)))
+        return np.asarray(self.spline(self._place_and_speed(times)[0]))
 
     def rates(self, times: Array) -> Array:
         """Their derivatives (N, 6)."""
-        return np.asarray(self.spline(self._place(times), 1) * self._speed(times)[:, None])
+        place, speed = self._place_and_speed(times)
+        return np.asarray(self.spline(place, 1) * speed[:, None])
 
-    def _place(self, times: Array) -> Array:
+    def _place_and_speed(self, times: Array) -> tuple[Array, Array]:
         """Where in the trace, s: at 0 s at its beginning and at its own speed, before that slowly out of rest."""
         start, end = times + STOP_DURATION / 2, times - self.duration + STOP_DURATION / 2
-        first = corner(start, STOP_DURATION) - STOP_DURATION / 2 - corner(end, STOP_DURATION)
-        return np.where(self._again(times), folded(times, self.duration, STOP_DURATION), first)
-
-    def _speed(self, times: Array) -> Array:
-        start, end = times + STOP_DURATION / 2, times - self.duration + STOP_DURATION / 2
-        first = corner_rate(start, STOP_DURATION) - corner_rate(end, STOP_DURATION)
-        return np.where(self._again(times), folded_rate(times, self.duration, STOP_DURATION), first)
-
-    def _again(self, times: Array) -> Array:
-        return np.asarray(self.back & (times > self.duration / 2))
+        place = corner(start, STOP_DURATION) - STOP_DURATION / 2 - corner(end, STOP_DURATION)
+        speed = corner_rate(start, STOP_DURATION) - corner_rate(end, STOP_DURATION)
+        folds = self.back & (times > self.duration / 2)
+        place = np.where(folds, folded(times, self.duration, STOP_DURATION), place)
+        return place, np.where(folds, folded_rate(times, self.duration, STOP_DURATION), speed)
 
 
 def played_trace(
@@ -212,13 +202,12 @@ def played_trace(
     delay): of 0.1 mm noise at 10 Hz an interpolating spline would make speeds of mm/s that no chest had. None takes
     SMOOTH_STEPS of the trace's own steps, 0 nothing.
     """
-    step, zero = float(np.median(np.diff(trace.stamps))), np.zeros((len(trace.stamps), 3))
+    stamps, duration = trace.stamps, float(trace.stamps[-1])
+    step, zero = float(np.median(np.diff(stamps))), np.zeros((len(stamps), 3))
     smooth = SMOOTH_STEPS * step if smooth is None else smooth
     coordinates = np.concatenate([_rotation_vectors(trace) if rotation else zero, trace.poses[:, :3, 3]], axis=1)
-    duration = float(trace.stamps[-1])
     if duration < 2 * STOP_DURATION:
         raise InputError(trace.where, "duration", f"{duration:g} s", f"{2 * STOP_DURATION:g} s or more")
-    stamps = trace.stamps
     if smooth > 0:
         if smooth < 2.5 * step:
             allowed = f"0, or at least 2.5 steps of the trace, {2.5 * step:g} s"

@@ -36,16 +36,13 @@ class TrueMotion(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """The surface's true motion. rest: (4, 4) base_from_surface at rest. strain: amount of the deformation over time.
+    """The surface's true motion."""
 
-    surface_from_grid: (4, 4) mm, of the frame in which the deformation is given.
-    """
-
-    rest: Array
+    rest: Array  # (4, 4) base_from_surface at rest
     motion: TrueMotion
     deformation: Deformation = field(default_factory=Deformation)
-    strain: Callable[[Array], Array] | None = None
-    surface_from_grid: Array = field(default_factory=lambda: np.eye(4))
+    strain: Callable[[Array], Array] | None = None  # amount of the deformation over time
+    surface_from_grid: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) mm, of the deformation's frame
 
     def base_from_surface(self, times: Array) -> Array:
         """(N, 4, 4) mm at times (N,), s."""
@@ -69,16 +66,20 @@ class Truth:
         if amount.any():
             moved = moved.copy()
             moved[:, :3, 3] += self.displacement(places, amount)
-            moved[:, :3, :3] = self._turn(places, amount) @ moved[:, :3, :3]
+            steps = GRADIENT_STEP / 2 * np.eye(3)
+            ahead = np.stack([self.displacement(places + step, amount) for step in steps], -1)
+            behind = np.stack([self.displacement(places - step, amount) for step in steps], -1)
+            gradient = np.eye(3) + (ahead - behind) / GRADIENT_STEP
+            moved[:, :3, :3] = se3.nearest_rotation(gradient) @ moved[:, :3, :3]
         return np.asarray(self.base_from_surface(times) @ moved)
 
     def material(self, times: Array, points_base: Array) -> Array:
         """Points of the undeformed surface (N, 3), mm, that lie at points_base (N, 3) at times (N,), s."""
         there = se3.inverse(self.base_from_surface(times))
-        points = (there[:, :3, :3] @ points_base[..., None])[..., 0] + there[:, :3, 3]
+        points: Array = (there[:, :3, :3] @ points_base[..., None])[..., 0] + there[:, :3, 3]
         amount = self.amount(times)
         if not amount.any():
-            return np.asarray(points)
+            return points
         grid = se3.transform_points(se3.inverse(self.surface_from_grid), points)
         return se3.transform_points(self.surface_from_grid, self.deformation.undo(grid, amount))
 
@@ -87,12 +88,6 @@ class Truth:
         grid = se3.transform_points(se3.inverse(self.surface_from_grid), points)
         moved = self.deformation.displacement(grid, amount)
         return np.asarray(moved @ self.surface_from_grid[:3, :3].T)
-
-    def _turn(self, points: Array, amount: Array) -> Array:
-        ahead = [self.displacement(points + GRADIENT_STEP / 2 * axis, amount) for axis in np.eye(3)]
-        behind = [self.displacement(points - GRADIENT_STEP / 2 * axis, amount) for axis in np.eye(3)]
-        gradient = np.eye(3) + (np.stack(ahead, -1) - np.stack(behind, -1)) / GRADIENT_STEP
-        return se3.nearest_rotation(gradient)
 
 
 FOLD_SIGMA = 8.0  # mm, one sigma of a fold: narrower than a wound, wider than a bead
@@ -113,16 +108,16 @@ class DisturbedMotion:
 
     def __call__(self, times: Array) -> Array:
         """rest_from_surface (N, 4, 4) at times (N,), s."""
-        return np.asarray(se3.make(np.eye(3), self._way(times)[0]) @ self.motion(times))
+        return np.asarray(se3.make(np.eye(3), self._shift_and_speed(times)[0]) @ self.motion(times))
 
     def twist(self, times: Array) -> Array:
         """Body twist (N, 6) at times (N,), rad/s and mm/s."""
-        turned = np.swapaxes(self.motion(times)[:, :3, :3], -1, -2)
+        surface_from_rest = np.swapaxes(self.motion(times)[:, :3, :3], -1, -2)
         twist = self.motion.twist(times).copy()
-        twist[:, 3:] += (turned @ self._way(times)[1][..., None])[..., 0]
+        twist[:, 3:] += (surface_from_rest @ self._shift_and_speed(times)[1][..., None])[..., 0]
         return np.asarray(twist)
 
-    def _way(self, times: Array) -> tuple[Array, Array]:
+    def _shift_and_speed(self, times: Array) -> tuple[Array, Array]:
         place, speed = np.zeros((len(times), 3)), np.zeros((len(times), 3))
         for fault in self.faults:
             risen, rate = fault_pulse(fault, times)
@@ -164,8 +159,6 @@ def fold_deformation(
         raise InputError(where, "faults", str(folds[0]), "a scenario without [scene.deformation]")
     return Deformation(bulge=1.0, radius=FOLD_SIGMA), FoldAmount(folds)
 
-
-RowIndex = NDArray[np.int64]
 
 ROW_STEP = 0.001  # s between rows
 
@@ -227,12 +220,12 @@ class TruthLog:
             surface_from_tip=self._truth.material(times, nozzle[:, :3, 3]),
         )
 
-    def _rows(self, times: Array) -> RowIndex:
+    def _rows(self, times: Array) -> NDArray[np.int64]:
         """Per instant (N,) the command that is being fulfilled, -1 before the first."""
         first = self._due[0] - self._tick if self._due else np.inf
         return np.array([-1 if t <= first else bisect_left(self._due, t) for t in times.tolist()], np.int64)
 
-    def _fractions(self, times: Array, index: RowIndex, known: NDArray[np.bool_]) -> Array:
+    def _fractions(self, times: Array, index: NDArray[np.int64], known: NDArray[np.bool_]) -> Array:
         """Fractional checkpoint (N,) due at times (N,), NaN where there is none."""
         out = np.full(len(times), np.nan)
         for row, i in enumerate(index.tolist()):
@@ -271,42 +264,35 @@ def drape_path(path: Path, shape: Shape, clearance: float, where: object = "path
     InputError with `where` for a checkpoint that lies beyond the surface's edge.
     """
     fine = divide_path(path, PIECE_LENGTH)
-    places = fine.surface_from_nozzle.copy()
-    points, there = surface_along_z(shape, places[:, :2, 3])
-    if not there.all():
-        x, y = places[~there][0, :2, 3]
-        allowed = "on the surface, {:g} x {:g} mm about its middle".format(*shape.size)
-        raise InputError(where, "a place on the path", f"x = {x:.2f}, y = {y:.2f} mm", allowed)
-    places[:, 2, 3] += points[:, 2] + clearance
-    return replace(fine, surface_from_nozzle=places)
-
-
-def surface_along_z(shape: Shape, xy: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Points (N, 3) mm of the surface at x and y (N, 2) mm, surface frame, and whether (N,) there is one."""
-    points, outwards = np.column_stack([xy, np.zeros(len(xy))]), shape.surface_from_grid[:3, 2]
+    poses = fine.surface_from_nozzle.copy()
+    points, outwards = np.column_stack([poses[:, :2, 3], np.zeros(len(poses))]), shape.surface_from_grid[:3, 2]
     for _ in range(PROJECTION_STEPS):
         off = shape.points(shape.material(points)) - points  # along the grid's own z
         points[:, 2] += (off @ outwards) / outwards[2]
     material = shape.material(points)
-    return points, shape.covers(material) & (np.linalg.norm(shape.points(material) - points, axis=1) < MAX_MISS)
+    there = shape.covers(material) & (np.linalg.norm(shape.points(material) - points, axis=1) < MAX_MISS)
+    if not there.all():
+        x, y = poses[~there][0, :2, 3]
+        allowed = "on the surface, {:g} x {:g} mm about its middle".format(*shape.size)
+        raise InputError(where, "a place on the path", f"x = {x:.2f}, y = {y:.2f} mm", allowed)
+    poses[:, 2, 3] += points[:, 2] + clearance
+    return replace(fine, surface_from_nozzle=poses)
 
 
 def divide_path(path: Path, piece: float) -> Path:
-    """The path with stretches longer than `piece` mm cut into equal ones; a new checkpoint takes after its next."""
-    places = path.surface_from_nozzle
-    counts = np.ceil(np.linalg.norm(np.diff(places[:, :3, 3], axis=0), axis=1) / piece).astype(int)
-    counts = np.maximum(np.where(keeps_direction(places), counts, 1), 1)
-    source = np.concatenate([[0], np.repeat(np.arange(1, len(places)), counts)])
+    """The path with stretches longer than `piece` mm cut into equal ones; a new checkpoint takes after its next.
+
+    Stretches over which the tool turns are left whole.
+    """
+    poses = path.surface_from_nozzle
+    counts = np.ceil(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / piece).astype(int)
+    turns = np.abs(np.diff(poses[:, :3, :3], axis=0)).max(axis=(1, 2)) >= 1e-9
+    counts = np.maximum(np.where(turns, 1, counts), 1)
+    source = np.concatenate([[0], np.repeat(np.arange(1, len(poses)), counts)])
     share = np.concatenate([[1.0], *(np.arange(1, n + 1) / n for n in counts)])
-    cut = places[source].copy()
-    before = places[np.maximum(source - 1, 0), :3, 3]
-    cut[:, :3, 3] = before + share[:, None] * (places[source, :3, 3] - before)
+    cut = poses[source].copy()
+    before = poses[np.maximum(source - 1, 0), :3, 3]
+    cut[:, :3, 3] = before + share[:, None] * (poses[source, :3, 3] - before)
     columns = {name: getattr(path, name)[source] for name in ("speed", "material", "temperature", "layer", "extrude")}
     extra = {name: column[source] for name, column in path.extra.items()}
     return replace(path, surface_from_nozzle=cut, extra=extra, **columns)
-
-
-def keeps_direction(surface_from_nozzle: Array) -> NDArray[np.bool_]:
-    """(N-1,) whether the tool keeps its direction from one of (N, 4, 4) to the next; others are left whole."""
-    turns = surface_from_nozzle[:, :3, :3]
-    return np.asarray(np.abs(np.diff(turns, axis=0)).max(axis=(1, 2)) < 1e-9)

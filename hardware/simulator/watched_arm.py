@@ -16,7 +16,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.rig import Rig
@@ -26,7 +25,7 @@ from hardware.arm.profile import ArmProfile, placed
 from hardware.files.folder_tables import SessionFolderWriter
 from hardware.files.images import encode
 from hardware.process.clock import Clock, WatchedClock
-from hardware.process.progress import ProgressReport, no_progress
+from hardware.process.progress import ProgressReport
 from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.ports import run_virtual_arm
 from hardware.simulator.arm.settings import ArmSettings
@@ -63,26 +62,26 @@ class WatchedArm:
     seed: int
 
 
-def watched_arm(seed: int, fps: float = PICTURE_RATE) -> WatchedArm:
+def watched_arm(seed: int) -> WatchedArm:
     """An arm before the cameras, with its own placement, tool and timing errors for each seed."""
     rng = np.random.default_rng([seed, 89])
     rig, profile = arc_rig(), placed(ArmProfile(), BASE_FROM_REST)
-    awry = se3.exp(rng.normal(size=6) * PLACEMENT_SIGMA)
+    placement_error = se3.exp(rng.normal(size=6) * PLACEMENT_SIGMA)
     tool = rng.normal(size=3) * TOOL_SIGMA
-    true = replace(profile.arm, arm_from_base=profile.arm.arm_from_base @ awry, tool_offset=tool)
+    true = replace(profile.arm, arm_from_base=profile.arm.arm_from_base @ placement_error, tool_offset=tool)
     settings = ArmSettings(dead_time=float(rng.uniform(*DEAD_TIME_RANGE)), servo_lag=float(rng.uniform(*LAG_RANGE)))
     phases = tuple(float(v) for v in rng.uniform(0, 0.01, len(rig)))
-    cameras = CameraSettings(phases, (0.0,) * len(rig), fps=fps)
+    cameras = CameraSettings(phases, (0.0,) * len(rig), fps=PICTURE_RATE)
     return WatchedArm(rig, profile, true, settings, cameras, profile.arm.home - [0, 0, 3.0, 0, 0, 0], seed)
 
 
 @dataclass(slots=True)
 class ServedArm:
-    """A virtual arm on a pseudo-terminal. device: its name. Afterwards, arm, and begun: its time 0 by the clock."""
+    """A virtual arm on a pseudo-terminal."""
 
-    device: str
-    arm: VirtualArm | None = None
-    begun: float = 0.0
+    device: str  # its name
+    arm: VirtualArm | None = None  # once it is served no more
+    begun: float = 0.0  # s, its time 0 by the clock, likewise
 
 
 @contextmanager
@@ -92,7 +91,7 @@ def serve_arm(watched: WatchedArm, link: Path, clock: Clock) -> Iterator[ServedA
     standing = replace(watched.profile, arm=replace(watched.profile.arm, home=watched.begin))
 
     def serve() -> None:
-        result.arm = run_virtual_arm(watched.settings, standing, (), link, clock=since, stop=stop, say=_ignore)
+        result.arm = run_virtual_arm(watched.settings, standing, (), link, None, since, stop, lambda text: None)
 
     thread = threading.Thread(target=serve, name="virtual arm", daemon=True)
     thread.start()
@@ -107,24 +106,13 @@ def serve_arm(watched: WatchedArm, link: Path, clock: Clock) -> Iterator[ServedA
         result.begun = since.begun or 0.0
 
 
-def _ignore(words: str) -> None:
-    pass
-
-
-def _lively(arm: VirtualArm, instants: Array) -> NDArray[np.bool_]:
-    offsets = (-ACCELERATION_SPAN, 0.0, ACCELERATION_SPAN)
-    before, at, after = (arm.axes_at(np.clip(instants + h, 0.0, arm.now))[:, :3] for h in offsets)
-    change = np.linalg.norm(after - 2 * at + before, axis=1)
-    return np.asarray(change > MIN_ACCELERATION * ACCELERATION_SPAN**2)
-
-
 def take_pictures(
     watched: WatchedArm,
     arm: VirtualArm,
     begun: float,
     span: tuple[float, float],
     folder: Path,
-    report: ProgressReport = no_progress,
+    report: ProgressReport,
 ) -> None:
     """Write the session folder of what the cameras saw of the arm from one instant to another, s, by the clock.
 
@@ -132,24 +120,28 @@ def take_pictures(
     """
     scene = Scene(cylinder((80.0, 60.0), 80.0), Appearance(texel=0.3, drape=False), seed=watched.seed)
     exposure, sensor = watched.cameras.exposure, Sensor()
-    before = StillScene(scene, watched.rig.cameras, WorldState(0.0, exposure, BASE_FROM_REST, np.zeros(6)))
+    still_scene = StillScene(scene, watched.rig.cameras, WorldState(0.0, exposure, BASE_FROM_REST, np.zeros(6)))
     cameras = SimulatedCameras(watched.cameras, watched.seed)
     until = min(span[1] - begun, arm.now)
     streams = [cameras.shots(c, until) for c in range(len(watched.rig))]
     rounds = [shots for shots in zip(*streams, strict=False) if shots[0].exposed + begun >= span[0]]
-    lively = _lively(arm, np.array([shots[0].exposed for shots in rounds]))
-    rounds = [shots for number, shots in enumerate(rounds) if lively[number] or number % KEPT_EVERY == 0]
+    instants = np.array([shots[0].exposed for shots in rounds])
+    offsets = (-ACCELERATION_SPAN, 0.0, ACCELERATION_SPAN)
+    past, now, next_place = (arm.axes_at(np.clip(instants + h, 0.0, arm.now))[:, :3] for h in offsets)
+    change = np.linalg.norm(next_place - 2 * now + past, axis=1)
+    accelerates = change > MIN_ACCELERATION * ACCELERATION_SPAN**2
+    rounds = [shots for number, shots in enumerate(rounds) if accelerates[number] or number % KEPT_EVERY == 0]
 
-    def taken(shot: Shot) -> tuple[str, bytes]:
+    def picture_of(shot: Shot) -> tuple[str, bytes]:
         axes = arm.axes_at(np.array([min(shot.exposed, arm.now)]))[0]
         nozzle = nozzle_from_axes(watched.true, axes)
         instant = WorldState(shot.exposed, exposure, BASE_FROM_REST, np.zeros(6), 0.0, nozzle, shot.gain)
         rng = np.random.default_rng([watched.seed, NOISE_STREAM, shot.camera, shot.picture])
-        return encode(before(shot.camera, instant, sensor, rng), LOSSLESS)
+        return encode(still_scene(shot.camera, instant, sensor, rng), LOSSLESS)
 
     with SessionFolderWriter(folder, watched.rig, ()) as session, ThreadPoolExecutor(2) as pool:
         for number, shots in enumerate(rounds):
-            for shot, picture in zip(shots, pool.map(taken, shots), strict=True):
+            for shot, picture in zip(shots, pool.map(picture_of, shots), strict=True):
                 session.picture(shot.camera, shot.stamp + begun, *picture)
             report(number + 1, len(rounds))
 
@@ -158,10 +150,10 @@ NOISE_MARGIN_PX = 97  # px by which the stored noise is larger than an image, so
 NOISE_SIGMA = 1.2  # grey levels, one sigma
 
 
-def closed_motion(count: int, rest: Array, rng: np.random.Generator, lively: float = 1.0) -> Array:
-    """Poses (N, 4, 4) of one period of a breath-like motion about `rest`: 3 mm and 2 degrees, with two harmonics.
+def closed_motion(count: int, rest: Array, rng: np.random.Generator, lively: float) -> Array:
+    """Poses (N, 4, 4) of one period of a breath-like motion about `rest`, with two harmonics.
 
-    lively: by what the amplitudes are multiplied.
+    lively: by what the amplitudes of 3 mm and 2 degrees are multiplied.
     """
     phase = 2 * np.pi * np.arange(count) / count
     xi = np.zeros((count, 6))
@@ -184,7 +176,6 @@ class PictureLoop:
         w, h = rig.cameras[0].size
         grain = self._rng.standard_normal((h + NOISE_MARGIN_PX, w + NOISE_MARGIN_PX))
         self._grain = (NOISE_SIGMA * grain).astype(np.int16)
-        self._fine = np.zeros(0)
 
     def __len__(self) -> int:
         return len(self.poses)

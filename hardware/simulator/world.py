@@ -50,7 +50,7 @@ from hardware.simulator.scenario import Scenario
 from hardware.simulator.scene.scene import Scene, WorldState
 from hardware.simulator.scene.shape import Shape
 from hardware.simulator.truth import Truth, TruthLog, row_instants
-from perception.frames import FrameSet, PrintHead
+from perception.frames import FrameSet
 from planning.command import Command
 from planning.path import Path
 from planning.progress import PrintPhase, PrintProgress
@@ -157,12 +157,13 @@ class SimulatedWorld:
             pictures = PictureRenderer(scene, TrueCameras(scenario.rig.cameras), *encoding, threads, self._print_beads)
         self._last_state: WorldState | None = None
         self._events = EventQueue()
-        views = pictures, self._state_at, self._head
+        self._commanded = CommandedPose(profile)
+        head = self._commanded.at if scenario.nozzle else lambda stamp: None
+        views = pictures, self._state_at, head
         self.pipeline = CameraPipeline(scenario, self._events, step, exposures, sink, clock, self._on_pose, *views)
         self._motion_stalls = faults_striking(scenario.faults, FaultPart.MOTION)
         self._pose: SurfacePose | None = None
         self._motion: MotionStep | None = None
-        self._commanded = CommandedPose(profile)
         self._ticks, self._rows_until, self._printed_until = 0, 0.0, 0.0
         self._bead_end: Array | None = None  # (2,) where the last piece of bead ended
         self._end = scenario.seconds
@@ -202,17 +203,11 @@ class SimulatedWorld:
         )
         return self._last_state
 
-    def _head(self, stamp: float) -> PrintHead | None:
-        return self._commanded.at(stamp) if self.scenario.nozzle else None
-
     def _on_pose(self, pose: SurfacePose, frames: FrameSet, observations: Observations) -> None:
-        self._pose = pose
-        if self._motion is None and pose.state is TrackState.TRACKING:
-            self._register(pose, frames, observations)
-
-    def _register(self, pose: SurfacePose, frames: FrameSet, observations: Observations) -> None:
         """Start the motion with the path in the tracker's surface frame, as soon as that frame can be measured."""
-        scenario = self.scenario
+        self._pose, scenario = pose, self.scenario
+        if self._motion is not None or pose.state is not TrackState.TRACKING:
+            return
         change: Array | None = np.eye(4)
         if scenario.tracking.pictures and not scenario.tracking.scan:
             exposed = np.full(len(scenario.rig), pose.stamp)
