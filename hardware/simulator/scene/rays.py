@@ -31,6 +31,10 @@ class RayLines(NamedTuple):
     du: Field
     dv: Field
 
+    def nodes(self, z: Field) -> tuple[Field, Field]:
+        """The nodes u, v over which they stand at heights z."""
+        return self.u + z * self.du, self.v + z * self.dv
+
 
 class HeightField(NamedTuple):
     """A height field (H, W) mm, its slopes a node along u and v, and the heights it keeps within, mm."""
@@ -82,14 +86,9 @@ def as_block(values: Field) -> Field:
 def near_field(relief: HeightField, rays: RayLines, z: Field, margin: float = 4.0) -> Mask:
     """Whether rays stand over the field, or within `margin` nodes of it, at height z."""
     rows, columns = relief.height.shape
-    u, v = rays.u + z * rays.du, rays.v + z * rays.dv
-    over: Mask = (u > -margin) & (u < columns + margin) & (v > -margin) & (v < rows + margin)
-    return over
-
-
-def _heights(relief: HeightField, rays: RayLines, z: Field) -> Field:
-    u, v = rays.u + z * rays.du, rays.v + z * rays.dv
-    return sample(relief.height, u, v)
+    u, v = rays.nodes(z)
+    near: Mask = (u > -margin) & (u < columns + margin) & (v > -margin) & (v < rows + margin)
+    return near
 
 
 def _newton(relief: HeightField, rays: RayLines, z: Field) -> tuple[Field, Field, Field]:
@@ -97,13 +96,12 @@ def _newton(relief: HeightField, rays: RayLines, z: Field) -> tuple[Field, Field
 
     The slope at the start serves all rounds.
     """
-    u, v = rays.u + z * rays.du, rays.v + z * rays.dv
-    slopes = sample(relief.slopes, u, v)
+    slopes = sample(relief.slopes, *rays.nodes(z))
     facing = 1 - slopes[..., 0] * rays.du - slopes[..., 1] * rays.dv
     step = 1 / np.maximum(facing, 0.15)
     for _ in range(NEWTON_ROUNDS):
-        z = as_field(z - (z - _heights(relief, rays, z)) * step)
-    rest = z - _heights(relief, rays, z)
+        z = as_field(z - (z - sample(relief.height, *rays.nodes(z))) * step)
+    rest = z - sample(relief.height, *rays.nodes(z))
     return as_field(z - rest * step), rest, facing
 
 
@@ -115,15 +113,15 @@ def search_down(relief: HeightField, rays: RayLines, low: Field, high: Field, st
     open_way = np.ones(z.shape, bool)
     for k in range(steps):
         level = high - np.float32(k) * step
-        left = level - _heights(relief, rays, level)
-        new = (left <= 0) & open_way
-        fall = np.maximum(above - left, 1e-6)
-        z = as_field(np.where(new, level - step * left / fall, z))
+        clearance = level - sample(relief.height, *rays.nodes(level))
+        new = (clearance <= 0) & open_way
+        fall = np.maximum(above - clearance, 1e-6)
+        z = as_field(np.where(new, level - step * clearance / fall, z))
         facing = as_field(np.where(new, fall / step, facing))
         open_way &= ~new
         if not open_way.any():
             break
-        above = left
+        above = clearance
     return z, facing
 
 
@@ -146,6 +144,21 @@ class ImageBox(NamedTuple):
         """(H, W) px."""
         return self.y1 - self.y0, self.x1 - self.x0
 
+    @property
+    def sample_size(self) -> tuple[int, int]:
+        """(H, W) samples."""
+        return self.size[0] * SAMPLES_PER_PIXEL, self.size[1] * SAMPLES_PER_PIXEL
+
+    def samples(self, part: ImageBox) -> tuple[slice, slice]:
+        """Rows and columns of a part's samples among those of this box."""
+        n = SAMPLES_PER_PIXEL
+        rows = slice((part.y0 - self.y0) * n, (part.y1 - self.y0) * n)
+        return rows, slice((part.x0 - self.x0) * n, (part.x1 - self.x0) * n)
+
+    def lattice(self, step: int) -> tuple[slice, slice]:
+        """Rows and columns of its squares of `step` px among those of the whole image."""
+        return slice(self.y0 // step, self.y1 // step), slice(self.x0 // step, self.x1 // step)
+
 
 class Rays(NamedTuple):
     """Tangents x / z and y / z (H, W) each, camera frame."""
@@ -160,10 +173,8 @@ class RenderView:
     def __init__(self, camera: Camera, base_from_rest: Array) -> None:
         """base_from_rest: (4, 4), of the scene's grid at rest."""
         self.camera = camera
-        self.camera_from_base = inverse(camera.base_from_camera)
-        at_rest = self.camera_from_base @ base_from_rest
-        rest_depth = float(np.linalg.norm(at_rest[:3, 3]))
-        self.spacing = rest_depth / float(camera.matrix[0, 0]) / SAMPLES_PER_PIXEL  # mm a sample
+        rest_distance = float(np.linalg.norm((inverse(camera.base_from_camera) @ base_from_rest)[:3, 3]))
+        self.spacing = rest_distance / float(camera.matrix[0, 0]) / SAMPLES_PER_PIXEL  # mm a sample
         self._box, self._rays = ImageBox(0, 0, 0, 0), Rays(*np.zeros((2, 0, 0), np.float32))
         self._coarse: dict[int, Rays] = {}
         self._fall: dict[float, NDArray[np.float32]] = {}
@@ -198,9 +209,7 @@ class RenderView:
                 for a, b in (held[::2], held[1::2])
             )
             self._rays, self._box = Rays(*rays_at(self.camera, x, y)), held
-        rows = slice((box.y0 - held.y0) * SAMPLES_PER_PIXEL, (box.y1 - held.y0) * SAMPLES_PER_PIXEL)
-        columns = slice((box.x0 - held.x0) * SAMPLES_PER_PIXEL, (box.x1 - held.x0) * SAMPLES_PER_PIXEL)
-        return Rays(self._rays.x[rows, columns], self._rays.y[rows, columns])
+        return Rays(*(tangents[held.samples(box)] for tangents in self._rays))
 
     def coarse(self, step: int) -> Rays:
         """Rays through the middles of squares of `step` px over the whole image."""
@@ -225,14 +234,9 @@ def _cubic(nodes: Array, places: Array) -> Array:
     u = (places - nodes[0]) / LENS_NODE_PX
     first = np.floor(u).astype(int)
     t = u - first
-    weights = np.zeros((len(places), len(nodes)))
-    for k, w in enumerate(
-        (
-            -t * (t - 1) * (t - 2) / 6,
-            (t + 1) * (t - 1) * (t - 2) / 2,
-            -(t + 1) * t * (t - 2) / 2,
-            (t + 1) * t * (t - 1) / 6,
-        )
-    ):
-        weights[np.arange(len(places)), first - 1 + k] = w
+    weights, rows = np.zeros((len(places), len(nodes))), np.arange(len(places))
+    weights[rows, first - 1] = -t * (t - 1) * (t - 2) / 6
+    weights[rows, first] = (t + 1) * (t - 1) * (t - 2) / 2
+    weights[rows, first + 1] = -(t + 1) * t * (t - 2) / 2
+    weights[rows, first + 2] = (t + 1) * t * (t - 1) / 6
     return weights

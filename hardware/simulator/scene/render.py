@@ -14,8 +14,8 @@ from estimation import se3
 from estimation.rig import Camera, pixels_from_points
 from estimation.se3 import Array
 from hardware.simulator.scene.appearance import Sensor, expose
-from hardware.simulator.scene.fields import Field, as_field
-from hardware.simulator.scene.rays import SAMPLES_PER_PIXEL, ImageBox, RenderView
+from hardware.simulator.scene.fields import Field, upsample
+from hardware.simulator.scene.rays import ImageBox, RenderView
 from hardware.simulator.scene.scene import (
     NOZZLE_PARTS,
     XYZ,
@@ -71,20 +71,12 @@ def nozzle_picture(
     assert state.instant.base_from_nozzle is not None
     box = whole_box(boxes)
     nozzle_from_camera = se3.inverse(state.instant.base_from_nozzle) @ view.camera.base_from_camera
-    columns, rows = (slice(a // NOZZLE_LATTICE_PX, b // NOZZLE_LATTICE_PX) for a, b in (box[::2], box[1::2]))
-    size = (box.size[1] * SAMPLES_PER_PIXEL, box.size[0] * SAMPLES_PER_PIXEL)
-    across, down = (
-        as_field(cv2.resize(c[rows, columns], size, interpolation=cv2.INTER_LINEAR))
-        for c in view.coarse(NOZZLE_LATTICE_PX)
-    )
-    rays = rotate_rays(nozzle_from_camera[:3, :3], across, down)
+    coarse = (tangents[box.lattice(NOZZLE_LATTICE_PX)] for tangents in view.coarse(NOZZLE_LATTICE_PX))
+    rays = rotate_rays(nozzle_from_camera[:3, :3], *(upsample(tangents, box.sample_size) for tangents in coarse))
     depth, which = behind.copy(), np.full(behind.shape, -1, np.int8)
     normal = [np.zeros(behind.shape, np.float32) for _ in range(3)]
     for part, inner in boxes:
-        at = (
-            slice((inner.y0 - box.y0) * SAMPLES_PER_PIXEL, (inner.y1 - box.y0) * SAMPLES_PER_PIXEL),
-            slice((inner.x0 - box.x0) * SAMPLES_PER_PIXEL, (inner.x1 - box.x0) * SAMPLES_PER_PIXEL),
-        )
+        at = box.samples(inner)
         hit = part_hit(part, nozzle_from_camera[:3, 3], (rays[0][at], rays[1][at], rays[2][at]))
         nearer = hit.depth < depth[at]
         which[at][nearer] = NOZZLE_PARTS.index(part)
@@ -108,10 +100,8 @@ def _shaded(
     metal = np.array([p.metal for p in NOZZLE_PARTS])[part]
     length = np.sqrt(rays[0] ** 2 + rays[1] ** 2 + rays[2] ** 2)
     away = _dot(rays, normal) / length  # cosine, negative towards the eye
-    mirrored = rays[0] / length - 2 * away * normal[0], rays[1] / length - 2 * away * normal[1]
-    gone = rays[2] / length - 2 * away * normal[2]
-    reflected = (*mirrored, gone)
-    up = nozzle_from_rest[:3, 2]
+    x, y, z = (ray / length - 2 * away * across for ray, across in zip(rays, normal, strict=True))
+    reflected, up = (x, y, z), nozzle_from_rest[:3, 2]
     height = _dot(reflected, up)
     room = np.clip(0.46 + 0.45 * height + 0.12 * np.sin(9 * height), 0.12, 1.0)
     light = np.float32(state.scene.look.ambient) * (0.6 + 0.4 * _dot(normal, up))
@@ -142,10 +132,7 @@ def render(
     threads: int = 2,
 ) -> list[Image]:
     """Images (H, W, 3) BGR, one per camera with its instant and its noise; the same for any number of threads."""
-    shared: dict[int, SceneState] = {}
-    for instant in instants:
-        if id(instant) not in shared:
-            shared[id(instant)] = scene_state(scene, instant)
+    shared = {key: scene_state(scene, instant) for key, instant in {id(i): i for i in instants}.items()}
     with ThreadPoolExecutor(threads) as pool:
         jobs = [(shared[id(i)], scene.view(c)) for c, i in zip(cameras, instants, strict=True)]
         skins = [pool.submit(surface_picture, s, v) for s, v in jobs]
@@ -196,25 +183,16 @@ def _blend_over(light: NDArray[np.float32], box: ImageBox, layer: NDArray[np.flo
     below = light[box.y0 : box.y1, box.x0 : box.x1]
     layer = layer[: below.shape[0], : below.shape[1]]
     b, g, r, opacity = cv2.split(layer)
-    through = 1 - opacity
-    np.multiply(below, cv2.merge([through, through, through]), out=below)
+    np.multiply(below, cv2.merge([1 - opacity] * 3), out=below)
     np.add(below, cv2.merge([b, g, r]), out=below)
 
 
 def _behind(box: ImageBox, skin: SurfacePicture | None, cloth: DrapePicture) -> NDArray[np.float32]:
-    columns, rows = (slice(a // DRAPE_LATTICE_PX, b // DRAPE_LATTICE_PX) for a, b in (box[::2], box[1::2]))
-    part = cloth.depth[rows, columns]
-    size = (box.size[1] * SAMPLES_PER_PIXEL, box.size[0] * SAMPLES_PER_PIXEL)
-    depth = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_LINEAR), np.float32)
+    depth = upsample(cloth.depth[box.lattice(DRAPE_LATTICE_PX)], box.sample_size)
     if skin is None or skin.depth is None:
         return depth
-    (x0, y0), (x1, y1) = np.maximum(box[:2], skin.box[:2]), np.minimum(box[2:], skin.box[2:])
-    if x1 <= x0 or y1 <= y0:
-        return depth
-    n = SAMPLES_PER_PIXEL
-    inner, near = (
-        a[(y0 - b.y0) * n : (y1 - b.y0) * n, (x0 - b.x0) * n : (x1 - b.x0) * n]
-        for a, b in ((depth, box), (skin.depth, skin.box))
-    )
-    np.copyto(inner, near, where=np.isfinite(near))
+    both = ImageBox(*np.maximum(box[:2], skin.box[:2]).tolist(), *np.minimum(box[2:], skin.box[2:]).tolist())
+    if min(both.size) > 0:
+        near = skin.depth[skin.box.samples(both)]
+        np.copyto(depth[box.samples(both)], near, where=np.isfinite(near))
     return depth

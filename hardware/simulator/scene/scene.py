@@ -29,10 +29,10 @@ UNDEFORMED = Deformation()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaintedScene:
-    """What takes a second to make. bare: height in mm of the nodes, (H, W); relief: of these, at rest."""
+    """What takes a second to make."""
 
-    bare: Field
-    relief: HeightField
+    node_heights: Field  # (H, W) mm, at rest
+    relief: HeightField  # of these
     layers: Layers
     sheet: Drape
     ink: PrintedBeads
@@ -78,16 +78,13 @@ class Scene:
     def _get_painted(self) -> PaintedScene:
         with self._lock:
             if self._painted is None:
-                self._painted = self._paint()
+                shape, look, rng = self.shape, self.look, np.random.default_rng([self._seed, 23])
+                half = half_opening(shape) if look.drape else None
+                heights = draped_heights(shape, half)
+                layers = paint_layers(shape, heights, half, look, self._seed)
+                cloth = backdrop(look, rng) if half is None else drape_over(shape, half, look, rng)
+                self._painted = PaintedScene(heights, height_field(heights), layers, cloth, PrintedBeads(layers))
             return self._painted
-
-    def _paint(self) -> PaintedScene:
-        shape, look, rng = self.shape, self.look, np.random.default_rng([self._seed, 23])
-        half = half_opening(shape) if look.drape else None
-        bare = draped_heights(shape, half)
-        layers = paint_layers(shape, bare, half, look, self._seed)
-        cloth = backdrop(look, rng) if half is None else drape_over(shape, half, look, rng)
-        return PaintedScene(bare, height_field(bare), layers, cloth, PrintedBeads(layers))
 
     def heights(self, amount: float) -> HeightField:
         """Heights on the nodes of material points under `amount` of the deformation, the drape's hem among them."""
@@ -95,7 +92,7 @@ class Scene:
         if not amount * self.deformation.bulge:
             return painted.relief
         lift = self.deformation.lift(np.stack(node_axes(self.shape.size, self.shape.step), -1), amount)
-        return height_field(painted.bare + lift.astype(np.float32))
+        return height_field(painted.node_heights + lift.astype(np.float32))
 
     @property
     def opening(self) -> tuple[float, float]:
@@ -181,10 +178,10 @@ XYZ = tuple[Field, Field, Field]  # x, y, z
 
 
 class PartHit(NamedTuple):
-    """What rays see of one part, each of their shape. depth: in lengths of the ray, inf: nothing. x, y, z: normal."""
+    """What rays see of one part, each of their shape."""
 
-    depth: Field
-    x: Field
+    depth: Field  # in lengths of the ray, inf: nothing
+    x: Field  # of the normal, like y and z
     y: Field
     z: Field
 
@@ -193,12 +190,6 @@ def part_outline(part: Frustum) -> Array:
     """Points (N, 3) mm, nozzle frame, whose pictures hold the part's."""
     rings = ((part.z0, 1.02 * part.r0), (part.z1, 1.02 * part.r1))
     return np.array([[r * np.cos(a), r * np.sin(a), z] for z, r in rings for a in RING_ANGLES])
-
-
-def radius_at(z: Field) -> Field:
-    """Radius mm at heights z mm, for shadows: steps are bridged."""
-    ends = np.array([(part.z0, part.r0) for part in NOZZLE_PARTS] + [(NOZZLE_LENGTH, NOZZLE_PARTS[-1].r1)])
-    return as_field(np.interp(z, ends[:, 0], ends[:, 1]))
 
 
 def part_hit(part: Frustum, origin: Array, rays: XYZ) -> PartHit:
@@ -245,7 +236,8 @@ def passing_light(points: XYZ, nozzle_from_rest: Array, lamp: Lamp) -> Field:
     gap = np.hypot(x + away * lx, y + away * ly)
     gap = np.hypot(gap, z + away * lz - height)
     soft = np.float32(0.25) + np.float32(lamp.spread) * away
-    radius = radius_at(height)
+    ends = np.array([(part.z0, part.r0) for part in NOZZLE_PARTS] + [(NOZZLE_LENGTH, NOZZLE_PARTS[-1].r1)])
+    radius = as_field(np.interp(height, ends[:, 0], ends[:, 1]))  # steps are bridged
     hidden = np.clip((radius + soft - gap) / (2 * soft), 0, 1) * np.minimum(1, (radius / soft) ** 0.7)
     return as_field(1 - hidden * hidden * (3 - 2 * hidden))
 
@@ -270,34 +262,23 @@ class SceneState:
 
 def scene_state(scene: Scene, instant: WorldState) -> SceneState:
     """Work out what the cameras of this instant share."""
-    base_from_grid = instant.base_from_surface @ scene.shape.surface_from_grid
+    shape, both = scene.shape, lamps(scene.look)
+    base_from_grid = instant.base_from_surface @ shape.surface_from_grid
     rest_from_grid = se3.inverse(scene.base_from_rest) @ base_from_grid
-    deformed = scene.heights(instant.strain)
-    both = lamps(scene.look)
+    relief = scene.heights(instant.strain)
     towards = np.stack([lamp.towards for lamp in both]) @ rest_from_grid[:3, :3]
     factors = scene.deformation.factors(instant.strain)
     shadow = None
     if instant.base_from_nozzle is not None:
-        shadow = _shadow(scene, instant.base_from_nozzle, base_from_grid, deformed, factors, both)
-    return SceneState(scene, instant, base_from_grid, rest_from_grid, deformed, factors, both, towards, shadow)
-
-
-def _shadow(
-    scene: Scene,
-    base_from_nozzle: Array,
-    base_from_grid: Array,
-    relief: HeightField,
-    factors: tuple[float, float],
-    both: tuple[Lamp, Lamp],
-) -> Field:
-    skip = max(1, round(SHADOW_STEP / scene.shape.step))
-    z = relief.height[::skip, ::skip]
-    x = (np.arange(z.shape[1], dtype=np.float32) * skip * scene.shape.step - scene.shape.size[0] / 2) * factors[0]
-    y = (np.arange(z.shape[0], dtype=np.float32) * skip * scene.shape.step - scene.shape.size[1] / 2) * factors[1]
-    nozzle_from_base = se3.inverse(base_from_nozzle)
-    points = transform_fields(nozzle_from_base @ base_from_grid, x[None], y[:, None], z)
-    nozzle_from_rest = nozzle_from_base @ scene.base_from_rest
-    return np.dstack([passing_light(points, nozzle_from_rest, lamp) for lamp in both])
+        skip = max(1, round(SHADOW_STEP / shape.step))
+        z = relief.height[::skip, ::skip]
+        x = (np.arange(z.shape[1], dtype=np.float32) * skip * shape.step - shape.size[0] / 2) * factors[0]
+        y = (np.arange(z.shape[0], dtype=np.float32) * skip * shape.step - shape.size[1] / 2) * factors[1]
+        nozzle_from_base = se3.inverse(instant.base_from_nozzle)
+        points = transform_fields(nozzle_from_base @ base_from_grid, x[None], y[:, None], z)
+        nozzle_from_rest = nozzle_from_base @ scene.base_from_rest
+        shadow = np.dstack([passing_light(points, nozzle_from_rest, lamp) for lamp in both])
+    return SceneState(scene, instant, base_from_grid, rest_from_grid, relief, factors, both, towards, shadow)
 
 
 def transform_fields(transform: Array, x: Field, y: Field, z: Field) -> tuple[Field, Field, Field]:

@@ -107,7 +107,7 @@ def _lattice(state: SceneState, view: RenderView, box: ImageBox) -> _Lattice:
     odd = np.asarray(cv2.dilate(hard.astype(np.uint8), NEIGHBOURS), bool)
     directions = rotate_rays(grid_from_camera[:3, :3], *cells)
     mirrors = mirror_slopes(directions, state.towards)
-    speed = _speed(state, directions, lines.u + start * lines.du, lines.v + start * lines.dv, start)
+    speed = _speed(state, directions, *lines.nodes(start), start)
     smear = float(np.abs(speed).max()) * state.instant.exposure / (SAMPLES_PER_PIXEL * view.spacing)  # px
     instants = int(np.clip(np.ceil(smear / SMEAR_STEP_PX / (2 * SUBPIXEL_TIMES.size)), 1, MAX_INSTANTS))
     instants = instants if smear > MIN_SMEAR_PX else 0
@@ -121,7 +121,7 @@ def _strip(state: SceneState, view: RenderView, lattice: _Lattice, first: int, l
     odd = np.repeat(np.repeat(lattice.odd[first:last], times, 0), times, 1)
     bounds = lattice.bounds[0][first:last], lattice.bounds[1][first:last]
     z = first_hit(state.relief, lines, lattice.spread(lattice.start, first, last), odd, bounds)
-    u, v = lines.u + z * lines.du, lines.v + z * lines.dv  # nodes of material points
+    u, v = lines.nodes(z)  # nodes of material points
     passed = None
     if state.shadow is not None:
         skip = np.float32(max(1, round(SHADOW_STEP / scene.shape.step)))
@@ -269,18 +269,26 @@ def drape_picture(state: SceneState, view: RenderView) -> DrapePicture:
     """The cloth as one camera sees it, the shape taken away."""
     frames = state.base_from_grid, state.scene.base_from_rest
     lens_rays = _DrapeRays(state, *(se3.inverse(each) @ view.camera.base_from_camera for each in frames))
-    rays = view.coarse(DRAPE_LATTICE_PX)
-    coarse = view.coarse(SEARCH_LATTICE_PX)
-    first_depth = _search(lens_rays, coarse, *_bounds(lens_rays, coarse), DEPTH_STEPS)
+    rays, coarse, m = view.coarse(DRAPE_LATTICE_PX), view.coarse(SEARCH_LATTICE_PX), lens_rays.rest_from_camera
+    sink = np.minimum(m[2, 0] * coarse.x + m[2, 1] * coarse.y + m[2, 2], -0.15)
+    near, far = (as_field((height - m[2, 3]) / sink) for height in (MAX_DRAPE_HEIGHT, MIN_DRAPE_HEIGHT))
+    first_depth = _search(lens_rays, coarse, near, far, DEPTH_STEPS)
     depth, x, y = _refined(lens_rays, rays, upsample(first_depth, (rays.x.shape[0], rays.x.shape[1])))
-    passed = _key_light_share(lens_rays, rays, depth)
     w, h = view.camera.size
-    planes = [upsample(plane, (view.whole.y1, view.whole.x1))[:h, :w] for plane in (*_texels(state, x, y), *passed)]
-    _edges(lens_rays, rays, depth, planes[0], planes[1])
-    light = np.empty((h, w, 3), np.float32)
+    u, v = (upsample(plane, view.whole.size)[:h, :w] for plane in _texels(state, x, y))
+    key_share = _key_light_share(lens_rays, rays, depth)
+    if key_share is not None:
+        key_share = upsample(key_share, view.whole.size)[:h, :w]
+    _edges(lens_rays, rays, depth, u, v)
+    light, tint = np.empty((h, w, 3), np.float32), CLOTH_TEAL * np.array(state.lamps[0].colour, np.float32)
+    bgr_from_texture = np.column_stack([np.eye(3, dtype=np.float32), tint])
     for first in range(0, h, DRAPE_ROWS_AT_ONCE):
         rows = slice(first, first + DRAPE_ROWS_AT_ONCE)
-        _fill_light(state, [plane[rows] for plane in planes], light[rows])
+        border = cv2.BORDER_REFLECT_101
+        texture = cv2.remap(state.scene.sheet.picture, u[rows], v[rows], cv2.INTER_LINEAR, borderMode=border)
+        if key_share is not None:
+            texture[..., 3] *= key_share[rows]
+        cv2.transform(texture, bgr_from_texture, light[rows])
     return DrapePicture(light, depth)
 
 
@@ -288,12 +296,6 @@ def _texels(state: SceneState, x: Field, y: Field) -> tuple[Field, Field]:
     rows, columns = state.scene.sheet.picture.shape[:2]
     scale = np.float32(1 / DRAPE_TEXEL)
     return x * scale + np.float32((columns - 1) / 2), y * scale + np.float32((rows - 1) / 2)
-
-
-def _bounds(eye: _DrapeRays, rays: Rays) -> tuple[Field, Field]:
-    m = eye.rest_from_camera
-    sink = np.minimum(m[2, 0] * rays.x + m[2, 1] * rays.y + m[2, 2], -0.15)
-    return as_field((MAX_DRAPE_HEIGHT - m[2, 3]) / sink), as_field((MIN_DRAPE_HEIGHT - m[2, 3]) / sink)
 
 
 def _search(eye: _DrapeRays, rays: Rays, near: Field, far: Field, steps: int) -> Field:
@@ -341,22 +343,12 @@ def _edges(eye: _DrapeRays, rays: Rays, depth: Field, u: Field, v: Field) -> Non
         into[place] = right.reshape(-1)[: len(place[0])]
 
 
-def _key_light_share(eye: _DrapeRays, rays: Rays, depth: Field) -> list[Field]:
+def _key_light_share(eye: _DrapeRays, rays: Rays, depth: Field) -> Field | None:
+    """Share of the key lamp's light that passes the nozzle; None without one."""
     state = eye.state
     if state.instant.base_from_nozzle is None:
-        return []
+        return None
     nozzle_from_base = se3.inverse(state.instant.base_from_nozzle)
     nozzle_from_camera = nozzle_from_base @ state.base_from_grid @ eye.grid_from_camera
     points = transform_fields(nozzle_from_camera, rays.x * depth, rays.y * depth, depth)
-    nozzle_from_rest = nozzle_from_base @ state.scene.base_from_rest
-    return [passing_light(points, nozzle_from_rest, state.lamps[0])]
-
-
-def _fill_light(state: SceneState, planes: list[Field], light: Field) -> None:
-    u, v, *passed = planes
-    border = cv2.BORDER_REFLECT_101
-    texture = as_field(cv2.remap(state.scene.sheet.picture, u, v, cv2.INTER_LINEAR, borderMode=border))
-    if passed:
-        texture[..., 3] *= passed[0]
-    tint = CLOTH_TEAL * np.array(state.lamps[0].colour, np.float32)
-    cv2.transform(texture, np.column_stack([np.eye(3, dtype=np.float32), tint]), light)
+    return passing_light(points, nozzle_from_base @ state.scene.base_from_rest, state.lamps[0])
