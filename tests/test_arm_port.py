@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -141,7 +141,7 @@ def test_a_signal_ends_it_in_order(tmp_path: Path, number: signal.Signals) -> No
 
 def test_bytes_go_through_a_pty_unchanged_and_at_once() -> None:
     rng = np.random.default_rng(0)
-    with PtyLink() as link:
+    with closing(PtyLink()) as link:
         assert link.name.startswith("/dev/")
         for size in 1, 48, 256, 20_000:
             data = rng.bytes(size)

@@ -273,7 +273,7 @@ def test_a_scenario_says_above_its_title_what_it_proves(file: Path) -> None:
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_a_scenario_bounds_error_and_duty(file: Path) -> None:
-    assert {"p95_mm", "duty"} <= set(scenario(file).limits.names)
+    assert {"p95_mm", "duty"} <= set(scenario(file).limits)
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)

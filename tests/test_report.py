@@ -27,7 +27,7 @@ from hardware.report.evaluation import (
     state_shares,
 )
 from hardware.report.page import Plot, Scale, round_step, spanning, stretches, thinned
-from hardware.report.report import page, write_report
+from hardware.report.report import track_page, write_report
 from hardware.report.summary import as_dict, percent, summary_text, text_of, verdict, write_summary
 from tests.runs import run
 
@@ -73,38 +73,38 @@ def eventful() -> Evaluation:
 
 
 def test_the_page_is_well_formed_and_says_what_happened() -> None:
-    text = text_of_page(page(eventful()))
+    text = text_of_page(track_page(eventful()))
     for words in ("monday <1>", "One pose was off by more than 10 mm", "LOST 1.3 %", "left, median", "row 31", "NEES"):
         assert words in text
 
 
 def test_the_page_needs_nothing_from_outside() -> None:
-    html = page(eventful())
+    html = track_page(eventful())
     assert not re.search(r"https?:|src=|@import|url\(|<script", html)
 
 
 def test_no_number_on_the_page_is_not_a_number() -> None:
-    assert not re.search(r'[" ML](nan|inf|-inf)\b', page(eventful()))
+    assert not re.search(r'[" ML](nan|inf|-inf)\b', track_page(eventful()))
 
 
 @pytest.mark.parametrize("rows", [0, 1, 2])
 def test_a_run_of_next_to_nothing_has_a_page(rows: int) -> None:
     table, truth = run(rows)
     for known in (truth if rows else None, None):
-        assert "stillbed" in text_of_page(page(evaluate(table, known, "short", complete=False)))
+        assert "stillbed" in text_of_page(track_page(evaluate(table, known, "short", complete=False)))
 
 
 def test_a_run_without_any_known_pose_has_a_page() -> None:
     table, truth = run(5, states={i: TrackState.INITIALISING for i in range(5)})
     table.base_from_surface[:] = np.nan
     table.covariance[:] = np.nan
-    assert "INITIALISING 100 %" in text_of_page(page(evaluate(table, truth)))
+    assert "INITIALISING 100 %" in text_of_page(track_page(evaluate(table, truth)))
 
 
 def test_the_page_says_when_each_camera_exposes() -> None:
     table, truth = run(40, sigma=SIGMA)
     result = evaluate(table, truth)
-    text = text_of_page(page(result))
+    text = text_of_page(track_page(result))
     at_end = "left +14.3 ± 0.4 ms, top -9.1 ± 0.4 ms, right -5.2 ± 0.4 ms"
     assert f"the cameras expose at {at_end}." in text
     assert "left, at the end +14.3 ± 0.4 ms" in text
@@ -125,7 +125,7 @@ def test_a_method_that_learns_no_clocks_says_nothing_of_them(states: dict[int, T
     table, truth = run(40, sigma=SIGMA, states=states)
     table.offset_sigmas[:] = np.nan
     result = evaluate(table, truth)
-    text = text_of_page(page(result))
+    text = text_of_page(track_page(result))
     assert "Clocks" not in text
     assert "expose" not in text
     assert as_dict(result)["clocks_ms"] is None
@@ -134,13 +134,13 @@ def test_a_method_that_learns_no_clocks_says_nothing_of_them(states: dict[int, T
 def test_a_perfect_run_has_a_page() -> None:
     table, truth = run(40)
     table.base_from_surface[:] = truth.base_from_surface[:] = np.eye(4)
-    assert "0.0000 mm" in text_of_page(page(evaluate(table, truth)))
+    assert "0.0000 mm" in text_of_page(track_page(evaluate(table, truth)))
 
 
 def test_a_measured_reference_is_not_called_truth() -> None:
     table, truth = run(40, sigma=SIGMA)
     reference = type(truth)(truth.stamps, truth.base_from_surface, False)
-    text = text_of_page(page(evaluate(table, reference)))
+    text = text_of_page(track_page(evaluate(table, reference)))
     assert "measured reference" in text
     assert "exact truth" not in text
 

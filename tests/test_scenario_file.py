@@ -38,7 +38,7 @@ def test_a_scenario_of_title_seconds_and_path_has_a_default_for_everything_else(
     assert (scenario.nozzle, scenario.beads, scenario.jpeg_quality, scenario.strain) == (True, True, 90, None)
     assert [camera.name for camera in scenario.rig.cameras] == ["cam_0", "cam_1", "cam_2"]
     assert np.array_equal(scenario.motion(np.array([3.0]))[0], np.eye(4))
-    assert scenario.limits.names == ()
+    assert scenario.limits == {}
 
 
 def test_the_motion_knows_all_of_the_lag_that_there_is_unless_told_otherwise(tmp_path: Path) -> None:

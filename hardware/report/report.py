@@ -11,20 +11,8 @@ import numpy as np
 from estimation import se3
 from estimation.pose import TrackState
 from estimation.se3 import Array
+from hardware.report import page
 from hardware.report.evaluation import MAX_TRACKING_ERROR_MM, NEES_BOUND, Comparison, Evaluation, spread
-from hardware.report.page import (
-    Plot,
-    area_key,
-    document,
-    figures_table,
-    legend,
-    line_key,
-    ribbon,
-    row_of_tiles,
-    section,
-    spanning,
-    tile,
-)
 from hardware.report.summary import clocks_learned, figure, measured_share, percent, verdict
 
 PAGE_CHART_WIDTH = 1030  # px of a chart across the page
@@ -34,15 +22,15 @@ MAX_EVENT_ROWS = 40  # rows of the table of state changes
 
 def write_report(path: Path, result: Evaluation) -> None:
     """Write the page to `path`."""
-    path.write_text(page(result), encoding="utf-8")
+    path.write_text(track_page(result), encoding="utf-8")
 
 
-def page(result: Evaluation) -> str:
+def track_page(result: Evaluation) -> str:
     """The page as HTML text."""
     body = [_tiles(result), *sections(result)]
     footer = "Lengths in mm, time in s from the session's own clock; poses are base_from_surface."
     kind = f"stillbed track, method {result.method}" if result.method else "stillbed track"
-    return document(kind, result.title or "a session", " ".join(verdict(result)), body, footer)
+    return page.document(kind, result.title or "a session", " ".join(verdict(result)), body, footer)
 
 
 def sections(result: Evaluation) -> list[str]:
@@ -52,16 +40,16 @@ def sections(result: Evaluation) -> list[str]:
 
 
 def _tiles(result: Evaluation) -> str:
-    tiles = [tile(percent(measured_share(result)).removesuffix(" %"), "%", "of the frame sets followed")]
+    tiles = [page.tile(percent(measured_share(result)).removesuffix(" %"), "%", "of the frame sets followed")]
     if result.comparison is not None:
         start, aligned = result.comparison.start, result.comparison.aligned
-        tiles.append(tile(figure(spread(start.translation).median), "mm", "median error from the start"))
-        tiles.append(tile(figure(math.degrees(spread(start.rotation).median)), "°", "median error from the start"))
-        tiles.append(tile(figure(spread(aligned.translation).rmse), "mm", "RMSE, aligned"))
+        tiles.append(page.tile(figure(spread(start.translation).median), "mm", "median error from the start"))
+        tiles.append(page.tile(figure(math.degrees(spread(start.rotation).median)), "°", "median error from the start"))
+        tiles.append(page.tile(figure(spread(aligned.translation).rmse), "mm", "RMSE, aligned"))
     if len(result.latency.total):
         late = result.latency
-        tiles.append(tile(f"{late.p50[-1]:.1f}", "ms", f"per pose; 99 % under {late.p99[-1]:.1f} ms"))
-    return row_of_tiles(tiles)
+        tiles.append(page.tile(f"{late.p50[-1]:.1f}", "ms", f"per pose; 99 % under {late.p99[-1]:.1f} ms"))
+    return page.row_of_tiles(tiles)
 
 
 def time_range(stamps: Array) -> tuple[float, float]:
@@ -80,16 +68,16 @@ def _followed(result: Evaluation) -> tuple[float, float]:
 def _states(result: Evaluation) -> str:
     table = result.table
     if not len(table):
-        return section("States", "No frame set was given.", "")
+        return page.section("States", "No frame set was given.", "")
     last = table.stamps[-1] + (np.median(np.diff(table.stamps)) if len(table) > 1 else 1.0)
     names = [state.value for state in table.states]
     titles = [f"{s:.2f} s: {n}. {why}" for s, n, why in zip(table.stamps, names, table.reasons, strict=True)]
-    strip = ribbon(np.append(table.stamps, last), names, titles, time_range(table.stamps), PAGE_CHART_WIDTH)
-    keys = [area_key(name, f"{name} {percent(share)}") for name, share in result.shares.items() if share > 0]
+    strip = page.ribbon(np.append(table.stamps, last), names, titles, time_range(table.stamps), PAGE_CHART_WIDTH)
+    keys = [page.area_key(name, f"{name} {percent(share)}") for name, share in result.shares.items() if share > 0]
     text = "TRACKING and DEGRADED are measured, COASTING is predicted, LOST is of no use."
     if math.isfinite(result.since):
         text += f" Shares count from {round(result.since, 2) + 0.0:.2f} s, the instant of the roi."
-    return section("States", text, strip + legend(keys) + _events(result))
+    return page.section("States", text, strip + page.legend(keys) + _events(result))
 
 
 def _events(result: Evaluation) -> str:
@@ -130,22 +118,27 @@ def _trajectory(result: Evaluation) -> str:
     values = components(table.base_from_surface, origin)
     sigma = 2 * deviations(table.base_from_surface, table.covariance)
     values[hidden], sigma[hidden] = np.nan, np.nan
-    keys, truth = [line_key("estimate", "estimate, with two standard deviations")], np.full((len(table), 6), np.nan)
+    keys, truth = (
+        [page.line_key("estimate", "estimate, with two standard deviations")],
+        np.full((len(table), 6), np.nan),
+    )
     if comparison is not None:
         target = comparison.expected @ comparison.start.truth_surface_from_estimated_surface
         truth[comparison.rows] = components(target, origin)
-        keys.append(line_key("truth", "truth" if comparison.exact else "reference"))
+        keys.append(page.line_key("truth", "truth" if comparison.exact else "reference"))
     names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
     plots = []
     for name, value, two_sigma, true_value in zip(names, values.T, sigma.T, truth.T, strict=True):
-        plot = Plot(HALF_CHART_WIDTH, 165, _followed(result), spanning([value, true_value], 0.12, 0.5), label=name)
+        plot = page.Plot(
+            HALF_CHART_WIDTH, 165, _followed(result), page.spanning([value, true_value], 0.12, 0.5), label=name
+        )
         plot.band(table.stamps, value - two_sigma, value + two_sigma, "spread")
         plot.line(table.stamps, true_value, "truth")
         plot.line(table.stamps, value, "estimate")
         plots.append(plot.svg())
     pairs = "".join(plots[i] for i in (0, 3, 1, 4, 2, 5))
     text = "Position of the surface's origin in base, and its rotation since the first pose. Time in s."
-    return section("Trajectory", text, f'{legend(keys)}<div class="two">{pairs}</div>')
+    return page.section("Trajectory", text, f'{page.legend(keys)}<div class="two">{pairs}</div>')
 
 
 def _motion(result: Evaluation) -> str:
@@ -155,7 +148,7 @@ def _motion(result: Evaluation) -> str:
         return ""
     moved = np.where(table.measured, table.moved, np.nan)
     label = "away from the last place of rest, mm"
-    plot = Plot(PAGE_CHART_WIDTH, 150, _followed(result), spanning([moved], 0.1, 0.3), label=label)
+    plot = page.Plot(PAGE_CHART_WIDTH, 150, _followed(result), page.spanning([moved], 0.1, 0.3), label=label)
     plot.line(table.stamps, moved, "estimate")
     onsets = np.unique(table.onset[np.isfinite(table.onset)])
     if len(onsets):
@@ -167,15 +160,15 @@ def _motion(result: Evaluation) -> str:
         f"The surface {still}; {began.get(len(onsets), f'{len(onsets)} movements were seen to begin')}. A movement is "
         "0.3 mm or 0.1°, and a dot marks the first pose of each."
     )
-    keys = [line_key("estimate", "middle of the surface since it was last at rest")]
-    return section("Motion", text, legend(keys) + plot.svg())
+    keys = [page.line_key("estimate", "middle of the surface since it was last at rest")]
+    return page.section("Motion", text, page.legend(keys) + plot.svg())
 
 
 def _errors(result: Evaluation) -> str:
     comparison = result.comparison
     if comparison is None:
         missing = "The session has neither truth.tum nor reference.tum, or no measured pose beside it."
-        return section("Errors", missing, "")
+        return page.section("Errors", missing, "")
     translation, rotation = comparison.start.translation, np.degrees(comparison.start.rotation)
     plots = _error_plot(result, comparison, translation, "distance from the start on, mm", MAX_TRACKING_ERROR_MM)
     plots += _error_plot(result, comparison, rotation, "angle from the start on, °")
@@ -184,7 +177,7 @@ def _errors(result: Evaluation) -> str:
         f"at {len(comparison.rows)} measured poses. From the start: the constant transform between the two surface "
         "frames is taken at the first TRACKING pose, nothing is fitted. Aligned: the best constant over the run."
     )
-    return section("Errors", text, plots + _error_table(comparison) + _consistency(comparison))
+    return page.section("Errors", text, plots + _error_table(comparison) + _consistency(comparison))
 
 
 def _error_plot(result: Evaluation, comparison: Comparison, errors: Array, label: str, limit: float = np.inf) -> str:
@@ -192,7 +185,7 @@ def _error_plot(result: Evaluation, comparison: Comparison, errors: Array, label
     positive = errors[errors > 1e-9]
     high = max(float(positive.max()) * 1.5, 1e-2) if len(positive) else 1.0
     low = max(float(np.percentile(positive, 2)) / 2, high / 1e5) if len(positive) else 0.1
-    plot = Plot(PAGE_CHART_WIDTH, 170, _followed(result), (min(low, high / 10), high), log_y=True, label=label)
+    plot = page.Plot(PAGE_CHART_WIDTH, 170, _followed(result), (min(low, high / 10), high), log_y=True, label=label)
     stamps, over_time = result.table.stamps, np.full(len(result.table), np.nan)
     over_time[comparison.rows] = errors
     plot.line(stamps, over_time, "estimate")
@@ -209,7 +202,7 @@ def _error_table(comparison: Comparison) -> str:
         for unit, values in (("mm", errors.translation), ("°", np.degrees(errors.rotation))):
             s = spread(values)
             rows.append([f"{name}, {unit}", *(figure(v) for v in (s.median, s.rmse, s.p95, s.max))])
-    return figures_table(["", "median", "RMSE", "95 %", "max"], rows)
+    return page.figures_table(["", "median", "RMSE", "95 %", "max"], rows)
 
 
 def _consistency(comparison: Comparison) -> str:
@@ -229,15 +222,15 @@ def _tracks(result: Evaluation) -> str:
     table = result.table
     if not len(table):
         return ""
-    plot = Plot(PAGE_CHART_WIDTH, 170, _followed(result), (0.0, max(float(table.used.max(initial=0)) * 1.08, 1.0)))
+    plot = page.Plot(PAGE_CHART_WIDTH, 170, _followed(result), (0.0, max(float(table.used.max(initial=0)) * 1.08, 1.0)))
     keys = []
     counted = ~table.is_state(TrackState.INITIALISING)
     for i, name in enumerate(table.cameras):
         plot.line(table.stamps, np.where(counted, table.used[:, i], np.nan), f"series c{i % 5}")
         middle = np.median(table.used[counted, i]) if counted.any() else 0
-        keys.append(line_key(f"series c{i % 5}", f"{name}, median {middle:.0f}"))
+        keys.append(page.line_key(f"series c{i % 5}", f"{name}, median {middle:.0f}"))
     text = "Tracks that carry the pose, per camera."
-    return section("Tracks", text, legend(keys) + plot.svg())
+    return page.section("Tracks", text, page.legend(keys) + plot.svg())
 
 
 def _clocks(result: Evaluation) -> str:
@@ -247,19 +240,21 @@ def _clocks(result: Evaluation) -> str:
         return ""
     shown = np.where(table.is_state(TrackState.INITIALISING), np.nan, 1.0)
     offsets, sigmas = 1000 * table.offsets * shown[:, None], 1000 * table.offset_sigmas
-    limits, keys = spanning([offsets], 0.15, 2.0), []
-    plot = Plot(PAGE_CHART_WIDTH, 150, _followed(result), limits, label="later than stamped, ms")
+    limits, keys = page.spanning([offsets], 0.15, 2.0), []
+    plot = page.Plot(PAGE_CHART_WIDTH, 150, _followed(result), limits, label="later than stamped, ms")
     for i, name in enumerate(table.cameras):
         plot.line(table.stamps, offsets[:, i], f"series c{i % 5}")
         final = f"{name}, at the end {1000 * table.offsets[-1, i]:+.1f} ± {sigmas[-1, i]:.1f} ms"
-        keys.append(line_key(f"series c{i % 5}", final))
+        keys.append(page.line_key(f"series c{i % 5}", final))
     text = (
         "How much later than stamped each camera exposes, against the mean of all, and one standard deviation. It "
         "shows where the surface moves, and is corrected once it is clearly there."
     )
     if not np.nan_to_num(offsets).any():
-        return section("Clocks", f"{text} Here chance explains what was seen, and nothing was corrected.", legend(keys))
-    return section("Clocks", f"{text} Until then a line stays at zero.", legend(keys) + plot.svg())
+        return page.section(
+            "Clocks", f"{text} Here chance explains what was seen, and nothing was corrected.", page.legend(keys)
+        )
+    return page.section("Clocks", f"{text} Until then a line stays at zero.", page.legend(keys) + plot.svg())
 
 
 def _latency(result: Evaluation) -> str:
@@ -269,17 +264,17 @@ def _latency(result: Evaluation) -> str:
         f"{late.initial_sets} frame sets, up to the first map, took {late.initialisation:.0f} ms and are not counted."
     )
     if not len(late.total):
-        return section("Latency", text, "")
+        return page.section("Latency", text, "")
     rows = [
         [name, *(f"{v:.2f}" for v in values)]
         for name, *values in zip(late.stages, late.p50, late.p95, late.p99, late.max, strict=True)
     ]
-    figures = figures_table(["stage, ms", "median", "95 %", "99 %", "max"], rows, last_total=True)
+    figures = page.figures_table(["stage, ms", "median", "95 %", "99 %", "max"], rows, last_total=True)
     high = max(float(np.percentile(late.total, 99.5)) * 1.25, 1.0)
     counts, edges = np.histogram(np.minimum(late.total, high * (1 - 1e-9)), bins=40, range=(0, high))
-    plot = Plot(HALF_CHART_WIDTH, 210, (0, high), (0, max(float(counts.max()) * 1.1, 1.0)))
+    plot = page.Plot(HALF_CHART_WIDTH, 210, (0, high), (0, max(float(counts.max()) * 1.1, 1.0)))
     plot.bars(edges, counts.astype(float), "bar")
     plot.mark(float(late.p50[-1]), "median", "median")
     plot.mark(float(late.p99[-1]), "99 %", "median")
     caption = '<div class="caption">frame sets by their total, ms</div>'
-    return section("Latency", text, f'<div class="two"><div>{figures}</div><div>{caption}{plot.svg()}</div></div>')
+    return page.section("Latency", text, f'<div class="two"><div>{figures}</div><div>{caption}{plot.svg()}</div></div>')

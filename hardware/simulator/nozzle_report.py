@@ -13,20 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.se3 import Array
-from hardware.report.page import (
-    Plot,
-    area_key,
-    document,
-    figures_table,
-    legend,
-    line_key,
-    round_step,
-    row_of_tiles,
-    section,
-    stretches,
-    thinned,
-    tile,
-)
+from hardware.report import page
 from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, sections, time_range
 from hardware.report.summary import figure
 from hardware.simulator.deposit import HALF_BEAD, DepositMap, gaps_and_overlaps, row_step
@@ -85,7 +72,7 @@ class TopView:
 
     def svg(self, body: str, name: str) -> str:
         """The picture with its scale below."""
-        length = round_step((self.high[0] - self.low[0]) / 6)
+        length = page.round_step((self.high[0] - self.low[0]) / 6)
         bar = f'<path class="scale" d="M2 {self.height + 10:.1f}v6h{length * self.scale:.1f}v-6"/>'
         bar += f'<text x="2" y="{self.height + 29:.1f}">{length:g} mm</text>'
         box = f'viewBox="0 0 {self.width:g} {self.height + SCALE_HEIGHT_PX:.1f}"'
@@ -142,7 +129,7 @@ def way_picture(result: NozzleResult, width: float) -> str:
     log, distance = result.run.log, result.errors.distance
     tip = view.pixels(log.surface_from_tip)
     stride = max(1, int(np.ceil(log.extrude.sum() / MAX_WAY_PIECES)))
-    for part in stretches(log.extrude & np.isfinite(tip[:, 0])):
+    for part in page.stretches(log.extrude & np.isfinite(tip[:, 0])):
         rows = np.append(np.arange(part.start, part.stop - 1, stride), part.stop - 1)
         worst = np.fmax.reduceat(distance, rows)[:-1] if len(rows) > 1 else np.empty(0)
         colour = np.searchsorted(ERROR_STEPS, np.nan_to_num(worst, nan=np.inf))
@@ -174,9 +161,9 @@ def nozzle_page(result: NozzleResult) -> str:
     if result.run.files:
         links = (f'<a href="{escape(name)}">{escape(name)}</a> {escape(note)}' for name, note in result.run.files)
         files = "".join(f"<span>{link}</span>" for link in links)
-        parts.append(section("Files", "Beside this page.", f'<div class="files">{files}</div>'))
+        parts.append(page.section("Files", "Beside this page.", f'<div class="files">{files}</div>'))
     lead = " ".join(nozzle_verdict(result))
-    return document(PAGE_KIND, result.run.title or "a print", lead, [part for part in parts if part], PAGE_FOOTER)
+    return page.document(PAGE_KIND, result.run.title or "a print", lead, [part for part in parts if part], PAGE_FOOTER)
 
 
 def _badge(result: NozzleResult) -> str:
@@ -196,7 +183,7 @@ def _tiles(result: NozzleResult) -> str:
         (figure(1000 * f.lag.seconds), "ms", "lag"),
         (share(result.figures.deposit.coverage).removesuffix(" %"), "%", "of the planned area covered"),
     )
-    return row_of_tiles([tile(*each) for each in tiles])
+    return page.row_of_tiles([page.tile(*each) for each in tiles])
 
 
 def _figures(result: NozzleResult) -> str:
@@ -209,10 +196,10 @@ def _figures(result: NozzleResult) -> str:
     time = f"of the {f.extruding:.2f} s it printed, of {f.printing:.2f} s it had"
     within = f"Within {NEAR_ERROR:g} mm for {share(f.near)} {time}"
     more = f"{within}; mean error {offset} mm along x, y and z of the surface."
-    errors = figures_table(["", *SPREAD_HEADS], rows) + f'<p class="note">{escape(more)}</p>'
+    errors = page.figures_table(["", *SPREAD_HEADS], rows) + f'<p class="note">{escape(more)}</p>'
     text = "Over the milliseconds in which material left the nozzle; parts of the error are without their sign."
-    limits = section("Limits", "What the scenario asks of a run.", _limits(result)) if result.verdicts else ""
-    return limits + section("Error while printing", text, errors)
+    limits = page.section("Limits", "What the scenario asks of a run.", _limits(result)) if result.verdicts else ""
+    return limits + page.section("Error while printing", text, errors)
 
 
 def _limits(result: NozzleResult) -> str:
@@ -225,23 +212,25 @@ def _limits(result: NozzleResult) -> str:
     return f"<table>{head}<tbody>{rows}</tbody></table>"
 
 
-def _shades(result: NozzleResult, plot: Plot) -> None:
+def _shades(result: NozzleResult, plot: page.Plot) -> None:
     log, spans = result.run.log, result.figures.nozzle.spans
     step = row_step(log)
-    printing = [(log.stamps[part.start], log.stamps[part.stop - 1] + step) for part in stretches(log.extrude)]
+    printing = [(log.stamps[part.start], log.stamps[part.stop - 1] + step) for part in page.stretches(log.extrude)]
     _shade_longest(plot, "extruding", printing)
     titles = [f"{span.start:.3f} s, for {span.end - span.start:.3f} s: {span.reason}" for span in spans]
     _shade_longest(plot, "holding", [(span.start, span.end) for span in spans], titles)
 
 
-def _shade_longest(plot: Plot, style: str, intervals: list[tuple[float, float]], titles: Sequence[str] = ()) -> None:
+def _shade_longest(
+    plot: page.Plot, style: str, intervals: list[tuple[float, float]], titles: Sequence[str] = ()
+) -> None:
     start, end = np.array(intervals).reshape(-1, 2).T
     longest = np.sort(np.argsort(start - end, kind="stable")[:MAX_SHADED_SPANS])
     plot.shade(start[longest], end[longest], style, [titles[i] for i in longest] if titles else ())
 
 
-def _draw_line(plot: Plot, stamps: Array, values: Array, style: str) -> None:
-    rows = thinned(values, MAX_LINE_POINTS)
+def _draw_line(plot: page.Plot, stamps: Array, values: Array, style: str) -> None:
+    rows = page.thinned(values, MAX_LINE_POINTS)
     plot.line(stamps[rows], values[rows], style)
 
 
@@ -249,19 +238,19 @@ def _over_time(result: NozzleResult) -> str:
     log, distance = result.run.log, result.errors.distance
     top = result.figures.nozzle.position.max
     top = max(1.12 * top, 1.2 * NEAR_ERROR) if np.isfinite(top) else 2 * NEAR_ERROR
-    plot = Plot(PAGE_CHART_WIDTH, 260, time_range(log.stamps), (0.0, top), label="error, mm")
+    plot = page.Plot(PAGE_CHART_WIDTH, 260, time_range(log.stamps), (0.0, top), label="error, mm")
     _shades(result, plot)
     _draw_line(plot, log.stamps, np.where(log.extrude, np.nan, distance), "aside")
     plot.level(NEAR_ERROR, f"{NEAR_ERROR:g} mm", "limit")
     _draw_line(plot, log.stamps, np.where(log.extrude, distance, np.nan), "estimate")
     keys = [
-        line_key("estimate", "error while printing"),
-        line_key("aside", "while not printing, where a place was due"),
-        area_key("extruding", "printing"),
-        area_key("holding", "holding; point at it for the reason"),
+        page.line_key("estimate", "error while printing"),
+        page.line_key("aside", "while not printing, where a place was due"),
+        page.area_key("extruding", "printing"),
+        page.area_key("holding", "holding; point at it for the reason"),
     ]
     text = "From the nozzle's tip to where it should have been, over time in s; what is higher is cut off."
-    return section("Error over time", text, legend(keys) + plot.svg())
+    return page.section("Error over time", text, page.legend(keys) + plot.svg())
 
 
 def _parts(result: NozzleResult) -> str:
@@ -276,11 +265,11 @@ def _parts(result: NozzleResult) -> str:
     for i, (name, value) in enumerate(zip(names, values, strict=True)):
         y = (-limit, limit) if i < 3 else (0.0, max(float(angles.max(initial=0)) * 1.1, 0.05))
         height = 156 if i == 3 else 140
-        plot = Plot(PAGE_CHART_WIDTH, height, time_range(log.stamps), y, label=name, x_ticks=i == 3)
+        plot = page.Plot(PAGE_CHART_WIDTH, height, time_range(log.stamps), y, label=name, x_ticks=i == 3)
         _draw_line(plot, log.stamps, value, f"series c{i}")
         plots.append(plot.svg())
     text = "Ahead, to the left and out of the surface are positive; the angle is that to the axis of the target."
-    return section("Parts of the error", text, "".join(plots))
+    return page.section("Parts of the error", text, "".join(plots))
 
 
 def _spread(result: NozzleResult) -> str:
@@ -292,7 +281,7 @@ def _spread(result: NozzleResult) -> str:
     high = max(float(distance.max()) * 1.02, 1.1 * NEAR_ERROR)
     counts, edges = np.histogram(distance, bins=48, range=(0, high))
     percents = 100 * counts / len(distance)
-    bars = Plot(HALF_CHART_WIDTH, 230, (0, high), (0, float(percents.max()) * 1.15), label="")
+    bars = page.Plot(HALF_CHART_WIDTH, 230, (0, high), (0, float(percents.max()) * 1.15), label="")
     bars.bars(edges, percents, "bar")
     bars.mark(f.position.median, "median", "median")
     bars.mark(f.position.p95, "95 %", "median")
@@ -302,7 +291,7 @@ def _spread(result: NozzleResult) -> str:
         "Left: how often the error was how large. Right: how far the nozzle is from the target (RMS) if one is shifted "
         "against the other in time; where that is least is the lag, positive when the nozzle is late."
     )
-    return section("Spread and lag", text, f'<div class="two">{charts}</div>')
+    return page.section("Spread and lag", text, f'<div class="two">{charts}</div>')
 
 
 def _lag(lag: NozzleLag) -> str:
@@ -310,7 +299,7 @@ def _lag(lag: NozzleLag) -> str:
         return '<div class="caption">The target moved too little, or not long enough, to tell a lag.</div>'
     milliseconds = 1000 * lag.shifts
     top = float(lag.distance.max()) * 1.1
-    plot = Plot(HALF_CHART_WIDTH, 230, (float(milliseconds[0]), float(milliseconds[-1])), (0.0, max(top, 0.01)))
+    plot = page.Plot(HALF_CHART_WIDTH, 230, (float(milliseconds[0]), float(milliseconds[-1])), (0.0, max(top, 0.01)))
     plot.line(milliseconds, lag.distance, "estimate")
     if np.isfinite(lag.seconds):
         plot.mark(1000 * lag.seconds, f"{figure(1000 * lag.seconds)} ms", "limit")
@@ -330,8 +319,10 @@ def _pictures(result: NozzleResult) -> str:
         + bead_picture(result, i, width)
         for i, number in enumerate(deposit.layers[:MAX_LAYERS])
     )
-    kinds = legend([area_key(kind.replace(" ", "-"), kind) for kind in CELL_KINDS])
-    colours = legend([line_key("plan", "planned"), *(line_key(style, words) for style, words in way_legend())])
+    kinds = page.legend([page.area_key(kind.replace(" ", "-"), kind) for kind in CELL_KINDS])
+    colours = page.legend(
+        [page.line_key("plan", "planned"), *(page.line_key(style, words) for style, words in way_legend())]
+    )
     both = f"<div>{maps}{kinds}</div><div>{way_picture(result, width)}{colours}</div>"
     text = (
         f"The surface from above, x to the right. Beads are {result.run.bead:g} mm wide, {f.area:.0f} mm² are planned: "
@@ -341,16 +332,18 @@ def _pictures(result: NozzleResult) -> str:
     )
     more = len(deposit.layers) - MAX_LAYERS
     rest = f'<p class="note">and {more} more layers</p>' if more > 0 else ""
-    return section("Deposited and planned", text, (both if wide else f'<div class="two">{both}</div>') + rest)
+    return page.section("Deposited and planned", text, (both if wide else f'<div class="two">{both}</div>') + rest)
 
 
 def _holds(result: NozzleResult) -> str:
     holds = result.figures.nozzle.holds
     if not holds:
-        return section("Holds", "The arm never held.", "")
+        return page.section("Holds", "The arm never held.", "")
     rows = [(h.reason, str(h.count), *(f"{v:.3f}" for v in (h.seconds, h.longest, h.first))) for h in holds]
     text = "Why the arm stood still until the path was finished; … stands for a number that was not always the same."
-    return section("Holds", text, figures_table(("reason", "times", "in all, s", "longest, s", "first at, s"), rows))
+    return page.section(
+        "Holds", text, page.figures_table(("reason", "times", "in all, s", "longest, s", "first at, s"), rows)
+    )
 
 
 def _camera_pictures(result: NozzleResult) -> str:
@@ -360,7 +353,7 @@ def _camera_pictures(result: NozzleResult) -> str:
         f'<figure><img alt="{escape(name)}" src="{_data_url(data)}"/><figcaption>{escape(name)}</figcaption></figure>'
         for name, data in result.run.pictures
     )
-    return section("What the cameras saw", "One instant of the run.", f'<div class="pictures">{figures}</div>')
+    return page.section("What the cameras saw", "One instant of the run.", f'<div class="pictures">{figures}</div>')
 
 
 def _data_url(data: bytes) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -212,14 +212,18 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
     prepare_out(out, options.force)
     clear_run(out)
     truth = true_surface(scenario, scene)
-    wound_rois, scan = regions(scenario, scene, truth), _scan(scenario, scene, out)
+    wound_rois, scan = regions(scenario, scene, truth), None
+    if scenario.tracking.pictures and scenario.tracking.scan:
+        scan = out / "session" / "surface.ply"
+        scan.parent.mkdir(exist_ok=True)
+        write_ply(scan, *scene.shape.mesh(SCAN_MESH_STEP))
     folder = RunFolder(out, scenario, planned_line(path), wound_rois, truth.base_from_surface, scan)
     complete, skipped = False, 0
     try:
         with folder, ExitStack() as stack:
             exposures: Exposures = {}
             step = stack.enter_context(_tracking(scenario, truth, scene.shape, wound_rois, scan, exposures))
-            line = stack.enter_context(PtyLink()).transfer if options.pty else bytes
+            line = stack.enter_context(closing(PtyLink())).transfer if options.pty else bytes
             progress = stack.enter_context(Progress("simulate", "frame sets", WallClock().now))
             print(f"watch: {folder.watch.page.resolve().as_uri()}", file=sys.stderr)
             loop = step, exposures, folder, WallClock(), options.threads, line
@@ -308,14 +312,6 @@ def regions(scenario: Scenario, scene: Scene, truth: Truth) -> tuple[Roi, ...]:
             pose = truth.base_from_surface(np.array([shot.exposed]))[0]
             polygons += [r for r in rois(scene, scenario.rig, pose, shot.stamp) if r.camera == camera]
     return tuple(polygons)
-
-
-def _scan(scenario: Scenario, scene: Scene, out: Path) -> Path | None:
-    if not (scenario.tracking.pictures and scenario.tracking.scan):
-        return None
-    (out / "session").mkdir(exist_ok=True)
-    write_ply(out / "session" / "surface.ply", *scene.shape.mesh(SCAN_MESH_STEP))
-    return out / "session" / "surface.ply"
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -134,20 +135,14 @@ def disturbed_motion(motion: TrueMotion, faults: Sequence[Fault]) -> TrueMotion:
     return DisturbedMotion(motion, fast) if fast else motion
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FoldAmount:
-    """How high folds stand: an amount over time, as a scenario's [strain] is."""
-
-    faults: Sequence[Fault]
-
-    def __call__(self, times: Array) -> Array:
-        """mm (N,) at times (N,), s."""
-        return np.asarray(sum(fault.amount * fault_pulse(fault, times)[0] for fault in self.faults))
+def _fold_heights(faults: Sequence[Fault], times: Array) -> Array:
+    """How high folds stand, mm (N,), at times (N,), s: an amount over time, as a scenario's [strain] is."""
+    return np.asarray(sum(fault.amount * fault_pulse(fault, times)[0] for fault in faults))
 
 
 def fold_deformation(
     where: object, deformation: Deformation, faults: Sequence[Fault]
-) -> tuple[Deformation, FoldAmount] | None:
+) -> tuple[Deformation, Callable[[Array], Array]] | None:
     """The deformation of folds and its amount over time; None without any.
 
     InputError where the surface is deformed already: there is one deformation at a time.
@@ -157,7 +152,7 @@ def fold_deformation(
         return None
     if deformation != Deformation():
         raise InputError(where, "faults", str(folds[0]), "a scenario without [scene.deformation]")
-    return Deformation(bulge=1.0, radius=FOLD_SIGMA), FoldAmount(folds)
+    return Deformation(bulge=1.0, radius=FOLD_SIGMA), partial(_fold_heights, folds)
 
 
 ROW_STEP = 0.001  # s between rows

@@ -18,7 +18,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol
 
 import numpy as np
@@ -179,9 +178,9 @@ def open_pty() -> tuple[int, int, str]:
 class PtyLink:
     """A pty with a serial client at one end, all in one process. name: of its device."""
 
-    def __init__(self, baud: int = 115_200) -> None:
+    def __init__(self) -> None:
         self._ours, self._theirs, self.name = open_pty()
-        self._client = serial.Serial(self.name, baudrate=baud)
+        self._client = serial.Serial(self.name, baudrate=115_200)
 
     def transfer(self, data: bytes) -> bytes:
         """Write `data` to the device as a client does, and give back what comes out at the arm's side."""
@@ -200,12 +199,6 @@ class PtyLink:
         self._client.close()
         for descriptor in (self._theirs, self._ours):
             os.close(descriptor)
-
-    def __enter__(self) -> PtyLink:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
 
 
 _print_line = partial(print, flush=True)

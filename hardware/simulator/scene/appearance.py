@@ -49,19 +49,11 @@ class Lamp:
 
 def lamps(look: Appearance) -> tuple[Lamp, Lamp]:
     """The key lamp, warm and to one side, and the fill, cool and broad, on the other."""
-    return (
-        Lamp(_unit_vector(-0.62, -0.30, 1.0), look.key, 0.075, (0.93, 0.99, 1.04)),
-        Lamp(_unit_vector(0.75, 0.42, 1.0), look.fill, 0.2, (1.08, 1.0, 0.94)),
-    )
+    key, fill = (np.array(v) / np.linalg.norm(v) for v in ((-0.62, -0.30, 1.0), (0.75, 0.42, 1.0)))
+    return Lamp(key, look.key, 0.075, (0.93, 0.99, 1.04)), Lamp(fill, look.fill, 0.2, (1.08, 1.0, 0.94))
 
 
 AMBIENT_COLOUR = (1.04, 1.0, 0.98)  # BGR of the room
-
-
-def _unit_vector(*vector: float) -> Array:
-    return np.asarray(np.array(vector) / np.linalg.norm(vector))
-
-
 GRAIN_MARGIN_PX = 256  # by which the stored grain is larger than an image: each image takes another cut of it
 MAX_NOISE, MAX_VIGNETTING, MAX_BLUR = 50.0, 2.0, 10.0  # the most of each; more is no camera
 ROWS_AT_ONCE = 48  # rows developed at once: they stay in the cache

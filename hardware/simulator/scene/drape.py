@@ -15,9 +15,11 @@ from hardware.simulator.scene.fields import (
     Texture,
     draw_lines,
     fibre_noise,
+    gaussian_blur,
     gradient,
     linear_light,
     octave_noise,
+    sample,
     smoothstep,
     wandering_line,
 )
@@ -48,12 +50,10 @@ def fold_heights(shape: Size, texel: float, rng: np.random.Generator) -> Field:
 
 def weave_texture(shape: Size, texel: float, rng: np.random.Generator) -> tuple[Field, Field]:
     """Shade (about 1) and height mm (H, W) of the pressed fibres."""
-    scales = ((3.0, 0.5), (0.5, 3.0), (1.2, 1.2))  # mm
     fibre = np.zeros(shape, np.float32)
-    for a, b in scales:
+    for a, b in ((3.0, 0.5), (0.5, 3.0), (1.2, 1.2)):  # mm
         fibre = fibre + fibre_noise(shape, (a / texel, b / texel), rng)
-    blotch = octave_noise(shape, 30 / texel, 3, rng)
-    shade = 1 + 0.035 * fibre + 0.05 * blotch
+    shade = 1 + 0.035 * fibre + 0.05 * octave_noise(shape, 30 / texel, 3, rng)
     return np.asarray(shade, np.float32), np.asarray(0.012 * fibre, np.float32)
 
 
@@ -115,7 +115,12 @@ def drape_over(shape: Shape, half: tuple[float, float], look: Appearance, rng: n
     reach = np.array(shape.size, np.float32) / 2
     cx, cy = np.clip(x, -reach[0], reach[0]), np.clip(y, -reach[1], reach[1])
     edge = np.stack([cx, cy], -1).reshape(-1, 2)
-    even = _smoothed_shape(shape)
+    sigma = 5 / shape.step
+    pad = int(3 * sigma)
+    smoothed = gaussian_filter(np.pad(shape.heights, pad, mode="reflect", reflect_type="odd"), sigma)[
+        pad:-pad, pad:-pad
+    ]
+    even = replace(shape, heights=smoothed)  # small unevenness would draw stripes if it went on beyond the edge
     away = np.hypot(x - cx, y - cy)
     ground = even.heights_at(edge).reshape(x.shape).astype(np.float32)
     back = even.heights_at(0.85 * edge).reshape(x.shape).astype(np.float32)
@@ -132,14 +137,6 @@ def drape_over(shape: Shape, half: tuple[float, float], look: Appearance, rng: n
     return Drape(np.asarray(heights, np.float32), _lit_texture(heights, look, rng), half)
 
 
-def _smoothed_shape(shape: Shape) -> Shape:
-    """The shape without its small unevenness, which would draw stripes if it went on beyond the edge."""
-    sigma = 5 / shape.step
-    pad = int(3 * sigma)
-    wide = np.pad(shape.heights, pad, mode="reflect", reflect_type="odd")
-    return replace(shape, heights=gaussian_filter(wide, sigma)[pad:-pad, pad:-pad])
-
-
 def backdrop(look: Appearance, rng: np.random.Generator) -> Drape:
     """A cloth at rest behind a bare patch."""
     x, _ = node_axes(DRAPE_SPAN, DRAPE_STEP)
@@ -151,7 +148,9 @@ def _lit_texture(heights: Field, look: Appearance, rng: np.random.Generator) -> 
     """The cloth lit by the lamps, which hang over it at rest; that it turns with the body near it is left out."""
     size = (round(DRAPE_SPAN[0] / DRAPE_TEXEL), round(DRAPE_SPAN[1] / DRAPE_TEXEL))
     shade, fibre = weave_texture(size[::-1], DRAPE_TEXEL, rng)
-    across, along = gradient(_enlarged(np.asarray(heights, np.float32), size) + fibre, DRAPE_TEXEL)
+    x, y = ((np.arange(n, dtype=np.float32) + 0.5) * np.float32(DRAPE_TEXEL / DRAPE_STEP) for n in size)
+    fine = sample(np.asarray(heights, np.float32), *np.meshgrid(x, y))
+    across, along = gradient(gaussian_blur(fine, 0.5 * DRAPE_STEP / DRAPE_TEXEL) + fibre, DRAPE_TEXEL)
     hollow = cv2.resize(cv2.GaussianBlur(heights, (0, 0), 12 / DRAPE_STEP) - heights, size)
     shade *= np.clip(1 - 0.06 * np.clip(hollow, -2, 8), 0.5, 1.0)
     facing = 1 / cv2.sqrt(across * across + along * along + 1)
@@ -164,10 +163,3 @@ def _lit_texture(heights: Field, look: Appearance, rng: np.random.Generator) -> 
     tints = zip(AMBIENT_COLOUR, lamps(look)[1].colour, CLOTH_TEAL, strict=True)
     rest = [shade * (room * np.float32(a) + fill * np.float32(f)) * teal for a, f, teal in tints]
     return np.ascontiguousarray(np.dstack([*rest, shade * key]), np.float32)
-
-
-def _enlarged(heights: Field, size: tuple[int, int]) -> Field:
-    x, y = ((np.arange(n, dtype=np.float32) + 0.5) * np.float32(DRAPE_TEXEL / DRAPE_STEP) for n in size)
-    u, v = np.meshgrid(x, y)
-    large = cv2.remap(heights, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(cv2.GaussianBlur(large, (0, 0), 0.5 * DRAPE_STEP / DRAPE_TEXEL), np.float32)

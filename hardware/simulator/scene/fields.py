@@ -28,9 +28,7 @@ def sample(source: Field, u: Field, v: Field) -> Field:
 
 def sample_texture(texture: Field, u: Field, v: Field) -> Field:
     """A texture (H, W, 4) at columns u and rows v, bilinear, nothing beyond its edge."""
-    return as_field(
-        cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0, 0, 0, 0))
-    )
+    return as_field(cv2.remap(texture, u, v, cv2.INTER_LINEAR))  # OpenCV's own border is zero
 
 
 def upsample(source: Field, size: Size) -> Field:
@@ -154,17 +152,14 @@ BLOCK_TEXELS = 1 << (PYRAMID_LEVELS - 1)  # texels: textures are whole blocks, s
 
 
 class Layers:
-    """Two textures over a rectangle, each with `PYRAMID_LEVELS` levels of half the one before.
-
-    colour: (H, W, 4) linear BGR of 0..1, times opacity, and opacity. relief: (H, W, 4) slope along x, along y, gloss
-    0..1, occlusion (1: open to the whole room). texel: mm. corner: x, y mm of the rectangle's corner at row 0 and
-    column 0, where both are least.
-    """
+    """Two textures over a rectangle, each with `PYRAMID_LEVELS` levels of half the one before."""
 
     def __init__(self, colour: Texture, relief: Texture, texel: float, corner: tuple[float, float]) -> None:
         assert colour.shape == relief.shape and not any(n % BLOCK_TEXELS for n in colour.shape[:2])
-        self.texel, self.corner = texel, corner
-        self.colour, self.relief = _pyramid(colour), _pyramid(relief)
+        self.texel = texel  # mm
+        self.corner = corner  # x, y mm of the rectangle's corner at row 0 and column 0, where both are least
+        self.colour = _pyramid(colour)  # (H, W, 4) linear BGR of 0..1, times opacity, and opacity
+        self.relief = _pyramid(relief)  # (H, W, 4) slope along x, along y, gloss 0..1, occlusion (1: open to the room)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -190,12 +185,6 @@ class Layers:
                 a, b, c, d = (v * n for v in box)
                 fine = pyramid[k - 1][2 * b : 2 * d, 2 * a : 2 * c]
                 pyramid[k][b:d, a:c] = cv2.resize(fine, (c - a, d - b), interpolation=cv2.INTER_AREA)
-
-
-def whole_blocks(size: tuple[float, float], texel: float) -> tuple[int, int]:
-    """(H, W) whole blocks of texels that cover `size` (x, y) mm."""
-    w, h = (int(np.ceil(s / texel / BLOCK_TEXELS - 1e-6)) * BLOCK_TEXELS for s in size)
-    return h, w
 
 
 def linear_light(display: object) -> Texture:

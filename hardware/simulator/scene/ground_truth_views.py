@@ -47,14 +47,17 @@ def wound_view(seed: int, wounded: bool = True) -> WoundView:
     wound = Wound((rng.uniform(12, 60), rng.uniform(10, 40)), rng.uniform(0.5, 4.0)) if wounded else None
     shape = body(rng.choice(list(BODIES)), wound, seed)
     scene = Scene(shape, _random_appearance(rng), seed=seed)
-    camera = _random_camera(rng)
+    size = IMAGE_SIZES[rng.integers(len(IMAGE_SIZES))]
+    focal = size[0] * rng.uniform(0.7, 1.1)
+    camera = arc_rig((rng.uniform(0, 75),), rng.uniform(220, 480), focal, size).cameras[0]
     pose = BASE_FROM_REST @ se3.make(se3.exp_rotation(rng.normal(0, [0.15, 0.15, 1.5])), rng.normal(0, [12, 12, 6]))
     instant = WorldState(0.0, 0.004, pose, np.zeros(6), gain=float(np.exp(rng.normal(0, 0.15))))
     sensor = Sensor(noise=rng.uniform(0.5, 4), blur=rng.uniform(0.3, 1.2))
     image = render(scene, [camera], [instant], sensor, [rng], threads=1)[0]
     points = [se3.transform_points(pose, shape.points(each)) for each in _outlines(shape)]
     outlines = [pixels_from_points(camera, each)[0] for each in points]
-    return WoundView(image, mask_from_outlines(outlines, camera.size), camera, pose, _area(shape))
+    area = 0.0 if shape.inside is None else float((shape.inside > 0).sum()) * shape.step**2
+    return WoundView(image, mask_from_outlines(outlines, camera.size), camera, pose, area)
 
 
 def mask_from_outlines(outlines: Sequence[Array], size: tuple[int, int]) -> NDArray[np.bool_]:
@@ -75,22 +78,12 @@ def _random_appearance(rng: np.random.Generator) -> Appearance:
     return Appearance(VIEW_TEXEL, tone, wetness, hair, drape, ambient=ambient, key=key, fill=fill)
 
 
-def _random_camera(rng: np.random.Generator) -> Camera:
-    size = IMAGE_SIZES[rng.integers(len(IMAGE_SIZES))]
-    focal = size[0] * rng.uniform(0.7, 1.1)
-    return arc_rig((rng.uniform(0, 75),), rng.uniform(220, 480), focal, size).cameras[0]
-
-
 def _outlines(shape: Shape) -> list[Array]:
     if shape.inside is None:
         return []
     contours, _ = cv2.findContours((shape.inside > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     middle = (np.array(shape.inside.shape[::-1]) - 1) / 2
     return [(nodes.reshape(-1, 2) - middle) * shape.step for nodes in contours]
-
-
-def _area(shape: Shape) -> float:
-    return 0.0 if shape.inside is None else float((shape.inside > 0).sum()) * shape.step**2
 
 
 BOARD_SAMPLES = 3  # per pixel and axis: edges lie true to a hundredth of a pixel

@@ -137,12 +137,10 @@ def shape_from_scan(vertices: ArrayLike, triangles: ArrayLike, step: float = NOD
     x, y = (np.arange(n) * step - (n - 1) * step / 2 for n in (columns, rows))
     nodes = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     apex = np.array([0.0, 0.0, CAST_HEIGHT])
-    directions = np.column_stack([nodes, np.full(len(nodes), 0.0)]) - apex
-    grid_from_apex = se3.make(np.eye(3), apex)
-    local = Scan(vertices_grid, scan.triangles, scan.normals)
-    hits = cast_rays(local, grid_from_apex, directions / CAST_HEIGHT)
-    heights = hits.points[:, 2].reshape(rows, columns)
-    valid = hits.hit.reshape(rows, columns)
+    directions = np.column_stack([nodes, np.zeros(len(nodes))]) - apex
+    scan_grid = Scan(vertices_grid, scan.triangles, scan.normals)
+    hits = cast_rays(scan_grid, se3.make(np.eye(3), apex), directions / CAST_HEIGHT)
+    heights, valid = hits.points[:, 2].reshape(rows, columns), hits.hit.reshape(rows, columns)
     nearest = distance_transform_edt(~valid, return_distances=False, return_indices=True)
     return Shape(step, heights[tuple(nearest)], surface_from_grid, valid=valid)
 
@@ -223,10 +221,10 @@ DRAPE_MARGIN = 9.0  # mm of body under the drape on every side of the opening
 
 @dataclass(frozen=True, slots=True)
 class Wound:
-    """A wound about the origin. size: (x, y) mm of its irregular outline; depth: mm of its bed below the skin."""
+    """A wound about the origin."""
 
-    size: tuple[float, float] = (42.0, 31.0)
-    depth: float = 2.4
+    size: tuple[float, float] = (42.0, 31.0)  # (x, y) mm of its irregular outline
+    depth: float = 2.4  # mm of its bed below the skin
 
 
 def forearm(x: Array, y: Array) -> Array:
@@ -261,8 +259,7 @@ def body(kind: str, wound: Wound | None, seed: int, step: float = NODE_STEP) -> 
     bare = shape_from_function(height, (opening[0] + 2 * DRAPE_MARGIN, opening[1] + 2 * DRAPE_MARGIN), step)
     grid = bare.heights.shape
     heights = bare.heights - bare.heights_at([[0.0, 0.0]])
-    uneven = 0.22 * smooth_noise(grid, 26 / step, rng) + 0.05 * smooth_noise(grid, 7 / step, rng)
-    heights += uneven
+    heights += 0.22 * smooth_noise(grid, 26 / step, rng) + 0.05 * smooth_noise(grid, 7 / step, rng)
     if wound is None:
         return Shape(step, heights)
     inside = wound_distance(grid, step, wound, rng)

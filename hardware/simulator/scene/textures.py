@@ -11,6 +11,7 @@ from estimation.errors import InputError
 from hardware.simulator.scene.appearance import Appearance
 from hardware.simulator.scene.drape import cloth_colour, cloth_thickness, node_axes, opening_distance, weave_texture
 from hardware.simulator.scene.fields import (
+    BLOCK_TEXELS,
     Field,
     Layers,
     Size,
@@ -27,7 +28,6 @@ from hardware.simulator.scene.fields import (
     smoothstep,
     voronoi_cells,
     wandering_line,
-    whole_blocks,
 )
 from hardware.simulator.scene.shape import DRAPE_MARGIN, Shape
 
@@ -42,11 +42,11 @@ SCALE_COLOUR = np.array([0.72, 0.82, 0.88], np.float32)  # linear BGR of dry sca
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coat:
-    """One painted material, (H, W) each: colour (H, W, 3) linear BGR, height mm, gloss 0..1."""
+    """One painted material."""
 
-    colour: Texture
-    height: Field
-    gloss: Field
+    colour: Texture  # (H, W, 3) linear BGR
+    height: Field  # (H, W) mm
+    gloss: Field  # (H, W) 0..1
 
 
 def base_colour(tone: float) -> Texture:
@@ -55,10 +55,9 @@ def base_colour(tone: float) -> Texture:
     return linear_light([np.interp(place, np.arange(len(SKIN_TONES)), SKIN_TONES[:, k]) for k in range(3)])
 
 
-def skin_coat(
-    shape: Size, texel: float, inside: Field | None, tone: float, hair: float, rng: np.random.Generator
-) -> Coat:
+def skin_coat(shape: Size, look: Appearance, inside: Field | None, rng: np.random.Generator) -> Coat:
     """Skin over (H, W) texels; inside: mm into the wound, for the redness round it."""
+    texel, tone = look.texel, look.tone
     edges, which = voronoi_cells(shape, 0.95 / texel, rng)
     fine, _ = voronoi_cells(shape, 0.45 / texel, rng)
     uneven = np.clip(0.65 + 0.4 * smooth_noise(shape, 6 / texel, rng), 0.1, 1)
@@ -70,7 +69,11 @@ def skin_coat(
     blood += 0.05 * grain + 0.10 * (which - 0.5) + 0.14 * furrow + 0.16 * pores
     melanin += 0.05 * (which - 0.5) + 0.05 * furrow + 0.05 * crease + 0.12 * pores + 0.035 * grain
     if inside is not None:
-        blood, melanin = _inflamed(shape, texel, inside, blood, melanin, rng)
+        away = np.clip(-inside, 0, None)
+        patchy = np.clip(1 + 0.45 * octave_noise(shape, 9 / texel, 3, rng), 0.2, 2)
+        blood = as_field(blood + (0.62 * np.exp(-away / 4.5) + 0.28 * np.exp(-away / 14)) * patchy)
+        pigmented = np.clip(octave_noise(shape, 6 / texel, 3, rng), 0, 2)
+        melanin = as_field(melanin + 0.16 * np.exp(-away / 10) * pigmented)
     veins = _veins(shape, texel, rng)
     veil = 1 - 0.6 * tone  # blood shows less through dark skin
     exponent = blood[..., None] * (BLOOD_ABSORPTION * veil) + melanin[..., None] * MELANIN_ABSORPTION
@@ -79,8 +82,8 @@ def skin_coat(
     scales = smoothstep(octave_noise(shape, 3.0 / texel, 3, rng), 1.5, 2.6) * np.float32(0.14 * (1 - 0.5 * tone))
     colour += scales[..., None] * (0.8 * SCALE_COLOUR - colour)
     height = -0.030 * furrow - 0.009 * crease - 0.035 * pores + 0.010 * grain + 0.02 * scales
-    if hair > 0:
-        colour, height = _hairs(shape, texel, tone, hair, colour, height, inside, rng)
+    if look.hair > 0:
+        colour, height = _hairs(colour, height, inside, look, rng)
     gloss = np.clip(0.22 + 0.05 * smooth_noise(shape, 12 / texel, rng) - 0.10 * furrow, 0.05, 0.5)
     return Coat(np.asarray(colour, np.float32), np.asarray(height, np.float32), np.asarray(gloss, np.float32))
 
@@ -96,16 +99,6 @@ def _pigments(shape: Size, texel: float, rng: np.random.Generator) -> tuple[Fiel
     return np.asarray(blood, np.float32), np.asarray(melanin, np.float32)
 
 
-def _inflamed(
-    shape: Size, texel: float, inside: Field, blood: Field, melanin: Field, rng: np.random.Generator
-) -> tuple[Field, Field]:
-    away = np.clip(-inside, 0, None)
-    patchy = np.clip(1 + 0.45 * octave_noise(shape, 9 / texel, 3, rng), 0.2, 2)
-    blood += (0.62 * np.exp(-away / 4.5) + 0.28 * np.exp(-away / 14)) * patchy
-    melanin += 0.16 * np.exp(-away / 10) * np.clip(octave_noise(shape, 6 / texel, 3, rng), 0, 2)
-    return np.asarray(blood, np.float32), np.asarray(melanin, np.float32)
-
-
 def _veins(shape: Size, texel: float, rng: np.random.Generator) -> Field:
     out = np.zeros(shape, np.float32)
     for width in (2.2, 1.5, 1.1):
@@ -118,19 +111,12 @@ def _veins(shape: Size, texel: float, rng: np.random.Generator) -> Field:
 
 
 def _hairs(
-    shape: Size,
-    texel: float,
-    tone: float,
-    hair: float,
-    colour: Texture,
-    height: Field,
-    inside: Field | None,
-    rng: np.random.Generator,
+    colour: Texture, height: Field, inside: Field | None, look: Appearance, rng: np.random.Generator
 ) -> tuple[Texture, Field]:
-    """Fine dark hairs that lie one way, with a follicle at the root of each; none in the wound."""
+    """Colour and height with fine dark hairs that lie one way, a follicle at the root of each; none in the wound."""
+    shape, texel, lines = height.shape, look.texel, []
     area = shape[0] * shape[1] * texel**2
-    lines = []
-    for _ in range(int(0.035 * hair * area)):
+    for _ in range(int(0.035 * look.hair * area)):
         start = rng.uniform(0, 1, 2) * shape[::-1]
         x, y = start.astype(int)
         if inside is not None and inside[y, x] > -2.5:
@@ -138,7 +124,7 @@ def _hairs(
         lines.append(wandering_line(start, 0.5 + rng.normal(0, 0.45), rng.gamma(4, 1.4) / texel, 0.7, rng, 8))
     cover = draw_lines(shape, lines, 0.075 / texel) * 0.62
     roots = draw_lines(shape, [line[:2] for line in lines], 0.2 / texel, 0.1 / texel) * 0.3
-    dark = base_colour(min(1.0, tone + 0.75)) * np.float32(0.25)
+    dark = base_colour(min(1.0, look.tone + 0.75)) * np.float32(0.25)
     shade = np.roll(cover, (2, 1), (0, 1)) * 0.25  # a hair's own shadow
     colour = as_field(colour * (1 - (roots + shade)[..., None]))
     return colour + cover[..., None] * (dark - colour), height + 0.02 * cover
@@ -158,7 +144,8 @@ def wound_bed_coat(shape: Size, texel: float, inside: Field, rng: np.random.Gene
     """The wound's bed over (H, W) texels; inside: mm from its edge, positive within."""
     colour, height = _granulation(shape, texel, rng)
     gloss = np.full(shape, 0.85, np.float32)
-    slough = _slough(shape, texel, inside, rng)
+    base = octave_noise(shape, 10 / texel, 5, rng, 0.62) + 0.5 * np.exp(-np.clip(inside, 0, None) / 3.0)
+    slough = smoothstep(base, 0.45, 1.15) * np.float32(0.92)
     fibres = _fibres(shape, texel, rng)
     shade = smoothstep(octave_noise(shape, 2.2 / texel, 3, rng), -1, 1.5)[..., None]
     tissue = SLOUGH_YELLOW + shade * (FIBRIN_CREAM - SLOUGH_YELLOW)
@@ -187,12 +174,9 @@ def insert_wound_bed(skin: Coat, bed: Coat, inside: Field, texel: float, rng: np
     new = np.exp(-(((ragged + 0.35) / 0.5) ** 2)) * np.clip(0.55 + 0.35 * smooth_noise(shape, 5 / texel, rng), 0, 1)
     crust = np.exp(-(((ragged + 0.9) / 1.0) ** 2)) * smoothstep(octave_noise(shape, 3.2 / texel, 3, rng), 0.9, 2.0)
     light = skin.colour.mean() / 0.42  # the rim is as dark as the skin it belongs to
-    for amount, tint in (
-        (0.62 * pale, MACERATED_SKIN * light),
-        (0.8 * new, NEW_SKIN * light),
-        (0.75 * crust, SLOUGH_YELLOW * 0.55),
-    ):
-        colour += amount[..., None] * (tint - colour)
+    colour += (0.62 * pale)[..., None] * (MACERATED_SKIN * light - colour)
+    colour += (0.8 * new)[..., None] * (NEW_SKIN * light - colour)
+    colour += (0.75 * crust)[..., None] * (SLOUGH_YELLOW * 0.55 - colour)
     cover = smoothstep(ragged, -0.18, 0.22)
     colour += cover[..., None] * (bed.colour - colour)
     wet = np.exp(-np.clip(-ragged, 0, None) / 1.2)
@@ -215,11 +199,6 @@ def _granulation(shape: Size, texel: float, rng: np.random.Generator) -> tuple[T
     colour += 0.5 * points[..., None] * (GRANULATION_DARK - colour)  # vessels that end at the surface
     height = 0.17 * dome + 0.06 * bead + 0.05 * base
     return colour, np.asarray(height, np.float32)
-
-
-def _slough(shape: Size, texel: float, inside: Field, rng: np.random.Generator) -> Field:
-    base = octave_noise(shape, 10 / texel, 5, rng, 0.62) + 0.5 * np.exp(-np.clip(inside, 0, None) / 3.0)
-    return smoothstep(base, 0.45, 1.15) * np.float32(0.92)
 
 
 def _fibres(shape: Size, texel: float, rng: np.random.Generator) -> Field:
@@ -252,15 +231,20 @@ def draped_heights(shape: Shape, half: tuple[float, float] | None) -> Field:
 def paint_layers(shape: Shape, heights: Field, half: tuple[float, float] | None, look: Appearance, seed: int) -> Layers:
     """The shape's layers; heights: as `draped_heights` gives."""
     covered, size = _texture_size(shape, look)
-    pad = (size[1] - covered[1]) // 2, (size[0] - covered[0]) // 2
-    corner = (-(covered[1] / 2 + pad[0]) * look.texel, -(covered[0] / 2 + pad[1]) * look.texel)
-    u, v = _texel_nodes(shape, size, look.texel, corner)
+    left, top = (size[1] - covered[1]) // 2, (size[0] - covered[0]) // 2
+    corner = (-(covered[1] / 2 + left) * look.texel, -(covered[0] / 2 + top) * look.texel)
+    x, y = (c + (np.arange(n) + 0.5) * look.texel for c, n in zip(corner, size[::-1], strict=True))  # texels' middles
+    rows, columns = shape.heights.shape
+    nodes = x / shape.step + (columns - 1) / 2, y / shape.step + (rows - 1) / 2
+    u, v = np.meshgrid(*(axis.astype(np.float32) for axis in nodes))
     rng = np.random.default_rng([seed, 22])
     if look.texture is not None:
-        coat = _picture_coat(linear_light(look.texture), size, pad)
+        edges = top, size[0] - top - covered[0], left, size[1] - left - covered[1]
+        colour = as_field(cv2.copyMakeBorder(linear_light(look.texture), *edges, cv2.BORDER_REPLICATE))
+        coat = Coat(colour, np.zeros(size, np.float32), np.zeros(size, np.float32))
     else:
         inside = None if shape.inside is None else sample(as_field(shape.inside), u, v)
-        coat = skin_coat(size, look.texel, inside, look.tone, look.hair, rng)
+        coat = skin_coat(size, look, inside, rng)
         if inside is not None:
             bed = wound_bed_coat(size, look.texel, inside, rng)
             coat = _wetted(insert_wound_bed(coat, bed, inside, look.texel, rng), inside, look.wetness)
@@ -268,7 +252,8 @@ def paint_layers(shape: Shape, heights: Field, half: tuple[float, float] | None,
     valid = np.ones(size, np.float32) if shape.valid is None else sample(as_field(shape.valid), u, v)
     opaque = smoothstep(valid, 0.4, 0.6)
     if half is not None:
-        coat, open_sky, opaque = _add_drape(coat, open_sky, opaque, u, v, shape, half, look.texel, rng)
+        x, y = (u - (columns - 1) / 2) * np.float32(shape.step), (v - (rows - 1) / 2) * np.float32(shape.step)
+        coat, open_sky, opaque = _add_drape(coat, open_sky, opaque, opening_distance(x, y, half), look.texel, rng)
     sx, sy = gradient(heights, shape.step)
     mx, my = gradient(coat.height, look.texel)
     across, along = sample(sx, u, v) + mx, sample(sy, u, v) + my
@@ -282,6 +267,7 @@ def _on_grid(nodes: Field, count: int) -> Field:
 
 
 def _texture_size(shape: Shape, look: Appearance) -> tuple[Size, Size]:
+    """Texels that cover the shape, and the whole blocks of texels that hold them."""
     rows, columns = (round(s / look.texel) for s in shape.size[::-1])
     if look.texture is not None:
         got = look.texture.shape[:2]
@@ -289,24 +275,8 @@ def _texture_size(shape: Shape, look: Appearance) -> tuple[Size, Size]:
             allowed = f"({rows}, {columns}, 3): {look.texel:g} mm a texel"
             raise InputError("look", "texture", look.texture.shape, allowed)
         rows, columns = got
-    return (rows, columns), whole_blocks((columns * look.texel, rows * look.texel), look.texel)
-
-
-def _texel_nodes(shape: Shape, size: Size, texel: float, corner: tuple[float, float]) -> tuple[Field, Field]:
-    """The texels' middles in nodes of the shape, along x and along y, (H, W) each."""
-    rows, columns = shape.heights.shape
-    x = (corner[0] + (np.arange(size[1]) + 0.5) * texel) / shape.step + (columns - 1) / 2
-    y = (corner[1] + (np.arange(size[0]) + 0.5) * texel) / shape.step + (rows - 1) / 2
-    u, v = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
-    return u, v
-
-
-def _picture_coat(colour: Texture, size: Size, pad: tuple[int, int]) -> Coat:
-    """The look's own picture, `pad` texels (x, y) from the corner of whole blocks."""
-    x, y = pad
-    right, bottom = size[1] - x - colour.shape[1], size[0] - y - colour.shape[0]
-    whole = as_field(cv2.copyMakeBorder(colour, y, bottom, x, right, cv2.BORDER_REPLICATE))
-    return Coat(whole, np.zeros(size, np.float32), np.zeros(size, np.float32))
+    w, h = (int(np.ceil(n * look.texel / look.texel / BLOCK_TEXELS - 1e-6)) * BLOCK_TEXELS for n in (columns, rows))
+    return (rows, columns), (h, w)
 
 
 def _wetted(coat: Coat, inside: Field, wetness: float) -> Coat:
@@ -327,30 +297,17 @@ def _occlusion(heights: Field, fine: Field, step: float, texel: float, u: Field,
 
 
 def _add_drape(
-    coat: Coat,
-    open_sky: Field,
-    opaque: Field,
-    u: Field,
-    v: Field,
-    shape: Shape,
-    half: tuple[float, float],
-    texel: float,
-    rng: np.random.Generator,
+    coat: Coat, open_sky: Field, opaque: Field, outside: Field, texel: float, rng: np.random.Generator
 ) -> tuple[Coat, Field, Field]:
-    rows, columns = shape.heights.shape
-    x = (u - (columns - 1) / 2) * np.float32(shape.step)
-    y = (v - (rows - 1) / 2) * np.float32(shape.step)
-    outside = opening_distance(x, y, half)
+    """Coat, openness and opacity with the drape over them; outside: (H, W) mm from its opening."""
     cover = smoothstep(outside, -texel, texel)
     shade, weave = weave_texture(coat.height.shape, texel, rng)
     colour = coat.colour + cover[..., None] * (cloth_colour(shade, outside) - coat.colour)
     height = coat.height * (1 - cover) + (weave * 0.5) * cover
     gloss = coat.gloss * (1 - cover) + 0.05 * cover
     open_sky = as_field(open_sky * (1 - 0.4 * np.exp(-np.abs(outside) / 0.9) * (1 - cover)))
-    colour = as_field(colour)
     opaque = np.maximum(opaque, cover) * smoothstep(outside, DRAPE_FADE[1], DRAPE_FADE[0])
-    painted = Coat(colour, as_field(height), as_field(gloss))
-    return painted, as_field(open_sky), as_field(opaque)
+    return Coat(as_field(colour), as_field(height), as_field(gloss)), open_sky, as_field(opaque)
 
 
 def half_opening(shape: Shape) -> tuple[float, float]:
