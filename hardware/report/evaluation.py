@@ -154,11 +154,11 @@ def latency(table: PoseTable) -> Latency:
     started = np.flatnonzero(~table.is_state(TrackState.INITIALISING))
     first = int(started[0]) + 1 if len(started) else len(table)
     milliseconds = 1000 * table.seconds[first:]
+    percentiles = np.full((4, len(table.stages)), np.nan)
     if len(milliseconds):
-        p50, p95, p99, top = np.percentile(milliseconds, [50, 95, 99, 100], axis=0)
-    else:
-        p50 = p95 = p99 = top = np.full(len(table.stages), np.nan)
+        percentiles = np.percentile(milliseconds, [50, 95, 99, 100], axis=0)
     spent = float(1000 * table.seconds[:first, -1].sum())
+    p50, p95, p99, top = percentiles
     return Latency(table.stages, p50, p95, p99, top, spent, first, milliseconds[:, -1])
 
 

@@ -118,10 +118,8 @@ def _trajectory(result: Evaluation) -> str:
     values = components(table.base_from_surface, origin)
     sigma = 2 * deviations(table.base_from_surface, table.covariance)
     values[hidden], sigma[hidden] = np.nan, np.nan
-    keys, truth = (
-        [page.line_key("estimate", "estimate, with two standard deviations")],
-        np.full((len(table), 6), np.nan),
-    )
+    truth = np.full((len(table), 6), np.nan)
+    keys = [page.line_key("estimate", "estimate, with two standard deviations")]
     if comparison is not None:
         target = comparison.expected @ comparison.start.truth_surface_from_estimated_surface
         truth[comparison.rows] = components(target, origin)
@@ -129,9 +127,8 @@ def _trajectory(result: Evaluation) -> str:
     names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
     plots = []
     for name, value, two_sigma, true_value in zip(names, values.T, sigma.T, truth.T, strict=True):
-        plot = page.Plot(
-            HALF_CHART_WIDTH, 165, _followed(result), page.spanning([value, true_value], 0.12, 0.5), label=name
-        )
+        limits = page.spanning([value, true_value], 0.12, 0.5)
+        plot = page.Plot(HALF_CHART_WIDTH, 165, _followed(result), limits, label=name)
         plot.band(table.stamps, value - two_sigma, value + two_sigma, "spread")
         plot.line(table.stamps, true_value, "truth")
         plot.line(table.stamps, value, "estimate")
@@ -251,9 +248,8 @@ def _clocks(result: Evaluation) -> str:
         "shows where the surface moves, and is corrected once it is clearly there."
     )
     if not np.nan_to_num(offsets).any():
-        return page.section(
-            "Clocks", f"{text} Here chance explains what was seen, and nothing was corrected.", page.legend(keys)
-        )
+        text += " Here chance explains what was seen, and nothing was corrected."
+        return page.section("Clocks", text, page.legend(keys))
     return page.section("Clocks", f"{text} Until then a line stays at zero.", page.legend(keys) + plot.svg())
 
 

@@ -29,7 +29,6 @@ from hardware.simulator.nozzle_summary import (
     share,
 )
 
-PAGE_KIND = "stillbed simulate"
 PAGE_FOOTER = (
     "Lengths in mm, time in s of the simulation's own clock. The error is the nozzle's tip less the place on the true "
     "surface that was due at that instant, both known exactly; nothing in the loop sees either."
@@ -163,7 +162,8 @@ def nozzle_page(result: NozzleResult) -> str:
         files = "".join(f"<span>{link}</span>" for link in links)
         parts.append(page.section("Files", "Beside this page.", f'<div class="files">{files}</div>'))
     lead = " ".join(nozzle_verdict(result))
-    return page.document(PAGE_KIND, result.run.title or "a print", lead, [part for part in parts if part], PAGE_FOOTER)
+    title, body = result.run.title or "a print", [part for part in parts if part]
+    return page.document("stillbed simulate", title, lead, body, PAGE_FOOTER)
 
 
 def _badge(result: NozzleResult) -> str:
@@ -221,10 +221,8 @@ def _shades(result: NozzleResult, plot: page.Plot) -> None:
     _shade_longest(plot, "holding", [(span.start, span.end) for span in spans], titles)
 
 
-def _shade_longest(
-    plot: page.Plot, style: str, intervals: list[tuple[float, float]], titles: Sequence[str] = ()
-) -> None:
-    start, end = np.array(intervals).reshape(-1, 2).T
+def _shade_longest(plot: page.Plot, style: str, spans: list[tuple[float, float]], titles: Sequence[str] = ()) -> None:
+    start, end = np.array(spans).reshape(-1, 2).T
     longest = np.sort(np.argsort(start - end, kind="stable")[:MAX_SHADED_SPANS])
     plot.shade(start[longest], end[longest], style, [titles[i] for i in longest] if titles else ())
 
@@ -320,9 +318,7 @@ def _pictures(result: NozzleResult) -> str:
         for i, number in enumerate(deposit.layers[:MAX_LAYERS])
     )
     kinds = page.legend([page.area_key(kind.replace(" ", "-"), kind) for kind in CELL_KINDS])
-    colours = page.legend(
-        [page.line_key("plan", "planned"), *(page.line_key(style, words) for style, words in way_legend())]
-    )
+    colours = page.legend([page.line_key(*entry) for entry in (("plan", "planned"), *way_legend())])
     both = f"<div>{maps}{kinds}</div><div>{way_picture(result, width)}{colours}</div>"
     text = (
         f"The surface from above, x to the right. Beads are {result.run.bead:g} mm wide, {f.area:.0f} mm² are planned: "
@@ -341,9 +337,8 @@ def _holds(result: NozzleResult) -> str:
         return page.section("Holds", "The arm never held.", "")
     rows = [(h.reason, str(h.count), *(f"{v:.3f}" for v in (h.seconds, h.longest, h.first))) for h in holds]
     text = "Why the arm stood still until the path was finished; … stands for a number that was not always the same."
-    return page.section(
-        "Holds", text, page.figures_table(("reason", "times", "in all, s", "longest, s", "first at, s"), rows)
-    )
+    head = ("reason", "times", "in all, s", "longest, s", "first at, s")
+    return page.section("Holds", text, page.figures_table(head, rows))
 
 
 def _camera_pictures(result: NozzleResult) -> str:

@@ -253,11 +253,7 @@ def nozzle_dict(result: NozzleResult) -> dict[str, Any]:
             "bead_mm": result.run.bead,
             "layers": len(result.deposit.layers),
             "planned_mm2": deposit.area,
-            "coverage": deposit.coverage,
-            "gaps": deposit.gaps,
-            "overlap": deposit.overlap,
-            "outside": deposit.outside,
-            "material": deposit.material,
+            **{name: getattr(deposit, name) for name in ("coverage", "gaps", "overlap", "outside", "material")},
         },
         "tracking_mm": None if result.figures.tracking is None else asdict(result.figures.tracking),
     }

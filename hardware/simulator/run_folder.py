@@ -114,7 +114,11 @@ class WatchPage:
     def _draw(self, tile: Image, image: Image, camera: int, pose: SurfacePose, line: Array | None) -> None:
         """The picture on its tile, brought close to the line where the pose says that it lies, and the line on it."""
         width, (h, w) = image.shape[1], tile.shape[:2]
-        pixels = self._pixels(camera, pose, line)
+        pixels: Array | None = None
+        if line is not None and pose.state.measured:
+            points = se3.transform_points(pose.base_from_surface, line)
+            projected, depth = pixels_from_points(self._rig.cameras[camera], points)
+            pixels = projected if (depth > 1).all() else None
         zoom, corner = w / width, np.zeros(2)
         if pixels is not None:
             zoom, corner = w / CLOSE_UP_PX, pixels.mean(0) - [CLOSE_UP_PX / 2, CLOSE_UP_PX * h / w / 2]
@@ -124,13 +128,6 @@ class WatchPage:
         if pixels is not None:
             corners = [np.rint(16 * zoom * (pixels - corner)).astype(np.int32).reshape(-1, 1, 2)]
             cv2.polylines(tile, corners, False, LINE_BGR, 1, cv2.LINE_AA, 4)
-
-    def _pixels(self, camera: int, pose: SurfacePose, line: Array | None) -> Array | None:
-        if line is None or not pose.state.measured:
-            return None
-        points = se3.transform_points(pose.base_from_surface, line)
-        pixels, depth = pixels_from_points(self._rig.cameras[camera], points)
-        return pixels if (depth > 1).all() else None
 
 
 NOZZLE_HEADER = (

@@ -95,7 +95,6 @@ class Scenario:
     beads: bool  # whether pictures show what was printed
 
 
-REQUIRED_KEYS = ("title", "seconds", "path")
 SCENARIO_TABLES = ("scene", "strain", "rig", "cameras", "sensor", "tracking", "arm", "planted", "limits")
 OPTIONAL_KEYS = ("seed", "clearance_mm", "bead_mm", "faults", "motion", *SCENARIO_TABLES)
 MAX_CAMERAS = 8
@@ -112,7 +111,7 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
     """
     path = Path(path)
     table = checks.read_toml(path)
-    checks.check_keys(path, "", table, REQUIRED_KEYS, OPTIONAL_KEYS)
+    checks.check_keys(path, "", table, ("title", "seconds", "path"), OPTIONAL_KEYS)
     if trace is not None:
         table["motion"] = [{"kind": "trace", "file": str(trace.resolve())}]
     parts = {name: _table(path, table, name) for name in SCENARIO_TABLES}

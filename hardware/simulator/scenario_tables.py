@@ -37,21 +37,10 @@ from estimation.se3 import Array
 from hardware.files.mesh_file import read_mesh
 from hardware.process import checks
 from hardware.process.checks import Table
+from hardware.simulator.scene import shape as shapes
 from hardware.simulator.scene.appearance import MAX_BLUR, MAX_NOISE, MAX_VIGNETTING, Appearance, Sensor
 from hardware.simulator.scene.scene import Scene
-from hardware.simulator.scene.shape import (
-    BODIES,
-    BULGE_RADIUS_RANGE,
-    DRAPE_MARGIN,
-    MAX_BULGE,
-    STRETCH_RANGE,
-    Deformation,
-    Shape,
-    Wound,
-    body,
-    shape_from_scan,
-    with_wound,
-)
+from hardware.simulator.scene.shape import Deformation, Shape, Wound
 
 
 @dataclass(slots=True)
@@ -198,18 +187,18 @@ def bare_scene(where: object, table: Table, folder: Path, seed: int) -> tuple[Sh
     depth = keys.number("wound_depth_mm", usual_wound.depth, *WOUND_DEPTH_RANGE)
     wound = Wound(size, depth) if keys.flag("wound", True) else None
     deformation = _deformation(keys)
-    kind = keys.word("body", tuple(BODIES), "forearm")
+    kind = keys.word("body", tuple(shapes.BODIES), "forearm")
     scan = keys.text("scan") if keys.has("scan") else None
     keys.done()
     if scan is None:
-        shape = body(kind, wound, seed)
+        shape = shapes.body(kind, wound, seed)
     elif keys.has("body"):
         raise InputError(where, "scene", "body and scan", "one of the two")
     else:
         shape = _scanned(folder / scan, wound, seed)
-        if look.drape and min(shape.size) < 2 * DRAPE_MARGIN + MIN_DRAPE_OPENING:
+        if look.drape and min(shape.size) < 2 * shapes.DRAPE_MARGIN + MIN_DRAPE_OPENING:
             extent = f"{shape.size[0]:.1f} x {shape.size[1]:.1f} mm"
-            allowed = f"false for a scan of {extent}: a drape needs {DRAPE_MARGIN:g} a side"
+            allowed = f"false for a scan of {extent}: a drape needs {shapes.DRAPE_MARGIN:g} a side"
             raise InputError(where, "scene.drape", True, allowed)
     return shape, look, deformation
 
@@ -234,9 +223,9 @@ def _deformation(scene: TableReader) -> Deformation:
         raise scene.wrong("deformation", "a table [scene.deformation]")
     keys = TableReader(scene.where, f"{scene.prefix}deformation.", table)
     deformation = Deformation(
-        stretch=keys.pair("stretch", usual.stretch, *STRETCH_RANGE),
-        bulge=keys.number("bulge_mm", usual.bulge, -MAX_BULGE, MAX_BULGE),
-        radius=keys.number("radius_mm", usual.radius, *BULGE_RADIUS_RANGE),
+        stretch=keys.pair("stretch", usual.stretch, *shapes.STRETCH_RANGE),
+        bulge=keys.number("bulge_mm", usual.bulge, -shapes.MAX_BULGE, shapes.MAX_BULGE),
+        radius=keys.number("radius_mm", usual.radius, *shapes.BULGE_RADIUS_RANGE),
     )
     keys.done()
     return deformation
@@ -248,7 +237,7 @@ def _scanned(path: Path, wound: Wound | None, seed: int) -> Shape:
     if longest > MAX_SCAN_SIZE:
         raise InputError(path, "size of the scan", f"{longest:.4g} mm", f"at most {MAX_SCAN_SIZE:g} mm in a scene")
     try:
-        shape = shape_from_scan(scan.vertices, scan.triangles)
+        shape = shapes.shape_from_scan(scan.vertices, scan.triangles)
     except InputError as error:
         raise InputError(path, error.what, error.got, error.allowed) from None
-    return shape if wound is None else with_wound(shape, wound, seed)
+    return shape if wound is None else shapes.with_wound(shape, wound, seed)

@@ -107,12 +107,7 @@ def serve_arm(watched: WatchedArm, link: Path, clock: Clock) -> Iterator[ServedA
 
 
 def take_pictures(
-    watched: WatchedArm,
-    arm: VirtualArm,
-    begun: float,
-    span: tuple[float, float],
-    folder: Path,
-    report: ProgressReport,
+    watched: WatchedArm, arm: VirtualArm, begun: float, span: tuple[float, float], folder: Path, report: ProgressReport
 ) -> None:
     """Write the session folder of what the cameras saw of the arm from one instant to another, s, by the clock.
 

@@ -192,15 +192,8 @@ class SimulatedWorld:
         if self.scenario.nozzle:
             self.arm.advance(now)
             nozzle = nozzle_from_axes(self.scenario.true_arm, self.arm.axes_at(times)[0])
-        self._last_state = WorldState(
-            stamp=shot.exposed,
-            exposure=shot.exposure,
-            base_from_surface=truth.base_from_surface(times)[0],
-            twist=truth.twist(times)[0],
-            strain=float(truth.amount(times)[0]),
-            base_from_nozzle=nozzle,
-            gain=shot.gain,
-        )
+        pose, twist, strain = truth.base_from_surface(times)[0], truth.twist(times)[0], float(truth.amount(times)[0])
+        self._last_state = WorldState(shot.exposed, shot.exposure, pose, twist, strain, nozzle, shot.gain)
         return self._last_state
 
     def _on_pose(self, pose: SurfacePose, frames: FrameSet, observations: Observations) -> None:

@@ -16,24 +16,14 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.protocol import (
-    FRAME_LENGTH,
-    FRAME_TAILS,
-    G1,
-    G4,
-    G54,
-    ControllerReset,
-    Dialect,
-    FrameStream,
-    Instruction,
-    Mode,
-    decode,
-)
+from hardware.arm import protocol
+from hardware.arm.protocol import G1, G4, G54, ControllerReset, Dialect, Instruction, Mode
 from hardware.process.faults import Fault, FaultPart, WorkRates, WorkStretches, faults_striking
 from hardware.simulator.arm.serial_line import FaultyLine, Telemetry
 from hardware.simulator.arm.settings import ArmSettings
@@ -209,7 +199,8 @@ class VirtualArm:
         self.underruns: list[float] = []  # s, the queue ran dry within a motion: the arm stopped before the next move
         self.garbage: list[tuple[float, bytes]] = []  # s, and bytes that belong to no frame of this dialect
         self._settings = settings
-        self._stream = FrameStream(FRAME_LENGTH, FRAME_TAILS, lambda frame: decode(frame, dialect))
+        decode = partial(protocol.decode, dialect=dialect)
+        self._stream = protocol.FrameStream(protocol.FRAME_LENGTH, protocol.FRAME_TAILS, decode)
         self._line_in = FaultyLine(faults, np.random.default_rng([settings.seed, 1]))
         self._rates = WorkRates(faults_striking(faults, FaultPart.ARM))
         self._answers = Telemetry(settings, baud, faults)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from estimation import se3
@@ -128,7 +129,7 @@ def render(
     cameras: Sequence[Camera],
     instants: Sequence[WorldState],
     sensor: Sensor,
-    rngs: Sequence[np.random.Generator],
+    rngs: Sequence[Generator],
     threads: int = 2,
 ) -> list[Image]:
     """Images (H, W, 3) BGR, one per camera with its instant and its noise; the same for any number of threads."""
@@ -154,7 +155,7 @@ class StillScene:
         self._views = [scene.view(camera) for camera in cameras]
         self._behind = [(surface_picture(shared, view), drape_picture(shared, view)) for view in self._views]
 
-    def __call__(self, camera: int, instant: WorldState, sensor: Sensor, rng: np.random.Generator) -> Image:
+    def __call__(self, camera: int, instant: WorldState, sensor: Sensor, rng: Generator) -> Image:
         """The image (H, W, 3) BGR of a camera by its number."""
         skin, cloth = self._behind[camera]
         now, fresh = replace(self._shared, instant=instant), replace(cloth, light=cloth.light.copy())
@@ -162,21 +163,16 @@ class StillScene:
 
 
 def _finished(
-    at: SceneState,
-    view: RenderView,
-    skin: SurfacePicture | None,
-    cloth: DrapePicture,
-    sensor: Sensor,
-    rng: np.random.Generator,
+    now: SceneState, view: RenderView, skin: SurfacePicture | None, cloth: DrapePicture, sensor: Sensor, rng: Generator
 ) -> Image:
     light = cloth.light
     if skin is not None:
         _blend_over(light, skin.box, skin.light)
-    boxes = part_boxes(at, view)
+    boxes = part_boxes(now, view)
     if boxes:
         box = whole_box(boxes)
-        _blend_over(light, box, nozzle_picture(at, view, boxes, _behind(box, skin, cloth)))
-    return expose(light, sensor, view.fall(sensor), at.instant.gain, rng)
+        _blend_over(light, box, nozzle_picture(now, view, boxes, _behind(box, skin, cloth)))
+    return expose(light, sensor, view.fall(sensor), now.instant.gain, rng)
 
 
 def _blend_over(light: NDArray[np.float32], box: ImageBox, layer: NDArray[np.float32]) -> None:

@@ -172,7 +172,6 @@ NOZZLE_PARTS = (
     Frustum(88.0, 96.0, 2.2, 2.2, STEEL, 0.6, True),
 )
 NOZZLE_LENGTH = NOZZLE_PARTS[-1].z1
-RING_ANGLES = np.linspace(0, 2 * np.pi, 17)[:-1]
 
 XYZ = tuple[Field, Field, Field]  # x, y, z
 
@@ -189,7 +188,8 @@ class PartHit(NamedTuple):
 def part_outline(part: Frustum) -> Array:
     """Points (N, 3) mm, nozzle frame, whose pictures hold the part's."""
     rings = ((part.z0, 1.02 * part.r0), (part.z1, 1.02 * part.r1))
-    return np.array([[r * np.cos(a), r * np.sin(a), z] for z, r in rings for a in RING_ANGLES])
+    angles = np.linspace(0, 2 * np.pi, 17)[:-1]
+    return np.array([[r * np.cos(a), r * np.sin(a), z] for z, r in rings for a in angles])
 
 
 def part_hit(part: Frustum, origin: Array, rays: XYZ) -> PartHit:

@@ -281,11 +281,11 @@ def drape_picture(state: SceneState, view: RenderView) -> DrapePicture:
         key_share = upsample(key_share, view.whole.size)[:h, :w]
     _edges(lens_rays, rays, depth, u, v)
     light, tint = np.empty((h, w, 3), np.float32), CLOTH_TEAL * np.array(state.lamps[0].colour, np.float32)
-    bgr_from_texture = np.column_stack([np.eye(3, dtype=np.float32), tint])
+    bgr_from_texture, border = np.column_stack([np.eye(3, dtype=np.float32), tint]), cv2.BORDER_REFLECT_101
+    picture = state.scene.sheet.picture
     for first in range(0, h, DRAPE_ROWS_AT_ONCE):
         rows = slice(first, first + DRAPE_ROWS_AT_ONCE)
-        border = cv2.BORDER_REFLECT_101
-        texture = cv2.remap(state.scene.sheet.picture, u[rows], v[rows], cv2.INTER_LINEAR, borderMode=border)
+        texture = as_field(cv2.remap(picture, u[rows], v[rows], cv2.INTER_LINEAR, borderMode=border))
         if key_share is not None:
             texture[..., 3] *= key_share[rows]
         cv2.transform(texture, bgr_from_texture, light[rows])

@@ -146,14 +146,21 @@ def wound_bed_coat(shape: Size, texel: float, inside: Field, rng: np.random.Gene
     gloss = np.full(shape, 0.85, np.float32)
     base = octave_noise(shape, 10 / texel, 5, rng, 0.62) + 0.5 * np.exp(-np.clip(inside, 0, None) / 3.0)
     slough = smoothstep(base, 0.45, 1.15) * np.float32(0.92)
-    fibres = _fibres(shape, texel, rng)
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
+    lean = 0.9 * smooth_noise(shape, 14 / texel, rng)
+    along = np.cos(lean) * y - np.sin(lean) * x
+    fibres = np.sin(along * (2 * np.pi * texel / 0.9) + 1.6 * octave_noise(shape, 2.5 / texel, 3, rng))
     shade = smoothstep(octave_noise(shape, 2.2 / texel, 3, rng), -1, 1.5)[..., None]
     tissue = SLOUGH_YELLOW + shade * (FIBRIN_CREAM - SLOUGH_YELLOW)
     tissue *= (1 + 0.10 * octave_noise(shape, 0.9 / texel, 2, rng) + 0.16 * fibres)[..., None]
     colour += slough[..., None] * (tissue - colour)
     height = height * (1 - 0.75 * slough) + 0.16 * slough + 0.03 * fibres * slough
     gloss -= 0.25 * slough
-    strands = np.clip(_strands(shape, texel, rng), 0, 1) * (0.35 + 0.4 * slough)
+    lines = []
+    for _ in range(int(0.010 * shape[0] * shape[1] * texel**2)):
+        start = rng.uniform(0, 1, 2) * shape[::-1]
+        lines.append(wandering_line(start, rng.uniform(0, np.pi), rng.gamma(3, 1.6) / texel, 1.4, rng, 10))
+    strands = np.clip(draw_lines(shape, lines, 0.16 / texel, 0.08 / texel), 0, 1) * (0.35 + 0.4 * slough)
     colour += strands[..., None] * (FIBRIN_CREAM - colour)
     height += 0.05 * strands
     clots = np.clip(random_spots(shape, 4.2 / texel, (0.3 / texel, 0.95 / texel), rng, 0.5) * 1.5 - 0.15, 0, 0.9)
@@ -201,22 +208,6 @@ def _granulation(shape: Size, texel: float, rng: np.random.Generator) -> tuple[T
     return colour, np.asarray(height, np.float32)
 
 
-def _fibres(shape: Size, texel: float, rng: np.random.Generator) -> Field:
-    y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
-    lean = 0.9 * smooth_noise(shape, 14 / texel, rng)
-    along = np.cos(lean) * y - np.sin(lean) * x
-    wave = along * (2 * np.pi * texel / 0.9) + 1.6 * octave_noise(shape, 2.5 / texel, 3, rng)
-    return np.asarray(np.sin(wave), np.float32)
-
-
-def _strands(shape: Size, texel: float, rng: np.random.Generator) -> Field:
-    lines = []
-    for _ in range(int(0.010 * shape[0] * shape[1] * texel**2)):
-        start = rng.uniform(0, 1, 2) * shape[::-1]
-        lines.append(wandering_line(start, rng.uniform(0, np.pi), rng.gamma(3, 1.6) / texel, 1.4, rng, 10))
-    return draw_lines(shape, lines, 0.16 / texel, 0.08 / texel)
-
-
 DRAPE_FADE = (5.5, 8.5)  # mm outside the opening: over this the painted drape hands over to the sheet
 
 
@@ -257,13 +248,9 @@ def paint_layers(shape: Shape, heights: Field, half: tuple[float, float] | None,
     sx, sy = gradient(heights, shape.step)
     mx, my = gradient(coat.height, look.texel)
     across, along = sample(sx, u, v) + mx, sample(sy, u, v) + my
-    opaque *= _on_grid(u, heights.shape[1]) * _on_grid(v, heights.shape[0])
+    opaque *= (u >= 0) & (u <= heights.shape[1] - 1) & (v >= 0) & (v <= heights.shape[0] - 1)
     colour = np.dstack([coat.colour * opaque[..., None], opaque])
     return Layers(colour, np.dstack([across, along, coat.gloss, open_sky]).astype(np.float32), look.texel, corner)
-
-
-def _on_grid(nodes: Field, count: int) -> Field:
-    return np.asarray((nodes >= 0) & (nodes <= count - 1), np.float32)
 
 
 def _texture_size(shape: Shape, look: Appearance) -> tuple[Size, Size]:
