@@ -161,8 +161,6 @@ class PictureRenderer:
         return np.random.default_rng([self._seed, stream, camera, number])
 
 
-NO_IMAGE = np.zeros((0, 0), np.uint8)  # of a frame that nobody looks at
-
 Exposures = dict[tuple[int, float], Shot]  # by camera and stamp, s
 
 
@@ -238,7 +236,7 @@ class CameraPipeline:
         self._events.at(shot.arrival, ARRIVAL_EVENT, partial(self._arrive, shot))
 
     def _arrive(self, shot: Shot, now: float) -> None:
-        frame = Frame(shot.camera, shot.stamp, NO_IMAGE)
+        frame = Frame(shot.camera, shot.stamp, np.zeros((0, 0), np.uint8))  # without renderer nobody looks at it
         if self._pictures is not None:
             kind, data = self._pictures.take(shot)
             try:

@@ -30,11 +30,6 @@ class PlannedLine:
     printed: NDArray[np.bool_]  # (K-1,) whether material leaves on it
     layer: NDArray[np.int64]  # (K-1,)
 
-    @property
-    def end(self) -> float:
-        """The place of the last checkpoint, mm."""
-        return float(self.knots[-1])
-
     def piece(self, place: Array) -> NDArray[np.int64]:
         """Piece (N,) on which each place (N,), mm, lies; a checkpoint belongs to the piece that leads to it."""
         return np.clip(np.searchsorted(self.knots, place, "left") - 1, 0, len(self.knots) - 2)
@@ -51,11 +46,10 @@ class PlannedLine:
 
     def distance(self, points: Array) -> Array:
         """Distance (N,), mm, of points (N, 3) in the surface frame from what is printed; NaN where nothing is."""
-        if not self.printed.any():
+        if not len(points) or not self.printed.any():
             return np.full(len(points), np.nan)
         size = max(1, DISTANCES_AT_ONCE // int(self.printed.sum()))
-        parts = [self._distance(points[i : i + size]) for i in range(0, len(points), size)]
-        return np.concatenate(parts) if parts else np.empty(0)
+        return np.concatenate([self._distance(points[i : i + size]) for i in range(0, len(points), size)])
 
     def _distance(self, points: Array) -> Array:
         start = self.points[:-1][self.printed]

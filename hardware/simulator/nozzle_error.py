@@ -241,7 +241,7 @@ def nozzle_figures(log: NozzleLog, line: PlannedLine, errors: RowErrors) -> Nozz
 def _printing(log: NozzleLog, line: PlannedLine) -> tuple[NDArray[np.bool_], int, bool]:
     """(N,) rows in which material was due; the row after the last before the end of the path; if it was finished."""
     known = np.isfinite(log.place)
-    short = known & (log.place < line.end - END_TOLERANCE)
+    short = known & (log.place < line.knots[-1] - END_TOLERANCE)
     finished = bool((known & ~short).any())
     going = np.flatnonzero(short | log.extrude)
     end = int(going[-1]) + 1 if finished and len(going) else len(log)

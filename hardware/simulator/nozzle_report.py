@@ -18,16 +18,7 @@ from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, sections,
 from hardware.report.summary import figure
 from hardware.simulator.deposit import HALF_BEAD, DepositMap, gaps_and_overlaps, row_step
 from hardware.simulator.nozzle_error import NEAR_ERROR, NozzleLag
-from hardware.simulator.nozzle_summary import (
-    SPREAD_HEADS,
-    SPREAD_PARTS,
-    NozzleResult,
-    allowed_in_words,
-    nozzle_verdict,
-    reached_in_words,
-    rows_of_errors,
-    share,
-)
+from hardware.simulator.nozzle_summary import SPREAD_COLUMNS, NozzleResult, nozzle_verdict, rows_of_errors, share
 
 PAGE_FOOTER = (
     "Lengths in mm, time in s of the simulation's own clock. The error is the nozzle's tip less the place on the true "
@@ -151,7 +142,10 @@ def _polyline(style: str, points: Array) -> str:
 
 def nozzle_page(result: NozzleResult) -> str:
     """The page as HTML text."""
-    parts = [_badge(result), _tiles(result), _figures(result)]
+    parts = [_tiles(result), _figures(result)]
+    if result.verdicts:
+        text = "limits met" if result.met else "limits missed" if result.run.complete else "not complete"
+        parts.insert(0, f'<div class="badge {"met" if result.met else "missed"}">{text}</div>')
     if len(result.run.log):
         parts += [_over_time(result), _parts(result), _spread(result), _pictures(result)]
     parts += [_holds(result), _camera_pictures(result)]
@@ -164,13 +158,6 @@ def nozzle_page(result: NozzleResult) -> str:
     lead = " ".join(nozzle_verdict(result))
     title, body = result.run.title or "a print", [part for part in parts if part]
     return page.document("stillbed simulate", title, lead, body, PAGE_FOOTER)
-
-
-def _badge(result: NozzleResult) -> str:
-    if not result.verdicts:
-        return ""
-    text = "limits met" if result.met else "limits missed" if result.run.complete else "not complete"
-    return f'<div class="badge {"met" if result.met else "missed"}">{text}</div>'
 
 
 def _tiles(result: NozzleResult) -> str:
@@ -188,7 +175,7 @@ def _tiles(result: NozzleResult) -> str:
 
 def _figures(result: NozzleResult) -> str:
     rows = [
-        [name, *(figure(getattr(spread, part) * scale) for part in SPREAD_PARTS)]
+        [name, *(figure(getattr(spread, part) * scale) for part in SPREAD_COLUMNS)]
         for name, _, spread, scale in rows_of_errors(result)
     ]
     offset = ", ".join(figure(v) for v in result.figures.nozzle.offset)
@@ -196,7 +183,7 @@ def _figures(result: NozzleResult) -> str:
     time = f"of the {f.extruding:.2f} s it printed, of {f.printing:.2f} s it had"
     within = f"Within {NEAR_ERROR:g} mm for {share(f.near)} {time}"
     more = f"{within}; mean error {offset} mm along x, y and z of the surface."
-    errors = page.figures_table(["", *SPREAD_HEADS], rows) + f'<p class="note">{escape(more)}</p>'
+    errors = page.figures_table(["", *SPREAD_COLUMNS.values()], rows) + f'<p class="note">{escape(more)}</p>'
     text = "Over the milliseconds in which material left the nozzle; parts of the error are without their sign."
     limits = page.section("Limits", "What the scenario asks of a run.", _limits(result)) if result.verdicts else ""
     return limits + page.section("Error while printing", text, errors)
@@ -204,8 +191,8 @@ def _figures(result: NozzleResult) -> str:
 
 def _limits(result: NozzleResult) -> str:
     rows = "".join(
-        f"<tr><td>{escape(v.bound.words)}</td><td>{escape(reached_in_words(v))}</td>"
-        f"<td>{escape(allowed_in_words(v))}</td><td>{MET_MARKS[v.met]}</td></tr>"
+        f"<tr><td>{escape(v.bound.words)}</td><td>{escape(v.reached_text)}</td>"
+        f"<td>{escape(v.allowed_text)}</td><td>{MET_MARKS[v.met]}</td></tr>"
         for v in result.verdicts
     )
     head = "<thead><tr><th></th><th>reached</th><th>allowed</th><th></th></tr></thead>"

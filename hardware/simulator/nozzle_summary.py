@@ -94,6 +94,17 @@ class LimitVerdict:
         """What is bounded, and how."""
         return BOUNDS[self.name]
 
+    @property
+    def reached_text(self) -> str:
+        """What was reached, with its unit; a share, which has none, in percent."""
+        return f"{figure(self.reached)} {self.bound.unit}" if self.bound.unit else share(self.reached)
+
+    @property
+    def allowed_text(self) -> str:
+        """The bound, with its unit and its side."""
+        number = f"{self.allowed:g} {self.bound.unit}" if self.bound.unit else percent(self.allowed)
+        return f"{'at least' if self.bound.minimum else 'at most'} {number}"
+
 
 def limits_from_table(where: object, table: checks.Table) -> RunLimits:
     """The limits in a table [limits] of the file `where`; InputError names the key that makes no sense."""
@@ -160,8 +171,7 @@ def evaluate_run(run: NozzleRun) -> NozzleResult:
     return NozzleResult(run, line, errors, figures, deposit, tuple(check_limits(run.limits, figures)))
 
 
-SPREAD_PARTS = ("median", "rmse", "p95", "p99", "max")
-SPREAD_HEADS = ("median", "RMS", "95 %", "99 %", "max")
+SPREAD_COLUMNS = {"median": "median", "rmse": "RMS", "p95": "95 %", "p99": "99 %", "max": "max"}  # field, heading
 
 
 def rows_of_errors(result: NozzleResult) -> list[tuple[str, str, Spread, float]]:
@@ -201,24 +211,13 @@ def _limits_in_words(result: NozzleResult) -> list[str]:
         return ["The scenario sets no limits."]
     if not missed:
         return [f"All {len(result.verdicts)} limits were met." if len(result.verdicts) > 1 else "Its limit was met."]
-    details = "; ".join(f"{v.bound.words} {reached_in_words(v)}, {allowed_in_words(v)}" for v in missed)
+    details = "; ".join(f"{v.bound.words} {v.reached_text}, {v.allowed_text}" for v in missed)
     return [f"{len(missed)} of {len(result.verdicts)} limits missed: {details}."]
 
 
 def share(value: float) -> str:
     """A share in percent, a dash for one that is not known."""
     return percent(value) if math.isfinite(value) else "–"
-
-
-def reached_in_words(verdict: LimitVerdict) -> str:
-    """What was reached, with its unit; a share, which has none, in percent."""
-    return f"{figure(verdict.reached)} {verdict.bound.unit}" if verdict.bound.unit else share(verdict.reached)
-
-
-def allowed_in_words(verdict: LimitVerdict) -> str:
-    """The bound, with its unit and its side."""
-    number = percent(verdict.allowed) if not verdict.bound.unit else f"{verdict.allowed:g} {verdict.bound.unit}"
-    return f"{'at least' if verdict.bound.minimum else 'at most'} {number}"
 
 
 def nozzle_dict(result: NozzleResult) -> dict[str, Any]:
@@ -263,10 +262,11 @@ def nozzle_dict(result: NozzleResult) -> dict[str, Any]:
 
 def nozzle_text(summary: dict[str, Any]) -> str:
     """The verdict and the tables, for a terminal, from a summary as `nozzle_dict` gives it."""
-    lines = [*summary["verdict"], "", f"{'error while printing':<26}" + "".join(f"{head:>9}" for head in SPREAD_HEADS)]
+    heads = "".join(f"{head:>9}" for head in SPREAD_COLUMNS.values())
+    lines = [*summary["verdict"], "", f"{'error while printing':<26}{heads}"]
     for key, figures in summary["errors"].items():
         name, _, unit = key.rpartition("_")
-        lines.append(f"{f'{name}, {unit}':<26}" + "".join(f"{_number(figures[part]):>9}" for part in SPREAD_PARTS))
+        lines.append(f"{f'{name}, {unit}':<26}" + "".join(f"{_number(figures[part]):>9}" for part in SPREAD_COLUMNS))
     deposit, lag = summary["deposit"], summary["lag_ms"]
     parts = [("duty", summary["duty"]), *((name, deposit[name]) for name in ("coverage", "gaps", "overlap", "outside"))]
     shares = [f"{name} {share(np.nan if value is None else value)}" for name, value in parts]

@@ -65,14 +65,9 @@ class WatchPage:
     """Writes watch.jpg and watch.html into a folder, at most every WATCH_INTERVAL s of the run."""
 
     def __init__(self, folder: Path, rig: Rig, title: str) -> None:
-        self._folder, self._rig, self._title = folder, rig, title
+        self.page, self._folder, self._rig, self._title = folder / "watch.html", folder, rig, title
         self._number, self._next = 0, -np.inf
         self._facts: list[tuple[str, str]] = []
-
-    @property
-    def page(self) -> Path:
-        """Where the page is."""
-        return self._folder / "watch.html"
 
     def show(self, frames: FrameSet, pose: SurfacePose, line: Array | None, facts: Sequence[tuple[str, str]]) -> None:
         """The newest frames, pose and printed line (N, 3), mm, surface frame of the pose; facts: name and value."""

@@ -83,7 +83,11 @@ class LandmarkTracker:
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
         """The pose at `frames.stamp`."""
-        observations = self._observe(frames)
+        views = [self._view(frame.camera, self._shot(frame.camera, frame.stamp)) for frame in frames.frames]
+        observations = no_observations(frames.stamp)
+        if any(len(track) for _, track, _ in views):
+            camera, track, pixels = (np.concatenate(parts) for parts in zip(*views, strict=True))
+            observations = Observations(frames.stamp, camera, track, pixels, np.full(len(track), TRACK_SIGMA))
         pose = self._pose(observations)
         used = np.bincount(observations.camera, minlength=self._cameras)
         self.last = report_without_offsets(observations, used, np.zeros(len(STAGES)))
@@ -103,13 +107,6 @@ class LandmarkTracker:
         self._follower = Follower(self._known_rig, observations, start, refine=False)
         assert self._follower.estimator.pose is not None
         return self._follower.estimator.pose
-
-    def _observe(self, frames: FrameSet) -> Observations:
-        views = [self._view(frame.camera, self._shot(frame.camera, frame.stamp)) for frame in frames.frames]
-        if not any(len(track) for _, track, _ in views):
-            return no_observations(frames.stamp)
-        camera, track, pixels = (np.concatenate(parts) for parts in zip(*views, strict=True))
-        return Observations(frames.stamp, camera, track, pixels, np.full(len(track), TRACK_SIGMA))
 
     def _view(self, camera: int, shot: Shot) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
         """Camera (N,), track (N,) and pixels (N, 2) of the landmarks that one picture shows."""
@@ -277,8 +274,8 @@ def _write_results(
     tracking = _tracking_report(scenario, truth, out / "tracking", regions, complete)
     pictures = tuple((scenario.rig.cameras[c].name, data) for c, data in sorted(folder.pictures.items()))
     files = tuple(f for f in FILE_NOTES if scenario.tracking.pictures or f[0] != "session")
-    print_settings = path, scenario.bead, scenario.limits
-    run = NozzleRun(scenario.title, join_logs(folder.logs), *print_settings, tracking, complete, pictures, files)
+    log = join_logs(folder.logs)
+    run = NozzleRun(scenario.title, log, path, scenario.bead, scenario.limits, tracking, complete, pictures, files)
     result = evaluate_run(run)
     summary = nozzle_dict(result) | {"frame_sets_skipped": skipped, "faults": [str(f) for f in scenario.faults]}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")

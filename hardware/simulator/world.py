@@ -210,8 +210,8 @@ class SimulatedWorld:
             change = truth_from_estimate(pose, observations, rigs, self._truth, self._scene.shape, exposed)
         if change is None:
             return
-        moved = se3.inverse(change) @ self._path.surface_from_nozzle
-        self._motion = MotionStep(replace(self._path, surface_from_nozzle=moved), scenario.profile)
+        placed_path = replace(self._path, surface_from_nozzle=se3.inverse(change) @ self._path.surface_from_nozzle)
+        self._motion = MotionStep(placed_path, scenario.profile)
         self._sink.registered(change)
 
     def _tick(self, now: float) -> None:

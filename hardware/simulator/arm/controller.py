@@ -202,6 +202,7 @@ class VirtualArm:
         decode = partial(protocol.decode, dialect=dialect)
         self._stream = protocol.FrameStream(protocol.FRAME_LENGTH, protocol.FRAME_TAILS, decode)
         self._line_in = FaultyLine(faults, np.random.default_rng([settings.seed, 1]))
+        self.struck = self._line_in.struck  # s, frames that a fault lost or garbled
         self._rates = WorkRates(faults_striking(faults, FaultPart.ARM))
         self._answers = Telemetry(settings, baud, faults)
         self._setpoint = Polyline(0.0, home_axes)
@@ -210,7 +211,7 @@ class VirtualArm:
             accelerations = settings.acceleration * np.array([1.0, settings.top_turn / settings.top_speed])
         self._servo = Servo(self._setpoint, settings.dead_time, settings.servo_lag, accelerations)
         self._target = home_axes.copy()  # machine coordinates, of the last command queued
-        self._origin = np.zeros(3)
+        self.origin = np.zeros(3)  # of work, mm
         self._fifo: deque[WorkStretches] = deque()  # of the commands in it
         self._free = 0.0  # when the last one ends
         self._flowing = False  # it is a move, and the next one may follow without a stop
@@ -231,7 +232,7 @@ class VirtualArm:
         self.now = until
         while self._fifo and self._fifo[0][-1][1] <= until:
             self._fifo.popleft()
-        self._answers.advance(until, self.axes_at, self._origin)
+        self._answers.advance(until, self.axes_at, self.origin)
 
     def transmit(self, now: float) -> bytes:
         """The bytes that have reached the host by `now`, s, since the last call."""
@@ -258,23 +259,13 @@ class VirtualArm:
         """Seconds of work in the queue: what it would take if nothing stalled."""
         return sum(rate * max(end - max(begin, self.now), 0.0) for each in self._fifo for begin, end, rate in each)
 
-    @property
-    def origin(self) -> Array:
-        """The work origin (3,), mm."""
-        return self._origin
-
-    @property
-    def struck(self) -> list[float]:
-        """Instants, s, of frames that a fault lost or garbled."""
-        return self._line_in.struck
-
     def _take(self, instruction: Instruction) -> None:
         low, high = self._settings.low, self._settings.high
         match instruction:
             case G1() | G4() if self.queued >= self._settings.fifo:
                 self.ignored.append(self.now)
             case G1():
-                target = np.concatenate([instruction.axes[:3] + self._origin, instruction.axes[3:]])
+                target = np.concatenate([instruction.axes[:3] + self.origin, instruction.axes[3:]])
                 if (target < low).any() or (target > high).any():
                     self.refused.append(self.now)
                 else:
@@ -284,7 +275,7 @@ class VirtualArm:
             case G54() if (instruction.origin < low[:3]).any() or (instruction.origin > high[:3]).any():
                 self.refused.append(self.now)
             case G54():
-                self._origin = instruction.origin
+                self.origin = instruction.origin
             case Mode():
                 self.mode = instruction.mode
             case _:
@@ -293,7 +284,7 @@ class VirtualArm:
                 self._fifo.clear()
                 self._free, self._flowing = self.now, False
                 if isinstance(instruction, ControllerReset):
-                    self._origin, self.mode = np.zeros(3), 0
+                    self.origin, self.mode = np.zeros(3), 0
 
     def _queue(self, work: float, target: Array | None) -> None:
         """Put a command behind the others: `work` s of motion to `target` (6,), or of pause."""

@@ -27,19 +27,14 @@ class SerialWire:
         if not baud > 0:
             raise InputError("wire", "baud", baud, "> 0 bits/s")
         self._byte_time = BITS_PER_BYTE / baud
-        self._free = -math.inf
+        self.free = -math.inf  # s, when the last byte sent so far has arrived; -inf before the first
 
     def send(self, data: bytes, now: float) -> Array:
         """Instants (N,), s, at which the bytes handed over at `now` have arrived; they wait for those before them."""
-        arrivals = max(self._free, now) + self._byte_time * np.arange(1, len(data) + 1)
+        arrivals = max(self.free, now) + self._byte_time * np.arange(1, len(data) + 1)
         if len(arrivals):
-            self._free = float(arrivals[-1])
+            self.free = float(arrivals[-1])
         return np.asarray(arrivals)
-
-    @property
-    def free(self) -> float:
-        """Instant, s, at which the last byte sent so far has arrived; -inf before the first."""
-        return self._free
 
 
 def unplugged(faults: Sequence[Fault], instant: float) -> bool:
@@ -113,7 +108,11 @@ class Telemetry:
             replies.append(bytes([self._stray]))
             self._schedule()
         if due and self._mode is ReplyMode.STREAM:
-            replies = [_encoded_replies(axes, origin) for axes in axes_at(np.array(due))]
+            kinds = ReplyKind.PLACE, ReplyKind.TOOL, ReplyKind.ARM
+            replies = []
+            for axes in axes_at(np.array(due)):
+                values = zip(kinds, (axes[:3] - origin, axes[3:], np.zeros(3)), strict=True)
+                replies.append(b"".join(encode_reply(Reply(*each)) for each in values))
         for instant, data in zip(due, replies, strict=True):
             if self._wire.free <= instant and not unplugged(self._faults, instant):
                 self._under_way.extend(zip(self._wire.send(data, instant).tolist(), data, strict=True))
@@ -132,8 +131,3 @@ class Telemetry:
         elif self._mode is ReplyMode.STRAY:
             self._next += self._rng.exponential(self._period)
             self._stray = int(self._rng.integers(256))
-
-
-def _encoded_replies(axes: Array, origin: Array) -> bytes:
-    numbers = (ReplyKind.PLACE, axes[:3] - origin), (ReplyKind.TOOL, axes[3:]), (ReplyKind.ARM, np.zeros(3))
-    return b"".join(encode_reply(Reply(kind, values)) for kind, values in numbers)

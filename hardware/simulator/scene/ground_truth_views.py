@@ -21,7 +21,7 @@ from hardware.simulator.scene.fields import Field
 from hardware.simulator.scene.rays import rays_at
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState
-from hardware.simulator.scene.shape import BODIES, Shape, Wound, body
+from hardware.simulator.scene.shape import BODIES, Wound, body
 from perception.boards.board import Board, ink_cells
 from perception.frames import Image
 
@@ -54,9 +54,15 @@ def wound_view(seed: int, wounded: bool = True) -> WoundView:
     instant = WorldState(0.0, 0.004, pose, np.zeros(6), gain=float(np.exp(rng.normal(0, 0.15))))
     sensor = Sensor(noise=rng.uniform(0.5, 4), blur=rng.uniform(0.3, 1.2))
     image = render(scene, [camera], [instant], sensor, [rng], threads=1)[0]
-    points = [se3.transform_points(pose, shape.points(each)) for each in _outlines(shape)]
-    outlines = [pixels_from_points(camera, each)[0] for each in points]
-    area = 0.0 if shape.inside is None else float((shape.inside > 0).sum()) * shape.step**2
+    outlines, area = [], 0.0
+    if shape.inside is not None:
+        wound_nodes = shape.inside > 0
+        area = float(wound_nodes.sum()) * shape.step**2
+        contours, _ = cv2.findContours(wound_nodes.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        middle = (np.array(wound_nodes.shape[::-1]) - 1) / 2
+        for nodes in contours:
+            points = shape.points((nodes.reshape(-1, 2) - middle) * shape.step)
+            outlines.append(pixels_from_points(camera, se3.transform_points(pose, points))[0])
     return WoundView(image, mask_from_outlines(outlines, camera.size), camera, pose, area)
 
 
@@ -76,14 +82,6 @@ def _random_appearance(rng: np.random.Generator) -> Appearance:
     tone, wetness, hair = rng.uniform(0, 0.9), rng.uniform(0.1, 1), rng.uniform(0, 1.2)
     drape = bool(rng.random() < 0.6)
     return Appearance(VIEW_TEXEL, tone, wetness, hair, drape, ambient=ambient, key=key, fill=fill)
-
-
-def _outlines(shape: Shape) -> list[Array]:
-    if shape.inside is None:
-        return []
-    contours, _ = cv2.findContours((shape.inside > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    middle = (np.array(shape.inside.shape[::-1]) - 1) / 2
-    return [(nodes.reshape(-1, 2) - middle) * shape.step for nodes in contours]
 
 
 BOARD_SAMPLES = 3  # per pixel and axis: edges lie true to a hundredth of a pixel

@@ -178,6 +178,8 @@ class RenderView:
         self._box, self._rays = ImageBox(0, 0, 0, 0), Rays(*np.zeros((2, 0, 0), np.float32))
         self._coarse: dict[int, Rays] = {}
         self._fall: dict[float, NDArray[np.float32]] = {}
+        w, h = camera.size
+        self.whole = ImageBox(0, 0, -(-w // CELL_PX) * CELL_PX, -(-h // CELL_PX) * CELL_PX)  # the image in whole cells
 
     def fall(self, sensor: Sensor) -> NDArray[np.float32]:
         """Share of the light (H, W, 3) that reaches each pixel."""
@@ -185,17 +187,10 @@ class RenderView:
             self._fall[sensor.vignetting] = vignette(self.camera, sensor)
         return self._fall[sensor.vignetting]
 
-    @property
-    def whole(self) -> ImageBox:
-        """The whole image in whole cells."""
-        w, h = self.camera.size
-        return ImageBox(0, 0, -(-w // CELL_PX) * CELL_PX, -(-h // CELL_PX) * CELL_PX)
-
     def clip(self, low: Array, high: Array) -> ImageBox | None:
         """The cells that hold pixels low to high (2,), None if they miss the image."""
-        whole = self.whole
-        x0, y0 = (int(v) for v in np.clip(np.floor(low / CELL_PX) * CELL_PX, 0, whole[2:]))
-        x1, y1 = (int(v) for v in np.clip(np.ceil(high / CELL_PX) * CELL_PX, 0, whole[2:]))
+        x0, y0 = (int(v) for v in np.clip(np.floor(low / CELL_PX) * CELL_PX, 0, self.whole[2:]))
+        x1, y1 = (int(v) for v in np.clip(np.ceil(high / CELL_PX) * CELL_PX, 0, self.whole[2:]))
         return ImageBox(x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
 
     def rays(self, box: ImageBox) -> Rays:
