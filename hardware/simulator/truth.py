@@ -275,10 +275,7 @@ def drape_path(path: Path, shape: Shape, clearance: float, where: object = "path
 
 
 def divide_path(path: Path, piece: float) -> Path:
-    """The path with stretches longer than `piece` mm cut into equal ones; a new checkpoint takes after its next.
-
-    Stretches over which the tool turns are left whole.
-    """
+    """The path with stretches over `piece` mm cut evenly, unless the tool turns; a new checkpoint copies its next."""
     poses = path.surface_from_nozzle
     counts = np.ceil(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / piece).astype(int)
     turns = np.abs(np.diff(poses[:, :3, :3], axis=0)).max(axis=(1, 2)) >= 1e-9

@@ -146,10 +146,7 @@ NOISE_SIGMA = 1.2  # grey levels, one sigma
 
 
 def closed_motion(count: int, rest: Array, rng: np.random.Generator, lively: float) -> Array:
-    """Poses (N, 4, 4) of one period of a breath-like motion about `rest`, with two harmonics.
-
-    lively: by what the amplitudes of 3 mm and 2 degrees are multiplied.
-    """
+    """Poses (N, 4, 4) of one period of a breath about `rest`: `lively` times 3 mm and 2 degrees, two harmonics more."""
     phase = 2 * np.pi * np.arange(count) / count
     xi = np.zeros((count, 6))
     for harmonic, part in ((1, 1.0), (2, 0.35), (3, 0.12)):
