@@ -262,8 +262,7 @@ def _texture_size(shape: Shape, look: Appearance) -> tuple[Size, Size]:
             allowed = f"({rows}, {columns}, 3): {look.texel:g} mm a texel"
             raise InputError("look", "texture", look.texture.shape, allowed)
         rows, columns = got
-    w, h = (int(np.ceil(n * look.texel / look.texel / BLOCK_TEXELS - 1e-6)) * BLOCK_TEXELS for n in (columns, rows))
-    return (rows, columns), (h, w)
+    return (rows, columns), (-(-rows // BLOCK_TEXELS) * BLOCK_TEXELS, -(-columns // BLOCK_TEXELS) * BLOCK_TEXELS)
 
 
 def _wetted(coat: Coat, inside: Field, wetness: float) -> Coat:
