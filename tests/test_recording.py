@@ -26,6 +26,7 @@ from hardware.files.images import IMAGE_SCHEMA_NAME, MAX_TIME_SECOND, decode, en
 from hardware.files.rig_file import table_from_rig
 from hardware.recording import session_reader as channels
 from hardware.recording.mcap_file import ChunkMessages, StoredMessage, walk
+from hardware.recording.messages import bytes_from_message
 from hardware.recording.recorder import Recorder
 from hardware.recording.schemas import WARNING
 from hardware.recording.session_reader import open_session
@@ -105,9 +106,11 @@ def test_every_record_comes_back_bit_by_bit(
     assert isinstance(first, Move) and isinstance(third, Move) and second == hold
     assert first.axes.tobytes() == move.axes.tobytes()
     assert (first.stamp, first.feed, first.checkpoint, first.extrude) == (stamp, 1 / 3, 7, True)
-    assert list(channels.read_sent(path)) == [(stamp, data)]
-    assert list(channels.read_received(path)) == [(stamp, data[::-1])]
-    assert list(channels.read_events(path)) == [(stamp, WARNING, "drape moved")]
+    sent, received = (channels.read_channels(path, {f"/arm/{way}": dict}) for way in ("sent", "received"))
+    assert [(m["stamp"], bytes_from_message(m)) for m in sent] == [(stamp, data)]
+    assert [(m["stamp"], bytes_from_message(m)) for m in received] == [(stamp, data[::-1])]
+    (event,) = channels.read_channels(path, {"/events": dict})
+    assert (event["stamp"], event["level"], event["message"]) == (stamp, WARNING, "drape moved")
     assert channels.read_truth_rows(path).tobytes() == rows_from_trajectory(moved).tobytes()
 
 

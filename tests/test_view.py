@@ -269,10 +269,10 @@ def test_honest_covariances_have_a_nees_of_six() -> None:
     found = truth @ se3.exp(draw.normal(size=(600, 6)) * sigma)
     covariance = np.broadcast_to(np.diag(sigma**2), (600, 6, 6))
     stamps = np.arange(600) / 30
-    judged = compare(posed(found, covariance, stamps), posed(truth, stamps=stamps)).judged
+    judged = compare(posed(found, covariance, stamps), posed(truth, stamps=stamps)).alignments
     assert judged[0].absolute.mean_nees / 6 == pytest.approx(1.0, abs=0.05)
     assert 0.93 < judged[0].absolute.nees_inside < 0.97
-    bold = compare(posed(found, covariance / 4, stamps), posed(truth, stamps=stamps)).judged[0]
+    bold = compare(posed(found, covariance / 4, stamps), posed(truth, stamps=stamps)).alignments[0]
     assert bold.absolute.mean_nees == pytest.approx(4 * judged[0].absolute.mean_nees)
 
 
@@ -286,7 +286,7 @@ def test_covariances_relative_to_a_pose_that_is_held_are_judged_in_its_frame(hel
     covariance[held] *= 1e-6
     frame = se3.exp(np.array([0.1, -0.2, 0.3, 5.0, -3.0, 2.0]))  # the truth's surface frame is another
     stamps = np.arange(600) / 30
-    judged = compare(posed(truth @ se3.exp(off), covariance, stamps), posed(truth @ frame, stamps=stamps)).laid
+    judged = compare(posed(truth @ se3.exp(off), covariance, stamps), posed(truth @ frame, stamps=stamps)).at_one_pose
     assert judged.absolute.mean_nees / 6 == pytest.approx(1.0, abs=0.05)
 
 
@@ -294,7 +294,7 @@ def test_positions_on_a_line_determine_no_alignment() -> None:
     truth = np.tile(np.eye(4), (30, 1, 1))
     truth[:, 2, 3] = np.arange(30)
     result = compare(posed(truth, stamps=STAMPS[:30]), posed(truth, stamps=STAMPS[:30]))
-    assert [judged.name for judged in result.judged] == [name for name in ALIGNMENTS if name != ALIGNMENTS[1]]
+    assert [judged.name for judged in result.alignments] == [name for name in ALIGNMENTS if name != ALIGNMENTS[1]]
 
 
 def test_a_denser_trajectory_gives_each_instant_once() -> None:

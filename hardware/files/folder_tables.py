@@ -10,8 +10,8 @@ import csv
 import json
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import TextIO
 
 import numpy as np
@@ -24,7 +24,6 @@ from estimation.se3 import Array
 from hardware.files.rig_file import ImageSource, write_rig
 from hardware.files.session import NO_PRINT_HEADS, FrameRef, PrintHeadLog
 from hardware.process import checks
-from hardware.process.checks import error_text
 from perception.frames import Roi
 
 TUM_HEADER = "# stamp_s x y z qx qy qz qw (mm, base_from_surface)\n"
@@ -102,7 +101,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, "file", error_text(error), "a readable text file") from error
+        raise InputError(path, "file", checks.error_text(error), "a readable text file") from error
     numbered = ((i, line.strip()) for i, line in enumerate(text.splitlines(), 1))
     return [(i, line) for i, line in numbered if line and not line.startswith("#")]
 
@@ -264,14 +263,14 @@ def write_roi(path: Path, rig: Rig, rois: Sequence[Roi], frames: Sequence[int]) 
 PICTURE_SUFFIXES = {"png": ".png", "jpeg": ".jpg"}
 
 
-class SessionFolderWriter:
-    """A session folder in the making; readable at every instant, whole once the context ends."""
+class SessionFolderWriter(ExitStack):
+    """Writes a session folder; readable at every instant, whole once the context ends."""
 
     def __init__(self, folder: Path, rig: Rig, rois: Sequence[Roi]) -> None:
         """folder: made if it is not there. rois: where the surface is in the first picture of each camera."""
+        super().__init__()
         self.folder, self._rig = folder, rig
         self._counts = [0] * len(rig)
-        self._truth: Trajectory | None = None
         self._heads: TextIO | None = None  # a session without an arm has no such file
         for camera in rig.cameras:
             (folder / camera.name).mkdir(parents=True, exist_ok=True)
@@ -279,7 +278,7 @@ class SessionFolderWriter:
         if rois:
             write_roi(folder / "roi.toml", rig, rois, [0] * len(rois))
         write_frames(folder / "frames.csv", rig, [])
-        self._frames = (folder / "frames.csv").open("a", encoding="utf-8")
+        self._frames = self.enter_context((folder / "frames.csv").open("a", encoding="utf-8"))
 
     def picture(self, camera: int, stamp: float, kind: str, data: bytes) -> None:
         """An encoded picture ("png" or "jpeg") of a camera at `stamp`, s; stamps of a camera rise."""
@@ -293,20 +292,10 @@ class SessionFolderWriter:
         """Where the print head was at a frame set: (8,) stamp x y z qx qy qz qw, s and mm; stamps rise."""
         if self._heads is None:
             write_heads(self.folder / "head.csv", NO_PRINT_HEADS)
-            self._heads = (self.folder / "head.csv").open("a", encoding="utf-8")
+            self._heads = self.enter_context((self.folder / "head.csv").open("a", encoding="utf-8"))
         self._heads.write(head_line(row, extruding))
         self._heads.flush()
 
     def truth(self, trajectory: Trajectory) -> None:
         """The exact poses, written when the folder is closed."""
-        self._truth = trajectory
-
-    def __enter__(self) -> SessionFolderWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._frames.close()
-        if self._heads is not None:
-            self._heads.close()
-        if self._truth is not None:
-            write_tum(self.folder / "truth.tum", self._truth)
+        self.callback(write_tum, self.folder / "truth.tum", trajectory)

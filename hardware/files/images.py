@@ -1,9 +1,9 @@
 """Images in and out of files: videos frame by frame, pictures, and the messages that recordings hold (owns cv2).
 
-A recording holds an encoded picture as it is, in ROS 2's sensor_msgs/msg/CompressedImage. Its schema (MCAP's `ros2msg`)
-is IMAGE_SCHEMA, its encoding (`cdr`) plain CDR, little endian: four bytes that say so, then each field at a multiple of
-its own size, counted from behind those four (OMG DDS-XTypes, section 7.4, XCDR1). Foxglove, Rerun and ROS 2 show it;
-JSON would need the picture as base64, a third larger and to be encoded and decoded.
+A recording holds an encoded picture as it is, in ROS 2's sensor_msgs/msg/CompressedImage. Its encoding (`cdr`) is plain
+little-endian CDR: a header of four bytes, then each field at a multiple of its own size, counted from behind the header
+(OMG DDS-XTypes, section 7.4, XCDR1). Foxglove, Rerun and ROS 2 show it; JSON would need the picture as base64, a third
+larger and to be encoded and decoded.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import struct
 from contextlib import suppress
 from pathlib import Path
 
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg's own lines on stderr: our errors say it instead
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silences FFmpeg's lines on stderr: our errors report instead
 
 import cv2
 import numpy as np
@@ -42,9 +42,9 @@ class Video:
         return max(0, int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)))
 
     def reaches(self, count: int) -> bool:
-        """Whether the container gives `count` frames and the last one decodes; afterwards the video is used up.
+        """Whether the container reports `count` frames and the last one decodes; afterwards the video is used up.
 
-        The jump to the end costs a few ms and was seen to fail for every cut avi, mkv and mp4 (index in front).
+        The jump to the end costs a few ms; it failed for every truncated avi, mkv and mp4 (index in front) tried.
         """
         if self.reported_count() != count:
             return False
@@ -70,7 +70,7 @@ class Video:
         return ok
 
     def close(self) -> None:
-        """Give the decoder back."""
+        """Release the decoder."""
         self._capture.release()
 
 
@@ -120,9 +120,8 @@ def small_jpeg(image: Image, width: int, quality: int) -> bytes:
     return encode(image, quality)[1]
 
 
-IMAGE_SCHEMA_NAME = "sensor_msgs/msg/CompressedImage"
-IMAGE_SCHEMA_ENCODING, IMAGE_ENCODING = "ros2msg", "cdr"
-IMAGE_SCHEMA = f"""std_msgs/Header header
+IMAGE_SCHEMA_NAME, IMAGE_ENCODING = "sensor_msgs/msg/CompressedImage", "cdr"
+_IMAGE_SCHEMA = f"""std_msgs/Header header
 string format
 uint8[] data
 {80 * "="}
@@ -134,6 +133,7 @@ MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
 """
+IMAGE_CHANNEL = IMAGE_SCHEMA_NAME, "ros2msg", IMAGE_ENCODING, _IMAGE_SCHEMA.encode()  # schema's name and kind; encoding
 MAX_TIME_SECOND = 2**31 - 1  # that a Time holds: in 2038
 
 _CDR = b"\x00\x01\x00\x00"  # plain CDR, little endian, no options
@@ -144,7 +144,7 @@ _TIME = struct.Struct("<iI")
 def pack_image(kind: str, data: bytes, frame: str, log_time: int) -> bytes:
     """The message of a picture of `kind` ("png" or "jpeg") in the camera frame `frame`, at log_time, ns.
 
-    A time after 2038 is told as the last one there is: the exact stamp stands in /frames.
+    A time after 2038 is written as the last one there is; the exact stamp stands in /frames.
     """
     seconds, rest = divmod(log_time, 1_000_000_000)
     head = _TIME.pack(min(seconds, MAX_TIME_SECOND), rest) + _text(frame) + _text(kind)
@@ -162,13 +162,13 @@ def unpack_image(message: bytes) -> tuple[str, bytes]:
 
 
 def _text(text: str) -> bytes:
-    """A string, ended by a zero, and so many more that what follows begins at a multiple of 4."""
+    """A string as CDR: its length, its bytes, a zero, and zeros up to a multiple of 4."""
     data = text.encode() + b"\x00"
     return _WORD.pack(len(data)) + data + bytes(-len(data) % 4)
 
 
 def _counted(message: bytes, start: int) -> tuple[bytes, int]:
-    """The bytes that a count at `start` announces, and where the next count is."""
+    """The field whose length stands at `start`, and where the next field's length stands."""
     begin = start + _WORD.size
     if begin > len(message):
         raise ValueError(f"ends at byte {len(message)}, before a count at {start}")

@@ -1,9 +1,9 @@
 """poses.tum, poses.csv and wound.csv: what a tracking run leaves behind, written line by line and read back.
 
 `poses.tum` holds the measured poses only, as evo reads them: `stamp x y z qx qy qz qw`, s and mm. `poses.csv` holds one
-line per frame set: stamp, images given, pose, upper triangle of the covariance, twist, motion, state, tracks per
+line per frame set: stamp, number of images, pose, upper triangle of the covariance, twist, motion, state, tracks per
 camera, the cameras' clocks, milliseconds per stage, reason. Every line is flushed, so a killed run leaves whole lines.
-`wound.csv` holds what each camera saw of the wound, at the segmentation's own pace.
+`wound.csv` holds the wound as each camera shows it, at the segmentation's own pace.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import csv
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,26 +34,29 @@ if TYPE_CHECKING:
     from perception.wound.segmentation import Segmenter
 
 TANGENT_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
-_UPPER = np.triu_indices(6)
-_POSE = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
-_COVARIANCE = tuple(f"cov_{TANGENT_NAMES[i]}_{TANGENT_NAMES[j]}" for i, j in zip(*_UPPER, strict=True))
-_TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_mm_s", "vy_mm_s", "vz_mm_s")
+UPPER_TRIANGLE = np.triu_indices(6)
+TRANSFORM_COLUMNS = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
+COVARIANCE_COLUMNS = tuple(f"cov_{TANGENT_NAMES[i]}_{TANGENT_NAMES[j]}" for i, j in zip(*UPPER_TRIANGLE, strict=True))
+TWIST_COLUMNS = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_mm_s", "vy_mm_s", "vz_mm_s")
 _MOTION = ("moving", "onset_s", "moved_mm", "turned_deg")
 _DEFORMATION = ("deformation_mm", "deformation_sigma_mm")
-_POSE_TABLE_COLUMNS = ("stamp_s", "frames", *_POSE, *_COVARIANCE, *_TWIST, *_MOTION, *_DEFORMATION, "state", "cameras")
+_POSE_TABLE_COLUMNS = (
+    *("stamp_s", "frames", *TRANSFORM_COLUMNS, *COVARIANCE_COLUMNS, *TWIST_COLUMNS),
+    *(*_MOTION, *_DEFORMATION, "state", "cameras"),
+)
 _STATES = tuple(state.value for state in TrackState)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseTable:
-    """A run as parallel arrays, one row per frame set; N frame sets, C cameras, S stages."""
+    """A run as parallel arrays, one row per frame set: N frame sets, C cameras, S stages of the tracking step."""
 
     stamps: Array  # (N,) s
-    frames: NDArray[np.int64]  # (N,) images given
+    frames: NDArray[np.int64]  # (N,) number of images
     base_from_surface: Array  # (N, 4, 4) mm
     covariance: Array  # (N, 6, 6), as in SurfacePose
     twist: Array  # (N, 6), as in SurfacePose
-    moving: NDArray[np.bool_]  # (N,), as in SurfaceMotion like the next three
+    moving: NDArray[np.bool_]  # (N,), as in MotionState like the next three
     onset: Array  # (N,) s, NaN before the first
     moved: Array  # (N,) mm
     turned: Array  # (N,) rad
@@ -81,76 +84,43 @@ class PoseTable:
         return np.array([s is state for s in self.states], bool)
 
 
-class PoseWriter:
+class PoseWriter(ExitStack):
     """Writes poses.csv and poses.tum into a folder, a flushed line at a time; closes them as a context manager."""
 
     def __init__(self, folder: Path, cameras: Sequence[str], stages: Sequence[str]) -> None:
-        self._csv_file = (folder / "poses.csv").open("w", newline="", encoding="utf-8")
-        self._tum_file = (folder / "poses.tum").open("w", encoding="utf-8")
+        super().__init__()
+        self._csv_file = self.enter_context((folder / "poses.csv").open("w", newline="", encoding="utf-8"))
+        self._tum_file = self.enter_context((folder / "poses.tum").open("w", encoding="utf-8"))
         self._csv = csv.writer(self._csv_file, lineterminator="\n")
-        self._csv.writerow(
-            [
-                *_POSE_TABLE_COLUMNS,
-                *_names("tracks_", cameras),
-                *_clock_names(cameras),
-                *(f"ms_{s}" for s in (*stages, "total")),
-                "reason",
-            ]
-        )
+        of_cameras = [*(f"tracks_{name}" for name in cameras), *_clock_names(cameras)]
+        of_stages = [f"ms_{stage}" for stage in (*stages, "total")]
+        self._csv.writerow([*_POSE_TABLE_COLUMNS, *of_cameras, *of_stages, "reason"])
         self._tum_file.write("# base_from_surface: stamp_s x y z qx qy qz qw (mm)\n")
         for file in (self._csv_file, self._tum_file):
             file.flush()  # a run that is cut short before its first pose is read back, too
 
     def write(self, pose: SurfacePose, frames: int, report: StepReport, total: float) -> None:
-        """One frame set: its pose, images given, what the step did, and the `total` s that it took."""
-        numbers = _pose_numbers(pose.base_from_surface)
-        upper = pose.covariance[_UPPER]
-        tracks = [int(n) for n in report.used]
-        in_ms = np.round(1000 * np.concatenate([report.offsets, report.offset_sigmas]), 4)
-        clocks = [f"{v:.4f}" for v in in_ms + 0.0]  # + 0.0: no -0.0000
-        milliseconds = [f"{1000 * s:.4f}" for s in (*report.seconds, total)]
-        motion = pose.motion
-        moved = [int(motion.moving), f"{motion.onset:.6f}", f"{motion.moved:.6f}", f"{np.rad2deg(motion.turned):.6f}"]
+        """Write one frame set. frames: number of its images. total: s that the whole step took."""
+        quaternion = se3.quaternion_from_rotation(pose.base_from_surface[:3, :3])
+        placed = [*(f"{v:.6f}" for v in pose.base_from_surface[:3, 3]), *(f"{v:.12f}" for v in quaternion)]
+        spread_and_twist = [f"{v:.9g}" for v in (*pose.covariance[UPPER_TRIANGLE], *pose.twist)]
+        moved = [pose.motion.onset, pose.motion.moved, np.rad2deg(pose.motion.turned)]
         bent = [0.0, 0.0] if pose.warp is None else [pose.warp.deformation, pose.warp.deformation_sigma]
-        self._csv.writerow(
-            [
-                f"{pose.stamp:.6f}",
-                frames,
-                *numbers,
-                *(f"{v:.9g}" for v in (*upper, *pose.twist)),
-                *moved,
-                *(f"{v:.6f}" for v in bent),
-            ]
-            + [pose.state.value, int(np.count_nonzero(tracks)), *tracks, *clocks, *milliseconds, pose.reason]
-        )
+        motion = [int(pose.motion.moving), *(f"{v:.6f}" for v in (*moved, *bent))]
+        tracks = [int(n) for n in report.used]
+        in_ms = np.round(1000 * np.concatenate([report.offsets, report.offset_sigmas]), 4) + 0.0  # + 0.0: no -0.0000
+        times = [f"{v:.4f}" for v in (*in_ms, *(1000 * s for s in (*report.seconds, total)))]
+        state = [pose.state.value, int(np.count_nonzero(tracks)), *tracks]
+        row = [f"{pose.stamp:.6f}", frames, *placed, *spread_and_twist, *motion, *state, *times, pose.reason]
+        self._csv.writerow(row)
         self._csv_file.flush()
         if pose.state.measured:
-            self._tum_file.write(f"{pose.stamp:.6f} {' '.join(numbers)}\n")
+            self._tum_file.write(f"{pose.stamp:.6f} {' '.join(placed)}\n")
             self._tum_file.flush()
-
-    def close(self) -> None:
-        """Close both files; a second call does nothing."""
-        self._csv_file.close()
-        self._tum_file.close()
-
-    def __enter__(self) -> PoseWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self.close()
-
-
-def _names(column: str, cameras: Sequence[str]) -> list[str]:
-    return [f"{column}{name}" for name in cameras]
 
 
 def _clock_names(cameras: Sequence[str]) -> list[str]:
-    return [*_names("offset_ms_", cameras), *_names("offset_sigma_ms_", cameras)]
-
-
-def _pose_numbers(transform: Array) -> list[str]:
-    quaternion = se3.quaternion_from_rotation(transform[:3, :3])
-    return [*(f"{v:.6f}" for v in transform[:3, 3]), *(f"{v:.12f}" for v in quaternion)]
+    return [f"{column}{name}" for column in ("offset_ms_", "offset_sigma_ms_") for name in cameras]
 
 
 def read_poses(path: Path) -> PoseTable:
@@ -191,7 +161,8 @@ def _table(path: Path, head: list[str], body: list[list[str]]) -> PoseTable:
         clocks = np.tile(np.repeat([0.0, np.nan], len(cameras)), (len(body), 1))
     offsets, offset_sigmas = np.split(clocks / 1000, [len(cameras)], axis=1)
     covariance = np.zeros((len(body), 6, 6))
-    covariance[:, _UPPER[0], _UPPER[1]] = covariance[:, _UPPER[1], _UPPER[0]] = upper
+    rows, columns = UPPER_TRIANGLE
+    covariance[:, rows, columns] = covariance[:, columns, rows] = upper
     return PoseTable(
         stamps=stamps[:, 0],
         frames=frames[:, 0].astype(np.int64),
@@ -235,47 +206,41 @@ WOUND_COLUMNS = (
 )  # fmt: skip
 
 
-class WoundFile:
-    """Segments beside a run, in one thread, and writes what it finds; a sink of `hardware.offline.track.follow`."""
+class WoundFile(ExitStack):
+    """Segments the wound in a thread of its own and writes wound.csv; a sink of `hardware.offline.track.follow`."""
 
     def __init__(self, folder: Path, rig: Rig, segmenter: Segmenter) -> None:
         from perception.tracking.wound_step import SEGMENTATION_DELAY_SETS, AsyncSegmentation  # loads onnxruntime
 
-        self._rig, self._thread = rig, ThreadPoolExecutor(1)
-        self._beside = AsyncSegmentation(rig, segmenter, self._thread)
+        super().__init__()
+        self._rig, thread = rig, ThreadPoolExecutor(1)
+        self._segmentation = AsyncSegmentation(rig, segmenter, thread)
         self._poses: deque[SurfacePose] = deque(maxlen=SEGMENTATION_DELAY_SETS + 1)
-        self._stream = (folder / WOUND_FILE_NAME).open("w", newline="", encoding="utf-8")
+        self._stream = self.enter_context((folder / WOUND_FILE_NAME).open("w", newline="", encoding="utf-8"))
+        self.callback(thread.shutdown, cancel_futures=True)
         self._table = csv.writer(self._stream, lineterminator="\n")
         self._table.writerow(WOUND_COLUMNS)
 
     def write(self, frames: FrameSet, pose: SurfacePose, report: StepReport) -> None:
-        """One frame set and its pose; rows of earlier pictures where a look at them is done."""
+        """One frame set and its pose; writes rows of earlier pictures once their segmentation is done."""
         self._poses.append(pose)
-        due = self._beside(frames)
-        if due is None:
+        done = self._segmentation(frames)
+        if done is None:
             return
-        stamp, sights = due
-        measured = [p for p in self._poses if p.stamp == stamp and p.state.measured]
-        for camera, sight in sights.items():
-            self._table.writerow(self._row(stamp, camera, sight, measured[0] if measured else None))
+        stamp, estimates = done
+        measured = next((p for p in self._poses if p.stamp == stamp and p.state.measured), None)
+        for camera, estimate in estimates.items():
+            self._table.writerow(self._row(stamp, camera, estimate, measured))
         self._stream.flush()
 
-    def _row(self, stamp: float, camera: int, sight: WoundEstimate, pose: SurfacePose | None) -> list[str | int]:
+    def _row(self, stamp: float, camera: int, wound: WoundEstimate, pose: SurfacePose | None) -> list[str | int]:
         from perception.wound.segmentation import area_on_plane
 
-        area = np.nan
-        if pose is not None and sight.box is not None:
-            area = area_on_plane(sight.mask, self._rig.cameras[camera], pose.base_from_surface)
-        visible = sight.box is not None
-        middle = [f"{value:.2f}" for value in sight.centroid] if visible else ["", ""]
+        area, visible = np.nan, wound.box is not None
+        if pose is not None and visible:
+            area = area_on_plane(wound.mask, self._rig.cameras[camera], pose.base_from_surface)
+        middle = [f"{value:.2f}" for value in wound.centroid] if visible else ["", ""]
         return [
-            f"{stamp:.6f}", self._rig.cameras[camera].name, int(visible), f"{sight.confidence:.4f}", sight.missed,
-            int(sight.mask.sum()), f"{area:.2f}" if np.isfinite(area) else "", *middle, *sight.roi,
+            f"{stamp:.6f}", self._rig.cameras[camera].name, int(visible), f"{wound.confidence:.4f}", wound.missed,
+            int(wound.mask.sum()), f"{area:.2f}" if np.isfinite(area) else "", *middle, *wound.roi,
         ]  # fmt: skip
-
-    def __enter__(self) -> WoundFile:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._thread.shutdown(cancel_futures=True)
-        self._stream.close()

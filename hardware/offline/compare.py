@@ -1,8 +1,8 @@
-"""`stillbed compare`: absolute and relative errors of poses as evo counts them, as text, JSON and page.
+"""`stillbed compare`: absolute and relative pose errors (APE, RPE, NEES) as evo counts them, as text, JSON and page.
 
-The metrics are those of Sturm et al. (IROS 2012) and Zhang and Scaramuzza (IROS 2018). evo itself draws in pandas,
-matplotlib and seaborn; its numbers are a page of arithmetic, and a test holds ours to them. Scale is never fitted:
-lengths here are calibrated mm.
+The metrics are those of Sturm et al. (IROS 2012) and Zhang and Scaramuzza (IROS 2018). evo needs pandas, matplotlib and
+seaborn for a page of arithmetic; a test compares our figures with its own. Scale is never fitted: lengths are
+calibrated mm.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +26,17 @@ from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, component
 from hardware.report.summary import figure, finite, percent
 
 ALIGNMENTS = ("as they stand", "aligned, SE(3)", "one surface frame", "laid at one pose")
-HELD_SIGMA_MM = 1e-3  # mm, one standard deviation in all: less is claimed of no pose that was measured
-UNFITTED_ALIGNMENTS = ALIGNMENTS[0], ALIGNMENTS[3]  # under which covariances mean what they say: nothing is fitted
+FIXED_POSE_SIGMA_MM = (
+    1e-3  # mm, of all axes: a smaller one is reported only of the pose that a smoothed run holds fixed
+)
+UNFITTED_ALIGNMENTS = ALIGNMENTS[0], ALIGNMENTS[3]  # those that covariances can be checked under: nothing is fitted
 RowNumbers = NDArray[np.int64]
-MIN_PAIRS = 3  # pairs: of fewer an alignment would leave nothing
+MIN_PAIRS = 3  # pairs of poses: fewer are aligned without a residual
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorStatistics:
-    """The figures that evo gives of errors, in their own unit; NaN where there are none."""
+    """evo's statistics of errors, in their own unit (sse: its square); NaN where there are no errors."""
 
     rmse: float
     mean: float
@@ -47,52 +49,57 @@ class ErrorStatistics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativeErrors:
-    """Errors of the change over `delta` poses, (P,) mm and rad. rows: (P,) of the poses at which each change ends."""
+    """Errors of the change from a pose to the one `delta` poses later, P changes."""
 
-    rows: RowNumbers
-    translation: Array
-    rotation: Array
+    rows: RowNumbers  # (P,) of the poses at which each change ends
+    translation: Array  # (P,) mm
+    rotation: Array  # (P,) rad
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlignedErrors:
-    """The errors under one alignment."""
+    """The errors of M poses under one alignment."""
 
     name: str  # of ALIGNMENTS
-    estimated: Array  # (M, 4, 4), aligned
-    reference: Array  # (M, 4, 4)
+    estimated: Array  # (M, 4, 4) mm, aligned
+    reference: Array  # (M, 4, 4) mm
     absolute: PoseErrors  # APE and NEES
     relative: RelativeErrors  # RPE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrajectoryComparison:
-    """Poses beside others of the same instants."""
+    """Estimated poses and the reference's at the same instants, M pairs."""
 
     estimated: PoseSeries
     reference: PoseSeries
-    stamps: Array  # (M,) s, of the estimated ones
-    gap: float  # s, median distance of the stamps that belong together
+    stamps: Array  # (M,) s, of the estimated poses
+    gap: float  # s, median difference of the two stamps of a pair
     delta: int  # poses between the two of a relative error
-    judged: tuple[AlignedErrors, ...]  # without the SE(3) alignment where positions do not determine it
+    alignments: tuple[AlignedErrors, ...]  # in order; without SE(3) where the positions do not determine it
 
     def of(self, name: str) -> AlignedErrors | None:
-        """The alignment of that name, None where there is none."""
-        return next((each for each in self.judged if each.name == name), None)
+        """The errors under the alignment of that name, None where it is left out."""
+        return next((each for each in self.alignments if each.name == name), None)
 
     @property
     def fitted(self) -> AlignedErrors:
         """In one surface frame, the one that fits best."""
-        return self.judged[-2]
+        return self.alignments[-2]
 
     @property
-    def laid(self) -> AlignedErrors:
+    def at_one_pose(self) -> AlignedErrors:
         """In the surface frame of one pose."""
-        return self.judged[-1]
+        return self.alignments[-1]
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last stamp, s."""
+        return float(self.stamps[0]), float(self.stamps[-1])
 
 
 def error_statistics(errors: Array) -> ErrorStatistics:
-    """The figures of errors (M,)."""
+    """The statistics of errors (M,)."""
     if not len(errors):
         return ErrorStatistics(*[float("nan")] * 7)
     square = errors**2
@@ -104,16 +111,16 @@ def compare(estimated: PoseSeries, reference: PoseSeries, delta: int = 1) -> Tra
     """The estimated poses evaluated against the reference, under each alignment.
 
     "As they stand": evo without options.
-    "Aligned, SE(3)": `evo_ape -a`, the rigid motion of the base that brings the positions nearest (Umeyama 1991); left
-        out where they lie on a line and do not determine it.
-    "One surface frame": the constant between the two runs' own surface frames that brings the poses nearest.
-    "Laid at one pose": that constant by one pose, whose error then is in all others. So are a run's covariances meant,
-        which lays its surface frame by its first pose or, smoothed, holds the pose that did.
+    "Aligned, SE(3)": `evo_ape -a`, the rigid motion of the base that fits the positions best (Umeyama 1991); left out
+        where they lie on a line and do not determine it.
+    "One surface frame": the constant transform between the two runs' surface frames that fits the poses best.
+    "Laid at one pose": that constant by one pose, whose error then is in all others. A run's covariances are relative
+        to such a pose: its first one defines the surface frame, and smoothing holds the pose that did so fixed.
     delta: poses between the two of a relative error; the pairs follow one another, as evo's do.
     InputError where fewer than MIN_PAIRS poses belong together.
     """
-    rows, theirs = associate(estimated.trajectory.stamps, reference.trajectory.stamps)
-    rows, theirs = _one_to_one(rows, theirs, estimated.trajectory.stamps, reference.trajectory.stamps)
+    stamps, their_stamps = estimated.trajectory.stamps, reference.trajectory.stamps
+    rows, theirs = _one_to_one(*associate(stamps, their_stamps), stamps, their_stamps)
     if len(rows) < max(MIN_PAIRS, delta + 1):
         need = f"{max(MIN_PAIRS, delta + 1)} or more: are both of the same recording, and on one clock?"
         raise InputError(estimated.name, f"poses at instants of {reference.name}", len(rows), need)
@@ -124,28 +131,24 @@ def compare(estimated: PoseSeries, reference: PoseSeries, delta: int = 1) -> Tra
         motion = se3.rigid_from_points(ours[:, :3, 3], target[:, :3, 3])
         pairs.append((ALIGNMENTS[1], motion @ ours, target))
     changes = se3.inverse(target) @ ours
-    pairs += [
-        (ALIGNMENTS[2], ours, target @ best_constant(changes)),
-        (ALIGNMENTS[3], ours, target @ changes[_held_row(covariance)]),
-    ]
-    judged = tuple(
+    pairs.append((ALIGNMENTS[2], ours, target @ best_constant(changes)))
+    pairs.append((ALIGNMENTS[3], ours, target @ changes[_fixed_row(covariance)]))
+    alignments = tuple(
         AlignedErrors(name, a, b, errors_under(np.eye(4), b, a, covariance), relative_errors(a, b, delta))
         for name, a, b in pairs
     )
-    gaps = np.abs(estimated.trajectory.stamps[rows] - reference.trajectory.stamps[theirs])
-    return TrajectoryComparison(
-        estimated, reference, estimated.trajectory.stamps[rows], float(np.median(gaps)), delta, judged
-    )
+    gap = float(np.median(np.abs(stamps[rows] - their_stamps[theirs])))
+    return TrajectoryComparison(estimated, reference, stamps[rows], gap, delta, alignments)
 
 
-def _held_row(covariance: Array) -> int:
-    """The pose that a smoothed run holds, of which next to nothing is claimed (M, 6, 6); the first where none is."""
+def _fixed_row(covariance: Array) -> int:
+    """The row of the pose that a smoothed run holds fixed, by its tiny covariance (M, 6, 6); 0 where there is none."""
     size = np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2)
-    return int(np.argmin(size)) if np.isfinite(size).all() and size.min() < HELD_SIGMA_MM**2 else 0
+    return int(np.argmin(size)) if np.isfinite(size).all() and size.min() < FIXED_POSE_SIGMA_MM**2 else 0
 
 
 def relative_errors(estimated: Array, reference: Array, delta: int) -> RelativeErrors:
-    """Of poses (M, 4, 4): how far the change from each to the one `delta` later is off, pairs end to end."""
+    """Errors of the change from each pose (M, 4, 4) to the one `delta` later, the pairs end to end."""
     ends = np.arange(0, len(estimated), delta, dtype=np.int64)
     change, expected = (se3.inverse(p[ends[:-1]]) @ p[ends[1:]] for p in (estimated, reference))
     off = se3.inverse(expected) @ change
@@ -155,15 +158,15 @@ def relative_errors(estimated: Array, reference: Array, delta: int) -> RelativeE
 def _one_to_one(
     rows: RowNumbers, theirs: RowNumbers, stamps: Array, their_stamps: Array
 ) -> tuple[RowNumbers, RowNumbers]:
-    """Each of the reference's rows once, with the nearest of those that chose it."""
+    """The pairs in which each row of the reference is used once, with the nearest of the rows associated with it."""
     order = np.lexsort((np.abs(stamps[rows] - their_stamps[theirs]), theirs))
     _, first = np.unique(theirs[order], return_index=True)
-    kept = np.sort(order[first])
-    return rows[kept], theirs[kept]
+    nearest = np.sort(order[first])
+    return rows[nearest], theirs[nearest]
 
 
 def _rotation_determined(a: Array, b: Array) -> bool:
-    """Whether positions (M, 3) tell a rotation between them: evo's own condition."""
+    """Whether positions (M, 3) determine the rotation between them: evo's condition."""
     sizes = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)) / len(a), compute_uv=False)
     return bool((sizes > np.finfo(float).eps).sum() >= 2)
 
@@ -178,61 +181,62 @@ ALIGNMENT_TEXT = (
 
 
 Errors = PoseErrors | RelativeErrors
-Line = tuple[str, Array, Errors]  # name of the alignment, stamps (M,) s, errors (M,)
+ErrorLine = tuple[str, Array, Errors]  # name of the alignment, stamps (M,) s, errors (M,)
 
 
-def comparison_verdict(compared: TrajectoryComparison) -> str:
-    """The verdict in words."""
-    words = [f"{len(compared.stamps)} of {len(compared.estimated)} poses have one beside them in the reference."]
-    if compared.gap > 1e-6:
-        words.append(f"Their stamps lie {figure(1000 * compared.gap)} ms apart (median).")
-    for judged in compared.judged[:-1]:
-        off = [error_statistics(values).rmse for _, values in _by_unit(judged.absolute)]
-        words.append(f"{judged.name.capitalize().replace('se(3)', 'SE(3)')}: {figure(off[0])} mm, {figure(off[1])}°.")
-    if compared.of(ALIGNMENTS[1]) is None:
+def comparison_verdict(comparison: TrajectoryComparison) -> str:
+    """The verdict in a few sentences."""
+    words = [f"{len(comparison.stamps)} of {len(comparison.estimated)} poses have one beside them in the reference."]
+    if comparison.gap > 1e-6:
+        words.append(f"Their stamps lie {figure(1000 * comparison.gap)} ms apart (median).")
+    for aligned in comparison.alignments[:-1]:
+        off = [error_statistics(values).rmse for _, values in _by_unit(aligned.absolute)]
+        words.append(f"{aligned.name.capitalize().replace('se(3)', 'SE(3)')}: {figure(off[0])} mm, {figure(off[1])}°.")
+    if comparison.of(ALIGNMENTS[1]) is None:
         words.append("The positions lie on a line and determine no SE(3) alignment.")
-    nees = compared.laid.absolute.mean_nees / 6
+    nees = comparison.at_one_pose.absolute.mean_nees / 6
     if np.isfinite(nees):
         words.append(f"NEES/6: {figure(nees)} laid at one pose, 1 where covariances are honest.")
     return " ".join(words)
 
 
-def comparison_text(compared: TrajectoryComparison) -> str:
+def comparison_text(comparison: TrajectoryComparison) -> str:
     """The verdict and the tables, for a terminal."""
-    lines = [comparison_verdict(compared), ""]
-    relative = f"RPE over {_poses(compared.delta)}"
-    for title, rows in (("APE", _absolute_rows(compared)), (relative, _relative_rows(compared))):
+    lines = [comparison_verdict(comparison), ""]
+    relative = f"RPE over {_poses(comparison.delta)}"
+    for title, rows in (("APE", _error_rows(comparison, "absolute")), (relative, _error_rows(comparison, "relative"))):
         lines.append(f"{title:<34}" + "".join(f"{name:>10}" for name in TABLE_HEAD[1:]))
         lines += [f"  {row[0]:<32}" + "".join(f"{cell:>10}" for cell in row[1:]) for row in rows]
     return "\n".join(lines)
 
 
-def comparison_figures(compared: TrajectoryComparison) -> dict[str, Any]:
+def comparison_figures(comparison: TrajectoryComparison) -> dict[str, Any]:
     """All figures by alignment: mm and degrees."""
     out: dict[str, Any] = {
-        "estimated": compared.estimated.name,
-        "reference": compared.reference.name,
-        "reference_is_exact": compared.reference.trajectory.exact,
-        "pairs": len(compared.stamps),
-        "stamp_gap_s": compared.gap,
-        "delta_poses": compared.delta,
+        "estimated": comparison.estimated.name,
+        "reference": comparison.reference.name,
+        "reference_is_exact": comparison.reference.trajectory.exact,
+        "pairs": len(comparison.stamps),
+        "stamp_gap_s": comparison.gap,
+        "delta_poses": comparison.delta,
     }
-    for judged in compared.judged:
-        out[judged.name] = {
-            "ape": _statistics(judged.absolute),
-            "rpe": _statistics(judged.relative),
-            "nees_over_6": judged.absolute.mean_nees / 6,
-            "nees_inside_95": judged.absolute.nees_inside,
+    for aligned in comparison.alignments:
+        out[aligned.name] = {
+            "ape": _statistics(aligned.absolute),
+            "rpe": _statistics(aligned.relative),
+            "nees_over_6": aligned.absolute.mean_nees / 6,
+            "nees_inside_95": aligned.absolute.nees_inside,
         }
     return out
 
 
-def comparison_page(compared: TrajectoryComparison) -> str:
+def comparison_page(comparison: TrajectoryComparison) -> str:
     """The page as HTML text."""
-    body = [_tiles(compared), _trajectory(compared), _absolute(compared), _relative(compared), _consistency(compared)]
-    title = f"{_short(compared.estimated.name)} by {_short(compared.reference.name)}"
+    parts = _tiles, _trajectory, _absolute, _relative, _consistency
+    body = [html for part in parts if (html := part(comparison))]
+    title = f"{_short(comparison.estimated.name)} by {_short(comparison.reference.name)}"
     footer = "Lengths in mm, time in s from the session's own clock; poses are base_from_surface. Scale is not fitted."
-    return document("stillbed compare", title, comparison_verdict(compared), [part for part in body if part], footer)
+    return document("stillbed compare", title, comparison_verdict(comparison), body, footer)
 
 
 def _by_unit(errors: Errors) -> tuple[tuple[str, Array], ...]:
@@ -244,96 +248,92 @@ def _statistics(errors: Errors) -> dict[str, Any]:
     return {name: asdict(error_statistics(values)) for name, (_, values) in zip(names, _by_unit(errors), strict=True)}
 
 
-def _tiles(compared: TrajectoryComparison) -> str:
-    tiles = [tile(str(len(compared.stamps)), "", "pairs of poses")]
-    for judged in compared.judged[:-1]:
-        rmse = error_statistics(judged.absolute.translation).rmse
-        tiles.append(tile(figure(1000 * rmse), "µm", f"APE {judged.name}, RMSE"))
-    nees = compared.laid.absolute.mean_nees / 6
+def _tiles(comparison: TrajectoryComparison) -> str:
+    tiles = [tile(str(len(comparison.stamps)), "", "pairs of poses")]
+    for aligned in comparison.alignments[:-1]:
+        rmse = error_statistics(aligned.absolute.translation).rmse
+        tiles.append(tile(figure(1000 * rmse), "µm", f"APE {aligned.name}, RMSE"))
+    nees = comparison.at_one_pose.absolute.mean_nees / 6
     if np.isfinite(nees):
-        tiles.append(tile(figure(nees), "", f"NEES / 6, {compared.laid.name}"))
+        tiles.append(tile(figure(nees), "", f"NEES / 6, {comparison.at_one_pose.name}"))
     return row_of_tiles(tiles)
 
 
-def _trajectory(compared: TrajectoryComparison) -> str:
-    judged, span = compared.fitted, _span(compared)
-    values, expected = (components(poses, judged.reference[0]) for poses in (judged.estimated, judged.reference))
+def _trajectory(comparison: TrajectoryComparison) -> str:
+    fitted = comparison.fitted
+    values, expected = (components(poses, fitted.reference[0]) for poses in (fitted.estimated, fitted.reference))
     names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
     plots = []
     for i in (0, 3, 1, 4, 2, 5):
         scale = spanning([values[:, i], expected[:, i]], 0.12, 0.5)
-        plot = Plot(HALF_CHART_WIDTH, 165, span, scale, label=names[i])
-        plot.line(compared.stamps, expected[:, i], "truth")
-        plot.line(compared.stamps, values[:, i], "estimate")
+        plot = Plot(HALF_CHART_WIDTH, 165, comparison.span, scale, label=names[i])
+        plot.line(comparison.stamps, expected[:, i], "truth")
+        plot.line(comparison.stamps, values[:, i], "estimate")
         plots.append(plot.svg())
-    sources = ("estimate", compared.estimated), ("truth", compared.reference)
+    sources = ("estimate", comparison.estimated), ("truth", comparison.reference)
     keys = legend([line_key(style, _short(series.name)) for style, series in sources])
     words = "The surface's origin in base and its rotation since the first pose, in one surface frame. Time in s."
     return section("Trajectories", words, f'{keys}<div class="two">{"".join(plots)}</div>')
 
 
-def _absolute(compared: TrajectoryComparison) -> str:
-    plots = _error_plots(compared, [(j.name, compared.stamps, j.absolute) for j in compared.judged])
-    table = figures_table(TABLE_HEAD, _absolute_rows(compared))
+def _absolute(comparison: TrajectoryComparison) -> str:
+    plots = _error_plots(comparison, [(j.name, comparison.stamps, j.absolute) for j in comparison.alignments])
+    table = figures_table(TABLE_HEAD, _error_rows(comparison, "absolute"))
     return section("Absolute pose error (APE)", ALIGNMENT_TEXT, plots + table)
 
 
-def _relative(compared: TrajectoryComparison) -> str:
-    name, errors = compared.fitted.name, compared.fitted.relative
-    plots = _error_plots(compared, [(name, compared.stamps[errors.rows], errors)])
-    over = _poses(compared.delta)
+def _relative(comparison: TrajectoryComparison) -> str:
+    name, errors = comparison.fitted.name, comparison.fitted.relative
+    plots = _error_plots(comparison, [(name, comparison.stamps[errors.rows], errors)])
+    over = _poses(comparison.delta)
     words = f"How far the change over {over} is off; an alignment of the base alone changes none of it."
-    return section("Relative pose error (RPE)", words, plots + figures_table(TABLE_HEAD, _relative_rows(compared)))
+    return section(
+        "Relative pose error (RPE)", words, plots + figures_table(TABLE_HEAD, _error_rows(comparison, "relative"))
+    )
 
 
-def _error_plots(compared: TrajectoryComparison, lines: list[Line]) -> str:
+def _error_plots(comparison: TrajectoryComparison, lines: list[ErrorLine]) -> str:
     plots = [legend([line_key(ALIGNMENT_STYLES[name], name) for name, _, _ in lines])]
     for unit, label in enumerate(("distance, mm", "angle, °")):
         values = [_by_unit(errors)[unit][1] for _, _, errors in lines]
         positive = np.concatenate([v[v > 1e-9] for v in values])
         high = max(float(positive.max(initial=0.0)) * 1.5, 1e-4)
         low = max(float(np.percentile(positive, 1)) / 2, high / 1e5) if len(positive) else high / 10
-        plot = Plot(PAGE_CHART_WIDTH, 170, _span(compared), (min(low, high / 10), high), log_y=True, label=label)
+        plot = Plot(PAGE_CHART_WIDTH, 170, comparison.span, (min(low, high / 10), high), log_y=True, label=label)
         for (name, stamps, _), errors in zip(lines, values, strict=True):
             plot.line(stamps, errors, ALIGNMENT_STYLES[name])
         plots.append(plot.svg())
     return "".join(plots)
 
 
-def _consistency(compared: TrajectoryComparison) -> str:
-    nees = compared.laid.absolute.nees
-    shown = np.isfinite(nees) & (nees > 1e-6)  # the first pose's is nothing by definition
+def _consistency(comparison: TrajectoryComparison) -> str:
+    nees = comparison.at_one_pose.absolute.nees
+    shown = np.isfinite(nees) & (nees > 1e-6)  # that of the one pose is zero by definition
     if not shown.any():
         return ""
     high = max(float(nees[shown].max()) * 1.3, 2 * NEES_BOUND)
     low = max(float(np.percentile(nees[shown], 1)) / 2, 1e-2)
-    label = f"NEES, {compared.laid.name}"
-    plot = Plot(PAGE_CHART_WIDTH, 170, _span(compared), (min(low, 1.0), high), log_y=True, label=label)
-    plot.line(compared.stamps[shown], nees[shown], "estimate")
+    label = f"NEES, {comparison.at_one_pose.name}"
+    plot = Plot(PAGE_CHART_WIDTH, 170, comparison.span, (min(low, 1.0), high), log_y=True, label=label)
+    plot.line(comparison.stamps[shown], nees[shown], "estimate")
     plot.level(NEES_BOUND, "95 %", "limit")
     plot.level(6.0, "6", "median")
-    unfitted = [judged for judged in compared.judged if judged.name in UNFITTED_ALIGNMENTS]
+    unfitted = [aligned for aligned in comparison.alignments if aligned.name in UNFITTED_ALIGNMENTS]
     rows = [[j.name, figure(j.absolute.mean_nees / 6), percent(j.absolute.nees_inside)] for j in unfitted]
     words = "Squared errors in parts of the covariance that is claimed; six on average where that is honest."
-    if not compared.reference.trajectory.exact:
+    if not comparison.reference.trajectory.exact:
         words += " The reference is no exact truth: its own error counts as well."
     table = figures_table(["", "NEES / 6", f"under {NEES_BOUND:.1f}, where 95 % should be"], rows)
     return section("Consistency (NEES)", words, plot.svg() + table)
 
 
-def _absolute_rows(compared: TrajectoryComparison) -> list[list[str]]:
-    return [row for judged in compared.judged for row in _rows(judged.name, judged.absolute)]
-
-
-def _relative_rows(compared: TrajectoryComparison) -> list[list[str]]:
-    return [row for judged in compared.judged for row in _rows(judged.name, judged.relative)]
-
-
-def _rows(name: str, errors: Errors) -> list[list[str]]:
+def _error_rows(comparison: TrajectoryComparison, kind: Literal["absolute", "relative"]) -> list[list[str]]:
+    """The rows of TABLE_HEAD: two for each alignment."""
     rows = []
-    for unit, values in _by_unit(errors):
-        s = error_statistics(values)
-        rows.append([f"{name}, {unit}", *(figure(v) for v in (s.rmse, s.mean, s.median, s.std, s.max))])
+    for aligned in comparison.alignments:
+        for unit, values in _by_unit(aligned.absolute if kind == "absolute" else aligned.relative):
+            s = error_statistics(values)
+            rows.append([f"{aligned.name}, {unit}", *(figure(v) for v in (s.rmse, s.mean, s.median, s.std, s.max))])
     return rows
 
 
@@ -345,24 +345,20 @@ def _short(name: str) -> str:
     return "/".join(Path(name).parts[-2:])
 
 
-def _span(compared: TrajectoryComparison) -> tuple[float, float]:
-    return float(compared.stamps[0]), float(compared.stamps[-1])
-
-
 def run_compare(estimated: str, reference: str | None, delta: int, out: Path | None) -> str:
-    """Judge `estimated` by `reference`, without one by the truth beside it; the figures as text."""
+    """Compare `estimated` with `reference`, by default with the truth beside it; the figures as text."""
     if delta < 1:
         raise InputError("command line", "--delta", delta, "1 or more poses")
     ours = read_pose_series(estimated)
     theirs = read_truth_series(estimated) if reference is None else read_pose_series(reference)
     if theirs.name == ours.name:
         raise InputError(ours.name, "poses", "the very ones they are judged by", "two different trajectories")
-    compared = compare(ours, theirs, delta)
-    report = comparison_text(compared)
+    comparison = compare(ours, theirs, delta)
+    report = comparison_text(comparison)
     if out is None:
         return report
     prepare_out(out, force=True)
-    figures = json.dumps(finite(comparison_figures(compared)), indent=2)
+    figures = json.dumps(finite(comparison_figures(comparison)), indent=2)
     (out / "compare.json").write_text(figures + "\n", encoding="utf-8")
-    (out / "report.html").write_text(comparison_page(compared), encoding="utf-8")
+    (out / "report.html").write_text(comparison_page(comparison), encoding="utf-8")
     return f"{report}\nreport: {out / 'report.html'}"

@@ -12,17 +12,17 @@ import glob
 import heapq
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
 from estimation.errors import InputError, StillbedError
 from estimation.pose import SurfacePose, TrackState
-from estimation.se3 import Array
 from hardware.files.folder_tables import (
+    PICTURE_SUFFIXES,
     read_rows,
     rows_from_trajectory,
     write_frames,
@@ -33,31 +33,25 @@ from hardware.files.folder_tables import (
 from hardware.files.rig_file import ImageSource, write_rig
 from hardware.files.session import HEAD_STAMP_TOLERANCE, FrameRef, Session
 from hardware.files.session_folder import TRUTH_FILES, truth_file
+from hardware.process.progress import ProgressReport, no_progress
 from hardware.recording.recorder import Recorder
 from hardware.recording.schemas import INFO, WARNING
 from hardware.recording.session_reader import open_session, read_truth_rows
 from perception.frames import Frame, FrameSet, Roi
 from perception.tracking.step import StepReport
 
-Progress = Callable[[int, int], None]  # images done, images in all
-
-_SUFFIX = {"png": ".png", "jpeg": ".jpg"}
-
-
-def _silent(done: int, total: int) -> None:
-    pass
-
 
 def import_folder(
     folder: str | Path,
     mcap_path: str | Path,
-    progress: Progress = _silent,
+    progress: ProgressReport = no_progress,
     overwrite: bool = False,
     jpeg_quality: int | None = None,
 ) -> None:
     """Turn a session folder into one .mcap file; `jpeg_quality` (0-100) stores images smaller and not exactly.
 
-    InputError where the folder is wrong or `mcap_path` exists and `overwrite` is not set.
+    progress: called with images done and images in all. InputError where the folder is wrong, or `mcap_path` exists and
+    `overwrite` is not set.
     """
     folder, target = Path(folder), Path(mcap_path)
     if not folder.is_dir():
@@ -80,11 +74,11 @@ def import_folder(
             part.unlink()
 
 
-def export_recording(mcap_path: str | Path, folder: str | Path, progress: Progress = _silent) -> str:
-    """Turn an .mcap file into a session folder with a picture per image; returns what was lost of it, "" if nothing.
+def export_recording(mcap_path: str | Path, folder: str | Path, progress: ProgressReport = no_progress) -> str:
+    """Turn an .mcap file into a session folder with a picture per image; returns the damage of the file, "" if none.
 
-    InputError unless `folder` is new or empty.
-    Poses, commands and arm bytes of a run have no place in a session folder; they stay in the recording.
+    InputError unless `folder` is new or empty. Poses, commands and arm bytes of a run have no place in a session
+    folder; they stay in the recording.
     """
     source, target = Path(mcap_path), Path(folder)
     if source.is_dir():
@@ -110,27 +104,31 @@ def _part_name(target: Path) -> Path:
     return target.parent / f".{target.name}.{os.getpid()}.part"
 
 
-def _record(session: Session, folder: Path, recorder: Recorder, progress: Progress, exact: bool) -> None:
+Entry = tuple[float, int, Callable[[], None]]  # stamp, s; rank among entries of one stamp; writes the entry
+
+
+def _record(session: Session, folder: Path, recorder: Recorder, progress: ProgressReport, exact: bool) -> None:
     """Everything in order of stamp, so that viewers need not sort."""
     if session.surface is not None:
         recorder.surface(session.surface)
-    reader, done, total = session.store.open(), 0, sum(map(len, session.sets))
+    reader, refs = session.store.open(), _refs(session)
 
-    def image(ref: FrameRef) -> None:
-        nonlocal done
+    def image(done: int, ref: FrameRef) -> None:
         encoded = reader.encoded(ref) if exact else None
         if encoded is None:
             recorder.frame(Frame(ref.camera, ref.stamp, reader.read(ref)), ref.camera_stamp)
         else:
             recorder.encoded_frame(ref.camera, ref.stamp, *encoded, ref.camera_stamp)
-        done += 1
-        progress(done, total)
+        progress(done, len(refs))
 
-    streams = [
-        _rois(session, recorder.write),
-        _truth(folder, recorder.truth_row),
-        _heads(session, recorder.head_row),
-        _images(session, image),
+    truth = truth_file(folder)
+    truth_rows, exact_truth = ((), False) if truth is None else (read_rows(truth[0]), truth[1])
+    heads = zip(session.heads.rows, session.heads.extruding, strict=True)
+    streams: list[Iterable[Entry]] = [
+        ((roi.stamp, 0, partial(recorder.write, roi)) for roi in sorted(session.roi, key=lambda roi: roi.stamp)),
+        ((float(row[0]), 1, partial(recorder.truth_row, row, exact_truth)) for row in truth_rows),
+        ((float(row[0]), 2, partial(recorder.head_row, row, bool(extruding))) for row, extruding in heads),
+        ((ref.stamp, 3, partial(image, done, ref)) for done, ref in enumerate(refs, 1)),
     ]
     try:
         for _, _, write in heapq.merge(*streams, key=lambda entry: entry[:2]):
@@ -139,32 +137,12 @@ def _record(session: Session, folder: Path, recorder: Recorder, progress: Progre
         reader.close()
 
 
-Entry = tuple[float, int, Callable[[], None]]  # stamp, s; which goes first; writes it
+def _refs(session: Session) -> list[FrameRef]:
+    """Every stored image, in order of stamp and camera."""
+    return sorted((ref for refs in session.sets for ref in refs), key=lambda ref: (ref.stamp, ref.camera))
 
 
-def _rois(session: Session, write: Callable[[Roi], None]) -> Iterator[Entry]:
-    return ((roi.stamp, 0, partial(write, roi)) for roi in sorted(session.roi, key=lambda r: r.stamp))
-
-
-def _truth(folder: Path, write: Callable[[Array, bool], None]) -> Iterator[Entry]:
-    found = truth_file(folder)
-    if found is None:
-        return iter(())
-    path, exact = found
-    return ((float(row[0]), 1, partial(write, row, exact)) for row in read_rows(path))
-
-
-def _heads(session: Session, write: Callable[[Array, bool], None]) -> Iterator[Entry]:
-    pairs = zip(session.heads.rows, session.heads.extruding, strict=True)
-    return ((float(row[0]), 2, partial(write, row, bool(extruding))) for row, extruding in pairs)
-
-
-def _images(session: Session, write: Callable[[FrameRef], None]) -> Iterator[Entry]:
-    refs = (ref for refs in session.sets for ref in refs)
-    return ((ref.stamp, 3, partial(write, ref)) for ref in sorted(refs, key=lambda r: (r.stamp, r.camera)))
-
-
-def _write_folder(session: Session, folder: Path, progress: Progress) -> None:
+def _write_folder(session: Session, folder: Path, progress: ProgressReport) -> None:
     rig, refs = session.rig, _renumbered(session)
     write_rig(folder / "rig.toml", rig, [ImageSource("images", f"{glob.escape(c.name)}/*") for c in rig.cameras])
     write_frames(folder / "frames.csv", rig, [new for _, new in refs])
@@ -181,7 +159,9 @@ def _write_folder(session: Session, folder: Path, progress: Progress) -> None:
     _write_pictures(session, folder, refs, progress)
 
 
-def _write_pictures(session: Session, folder: Path, refs: list[tuple[FrameRef, FrameRef]], progress: Progress) -> None:
+def _write_pictures(
+    session: Session, folder: Path, refs: list[tuple[FrameRef, FrameRef]], progress: ProgressReport
+) -> None:
     for camera in session.rig.cameras:
         (folder / camera.name).mkdir()
     reader = session.store.open()
@@ -190,20 +170,20 @@ def _write_pictures(session: Session, folder: Path, refs: list[tuple[FrameRef, F
             encoded = reader.encoded(ref)
             assert encoded is not None
             kind, data = encoded
-            if kind not in _SUFFIX:
-                raise InputError(session.path, "image format", kind, f"one of {', '.join(_SUFFIX)}")
+            if kind not in PICTURE_SUFFIXES:
+                raise InputError(session.path, "image format", kind, f"one of {', '.join(PICTURE_SUFFIXES)}")
             name = session.rig.cameras[ref.camera].name
-            (folder / name / f"{new.number:06d}{_SUFFIX[kind]}").write_bytes(data)
+            (folder / name / f"{new.number:06d}{PICTURE_SUFFIXES[kind]}").write_bytes(data)
             progress(done, len(refs))
     finally:
         reader.close()
 
 
 def _renumbered(session: Session) -> list[tuple[FrameRef, FrameRef]]:
-    """Every stored image with its number counted anew by stamp, from 0 in each camera; in order of stamp."""
+    """Every stored image beside itself with a new number, counted by stamp from 0 in each camera; in order of stamp."""
     counts = [0] * len(session.rig)
     pairs = []
-    for ref in sorted((ref for refs in session.sets for ref in refs), key=lambda r: (r.stamp, r.camera)):
+    for ref in _refs(session):
         pairs.append((ref, FrameRef(ref.camera, counts[ref.camera], ref.camera_stamp, ref.stamp)))
         counts[ref.camera] += 1
     return pairs
@@ -219,15 +199,14 @@ def _frame_at(session: Session, roi: Roi, refs: list[tuple[FrameRef, FrameRef]])
 
 
 class TrackRecorder:
-    """Writes images, tracks, poses and state changes as they pass, and beside them what the session knows."""
+    """Records a tracking run: images, tracks, poses, state changes, and the session's truth, print heads and scan."""
 
     def __init__(self, path: Path, session: Session, overwrite: bool) -> None:
         """Create the file at `path`; InputError where it exists and `overwrite` is not set."""
         self._recorder = Recorder(path, session.rig, overwrite=overwrite)
-        self._truth = np.empty((0, 8)) if session.truth is None else rows_from_trajectory(session.truth)
+        self._truth = deque(() if session.truth is None else rows_from_trajectory(session.truth))
         self._exact = session.truth is not None and session.truth.exact
-        self._heads = session.heads
-        self._next_truth, self._next_head = 0, 0
+        self._heads = deque(zip(session.heads.rows, session.heads.extruding, strict=True))
         self._state: TrackState | None = None
         if session.surface is not None:
             self._recorder.surface(session.surface)
@@ -236,8 +215,7 @@ class TrackRecorder:
 
     def write(self, frames: FrameSet, pose: SurfacePose, report: StepReport) -> None:
         """One frame set, its pose and tracks, and truth and print heads up to its stamp."""
-        self._write_truth(frames.stamp)
-        self._write_heads(frames.stamp + HEAD_STAMP_TOLERANCE)  # the row of this very frame set included
+        self._write_session_rows(frames.stamp)
         for frame in frames.frames:
             self._recorder.write(frame)
         self._recorder.write(report.observations)
@@ -247,22 +225,18 @@ class TrackRecorder:
             self._recorder.event(pose.stamp, f"{pose.state.value}: {pose.reason}", level, "tracking")
             self._state = pose.state
 
-    def _write_truth(self, until: float) -> None:
-        while self._next_truth < len(self._truth) and self._truth[self._next_truth, 0] <= until:
-            self._recorder.truth_row(self._truth[self._next_truth], self._exact)
-            self._next_truth += 1
-
-    def _write_heads(self, until: float) -> None:
-        """As stored: what a frame set holds of a head has been turned into a matrix."""
-        while self._next_head < len(self._heads) and self._heads.rows[self._next_head, 0] <= until:
-            self._recorder.head_row(self._heads.rows[self._next_head], bool(self._heads.extruding[self._next_head]))
-            self._next_head += 1
+    def _write_session_rows(self, until: float) -> None:
+        """Write truth and print heads, as the session stores them, up to those of a frame set at `until`, s."""
+        while self._truth and self._truth[0][0] <= until:
+            self._recorder.truth_row(self._truth.popleft(), self._exact)
+        while self._heads and self._heads[0][0][0] <= until + HEAD_STAMP_TOLERANCE:
+            row, extruding = self._heads.popleft()
+            self._recorder.head_row(row, bool(extruding))
 
     def __enter__(self) -> TrackRecorder:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         with self._recorder:
             if error is None:
-                self._write_truth(np.inf)
-                self._write_heads(np.inf)
+                self._write_session_rows(np.inf)

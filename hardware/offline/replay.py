@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path as File
-from types import TracebackType
 
 import numpy as np
 
@@ -120,35 +120,25 @@ def _check_order(before: SurfacePose, after: SurfacePose | None) -> None:
         raise InputError("poses", "stamp", after.stamp, f"after the one before, {before.stamp} s")
 
 
-class CommandWriter:
+class CommandWriter(ExitStack):
     """Writes commands.csv and frames.bin into a folder, tick by tick; closes them as a context manager.
 
     commands.csv is for people, in degrees and mm/min; frames.bin holds the frames as sent, one after the other.
     """
 
     def __init__(self, folder: File) -> None:
-        self._table = (folder / "commands.csv").open("w", newline="", encoding="utf-8")
-        self._frames = (folder / "frames.bin").open("wb")
+        super().__init__()
+        self._table = self.enter_context((folder / "commands.csv").open("w", newline="", encoding="utf-8"))
+        self._frames = self.enter_context((folder / "frames.bin").open("wb"))
         self._csv = csv.writer(self._table, lineterminator="\n")
         self._csv.writerow(COMMAND_COLUMNS)
 
     def write(self, command: Command, frame: bytes) -> None:
-        """One tick; on the disk, as far as this process can see to it, when it returns."""
+        """Write one tick and flush both files."""
         self._csv.writerow(_row(command))
         self._frames.write(frame)
         self._table.flush()
         self._frames.flush()
-
-    def close(self) -> None:
-        """Close both files; a second call does nothing."""
-        self._table.close()
-        self._frames.close()
-
-    def __enter__(self) -> CommandWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self.close()
 
 
 def _row(command: Command) -> list[str]:

@@ -1,4 +1,4 @@
-"""report.html of a smoothed session: against the live run and the truth, its spectrum, and loops of other delays."""
+"""report.html of a smoothed session: errors against live run and truth, spectrum, errors by the loop's delay."""
 
 from __future__ import annotations
 
@@ -19,23 +19,27 @@ from hardware.report.summary import figure
 
 BREATHING_BAND_HZ = (0.1, 0.7)  # Hz: 6 to 42 breaths a minute
 PULSE_BAND_HZ = (0.75, 3.0)  # Hz: 45 to 180 beats a minute
-MIN_CYCLES = 4  # of a rhythm that a recording must hold for it to be named
-MIN_SPECTRUM_S = 10.0  # s: of a shorter recording nothing is said
+MIN_CYCLES = 4  # of a rhythm within the recording: slower ones are not reported
+MIN_SPECTRUM_S = 10.0  # s: of a shorter recording no rhythm is reported
 MIN_PEAK_POWER_RATIO = 8.0  # times the band's own median power: a peak that stands out
-HARMONIC_TOLERANCE = 0.08  # parts: a peak so near to a multiple of the breathing is the breathing's
+HARMONIC_TOLERANCE = 0.08  # of the breathing's rate: a peak so near to one of its multiples is a harmonic
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionSpectrum:
-    """hertz: (F,), amplitude: (F,) mm, of the motion along `direction` (3,) in base. breathing, pulse: Hz, nan where no
-    peak stands out.
-    """
+    """The spectrum of the motion along the direction in which the surface moves most."""
 
-    hertz: Array
-    amplitude: Array
-    direction: Array
-    breathing: float
-    pulse: float
+    hertz: Array  # (F,)
+    amplitude: Array  # (F,) mm
+    direction: Array  # (3,) in base
+    breathing: float  # Hz, nan where no peak stands out
+    pulse: float  # Hz, likewise
+
+    @property
+    def rhythms(self) -> tuple[tuple[str, float], ...]:
+        """Name and rate, Hz, of each rhythm that stands out."""
+        pairs = ("breathing", self.breathing), ("pulse", self.pulse)
+        return tuple((name, rate) for name, rate in pairs if np.isfinite(rate))
 
 
 def motion_spectrum(smoothed: Smoothed, rate: float = 30.0) -> MotionSpectrum:
@@ -65,26 +69,31 @@ def _peak(
         inside &= np.abs(times - np.round(times)) > HARMONIC_TOLERANCE * np.maximum(1.0, times / 4)
     peaks = np.zeros(len(hertz), bool)
     peaks[1:-1] = (amplitude[1:-1] > amplitude[:-2]) & (amplitude[1:-1] >= amplitude[2:])
-    found = np.flatnonzero(inside & peaks)
-    if not len(found) or seconds < MIN_SPECTRUM_S:
+    candidates = np.flatnonzero(inside & peaks)
+    if not len(candidates) or seconds < MIN_SPECTRUM_S:
         return float("nan")
-    best = found[amplitude[found].argmax()]
-    usual = np.median(amplitude[(hertz >= band[0]) & (hertz <= band[1])] ** 2)
-    clear = amplitude[best] ** 2 > MIN_PEAK_POWER_RATIO * usual
+    best = candidates[amplitude[candidates].argmax()]
+    median_power = np.median(amplitude[(hertz >= band[0]) & (hertz <= band[1])] ** 2)
+    clear = amplitude[best] ** 2 > MIN_PEAK_POWER_RATIO * median_power
     return float(hertz[best]) if clear else float("nan")
 
 
+def position_sigma(smoothed: Smoothed) -> Array:
+    """(K,) mm: one standard deviation of an axis of each position, the root mean square over the three axes."""
+    return np.asarray(np.sqrt(np.trace(smoothed.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3))
+
+
 LOOP_DELAYS_S = (0.02, 0.033, 0.05, 0.1, 0.15, 0.2, 0.3)  # s, from exposure to the nozzle's arrival
-LOOP_RATE_HZ = 60.0  # Hz, of the instants that a loop is asked at
+LOOP_RATE_HZ = 60.0  # Hz, of the instants at which a loop's error is taken
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveErrors:
-    """The live run's measured poses, after the constant between the surface frames that fits best."""
+    """The live run's measured poses, after the constant between the surface frames that fits best; M poses."""
 
-    rows: NDArray[np.int64]  # (M,) of the smoothed poses
-    poses: Array  # (M, 4, 4)
-    apart: Array  # (M, 6) right perturbations of the smoothed poses, rad and mm
+    rows: NDArray[np.int64]  # (M,) of the smoothed poses at the same instants
+    poses: Array  # (M, 4, 4) mm, in the smoothed poses' surface frame
+    errors: Array  # (M, 6) right perturbations of the smoothed poses, rad and mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,23 +102,28 @@ class SmoothEvaluation:
 
     live: LiveErrors | None  # None without measured poses
     errors: tuple[PoseErrors, PoseErrors | None] | None  # smoothed and live, against truth or reference
-    exact: bool  # whether that is a truth
-    late: Array  # (D, 4) mm, see `delay_errors`
+    exact: bool  # whether that is an exact truth
+    by_delay: Array  # (D, 4) mm, see `delay_errors`
     spectrum: MotionSpectrum
 
     @property
     def live_rms(self) -> float:
-        """RMS distance, mm, of live from smoothed poses; nan without."""
-        return float("nan") if self.live is None else float(np.sqrt((self.live.apart[:, 3:] ** 2).sum(1).mean()))
+        """RMS distance, mm, of live from smoothed poses; nan without a live run."""
+        return float("nan") if self.live is None else float(np.sqrt((self.live.errors[:, 3:] ** 2).sum(1).mean()))
+
+    @property
+    def rmse(self) -> tuple[float | None, float | None]:
+        """RMSE, mm, of the smoothed and of the live positions; None where they cannot be compared."""
+        smoothed, live = (None if e is None else spread(e.translation).rmse for e in self.errors or (None, None))
+        return smoothed, live
 
 
 def evaluate_smoothed(smoothed: Smoothed, tracks: SessionTracks, truth: Trajectory | None) -> SmoothEvaluation:
     """Errors, spectrum and delays of a smoothed session."""
     live = _live_errors(smoothed, tracks)
     errors = None if truth is None else _reference_errors(smoothed, live, truth)
-    return SmoothEvaluation(
-        live, errors, truth is not None and truth.exact, delay_errors(smoothed), motion_spectrum(smoothed)
-    )
+    exact = truth is not None and truth.exact
+    return SmoothEvaluation(live, errors, exact, delay_errors(smoothed), motion_spectrum(smoothed))
 
 
 def _live_errors(smoothed: Smoothed, tracks: SessionTracks) -> LiveErrors | None:
@@ -120,9 +134,8 @@ def _live_errors(smoothed: Smoothed, tracks: SessionTracks) -> LiveErrors | None
     if not len(rows):
         return None
     poses, ours = start.base_from_surface[theirs], smoothed.states.poses[rows]
-    constant = best_constant(se3.inverse(ours) @ poses)
-    laid = poses @ se3.inverse(constant)
-    return LiveErrors(rows, laid, se3.log(se3.inverse(ours) @ laid))
+    aligned = poses @ se3.inverse(best_constant(se3.inverse(ours) @ poses))
+    return LiveErrors(rows, aligned, se3.log(se3.inverse(ours) @ aligned))
 
 
 def _reference_errors(
@@ -131,47 +144,50 @@ def _reference_errors(
     rows, true_rows = associate(smoothed.stamps, truth.stamps)
     if not len(rows):
         return None
-    ours = _under(smoothed.states.poses[rows], truth.base_from_surface[true_rows], smoothed.covariance[rows, :6, :6])
+    covariance = smoothed.covariance[rows, :6, :6]
+    ours = _aligned_errors(smoothed.states.poses[rows], truth.base_from_surface[true_rows], covariance)
     if live is None:
         return ours, None
-    mine, of_truth = associate(smoothed.stamps[live.rows], truth.stamps)
-    unknown = np.full((len(mine), 6, 6), np.nan)
-    return ours, _under(live.poses[mine], truth.base_from_surface[of_truth], unknown) if len(mine) else None
+    rows, true_rows = associate(smoothed.stamps[live.rows], truth.stamps)
+    unknown = np.full((len(rows), 6, 6), np.nan)
+    return ours, _aligned_errors(live.poses[rows], truth.base_from_surface[true_rows], unknown) if len(rows) else None
 
 
-def _under(poses: Array, truth: Array, covariance: Array) -> PoseErrors:
+def _aligned_errors(poses: Array, truth: Array, covariance: Array) -> PoseErrors:
     return errors_under(best_constant(se3.inverse(truth) @ poses), truth, poses, covariance)
 
 
 def delay_errors(smoothed: Smoothed) -> Array:
-    """(D, 4) mm for each of LOOP_DELAYS_S: RMS and 95 % of the nozzle's error where the last pose is held, and where it
-    is extrapolated by its twist. The nozzle stands over the middle of the map, and the pose is known exactly."""
+    """(D, 4) mm, for each of LOOP_DELAYS_S RMS and 95th percentile of the nozzle's error, with the last pose held and
+    with it extrapolated by its twist. The nozzle stands over the middle of the map; smoothed poses are taken as exact.
+    """
     middle = np.median(smoothed.map.points, axis=0)
     first, last = smoothed.stamps[[0, -1]]
     out = np.full((len(LOOP_DELAYS_S), 4), np.nan)
     times = np.arange(first, last, 1 / LOOP_RATE_HZ)
     now = smoothed.at(times)
     for i, delay in enumerate(LOOP_DELAYS_S):
-        kept = times + delay <= last
-        if not kept.any():
+        inside = times + delay <= last
+        if not inside.any():
             continue
-        then = smoothed.at(times[kept] + delay).base_from_surface
-        held = now.base_from_surface[kept]
-        carried = held @ se3.exp(now.twist[kept] * delay)
-        true = se3.transform_points(then, middle[None])[:, 0]
-        for j, guess in enumerate((held, carried)):
-            off = np.linalg.norm(se3.transform_points(guess, middle[None])[:, 0] - true, axis=1)
-            out[i, 2 * j : 2 * j + 2] = np.sqrt(np.mean(off**2)), np.percentile(off, 95)
+        later = smoothed.at(times[inside] + delay).base_from_surface
+        held = now.base_from_surface[inside]
+        extrapolated = held @ se3.exp(now.twist[inside] * delay)
+        true = se3.transform_points(later, middle[None])[:, 0]
+        for j, predicted in enumerate((held, extrapolated)):
+            error = np.linalg.norm(se3.transform_points(predicted, middle[None])[:, 0] - true, axis=1)
+            out[i, 2 * j : 2 * j + 2] = np.sqrt(np.mean(error**2)), np.percentile(error, 95)
     return out
 
 
-RESIDUAL_PARTS = 4  # of the recording, whose residuals stand side by side: what a camera drifts by shows there
-MAX_SPECTRUM_HZ = 5.0  # Hz, of the spectrum shown
+RESIDUAL_PARTS = 4  # parts of the recording whose residuals stand side by side: there a camera's drift shows
+MAX_SPECTRUM_HZ = 5.0  # Hz, of the spectrum on the page
+SPREAD_HEAD = ("", "median", "RMSE", "95 %", "max")
 
 
 def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
-    """The verdict in words."""
-    sigma = float(np.median(np.sqrt(np.trace(result.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)))
+    """The verdict in a few sentences."""
+    sigma = float(np.median(position_sigma(result)))
     words = [
         f"{len(result)} poses and {len(result.map)} landmarks over {result.stamps[-1] - result.stamps[0]:.1f} s; "
         f"an axis of a position is known to {figure(sigma)} mm (median, one sigma)."
@@ -179,49 +195,41 @@ def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
     if evaluation.live is not None:
         words.append(f"The live run stood {figure(evaluation.live_rms)} mm off (RMS).")
     if evaluation.errors is not None:
-        ours, live = (None if e is None else figure(spread(e.translation).rmse) for e in evaluation.errors)
-        beside = "" if live is None else f", live {live} mm"
-        words.append(f"Against the {_other(evaluation)}: {ours} mm{beside} (RMS, aligned).")
-    for name, rate in (("Breathing", evaluation.spectrum.breathing), ("Pulse", evaluation.spectrum.pulse)):
-        if np.isfinite(rate):
-            words.append(f"{name}: {60 * rate:.1f} a minute.")
+        ours, live = (None if rmse is None else figure(rmse) for rmse in evaluation.rmse)
+        live_text = "" if live is None else f", live {live} mm"
+        words.append(f"Against the {_reference_name(evaluation)}: {ours} mm{live_text} (RMS, aligned).")
+    words += [f"{name.capitalize()}: {60 * rate:.1f} a minute." for name, rate in evaluation.spectrum.rhythms]
     return " ".join(words)
 
 
 def smooth_page(title: str, words: str, result: Smoothed, evaluation: SmoothEvaluation) -> str:
     """The page as HTML text. words: the verdict."""
     body = [_tiles(result, evaluation), _trajectory(result, evaluation), _live(result, evaluation), _errors(evaluation)]
-    body += [_residuals(result), _spectrum(evaluation.spectrum), _what_if(evaluation), _cameras(result)]
+    body += [_residuals(result), _spectrum(evaluation.spectrum), _errors_by_delay(evaluation), _cameras(result)]
     footer = "Lengths in mm, time in s from the session's own clock; poses are base_from_surface."
     return document("stillbed smooth", title, words, [part for part in body if part], footer)
 
 
-def _other(evaluation: SmoothEvaluation) -> str:
+def _reference_name(evaluation: SmoothEvaluation) -> str:
     return "exact truth" if evaluation.exact else "measured reference"
 
 
 def _tiles(result: Smoothed, evaluation: SmoothEvaluation) -> str:
-    sigma = np.sqrt(np.trace(result.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)
-    tiles = [tile(figure(1000 * float(np.median(sigma))), "µm", "one sigma of an axis, median")]
+    tiles = [tile(figure(1000 * float(np.median(position_sigma(result)))), "µm", "one sigma of an axis, median")]
     if evaluation.live is not None:
         tiles.append(tile(figure(1000 * evaluation.live_rms), "µm", "live against smoothed, RMS"))
-    for name, rate in (
-        ("breaths a minute", evaluation.spectrum.breathing),
-        ("beats a minute", evaluation.spectrum.pulse),
-    ):
-        if np.isfinite(rate):
-            tiles.append(tile(f"{60 * rate:.1f}", "", name))
+    labels = {"breathing": "breaths a minute", "pulse": "beats a minute"}
+    tiles += [tile(f"{60 * rate:.1f}", "", labels[name]) for name, rate in evaluation.spectrum.rhythms]
     return row_of_tiles(tiles)
 
 
 def _trajectory(result: Smoothed, evaluation: SmoothEvaluation) -> str:
     values = components(result.states.poses, result.states.poses[0])
     sigma = 2 * deviations(result.states.poses, result.covariance[:, :6, :6])
-    span = float(result.stamps[0]), float(result.stamps[-1])
     names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
     plots = []
     for i in (0, 3, 1, 4, 2, 5):
-        plot = Plot(HALF_CHART_WIDTH, 165, span, spanning([values[:, i]], 0.12, 0.5), label=names[i])
+        plot = Plot(HALF_CHART_WIDTH, 165, _span(result), spanning([values[:, i]], 0.12, 0.5), label=names[i])
         plot.band(result.stamps, values[:, i] - sigma[:, i], values[:, i] + sigma[:, i], "spread")
         plot.line(result.stamps, values[:, i], "estimate")
         plots.append(plot.svg())
@@ -230,21 +238,29 @@ def _trajectory(result: Smoothed, evaluation: SmoothEvaluation) -> str:
     return section("Trajectory", text, f'{keys}<div class="two">{"".join(plots)}</div>')
 
 
+def _span(result: Smoothed) -> tuple[float, float]:
+    return float(result.stamps[0]), float(result.stamps[-1])
+
+
+def _spread_row(name: str, values: Array) -> list[str]:
+    s = spread(values)
+    return [name, *(figure(v) for v in (s.median, s.rmse, s.p95, s.max))]
+
+
 def _live(result: Smoothed, evaluation: SmoothEvaluation) -> str:
     if evaluation.live is None:
         return ""
-    apart = evaluation.live.apart
-    stamps, span = result.stamps[evaluation.live.rows], (float(result.stamps[0]), float(result.stamps[-1]))
-    distance = np.linalg.norm(apart[:, 3:], axis=1)
-    turn = np.degrees(np.linalg.norm(apart[:, :3], axis=1))
+    errors, stamps = evaluation.live.errors, result.stamps[evaluation.live.rows]
+    distance = np.linalg.norm(errors[:, 3:], axis=1)
+    turn = np.degrees(np.linalg.norm(errors[:, :3], axis=1))
     plots, rows = [], []
     for values, name, unit in ((1000 * distance, "distance, µm", "µm"), (turn, "angle, °", "°")):
-        plot = Plot(PAGE_CHART_WIDTH, 150, span, (0.0, max(float(values.max()) * 1.08, 1e-3)), label=name)
+        scale = 0.0, max(float(values.max()) * 1.08, 1e-3)
+        plot = Plot(PAGE_CHART_WIDTH, 150, _span(result), scale, label=name)
         plot.line(stamps, values, "estimate")
         plots.append(plot.svg())
-        s = spread(values)
-        rows.append([f"live from smoothed, {unit}", *(figure(v) for v in (s.median, s.rmse, s.p95, s.max))])
-    table = figures_table(["", "median", "RMSE", "95 %", "max"], rows)
+        rows.append(_spread_row(f"live from smoothed, {unit}", values))
+    table = figures_table(SPREAD_HEAD, rows)
     text = "The causal run's measured poses, after the constant between the two surface frames that fits best."
     return section("Live against smoothed", text, "".join(plots) + table)
 
@@ -255,57 +271,53 @@ def _errors(evaluation: SmoothEvaluation) -> str:
     rows = []
     for name, errors in zip(("smoothed", "live"), evaluation.errors, strict=True):
         if errors is not None:
-            for unit, values in (("mm", errors.translation), ("°", np.degrees(errors.rotation))):
-                s = spread(values)
-                rows.append([f"{name}, {unit}", *(figure(v) for v in (s.median, s.rmse, s.p95, s.max))])
-    text = f"Against the {_other(evaluation)}, aligned: the best constant over the run."
-    return section("Errors", text, figures_table(["", "median", "RMSE", "95 %", "max"], rows))
+            rows.append(_spread_row(f"{name}, mm", errors.translation))
+            rows.append(_spread_row(f"{name}, °", np.degrees(errors.rotation)))
+    text = f"Against the {_reference_name(evaluation)}, aligned: the best constant over the run."
+    return section("Errors", text, figures_table(SPREAD_HEAD, rows))
 
 
 def _residuals(result: Smoothed) -> str:
-    rms, span = result.fitted.rms, (float(result.stamps[0]), float(result.stamps[-1]))
+    rms = result.fitted.rms
     top = float(np.nanpercentile(rms, 99.5)) * 1.15 if np.isfinite(rms).any() else 1.0
-    plot = Plot(PAGE_CHART_WIDTH, 170, span, (0.0, max(top, 0.05)), label="residual, px RMS")
+    plot = Plot(PAGE_CHART_WIDTH, 170, _span(result), (0.0, max(top, 0.05)), label="residual, px RMS")
     keys, rows = [], []
     parts = np.array_split(np.arange(len(result)), RESIDUAL_PARTS)
     used, seen = result.fitted.used.sum(0), result.fitted.seen.sum(0)
     for i, camera in enumerate(result.rig.cameras):
         plot.line(result.stamps, rms[:, i], f"series c{i % 5}")
         keys.append(line_key(f"series c{i % 5}", camera.name))
-        shares = [_mean(rms[part, i]) for part in parts]
-        rows.append([camera.name, *(figure(v) for v in shares), f"{100 * used[i] / max(seen[i], 1):.1f} %"])
+        by_part = [_root_mean_square(rms[part, i]) for part in parts]
+        rows.append([camera.name, *(figure(v) for v in by_part), f"{100 * used[i] / max(seen[i], 1):.1f} %"])
     head = ["camera, px RMS", *(f"quarter {k + 1}" for k in range(RESIDUAL_PARTS)), "tracks that agree"]
     text = "What is left of the pixels of the tracks that agree, camera by camera."
     return section("Residuals", text, legend(keys) + plot.svg() + figures_table(head, rows))
 
 
-def _mean(values: Array) -> float:
+def _root_mean_square(values: Array) -> float:
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
-def _spectrum(found: MotionSpectrum) -> str:
-    shown = (found.hertz > 0) & (found.hertz <= MAX_SPECTRUM_HZ)
+def _spectrum(spectrum: MotionSpectrum) -> str:
+    shown = (spectrum.hertz > 0) & (spectrum.hertz <= MAX_SPECTRUM_HZ)
     if shown.sum() < 2:
         return ""
-    amplitude = np.maximum(found.amplitude[shown], 1e-6)
+    amplitude = np.maximum(spectrum.amplitude[shown], 1e-6)
     high = float(amplitude.max()) * 1.5
-    span = 0.0, float(found.hertz[shown][-1])
+    span = 0.0, float(spectrum.hertz[shown][-1])
     plot = Plot(PAGE_CHART_WIDTH, 190, span, (max(high / 1e4, 1e-5), high), log_y=True, label="amplitude, mm")
-    plot.line(found.hertz[shown], amplitude, "estimate")
-    for name, rate in (("breathing", found.breathing), ("pulse", found.pulse)):
-        if np.isfinite(rate):
-            plot.mark(rate, f"{name} {60 * rate:.1f}/min", "median")
-    along = ", ".join(f"{v:.2f}" for v in found.direction)
+    plot.line(spectrum.hertz[shown], amplitude, "estimate")
+    for name, rate in spectrum.rhythms:
+        plot.mark(rate, f"{name} {60 * rate:.1f}/min", "median")
+    along = ", ".join(f"{v:.2f}" for v in spectrum.direction)
     text = f"Of the origin's motion along the direction in which it moves most, ({along}) in base; frequency in Hz."
     return section("Spectrum", text, plot.svg())
 
 
-def _what_if(evaluation: SmoothEvaluation) -> str:
-    rows = [
-        [f"{1000 * delay:.0f} ms", *(figure(1000 * v) for v in row)]
-        for delay, row in zip(LOOP_DELAYS_S, evaluation.late, strict=True)
-    ]
+def _errors_by_delay(evaluation: SmoothEvaluation) -> str:
+    pairs = zip(LOOP_DELAYS_S, evaluation.by_delay, strict=True)
+    rows = [[f"{1000 * delay:.0f} ms", *(figure(1000 * v) for v in row)] for delay, row in pairs]
     head = ["delay", "held, µm RMS", "95 %", "carried on, µm RMS", "95 %"]
     text = (
         "How far the nozzle, over the middle of the map, would be off by the loop's delay alone, from exposure to "

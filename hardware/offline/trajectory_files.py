@@ -1,6 +1,6 @@
-"""Poses out of any file or folder that stillbed writes, and the files of a smoothed session.
+"""Trajectories read from any file or folder that stillbed writes, and the files of a smoothed session.
 
-A recording is never written to: it is copied with the smoothed poses beside the rest. Of a damaged recording the copy
+A recording is never changed: it is copied, with the smoothed poses as a channel more. Of a damaged recording the copy
 holds what can be read.
 """
 
@@ -25,27 +25,24 @@ from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.rig import Rig, distort, ideal_pixels
 from estimation.se3 import Array, quaternion_from_rotation, transform_points
 from hardware.files.folder_tables import checked_rows, read_tum, row_from_words, trajectory_from_rows
-from hardware.files.pose_file import TANGENT_NAMES
+from hardware.files.pose_file import COVARIANCE_COLUMNS, TRANSFORM_COLUMNS, TWIST_COLUMNS, UPPER_TRIANGLE
 from hardware.files.pose_file import read_poses as read_pose_table
 from hardware.files.session import Session
-from hardware.process import checks
 from hardware.process.checks import read_csv
 from hardware.recording.mcap_file import Damage, record_groups
 from hardware.recording.messages import message_from_pose
-from hardware.recording.schemas import POSE
+from hardware.recording.schemas import TOPICS
 from hardware.recording.session_reader import open_session, read_poses, read_smoothed
 from perception.frames import Image
 
-POSE_COLUMNS = ("stamp_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
-TWIST_COLUMNS = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_mm_s", "vy_mm_s", "vz_mm_s")
-UPPER_TRIANGLE = np.triu_indices(6)
-UNKNOWN_COLOUR = np.array([150, 150, 150])
+POSE_COLUMNS = ("stamp_s", *TRANSFORM_COLUMNS)
+UNKNOWN_COLOUR = np.array([150, 150, 150])  # red green blue of a landmark that no camera shows
+MAX_COLOUR_AGE_S = 0.05  # s between a frame set and the smoothed pose by which its pictures give colours
 
 
 def write_instants(path: Path, instants: Instants) -> None:
     """smoothed.csv: pose, twist, and the upper triangles of both covariances, a line for each instant."""
-    pairs = [f"{TANGENT_NAMES[i]}_{TANGENT_NAMES[j]}" for i, j in zip(*UPPER_TRIANGLE, strict=True)]
-    head = [*POSE_COLUMNS, *TWIST_COLUMNS, *(f"cov_{pair}" for pair in pairs), *(f"twist_cov_{pair}" for pair in pairs)]
+    head = [*POSE_COLUMNS, *TWIST_COLUMNS, *COVARIANCE_COLUMNS, *(f"twist_{name}" for name in COVARIANCE_COLUMNS)]
     poses = instants.base_from_surface
     numbers = np.concatenate([poses[:, :3, 3], quaternion_from_rotation(poses[:, :3, :3]), instants.twist], axis=1)
     spreads = [c[:, UPPER_TRIANGLE[0], UPPER_TRIANGLE[1]] for c in (instants.covariance, instants.twist_covariance)]
@@ -53,8 +50,7 @@ def write_instants(path: Path, instants: Instants) -> None:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(head)
         for stamp, row, *parts in zip(instants.stamps, numbers, *spreads, strict=True):
-            claims = (f"{v:.6g}" for part in parts for v in part)
-            writer.writerow([f"{stamp:.6f}", *(f"{v:.9f}" for v in row), *claims])
+            writer.writerow([f"{stamp:.6f}", *(f"{v:.9f}" for v in row), *(f"{v:.6g}" for v in np.concatenate(parts))])
 
 
 def read_instants(path: Path) -> tuple[Array, Array, Array]:
@@ -70,10 +66,9 @@ def read_instants(path: Path) -> tuple[Array, Array, Array]:
         raise InputError(path, "poses", "none", "at least one line")
     covariance = np.empty((len(lines), 6, 6))
     for k, (what, words) in enumerate(lines):
-        claims = row_from_words(
-            path, f"{what}: covariance", words[width : width + len(UPPER_TRIANGLE[0])], "21 numbers"
-        )
-        covariance[k][UPPER_TRIANGLE] = covariance[k].T[UPPER_TRIANGLE] = claims
+        upper = words[width : width + len(COVARIANCE_COLUMNS)]
+        numbers = row_from_words(path, f"{what}: covariance", upper, f"{len(COVARIANCE_COLUMNS)} numbers")
+        covariance[k][UPPER_TRIANGLE] = covariance[k].T[UPPER_TRIANGLE] = numbers
     trajectory = trajectory_from_rows(places, exact=False)
     return trajectory.stamps, trajectory.base_from_surface, covariance
 
@@ -101,17 +96,17 @@ def _colours(smoothed: Smoothed, session: Session) -> NDArray[np.int64]:
     out = np.tile(UNKNOWN_COLOUR, (len(smoothed.map), 1))
     for frames in session.frame_sets():
         k = int(np.abs(smoothed.stamps - frames.stamp).argmin())
-        if abs(smoothed.stamps[k] - frames.stamp) > 0.05:
+        if abs(smoothed.stamps[k] - frames.stamp) > MAX_COLOUR_AGE_S:
             continue
         points_base = transform_points(smoothed.states.poses[k], smoothed.map.points)
         for frame in frames.frames:
-            _lay(out, frame.image, smoothed.rig, frame.camera, points_base)
+            _colour(out, frame.image, smoothed.rig, frame.camera, points_base)
         break
     return out
 
 
-def _lay(colours: NDArray[np.int64], image: Image, rig: Rig, camera: int, points_base: Array) -> None:
-    """The colours (L, 3) of what the image, grey or BGR, shows of points (L, 3)."""
+def _colour(colours: NDArray[np.int64], image: Image, rig: Rig, camera: int, points_base: Array) -> None:
+    """Set those of the colours (L, 3) whose points (L, 3), mm, lie inside the image, grey or BGR."""
     ideal, depth = ideal_pixels(rig.cameras[camera], points_base)
     at = np.round(distort(rig.cameras[camera], ideal))
     inside = (depth > 0) & (at >= 0).all(1) & (at < image.shape[1::-1]).all(1)
@@ -128,20 +123,20 @@ POSE_SOURCES = f"a TUM or CSV file, an .mcap file, or a folder with one of {', '
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSeries:
-    """A trajectory. name: where it is from. covariance: (N, 6, 6) of right perturbations, NaN where nothing is told."""
+    """A trajectory and where it is from."""
 
-    name: str
+    name: str  # file, and channel of a recording
     trajectory: Trajectory
-    covariance: Array
+    covariance: Array  # (N, 6, 6) of right perturbations, rad and mm; NaN where the file has none
 
     def __len__(self) -> int:
         return len(self.trajectory)
 
 
 def read_pose_series(text: str) -> PoseSeries:
-    """The trajectory that a word of the command line names; InputError says what is wrong.
+    """The trajectory that an argument of the command line names; InputError says what is wrong.
 
-    A path; of an .mcap file also PATH:CHANNEL, with one of CHANNELS.
+    text: a path; of an .mcap file also PATH:CHANNEL, with one of POSE_CHANNELS.
     """
     path, channel = _path_and_channel(text)
     if path.is_dir():
@@ -155,21 +150,18 @@ def read_pose_series(text: str) -> PoseSeries:
         return _of_recording(path, (channel,) if channel else POSE_CHANNELS)
     if path.suffix == ".csv":
         return _of_csv(path)
-    return _without_covariance(path, read_tum(path, exact=path.name == "truth.tum"))
+    return _without_covariance(str(path), read_tum(path, exact=path.name == "truth.tum"))
 
 
 def read_truth_series(text: str) -> PoseSeries:
-    """The truth or reference that lies in the session that a word of the command line names."""
+    """The truth or reference in the session that an argument of the command line names."""
     path, _ = _path_and_channel(text)
     if path.is_dir():
-        for name in ("smoothed.mcap", "truth.tum", "reference.tum"):
-            if (path / name).exists():
-                return (
-                    read_truth_series(str(path / name))
-                    if name.endswith(".mcap")
-                    else read_pose_series(str(path / name))
-                )
-    elif path.suffix == ".mcap":
+        inside = [path / name for name in ("smoothed.mcap", "truth.tum", "reference.tum") if (path / name).exists()]
+        if inside and inside[0].suffix == ".tum":
+            return read_pose_series(str(inside[0]))
+        path = inside[0] if inside else path
+    if path.suffix == ".mcap" and not path.is_dir():
         return _of_recording(path, ("truth",))
     raise InputError(path, "truth", "none", "a session with its truth or reference; else name what it is compared with")
 
@@ -183,56 +175,43 @@ def _path_and_channel(text: str) -> tuple[Path, str]:
     return Path(before), channel
 
 
-def _without_covariance(path: Path, trajectory: Trajectory) -> PoseSeries:
-    return PoseSeries(str(path), trajectory, np.full((len(trajectory), 6, 6), np.nan))
+def _without_covariance(name: str, trajectory: Trajectory) -> PoseSeries:
+    return PoseSeries(name, trajectory, np.full((len(trajectory), 6, 6), np.nan))
 
 
 def _of_csv(path: Path) -> PoseSeries:
     """A poses.csv, a smoothed.csv, or rows of `stamp,x,y,z,qx,qy,qz,qw`."""
-    head = checks.read_csv(path)[:1]
-    words = head[0][1] if head else []
+    words = next((words for _, words in read_csv(path)), [])
     if words[: len(POSE_COLUMNS)] == list(POSE_COLUMNS):
         stamps, poses, covariance = read_instants(path)
         return PoseSeries(str(path), Trajectory(stamps, poses, exact=False), covariance)
     if words[:1] == ["stamp_s"]:
         table = read_pose_table(path)
         rows = table.measured
+        if not rows.any():
+            raise InputError(path, "poses", "none that was measured", "one or more")
         trajectory = Trajectory(table.stamps[rows], table.base_from_surface[rows], exact=False)
-        return _nonempty(path, PoseSeries(str(path), trajectory, table.covariance[rows]))
-    return _without_covariance(path, read_tum(path, exact=False))
+        return PoseSeries(str(path), trajectory, table.covariance[rows])
+    return _without_covariance(str(path), read_tum(path, exact=False))
 
 
 def _of_recording(path: Path, channels: tuple[str, ...]) -> PoseSeries:
     for channel in channels:
-        found = _truth_of(path) if channel == "truth" else _poses_of(path, POSE_READERS[channel])
-        if len(found):
-            return PoseSeries(f"{path}:{channel}", found.trajectory, found.covariance)
+        name, truth = f"{path}:{channel}", open_session(path).truth if channel == "truth" else None
+        if truth is not None and len(truth):
+            return _without_covariance(name, truth)
+        if channel != "truth" and len(series := _poses_of(path, name, POSE_READERS[channel])):
+            return series
     raise InputError(path, "poses", "none", " or ".join(f"something in /{channel}" for channel in channels))
 
 
-def _poses_of(path: Path, read: Callable[[Path], Iterator[SurfacePose]]) -> PoseSeries:
+def _poses_of(path: Path, name: str, read: Callable[[Path], Iterator[SurfacePose]]) -> PoseSeries:
     """Measured poses in order of stamp, each once."""
-    found: dict[float, SurfacePose] = {}
-    for pose in read(path):
-        if np.isfinite(pose.base_from_surface).all() and pose.state.measured:
-            found[pose.stamp] = pose
-    poses = [found[stamp] for stamp in sorted(found)]
-    placed = np.array([pose.base_from_surface for pose in poses]).reshape(-1, 4, 4)
-    spread = np.array([pose.covariance for pose in poses]).reshape(-1, 6, 6)
-    return PoseSeries(str(path), Trajectory(np.array([pose.stamp for pose in poses]), placed, exact=False), spread)
-
-
-def _truth_of(path: Path) -> PoseSeries:
-    truth = open_session(path).truth
-    return _without_covariance(
-        path, Trajectory(np.zeros(0), np.zeros((0, 4, 4)), exact=False) if truth is None else truth
-    )
-
-
-def _nonempty(path: Path, posed: PoseSeries) -> PoseSeries:
-    if not len(posed):
-        raise InputError(path, "poses", "none that was measured", "one or more")
-    return posed
+    measured = (pose for pose in read(path) if np.isfinite(pose.base_from_surface).all() and pose.state.measured)
+    poses = [pose for _, pose in sorted({pose.stamp: pose for pose in measured}.items())]
+    transforms = np.array([pose.base_from_surface for pose in poses]).reshape(-1, 4, 4)
+    covariance = np.array([pose.covariance for pose in poses]).reshape(-1, 6, 6)
+    return PoseSeries(name, Trajectory(np.array([pose.stamp for pose in poses]), transforms, exact=False), covariance)
 
 
 SMOOTHED_TOPIC = "/smoothed"
@@ -242,14 +221,14 @@ def write_copy(source: Path, target: Path, smoothed: Smoothed) -> None:
     """Copy the .mcap file `source` to `target` with the channel /smoothed; StillbedError where it cannot be copied."""
     part = target.with_suffix(".part.mcap")
     try:
-        with part.open("wb") as written:
-            writer = Writer(written)
+        with part.open("wb") as stream:
+            writer = Writer(stream)
             writer.start(profile="", library="stillbed")
-            copying = _RecordCopier(writer)
-            for piece in record_groups(source):
-                for record in () if isinstance(piece, Damage) else piece.records:
-                    copying.write(record)
-            _add(writer, smoothed, copying.epoch)
+            copier = _RecordCopier(writer)
+            for group in record_groups(source):
+                for record in () if isinstance(group, Damage) else group.records:
+                    copier.write(record)
+            _add_smoothed(writer, smoothed, copier.epoch)
             writer.finish()  # type: ignore[no-untyped-call]
         os.replace(part, target)
     except McapError as error:
@@ -259,24 +238,25 @@ def write_copy(source: Path, target: Path, smoothed: Smoothed) -> None:
 
 
 class _RecordCopier:
-    """Writes the records of one file into another, where channels have other numbers. epoch: s, as metadata said."""
+    """Writes the records of one file into another, where channels have other numbers."""
 
     def __init__(self, writer: Writer) -> None:
-        self.epoch = 0
+        self.epoch = 0  # s added to log times, by the file's metadata
         self._writer = writer
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
-        self._kept: dict[int, int] = {}  # number of a channel that has messages: its number in the copy
+        self._numbers: dict[int, int] = {}  # number of a channel that has messages: its number in the copy
 
     def write(self, record: McapRecord) -> None:
-        """Write a record, or keep what later ones need of it."""
+        """Write a record; schemas and channels are kept until a message needs them."""
         if isinstance(record, Metadata):
             self._writer.add_metadata(record.name, record.metadata)
             epoch = record.metadata.get("epoch_s", "")
             self.epoch = int(epoch) if epoch.isdecimal() else self.epoch
         elif isinstance(record, Attachment):
-            a = record
-            self._writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
+            self._writer.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
         elif isinstance(record, Schema):
             self._schemas[record.id] = record
         elif isinstance(record, Channel):
@@ -286,16 +266,17 @@ class _RecordCopier:
             self._writer.add_message(number, m.log_time, m.data, m.publish_time, m.sequence)
 
     def _number(self, channel: int) -> int:
-        if channel not in self._kept:
+        if channel not in self._numbers:
             of, schema = self._channels[channel], self._schemas.get(self._channels[channel].schema_id)
             number = 0 if schema is None else self._writer.register_schema(schema.name, schema.encoding, schema.data)
-            self._kept[channel] = self._writer.register_channel(of.topic, of.message_encoding, number)
-        return self._kept[channel]
+            self._numbers[channel] = self._writer.register_channel(of.topic, of.message_encoding, number)
+        return self._numbers[channel]
 
 
-def _add(writer: Writer, smoothed: Smoothed, epoch: int) -> None:
-    kept = writer.register_schema(f"{POSE['title']}", "jsonschema", json.dumps(POSE).encode())
-    channel = writer.register_channel(SMOOTHED_TOPIC, "json", kept)
+def _add_smoothed(writer: Writer, smoothed: Smoothed, epoch: int) -> None:
+    schema = TOPICS["/pose"]
+    number = writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
+    channel = writer.register_channel(SMOOTHED_TOPIC, "json", number)
     used = smoothed.fitted.used.sum(1)
     at = smoothed.instants
     for k, stamp in enumerate(smoothed.stamps):

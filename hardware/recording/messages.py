@@ -1,6 +1,7 @@
-"""Records as the JSON messages of a recording, and back: what is written is read back to the same float64s.
+"""Records as the JSON messages of a recording, and back: every float64 is read back as it was written.
 
-Matrices are flat, row by row. An array that is not finite becomes an empty one, which reads as NaN throughout.
+Matrices are flat, row by row. An array with a number that is not finite is written as an empty one, which reads as NaN
+throughout. `schemas.py` says what each field of a message is.
 """
 
 from __future__ import annotations
@@ -34,8 +35,9 @@ _POSE_SHAPES = {
     "acceleration_psd": (6,),
 }
 _FORECAST: dict[str, tuple[int, ...]] = {"horizons": (), "increments": (6,), "covariances": (6, 6)}  # of each horizon
-_WARP = {"control": 1, "coefficients": 1, "covariance": 2, "growth": 2}  # of 3 x as many numbers as control points
-_MM = 1e-3  # viewers count in metres
+_WARP_ARRAYS = {"control": 1, "coefficients": 1, "covariance": 2, "growth": 2}  # 1: (K, 3), 2: (3K, 3K); K points
+_WARP_NUMBERS = ("reach", "deformation", "deformation_sigma")
+_M_PER_MM = 1e-3  # viewers count in metres
 
 
 def time_of(log_time: int) -> dict[str, int]:
@@ -84,7 +86,7 @@ def message_from_head(row: Array, extruding: bool) -> Message:
 
 
 def row_from_message(message: Message) -> list[float]:
-    """The row of 8 numbers, stamp x y z qx qy qz qw, in a message of truth or of a print head."""
+    """The row of 8 numbers, stamp x y z qx qy qz qw (s and mm), in a message of truth or of a print head."""
     return [float(value) for value in (message["stamp"], *message["position"], *message["quaternion"])]
 
 
@@ -107,13 +109,8 @@ def message_from_observations(observations: Observations) -> Message:
 def observations_from_message(message: Message) -> Observations:
     """Observations from their message."""
     camera, track = (np.array(message[key], np.int64) for key in ("camera", "track"))
-    return Observations(
-        message["stamp"],
-        camera,
-        track,
-        _array(message["pixels"], (len(camera), 2)),
-        _array(message["sigma"], (len(camera),)),
-    )
+    pixels, sigma = _array(message["pixels"], (len(camera), 2)), _array(message["sigma"], (len(camera),))
+    return Observations(message["stamp"], camera, track, pixels, sigma)
 
 
 def message_from_pose(pose: SurfacePose) -> Message:
@@ -127,9 +124,17 @@ def message_from_pose(pose: SurfacePose) -> Message:
         "twist_covariance": _flat(pose.twist_covariance),
         "acceleration_psd": _flat(pose.acceleration_psd),
         "reason": pose.reason,
-        "motion": _message_from_motion(pose.motion),
-        "warp": _message_from_warp(pose.warp),
-        "forecast": _message_from_forecast(pose.forecast),
+        "motion": {
+            "moving": pose.motion.moving,
+            "onset": _flat(np.array([pose.motion.onset])),
+            "moved": pose.motion.moved,
+            "turned": pose.motion.turned,
+        },
+        "warp": {
+            **{name: [] if pose.warp is None else _flat(getattr(pose.warp, name)) for name in _WARP_ARRAYS},
+            **{name: 0.0 if pose.warp is None else getattr(pose.warp, name) for name in _WARP_NUMBERS},
+        },
+        "forecast": {name: [] if pose.forecast is None else _flat(getattr(pose.forecast, name)) for name in _FORECAST},
     }
 
 
@@ -147,20 +152,9 @@ def pose_from_message(message: Message) -> SurfacePose:
     )
 
 
-def _message_from_motion(motion: MotionState) -> Message:
-    onset = _flat(np.array([motion.onset]))
-    return {"moving": motion.moving, "onset": onset, "moved": motion.moved, "turned": motion.turned}
-
-
 def _motion_from_message(message: Message) -> MotionState:
     onset = float(_array(message["onset"], (1,))[0])
     return MotionState(message["moving"], onset, message["moved"], message["turned"])
-
-
-def _message_from_forecast(forecast: Forecast | None) -> Message:
-    if forecast is None:
-        return {name: [] for name in _FORECAST}
-    return {name: _flat(getattr(forecast, name)) for name in _FORECAST}
 
 
 def _forecast_from_message(message: Message) -> Forecast | None:
@@ -169,33 +163,13 @@ def _forecast_from_message(message: Message) -> Forecast | None:
     return Forecast(*arrays) if count else None
 
 
-def _message_from_warp(warp: Warp | None) -> Message:
-    if warp is None:
-        return {**{name: [] for name in _WARP}, "reach": 0.0, "deformation": 0.0, "deformation_sigma": 0.0}
-    return {
-        **{name: _flat(getattr(warp, name)) for name in _WARP},
-        "reach": warp.reach,
-        "deformation": warp.deformation,
-        "deformation_sigma": warp.deformation_sigma,
-    }
-
-
 def _warp_from_message(message: Message) -> Warp | None:
     size = len(message["control"])
     if not size:
         return None
-    control, coefficients, covariance, growth = (
-        _array(message[name], (size // 3, 3) if shape == 1 else (size, size)) for name, shape in _WARP.items()
-    )
-    return Warp(
-        control,
-        coefficients,
-        covariance,
-        growth,
-        message["reach"],
-        message["deformation"],
-        message["deformation_sigma"],
-    )
+    shapes = {1: (size // 3, 3), 2: (size, size)}
+    arrays: dict[str, Any] = {name: _array(message[name], shapes[kind]) for name, kind in _WARP_ARRAYS.items()}
+    return Warp(**arrays, **{name: message[name] for name in _WARP_NUMBERS})
 
 
 def message_from_move(move: Move) -> Message:
@@ -227,7 +201,7 @@ def hold_from_message(message: Message) -> Hold:
 
 
 def message_from_tick(tick: RecordedTick) -> Message:
-    """A tick of the motion as a message; its command is a message of its own."""
+    """A tick of the motion as a message; its command is written as a message of its own."""
     return {
         "stamp": tick.stamp,
         "pose_stamp": _flat(np.array([tick.pose_stamp])),
@@ -268,8 +242,8 @@ def message_from_calibration(camera: Camera, log_time: int) -> Message:
 
 
 def message_from_transform(base_from_child: Array, child: str, log_time: int) -> Message:
-    """Where a frame stands in the base frame (4, 4), mm, as Foxglove's FrameTransform, metres."""
-    position = base_from_child[:3, 3] * _MM
+    """The pose of a frame in the base frame (4, 4), mm, as Foxglove's FrameTransform, metres."""
+    position = base_from_child[:3, 3] * _M_PER_MM
     quaternion = se3.quaternion_from_rotation(base_from_child[:3, :3])
     return {
         "timestamp": time_of(log_time),
@@ -281,7 +255,7 @@ def message_from_transform(base_from_child: Array, child: str, log_time: int) ->
 
 
 def message_from_event(stamp: float, level: int, text: str, name: str, log_time: int) -> Message:
-    """Something that happened, as Foxglove's Log."""
+    """An event as Foxglove's Log. stamp: s. log_time: ns. name: of the part that tells it."""
     time = time_of(log_time)
     return {"timestamp": time, "level": level, "message": text, "name": name, "file": "", "line": 0, "stamp": stamp}
 

@@ -7,8 +7,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import orjson
@@ -20,15 +19,7 @@ from estimation.pose import SurfacePose, Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.files.folder_tables import rows_from_trajectory
-from hardware.files.images import (
-    IMAGE_ENCODING,
-    IMAGE_SCHEMA,
-    IMAGE_SCHEMA_ENCODING,
-    IMAGE_SCHEMA_NAME,
-    check_size,
-    encode,
-    pack_image,
-)
+from hardware.files.images import IMAGE_CHANNEL, check_size, encode, pack_image
 from hardware.files.session import SURFACE_SUFFIXES
 from hardware.motion.loop import RecordedTick
 from hardware.process.checks import read_bytes
@@ -37,13 +28,21 @@ from hardware.recording.mcap_file import McapWriter
 from hardware.recording.messages import SURFACE_FRAME, Message
 from hardware.recording.schemas import CALIBRATION, INFO, TOPICS, Schema, calibration_topic, camera_frame, image_topic
 from perception.frames import Frame, Roi
-from planning.command import Command, Move
+from planning.command import Command, Hold, Move
 
-MAX_CHUNK_SECONDS = 0.5  # s of stamps, which a killed run may lose: half of the second that is promised
+MAX_CHUNK_SECONDS = 0.5  # s of stamps that a killed run may lose: half of the second that is promised
 MAX_CHUNK_BYTES = 4 * 2**20  # a chunk is unpacked whole, so its size bounds the reader's memory
 LOG_EPOCH = 1_000_000_000  # s added to log times where stamps do not count from 1970: MCAP has none below zero
 MIN_WALL_CLOCK_STAMP = 1e8  # s: a first stamp above it counts from 1970
 MAX_LOG_TIME = 2**63 - 1  # ns
+
+RECORD_CHANNELS: dict[type, tuple[str, Callable[[Any], Message]]] = {  # topic and encoder of each kind of record
+    Observations: ("/observations", messages.message_from_observations),
+    Roi: ("/roi", messages.message_from_roi),
+    RecordedTick: ("/tick", messages.message_from_tick),
+    Move: ("/move", messages.message_from_move),
+    Hold: ("/hold", messages.message_from_hold),
+}
 
 T = TypeVar("T")
 
@@ -52,8 +51,8 @@ class Recorder:
     """Writes a recording; a context manager. Stamps, s, may start anywhere, also below zero.
 
     A chunk is closed and handed to the system before its stamps span more than half a second: a run that is killed at
-    any instant loses no more than that (a power cut may take more). A disk that is full or gone is a StillbedError;
-    what was written before stays readable, and later writes raise the same error.
+    any instant loses no more than that (a power cut may take more). A full or lost disk is a StillbedError: what was
+    written before stays readable, and later writes raise the same error.
     """
 
     def __init__(
@@ -66,7 +65,7 @@ class Recorder:
     ) -> None:
         """Create the file at `path`; images are stored as PNG, or as JPEG of `jpeg_quality` (0-100).
 
-        compress: whether chunks are; that saves a quarter of the file and costs a third of the time.
+        compress: whether chunks are compressed: a quarter less of file for a third more of time.
         """
         self.path, self.rig = Path(path), rig
         self._jpeg_quality = jpeg_quality
@@ -91,9 +90,7 @@ class Recorder:
     def __enter__(self) -> Recorder:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         try:
             self.close()
         except StillbedError:
@@ -104,18 +101,11 @@ class Recorder:
         """Write a record to its channel at its own stamp."""
         if isinstance(record, Frame):
             self.frame(record)
-        elif isinstance(record, Observations):
-            self._message("/observations", record.stamp, messages.message_from_observations(record))
         elif isinstance(record, SurfacePose):
             self._pose(record)
-        elif isinstance(record, Roi):
-            self._message("/roi", record.stamp, messages.message_from_roi(record))
-        elif isinstance(record, RecordedTick):
-            self._message("/tick", record.stamp, messages.message_from_tick(record))
-        elif isinstance(record, Move):
-            self._message("/move", record.stamp, messages.message_from_move(record))
         else:
-            self._message("/hold", record.stamp, messages.message_from_hold(record))
+            topic, encoded = next(each for kind, each in RECORD_CHANNELS.items() if isinstance(record, kind))
+            self._message(topic, record.stamp, encoded(record))
 
     def frame(self, frame: Frame, camera_stamp: float | None = None) -> None:
         """Write an image; camera_stamp: s on the camera's own clock, by default the frame's less the clock offset."""
@@ -205,12 +195,11 @@ class Recorder:
         self._message("/pose", pose.stamp, messages.message_from_pose(pose))
         if np.isfinite(pose.base_from_surface).all():
             log_time = self._log_time(pose.stamp)
-            self._message(
-                "/tf", pose.stamp, messages.message_from_transform(pose.base_from_surface, SURFACE_FRAME, log_time)
-            )
+            transform = messages.message_from_transform(pose.base_from_surface, SURFACE_FRAME, log_time)
+            self._message("/tf", pose.stamp, transform)
 
     def _check_rising(self, stream: str, stamp: float) -> None:
-        """Refuse a stamp now for which the reader would refuse the whole file."""
+        """InputError for a stamp not later than the stream's last: the reader would refuse the whole file."""
         last = self._last.get(stream, -math.inf)
         if not stamp > last:
             raise InputError(self.path, stream, stamp, f"later than the one before, {last} s")
@@ -245,7 +234,7 @@ class Recorder:
         self._add(topic, TOPICS[topic] if schema is None else schema, stamp, self._text(topic, message))
 
     def _add(self, topic: str, schema: Schema | None, stamp: float, data: bytes, sequence: int = 0) -> None:
-        """Write the bytes of a message; schema: None for an image."""
+        """Write an encoded message; schema: None for an image."""
         log_time = self._log_time(stamp)
         if abs(stamp - self._chunk_start) >= MAX_CHUNK_SECONDS:
             self.flush()
@@ -265,14 +254,8 @@ class Recorder:
 
     def _channel(self, topic: str, schema: Schema | None) -> int:
         if topic not in self._channels:
-            if schema is None:
-                name, kind, encoding, text = (
-                    IMAGE_SCHEMA_NAME,
-                    IMAGE_SCHEMA_ENCODING,
-                    IMAGE_ENCODING,
-                    IMAGE_SCHEMA.encode(),
-                )
-            else:
+            name, kind, encoding, text = IMAGE_CHANNEL
+            if schema is not None:
                 name, kind, encoding, text = schema["title"], "jsonschema", "json", orjson.dumps(schema)
             if name not in self._schemas:
                 self._schemas[name] = self._guarded(lambda: self._writer.register_schema(name, kind, text))
@@ -281,7 +264,7 @@ class Recorder:
         return self._channels[topic]
 
     def _guarded(self, action: Callable[[], T]) -> T:
-        """Run one write; a fault of the disk becomes a StillbedError, now and at every later write."""
+        """Run one write; an error of the disk becomes a StillbedError, now and at every later write."""
         if self._failed:
             raise StillbedError(self._failed)
         try:

@@ -33,7 +33,8 @@ def _array(items: Schema, count: int | None = None, about: str = "") -> Schema:
     return {"type": "array", "items": items, **length, **({"description": about} if about else {})}
 
 
-def _perhaps(about: str) -> Schema:
+def _finite_array(about: str) -> Schema:
+    """Numbers that are all finite, or none."""
     return _array(NUMBER, None, f"{about}; empty: not finite")
 
 
@@ -43,22 +44,17 @@ def _part(about: str = "", **properties: Schema) -> Schema:
     return {"type": "object", **description, "properties": properties, "required": list(properties)}
 
 
-def _object(title: str, about: str, **properties: Schema) -> Schema:
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": title,
-        "description": about,
-        "type": "object",
-        "properties": properties,
-        "required": list(properties),
-    }
+def _message(title: str, about: str, **properties: Schema) -> Schema:
+    """The schema of a channel's messages, all properties required."""
+    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, "description": about}
+    return {**head, "type": "object", "properties": properties, "required": list(properties)}
 
 
-def _about(schema: Schema, words: str) -> Schema:
-    return {**schema, "description": words}
+def _described(schema: Schema, about: str) -> Schema:
+    return {**schema, "description": about}
 
 
-STAMP = _about(NUMBER, "s, exact")
+STAMP = _described(NUMBER, "s, exact")
 XYZ = _part(x=NUMBER, y=NUMBER, z=NUMBER)
 QUATERNION = _part(x=NUMBER, y=NUMBER, z=NUMBER, w=NUMBER)
 CAMERA = {
@@ -69,12 +65,12 @@ CAMERA = {
         "matrix": _array(NUMBER, 9, "3x3, px"),
         "distortion": _array(NUMBER, 5, "k1 k2 p1 p2 k3"),
         "base_from_camera": _array(NUMBER, 16, "4x4, mm"),
-        "clock_offset_s": _about(NUMBER, "s, to be added to the camera's stamps"),
+        "clock_offset_s": _described(NUMBER, "s, to be added to the camera's stamps"),
     },
     "required": ["name", "size", "matrix", "distortion", "base_from_camera"],
 }
 
-CALIBRATION = _object(
+CALIBRATION = _message(
     "foxglove.CameraCalibration",
     "A camera of the rig",
     timestamp=TIME,
@@ -87,159 +83,148 @@ CALIBRATION = _object(
     R=_array(NUMBER, 9),
     P=_array(NUMBER, 12),
 )
-TRANSFORM = _object(
-    "foxglove.FrameTransform",
-    "Pose of a child frame in its parent, metres",
-    timestamp=TIME,
-    parent_frame_id=TEXT,
-    child_frame_id=TEXT,
-    translation=XYZ,
-    rotation=QUATERNION,
-)
-LOG = _object(
-    "foxglove.Log",
-    "Something that happened",
-    timestamp=TIME,
-    level=_about(WHOLE, "1 debug, 2 info, 3 warning, 4 error, 5 fatal"),
-    message=TEXT,
-    name=TEXT,
-    file=TEXT,
-    line=WHOLE,
-    stamp=STAMP,
-)
-RIG = _object("stillbed.Rig", "The calibrated cameras; mm, px", camera=_array(CAMERA))
-ROI = _object(
-    "stillbed.Roi",
-    "Where the surface is in one image, px",
-    stamp=STAMP,
-    camera=WHOLE,
-    polygon=_array(NUMBER, None, "x y of each corner"),
-)
-FRAME = _object(
-    "stillbed.Frame",
-    "When an image was taken; the image is the message of the same sequence number on its camera's channel",
-    stamp=_about(NUMBER, "s on the common clock, exact"),
-    camera_stamp=_about(NUMBER, "s on the camera's own clock, exact"),
-    camera=WHOLE,
-    number=_about(WHOLE, "sequence number of the image"),
-)
-TRUTH = _object(
-    "stillbed.Truth",
-    "Known or measured pose of the surface in the base frame, mm",
-    stamp=STAMP,
-    position=_array(NUMBER, 3, "mm"),
-    quaternion=_array(NUMBER, 4, "qx qy qz qw"),
-    exact=_about(FLAG, "true: a simulator's or an instrument's; false: a measured reference"),
-)
-HEAD = _object(
-    "stillbed.PrintHead",
-    "Pose of the nozzle in the base frame by the commands that were sent, z from the tip up into the head, mm",
-    stamp=_about(NUMBER, "s, of the frame set, exact"),
-    position=_array(NUMBER, 3, "mm"),
-    quaternion=_array(NUMBER, 4, "qx qy qz qw"),
-    extruding=_about(FLAG, "true: ink flows"),
-)
-OBSERVATIONS = _object(
-    "stillbed.Observations",
-    "Tracks of one frame set, parallel arrays of length N",
-    stamp=STAMP,
-    camera=_array(WHOLE),
-    track=_array({"type": "integer"}),
-    pixels=_perhaps("x y of each track, undistorted px"),
-    sigma=_perhaps("px, one standard deviation per axis"),
-)
 MOTION = _part(
     "Whether the surface moves",
     moving=FLAG,
     onset=_array(NUMBER, None, "s, start of the last movement; empty: before the first pose"),
-    moved=_about(NUMBER, "mm since it was last at rest"),
-    turned=_about(NUMBER, "rad since it was last at rest"),
+    moved=_described(NUMBER, "mm since it was last at rest"),
+    turned=_described(NUMBER, "rad since it was last at rest"),
 )
 FORECAST = _part(
     "where the surface is expected after the stamp; empty: by its twist",
-    horizons=_perhaps("s after the stamp, H of them"),
-    increments=_perhaps("Hx6, tangent at the pose"),
-    covariances=_perhaps("Hx6x6, rad, mm"),
+    horizons=_finite_array("s after the stamp, H of them"),
+    increments=_finite_array("Hx6, tangent at the pose"),
+    covariances=_finite_array("Hx6x6, rad, mm"),
 )
 WARP: Schema = {
     "type": "object",
     "description": "Departure from a rigid body: Gaussian bells about K points, surface frame; K = 0: none",
     "properties": {
-        "control": _perhaps("K x 3, mm"),
-        "coefficients": _perhaps("K x 3, mm"),
-        "covariance": _perhaps("3K x 3K, mm^2, of the coefficients"),
-        "growth": _perhaps("3K x 3K, mm^2/s"),
-        "reach": _about(NUMBER, "mm, one sigma of a bell"),
-        "deformation": _about(NUMBER, "mm, root mean square over the landmarks"),
-        "deformation_sigma": _about(NUMBER, "mm"),
+        "control": _finite_array("K x 3, mm"),
+        "coefficients": _finite_array("K x 3, mm"),
+        "covariance": _finite_array("3K x 3K, mm^2, of the coefficients"),
+        "growth": _finite_array("3K x 3K, mm^2/s"),
+        "reach": _described(NUMBER, "mm, one sigma of a bell"),
+        "deformation": _described(NUMBER, "mm, root mean square over the landmarks"),
+        "deformation_sigma": _described(NUMBER, "mm"),
     },
 }
-POSE = _object(
-    "stillbed.SurfacePose",
-    "Estimated pose of the surface; mm, rad, s; tangent order rx ry rz tx ty tz, right perturbation",
-    stamp=STAMP,
-    base_from_surface=_perhaps("4x4, mm"),
-    covariance=_perhaps("6x6, rad, mm"),
-    twist=_perhaps("6, rad/s, mm/s, surface frame"),
-    state=TEXT,
-    twist_covariance=_perhaps("6x6, rad/s, mm/s"),
-    acceleration_psd=_perhaps("6, rad^2/s^3, mm^2/s^3"),
-    reason=TEXT,
-    motion=MOTION,
-    warp=WARP,
-    forecast=FORECAST,
-)
-MOVE = _object(
-    "stillbed.Move",
-    "Go to the machine axes on the way to a checkpoint",
-    stamp=STAMP,
-    axes=_array(NUMBER, 6, "X Y Z A B C, mm and rad"),
-    feed=_about(NUMBER, "mm/s"),
-    checkpoint={"type": "integer"},
-    extrude=FLAG,
-    reason=_about(TEXT, "why it brakes; empty of a move along the path"),
-)
-HOLD = _object("stillbed.Hold", "Stay, because of the reason", stamp=STAMP, duration=_about(NUMBER, "s"), reason=TEXT)
-BYTES = _object("stillbed.Bytes", "Bytes on the arm's link", stamp=STAMP, data=BASE64)
-TICK = _object(
-    "stillbed.Tick",
-    "A tick of the motion: what it was given, and the frame that it gave",
-    stamp=STAMP,
-    pose_stamp=_array(NUMBER, None, "s, of the pose they were given; empty: none"),
-    asked=_about(FLAG, "whether planner and guard were asked, and gave the frame"),
-    begun=_array(NUMBER, None, "where on the path they were begun anew before it; empty: they were not"),
-    recalled=_array(NUMBER, None, "12, mm and rad: where the arm rested and stands, if moves were called back"),
-    paused=_about(FLAG, "whether they were told to wait above the surface"),
-    fraction=_about(NUMBER, "place on the path, counted in checkpoints"),
-    phase=TEXT,
-    frame=BASE64,
-)
-LATENCY = _object(
-    "stillbed.Latency",
-    "How long a stage took so far",
-    stamp=STAMP,
-    stage=TEXT,
-    width=_about(NUMBER, "s, of a bin"),
-    counts=_array(WHOLE, None, "in each bin; the last holds all that were later"),
-    most=_about(NUMBER, "s, the largest"),
-)
+BYTES = _message("stillbed.Bytes", "Bytes on the arm's link", stamp=STAMP, data=BASE64)
 
 TOPICS: dict[str, Schema] = {
-    "/rig": RIG,
-    "/roi": ROI,
-    "/frames": FRAME,
-    "/truth": TRUTH,
-    "/head": HEAD,
-    "/observations": OBSERVATIONS,
-    "/pose": POSE,
-    "/move": MOVE,
-    "/hold": HOLD,
+    "/rig": _message("stillbed.Rig", "The calibrated cameras; mm, px", camera=_array(CAMERA)),
+    "/roi": _message(
+        "stillbed.Roi",
+        "Where the surface is in one image, px",
+        stamp=STAMP,
+        camera=WHOLE,
+        polygon=_array(NUMBER, None, "x y of each corner"),
+    ),
+    "/frames": _message(
+        "stillbed.Frame",
+        "When an image was taken; the image is the message of the same sequence number on its camera's channel",
+        stamp=_described(NUMBER, "s on the common clock, exact"),
+        camera_stamp=_described(NUMBER, "s on the camera's own clock, exact"),
+        camera=WHOLE,
+        number=_described(WHOLE, "sequence number of the image"),
+    ),
+    "/truth": _message(
+        "stillbed.Truth",
+        "Known or measured pose of the surface in the base frame, mm",
+        stamp=STAMP,
+        position=_array(NUMBER, 3, "mm"),
+        quaternion=_array(NUMBER, 4, "qx qy qz qw"),
+        exact=_described(FLAG, "true: a simulator's or an instrument's; false: a measured reference"),
+    ),
+    "/head": _message(
+        "stillbed.PrintHead",
+        "Pose of the nozzle in the base frame by the commands that were sent, z from the tip up into the head, mm",
+        stamp=_described(NUMBER, "s, of the frame set, exact"),
+        position=_array(NUMBER, 3, "mm"),
+        quaternion=_array(NUMBER, 4, "qx qy qz qw"),
+        extruding=_described(FLAG, "true: ink flows"),
+    ),
+    "/observations": _message(
+        "stillbed.Observations",
+        "Tracks of one frame set, parallel arrays of length N",
+        stamp=STAMP,
+        camera=_array(WHOLE),
+        track=_array({"type": "integer"}),
+        pixels=_finite_array("x y of each track, undistorted px"),
+        sigma=_finite_array("px, one standard deviation per axis"),
+    ),
+    "/pose": _message(
+        "stillbed.SurfacePose",
+        "Estimated pose of the surface; mm, rad, s; tangent order rx ry rz tx ty tz, right perturbation",
+        stamp=STAMP,
+        base_from_surface=_finite_array("4x4, mm"),
+        covariance=_finite_array("6x6, rad, mm"),
+        twist=_finite_array("6, rad/s, mm/s, surface frame"),
+        state=TEXT,
+        twist_covariance=_finite_array("6x6, rad/s, mm/s"),
+        acceleration_psd=_finite_array("6, rad^2/s^3, mm^2/s^3"),
+        reason=TEXT,
+        motion=MOTION,
+        warp=WARP,
+        forecast=FORECAST,
+    ),
+    "/move": _message(
+        "stillbed.Move",
+        "Go to the machine axes on the way to a checkpoint",
+        stamp=STAMP,
+        axes=_array(NUMBER, 6, "X Y Z A B C, mm and rad"),
+        feed=_described(NUMBER, "mm/s"),
+        checkpoint={"type": "integer"},
+        extrude=FLAG,
+        reason=_described(TEXT, "why it brakes; empty of a move along the path"),
+    ),
+    "/hold": _message(
+        "stillbed.Hold", "Stay, because of the reason", stamp=STAMP, duration=_described(NUMBER, "s"), reason=TEXT
+    ),
     "/arm/sent": BYTES,
     "/arm/received": BYTES,
-    "/tick": TICK,
-    "/latency": LATENCY,
-    "/events": LOG,
-    "/tf": TRANSFORM,
+    "/tick": _message(
+        "stillbed.Tick",
+        "A tick of the motion: what it was given, and the frame that it gave",
+        stamp=STAMP,
+        pose_stamp=_array(NUMBER, None, "s, of the pose they were given; empty: none"),
+        asked=_described(FLAG, "whether planner and guard were asked, and gave the frame"),
+        begun=_array(NUMBER, None, "where on the path they were begun anew before it; empty: they were not"),
+        recalled=_array(NUMBER, None, "12, mm and rad: where the arm rested and stands, if moves were called back"),
+        paused=_described(FLAG, "whether they were told to wait above the surface"),
+        fraction=_described(NUMBER, "place on the path, counted in checkpoints"),
+        phase=TEXT,
+        frame=BASE64,
+    ),
+    "/latency": _message(
+        "stillbed.Latency",
+        "How long a stage took so far",
+        stamp=STAMP,
+        stage=TEXT,
+        width=_described(NUMBER, "s, of a bin"),
+        counts=_array(WHOLE, None, "in each bin; the last holds all that were later"),
+        most=_described(NUMBER, "s, the largest"),
+    ),
+    "/events": _message(
+        "foxglove.Log",
+        "Something that happened",
+        timestamp=TIME,
+        level=_described(WHOLE, "1 debug, 2 info, 3 warning, 4 error, 5 fatal"),
+        message=TEXT,
+        name=TEXT,
+        file=TEXT,
+        line=WHOLE,
+        stamp=STAMP,
+    ),
+    "/tf": _message(
+        "foxglove.FrameTransform",
+        "Pose of a child frame in its parent, metres",
+        timestamp=TIME,
+        parent_frame_id=TEXT,
+        child_frame_id=TEXT,
+        translation=XYZ,
+        rotation=QUATERNION,
+    ),
 }
 
 

@@ -1,6 +1,6 @@
-"""Recordings read back: as a session, one channel at a time, and the path and arm that a run used.
+"""Recordings read back: as a session, as the records of one channel, and as the path and arm that a run used.
 
-A damaged file is read up to its damage. Sessions of both containers, folder and MCAP file, are opened here.
+A damaged file is read up to its damage. `open_session` opens both containers, session folder and MCAP file.
 """
 
 from __future__ import annotations
@@ -22,10 +22,9 @@ from estimation.pose import SurfacePose, Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
-from hardware.files import images as compressed_image
 from hardware.files.arm_file import arm_from_text, arm_text
 from hardware.files.folder_tables import check_polygon, checked_rows, trajectory_from_rows
-from hardware.files.images import check_size, decode
+from hardware.files.images import IMAGE_ENCODING, check_size, decode, unpack_image
 from hardware.files.path_file import path_from_text, path_text
 from hardware.files.session import SURFACE_SUFFIXES, FrameRef, PrintHeadLog, Session, head_from_row, pair_refs
 from hardware.files.session_folder import open_folder
@@ -38,29 +37,30 @@ from planning.command import Command
 from planning.path import Path as PrintPath
 
 CACHED_CHUNKS = 4  # frames of one instant lie in neighbouring chunks
+SURFACE_NAMES = tuple(f"surface{suffix}" for suffix in SURFACE_SUFFIXES)  # exact names: one with a folder in it is none
+SESSION_TOPICS = ("/rig", "/roi", "/truth", "/head", "/frames")
 
-SURFACE_NAMES = tuple(f"surface{suffix}" for suffix in SURFACE_SUFFIXES)  # an attachment with a path in it is none
-
-# of an image's topic and number: offset of its chunk, place in it, how it is encoded
+T = TypeVar("T")
+# of an image, by topic and number: offset of its chunk, index of the message in the chunk, encoding
 ImagePlaces = dict[tuple[str, int], tuple[int, int, str]]
 
 
 @dataclass(slots=True)
 class RecordingContents:
-    """What a walk through a recording found: everything but the images, and the chunk each image is in.
+    """What is read of a recording before any image is: all records of a session, and where each image is stored.
 
-    A run that is interrupted while it writes may store a chunk twice: what is told twice counts once.
+    A run that is interrupted while it writes may store a chunk twice; sets and dictionaries keep each record once.
     """
 
     rig: Rig | None = None
-    rois: dict[tuple[int, float], Roi] = field(default_factory=dict)
-    truth: set[tuple[float, ...]] = field(default_factory=set)
-    exact: bool = False
-    heads: set[tuple[tuple[float, ...], bool]] = field(default_factory=set)
-    frames: dict[tuple[int, int], FrameRef] = field(default_factory=dict)
+    rois: dict[tuple[int, float], Roi] = field(default_factory=dict)  # by camera and stamp
+    truth: set[tuple[float, ...]] = field(default_factory=set)  # rows of stamp x y z qx qy qz qw, s and mm
+    exact: bool = False  # whether truth is exact
+    heads: set[tuple[tuple[float, ...], bool]] = field(default_factory=set)  # such a row, and whether ink flows
+    frames: dict[tuple[int, int], FrameRef] = field(default_factory=dict)  # by camera and number
     places: ImagePlaces = field(default_factory=dict)
     surface: AttachedFile | None = None
-    damage: str = ""
+    damage: str = ""  # "" if none
 
 
 def open_session(path: str | Path) -> Session:
@@ -74,7 +74,7 @@ def open_session(path: str | Path) -> Session:
 
 
 def open_recording(path: Path) -> Session:
-    """Open an .mcap recording; what is damaged is left out and told in `Session.damage`."""
+    """Open an .mcap recording; what is damaged is left out, `Session.damage` says what."""
     contents = _contents(path)
     rig = contents.rig
     if rig is None:
@@ -109,12 +109,17 @@ def _contents(path: Path) -> RecordingContents:
 def _take(path: Path, contents: RecordingContents, place: tuple[int, int], stored: StoredMessage) -> None:
     if stored.topic.endswith("/image"):
         contents.places[stored.topic, stored.sequence] = *place, stored.encoding
-    elif stored.topic in ("/rig", "/roi", "/truth", "/head", "/frames"):
-        message = parse(path, stored)
-        try:
-            _take_message(path, contents, stored.topic, message)
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise InputError(path, stored.topic, repr(error), "a message of its schema") from error
+    elif stored.topic in SESSION_TOPICS:
+        _decoded(path, stored, lambda message: _take_message(path, contents, stored.topic, message))
+
+
+def _decoded(path: Path, stored: StoredMessage, decode: Callable[[Message], T]) -> T:
+    """The record that `decode` makes of a stored message; InputError where it is none of its channel's schema."""
+    message = parse(path, stored)
+    try:
+        return decode(message)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(path, stored.topic, repr(error), "a message of its schema") from error
 
 
 def _take_message(path: Path, contents: RecordingContents, topic: str, message: Message) -> None:
@@ -146,9 +151,8 @@ def _check_frames(path: Path, contents: RecordingContents, rig: Rig) -> None:
             raise InputError(path, "/frames: stamp", [ref.stamp, ref.camera_stamp], "finite numbers of seconds")
         topic = image_topic(rig.cameras[ref.camera].name)
         if (topic, ref.number) not in contents.places:
-            raise InputError(
-                path, f"{topic}: image", f"no number {ref.number}", "an image for every message of /frames"
-            )
+            allowed = "an image for every message of /frames"
+            raise InputError(path, f"{topic}: image", f"no number {ref.number}", allowed)
 
 
 def _checked_rois(path: Path, contents: RecordingContents, rig: Rig) -> tuple[Roi, ...]:
@@ -182,7 +186,7 @@ def _heads(path: Path, contents: RecordingContents) -> PrintHeadLog:
 
 
 def _unpacked_surface(surface: AttachedFile | None, store: RecordingStore) -> Path | None:
-    """A copy of the scan beside the session, since mesh readers want a file; it goes when the session goes."""
+    """The scan as a temporary file, which mesh readers need; it is deleted with the session's store."""
     if surface is None:
         return None
     folder = tempfile.mkdtemp(prefix="stillbed-")
@@ -225,8 +229,8 @@ class RecordingReader:
         offset, index, encoding = self._store.places[topic, ref.number]
         data = self._chunk(offset)[index]
         try:
-            if encoding == compressed_image.IMAGE_ENCODING:
-                return compressed_image.unpack_image(data)
+            if encoding == IMAGE_ENCODING:
+                return unpack_image(data)
             message = parse(self._store.path, StoredMessage(topic, ref.number, data))  # as recordings once held them
             return message["format"], messages.bytes_from_message(message)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -244,52 +248,34 @@ class RecordingReader:
         self._file.close()
 
 
-T = TypeVar("T")
-
-
 def read_poses(path: str | Path) -> Iterator[SurfacePose]:
     """Estimated poses."""
-    return _read(path, {"/pose": messages.pose_from_message})
+    return read_channels(path, {"/pose": messages.pose_from_message})
 
 
 def read_smoothed(path: str | Path) -> Iterator[SurfacePose]:
     """Poses as `stillbed smooth` added them."""
-    return _read(path, {"/smoothed": messages.pose_from_message})
+    return read_channels(path, {"/smoothed": messages.pose_from_message})
 
 
 def read_observations(path: str | Path) -> Iterator[Observations]:
-    """Observations."""
-    return _read(path, {"/observations": messages.observations_from_message})
+    """Tracked image points of every frame set."""
+    return read_channels(path, {"/observations": messages.observations_from_message})
 
 
 def read_commands(path: str | Path) -> Iterator[Command]:
     """Moves and holds as they were decided."""
-    return _read(path, {"/move": messages.move_from_message, "/hold": messages.hold_from_message})
-
-
-def read_sent(path: str | Path) -> Iterator[tuple[float, bytes]]:
-    """Stamps (s) and bytes of what went to the arm."""
-    return _read(path, {"/arm/sent": _stamped_bytes})
-
-
-def read_received(path: str | Path) -> Iterator[tuple[float, bytes]]:
-    """Stamps (s) and bytes of what came from the arm."""
-    return _read(path, {"/arm/received": _stamped_bytes})
-
-
-def read_events(path: str | Path) -> Iterator[tuple[float, int, str]]:
-    """Stamp (s), level and words of every event."""
-    return _read(path, {"/events": lambda m: (m["stamp"], m["level"], m["message"])})
+    return read_channels(path, {"/move": messages.move_from_message, "/hold": messages.hold_from_message})
 
 
 def read_truth_rows(path: str | Path) -> Array:
     """Truth or reference as stored, rows (N, 8) of stamp x y z qx qy qz qw, s and mm, in order of stamp."""
-    return np.array(sorted(_read(path, {"/truth": messages.row_from_message})), float).reshape(-1, 8)
+    return np.array(sorted(read_channels(path, {"/truth": messages.row_from_message})), float).reshape(-1, 8)
 
 
 def read_heads(path: str | Path) -> Iterator[tuple[float, PrintHead]]:
     """Stamps (s) of frame sets, and the print head at each."""
-    return _read(path, {"/head": _stamped_head})
+    return read_channels(path, {"/head": _stamped_head})
 
 
 def _stamped_head(message: Message) -> tuple[float, PrintHead]:
@@ -297,27 +283,20 @@ def _stamped_head(message: Message) -> tuple[float, PrintHead]:
     return row[0], head_from_row(row, message["extruding"])
 
 
-def _stamped_bytes(message: Message) -> tuple[float, bytes]:
-    return message["stamp"], messages.bytes_from_message(message)
-
-
-def _read(path: str | Path, decoders: dict[str, Callable[[Message], T]]) -> Iterator[T]:
+def read_channels(path: str | Path, decoders: Mapping[str, Callable[[Message], T]]) -> Iterator[T]:
+    """The records of some channels in the order of the file. decoders: topic: record of a message."""
     path = Path(path)
     for part in walk(path):
         for stored in part.messages if isinstance(part, ChunkMessages) else ():
             if stored.topic in decoders:
-                message = parse(path, stored)
-                try:
-                    yield decoders[stored.topic](message)
-                except (KeyError, TypeError, ValueError, OverflowError) as error:
-                    raise InputError(path, stored.topic, repr(error), "a message of its schema") from error
+                yield _decoded(path, stored, decoders[stored.topic])
 
 
 PATH_ATTACHMENT, ARM_ATTACHMENT = "path.csv", "arm.toml"
 
 
 def input_texts(path: PrintPath, profile: ArmProfile) -> dict[str, str]:
-    """Path and arm as the texts that a recording keeps."""
+    """Path and arm as texts, by the names of the recording's attachments."""
     return {PATH_ATTACHMENT: path_text(path), ARM_ATTACHMENT: arm_text(profile, "as a live run used it")}
 
 
@@ -328,7 +307,7 @@ def used_inputs(record: Path) -> tuple[PrintPath, ArmProfile]:
 
 
 def inputs_from_texts(texts: Mapping[str, str], record: Path) -> tuple[PrintPath, ArmProfile]:
-    """Path and arm of the texts of a recording; InputError where they are not there."""
+    """Path and arm in the attached texts of a recording; InputError where they are missing."""
     if PATH_ATTACHMENT not in texts or ARM_ATTACHMENT not in texts:
         raise InputError(record, "recording", "no path", "the recording of a run that began to print")
     path = path_from_text(texts[PATH_ATTACHMENT], record / PATH_ATTACHMENT)
