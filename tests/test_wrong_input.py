@@ -208,7 +208,7 @@ import os, time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from hardware.bench.figures import workers
-from hardware.offline.track import _settle
+from hardware.offline.track import _start_map_process
 
 def work(number):
     os.write(1, f"{os.getpid()}\\n".encode())
@@ -246,7 +246,7 @@ if __name__ == "__main__":
         print("interrupted")
 """
 BENCH = "workers(2)"
-TRACKER = "ProcessPoolExecutor(2, get_context('spawn'), _settle)"
+TRACKER = "ProcessPoolExecutor(2, get_context('spawn'), _start_map_process)"
 
 
 def pipe_closed(pid: int) -> bool:

@@ -1,7 +1,7 @@
 """`stillbed replay`: tracking and motion in one process under a simulated clock, merged by stamp.
 
-A pose becomes known to the motion POSE_DELAY_S after its stamp, which stands for transport and processing: never the
-time that was measured, so the same input gives the same bytes on every machine.
+The motion gets a pose POSE_DELAY_S after its stamp. That fixed delay stands for transport and processing in place of
+the measured time, so that the same input gives the same bytes on every machine.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import csv
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path as File
 
 import numpy as np
@@ -24,7 +24,6 @@ from hardware.files.arm_file import write_arm
 from hardware.files.path_file import ProgressFile, read_path, read_progress
 from hardware.files.session import Session
 from hardware.motion.step import MotionStep
-from hardware.process.clock import SimClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults, faults_striking
 from hardware.process.progress import ProgressReport, no_progress
 from perception.frames import Frame, FrameSet, Image
@@ -32,32 +31,32 @@ from planning.command import Command, Move
 
 
 class FrameFaults:
-    """What cameras deliver of one frame set after the other, in order."""
+    """Applies the faults of cameras to one frame set after the other, in order."""
 
     def __init__(self, faults: Sequence[Fault], rig: Rig, where: object) -> None:
         """InputError where cables are exchanged between cameras whose pictures differ in size."""
         self._faults, self._count = faults_striking(faults, FaultPart.CAMERA), len(rig)
-        self._last: dict[int, Image] = {}  # of each camera, before it stuck
+        self._last: dict[int, Image] = {}  # of each camera, its last picture before it stuck
         for fault in faults_striking(self._faults, FaultPart.CAMERA, FaultKind.SWAP):
             sizes = [rig.cameras[camera].size for camera in self._pair(fault)]
             if sizes[0] != sizes[1]:
                 raise InputError(where, "--fault", str(fault), "cameras whose pictures are of one size")
 
     def __call__(self, frames: FrameSet, instant: float) -> FrameSet:
-        """The set as it comes at `instant`, s; frames may be missing from it."""
+        """The frame set as the cameras deliver it at `instant`, s; frames may be missing."""
         images = {frame.camera: frame.image for frame in frames.frames}
         for fault in self._faults:
             if fault.kind is FaultKind.SWAP and fault.covers(instant):
                 one, other = self._pair(fault)
                 if one in images and other in images:
                     images[one], images[other] = images[other], images[one]
-        found = [self._one(frame, images[frame.camera], instant) for frame in frames.frames]
-        return replace(frames, frames=tuple(frame for frame in found if frame is not None))
+        delivered = (self._frame(frame, images[frame.camera], instant) for frame in frames.frames)
+        return replace(frames, frames=tuple(frame for frame in delivered if frame is not None))
 
     def _pair(self, fault: Fault) -> tuple[int, int]:
         return fault.number, (fault.number + 1) % self._count
 
-    def _one(self, frame: Frame, image: Image, instant: float) -> Frame | None:
+    def _frame(self, frame: Frame, image: Image, instant: float) -> Frame | None:
         kinds = {fault.kind for fault in self._faults if fault.number == frame.camera and fault.covers(instant)}
         if FaultKind.OFF in kinds:
             return None
@@ -72,13 +71,13 @@ class FrameFaults:
 
 
 def tracked_sets(sets: Iterable[FrameSet], faults: Sequence[Fault], rig: Rig, where: object) -> Iterator[FrameSet]:
-    """The sets of a recording that a tracking with faults gets to see; instants count from the first set's stamp."""
-    spoil, idle, start = FrameFaults(faults, rig, where), faults_striking(faults, FaultPart.TRACKING), None
+    """The frame sets that tracking gets under faults of cameras and tracking, whose times count from the first set."""
+    with_faults, pauses, start = FrameFaults(faults, rig, where), faults_striking(faults, FaultPart.TRACKING), None
     for frames in sets:
         start = frames.stamp if start is None else start
-        spoilt = spoil(frames, frames.stamp - start)
-        if spoilt.frames and not any(fault.covers(frames.stamp - start) for fault in idle):
-            yield spoilt
+        delivered = with_faults(frames, frames.stamp - start)
+        if delivered.frames and not any(fault.covers(frames.stamp - start) for fault in pauses):
+            yield delivered
 
 
 POSE_DELAY_S = 0.05  # s: 20 ms from exposure to decoded image, 15 ms of tracking, 15 ms of spread (30 Hz cameras, USB)
@@ -91,33 +90,26 @@ COMMAND_COLUMNS = (
 def replay(
     poses: Iterable[SurfacePose], motion: MotionStep, delay: float = POSE_DELAY_S, hangs: Sequence[Fault] = ()
 ) -> Iterator[tuple[float, Command]]:
-    """Every tick's instant (s) and command, from the first pose's stamp until the last pose is known.
+    """Every tick's instant (s) and command, from the first pose's stamp until the motion has the last pose.
 
-    poses: in order of stamp, asked for only when they are due. delay: s, from a pose's stamp until the motion knows it.
-    hangs: when no tick is made, s from the first.
+    poses: in order of stamp, taken only when they are due. delay: s, from a pose's stamp until the motion has it.
+    hangs: faults during which there is no tick, s from the first tick.
     """
     coming = iter(poses)
-    pose, ahead = None, next(coming, None)
-    if ahead is None:
+    pose, following = None, next(coming, None)
+    if following is None:
         return
-    clock, start, tick = SimClock(ahead.stamp), ahead.stamp, 0
-    while True:
-        while ahead is not None and ahead.stamp + delay <= clock.now():
-            pose, after = ahead, next(coming, None)
-            _check_order(ahead, after)
-            ahead = after
-        now = clock.now()
+    start = following.stamp
+    for tick in count():
+        now = start + tick * motion.profile.tick
+        while following is not None and following.stamp + delay <= now:
+            pose, following = following, next(coming, None)
+            if following is not None and not following.stamp > pose.stamp:
+                raise InputError("poses", "stamp", following.stamp, f"after the one before, {pose.stamp} s")
         if not any(fault.covers(now - start) for fault in hangs):
             yield now, motion(pose, now)
-        if ahead is None:
+        if following is None:
             return
-        tick += 1
-        clock.wait_until(start + tick * motion.profile.tick)
-
-
-def _check_order(before: SurfacePose, after: SurfacePose | None) -> None:
-    if after is not None and not after.stamp > before.stamp:
-        raise InputError("poses", "stamp", after.stamp, f"after the one before, {before.stamp} s")
 
 
 class CommandWriter(ExitStack):
@@ -160,10 +152,10 @@ def replay_session(
 ) -> tuple[int, int]:
     """Replay a session with the path at `path` (CSV) into `out`: commands.csv, frames.bin, arm.toml, progress.toml.
 
-    A recording knows no arm. Without a profile the default arm is placed so that the first measured surface lies on its
-    bench, level and below home; arm.toml says where that is. What was written before an error stays readable.
-    resume: progress.toml of an earlier run, to go on where that stopped. faults: of cameras, tracking and motion.
-    Returns how many moves and how many holds were written.
+    profile: the arm; a session has none. By default the default arm, placed so that the first measured surface lies on
+    its bench, level and below home; arm.toml says where that is. resume: progress.toml of an earlier run, to continue
+    it. faults: of cameras, tracking and motion. Returns the numbers of moves and of holds written. Whatever was written
+    before an error stays readable.
     """
     from hardware.offline.track import tracker  # loads cv2: the motion must not
 
@@ -183,22 +175,21 @@ def replay_session(
         poses: Iterable[SurfacePose] = track()
         if profile is None:
             poses, profile = placed_by(poses)
-        write_arm(
-            out / "arm.toml", profile, f"what this replay assumed; poses were known {POSE_DELAY_S} s after their stamps"
-        )
-        motion, keeper = MotionStep(checkpoints, profile, start), ProgressFile(out / "progress.toml", checkpoints)
+        remark = f"what this replay assumed; poses were known {POSE_DELAY_S} s after their stamps"
+        write_arm(out / "arm.toml", profile, remark)
+        motion, saved = MotionStep(checkpoints, profile, start), ProgressFile(out / "progress.toml", checkpoints)
         moves = ticks = 0
         for _, command in replay(poses, motion, hangs=faults_striking(faults, FaultPart.MOTION)):
             writer.write(command, frame_from_command(command, profile.dialect))
             moves, ticks = moves + isinstance(command, Move), ticks + 1
-            keeper.write(motion.progress)
+            saved.write(motion.progress)
     return moves, ticks - moves
 
 
 def placed_by(poses: Iterable[SurfacePose]) -> tuple[Iterator[SurfacePose], ArmProfile]:
-    """The same poses, and the default arm placed by the first of them that is measured.
+    """The same poses, and the default arm placed under the surface by the first measured pose.
 
-    Before that pose the motion only holds, so nothing is known earlier than it would be live.
+    Before that pose the motion only holds, so that no command depends on a later pose.
     """
     coming, waiting = iter(poses), list[SurfacePose]()
     for pose in coming:

@@ -1,4 +1,4 @@
-"""`stillbed segment`: pictures or a video in, one PNG mask each and a table out."""
+"""`stillbed segment`: a PNG mask for each picture or frame of a video, and a table of all."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 WOUND_TABLE = "wounds.csv"
 OVERLAY_FOLDER = "overlays"  # folder of the pictures with outlines
-OVERLAY_QUALITY = 90  # JPEG: they are for the eye
+OVERLAY_QUALITY = 90  # of JPEG
 WOUND_COLUMNS = (
     "name", "wound", "confidence", "threshold", "area_px", "area_mm2", "centroid_x_px", "centroid_y_px",
     "x0_px", "y0_px", "x1_px", "y1_px", "ms",
@@ -30,44 +30,43 @@ WOUND_COLUMNS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SegmentOptions:
-    """How it is written. overlay: pictures with outlines as well. mm_per_px: of the wound's plane, None: unknown.
-    force: into a folder that is not empty."""
+    """What is written, and where."""
 
-    overlay: bool = False
-    mm_per_px: float | None = None
-    force: bool = False
+    overlay: bool = False  # pictures with outlines as well
+    mm_per_px: float | None = None  # in the wound's plane; None: unknown
+    force: bool = False  # into a folder that is not empty
 
 
 def run_segment(inputs: Sequence[Path], out: Path, segmenter: Segmenter, options: SegmentOptions) -> str:
-    """Segment pictures, folders of pictures and videos into the folder `out`; what it came to, in words.
+    """Segment pictures, folders of pictures and videos into the folder `out`; the result in two lines of text.
 
-    A mask lies there as NAME.png (a video's as NAME_000000.png and so on), 0 or 255, of the picture's own size. A file
-    that cannot be read is told at the end, by InputError; all others have been written.
+    A mask is NAME.png (a video's NAME_000000.png and so on), 0 or 255, of the picture's own size. InputError for files
+    that cannot be read is raised at the end, when the masks of all others are written.
     """
     files = input_files(inputs)
     prepare_out(out, options.force)
     if options.overlay:
         (out / OVERLAY_FOLDER).mkdir(exist_ok=True)
-    clock, faults = WallClock(), list[InputError]()
-    times, found = list[float](), 0
+    clock, errors = WallClock(), list[InputError]()
+    times, wounds = list[float](), 0  # times: ms of each picture
     with (out / WOUND_TABLE).open("w", newline="", encoding="utf-8") as stream:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(WOUND_COLUMNS)
         with Progress("segment", "pictures", clock.now) as progress:
             total = sum(expected_count(file) for file in files)
-            for name, image in read_pictures(files, faults):
+            for name, image in read_pictures(files, errors):
                 start = clock.now()
-                seen = segmenter(image)
+                result = segmenter(image)
                 times.append(1000 * (clock.now() - start))
-                found += seen.found
-                _write(out, name, image, seen, options)
-                table.writerow(table_row(name, seen, options.mm_per_px, times[-1]))
+                wounds += result.found
+                _write(out, name, image, result, options)
+                table.writerow(table_row(name, result, options.mm_per_px, times[-1]))
                 stream.flush()
                 progress(len(times), max(total, len(times)))
-    _raise_faults(faults, len(times))
-    median, late = np.percentile(times, [50, 99])
-    took = f"{median:.1f} ms each (median), {late:.1f} ms (p99)"
-    return f"{found} of {len(times)} pictures show a wound; {took}\nmasks and {WOUND_TABLE} are in {out}"
+    _raise_errors(errors, len(times))
+    median, p99 = np.percentile(times, [50, 99])
+    took = f"{median:.1f} ms each (median), {p99:.1f} ms (p99)"
+    return f"{wounds} of {len(times)} pictures show a wound; {took}\nmasks and {WOUND_TABLE} are in {out}"
 
 
 def input_files(inputs: Sequence[Path]) -> list[Path]:
@@ -88,14 +87,13 @@ def input_files(inputs: Sequence[Path]) -> list[Path]:
     first: dict[str, Path] = {}
     for file in files:
         if first.setdefault(file.stem, file) is not file:
-            raise InputError(
-                file, "name", file.stem, f"another than that of {first[file.stem]}: masks are named for it"
-            )
+            allowed = f"another than that of {first[file.stem]}: masks are named for it"
+            raise InputError(file, "name", file.stem, allowed)
     return files
 
 
 def expected_count(file: Path) -> int:
-    """How many pictures a file holds, as far as it tells."""
+    """How many pictures a file holds by its own header; 0 if unreadable."""
     if file.suffix.lower() in PICTURE_SUFFIXES:
         return 1
     try:
@@ -107,51 +105,52 @@ def expected_count(file: Path) -> int:
     return count
 
 
-def read_pictures(files: Sequence[Path], faults: list[InputError]) -> Iterator[tuple[str, Image]]:
-    """Name of the mask and picture (H, W) or (H, W, 3) BGR, one after another; what cannot be read goes to `faults`."""
+def read_pictures(files: Sequence[Path], errors: list[InputError]) -> Iterator[tuple[str, Image]]:
+    """Name of the mask and picture (H, W) or (H, W, 3) BGR, one after another; adds what cannot be read to `errors`."""
     for file in files:
         try:
             if file.suffix.lower() in PICTURE_SUFFIXES:
                 yield file.stem, decode(file.read_bytes(), file, "picture")
             else:
                 yield from _frames(file)
-        except InputError as fault:
-            faults.append(fault)
+        except InputError as error:
+            errors.append(error)
 
 
 def _frames(file: Path) -> Iterator[tuple[str, Image]]:
     video = Video(file)
-    told = video.reported_count()
+    reported = video.reported_count()
     try:
         while (image := video.read()) is not None:
             yield f"{file.stem}_{video.next - 1:06d}", image
-        if video.next < told or not video.next:
-            raise InputError(
-                file, "frames", f"{video.next} that decode", f"{told}, as the file says (is it cut short?)"
-            )
+        if video.next < reported or not video.next:
+            allowed = f"{reported}, as the file says (is it cut short?)"
+            raise InputError(file, "frames", f"{video.next} that decode", allowed)
     finally:
         video.close()
 
 
-def table_row(name: str, seen: Segmentation, mm_per_px: float | None, ms: float) -> list[Any]:
+def table_row(name: str, result: Segmentation, mm_per_px: float | None, ms: float) -> list[Any]:
     """One line of the table; what is not known is empty."""
-    area, box = int(seen.mask.sum()), box_of(seen.mask)
-    middle = [f"{value:.2f}" for value in centroid(seen.mask)] if seen.found else ["", ""]
+    area, box = int(result.mask.sum()), box_of(result.mask)
+    middle = [f"{value:.2f}" for value in centroid(result.mask)] if result.found else ["", ""]
+    threshold = f"{result.threshold:.1f}" if np.isfinite(result.threshold) else ""
     return [
-        name, int(seen.found), f"{seen.confidence:.4f}", f"{seen.threshold:.1f}" if np.isfinite(seen.threshold) else "",
-        area, "" if mm_per_px is None else f"{area * mm_per_px**2:.2f}", *middle, *(box or ("",) * 4), f"{ms:.2f}",
+        name, int(result.found), f"{result.confidence:.4f}", threshold, area,
+        "" if mm_per_px is None else f"{area * mm_per_px**2:.2f}", *middle, *(box or ("",) * 4), f"{ms:.2f}",
     ]  # fmt: skip
 
 
-def _write(out: Path, name: str, image: Image, seen: Segmentation, options: SegmentOptions) -> None:
-    (out / f"{name}.png").write_bytes(encode(seen.mask.astype(np.uint8) * np.uint8(255))[1])
+def _write(out: Path, name: str, image: Image, result: Segmentation, options: SegmentOptions) -> None:
+    (out / f"{name}.png").write_bytes(encode(result.mask.astype(np.uint8) * np.uint8(255))[1])
     if options.overlay:
-        (out / OVERLAY_FOLDER / f"{name}.jpg").write_bytes(encode(draw_overlay(image, seen), OVERLAY_QUALITY)[1])
+        (out / OVERLAY_FOLDER / f"{name}.jpg").write_bytes(encode(draw_overlay(image, result), OVERLAY_QUALITY)[1])
 
 
-def _raise_faults(faults: list[InputError], done: int) -> None:
-    if len(faults) == 1 or (faults and not done):
-        raise faults[0]
-    if faults:
-        others = ", ".join(str(fault.where) for fault in faults[1:])
-        raise InputError(faults[0].where, faults[0].what, f"{faults[0].got}; also {others}", faults[0].allowed)
+def _raise_errors(errors: list[InputError], done: int) -> None:
+    """Raise the first error; it names the other files where some pictures were read. done: number of those."""
+    if len(errors) == 1 or (errors and not done):
+        raise errors[0]
+    if errors:
+        others = ", ".join(str(error.where) for error in errors[1:])
+        raise InputError(errors[0].where, errors[0].what, f"{errors[0].got}; also {others}", errors[0].allowed)

@@ -1,6 +1,6 @@
-"""The tracks that a session is smoothed by: recorded ones, or the tracker's on its images; and reobserved landmarks.
+"""The tracks of a session that is smoothed: recorded ones, else the tracker's on its images; and reobserved landmarks.
 
-Tracks that took long to make are kept as a recording beside the results, with the hash of what they were made of.
+Tracks take long to compute, so they are kept as a recording beside the results, with the hash of their source.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ from hardware.recording.session_reader import read_observations, read_poses
 from perception.pairing import mean_stamp
 from perception.tracking.reobservation import KnownMotion, ReferencePictures, Reobserver, joined_observations
 
-SOURCE_ATTACHMENT = "made_of.txt"  # attached to the recording, before all else in it
+SOURCE_ATTACHMENT = "made_of.txt"  # name of the attachment with the hash, the recording's first record
 
 
 def source_hash(path: Path) -> str:
-    """What `track_writer` was told that the recording is made of; "" where there is none, or none of its own."""
+    """The hash that `track_writer` stored in a recording; "" where there is no recording, or no hash in it."""
     try:
         for part in walk(path):
             if isinstance(part, AttachedFile) and part.name == SOURCE_ATTACHMENT:
                 return part.data.decode()
             if isinstance(part, ChunkMessages):
                 break
-    except InputError:  # it is made anew
+    except InputError:  # unreadable: the tracks are computed again
         pass
     return ""
 
 
 def part_path(target: Path) -> Path:
-    """What is there of it while it is made, and where that was interrupted."""
+    """The recording while it is written, and what an interruption leaves of it."""
     return target.with_suffix(".part.mcap")
 
 
 @contextmanager
 def track_writer(target: Path, rig: Rig, contents: str) -> Iterator[Recorder]:
-    """A recorder for what is made of `contents`, a hash; the file has its name once it is whole."""
+    """A recorder for tracks computed from a source of the hash `contents`; the file gets its name once it is whole."""
     part = part_path(target)
     with Recorder(part, rig, overwrite=True) as recorder:
         recorder.attach(SOURCE_ATTACHMENT, contents.encode())
@@ -65,10 +65,10 @@ TRACKS_FILE = "tracks.mcap"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SessionTracks:
-    """What a causal run left. observations: of each frame set, in order of stamp. poses: its own, in order of stamp."""
+    """The results of a causal run."""
 
-    observations: tuple[Observations, ...]
-    poses: tuple[SurfacePose, ...]
+    observations: tuple[Observations, ...]  # of each frame set, in order of stamp
+    poses: tuple[SurfacePose, ...]  # in order of stamp
 
     @property
     def start(self) -> Trajectory | None:
@@ -83,24 +83,22 @@ class SessionTracks:
 def tracks_of(session: Session, out: Path, contents: str, stream: TextIO | None = None) -> SessionTracks:
     """The session's tracks. Where it has none, its images are tracked first, into tracks.mcap in the folder `out`.
 
-    contents: the session's hash; tracks.mcap of another one is made anew. stream: where progress is said, stderr
-    without.
+    contents: the session's hash; tracks.mcap of another one is replaced. stream: for progress, by default stderr.
     """
     if session.path.is_file():
         recorded = read_tracks(session.path)
         if any(map(len, recorded.observations)):
             return recorded
-    kept = out / TRACKS_FILE
-    if source_hash(kept) != contents:
-        _track(session, kept, contents, stream)
-    found = read_tracks(kept)
-    if not any(map(len, found.observations)):
+    if source_hash(out / TRACKS_FILE) != contents:
+        _track(session, out / TRACKS_FILE, contents, stream)
+    tracks = read_tracks(out / TRACKS_FILE)
+    if not any(map(len, tracks.observations)):
         raise InputError(session.path, "tracks", "none in its images", "a surface that the tracker finds")
-    return found
+    return tracks
 
 
 def read_tracks(path: Path) -> SessionTracks:
-    """By stamp, each once: a run that was interrupted while it wrote may have stored a stretch twice."""
+    """The tracks in a recording, each stamp once: a run interrupted while it wrote may have stored a chunk twice."""
     observations = {seen.stamp: seen for seen in read_observations(path)}
     poses = {pose.stamp: pose for pose in read_poses(path) if np.isfinite(pose.base_from_surface).all()}
     return SessionTracks(
@@ -129,24 +127,22 @@ STAMP_TOLERANCE_S = 1e-6  # s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReobservedTracks:
-    """tracks: of the session, with what was found. looks: how many that are, early: of landmarks before they were first
-    seen; sets: frame sets that had none before. trouble: why not all images were searched, "" if they were.
-    """
+    """The session's tracks with the landmarks that were found again in its images."""
 
     tracks: SessionTracks
-    looks: int = 0
-    early: int = 0
-    sets: int = 0
-    trouble: str = ""
+    looks: int = 0  # number of added observations
+    early: int = 0  # those of them that precede their landmark's first track
+    sets: int = 0  # frame sets that had no track before
+    trouble: str = ""  # why not all images were searched, "" if they were
 
     @property
     def text(self) -> str:
-        """In words, behind others."""
+        """A sentence to follow others, "" where nothing was found."""
         found = f" {self.looks} looks at landmarks were found besides the tracks'" if self.looks else ""
         parts = [(self.early, "of landmarks that joined the map later"), (self.sets, "frame sets had none")]
-        told = ", ".join(f"{count} {what}" for count, what in parts if count)
+        details = ", ".join(f"{count} {what}" for count, what in parts if count)
         trouble = f" Images were not searched to their end: {self.trouble}." if self.trouble else ""
-        return f"{found}{': ' if found and told else ''}{told}{'.' if found else ''}{trouble}"
+        return f"{found}{': ' if found and details else ''}{details}{'.' if found else ''}{trouble}"
 
     @property
     def figures(self) -> dict[str, int]:
@@ -157,25 +153,24 @@ class ReobservedTracks:
 def reobserve(
     session: Session, tracks: SessionTracks, smoothed: Smoothed, out: Path, contents: str, stream: TextIO | None = None
 ) -> ReobservedTracks:
-    """The session's tracks, and looks at its landmarks wherever its images show one and the tracks do not say so.
+    """The session's tracks, and observations of its landmarks in images that show one without a track.
 
-    What is found is kept in relinked.mcap in the folder `out`. smoothed: of these tracks. contents: hash of the session
-    and of how it was smoothed; a file made of others is made anew. stream: where progress is said, stderr without.
+    They are kept in relinked.mcap in the folder `out`. smoothed: by these tracks. contents: hash of the session and of
+    how it was smoothed; a file of another one is replaced. stream: for progress, by default stderr.
     """
-    kept = out / RELINKED_FILE
-    if source_hash(kept) == contents:
-        return with_looks(tracks, read_tracks(kept).observations)
-    try:
-        with track_writer(kept, session.rig, contents) as recorder:
-            for seen in _searched(session, tracks, smoothed, stream):
-                recorder.write(seen)
-    except InputError as damage:  # the tracks do not need the images
-        return replace(with_looks(tracks, read_tracks(part_path(kept)).observations), trouble=str(damage))
-    return with_looks(tracks, read_tracks(kept).observations)
+    file, trouble = out / RELINKED_FILE, ""
+    if source_hash(file) != contents:
+        try:
+            with track_writer(file, session.rig, contents) as recorder:
+                for seen in _searched(session, tracks, smoothed, stream):
+                    recorder.write(seen)
+        except InputError as damage:  # the tracks do not need the images
+            file, trouble = part_path(file), str(damage)
+    return replace(with_looks(tracks, read_tracks(file).observations), trouble=trouble)
 
 
 def with_looks(tracks: SessionTracks, found: Iterable[Observations]) -> ReobservedTracks:
-    """The tracks with what was found besides, in order of stamp."""
+    """The tracks together with more observations, in order of stamp."""
     whole = {seen.stamp: seen for seen in tracks.observations}
     first: dict[int, float] = {}
     for seen in tracks.observations:

@@ -1,6 +1,6 @@
-"""The trackers that can be chosen by name, and `stillbed track`: one of them over a recorded session.
+"""`stillbed track`: a recorded session tracked frame set by frame set; and the trackers that can be chosen by name.
 
-The command line needs the names alone, so GTSAM, OpenCV and onnxruntime are imported where they are used.
+The command line needs only the names, so GTSAM, OpenCV and onnxruntime are imported where they are used.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from perception.tracking.wound_step import WoundTrackingStep
     from perception.wound.segmentation import NetworkSegmenter
 
-    PoseSink = Callable[[FrameSet, SurfacePose, StepReport], None]  # what else is done with each pose
+    PoseSink = Callable[[FrameSet, SurfacePose, StepReport], None]  # takes each pose once it is written
 
-MAP_PROCESS_NICE = 10  # by which the process of the map stands back
+MAP_PROCESS_NICE = 10  # added to the niceness of the map's process
 MAP_METHOD, THESIS_METHOD, THESIS_FLOW_METHOD = "map", "thesis", "thesis-flow"
 TRACKING_METHODS = {
     MAP_METHOD: "the pose from all cameras against a map of the surface",
@@ -40,7 +40,7 @@ TRACKING_METHODS = {
 
 
 class FrameSetStep(Protocol):
-    """A tracker as it is driven: TrackingStep, or anything that answers like it."""
+    """A tracker: TrackingStep, or anything that is called like it."""
 
     last: StepReport
 
@@ -48,7 +48,7 @@ class FrameSetStep(Protocol):
         """The pose at `frames.stamp`."""
 
     def idle(self) -> None:
-        """Work that no pose waits for."""
+        """Do the work that no pose waits for."""
 
 
 @contextmanager
@@ -61,10 +61,9 @@ def step_by(
     tool: Array | None = None,
     prefilter: str = "none",
 ) -> Iterator[FrameSetStep]:
-    """The tracker of a method, a key of TRACKING_METHODS, for these cameras.
+    """The tracker of a method, a key of TRACKING_METHODS, for these cameras; other arguments as `tracker` takes them.
 
-    roi, surface, now, tool, prefilter: as `tracker` takes them. The thesis's methods make no use of scan and tool, and
-    always apply the bilateral filter.
+    The thesis's methods make no use of scan and tool, and always apply the bilateral filter.
     """
     if method == MAP_METHOD:
         with tracker(rig, roi, surface, now, tool, prefilter) as step:
@@ -86,12 +85,12 @@ def tracker(
     tool: Array | None = None,
     prefilter: str = "none",
 ) -> Iterator[TrackingStep | WoundTrackingStep]:
-    """TrackingStep for these cameras; the map is refined in a process of its own, as GTSAM holds the interpreter.
+    """TrackingStep for these cameras; the map is refined in a process of its own, as GTSAM holds the interpreter lock.
 
-    roi: where the surface is at the start; without one the wound is looked for first, by the network that comes along,
-    and where it sees none the whole pictures are the surface. surface: the scan's file, mm; InputError where it cannot
-    be read. now: s, only to say how long the stages take. tool: (K, 2) mm, profile of what hangs on the arm, as
-    `ArmProfile.tool`. prefilter: a key of perception.lens.PREFILTERS.
+    roi: where the surface is at the start; without one the shipped network segments the wound first, and where it finds
+    none the whole pictures are the surface. surface: the scan's file, mm; InputError where it cannot be read. now: s,
+    by which the stages are timed. tool: (K, 2) mm, profile of the tool on the arm as `ArmProfile.tool`. prefilter: a
+    key of perception.lens.PREFILTERS.
     """
     from hardware.files.mesh_file import read_mesh
     from perception.lens import PREFILTERS
@@ -100,14 +99,14 @@ def tracker(
     from perception.tracking.wound_step import WoundTrackingStep
 
     scan = None if surface is None else read_mesh(surface).scan
-    with ProcessPoolExecutor(1, get_context("spawn"), _settle) as executor:
+    with ProcessPoolExecutor(1, get_context("spawn"), _start_map_process) as executor:
         with blocked_sigint():
             first = executor.submit(int)
-        first.result()  # started before the first frame set, not beside it
+        first.result()  # the process has started before the first frame set
 
         def make_step(regions: Sequence[Roi]) -> TrackingStep:
-            held = None if tool is None else Tool(tool)
-            return TrackingStep(rig, regions, now, executor, scan, held, PREFILTERS[prefilter])
+            masked = None if tool is None else Tool(tool)
+            return TrackingStep(rig, regions, now, executor, scan, masked, PREFILTERS[prefilter])
 
         if roi:
             yield make_step(roi)
@@ -117,8 +116,8 @@ def tracker(
             yield WoundTrackingStep(rig, make_step, segmenter, thread)
 
 
-def _settle() -> None:
-    """Ctrl-C is for the parent, which then ends this process in good order; frames go before the map."""
+def _start_map_process() -> None:
+    """Set up the map's process: the parent ends it, also after Ctrl-C, and frames have priority over the map."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     exit_with_parent()
     os.nice(MAP_PROCESS_NICE)
@@ -144,8 +143,8 @@ def run_track(
 ) -> str:
     """Track the session at `path` into the folder `out`; returns the summary as text.
 
-    method, tool, prefilter: as `step_by` takes them. wound: whether the wound is segmented beside it, into wound.csv.
-    Whatever ends the run early, a fault of the input or Ctrl-C, leaves poses and a report of all frame sets until then.
+    method, tool, prefilter: as `step_by` takes them. wound: whether the wound is segmented as well, into wound.csv.
+    An early end, by an error of the input or Ctrl-C, leaves poses and a report of all frame sets until then.
     """
     from hardware.files.pose_file import PoseWriter, WoundFile
     from hardware.offline.convert import TrackRecorder
@@ -156,15 +155,14 @@ def run_track(
     session = open_session(path)
     prepare_out(out, force)
     clock = WallClock()
-    cameras = [camera.name for camera in session.rig.cameras]
     complete = False
     with ExitStack() as stack:
-        follows = step_by(method, session.rig, session.roi, session.surface, clock.now, tool, prefilter)
-        step = stack.enter_context(follows)
+        chosen = step_by(method, session.rig, session.roi, session.surface, clock.now, tool, prefilter)
+        step = stack.enter_context(chosen)
         sinks = [] if record is None else [stack.enter_context(TrackRecorder(record, session, force)).write]
         if wound:
             sinks.append(stack.enter_context(WoundFile(out, session.rig, _network_segmenter())).write)
-        writer = stack.enter_context(PoseWriter(out, cameras, STAGES))
+        writer = stack.enter_context(PoseWriter(out, [camera.name for camera in session.rig.cameras], STAGES))
         progress = stack.enter_context(Progress("track", "frame sets", clock.now))
         try:
             follow(session.frame_sets(), step, writer, clock.now, progress, len(session), sinks)
@@ -183,12 +181,12 @@ def follow(
     total: int,
     sinks: Sequence[PoseSink] = (),
 ) -> int:
-    """Drive `step` over the frame sets, each pose written before the next is asked for; how many there were.
+    """Run `step` over the frame sets, each pose written before the next frame set is taken; returns their number.
 
-    `total` is for the progress only. The step's own time is measured by `now` and ends before anything is written.
+    now: s, by which the step alone is timed, not the writing. total: frame sets, for the progress only.
     """
     done = 0
-    for frames in frame_sets:
+    for done, frames in enumerate(frame_sets, 1):
         start = now()
         pose = step(frames)
         spent = now() - start
@@ -196,13 +194,12 @@ def follow(
         for sink in sinks:
             sink(frames, pose, step.last)
         step.idle()
-        done += 1
         progress(done, total)
     return done
 
 
 def _write_report(out: Path, session: Session, complete: bool, method: str) -> str:
-    """Evaluate the poses.csv in `out`; report.html and summary.json there, the summary as text."""
+    """Evaluate the poses.csv in `out` into report.html and summary.json there; returns the summary as text."""
     from hardware.files.pose_file import read_poses
     from hardware.report.evaluation import evaluate
     from hardware.report.report import write_report

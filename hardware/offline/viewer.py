@@ -1,6 +1,6 @@
-"""`stillbed view`: a recorded session as a page; at each frame set the pictures and all that is known beside them.
+"""`stillbed view`: a recorded session as a page that shows the pictures of each frame set with pose, tracks and nozzle.
 
-Behind the same access control as the operator's page: this machine only, a token in the address, nothing from outside.
+It has the access control of the operator's page: this machine only, a token in the address, nothing from outside.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from threading import Lock
+from typing import TypeVar
 
 import numpy as np
 from aiohttp import web
-from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError, StillbedError
@@ -44,30 +44,27 @@ from hardware.recording.session_reader import (
 )
 from hardware.report.evaluation import associate
 from perception.frames import Frame, FrameSet
-from perception.pairing import frame_set
+from perception.pairing import frame_set, mean_stamp
 from planning.command import Move
 from planning.path import Path as Toolpath
 
 MIN_SURFACE_TRACKS = 12  # tracks that make a surface worth showing
-MAX_SURFACE_SETS = 60  # frame sets among which the one that shows most of the surface is sought
+MAX_SURFACE_SETS = 60  # first frame sets, of which the one with most tracks gives the surface
+
+Record = TypeVar("Record", SurfacePose, Observations)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Playback:
-    """A session as it is shown. stamps: (K,) s, of the frame sets. poses: K of them, None where there is none.
-
-    source: where the poses are from, "" without any. tracks: of each frame set, None without. fraction: (K,) of the
-    path, by checkpoint, NaN where nothing was commanded. off: (K,) mm from the truth, laid at the first pose, NaN
-    without one.
-    """
+    """A session as it is shown, K frame sets."""
 
     session: Session
-    source: str
-    stamps: Array
-    poses: tuple[SurfacePose | None, ...]
-    tracks: tuple[Observations | None, ...]
-    fraction: Array
-    off: Array
+    source: str  # of the poses, "" without any
+    stamps: Array  # (K,) s, of the frame sets
+    poses: tuple[SurfacePose | None, ...]  # K
+    tracks: tuple[Observations | None, ...]  # K
+    fraction: Array  # (K,) place on the path, counted in checkpoints; NaN where nothing was commanded
+    off: Array  # (K,) mm from the truth, aligned at the first pose; NaN without one
     scene: PageScene
 
     def __len__(self) -> int:
@@ -94,40 +91,35 @@ class Playback:
 
 
 def open_playback(path: Path, poses: str | None = None, toolpath: Path | None = None) -> Playback:
-    """A session folder, an .mcap file, or what was smoothed of one. poses: of another file, as `stillbed compare` reads
-    them. toolpath: a path, where the recording has none. Raises InputError.
+    """Open a session folder, an .mcap file, or the results of `stillbed smooth`; InputError where that cannot be read.
+
+    poses: an argument of `stillbed compare` whose poses are shown instead. toolpath: instead of the recording's path.
     """
     if (path / "smoothed.mcap").is_file():
         path = path / "smoothed.mcap"
     session = open_session(path)
-    sets = _stamps(session)
-    if not len(sets):
+    stamps = np.array([mean_stamp(refs) for refs in session.sets])
+    if not len(stamps):
         raise InputError(path, "frame sets", "none", "a session with pictures")
-    found, source = _poses(session, poses)
-    seen = _tracks(session, sets)
-    placed = _beside(sets, found)
-    off = _off(sets, placed, session)
-    way = _toolpath(session) if toolpath is None else read_path(toolpath)
-    scene = scene_from(session.rig, way, _surface(session.rig, placed, seen))
-    return Playback(session, source, sets, placed, seen, _fraction(session, sets), off, scene)
-
-
-def _stamps(session: Session) -> Array:
-    """(K,) s, as frame sets have them: the mean of their images'."""
-    blank = np.zeros((1, 1), np.uint8)
-    return np.array([frame_set([Frame(r.camera, r.stamp, blank) for r in refs]).stamp for refs in session.sets])
+    recorded, source = _poses(session, poses)
+    shown = _at_stamps(stamps, recorded)
+    tracks = _at_stamps(stamps, list(read_observations(session.path)) if session.path.is_file() else [])
+    off = _off(stamps, shown, session)
+    path_shown = _toolpath(session) if toolpath is None else read_path(toolpath)
+    scene = scene_from(session.rig, path_shown, _surface(session.rig, shown, tracks))
+    return Playback(session, source, stamps, shown, tracks, _fraction(session, stamps), off, scene)
 
 
 def _poses(session: Session, named: str | None) -> tuple[list[SurfacePose], str]:
-    """The poses to show and where they are from: those asked for, else smoothed, live or true ones."""
+    """The poses to show and where they are from: the named ones, else smoothed, live or true ones."""
     if named is not None:
-        posed = read_pose_series(named)
-        return _as_poses(posed), posed.name
+        series = read_pose_series(named)
+        return _as_poses(series), series.name
     if session.path.is_file():
         for name, read in (("smoothed", read_smoothed), ("live", read_poses)):
-            found = [pose for pose in read(session.path) if np.isfinite(pose.base_from_surface).all()]
-            if found:
-                return sorted(found, key=lambda pose: pose.stamp), name
+            finite = [pose for pose in read(session.path) if np.isfinite(pose.base_from_surface).all()]
+            if finite:
+                return finite, name
     truth = session.truth
     if truth is None:
         return [], ""
@@ -135,40 +127,32 @@ def _poses(session: Session, named: str | None) -> tuple[list[SurfacePose], str]
     return _as_poses(PoseSeries("truth", truth, unknown)), "truth" if truth.exact else "reference"
 
 
-def _as_poses(posed: PoseSeries) -> list[SurfacePose]:
-    rows = zip(posed.trajectory.stamps, posed.trajectory.base_from_surface, posed.covariance, strict=True)
-    return [SurfacePose(float(t), pose, spread, np.zeros(6), TrackState.TRACKING) for t, pose, spread in rows]
+def _as_poses(series: PoseSeries) -> list[SurfacePose]:
+    rows = zip(series.trajectory.stamps, series.trajectory.base_from_surface, series.covariance, strict=True)
+    return [SurfacePose(float(t), pose, covariance, np.zeros(6), TrackState.TRACKING) for t, pose, covariance in rows]
 
 
-def _beside(stamps: Array, poses: list[SurfacePose]) -> tuple[SurfacePose | None, ...]:
-    rows, theirs = associate(stamps, np.array([pose.stamp for pose in poses]))
-    out: list[SurfacePose | None] = [None] * len(stamps)
+def _at_stamps(stamps: Array, records: list[Record]) -> tuple[Record | None, ...]:
+    """The record at each of the stamps (K,), s; None where there is none."""
+    records = sorted(records, key=lambda record: record.stamp)
+    rows, theirs = associate(stamps, np.array([record.stamp for record in records]))
+    out: list[Record | None] = [None] * len(stamps)
     for row, their in zip(rows.tolist(), theirs.tolist(), strict=True):
-        out[row] = poses[their]
-    return tuple(out)
-
-
-def _tracks(session: Session, stamps: Array) -> tuple[Observations | None, ...]:
-    out: list[Observations | None] = [None] * len(stamps)
-    if session.path.is_file():
-        found = sorted(read_observations(session.path), key=lambda seen: seen.stamp)
-        rows, theirs = associate(stamps, np.array([seen.stamp for seen in found]))
-        for row, their in zip(rows.tolist(), theirs.tolist(), strict=True):
-            out[row] = found[their]
+        out[row] = records[their]
     return tuple(out)
 
 
 def _surface(rig: Rig, poses: tuple[SurfacePose | None, ...], tracks: tuple[Observations | None, ...]) -> Array | None:
-    """Landmarks (V, 3) mm in the surface frame, by the rays of the frame set that shows most; None without."""
-    both = [k for k, pose in enumerate(poses) if pose is not None and tracks[k] is not None][:MAX_SURFACE_SETS]
-    sizes = {k: len(seen) for k in both if (seen := tracks[k]) is not None}
-    k = max(sizes, key=lambda each: sizes[each], default=None)
-    if k is None or sizes[k] < MIN_SURFACE_TRACKS:
+    """Landmarks (V, 3) mm in the surface frame, triangulated in the frame set with most tracks; None without one."""
+    pairs = zip(poses, tracks, strict=True)
+    both = [(pose, seen) for pose, seen in pairs if pose is not None and seen is not None][:MAX_SURFACE_SETS]
+    if not both:
         return None
-    pose, seen = poses[k], tracks[k]
-    assert pose is not None and seen is not None
-    laid = triangulated_map(rig, seen)
-    return se3.transform_points(se3.inverse(pose.base_from_surface) @ laid.base_from_surface, laid.map.points)
+    pose, seen = max(both, key=lambda pair: len(pair[1]))
+    if len(seen) < MIN_SURFACE_TRACKS:
+        return None
+    first = triangulated_map(rig, seen)
+    return se3.transform_points(se3.inverse(pose.base_from_surface) @ first.base_from_surface, first.map.points)
 
 
 def _off(stamps: Array, poses: tuple[SurfacePose | None, ...], session: Session) -> Array:
@@ -195,7 +179,7 @@ def _toolpath(session: Session) -> Toolpath | None:
 
 
 def _fraction(session: Session, stamps: Array) -> Array:
-    """(K,) the checkpoint that the arm was last sent to."""
+    """(K,) the checkpoint that the arm was last sent to; NaN before the first move."""
     out = np.full(len(stamps), np.nan)
     if not session.path.is_file():
         return out
@@ -208,7 +192,7 @@ def _fraction(session: Session, stamps: Array) -> Array:
 
 
 class PictureReader:
-    """The pictures of a session by frame set, in any order; one page is made at a time, from any thread."""
+    """The pictures of a session by frame set, in any order and from any thread, one frame set at a time."""
 
     def __init__(self, playback: Playback) -> None:
         self._playback, self._lock = playback, Lock()
@@ -221,19 +205,15 @@ class PictureReader:
             frames = self._read(k)
         pose, seen = self._playback.poses[k], self._playback.tracks[k]
         cameras = self._playback.session.rig.cameras
-        pictures = tuple(
-            CameraPicture(
-                cameras[f.camera].name,
-                small_jpeg(f.image, THUMBNAIL_WIDTH, THUMBNAIL_QUALITY),
-                (),
-                _pixels(seen, f.camera),
-            )
-            for f in frames.frames
-        )
-        return PagePictures(frames.stamp, pictures, None if pose is None else pose.base_from_surface)
+        pictures = []
+        for frame in frames.frames:
+            jpeg = small_jpeg(frame.image, THUMBNAIL_WIDTH, THUMBNAIL_QUALITY)
+            pixels = np.zeros((0, 2)) if seen is None else seen.pixels[seen.camera == frame.camera]
+            pictures.append(CameraPicture(cameras[frame.camera].name, jpeg, (), pixels))
+        return PagePictures(frames.stamp, tuple(pictures), None if pose is None else pose.base_from_surface)
 
     def _read(self, k: int) -> FrameSet:
-        """Readers go forward only: going back, a new one is begun."""
+        """The frame set k. Readers go forward only; to go back, a new one is opened."""
         refs = self._playback.session.sets[k]
         if self._reader is None or k < self._next:
             self.close()
@@ -246,19 +226,14 @@ class PictureReader:
             raise
 
     def close(self) -> None:
-        """Give the reader back."""
+        """Close the reader."""
         if self._reader is not None:
             self._reader.close()
             self._reader = None
 
 
-def _pixels(seen: Observations | None, camera: int) -> NDArray[np.float64]:
-    return np.zeros((0, 2)) if seen is None else seen.pixels[seen.camera == camera]
-
-
-# of the operator's page
-OPERATOR_FILES = ("camera.js", "lens.js", "panes.js", "scene.js", "words.js", "page.css", "icon.svg")
-STATUS_UNREADABLE = 422  # an answer that says why, to a question that was understood
+OPERATOR_FILES = ("camera.js", "lens.js", "panes.js", "scene.js", "words.js", "page.css", "icon.svg")  # of its page
+STATUS_UNREADABLE = 422  # HTTP, unprocessable content; its text says why
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -267,32 +242,26 @@ class ViewServer:
     """One session's viewer."""
 
     def __init__(self, playback: Playback, settings: OperatorSettings, port: int) -> None:
-        self._playback, self._book = playback, PictureReader(playback)
-        self._gate, self._headers = (
-            AccessControl(settings, port),
-            {**response_headers(settings, port), "Server": "stillbed"},
-        )
+        self._playback, self._pictures = playback, PictureReader(playback)
+        self._access = AccessControl(settings, port)
+        self._headers = {**response_headers(settings, port), "Server": "stillbed"}
         own = {each.name: each.read_bytes() for each in (files("hardware.offline") / "viewer_page").iterdir()}
         self._files = {**{name: page_files()[name] for name in OPERATOR_FILES}, **own}
         self._session = session_text(playback)
 
     def application(self) -> web.Application:
-        """Everything behind the gate."""
-        made = web.Application(middlewares=[self._guard])
-        made.add_routes(
-            [
-                web.get("/{token}/session", self._whole),
-                web.get("/{token}/at/{k:[0-9]{1,9}}", self._instant),
-                web.get("/{token}/pictures/{k:[0-9]{1,9}}", self._pictures),
-                web.get("/{token}/{name:[a-z_.]*}", self._file),
-            ]
-        )
-        return made
+        """The routes, all behind the access control."""
+        application = web.Application(middlewares=[self._check_access])
+        application.router.add_get("/{token}/session", self._get_session)
+        application.router.add_get("/{token}/at/{k:[0-9]{1,9}}", self._get_instant)
+        application.router.add_get("/{token}/pictures/{k:[0-9]{1,9}}", self._get_pictures)
+        application.router.add_get("/{token}/{name:[a-z_.]*}", self._get_file)
+        return application
 
     @web.middleware
-    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+    async def _check_access(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         token = request.path.partition("/")[2].partition("/")[0]
-        if reason := self._gate.refusal(token, request.headers, request.method != "GET"):
+        if reason := self._access.refusal(token, request.headers, request.method != "GET"):
             return web.Response(status=403, text=f"refused: {reason}\n", headers=self._headers)
         try:
             return await handler(request)
@@ -301,23 +270,23 @@ class ViewServer:
         except StillbedError as error:
             return web.Response(status=STATUS_UNREADABLE, text=str(error), headers=self._headers)
 
-    async def _file(self, request: web.Request) -> web.StreamResponse:
+    async def _get_file(self, request: web.Request) -> web.StreamResponse:
         name = request.match_info["name"] or "view.html"
         if name not in self._files:
             raise web.HTTPNotFound
         kind = CONTENT_TYPES[name.rsplit(".", 1)[1]]
         return web.Response(body=self._files[name], content_type=kind, charset="utf-8", headers=self._headers)
 
-    async def _whole(self, _: web.Request) -> web.StreamResponse:
+    async def _get_session(self, _: web.Request) -> web.StreamResponse:
         return web.Response(text=self._session, content_type="application/json", headers=self._headers)
 
-    async def _instant(self, request: web.Request) -> web.StreamResponse:
-        said = instant_text(self._playback, self._number(request))
-        return web.Response(text=said, content_type="application/json", headers=self._headers)
+    async def _get_instant(self, request: web.Request) -> web.StreamResponse:
+        instant = instant_text(self._playback, self._number(request))
+        return web.Response(text=instant, content_type="application/json", headers=self._headers)
 
-    async def _pictures(self, request: web.Request) -> web.StreamResponse:
+    async def _get_pictures(self, request: web.Request) -> web.StreamResponse:
         k = self._number(request)
-        body = await asyncio.to_thread(lambda: pictures_bytes(self._book(k)))
+        body = await asyncio.to_thread(lambda: pictures_bytes(self._pictures(k)))
         return web.Response(body=body, content_type="application/octet-stream", headers=self._headers)
 
     def _number(self, request: web.Request) -> int:
@@ -328,7 +297,7 @@ class ViewServer:
 
 
 def session_text(playback: Playback) -> str:
-    """What does not change with time: the scene, and where the surface is all along."""
+    """What does not change with time, as JSON: the scene, and the surface's position at every frame set."""
     truth = playback.session.truth
     whole = text(
         title=playback.session.path.name,
@@ -345,14 +314,9 @@ def session_text(playback: Playback) -> str:
 
 
 def instant_text(playback: Playback, k: int) -> str:
-    """What is known at frame set k."""
-    return text(
-        k=k,
-        tracking=playback.tracking(k),
-        motion=playback.motion(k),
-        fraction=playback.fraction[k],
-        off=playback.off[k],
-    )
+    """Estimate, nozzle, place on the path and error at frame set k, as JSON."""
+    tracking, motion = playback.tracking(k), playback.motion(k)
+    return text(k=k, tracking=tracking, motion=motion, fraction=playback.fraction[k], off=playback.off[k])
 
 
 async def serve(playback: Playback, settings: OperatorSettings, listener: socket.socket) -> None:
@@ -368,7 +332,7 @@ async def serve(playback: Playback, settings: OperatorSettings, listener: socket
 
 
 def run_view(session: Path, poses: str | None, toolpath: Path | None, port: int) -> None:
-    """Say where the page is, and serve it until interrupted; InputError where the session cannot be opened."""
+    """Print the page's address and serve it until interrupted; InputError where the session cannot be opened."""
     settings = check_settings(OperatorSettings(port=port))
     playback = open_playback(session, poses, toolpath)
     with socket.create_server((settings.host, settings.port)) as listener:
