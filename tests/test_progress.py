@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from hardware.arm.profile import ArmProfile
-from hardware.files.path_file import ProgressFile, read_progress, write_progress
+from hardware.files.path_file import ProgressFile, read_progress
 from hardware.motion.step import MotionStep
 from planning.command import Move
 from planning.limits import MotionLimits
@@ -116,7 +116,7 @@ def test_a_record_serves_a_later_run_of_the_same_path_and_no_other(tmp_path: Fil
     start = read_progress(file, path)
     assert start == motion.progress.fraction > 0
     assert MotionStep(path, start=start).progress.place == pytest.approx(motion.progress.place)
-    write_progress(tmp_path / "again.toml", path, motion.progress)
+    ProgressFile(tmp_path / "again.toml", path).write(motion.progress)
     assert (tmp_path / "again.toml").read_bytes() == file.read_bytes()
     with pytest.raises(InputError, match="fingerprint of the path"):
         read_progress(file, replace(path, speed=path.speed * 2))

@@ -1,4 +1,4 @@
-"""Arm files: an ArmProfile as TOML, in mm, degrees and s; what a file leaves out keeps its default.
+"""Arm files: an ArmProfile as TOML, in mm, degrees and s; keys that a file leaves out have their defaults.
 
 home_mm_deg = [202.5, 225, 113, 0, 0, 0]      # X Y Z A B C
 arm_from_base = [[...], ...]                  # 4x4, mm
@@ -35,6 +35,7 @@ posture = ["front", "up", "negative"]
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields
 from pathlib import Path
 
@@ -49,55 +50,47 @@ from perception.frames import check_profile
 from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
 from planning.robot.kinematics import AngleMode, JointModel, SimpleArm
 
-KINEMATICS_KEYS = ("name", "dh_mm_deg", "low_deg", "high_deg", "speed_deg_s", "acceleration_deg_s2")
-OPTIONAL_KINEMATICS_KEYS = ("nominal", "angles", "arm_from_foot", "flange_from_nozzle", "posture")
-_DH = np.array([1.0, np.deg2rad(1.0), 1.0, np.deg2rad(1.0)])  # of a row, in mm and rad
-_DEG = float(np.deg2rad(1.0))
+JOINT_KEYS = {"low_deg": "low", "high_deg": "high", "speed_deg_s": "speed", "acceleration_deg_s2": "acceleration"}
+PLACE_KEYS = ("arm_from_foot", "flange_from_nozzle")
+DEFAULT_POSTURE = ["front", "up", "negative"]
+_RAD = float(np.deg2rad(1.0))  # rad a degree
+_DH_UNITS = np.array([1.0, _RAD, 1.0, _RAD])  # mm and rad, of a row in mm and degrees
+_AXIS_UNITS = np.array([1.0, 1, 1, _RAD, _RAD, _RAD])  # likewise, of X Y Z A B C
 
 
-def kinematics_from_table(where: object, table: object) -> tuple[JointModel | None, AngleMode]:
-    """The model in a table, and what A B C are; no model without a table. InputError names the key."""
+def _kinematics(where: object, table: object) -> tuple[JointModel | None, AngleMode]:
+    """The model in the table, and what A B C are; no model without a table. InputError names the key."""
     if table is None:
         return None, AngleMode.SURFACE
     if not isinstance(table, dict):
         raise InputError(where, "kinematics", table, "a table [kinematics]")
-    checks.check_keys(where, "kinematics.", table, KINEMATICS_KEYS, OPTIONAL_KINEMATICS_KEYS)
+    checks.check_keys(
+        where, "kinematics.", table, ("name", "dh_mm_deg", *JOINT_KEYS), ("nominal", "angles", *PLACE_KEYS, "posture")
+    )
 
     def numbers(key: str, shape: tuple[int, ...], unit: Array | float = 1.0) -> Array:
         return np.asarray(checks.numbers(where, f"kinematics.{key}", table[key], shape) * unit)
 
-    def place(key: str) -> Array:
-        return numbers(key, (4, 4)) if key in table else np.eye(4)
-
-    low, high, speed, acceleration = (numbers(key, (6,), _DEG) for key in KINEMATICS_KEYS[2:])
-    nominal = table.get("nominal", True)
+    joints = {name: numbers(key, (6,), _RAD) for key, name in JOINT_KEYS.items()}
+    nominal, posture = table.get("nominal", True), table.get("posture", DEFAULT_POSTURE)
     if not isinstance(nominal, bool):
         raise InputError(where, "kinematics.nominal", nominal, "true or false")
-    model = JointModel(
-        checks.text(where, "kinematics.name", table["name"]),
-        numbers("dh_mm_deg", (6, 4), _DH),
-        low,
-        high,
-        speed,
-        acceleration,
-        place("arm_from_foot"),
-        place("flange_from_nozzle"),
-        _posture(where, table.get("posture", ["front", "up", "negative"])),
-        nominal,
-    )
-    return model, _angles(where, table.get("angles", AngleMode.SURFACE.value))
+    name, dh = checks.text(where, "kinematics.name", table["name"]), numbers("dh_mm_deg", (6, 4), _DH_UNITS)
+    places = {key: numbers(key, (4, 4)) for key in PLACE_KEYS if key in table}
+    if not (isinstance(posture, list) and len(posture) == 3):
+        raise InputError(where, "kinematics.posture", posture, "three words, of shoulder, elbow and wrist")
+    shoulder, elbow, wrist = map(str, posture)
+    model = JointModel(name, dh, **joints, **places, posture=(shoulder, elbow, wrist), nominal=nominal)
+    angles, modes = table.get("angles", AngleMode.SURFACE.value), [mode.value for mode in AngleMode]
+    if angles not in modes:
+        raise InputError(where, "kinematics.angles", angles, checks.one_of_text(str(angles), modes))
+    return model, AngleMode(angles)
 
 
-def kinematics_lines(arm: SimpleArm) -> list[str]:
+def _kinematics_lines(arm: SimpleArm) -> list[str]:
     """The table of an arm as lines of TOML; none where it has no model."""
     if (model := arm.joints) is None:
         return []
-    degrees = {
-        "low_deg": model.low,
-        "high_deg": model.high,
-        "speed_deg_s": model.speed,
-        "acceleration_deg_s2": model.acceleration,
-    }
     quoted = model.name.replace("\\", "\\\\").replace('"', '\\"')
     return [
         "",
@@ -105,46 +98,29 @@ def kinematics_lines(arm: SimpleArm) -> list[str]:
         f'name = "{quoted}"',
         f"nominal = {str(model.nominal).lower()}",
         f'angles = "{arm.angles.value}"',
-        f"dh_mm_deg = {checks.toml_numbers(model.dh / _DH)}",
-        *(f"{key} = {checks.toml_numbers(np.rad2deg(value))}" for key, value in degrees.items()),
-        f"arm_from_foot = {checks.toml_numbers(model.arm_from_foot)}",
-        f"flange_from_nozzle = {checks.toml_numbers(model.flange_from_nozzle)}",
-        "posture = [" + ", ".join(f'"{word}"' for word in model.posture) + "]",
+        f"dh_mm_deg = {checks.toml_numbers(model.dh / _DH_UNITS)}",
+        *(f"{key} = {checks.toml_numbers(np.rad2deg(getattr(model, name)))}" for key, name in JOINT_KEYS.items()),
+        *(f"{key} = {checks.toml_numbers(getattr(model, key))}" for key in PLACE_KEYS),
+        f"posture = {json.dumps(model.posture)}",
     ]
-
-
-def _posture(where: object, value: object) -> tuple[str, str, str]:
-    if not (isinstance(value, list) and len(value) == 3):
-        raise InputError(where, "kinematics.posture", value, "three words, of shoulder, elbow and wrist")
-    return str(value[0]), str(value[1]), str(value[2])
-
-
-def _angles(where: object, value: object) -> AngleMode:
-    words = [angles.value for angles in AngleMode]
-    if value not in words:
-        raise InputError(where, "kinematics.angles", value, checks.one_of_text(str(value), words))
-    return AngleMode(value)
 
 
 ZONE_KINDS = ("half_space", "box", "cylinder")
 
 
-def zones_from_tables(where: object, value: object) -> tuple[NoGo, ...]:
-    """The zones of `[[no_go]]` tables; InputError names the key."""
-    return tuple(_zone(where, table) for table in checks.tables(where, "no_go", value))
-
-
-def no_go_lines(zones: tuple[NoGo, ...]) -> list[str]:
-    """Tables that give the zones back: one of half-spaces each, with a cylinder where there is one."""
+def _no_go_lines(zones: tuple[NoGo, ...]) -> list[str]:
+    """The zones as `[[no_go]]` tables."""
     lines: list[str] = []
     for zone in zones:
         lines += ["", "[[no_go]]", f'name = "{zone.name}"']
         if zone.radius < float("inf"):
             lines += [f"cylinder = {checks.toml_numbers(zone.axis)}", f"radius = {checks.toml_number(zone.radius)}"]
         elif len(zone.offsets) == 1:
-            lines.append(f"half_space = {checks.toml_numbers(_plane(zone))}")
+            plane = zone.normals.repeat(2, axis=0) * [[1.0], [zone.offsets[0]]]
+            lines.append(f"half_space = {checks.toml_numbers(plane)}")
         else:
-            lines.append(f"box = {checks.toml_numbers(_corners(zone))}")
+            corners = (zone.offsets.reshape(2, 3) * [[1.0], [-1.0]])[::-1]
+            lines.append(f"box = {checks.toml_numbers(corners)}")
     return lines
 
 
@@ -160,61 +136,21 @@ def _zone(where: object, table: checks.Table) -> NoGo:
     return half_space(name, first, second) if kinds == ["half_space"] else box(name, first, second)
 
 
-def _plane(zone: NoGo) -> Array:
-    plane: Array = zone.normals.repeat(2, axis=0) * [[1.0], [zone.offsets[0]]]
-    return plane
-
-
-def _corners(zone: NoGo) -> Array:
-    corners: Array = (zone.offsets.reshape(2, 3) * [[1.0], [-1.0]])[::-1]
-    return corners
-
-
-ARM_KEYS = (
-    "home_mm_deg",
-    "arm_from_base",
-    "arm_from_upright",
-    "tool_offset_mm",
-    "motion_byte",
-    "slots",
-    "origin_scale",
-    "pwm",
-    "baud",
-    "tick_s",
-    "lag_s",
-    "tool_mm",
-    "limits",
-    "no_go",
-    "kinematics",
-)
 LIMIT_KEYS = tuple(f.name for f in fields(MotionLimits) if f.name != "zones")
 _AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
 _ANGLES = ("turn", "surface_turn")  # single numbers in rad
-_SHAPES: dict[str, tuple[int | None, ...]] = {
-    "home_mm_deg": (6,),
-    "arm_from_base": (4, 4),
-    "arm_from_upright": (3, 3),
-    "tool_offset_mm": (3,),
-}
-PART_PREFIXES = {
-    "arm profile": "",
-    "arm": "",
-    "dialect": "",
-    "limits": "limits.",
-    "kinematics": "kinematics.",
-}  # with tables
-FILE_KEYS = {  # by what is wrong with them
-    "home": "home_mm_deg",
-    "tool_offset": "tool_offset_mm",
-    "tick": "tick_s",
-    "lag": "lag_s",
-    "tool": "tool_mm",
+_ARRAYS = {"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3), "tool_offset_mm": (3,)}  # shapes
+ARM_KEYS = (
+    *(*_ARRAYS, "motion_byte", "slots", "origin_scale", "pwm", "baud", "tick_s", "lag_s", "tool_mm"),
+    *("limits", "no_go", "kinematics"),
+)
+# of errors about a part of the profile: the prefix of the part's keys in the file; keys that are not the fields' names
+PART_PREFIXES = {"arm profile": "", "arm": "", "dialect": "", "limits": "limits.", "kinematics": "kinematics."}
+FILE_KEYS = {
+    **{"home": "home_mm_deg", "tool_offset": "tool_offset_mm", "tick": "tick_s", "lag": "lag_s", "tool": "tool_mm"},
     "kinematics.dh": "kinematics.dh_mm_deg",
-    "kinematics.low": "kinematics.low_deg",
-    "kinematics.speed": "kinematics.speed_deg_s",
-    "kinematics.acceleration": "kinematics.acceleration_deg_s2",
+    **{f"kinematics.{name}": f"kinematics.{key}" for key, name in JOINT_KEYS.items()},
 }
-_TO_RAD = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])
 
 
 def read_arm(path: str | Path) -> ArmProfile:
@@ -231,13 +167,13 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
     checks.check_keys(path, "", table, (), ARM_KEYS)
     try:
         default = at_baud(ArmProfile(), checks.integer(path, "baud", table.get("baud", ArmProfile().baud), 1))
-        arrays = {key: checks.numbers(path, key, table[key], shape) for key, shape in _SHAPES.items() if key in table}
+        arrays = {key: checks.numbers(path, key, table[key], shape) for key, shape in _ARRAYS.items() if key in table}
         return ArmProfile(
             arm=SimpleArm(
                 arrays.get("arm_from_base", default.arm.arm_from_base),
                 arrays.get("arm_from_upright", default.arm.arm_from_upright),
-                arrays["home_mm_deg"] * _TO_RAD if "home_mm_deg" in arrays else default.arm.home,
-                *kinematics_from_table(path, table.get("kinematics")),
+                arrays["home_mm_deg"] * _AXIS_UNITS if "home_mm_deg" in arrays else default.arm.home,
+                *_kinematics(path, table.get("kinematics")),
                 tool_offset=arrays.get("tool_offset_mm", default.arm.tool_offset),
             ),
             limits=_limits(path, table.get("limits", {}), table.get("no_go")),
@@ -254,7 +190,7 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
 
 
 def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
-    """Write an arm file that gives the profile back, to rounding of angles."""
+    """Write an arm file from which the same profile is read, to rounding of angles. remark: comment at its top."""
     Path(path).write_text(arm_text(profile, remark), encoding="utf-8")
 
 
@@ -262,12 +198,12 @@ def arm_text(profile: ArmProfile, remark: str = "") -> str:
     """The text of an arm file, as `write_arm` writes it."""
     arm, dialect, limits = profile.arm, profile.dialect, profile.limits
     lines = [f"# {line}" for line in remark.splitlines()] + [
-        f"home_mm_deg = {checks.toml_numbers(arm.home / _TO_RAD)}",
+        f"home_mm_deg = {checks.toml_numbers(arm.home / _AXIS_UNITS)}",
         f"arm_from_base = {checks.toml_numbers(arm.arm_from_base)}",
         f"arm_from_upright = {checks.toml_numbers(arm.arm_from_upright)}",
         f"tool_offset_mm = {checks.toml_numbers(arm.tool_offset)}",
         f"motion_byte = {dialect.motion_byte}",
-        "slots = [" + ", ".join(f'"{joint}"' for joint in dialect.slots) + "]",
+        f"slots = {json.dumps(dialect.slots)}",
         f"origin_scale = {dialect.origin_scale}",
         f"pwm = {checks.toml_number(dialect.pwm)}",
         f"baud = {profile.baud}",
@@ -277,14 +213,14 @@ def arm_text(profile: ArmProfile, remark: str = "") -> str:
         "",
         "[limits] # X Y Z in mm, A B C in degrees",
         *(f"{name} = {checks.toml_numbers(getattr(limits, name) / _unit(name))}" for name in LIMIT_KEYS),
-        *no_go_lines(limits.zones),
-        *kinematics_lines(arm),
+        *_no_go_lines(limits.zones),
+        *_kinematics_lines(arm),
     ]
     return "\n".join(lines) + "\n"
 
 
 def _in_file(path: Path, table: checks.Table, error: InputError) -> InputError:
-    """What is wrong with a part of the profile, by its key and value in the file; of a default, its own value."""
+    """The error about a part of the profile with the key and the value in the file; of a default with its own value."""
     if error.where not in PART_PREFIXES:
         return InputError(path, f"{error.where}: {error.what}", error.got, error.allowed)
     key = PART_PREFIXES[error.where] + error.what
@@ -304,8 +240,8 @@ def tool_from_value(where: object, key: str, value: object) -> Array:
 
 
 def _unit(name: str) -> Array:
-    """What the number in the file is times this, in mm and rad."""
-    return _TO_RAD if name in _AXES else np.asarray(np.deg2rad(1.0) if name in _ANGLES else 1.0)
+    """Factor from a limit in the file, in mm and degrees, to mm and rad."""
+    return _AXIS_UNITS if name in _AXES else np.asarray(_RAD if name in _ANGLES else 1.0)
 
 
 def _limits(path: Path, table: object, zones: object) -> MotionLimits:
@@ -316,8 +252,8 @@ def _limits(path: Path, table: object, zones: object) -> MotionLimits:
     for name, value in table.items():
         number = checks.numbers(path, f"limits.{name}", value, (6,) if name in _AXES else ()) * _unit(name)
         limits[name] = number if name in _AXES else float(number)
-    no_go = () if zones is None else zones_from_tables(path, zones)
-    return MotionLimits(**limits, zones=no_go)  # type: ignore[arg-type]
+    no_go = [] if zones is None else [_zone(path, each) for each in checks.tables(path, "no_go", zones)]
+    return MotionLimits(**limits, zones=tuple(no_go))  # type: ignore[arg-type]
 
 
 def _dialect(path: Path, table: checks.Table) -> Dialect:

@@ -1,4 +1,4 @@
-"""The tables of a session folder: TUM trajectories, frames.csv, head.csv, roi.toml; and a writer of such folders.
+"""The tables of a session folder: TUM trajectories, frames.csv, head.csv, roi.toml; and the writer of such folders.
 
 A TUM file has one `stamp x y z qx qy qz qw` a line, s and mm: base_from_surface. frames.csv has the stamp of every
 image, head.csv the print head at each frame set, roi.toml polygons around the surface.
@@ -70,7 +70,7 @@ def read_rows(path: str | Path) -> Array:
 
 
 def checked_rows(where: object, rows: Iterable[tuple[str, Sequence[float]]]) -> Array:
-    """Rows (N, 8) of stamp x y z qx qy qz qw, N >= 0, each told with its name, such as its line.
+    """Rows (N, 8) of stamp x y z qx qy qz qw, N >= 0, from rows with their names in error messages, such as "line 3".
 
     InputError (where, name) unless they are finite, stamps rise and quaternions are of unit length to 1 %.
     """
@@ -140,8 +140,12 @@ def _rows(path: Path, columns: Sequence[str]) -> list[tuple[int, dict[str, str |
     return rows
 
 
+def _cells(row: dict[str, str | None], columns: Sequence[str]) -> list[str]:
+    return [(row[column] or "").strip() for column in columns]
+
+
 def _frame_row(path: Path, line: int, row: dict[str, str | None], names: Sequence[str]) -> tuple[int, int, float]:
-    name, frame, stamp = ((row[c] or "").strip() for c in FRAME_COLUMNS)
+    name, frame, stamp = _cells(row, FRAME_COLUMNS)
     if name not in names:
         raise InputError(path, f"line {line}: camera", name, f"a camera of rig.toml, {checks.one_of_text(name, names)}")
     if not (frame.isascii() and frame.isdigit() and len(frame) < 10):
@@ -172,8 +176,7 @@ def write_frames(path: Path, rig: Rig, refs: Iterable[FrameRef]) -> None:
     """Write frames.csv, camera by camera, every stamp with the digits that give the same float64 back."""
     with open(path, "w", encoding="utf-8") as file:
         file.write(",".join(FRAME_COLUMNS) + "\n")
-        for ref in sorted(refs, key=lambda r: (r.camera, r.number)):
-            file.write(frame_line(rig, ref))
+        file.writelines(frame_line(rig, ref) for ref in sorted(refs, key=lambda r: (r.camera, r.number)))
 
 
 def frame_line(rig: Rig, ref: FrameRef) -> str:
@@ -183,8 +186,7 @@ def frame_line(rig: Rig, ref: FrameRef) -> str:
 
 def read_heads(path: Path) -> PrintHeadLog:
     """The print heads of head.csv, base_from_nozzle; none is allowed, as where a run ended before the arm moved."""
-    rows_read = _rows(path, HEAD_COLUMNS)
-    table = [(f"line {line}", [(row[c] or "").strip() for c in HEAD_COLUMNS]) for line, row in rows_read]
+    table = [(f"line {line}", _cells(row, HEAD_COLUMNS)) for line, row in _rows(path, HEAD_COLUMNS)]
     rows = checked_rows(path, ((line, row_from_words(path, line, words[:-1])) for line, words in table))
     return PrintHeadLog(rows, np.array([_extruding(path, line, words[-1]) for line, words in table], bool))
 

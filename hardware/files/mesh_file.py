@@ -1,7 +1,7 @@
-"""Scans from PLY, STL and OBJ files, read strictly: what is wrong, missing or too much is said, and nothing left out.
+"""Scans from PLY, STL and OBJ files, read strictly: whatever is wrong, missing or unknown in the file is an error.
 
-An arm moves along what was read, and the libraries for these files read damaged ones too, in part and without a word
-(trimesh 5.2: text that ends early, vertex 0 of an OBJ file), or end the process (open3d 0.20).
+An arm moves along the scan, and the libraries for these files read damaged ones in part and without an error (trimesh
+5.2: text that ends early, vertex 0 of an OBJ file), or end the process (open3d 0.20).
 """
 
 from __future__ import annotations
@@ -36,10 +36,8 @@ def read_stl(path: Path) -> RawMesh:
             corners = np.array(_text_corners(file, path), np.float64).reshape(-1, 3)
         else:
             got = f"{size} bytes" + (f", {count} triangles by its header" if len(head) == STL_HEADER_BYTES else "")
-            allowed = (
-                f"{STL_HEADER_BYTES} bytes and {STL_TRIANGLE.itemsize} for each triangle (is it cut short?), or text"
-            )
-            raise InputError(path, "scan", got, allowed)
+            sizes = f"{STL_HEADER_BYTES} bytes and {STL_TRIANGLE.itemsize} for each triangle"
+            raise InputError(path, "scan", got, f"{sizes} (is it cut short?), or text")
     return RawMesh(corners, np.arange(len(corners)).reshape(-1, 3))
 
 
@@ -92,9 +90,8 @@ def read_obj(path: Path) -> RawMesh:
                     corners.extend(face)
             except (ValueError, OverflowError):
                 raise wrong_line(path, number, words, OBJ_VERTEX if word == b"v" else OBJ_FACE) from None
-    return RawMesh(
-        np.array(places, np.float64).reshape(-1, 3), fans(np.array(counts, np.int64), np.array(corners, np.int64))
-    )
+    triangles = fans(np.array(counts, np.int64), np.array(corners, np.int64))
+    return RawMesh(np.array(places, np.float64).reshape(-1, 3), triangles)
 
 
 def _face(words: list[bytes], vertices: int) -> list[int]:
@@ -118,14 +115,14 @@ WHOLE_MESH = "a whole PLY, STL or OBJ file with triangles"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeshFile:
-    """A scan and how whole it is. open_edges: edges with one triangle only, the rim and the holes; 0 if closed."""
+    """A scan, and how far from closed it is."""
 
     scan: Scan
-    open_edges: int
+    open_edges: int  # edges with one triangle only, of the rim and of holes; 0 if closed
 
 
 def read_raw_mesh(path: str | Path) -> RawMesh:
-    """What a PLY, STL or OBJ file holds, unchecked but for being whole; InputError where it cannot be read."""
+    """The mesh in a PLY, STL or OBJ file, checked only for being whole; InputError where it cannot be read."""
     path = Path(path)
     if path.suffix.lower() not in MESH_READERS:
         raise InputError(path, "scan", path.suffix or "no suffix", f"a file {', '.join(MESH_READERS)}")
@@ -164,9 +161,8 @@ def _check_size(path: Path, vertices: Array) -> None:
     longest = float(np.ptp(vertices, axis=0).max())
     if MIN_SCAN_SIZE <= longest <= MAX_SCAN_SIZE:
         return
-    hint = ""
-    if MIN_SCAN_SIZE <= 1000 * longest <= MAX_SCAN_SIZE:
-        hint = f"; this one looks like metres ({1000 * longest:.4g} mm): multiply it by 1000"
+    metres = MIN_SCAN_SIZE <= 1000 * longest <= MAX_SCAN_SIZE
+    hint = f"; this one looks like metres ({1000 * longest:.4g} mm): multiply it by 1000" if metres else ""
     got = f"{longest:.4g} mm along its longest side"
     raise InputError(path, "size of the scan", got, f"{MIN_SCAN_SIZE:g} to {MAX_SCAN_SIZE:g} mm{hint}")
 
@@ -181,14 +177,13 @@ def in_mm(vertices: Array, triangles: Array, unit: str, where: object) -> Array:
     used = used[np.isfinite(used).all(axis=1)]
     if not len(used):
         raise InputError(where, "vertices", "none that is finite", "a scan with finite coordinates")
-    low, high = np.percentile(used, [1, 99], axis=0)  # a stray vertex says nothing of the size
+    low, high = np.percentile(used, [1, 99], axis=0)  # without stray vertices
     longest = float((high - low).max())
     size = longest * SCAN_UNITS[unit]
     if MIN_SCAN_WITH_SKIN <= size <= MAX_SCAN_WITH_SKIN:
         return np.asarray(vertices * SCAN_UNITS[unit])
     fitting = [name for name, mm in SCAN_UNITS.items() if MIN_SCAN_WITH_SKIN <= longest * mm <= MAX_SCAN_WITH_SKIN]
-    hint = " or ".join(f"--unit {name} ({longest * SCAN_UNITS[name]:.0f} mm)" for name in fitting)
-    allowed = f"{MIN_SCAN_WITH_SKIN:g} to {MAX_SCAN_WITH_SKIN:g} mm" + (
-        f"; its numbers look like another unit: say {hint}" if hint else ""
-    )
+    units = " or ".join(f"--unit {name} ({longest * SCAN_UNITS[name]:.0f} mm)" for name in fitting)
+    hint = f"; its numbers look like another unit: say {units}" if units else ""
+    allowed = f"{MIN_SCAN_WITH_SKIN:g} to {MAX_SCAN_WITH_SKIN:g} mm{hint}"
     raise InputError(where, "size of the scan", f"{size:.4g} mm along its longest side, read as {unit}", allowed)

@@ -32,7 +32,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.process import checks
 from planning.path import Path, check_path
-from planning.progress import PrintProgress, ProgressMark, fingerprint, progress_mark, resume_fraction
+from planning.progress import PrintProgress, ProgressMark, fingerprint, resume_fraction
 
 POSE_COLUMNS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 SPEED_COLUMNS = {"speed_mm_s": 1.0, "speed_mm_min": 1 / 60}  # column: mm/s of its unit
@@ -58,17 +58,16 @@ def path_from_text(text: str, where: str | File) -> Path:
 def _path_from_rows(file: File, rows: list[checks.CsvRow]) -> Path:
     lines, words = _columns(file, rows)
     speed_column = next(name for name in SPEED_COLUMNS if name in words)
-    numbers = {
-        name: _numbers(file, lines, name, words[name]) for name in (*POSE_COLUMNS, speed_column, "temperature_c")
-    }
+    number_columns = (*POSE_COLUMNS, speed_column, "temperature_c")
+    numbers = {name: _numbers(file, lines, name, words[name]) for name in number_columns}
     pose = np.stack([numbers[name] for name in POSE_COLUMNS], axis=1)
     path = Path(
         surface_from_nozzle=se3.make(se3.rotation_from_euler(np.deg2rad(pose[:, 3:])), pose[:, :3]),
         speed=numbers[speed_column] * SPEED_COLUMNS[speed_column],
         material=_material(file, lines, words["material"]),
         temperature=numbers["temperature_c"],
-        layer=_whole(file, lines, "layer", words.get("layer", ["0"] * len(lines)), None),
-        extrude=_whole(file, lines, "extrude", words.get("extrude", ["1"] * len(lines)), (0, 1)) == 1,
+        layer=_whole(file, lines, "layer", words.get("layer", ["0"] * len(lines))),
+        extrude=_whole(file, lines, "extrude", words.get("extrude", ["1"] * len(lines)), flags=True) == 1,
         extra={name: np.array(words[name]) for name in words if name not in (*PATH_HEADER, *SPEED_COLUMNS)},
     )
     named = {"speed": speed_column, "temperature": "temperature_c"}
@@ -99,7 +98,7 @@ def path_text(path: Path) -> str:
 
 
 def _columns(file: File, rows: list[checks.CsvRow]) -> tuple[list[int], ColumnWords]:
-    """Line numbers of the checkpoints, and the words of each column."""
+    """Line numbers of the checkpoints, and the cells of each column."""
     rows = _stripped(rows)
     if not rows:
         raise InputError(file, "file", "empty", f"a header {','.join(PATH_HEADER)} and 2 checkpoints or more")
@@ -152,13 +151,11 @@ def _number(word: str) -> float:
         return math.nan
 
 
-def _whole(
-    file: File, lines: Sequence[int], name: str, words: Sequence[str], allowed: tuple[int, ...] | None
-) -> NDArray[np.int64]:
+def _whole(file: File, lines: Sequence[int], name: str, words: Sequence[str], flags: bool = False) -> NDArray[np.int64]:
     for line, word in zip(lines, words, strict=True):
         whole = word.removeprefix("-").isdecimal() and word.isascii() and len(word) < 19
-        if not whole or (allowed is not None and int(word) not in allowed):
-            raise InputError(file, f"line {line}: {name}", word, "a whole number" if allowed is None else "0 or 1")
+        if not whole or (flags and int(word) not in (0, 1)):
+            raise InputError(file, f"line {line}: {name}", word, "0 or 1" if flags else "a whole number")
     return np.array([int(word) for word in words], np.int64)
 
 
@@ -182,7 +179,7 @@ G92 E0
 
 
 def gcode_text(path: Path) -> str:
-    """The path as G-code: G0 where nothing is laid, G1 where ink flows, G4 for waits, a comment for each layer."""
+    """The path as G-code: G0 without ink, G1 where ink flows, G4 for waits, a comment for each layer."""
     places = path.surface_from_nozzle[:, :3, 3]
     angles = np.rad2deg(se3.euler_from_rotation(path.surface_from_nozzle[:, :3, :3])) + 0.0
     columns = {name: path.extra[name].astype(float) for name in ("volume_mm3", "wait_s") if name in path.extra}
@@ -203,7 +200,7 @@ def gcode_text(path: Path) -> str:
 
 
 def _changes(path: Path, i: int, names: list[object]) -> list[str]:
-    """What begins at checkpoint i: a layer, a material, a temperature."""
+    """The lines for a layer, a material or a temperature that begins at checkpoint i."""
     first, before = i == 0, max(i - 1, 0)
     lines = []
     if first or path.layer[i] != path.layer[before]:
@@ -229,9 +226,8 @@ def read_contour(file: str | File) -> Array:
     if tuple(header) not in (CONTOUR_COLUMNS[:2], CONTOUR_COLUMNS):
         raise InputError(file, "header", ",".join(header), allowed)
     points = np.array([_point(file, line, row, len(header)) for line, row in body]).reshape(-1, len(header))
-    keep = np.ones(len(points), bool)
-    keep[1:] = np.abs(np.diff(points, axis=0)).max(axis=1, initial=0.0) > 0
-    points = points[keep]
+    if len(points):
+        points = points[np.r_[True, (np.diff(points, axis=0) != 0).any(axis=1)]]  # no point twice in a row
     if len(points) > 1 and np.array_equal(points[0], points[-1]):
         points = points[:-1]
     if len(points) < 3:
@@ -255,44 +251,39 @@ KEYS = ("path", "fraction", "printed")
 
 
 class ProgressFile:
-    """Keeps the file up to date, tick by tick; whatever ends the run, the file there is whole."""
+    """Keeps progress.toml up to date, tick by tick; the file is whole at every instant, however the run ends."""
 
     def __init__(self, file: File, path: Path) -> None:
         self._file, self._path = file, fingerprint(path)
         self._fraction = -1.0
 
     def write(self, progress: PrintProgress) -> None:
-        """Write how far the print is, if it went on since the last time."""
+        """Write how far the print is, if that has changed."""
         if progress.fraction != self._fraction:
             self._fraction = progress.fraction
             _replace(self._file, ProgressMark(self._path, progress.fraction), progress.printed)
 
 
 def write_progress_durably(file: File, fingerprint: str, fraction: float) -> None:
-    """Write how far a print is, so that it outlives a power cut as well: this waits for the disk."""
-    _replace(file, ProgressMark(fingerprint, fraction), floor(fraction), sure=True)
-
-
-def write_progress(file: File, path: Path, progress: PrintProgress) -> None:
-    """Write how far a print of `path` is."""
-    _replace(file, progress_mark(path, progress), progress.printed)
+    """Write how far a print is and wait for the disk, so that it outlives a power cut as well."""
+    _replace(file, ProgressMark(fingerprint, fraction), floor(fraction), durable=True)
 
 
 def read_progress(file: File, path: Path) -> float:
-    """Where a print of `path` goes on, counted in checkpoints; InputError if the file is of another path or wrong."""
+    """Where a print of `path` continues, counted in checkpoints; InputError if the file is of another path or wrong."""
     table = checks.read_toml(file)
     checks.check_keys(file, "", table, KEYS)
     mark = ProgressMark(checks.text(file, "path", table["path"]), checks.number(file, "fraction", table["fraction"]))
     return resume_fraction(path, mark, file)
 
 
-def _replace(file: File, mark: ProgressMark, printed: int, sure: bool = False) -> None:
-    """Write beside the file and rename: there is always one that can be read. sure: it is on the disk on return."""
+def _replace(file: File, mark: ProgressMark, printed: int, durable: bool = False) -> None:
+    """Write beside the file and rename, so that a whole file is there always. durable: wait for the disk."""
     text = f'path = "{mark.path}"\nfraction = {checks.toml_number(mark.fraction)}\nprinted = {printed}\n'
     beside = file.with_name(file.name + ".new")
     with beside.open("w", encoding="utf-8") as stream:
         stream.write(text)
         stream.flush()
-        if sure:
+        if durable:
             os.fsync(stream.fileno())
     beside.replace(file)

@@ -1,6 +1,6 @@
 """Meshes as PLY files: written as text, which every viewer reads; read as text and as binary of either byte order.
 
-What the readers of all mesh formats share stands here too: the raw mesh, lines of words, polygons as fans.
+The readers of all mesh formats use the raw mesh, the lines of words and the fans of triangles defined here.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +20,15 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 
 MAX_LINE_BYTES = 1 << 16  # bytes of a line of text: a triangle takes some fifty
+Numbers = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawMesh:
-    """A mesh as its file has it. vertices: (V, 3), in whatever unit. triangles: (T, 3) numbers of vertices."""
+    """A mesh as its file has it."""
 
-    vertices: np.ndarray[Any, Any]
-    triangles: np.ndarray[Any, Any]
+    vertices: Numbers  # (V, 3), in the file's unit
+    triangles: Numbers  # (T, 3) numbers of vertices
 
 
 def text_rows(file: BinaryIO, path: Path, first: int = 1) -> Iterator[tuple[int, list[bytes]]]:
@@ -45,7 +46,7 @@ def wrong_line(path: Path, number: int, words: list[bytes], allowed: str) -> Inp
     return InputError(path, f"line {number}", b" ".join(words).decode("utf-8", "replace"), allowed)
 
 
-def fans(counts: np.ndarray[Any, Any], corners: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def fans(counts: Numbers, corners: Numbers) -> Numbers:
     """Triangles (T, 3) of convex polygons. counts: (P,) corners of each, 3 or more. corners: all of them in a row."""
     inner = counts - 2  # triangles of each polygon
     start = np.repeat(np.cumsum(counts) - counts, inner)
@@ -53,7 +54,7 @@ def fans(counts: np.ndarray[Any, Any], corners: np.ndarray[Any, Any]) -> np.ndar
     return np.column_stack([corners[start], corners[start + number + 1], corners[start + number + 2]])
 
 
-PLY_TYPES = {  # of the types: numpy and struct share them behind a byte order, and array has them too
+PLY_TYPES = {  # type: its letter, which numpy and struct share behind a byte order, and array has too
     **{b"char": "b", b"uchar": "B", b"short": "h", b"ushort": "H", b"int": "i", b"uint": "I", b"float": "f"},
     **{b"int8": "b", b"uint8": "B", b"int16": "h", b"uint16": "H", b"int32": "i", b"uint32": "I", b"float32": "f"},
     **{b"double": "d", b"float64": "d"},
@@ -66,33 +67,33 @@ PLY_HEADER_LINES = "comment ..., element NAME COUNT, property TYPE NAME, propert
 
 @dataclass(frozen=True, slots=True)
 class PlyProperty:
-    """A value of each row, or a list of them. letter: of its type. count: of its length's type, "" for one value."""
+    """A value of each row, or a list of values."""
 
     name: str
-    letter: str
-    count: str = ""
+    letter: str  # of its type
+    count: str = ""  # letter of the type of a list's length; "": one value
 
 
 @dataclass(slots=True)
 class PlyElement:
-    """A table of the file. rows: how many the header promises."""
+    """A table of the file."""
 
     name: str
-    rows: int
+    rows: int  # by the header
     properties: list[PlyProperty] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
 class PlyHeader:
-    """order: of bytes, "" where the rows are text. lines: how many the header has."""
+    """The header of a PLY file."""
 
-    order: str
+    order: str  # of bytes, as numpy and struct write it; "": the rows are text
     elements: list[PlyElement]
-    lines: int
+    lines: int  # of the header
 
 
 def read_header(file: BinaryIO, path: Path) -> PlyHeader:
-    """The header of a PLY file, which then stands behind it; InputError names the line that is wrong or missing."""
+    """Read the header of a PLY file and stop behind it; InputError names the line that is wrong or missing."""
     rows = text_rows(file, path)
     number, words = next(rows, (1, []))
     if words != [b"ply"]:
@@ -105,9 +106,8 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
             case [b"format", kind, b"1.0"] if order is None and kind in BYTE_ORDERS:
                 order = BYTE_ORDERS[kind]
             case _ if order is None:
-                raise wrong_line(
-                    path, number, words, f"format, one of {', '.join(map(bytes.decode, BYTE_ORDERS))}, 1.0"
-                )
+                formats = ", ".join(map(bytes.decode, BYTE_ORDERS))
+                raise wrong_line(path, number, words, f"format, one of {formats}, 1.0")
             case [b"element", name, count] if count.isdigit() and len(count) <= MAX_COUNT_DIGITS:
                 elements.append(PlyElement(_name(name), int(count)))
             case [b"property", *rest] if elements and (declared := _property(rest)):
@@ -142,36 +142,23 @@ def _check(path: Path, number: int, elements: list[PlyElement]) -> None:
             raise wrong_line(path, number, [b"end_header"], "it behind elements with properties, no name twice")
 
 
-Numbers = np.ndarray[Any, Any]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Column:
-    """One property of all rows. counts: (R,) values of each row. values: all of them, one row behind the other."""
+    """One property of all R rows."""
 
-    counts: Numbers
-    values: Numbers
-
-
-class PlyRows(Protocol):
-    """The rows that follow a header, element by element."""
-
-    def columns(self, element: PlyElement, wanted: list[int]) -> list[Column]:
-        """The wanted properties of the next element, by their numbers; InputError where it is not whole."""
-
-    def end(self) -> None:
-        """InputError where more follows than the header tells of."""
+    counts: Numbers  # (R,) number of values in each row
+    values: Numbers  # of all rows, one row behind the other
 
 
 @dataclass(slots=True)
 class TextRows:
-    """A line for each row. lines: numbers and words of those behind the header."""
+    """The rows that follow a header as text, one a line, read element by element."""
 
     path: Path
-    lines: Iterator[tuple[int, list[bytes]]]
+    lines: Iterator[tuple[int, list[bytes]]]  # number and words of each line behind the header
 
     def columns(self, element: PlyElement, wanted: list[int]) -> list[Column]:
-        """As `Rows.columns`."""
+        """The wanted properties of the next element, by their numbers; InputError where the element is not whole."""
         whole = [element.properties[k].letter in WHOLE_NUMBER_TYPES for k in wanted]
         counts, values = _arrays(["q" if each else "d" for each in whole])
         places = [(k, counts[n], values[n], int if whole[n] else float) for n, k in enumerate(wanted)]
@@ -190,7 +177,7 @@ class TextRows:
         return _columns(counts, values)
 
     def end(self) -> None:
-        """As `Rows.end`."""
+        """InputError where more rows follow than the header announces."""
         for number, words in self.lines:
             raise wrong_line(self.path, number, words, "nothing behind the rows that the header tells of")
 
@@ -214,25 +201,25 @@ def _fields(element: PlyElement, words: list[bytes]) -> list[list[bytes]]:
 
 @dataclass(slots=True)
 class BinaryRows:
-    """Rows without anything between them. data: what is behind the header. order: of its bytes. at: the next one."""
+    """The rows that follow a header as packed binary numbers, read element by element."""
 
     path: Path
-    data: bytes
-    order: str
-    at: int = 0
+    data: bytes  # behind the header
+    order: str  # of bytes
+    at: int = 0  # place of the next row in data
 
     def columns(self, element: PlyElement, wanted: list[int]) -> list[Column]:
-        """As `Rows.columns`."""
+        """The wanted properties of the next element, by their numbers; InputError where the element is not whole."""
         columns = self._alike(element, wanted) if element.rows else None
         return self._one_by_one(element, wanted) if columns is None else columns
 
     def end(self) -> None:
-        """As `Rows.end`."""
+        """InputError where more bytes follow than the header announces."""
         if self.data[self.at :].strip():
             raise InputError(self.path, "bytes behind the header", len(self.data), f"{self.at}, as it tells")
 
     def _alike(self, element: PlyElement, wanted: list[int]) -> list[Column] | None:
-        """All rows at once, where their lists are as long as those of the first; None where they are not."""
+        """All rows at once where every list has the same length in all of them, else None."""
         lengths = [count for _, count in self._row(element, 0)]
         kinds: list[tuple[Any, ...]] = []
         for k, (one, count) in enumerate(zip(element.properties, lengths, strict=True)):
@@ -309,11 +296,11 @@ def write_ply(path: Path, vertices: Array, triangles: NDArray[np.int64]) -> None
 
 
 def read_ply(path: Path) -> RawMesh:
-    """The mesh in a PLY file, polygons as fans of triangles; InputError says what of it is wrong, or too little."""
+    """The mesh in a PLY file, polygons as fans of triangles; InputError says what is wrong or missing."""
     vertices, triangles = np.empty((0, 3)), np.empty((0, 3), np.int64)
     with path.open("rb") as file:
         header = read_header(file, path)
-        rows: PlyRows = TextRows(path, text_rows(file, path, header.lines + 1))
+        rows: TextRows | BinaryRows = TextRows(path, text_rows(file, path, header.lines + 1))
         if header.order:
             rows = BinaryRows(path, file.read(), header.order)
         for element in header.elements:

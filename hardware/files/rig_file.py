@@ -20,15 +20,8 @@ from perception.boards.board import BOARD_KINDS, DICTIONARIES, Board
 CAMERA_KEYS = ("name", "size", "matrix", "distortion", "base_from_camera")
 SIGMA_KEY = "lens_sigma"  # standard deviations of fx fy cx cy k1 k2 p1 p2 k3, where a calibration gave them
 RECORDED_KEYS = ("video", "images")  # where a recorded session's images are
-LIVE_KEYS = (
-    "source",
-    "exposure_s",
-    "gain",
-    "focus_abs",
-    "white_balance_k",
-    "fps",
-    "format",
-)  # hardware/cameras reads them
+# of live cameras, read by hardware/cameras
+LIVE_KEYS = ("source", "exposure_s", "gain", "focus_abs", "white_balance_k", "fps", "format")
 PINHOLE = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px"
 ROTATION_TOLERANCE = 1e-3  # four digits written by hand pass (and are made orthonormal); a wrong matrix does not
 EXACT_ROTATION = 1e-12  # below, the matrix is kept bit by bit, so that a rig written by us comes back the same
@@ -47,7 +40,7 @@ class ImageSource:
 
 @dataclass(frozen=True, slots=True)
 class RigFile:
-    """What rig.toml says."""
+    """The contents of a rig.toml."""
 
     rig: Rig
     sources: tuple[ImageSource | None, ...]  # of each camera
@@ -73,13 +66,13 @@ def read_uncalibrated(path: Path) -> RigFile:
     checks.check_keys(path, "", table, ["camera"], ["surface"])
     entries = checks.tables(path, "camera", table.get("camera"))
     for number, entry in enumerate(entries):
-        checks.check_keys(path, f"camera[{number}].", entry, ("name", "size"), ("video", "images"))
+        checks.check_keys(path, f"camera[{number}].", entry, ("name", "size"), RECORDED_KEYS)
         size = checks.numbers(path, f"camera[{number}].size", entry["size"], (2,), "[width, height] in px")
         f, middle = float(size.max()), (size - 1) / 2
         entry["matrix"] = [[f, 0.0, float(middle[0])], [0.0, f, float(middle[1])], [0.0, 0.0, 1.0]]
         entry["distortion"] = [0.0] * 5
         entry["base_from_camera"] = se3.make(np.eye(3), [MIN_RIG_SPAN * number, 0.0, 0.0]).tolist()
-    rig = rig_from_table(path, table, ("video", "images"))
+    rig = rig_from_table(path, table, RECORDED_KEYS)
     return RigFile(rig, tuple(_source(path, entry) for entry in entries), None, (None,) * len(rig))
 
 
@@ -102,20 +95,12 @@ def rig_from_table(where: object, table: Table, also: Sequence[str] = ()) -> Rig
 
 
 def table_from_rig(rig: Rig) -> Table:
-    """The rig as plain lists and numbers, keys as in rig.toml; `rig_from_table` gives the same rig back, bit by bit."""
-    return {
-        "camera": [
-            {
-                "name": c.name,
-                "size": list(c.size),
-                "matrix": c.matrix.tolist(),
-                "distortion": c.distortion.tolist(),
-                "base_from_camera": c.base_from_camera.tolist(),
-                "clock_offset_s": c.clock_offset,
-            }
-            for c in rig.cameras
-        ]
-    }
+    """The rig as plain lists and numbers, keys as in rig.toml; `rig_from_table` reads the same rig back, bit by bit."""
+    entries: list[Table] = []
+    for c in rig.cameras:
+        arrays = {key: getattr(c, key).tolist() for key in ("matrix", "distortion", "base_from_camera")}
+        entries.append({"name": c.name, "size": list(c.size), **arrays, "clock_offset_s": c.clock_offset})
+    return {"camera": entries}
 
 
 def write_rig(
@@ -129,9 +114,8 @@ def write_rig(
         if source is not None:
             lines.append(f"{source.kind} = {json.dumps(source.pattern, ensure_ascii=False)}")
         lines.append(f"size = {list(camera.size)}")
-        for key, array in (("matrix", camera.matrix), ("distortion", camera.distortion)):
-            lines.append(f"{key} = {checks.toml_numbers(array)}")
-        lines.append(f"base_from_camera = {checks.toml_numbers(camera.base_from_camera)}")
+        for key in ("matrix", "distortion", "base_from_camera"):
+            lines.append(f"{key} = {checks.toml_numbers(getattr(camera, key))}")
         if camera.clock_offset:
             lines.append(f"clock_offset_s = {checks.toml_number(camera.clock_offset)}")
         if sigma is not None:
@@ -187,8 +171,9 @@ def _check_matrix(where: object, key: str, matrix: Array, longer_side: float) ->
         if focal <= 0:
             raise InputError(where, f"{key} {name}", focal, "a focal length > 0 px")
         if focal < MIN_FOCAL_SHARE * longer_side:
-            least = MIN_FOCAL_SHARE * longer_side
-            allowed = f">= {least:g} px, {MIN_FOCAL_SHARE} of the image's longer side (px, not mm)"
+            allowed = (
+                f">= {MIN_FOCAL_SHARE * longer_side:g} px, {MIN_FOCAL_SHARE} of the image's longer side (px, not mm)"
+            )
             raise InputError(where, f"{key} {name}", focal, allowed)
     if matrix[0, 1] or matrix[1, 0] or (matrix[2] != [0, 0, 1]).any():
         raise InputError(where, key, matrix.tolist(), PINHOLE)
@@ -240,9 +225,8 @@ def read_board(path: str | Path) -> Board:
         raise InputError(path, "kind", kind, " or ".join(BOARD_KINDS))
     squares = checks.numbers(path, "squares", table["squares"], (2,), "[columns, rows]")
     if (squares != squares.round()).any() or (squares < MIN_SQUARES).any() or (squares > MAX_SQUARES).any():
-        raise InputError(
-            path, "squares", table["squares"], f"[columns, rows], whole, {MIN_SQUARES} to {MAX_SQUARES} each"
-        )
+        allowed = f"[columns, rows], whole, {MIN_SQUARES} to {MAX_SQUARES} each"
+        raise InputError(path, "squares", table["squares"], allowed)
     square = _within(path, "square_mm", table["square_mm"], *SQUARE_SIZE_RANGE)
     marker = _within(path, "marker", table.get("marker", DEFAULT_BOARD.marker), *MARKER_SHARE_RANGE)
     dictionary = str(table.get("dictionary", DEFAULT_BOARD.dictionary)).removeprefix("DICT_")

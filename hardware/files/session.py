@@ -23,7 +23,7 @@ HEAD_STAMP_TOLERANCE = 0.002  # s from a row to its frame set: the rounding of s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrintHeadLog:
-    """Where the print head was at each frame set of a session with an arm, in order of stamp, as stored."""
+    """The print head at each of N frame sets of a session with an arm, in order of stamp, as stored."""
 
     rows: Array  # (N, 8) stamp x y z qx qy qz qw of base_from_nozzle, s and mm
     extruding: NDArray[np.bool_]  # (N,) whether ink flowed
@@ -32,7 +32,7 @@ class PrintHeadLog:
         return len(self.rows)
 
     def at(self, stamp: float) -> PrintHead | None:
-        """The head of the frame set at `stamp`, s; None where there is no row near enough."""
+        """The head of the frame set at `stamp`, s; None without a row within HEAD_STAMP_TOLERANCE of it."""
         if not len(self):
             return None
         after = int(np.searchsorted(self.rows[:, 0], stamp))
@@ -67,14 +67,14 @@ class FrameRef:
 
 
 class FrameReader(Protocol):
-    """Decodes images; each camera's are asked for in rising order."""
+    """Decodes images; those of one camera must be read in rising order."""
 
     def read(self, ref: FrameRef) -> Image:
         """The image; InputError where it is missing, undecodable or not of the camera's size."""
         ...
 
     def encoded(self, ref: FrameRef) -> tuple[str, bytes] | None:
-        """Format ("png" or "jpeg") and bytes of the image as stored, None where it is not stored as a picture."""
+        """Format ("png" or "jpeg") and bytes of the image as stored; None for a frame of a video."""
         ...
 
     def close(self) -> None:
@@ -83,7 +83,7 @@ class FrameReader(Protocol):
 
 
 class FrameStore(Protocol):
-    """Where a session's images are."""
+    """The stored images of a session."""
 
     def open(self) -> FrameReader:
         """A reader of its own, at the beginning."""
@@ -92,25 +92,25 @@ class FrameStore(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Session:
-    """A recorded session, checked as far as that goes without decoding every image."""
+    """A recorded session; everything in it is checked but the decoding of its images."""
 
     path: Path
     rig: Rig
     roi: tuple[Roi, ...]  # where the surface is at the start
     surface: Path | None  # the scan's file, mm; of an MCAP file a copy that lives as long as the session
-    truth: Trajectory | None  # base_from_surface; its `exact` tells truth.tum from reference.tum
+    truth: Trajectory | None  # base_from_surface; `exact`: a truth, else a measured reference
     sets: tuple[tuple[FrameRef, ...], ...]  # the images of one instant each, in order of stamp
     store: FrameStore
-    damage: str = ""  # what was lost of the file, "" if nothing; all that is here was read whole
+    damage: str = ""  # which part of the file could not be read, "" if none
     heads: PrintHeadLog = NO_PRINT_HEADS
 
     def __len__(self) -> int:
         return len(self.sets)
 
     def frame_sets(self) -> Iterator[FrameSet]:
-        """The frame sets in order of stamp on the cameras' common clock, each decoded when it is asked for.
+        """The frame sets in order of stamp on the cameras' common clock, decoded one by one.
 
-        InputError where an image turns out to be missing or undecodable; the sets before it were yielded.
+        InputError at the first image that is missing or undecodable.
         """
         reader = self.store.open()
         try:

@@ -1,4 +1,4 @@
-"""A session as a plain folder that a person can make by hand: rig.toml, frames.csv, videos or pictures, and more.
+"""A session as a plain folder that a person can write by hand: rig.toml, frames.csv, videos or pictures, and more.
 
 Optional beside them: roi.toml, head.csv, truth.tum (exact) or reference.tum (measured; truth wins), surface.ply, .stl
 or .obj.
@@ -26,11 +26,11 @@ TRUTH_FILES = (("truth.tum", True), ("reference.tum", False))  # the first that 
 
 @dataclass(frozen=True, slots=True)
 class CameraFiles:
-    """One camera's images. video: the file, or None; pictures: else one file per frame."""
+    """The files of one camera's images."""
 
     camera: Camera
     video: Path | None
-    pictures: tuple[Path, ...]
+    pictures: tuple[Path, ...]  # one per frame, where there is no video
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class FolderReader:
         return None if kind is None else (kind, checks.read_bytes(files.pictures[ref.number]))
 
     def close(self) -> None:
-        """Give the decoders back."""
+        """Release the decoders."""
         for video in self._videos.values():
             video.close()
 
@@ -141,7 +141,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def _check_count(frames_csv: Path, files: CameraFiles, named: int) -> None:
-    """InputError unless frames.csv names every image once; a video that seems not to is counted out."""
+    """InputError unless frames.csv names as many images as there are; a video is decoded to count them if in doubt."""
     if files.video is None:
         there, what = len(files.pictures), "pictures"
     else:

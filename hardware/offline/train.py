@@ -1,11 +1,11 @@
-"""`stillbed train`: labelled pictures in, a network with its settings, card and curves out."""
+"""`stillbed train`: a segmentation network with its settings, card and curves, from labelled pictures."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 SPLIT_SEED = 2024  # fixed: figures of networks trained with other seeds are of the same pictures
 VALIDATION_PICTURES = 60  # pictures kept for choosing thresholds
-OTHER_SET_WEIGHT = 0.35  # of a picture of a further data set, relative to the first: it is in there four times
-HEALTHY_PIECES = 200  # pieces of healthy skin, real, to judge by; a third as many rendered ones
+OTHER_SET_WEIGHT = 0.35  # of a picture of a further data set, relative to the first's: it is contained four times
+HEALTHY_PIECES = 200  # pieces of real healthy skin for the evaluation; a third as many rendered ones
 DRAWS_PER_PICTURE = 3  # pieces from each of the few pictures kept for choosing
-RENDERED_SEED = 5000  # the seeds below are the bench's
+RENDERED_SEED = 5000  # the first; the bench uses those below
 
 
 class RenderedView(Protocol):
-    """A rendered picture of skin. image: (H, W, 3) BGR. wound: (H, W) bool, all False where the skin is healthy."""
+    """A rendered picture of skin. image: (H, W, 3) BGR. wound: (H, W) bool, all False of healthy skin."""
 
     @property
     def image(self) -> NDArray[np.uint8]: ...  # noqa: D102
@@ -44,69 +44,55 @@ RenderView = Callable[[int, bool], RenderedView]  # (seed, wounded): the simulat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DatasetParts:
-    """The first data set in its three uses, and everything else that is trained on."""
+    """The first data set split by use, and the other pictures for training."""
 
     trained: Sequence[Labelled]
-    chosen_on: Sequence[Labelled]
+    chosen_on: Sequence[Labelled]  # for choosing thresholds
     held_out: Sequence[Labelled]
-    others: Sequence[Labelled]
-    group_count: int  # groups that the first data set falls into
+    others: Sequence[Labelled]  # of further data sets and rendered, for training
+    group_count: int  # groups of near-duplicates in the first data set
 
 
 def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
-    """Train, choose thresholds, export, judge; what it came to, in words."""
+    """Train, choose thresholds, export and evaluate; returns the result in words."""
     out: Path = options.out
     _check(options)
+    parts = _parts(options, render_view)
     if options.network == "shape":
-        return _shapes(_parts(options, render_view), out, options.seed)
+        from perception.training.metrics import fit_shapes, write_shape_model
+
+        with _progress("fit", "pictures") as progress:
+            write_shape_model(out, fit_shapes(parts.trained, options.seed, progress))
+        return f"{out} is written; judge it with stillbed bench segmentation"
+    from perception.training import loop
     from perception.training.augmentation import sample_pyramid
     from perception.training.export import NetworkOrigin, export
-    from perception.training.loop import (
-        THESIS_RECIPE,
-        THESIS_SCHEDULE,
-        Recipe,
-        Schedule,
-        Source,
-        build_network,
-        draw_curves,
-        parameter_count,
-        train,
-    )
     from perception.training.metrics import chosen_settings
 
-    parts = _parts(options, render_view)
-    network = build_network(options.network, options.seed)
-    recipe, usual = (THESIS_RECIPE, THESIS_SCHEDULE) if options.network == "thesis" else (Recipe(), Schedule())
-    schedule = replace(usual, rounds=options.rounds or usual.rounds, seed=options.seed, threads=options.threads)
+    network = loop.build_network(options.network, options.seed)
+    recipe, schedule = loop.Recipe(), loop.Schedule()
+    if options.network == "thesis":
+        recipe, schedule = loop.THESIS_RECIPE, loop.THESIS_SCHEDULE
+    rounds = options.rounds or schedule.rounds
+    schedule = replace(schedule, rounds=rounds, seed=options.seed, threads=options.threads)
     weights = np.r_[np.ones(len(parts.trained)), np.full(len(parts.others), OTHER_SET_WEIGHT)]
-    source = Source([sample_pyramid(each) for each in (*parts.trained, *parts.others)], weights)
-    with _progress("train", "steps") as said:
-        network, curve = train(network, source, parts.chosen_on, schedule, out.with_suffix(".ckpt"), said, recipe)
-    draw_curves(out.with_name(f"{out.stem}_curves.png"), curve, schedule.steps)
+    source = loop.Source([sample_pyramid(each) for each in (*parts.trained, *parts.others)], weights)
+    checkpoint = out.with_suffix(".ckpt")
+    with _progress("train", "steps") as progress:
+        network, curve = loop.train(network, source, parts.chosen_on, schedule, checkpoint, progress, recipe)
+    loop.draw_curves(out.with_name(f"{out.stem}_curves.png"), curve, schedule.steps)
     rng = np.random.default_rng(SPLIT_SEED)
     real = [piece for _ in range(DRAWS_PER_PICTURE) for piece in healthy_pieces(parts.chosen_on, rng, HEALTHY_PIECES)]
     healthy = [*real, *_healthy_rendered(render_view, RENDERED_SEED - HEALTHY_PIECES, HEALTHY_PIECES // 6)]
-    alike = export(
-        network,
-        out,
-        parts.chosen_on,
-        recipe.looks,
-        lambda written: chosen_settings(written, parts.chosen_on, healthy, recipe.looks),
-    )
+    choose = partial(chosen_settings, pictures=parts.chosen_on, healthy=healthy, looks=recipe.looks)
+    alike = export(network, out, parts.chosen_on, recipe.looks, choose)
     (out.with_name(f"{out.stem}_held_out.txt")).write_text("".join(f"{p.name}\n" for p in parts.held_out), "utf-8")
-    return finish(out, parts, NetworkOrigin(out.stem, parameter_count(network), str(schedule), alike), render_view)
+    origin = NetworkOrigin(out.stem, loop.parameter_count(network), str(schedule), alike)
+    return evaluate(out, parts, origin, render_view)
 
 
-def _shapes(parts: DatasetParts, out: Path, seed: int) -> str:
-    from perception.training.metrics import fit_shapes, write_shape_model
-
-    with _progress("fit", "pictures") as said:
-        write_shape_model(out, fit_shapes(parts.trained, seed, said))
-    return f"{out} is written; judge it with stillbed bench segmentation"
-
-
-def finish(out: Path, parts: DatasetParts, making: NetworkOrigin, render_view: RenderView) -> str:
-    """Judge the network in `out` on what was held out, and write its card."""
+def evaluate(out: Path, parts: DatasetParts, origin: NetworkOrigin, render_view: RenderView) -> str:
+    """Evaluate the network in `out` on the pictures held out, and write its card."""
     from perception.training.export import HeldOutFigures, write_card
     from perception.training.metrics import dice_before_and_after_cover, scores, silent_share
     from perception.wound.network import WoundNetwork, hash_of
@@ -114,14 +100,14 @@ def finish(out: Path, parts: DatasetParts, making: NetworkOrigin, render_view: R
 
     network = WoundNetwork(out)
     segmenter = NetworkSegmenter(network, network.settings)
-    with _progress("judge", "pictures") as said:
-        dice = scores(segmenter, parts.held_out, said)
+    with _progress("judge", "pictures") as progress:
+        dice = scores(segmenter, parts.held_out, progress)
     rng = np.random.default_rng(SPLIT_SEED)
     before, after = dice_before_and_after_cover(segmenter, parts.held_out, rng)
     real = silent_share(segmenter, healthy_pieces(parts.held_out, rng, HEALTHY_PIECES))
     rendered = silent_share(segmenter, _healthy_rendered(render_view, 0, HEALTHY_PIECES // 3))
     empty = sum(not each.wound.any() for each in parts.held_out)
-    judged = HeldOutFigures(dice, empty, real, rendered, before, after)
+    figures = HeldOutFigures(dice, empty, real, rendered, before, after)
     data = (
         f"{len(parts.trained)} pictures trained on, {len(parts.chosen_on)} for choosing thresholds,"
         f" {len(parts.held_out)} held out",
@@ -129,9 +115,9 @@ def finish(out: Path, parts: DatasetParts, making: NetworkOrigin, render_view: R
         f"split by {parts.group_count} groups of near-duplicates (small colour copies, mirrored and turned; SIFT),"
         " never at random",
     )
-    write_card(out.with_suffix(".md"), making, data, judged, network.settings, hash_of(out))
-    reached = f"mean Dice of {len(dice)} pictures held out: {dice.mean():.3f} (median {np.median(dice):.3f})"
-    return f"{reached}\n{out}, its settings and its card are written"
+    write_card(out.with_suffix(".md"), origin, data, figures, network.settings, hash_of(out))
+    result = f"mean Dice of {len(dice)} pictures held out: {dice.mean():.3f} (median {np.median(dice):.3f})"
+    return f"{result}\n{out}, its settings and its card are written"
 
 
 def parts_of(pictures: Sequence[Labelled], others: Sequence[Labelled], held_out: int) -> DatasetParts:
@@ -151,8 +137,8 @@ def parts_of(pictures: Sequence[Labelled], others: Sequence[Labelled], held_out:
 def _parts(options: argparse.Namespace, render_view: RenderView) -> DatasetParts:
     read = []
     for folder in options.datasets:
-        with _progress(f"read {folder.name}", "pictures") as said:
-            read.append(read_dataset(folder, said))
+        with _progress(f"read {folder.name}", "pictures") as progress:
+            read.append(read_dataset(folder, progress))
     if len(read[0]) < options.hold_out + VALIDATION_PICTURES + 1:
         needed = f"more than the {options.hold_out} held out and {VALIDATION_PICTURES} for choosing"
         raise InputError(options.datasets[0], "pictures", len(read[0]), needed)
@@ -161,15 +147,15 @@ def _parts(options: argparse.Namespace, render_view: RenderView) -> DatasetParts
 
 
 def _rendered(render_view: RenderView, count: int) -> list[Labelled]:
-    """Rendered pictures, every fourth of healthy skin: what the simulator shows is found as well."""
-    found = []
-    with _progress("render", "pictures") as said:
+    """Rendered pictures, every fourth of healthy skin, so that the network segments the simulator's wounds as well."""
+    pictures = []
+    with _progress("render", "pictures") as progress:
         for number in range(count):
             view = render_view(RENDERED_SEED + number, number % 4 != 3)
             picture = np.ascontiguousarray(view.image[..., ::-1])
-            found.append(Labelled(f"rendered/{RENDERED_SEED + number}", picture, view.wound))
-            said(number + 1, count)
-    return found
+            pictures.append(Labelled(f"rendered/{RENDERED_SEED + number}", picture, view.wound))
+            progress(number + 1, count)
+    return pictures
 
 
 def _healthy_rendered(render_view: RenderView, first: int, count: int) -> list[NDArray[np.uint8]]:
@@ -196,7 +182,5 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError("command line", "--rounds", options.rounds, "1 or more")
 
 
-@contextmanager
-def _progress(what: str, unit: str) -> Iterator[Progress]:
-    with Progress(what, unit, WallClock().now) as progress:
-        yield progress
+def _progress(what: str, unit: str) -> Progress:
+    return Progress(what, unit, WallClock().now)

@@ -1,7 +1,7 @@
-"""MCAP files: walked through, whole or damaged, every checksum checked; and written with a packed index.
+"""MCAP files: read record by record, whole or damaged, every checksum checked; and written with a packed index.
 
-A file is walked from its start, record by record, and never through its index: so a file whose end is missing is read
-by the same code as a whole one, and an index that lies cannot mislead.
+A file is read from its start and never through its index: the same code reads a file whose end is missing, and a wrong
+index does no harm.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ _RECORD_HEAD = struct.Struct("<BQ")  # opcode and length in front of every recor
 
 @dataclass(frozen=True, slots=True)
 class StoredMessage:
-    """One message as it is stored: its channel's topic and encoding, its sequence number, its bytes."""
+    """One message as it is stored."""
 
-    topic: str
+    topic: str  # of its channel
     sequence: int
     data: bytes
-    encoding: str = "json"
+    encoding: str = "json"  # of its channel
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class ChunkMessages:
 
 @dataclass(frozen=True, slots=True)
 class AttachedFile:
-    """A file that travels in the recording."""
+    """A file attached to the recording."""
 
     name: str
     data: bytes
@@ -78,9 +78,6 @@ class Damage:
     text: str
 
 
-RecordingPart = ChunkMessages | AttachedFile | Damage
-
-
 @dataclass(frozen=True, slots=True)
 class RecordGroup:
     """The records of a chunk that begins at byte `offset`, or the one attachment or metadata there."""
@@ -89,23 +86,26 @@ class RecordGroup:
     records: tuple[McapRecord, ...]
 
 
-def walk(path: Path) -> Iterator[RecordingPart]:
+def walk(path: Path) -> Iterator[ChunkMessages | AttachedFile | Damage]:
     """The parts of a recording in the order of the file; a Damage, if any, is the last one."""
     channels: dict[int, Channel] = {}
-    for piece in record_groups(path):
-        if isinstance(piece, Damage):
-            yield piece
+    for group in record_groups(path):
+        if isinstance(group, Damage):
+            yield group
             continue
-        first = next(iter(piece.records), None)
+        first = next(iter(group.records), None)
         if isinstance(first, Attachment):
             yield AttachedFile(first.name, first.data)
         elif not isinstance(first, Metadata):
-            yield ChunkMessages(piece.offset, _stored(piece, channels))
+            channels.update((r.id, r) for r in group.records if isinstance(r, Channel))
+            pairs = ((channels[r.channel_id], r) for r in group.records if isinstance(r, Message))
+            stored = (StoredMessage(of.topic, r.sequence, r.data, of.message_encoding) for of, r in pairs)
+            yield ChunkMessages(group.offset, tuple(stored))
 
 
 def record_groups(path: Path) -> Iterator[RecordGroup | Damage]:
-    """The same parts as the library's records, and the metadata."""
-    known: set[int] = set()
+    """The same parts as the MCAP library's records, and the metadata."""
+    known: set[int] = set()  # channels so far
     try:
         file = open(path, "rb")  # noqa: SIM115  (closed by the block below)
     except OSError as error:
@@ -146,7 +146,7 @@ def _damage(offset: int, size: int, reason: str) -> Damage:
 
 
 def _records(opcode: int, data: bytes, known: set[int]) -> tuple[McapRecord, ...] | None:
-    """What a record holds, its checksum checked; None if it is broken. known: channels, learnt on the way."""
+    """The records in a record, its checksum checked; None if it is broken. known: channels so far, added to."""
     stream = ReadDataStream(BytesIO(data))
     try:
         if opcode == Opcode.METADATA:
@@ -155,21 +155,14 @@ def _records(opcode: int, data: bytes, known: set[int]) -> tuple[McapRecord, ...
             (crc,) = struct.unpack("<I", data[-4:])
             return (Attachment.read(stream),) if crc in (0, zlib.crc32(data[:-4])) else None
         records = tuple(breakup_chunk(Chunk.read(stream), validate_crc=True))
-    except Exception:  # whatever the library, its decompressors and struct say of broken bytes: the same thing
+    except Exception:  # of broken bytes the library, its decompressors and struct raise many kinds
         return None
     known.update(r.id for r in records if isinstance(r, Channel))
     return records if all(r.channel_id in known for r in records if isinstance(r, Message)) else None
 
 
-def _stored(chunk: RecordGroup, channels: dict[int, Channel]) -> tuple[StoredMessage, ...]:
-    """The messages of a chunk; channels: learnt on the way."""
-    channels.update((r.id, r) for r in chunk.records if isinstance(r, Channel))
-    pairs = ((channels[r.channel_id], r) for r in chunk.records if isinstance(r, Message))
-    return tuple(StoredMessage(of.topic, r.sequence, r.data, of.message_encoding) for of, r in pairs)
-
-
 def chunk_messages(file: BinaryIO, offset: int) -> list[bytes]:
-    """The bytes of every message in the chunk at `offset` of a file that `walk` found whole."""
+    """The bytes of every message in the chunk at `offset`, which `walk` has checked."""
     file.seek(offset)
     _, length = _RECORD_HEAD.unpack(file.read(_RECORD_HEAD.size))
     chunk = Chunk.read(ReadDataStream(BytesIO(file.read(length))))
@@ -187,15 +180,15 @@ def parse(path: Path, stored: StoredMessage) -> dict[str, Any]:
     return message
 
 
-_FOOTER_HEAD = struct.Struct("<BQQQ")  # what of the footer its checksum covers
+_FOOTER_HEAD = struct.Struct("<BQQQ")  # the footer without its checksum, which covers it
 _FOOTER_LENGTH = 20
 
 
 class McapWriter:
-    """Writes the records of an MCAP file, the same bytes as the library's Writer, and keeps its index packed.
+    """Writes an MCAP file, the same bytes as the library's Writer, and keeps its index as packed records.
 
-    The library's Writer holds an object for each chunk until the file is closed: 7 to 10 MB an hour of a live run. The
-    records of the index say the same in a tenth of that.
+    The library's Writer keeps an object for each chunk until the file is closed: 7 to 10 MB an hour of a live run. The
+    packed records take a tenth of that.
     """
 
     def __init__(self, file: BinaryIO, chunk_size: int, compress: bool) -> None:
@@ -241,7 +234,7 @@ class McapWriter:
         self._add(Message(channel, log_time=log_time, data=data, publish_time=log_time, sequence=sequence))
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Write a file that travels in the recording."""
+        """Write an attached file."""
         record = _bytes(Attachment(0, 0, name, media_type, data))
         self._attachments.append(
             AttachmentIndex(self._file.tell(), len(record), 0, 0, data_size=len(data), name=name, media_type=media_type)
@@ -249,7 +242,7 @@ class McapWriter:
         self._file.write(record)
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Write what is known of the whole file."""
+        """Write a table about the whole file."""
         record = _bytes(Metadata(name, data))
         self._metadata.append(MetadataIndex(self._file.tell(), len(record), name))
         self._file.write(record)
