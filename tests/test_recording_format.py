@@ -229,7 +229,7 @@ def test_images_that_are_json_are_read_as_before(tmp_path: Path) -> None:
     session = open_session(tmp_path / "x.mcap")
     (frames,) = session.frame_sets()
     assert np.array_equal(frames.frames[0].image, image(0, 0))
-    reader = session.store.open()
+    reader = session.open_reader()
     assert reader.encoded(session.sets[0][0]) == encode(image(0, 0))
 
 

@@ -88,7 +88,7 @@ def find_tips(session: Session, set_point: SetPoint, tool: Array, report: Progre
     chosen = _select_sets(session, set_point)
     finders = _finders(session, set_point, needle_radius(session.rig, tool))
     pictures: list[_TipPicture] = []
-    with closing(session.store.open()) as reader, ThreadPoolExecutor(2) as pool:
+    with closing(session.open_reader()) as reader, ThreadPoolExecutor(2) as pool:
         for done, (refs, places) in enumerate(chosen, 1):
             images = [reader.read(ref) for ref in refs]
             pictures += pool.map(partial(_find, finders), refs, places, images)
@@ -122,7 +122,7 @@ def _finders(session: Session, set_point: SetPoint, radius: float) -> list[TipFi
     refs = [[ref for refs in session.sets for ref in refs if ref.camera == c] for c in range(len(cameras))]
     spread = [ref for own in refs for ref in _spread_pictures(own, set_point)]
     stacks: list[list[Image]] = [[] for _ in cameras]
-    with closing(session.store.open()) as reader:
+    with closing(session.open_reader()) as reader:
         for ref in sorted(spread, key=lambda one: one.stamp):
             stacks[ref.camera].append(reader.read(ref))
     for camera, stack in zip(cameras, stacks, strict=True):

@@ -120,7 +120,7 @@ class CornerSearch:
 def collect_corners(session: Session, board: Board, store: Path | None, report: ProgressReport) -> CornerTable:
     """The corners of all pictures. store: the file for them, or None. InputError where a picture is missing."""
     search = CornerSearch(board, len(session.rig), store, content_key(session, board) if store is not None else "")
-    with closing(session.store.open()) as reader, ThreadPoolExecutor(CORNER_THREADS) as pool:
+    with closing(session.open_reader()) as reader, ThreadPoolExecutor(CORNER_THREADS) as pool:
         try:
             for refs in session.sets[search.done :]:
                 search.add(pool, [(ref.camera, ref.camera_stamp, reader.read(ref)) for ref in refs])

@@ -99,7 +99,7 @@ def pictures_of(session: Session, camera: int) -> list[Image]:
     """A few pictures of a camera, spread over a recording."""
     refs = [ref for refs in session.sets for ref in refs if ref.camera == camera]
     chosen = refs[:: max(len(refs) // SAMPLE_PICTURES, 1)][:SAMPLE_PICTURES]
-    with closing(session.store.open()) as reader:
+    with closing(session.open_reader()) as reader:
         return [reader.read(ref) for ref in chosen]
 
 

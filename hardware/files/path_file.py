@@ -42,7 +42,6 @@ PATH_HEADER = (*POSE_COLUMNS, "speed_mm_s", *PRINT_COLUMNS, *OPTIONAL_COLUMNS)
 COLUMN_STEMS = {name.split("_")[0]: name for name in ("temperature_c", *POSE_COLUMNS)}  # x, alpha: they need units
 COLUMN_STEMS["speed"] = " or ".join(SPEED_COLUMNS)
 MIN_PATH_SPAN = 0.1  # mm, corner to corner: less than any wound, and as much as a tenth of a metre has in metres
-ColumnWords = dict[str, list[str]]
 
 
 def read_path(file: str | File) -> Path:
@@ -97,7 +96,7 @@ def path_text(path: Path) -> str:
     return stream.getvalue()
 
 
-def _columns(file: File, rows: list[checks.CsvRow]) -> tuple[list[int], ColumnWords]:
+def _columns(file: File, rows: list[checks.CsvRow]) -> tuple[list[int], dict[str, list[str]]]:
     """Line numbers of the checkpoints, and the cells of each column."""
     rows = _stripped(rows)
     if not rows:

@@ -54,7 +54,7 @@ def fans(counts: Numbers, corners: Numbers) -> Numbers:
     return np.column_stack([corners[start], corners[start + number + 1], corners[start + number + 2]])
 
 
-PLY_TYPES = {  # type: its letter, which numpy and struct share behind a byte order, and array has too
+PLY_TYPES = {  # letter of each type, which numpy and struct share behind a byte order, and array has too
     **{b"char": "b", b"uchar": "B", b"short": "h", b"ushort": "H", b"int": "i", b"uint": "I", b"float": "f"},
     **{b"int8": "b", b"uint8": "B", b"int16": "h", b"uint16": "H", b"int32": "i", b"uint32": "I", b"float32": "f"},
     **{b"double": "d", b"float64": "d"},
@@ -308,7 +308,11 @@ def read_ply(path: Path) -> RawMesh:
                 columns = rows.columns(element, _places(element, path))
                 vertices = np.column_stack([column.values for column in columns]).astype(np.float64)
             elif element.name == "face":
-                triangles = _triangles(rows.columns(element, [_corners(element, path)])[0], path)
+                (corners,) = rows.columns(element, [_corners(element, path)])
+                few = np.flatnonzero(corners.counts < 3)
+                if len(few):
+                    raise InputError(path, f"face {few[0]}", f"{corners.counts[few[0]]} vertices", "3 or more")
+                triangles = fans(corners.counts, corners.values.astype(np.int64))
             else:
                 rows.columns(element, [])
         rows.end()
@@ -330,10 +334,3 @@ def _corners(element: PlyElement, path: Path) -> int:
             return k
     names = ", ".join(one.name for one in element.properties)
     raise InputError(path, "properties of face", names, f"{FACE_LIST_NAMES[0]} among them, a list of whole numbers")
-
-
-def _triangles(corners: Column, path: Path) -> NDArray[np.int64]:
-    few = np.flatnonzero(corners.counts < 3)
-    if len(few):
-        raise InputError(path, f"face {few[0]}", f"{corners.counts[few[0]]} vertices", "3 or more")
-    return fans(corners.counts, corners.values.astype(np.int64))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -82,14 +82,6 @@ class FrameReader(Protocol):
         ...
 
 
-class FrameStore(Protocol):
-    """The stored images of a session."""
-
-    def open(self) -> FrameReader:
-        """A reader of its own, at the beginning."""
-        ...
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Session:
     """A recorded session; everything in it is checked but the decoding of its images."""
@@ -100,7 +92,7 @@ class Session:
     surface: Path | None  # the scan's file, mm; of an MCAP file a copy that lives as long as the session
     truth: Trajectory | None  # base_from_surface; `exact`: a truth, else a measured reference
     sets: tuple[tuple[FrameRef, ...], ...]  # the images of one instant each, in order of stamp
-    store: FrameStore
+    open_reader: Callable[[], FrameReader]  # each call gives a new reader, at the beginning
     damage: str = ""  # which part of the file could not be read, "" if none
     heads: PrintHeadLog = NO_PRINT_HEADS
 
@@ -112,7 +104,7 @@ class Session:
 
         InputError at the first image that is missing or undecodable.
         """
-        reader = self.store.open()
+        reader = self.open_reader()
         try:
             for refs in self.sets:
                 frames = frame_set([Frame(ref.camera, ref.stamp, reader.read(ref)) for ref in refs])

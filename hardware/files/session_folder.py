@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from estimation.errors import InputError
@@ -31,17 +32,6 @@ class CameraFiles:
     camera: Camera
     video: Path | None
     pictures: tuple[Path, ...]  # one per frame, where there is no video
-
-
-@dataclass(frozen=True, slots=True)
-class FolderStore:
-    """The image files of a folder, one entry per camera."""
-
-    cameras: tuple[CameraFiles, ...]
-
-    def open(self) -> FolderReader:
-        """A reader of its own, at the beginning."""
-        return FolderReader(self.cameras)
 
 
 class FolderReader:
@@ -105,8 +95,8 @@ def open_folder(folder: Path, rig_file: RigFile | None = None) -> Session:
     rois = read_roi(roi, rig, common_stamps(rig, stamps)) if roi.exists() else ()
     head = folder / "head.csv"
     heads = read_heads(head) if head.exists() else NO_PRINT_HEADS
-    sets, surface = frame_refs(rig, stamps), _surface(folder, rig_file)
-    return Session(folder, rig, rois, surface, truth_of(folder), sets, FolderStore(cameras), heads=heads)
+    sets, surface, open_reader = frame_refs(rig, stamps), _surface(folder, rig_file), partial(FolderReader, cameras)
+    return Session(folder, rig, rois, surface, truth_of(folder), sets, open_reader, heads=heads)
 
 
 def truth_of(folder: Path) -> Trajectory | None:

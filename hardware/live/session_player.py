@@ -126,7 +126,7 @@ class _PictureCache:
 
     def __init__(self, session: Session, keep: bool) -> None:
         self._session, self._keep, self._cache, self._size = session, keep, dict[FrameRef, Encoded](), 0
-        self._reader: FrameReader = session.store.open()
+        self._reader: FrameReader = session.open_reader()
 
     def decoded(self, refs: tuple[FrameRef, ...]) -> tuple[dict[int, Encoded], list[Frame]]:
         """The pictures of a set, as stored and as arrays."""

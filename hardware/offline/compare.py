@@ -26,9 +26,7 @@ from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, component
 from hardware.report.summary import figure, finite, percent
 
 ALIGNMENTS = ("as they stand", "aligned, SE(3)", "one surface frame", "laid at one pose")
-FIXED_POSE_SIGMA_MM = (
-    1e-3  # mm, of all axes: a smaller one is reported only of the pose that a smoothed run holds fixed
-)
+FIXED_POSE_SIGMA_MM = 1e-3  # mm, of all axes: only the pose that a smoothed run holds fixed has a smaller one
 UNFITTED_ALIGNMENTS = ALIGNMENTS[0], ALIGNMENTS[3]  # those that covariances can be checked under: nothing is fitted
 RowNumbers = NDArray[np.int64]
 MIN_PAIRS = 3  # pairs of poses: fewer are aligned without a residual
@@ -285,11 +283,9 @@ def _absolute(comparison: TrajectoryComparison) -> str:
 def _relative(comparison: TrajectoryComparison) -> str:
     name, errors = comparison.fitted.name, comparison.fitted.relative
     plots = _error_plots(comparison, [(name, comparison.stamps[errors.rows], errors)])
-    over = _poses(comparison.delta)
+    over, table = _poses(comparison.delta), figures_table(TABLE_HEAD, _error_rows(comparison, "relative"))
     words = f"How far the change over {over} is off; an alignment of the base alone changes none of it."
-    return section(
-        "Relative pose error (RPE)", words, plots + figures_table(TABLE_HEAD, _error_rows(comparison, "relative"))
-    )
+    return section("Relative pose error (RPE)", words, plots + table)
 
 
 def _error_plots(comparison: TrajectoryComparison, lines: list[ErrorLine]) -> str:

@@ -111,7 +111,7 @@ def _record(session: Session, folder: Path, recorder: Recorder, progress: Progre
     """Everything in order of stamp, so that viewers need not sort."""
     if session.surface is not None:
         recorder.surface(session.surface)
-    reader, refs = session.store.open(), _refs(session)
+    reader, refs = session.open_reader(), _refs(session)
 
     def image(done: int, ref: FrameRef) -> None:
         encoded = reader.encoded(ref) if exact else None
@@ -164,7 +164,7 @@ def _write_pictures(
 ) -> None:
     for camera in session.rig.cameras:
         (folder / camera.name).mkdir()
-    reader = session.store.open()
+    reader = session.open_reader()
     try:
         for done, (ref, new) in enumerate(refs, 1):
             encoded = reader.encoded(ref)

@@ -92,7 +92,7 @@ class ReachQuestion:
     """Where the surface is, how it moves, and whether the tool may spin."""
 
     surface: tuple[float, ...] | None = (
-        None  # (6,) X Y Z mm, A B C degrees at rest, arm frame; None: default arm's bench
+        None  # (6,) at rest, arm frame, mm and degrees; None: on the default arm's bench
     )
     amplitude_mm: float = 0.0  # of the surface's motion, as the next two
     turn_deg: float = 0.0

@@ -26,13 +26,7 @@ from estimation.errors import InputError, StillbedError
 from hardware.files.folder_tables import write_tum
 from hardware.files.rig_file import write_rig
 from hardware.files.session import Session, damage_text
-from hardware.offline.smooth_report import (
-    SmoothEvaluation,
-    evaluate_smoothed,
-    position_sigma,
-    smooth_page,
-    smooth_verdict,
-)
+from hardware.offline.smooth_report import SmoothEvaluation, evaluate_smoothed, smooth_page, smooth_verdict
 from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks, reobserve, tracks_of
 from hardware.offline.trajectory_files import write_copy, write_instants, write_map
 from hardware.process.clock import WallClock
@@ -142,7 +136,7 @@ def _figures(result: Smoothed, evaluation: SmoothEvaluation, session: Session) -
         "poses": len(result),
         "seconds": float(result.stamps[-1] - result.stamps[0]),
         "landmarks": len(result.map),
-        "sigma_mm": float(np.median(position_sigma(result))),
+        "sigma_mm": evaluation.sigma,
         "residual_px": dict(zip(names, np.nanmedian(fitted.rms, axis=0).tolist(), strict=True)),
         "offset_ms": dict(zip(names, (1000 * result.offsets).tolist(), strict=True)),
         "offset_sigma_ms": dict(zip(names, (1000 * result.offset_sigma).tolist(), strict=True)),

@@ -78,11 +78,6 @@ def _peak(
     return float(hertz[best]) if clear else float("nan")
 
 
-def position_sigma(smoothed: Smoothed) -> Array:
-    """(K,) mm: one standard deviation of an axis of each position, the root mean square over the three axes."""
-    return np.asarray(np.sqrt(np.trace(smoothed.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3))
-
-
 LOOP_DELAYS_S = (0.02, 0.033, 0.05, 0.1, 0.15, 0.2, 0.3)  # s, from exposure to the nozzle's arrival
 LOOP_RATE_HZ = 60.0  # Hz, of the instants at which a loop's error is taken
 
@@ -104,6 +99,7 @@ class SmoothEvaluation:
     errors: tuple[PoseErrors, PoseErrors | None] | None  # smoothed and live, against truth or reference
     exact: bool  # whether that is an exact truth
     by_delay: Array  # (D, 4) mm, see `delay_errors`
+    sigma: float  # mm, median over the poses of one standard deviation of an axis of the position
     spectrum: MotionSpectrum
 
     @property
@@ -123,7 +119,9 @@ def evaluate_smoothed(smoothed: Smoothed, tracks: SessionTracks, truth: Trajecto
     live = _live_errors(smoothed, tracks)
     errors = None if truth is None else _reference_errors(smoothed, live, truth)
     exact = truth is not None and truth.exact
-    return SmoothEvaluation(live, errors, exact, delay_errors(smoothed), motion_spectrum(smoothed))
+    sigmas = np.sqrt(np.trace(smoothed.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)
+    by_delay, sigma = delay_errors(smoothed), float(np.median(sigmas))
+    return SmoothEvaluation(live, errors, exact, by_delay, sigma, motion_spectrum(smoothed))
 
 
 def _live_errors(smoothed: Smoothed, tracks: SessionTracks) -> LiveErrors | None:
@@ -187,10 +185,9 @@ SPREAD_HEAD = ("", "median", "RMSE", "95 %", "max")
 
 def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
     """The verdict in a few sentences."""
-    sigma = float(np.median(position_sigma(result)))
     words = [
         f"{len(result)} poses and {len(result.map)} landmarks over {result.stamps[-1] - result.stamps[0]:.1f} s; "
-        f"an axis of a position is known to {figure(sigma)} mm (median, one sigma)."
+        f"an axis of a position is known to {figure(evaluation.sigma)} mm (median, one sigma)."
     ]
     if evaluation.live is not None:
         words.append(f"The live run stood {figure(evaluation.live_rms)} mm off (RMS).")
@@ -204,7 +201,7 @@ def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
 
 def smooth_page(title: str, words: str, result: Smoothed, evaluation: SmoothEvaluation) -> str:
     """The page as HTML text. words: the verdict."""
-    body = [_tiles(result, evaluation), _trajectory(result, evaluation), _live(result, evaluation), _errors(evaluation)]
+    body = [_tiles(evaluation), _trajectory(result, evaluation), _live(result, evaluation), _errors(evaluation)]
     body += [_residuals(result), _spectrum(evaluation.spectrum), _errors_by_delay(evaluation), _cameras(result)]
     footer = "Lengths in mm, time in s from the session's own clock; poses are base_from_surface."
     return document("stillbed smooth", title, words, [part for part in body if part], footer)
@@ -214,8 +211,8 @@ def _reference_name(evaluation: SmoothEvaluation) -> str:
     return "exact truth" if evaluation.exact else "measured reference"
 
 
-def _tiles(result: Smoothed, evaluation: SmoothEvaluation) -> str:
-    tiles = [tile(figure(1000 * float(np.median(position_sigma(result)))), "µm", "one sigma of an axis, median")]
+def _tiles(evaluation: SmoothEvaluation) -> str:
+    tiles = [tile(figure(1000 * evaluation.sigma), "µm", "one sigma of an axis, median")]
     if evaluation.live is not None:
         tiles.append(tile(figure(1000 * evaluation.live_rms), "µm", "live against smoothed, RMS"))
     labels = {"breathing": "breaths a minute", "pulse": "beats a minute"}

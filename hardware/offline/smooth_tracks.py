@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TextIO
@@ -34,14 +34,12 @@ SOURCE_ATTACHMENT = "made_of.txt"  # name of the attachment with the hash, the r
 
 def source_hash(path: Path) -> str:
     """The hash that `track_writer` stored in a recording; "" where there is no recording, or no hash in it."""
-    try:
+    with suppress(InputError):  # unreadable: the tracks are computed again
         for part in walk(path):
             if isinstance(part, AttachedFile) and part.name == SOURCE_ATTACHMENT:
                 return part.data.decode()
             if isinstance(part, ChunkMessages):
                 break
-    except InputError:  # unreadable: the tracks are computed again
-        pass
     return ""
 
 

@@ -120,30 +120,25 @@ def evaluate(out: Path, parts: DatasetParts, origin: NetworkOrigin, render_view:
     return f"{result}\n{out}, its settings and its card are written"
 
 
-def parts_of(pictures: Sequence[Labelled], others: Sequence[Labelled], held_out: int) -> DatasetParts:
-    """The three parts of a data set, split by groups, always the same."""
+def _parts(options: argparse.Namespace, render_view: RenderView) -> DatasetParts:
+    """The data sets read, and the first one split by groups, always the same way."""
+    data_sets = []
+    for folder in options.datasets:
+        with _progress(f"read {folder.name}", "pictures") as progress:
+            data_sets.append(read_dataset(folder, progress))
+    pictures = data_sets[0]
+    if len(pictures) < options.hold_out + VALIDATION_PICTURES + 1:
+        needed = f"more than the {options.hold_out} held out and {VALIDATION_PICTURES} for choosing"
+        raise InputError(options.datasets[0], "pictures", len(pictures), needed)
+    others = [each for data_set in data_sets[1:] for each in data_set] + _rendered(render_view, options.rendered)
     group, rng = picture_groups(pictures), np.random.default_rng(SPLIT_SEED)
-    held = hold_out_groups(group, held_out, rng)
+    held = hold_out_groups(group, options.hold_out, rng)
     rest = np.flatnonzero(~held)
     chosen = np.zeros(len(pictures), bool)
     chosen[rest[hold_out_groups(group[rest], VALIDATION_PICTURES, rng)]] = True
-
-    def those(mask: NDArray[np.bool_]) -> list[Labelled]:
-        return [pictures[number] for number in np.flatnonzero(mask).tolist()]
-
-    return DatasetParts(those(~held & ~chosen), those(chosen), those(held), others, len(np.unique(group)))
-
-
-def _parts(options: argparse.Namespace, render_view: RenderView) -> DatasetParts:
-    read = []
-    for folder in options.datasets:
-        with _progress(f"read {folder.name}", "pictures") as progress:
-            read.append(read_dataset(folder, progress))
-    if len(read[0]) < options.hold_out + VALIDATION_PICTURES + 1:
-        needed = f"more than the {options.hold_out} held out and {VALIDATION_PICTURES} for choosing"
-        raise InputError(options.datasets[0], "pictures", len(read[0]), needed)
-    others = [each for pictures in read[1:] for each in pictures] + _rendered(render_view, options.rendered)
-    return parts_of(read[0], others, options.hold_out)
+    uses = (~held & ~chosen, chosen, held)
+    trained, chosen_on, held_out = ([pictures[i] for i in np.flatnonzero(mask).tolist()] for mask in uses)
+    return DatasetParts(trained, chosen_on, held_out, others, len(np.unique(group)))
 
 
 def _rendered(render_view: RenderView, count: int) -> list[Labelled]:

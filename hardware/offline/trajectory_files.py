@@ -281,9 +281,8 @@ def _add_smoothed(writer: Writer, smoothed: Smoothed, epoch: int) -> None:
     at = smoothed.instants
     for k, stamp in enumerate(smoothed.stamps):
         state = TrackState.TRACKING if used[k] else TrackState.COASTING
-        pose = SurfacePose(
-            float(stamp), at.base_from_surface[k], at.covariance[k], at.twist[k], state, at.twist_covariance[k]
-        )
+        twist, twist_covariance = at.twist[k], at.twist_covariance[k]
+        pose = SurfacePose(float(stamp), at.base_from_surface[k], at.covariance[k], twist, state, twist_covariance)
         data = json.dumps(message_from_pose(pose), allow_nan=False, separators=(",", ":")).encode()
         log_time = round(float(stamp) * 1e9) + epoch * 1_000_000_000
         writer.add_message(channel, log_time, data, log_time)

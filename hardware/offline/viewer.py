@@ -217,7 +217,7 @@ class PictureReader:
         refs = self._playback.session.sets[k]
         if self._reader is None or k < self._next:
             self.close()
-            self._reader = self._playback.session.store.open()
+            self._reader = self._playback.session.open_reader()
         self._next = k + 1
         try:
             return frame_set([Frame(ref.camera, ref.stamp, self._reader.read(ref)) for ref in refs])

@@ -97,18 +97,13 @@ def _message_from_row(row: Array) -> Message:
 
 def message_from_observations(observations: Observations) -> Message:
     """Observations as a message."""
-    return {
-        "stamp": observations.stamp,
-        "camera": observations.camera.tolist(),
-        "track": observations.track.tolist(),
-        "pixels": _flat(observations.pixels),
-        "sigma": _flat(observations.sigma),
-    }
+    whole = {name: getattr(observations, name).tolist() for name in ("camera", "track")}
+    return {"stamp": observations.stamp, **whole, **{k: _flat(getattr(observations, k)) for k in ("pixels", "sigma")}}
 
 
 def observations_from_message(message: Message) -> Observations:
     """Observations from their message."""
-    camera, track = (np.array(message[key], np.int64) for key in ("camera", "track"))
+    camera, track = (np.array(message[name], np.int64) for name in ("camera", "track"))
     pixels, sigma = _array(message["pixels"], (len(camera), 2)), _array(message["sigma"], (len(camera),))
     return Observations(message["stamp"], camera, track, pixels, sigma)
 

@@ -57,6 +57,7 @@ def _described(schema: Schema, about: str) -> Schema:
 STAMP = _described(NUMBER, "s, exact")
 XYZ = _part(x=NUMBER, y=NUMBER, z=NUMBER)
 QUATERNION = _part(x=NUMBER, y=NUMBER, z=NUMBER, w=NUMBER)
+POSE_ROW = {"position": _array(NUMBER, 3, "mm"), "quaternion": _array(NUMBER, 4, "qx qy qz qw")}
 CAMERA = {
     "type": "object",
     "properties": {
@@ -132,16 +133,14 @@ TOPICS: dict[str, Schema] = {
         "stillbed.Truth",
         "Known or measured pose of the surface in the base frame, mm",
         stamp=STAMP,
-        position=_array(NUMBER, 3, "mm"),
-        quaternion=_array(NUMBER, 4, "qx qy qz qw"),
+        **POSE_ROW,
         exact=_described(FLAG, "true: a simulator's or an instrument's; false: a measured reference"),
     ),
     "/head": _message(
         "stillbed.PrintHead",
         "Pose of the nozzle in the base frame by the commands that were sent, z from the tip up into the head, mm",
         stamp=_described(NUMBER, "s, of the frame set, exact"),
-        position=_array(NUMBER, 3, "mm"),
-        quaternion=_array(NUMBER, 4, "qx qy qz qw"),
+        **POSE_ROW,
         extruding=_described(FLAG, "true: ink flows"),
     ),
     "/observations": _message(

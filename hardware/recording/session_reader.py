@@ -11,6 +11,7 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
@@ -85,11 +86,15 @@ def open_recording(path: Path) -> Session:
     for camera, times in zip(rig.cameras, stamps, strict=True):
         if (np.diff(times) <= 0).any():
             raise InputError(path, f"/frames: stamp of camera {camera.name!r}", "one stamp twice", "each stamp once")
-    store = RecordingStore(path, rig, contents.places)
-    _check_first_images(store, frames)
+    open_reader = partial(RecordingReader, path, rig, contents.places)
+    reader = open_reader()
+    for ref in {ref.camera: ref for ref in reversed(frames)}.values():  # the first image of each camera
+        reader.read(ref)
+    reader.close()
     rois = _checked_rois(path, contents, rig)
-    truth, heads, surface = _truth(path, contents), _heads(path, contents), _unpacked_surface(contents.surface, store)
-    return Session(path, rig, rois, surface, truth, pair_refs(frames, stamps, len(rig)), store, contents.damage, heads)
+    truth, heads = _truth(path, contents), _heads(path, contents)
+    surface, sets = _unpacked_surface(contents.surface, open_reader), pair_refs(frames, stamps, len(rig))
+    return Session(path, rig, rois, surface, truth, sets, open_reader, contents.damage, heads)
 
 
 def _contents(path: Path) -> RecordingContents:
@@ -164,14 +169,6 @@ def _checked_rois(path: Path, contents: RecordingContents, rig: Rig) -> tuple[Ro
     return tuple(contents.rois.values())
 
 
-def _check_first_images(store: RecordingStore, frames: list[FrameRef]) -> None:
-    reader = store.open()
-    first = {ref.camera: ref for ref in reversed(frames)}
-    for ref in first.values():
-        reader.read(ref)
-    reader.close()
-
-
 def _truth(path: Path, contents: RecordingContents) -> Trajectory | None:
     if not contents.truth:
         return None
@@ -185,56 +182,45 @@ def _heads(path: Path, contents: RecordingContents) -> PrintHeadLog:
     return PrintHeadLog(rows, np.array([extruding for _, extruding in heads], bool))
 
 
-def _unpacked_surface(surface: AttachedFile | None, store: RecordingStore) -> Path | None:
-    """The scan as a temporary file, which mesh readers need; it is deleted with the session's store."""
+def _unpacked_surface(surface: AttachedFile | None, owner: object) -> Path | None:
+    """The scan as a temporary file, which mesh readers need; it is deleted with its owner, a part of the session."""
     if surface is None:
         return None
     folder = tempfile.mkdtemp(prefix="stillbed-")
-    weakref.finalize(store, shutil.rmtree, folder, ignore_errors=True)
+    weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
     path = Path(folder) / surface.name
     path.write_bytes(surface.data)
     return path
 
 
-class RecordingStore:
-    """Where the images of a recording are: the offset of the chunk that holds each."""
-
-    def __init__(self, path: Path, rig: Rig, places: ImagePlaces) -> None:
-        self.path, self.rig, self.places = path, rig, places
-
-    def open(self) -> RecordingReader:
-        """A reader of its own."""
-        return RecordingReader(self)
-
-
 class RecordingReader:
     """Decodes the images of a recording; keeps the last few chunks unpacked."""
 
-    def __init__(self, store: RecordingStore) -> None:
-        self._store = store
-        self._file: BinaryIO = open(store.path, "rb")  # noqa: SIM115  (closed in `close`)
+    def __init__(self, path: Path, rig: Rig, places: ImagePlaces) -> None:
+        self._path, self._rig, self._places = path, rig, places
+        self._file: BinaryIO = open(path, "rb")  # noqa: SIM115  (closed in `close`)
         self._chunks: OrderedDict[int, list[bytes]] = OrderedDict()
 
     def read(self, ref: FrameRef) -> Image:
         """The image; InputError where it is undecodable or not of the camera's size."""
-        camera = self._store.rig.cameras[ref.camera]
+        camera = self._rig.cameras[ref.camera]
         what = f"{image_topic(camera.name)}: image {ref.number}"
-        image = decode(self.encoded(ref)[1], self._store.path, what)
-        check_size(image, camera.size, self._store.path, what)
+        image = decode(self.encoded(ref)[1], self._path, what)
+        check_size(image, camera.size, self._path, what)
         return image
 
     def encoded(self, ref: FrameRef) -> tuple[str, bytes]:
         """Format ("png" or "jpeg") and bytes of the image as stored."""
-        topic = image_topic(self._store.rig.cameras[ref.camera].name)
-        offset, index, encoding = self._store.places[topic, ref.number]
+        topic = image_topic(self._rig.cameras[ref.camera].name)
+        offset, index, encoding = self._places[topic, ref.number]
         data = self._chunk(offset)[index]
         try:
             if encoding == IMAGE_ENCODING:
                 return unpack_image(data)
-            message = parse(self._store.path, StoredMessage(topic, ref.number, data))  # as recordings once held them
+            message = parse(self._path, StoredMessage(topic, ref.number, data))  # as recordings once held them
             return message["format"], messages.bytes_from_message(message)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise InputError(self._store.path, topic, repr(error), "an encoded image") from error
+            raise InputError(self._path, topic, repr(error), "an encoded image") from error
 
     def _chunk(self, offset: int) -> list[bytes]:
         if offset not in self._chunks:
