@@ -28,7 +28,7 @@ from hardware.bench.figures import (
     save,
     table_text,
     this_machine,
-    whole_table,
+    whole_text,
 )
 from hardware.bench.live import memory_growth
 from hardware.bench.subjects import SUBJECTS, Subject
@@ -264,7 +264,7 @@ def test_the_whole_is_asked_for_by_either_word(
 
 def table(tmp_path: Path, figures: list[Figure]) -> Path:
     file = tmp_path / "before.json"
-    file.write_text(json.dumps(whole_table({"toy": figures}, this_machine())))
+    file.write_text(whole_text({"toy": figures}, this_machine()))
     return file
 
 

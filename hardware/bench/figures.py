@@ -166,13 +166,16 @@ def _figure(row: Mapping[str, Any]) -> Figure:
     return Figure(row["what"], value, row["unit"], target, row["reference"], row["note"])
 
 
-def whole_table(parts: Mapping[str, Sequence[Figure]], machine: Machine) -> dict[str, object]:
-    """The figures of several subjects, ready for JSON."""
+def whole_text(parts: Mapping[str, Sequence[Figure]], machine: Machine) -> str:
+    """The figures of several subjects as JSON, one figure a line, so that a new measurement changes only its lines."""
     from hardware.report.summary import finite
 
-    subjects = {name: [_row(figure) for figure in figures] for name, figures in parts.items()}
-    table: dict[str, object] = finite({"machine": asdict(machine), "subjects": subjects})
-    return table
+    subjects = []
+    for name, figures in parts.items():
+        lines = ",\n".join(json.dumps(finite(_row(figure))) for figure in figures)
+        subjects.append(f"{json.dumps(name)}: [\n{lines}\n]")
+    whole = ",\n".join(subjects)
+    return f'{{"machine": {json.dumps(finite(asdict(machine)))},\n"subjects": {{\n{whole}\n}}}}\n'
 
 
 TABLE_HEADER = ("figure", "value", "unit", "target", "", "reference", "note")

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from estimation.errors import InputError, StillbedError
-from hardware.bench.figures import Figure, Machine, Target, read_figures, table_text, this_machine, whole_table
+from hardware.bench.figures import Figure, Machine, Target, read_figures, table_text, this_machine, whole_text
 from hardware.process.checks import error_text
 from hardware.process.clock import WallClock
 from hardware.process.progress import duration_text
@@ -201,7 +201,7 @@ def _save(out: Path, done: Sequence[MeasuredPart], machine: Machine) -> None:
     troubles = {one.subject: one.trouble for one in done if one.trouble}
     drawn = {one.subject: sorted((out / one.subject).glob("*.html")) for one in done}
     pages = {name: files[0].relative_to(out).as_posix() for name, files in drawn.items() if files}
-    (out / FIGURES_FILE).write_text(json.dumps(whole_table(parts, machine), indent=2) + "\n", encoding="utf-8")
+    (out / FIGURES_FILE).write_text(whole_text(parts, machine), encoding="utf-8")
     (out / PAGE_FILE).write_text(whole_page(parts, troubles, pages, machine), encoding="utf-8")
     (out / TABLE_FILE).write_text(whole_markdown(parts, machine), encoding="utf-8")
 

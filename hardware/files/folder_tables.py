@@ -188,13 +188,10 @@ def read_heads(path: Path) -> PrintHeadLog:
     """The print heads of head.csv, base_from_nozzle; none is allowed, as where a run ended before the arm moved."""
     table = [(f"line {line}", _cells(row, HEAD_COLUMNS)) for line, row in _rows(path, HEAD_COLUMNS)]
     rows = checked_rows(path, ((line, row_from_words(path, line, words[:-1])) for line, words in table))
-    return PrintHeadLog(rows, np.array([_extruding(path, line, words[-1]) for line, words in table], bool))
-
-
-def _extruding(path: Path, line: str, word: str) -> bool:
-    if word not in ("0", "1"):
-        raise InputError(path, f"{line}: extruding", word, "0 or 1")
-    return word == "1"
+    for line, words in table:
+        if words[-1] not in ("0", "1"):
+            raise InputError(path, f"{line}: extruding", words[-1], "0 or 1")
+    return PrintHeadLog(rows, np.array([words[-1] == "1" for _, words in table], bool))
 
 
 def write_heads(path: Path, heads: PrintHeadLog) -> None:

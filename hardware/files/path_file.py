@@ -21,7 +21,6 @@ import io
 import math
 import os
 from collections.abc import Sequence
-from math import floor
 from pathlib import Path as File
 
 import numpy as np
@@ -265,7 +264,7 @@ class ProgressFile:
 
 def write_progress_durably(file: File, fingerprint: str, fraction: float) -> None:
     """Write how far a print is and wait for the disk, so that it outlives a power cut as well."""
-    _replace(file, ProgressMark(fingerprint, fraction), floor(fraction), durable=True)
+    _replace(file, ProgressMark(fingerprint, fraction), math.floor(fraction), durable=True)
 
 
 def read_progress(file: File, path: Path) -> float:

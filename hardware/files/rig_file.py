@@ -232,7 +232,10 @@ def read_board(path: str | Path) -> Board:
     dictionary = str(table.get("dictionary", DEFAULT_BOARD.dictionary)).removeprefix("DICT_")
     if dictionary not in DICTIONARIES:
         raise InputError(path, "dictionary", dictionary, checks.one_of_text(dictionary, DICTIONARIES))
-    flags = [_flag(path, key, table.get(key, False)) for key in ("inverted", "legacy")]
+    flags = [table.get(key, False) for key in ("inverted", "legacy")]
+    for key, flag in zip(("inverted", "legacy"), flags, strict=True):
+        if not isinstance(flag, bool):
+            raise InputError(path, key, flag, "true or false")
     columns, rows = int(squares[0]), int(squares[1])
     board = Board(kind, (columns, rows), square, marker, dictionary, *flags)
     _check_whole(path, board)
@@ -267,9 +270,3 @@ def _within(path: Path, key: str, value: object, low: float, high: float) -> flo
     if not low <= number <= high:
         raise InputError(path, key, number, f"{low:g} to {high:g}")
     return number
-
-
-def _flag(path: Path, key: str, value: object) -> bool:
-    if not isinstance(value, bool):
-        raise InputError(path, key, value, "true or false")
-    return value

@@ -71,15 +71,12 @@ class FrameReader(Protocol):
 
     def read(self, ref: FrameRef) -> Image:
         """The image; InputError where it is missing, undecodable or not of the camera's size."""
-        ...
 
     def encoded(self, ref: FrameRef) -> tuple[str, bytes] | None:
         """Format ("png" or "jpeg") and bytes of the image as stored; None for a frame of a video."""
-        ...
 
     def close(self) -> None:
         """Close files and decoders."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -181,7 +181,11 @@ def on_cluster(jobs: Sequence[SmoothJob], options: SmoothOptions, cluster: Clust
         futures = [client.submit(smooth_job, task, options, pure=False) for task in tasks]
         jobs_by_key = {future.key: job for future, job in zip(futures, jobs, strict=True)}
         for future in distributed.as_completed(futures):
-            yield _task_outcome(jobs_by_key[future.key], future)
+            job, error = jobs_by_key[future.key], future.exception()  # the job has the paths of the command line
+            if error is None:
+                yield replace(future.result(), job=job)
+            else:  # Dask gave up on the task
+                yield SmoothOutcome(job, FAILED, f"{type(error).__name__}: {error}", 0.0)
 
 
 @contextmanager
@@ -207,15 +211,6 @@ def _library(scheduler: str) -> Any:
     except ImportError:
         raise InputError("command line", "--scheduler", scheduler, MISSING_LIBRARY) from None
     return distributed
-
-
-def _task_outcome(job: SmoothJob, future: Any) -> SmoothOutcome:
-    """The task's outcome, with the paths of the command line; a task that Dask gave up on failed with Dask's reason."""
-    error = future.exception()
-    if error is not None:
-        return SmoothOutcome(job, FAILED, f"{type(error).__name__}: {error}", 0.0)
-    outcome: SmoothOutcome = future.result()
-    return replace(outcome, job=job)
 
 
 SESSION_TABLE = "sessions.csv"

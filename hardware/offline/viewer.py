@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -170,12 +171,10 @@ def _off(stamps: Array, poses: tuple[SurfacePose | None, ...], session: Session)
 
 
 def _toolpath(session: Session) -> Toolpath | None:
-    if not session.path.is_file():
-        return None
-    try:
-        return used_inputs(session.path)[0]
-    except InputError:
-        return None
+    """The recording's path; None where it has none."""
+    with suppress(InputError):
+        return used_inputs(session.path)[0] if session.path.is_file() else None
+    return None
 
 
 def _fraction(session: Session, stamps: Array) -> Array:
