@@ -64,9 +64,8 @@ def _kinematics(where: object, table: object) -> tuple[JointModel | None, AngleM
         return None, AngleMode.SURFACE
     if not isinstance(table, dict):
         raise InputError(where, "kinematics", table, "a table [kinematics]")
-    checks.check_keys(
-        where, "kinematics.", table, ("name", "dh_mm_deg", *JOINT_KEYS), ("nominal", "angles", *PLACE_KEYS, "posture")
-    )
+    required, optional = ("name", "dh_mm_deg", *JOINT_KEYS), ("nominal", "angles", *PLACE_KEYS, "posture")
+    checks.check_keys(where, "kinematics.", table, required, optional)
 
     def numbers(key: str, shape: tuple[int, ...], unit: Array | float = 1.0) -> Array:
         return np.asarray(checks.numbers(where, f"kinematics.{key}", table[key], shape) * unit)

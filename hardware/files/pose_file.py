@@ -102,20 +102,20 @@ class PoseWriter(ExitStack):
     def write(self, pose: SurfacePose, frames: int, report: StepReport, total: float) -> None:
         """Write one frame set. frames: number of its images. total: s that the whole step took."""
         quaternion = se3.quaternion_from_rotation(pose.base_from_surface[:3, :3])
-        placed = [*(f"{v:.6f}" for v in pose.base_from_surface[:3, 3]), *(f"{v:.12f}" for v in quaternion)]
-        spread_and_twist = [f"{v:.9g}" for v in (*pose.covariance[UPPER_TRIANGLE], *pose.twist)]
+        transform = [*(f"{v:.6f}" for v in pose.base_from_surface[:3, 3]), *(f"{v:.12f}" for v in quaternion)]
+        covariance_and_twist = [f"{v:.9g}" for v in (*pose.covariance[UPPER_TRIANGLE], *pose.twist)]
         moved = [pose.motion.onset, pose.motion.moved, np.rad2deg(pose.motion.turned)]
-        bent = [0.0, 0.0] if pose.warp is None else [pose.warp.deformation, pose.warp.deformation_sigma]
-        motion = [int(pose.motion.moving), *(f"{v:.6f}" for v in (*moved, *bent))]
+        deformation = [0.0, 0.0] if pose.warp is None else [pose.warp.deformation, pose.warp.deformation_sigma]
+        motion = [int(pose.motion.moving), *(f"{v:.6f}" for v in (*moved, *deformation))]
         tracks = [int(n) for n in report.used]
         in_ms = np.round(1000 * np.concatenate([report.offsets, report.offset_sigmas]), 4) + 0.0  # + 0.0: no -0.0000
         times = [f"{v:.4f}" for v in (*in_ms, *(1000 * s for s in (*report.seconds, total)))]
         state = [pose.state.value, int(np.count_nonzero(tracks)), *tracks]
-        row = [f"{pose.stamp:.6f}", frames, *placed, *spread_and_twist, *motion, *state, *times, pose.reason]
+        row = [f"{pose.stamp:.6f}", frames, *transform, *covariance_and_twist, *motion, *state, *times, pose.reason]
         self._csv.writerow(row)
         self._csv_file.flush()
         if pose.state.measured:
-            self._tum_file.write(f"{pose.stamp:.6f} {' '.join(placed)}\n")
+            self._tum_file.write(f"{pose.stamp:.6f} {' '.join(transform)}\n")
             self._tum_file.flush()
 
 

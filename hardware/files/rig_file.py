@@ -171,9 +171,8 @@ def _check_matrix(where: object, key: str, matrix: Array, longer_side: float) ->
         if focal <= 0:
             raise InputError(where, f"{key} {name}", focal, "a focal length > 0 px")
         if focal < MIN_FOCAL_SHARE * longer_side:
-            allowed = (
-                f">= {MIN_FOCAL_SHARE * longer_side:g} px, {MIN_FOCAL_SHARE} of the image's longer side (px, not mm)"
-            )
+            minimum = MIN_FOCAL_SHARE * longer_side
+            allowed = f">= {minimum:g} px, {MIN_FOCAL_SHARE} of the image's longer side (px, not mm)"
             raise InputError(where, f"{key} {name}", focal, allowed)
     if matrix[0, 1] or matrix[1, 0] or (matrix[2] != [0, 0, 1]).any():
         raise InputError(where, key, matrix.tolist(), PINHOLE)

@@ -181,11 +181,11 @@ def on_cluster(jobs: Sequence[SmoothJob], options: SmoothOptions, cluster: Clust
         futures = [client.submit(smooth_job, task, options, pure=False) for task in tasks]
         jobs_by_key = {future.key: job for future, job in zip(futures, jobs, strict=True)}
         for future in distributed.as_completed(futures):
-            job, error = jobs_by_key[future.key], future.exception()  # the job has the paths of the command line
-            if error is None:
+            job, fault = jobs_by_key[future.key], future.exception()  # the job has the paths of the command line
+            if fault is None:
                 yield replace(future.result(), job=job)
             else:  # Dask gave up on the task
-                yield SmoothOutcome(job, FAILED, f"{type(error).__name__}: {error}", 0.0)
+                yield SmoothOutcome(job, FAILED, f"{type(fault).__name__}: {fault}", 0.0)
 
 
 @contextmanager

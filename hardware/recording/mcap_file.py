@@ -236,9 +236,7 @@ class McapWriter:
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Write an attached file."""
         record = _bytes(Attachment(0, 0, name, media_type, data))
-        self._attachments.append(
-            AttachmentIndex(self._file.tell(), len(record), 0, 0, data_size=len(data), name=name, media_type=media_type)
-        )
+        self._attachments.append(AttachmentIndex(self._file.tell(), len(record), 0, 0, len(data), name, media_type))
         self._file.write(record)
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
@@ -292,9 +290,8 @@ class McapWriter:
         for channel, index in self._messages.items():
             offsets[channel] = start + len(record) + len(indexes)
             indexes += _bytes(index)
-        self._chunk_index += _bytes(
-            ChunkIndex(len(record), start, kind, len(packed), last, len(indexes), offsets, first, len(data))
-        )
+        entry = ChunkIndex(len(record), start, kind, len(packed), last, len(indexes), offsets, first, len(data))
+        self._chunk_index += _bytes(entry)
         self._file.write(record)
         self._file.write(indexes)
         self._chunks += 1

@@ -65,7 +65,7 @@ class Recorder:
     ) -> None:
         """Create the file at `path`; images are stored as PNG, or as JPEG of `jpeg_quality` (0-100).
 
-        compress: whether chunks are compressed: a quarter less of file for a third more of time.
+        compress: whether chunks are compressed, which saves a quarter of the file and costs a third of the time.
         """
         self.path, self.rig = Path(path), rig
         self._jpeg_quality = jpeg_quality
