@@ -97,8 +97,9 @@ def _message_from_row(row: Array) -> Message:
 
 def message_from_observations(observations: Observations) -> Message:
     """Observations as a message."""
-    whole = {name: getattr(observations, name).tolist() for name in ("camera", "track")}
-    return {"stamp": observations.stamp, **whole, **{k: _flat(getattr(observations, k)) for k in ("pixels", "sigma")}}
+    camera, track = observations.camera.tolist(), observations.track.tolist()
+    pixels, sigma = _flat(observations.pixels), _flat(observations.sigma)
+    return {"stamp": observations.stamp, "camera": camera, "track": track, "pixels": pixels, "sigma": sigma}
 
 
 def observations_from_message(message: Message) -> Observations:
