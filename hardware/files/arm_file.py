@@ -52,7 +52,6 @@ from planning.robot.kinematics import AngleMode, JointModel, SimpleArm
 
 JOINT_KEYS = {"low_deg": "low", "high_deg": "high", "speed_deg_s": "speed", "acceleration_deg_s2": "acceleration"}
 PLACE_KEYS = ("arm_from_foot", "flange_from_nozzle")
-DEFAULT_POSTURE = ["front", "up", "negative"]
 _RAD = float(np.deg2rad(1.0))  # rad a degree
 _DH_UNITS = np.array([1.0, _RAD, 1.0, _RAD])  # mm and rad, of a row in mm and degrees
 _AXIS_UNITS = np.array([1.0, 1, 1, _RAD, _RAD, _RAD])  # likewise, of X Y Z A B C
@@ -71,7 +70,7 @@ def _kinematics(where: object, table: object) -> tuple[JointModel | None, AngleM
         return np.asarray(checks.numbers(where, f"kinematics.{key}", table[key], shape) * unit)
 
     joints = {name: numbers(key, (6,), _RAD) for key, name in JOINT_KEYS.items()}
-    nominal, posture = table.get("nominal", True), table.get("posture", DEFAULT_POSTURE)
+    nominal, posture = table.get("nominal", True), table.get("posture", ["front", "up", "negative"])
     if not isinstance(nominal, bool):
         raise InputError(where, "kinematics.nominal", nominal, "true or false")
     name, dh = checks.text(where, "kinematics.name", table["name"]), numbers("dh_mm_deg", (6, 4), _DH_UNITS)

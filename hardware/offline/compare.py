@@ -122,8 +122,8 @@ def compare(estimated: PoseSeries, reference: PoseSeries, delta: int = 1) -> Tra
     if len(rows) < max(MIN_PAIRS, delta + 1):
         need = f"{max(MIN_PAIRS, delta + 1)} or more: are both of the same recording, and on one clock?"
         raise InputError(estimated.name, f"poses at instants of {reference.name}", len(rows), need)
-    ours, target = estimated.trajectory.base_from_surface[rows], reference.trajectory.base_from_surface[theirs]
-    covariance = estimated.covariance[rows]
+    ours, covariance = estimated.trajectory.base_from_surface[rows], estimated.covariance[rows]
+    target = reference.trajectory.base_from_surface[theirs]
     pairs = [(ALIGNMENTS[0], ours, target)]
     if _rotation_determined(ours[:, :3, 3], target[:, :3, 3]):
         motion = se3.rigid_from_points(ours[:, :3, 3], target[:, :3, 3])
