@@ -176,7 +176,7 @@ def test_a_picture_that_cannot_be_read_leaves_the_tracks_to_be_smoothed(recordin
     session = open_session(recording)
     tracks = tracks_of(session, tmp_path, "")
     result = smooth(session.rig, tracks.observations, start=tracks.start)
-    broken = replace(session, store=Unreadable())
+    broken = replace(session, open_reader=Unreadable)
     found = reobserve(broken, tracks, result, tmp_path, "of these", StringIO())
     assert found.looks == 0 and "no picture" in found.text
     assert source_hash(tmp_path / "relinked.mcap") == ""
@@ -184,9 +184,6 @@ def test_a_picture_that_cannot_be_read_leaves_the_tracks_to_be_smoothed(recordin
 
 class Unreadable:
     """Holds no picture."""
-
-    def open(self) -> Unreadable:
-        return self
 
     def read(self, ref: FrameRef) -> Image:
         raise InputError("x.avi", "picture", "no picture", "a whole one")
