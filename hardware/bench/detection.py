@@ -28,7 +28,7 @@ from estimation.surface_map import SurfaceMap
 from estimation.synthetic.follow import pose_information
 from estimation.synthetic.movements import irregular, patch
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations, synthetic_world
-from hardware.bench.figures import Figure, at_least, at_most, with_progress
+from hardware.bench.figures import Figure, at_least, at_most, columns, with_progress
 from hardware.cameras.feed import Arrival, FrameWatch
 from hardware.cameras.live import FrameSetBuilder
 from hardware.cameras.stamping import FrameStamper
@@ -38,7 +38,7 @@ from perception.frames import Frame, FrameSet, Image
 FRAME_PERIOD = 1 / 30  # s
 CAMERA_OFFSETS = np.array([0.0, 0.016, -0.016])  # s
 OFFSET_SIGMA = 0.0005  # s, sigma of an offset as the estimator learns it
-TRANSPORT, MEAN_DELAY = 0.025, 0.002  # s, on the way to arrival; mean of what comes on top
+TRANSPORT_S, MEAN_DELAY = 0.025, 0.002  # s from exposure to arrival: always, and the mean of what is added at random
 MAX_SET_WAIT = 1.5 * FRAME_PERIOD  # s that a set may be waited for
 IMAGE = np.zeros((1, 1), np.uint8)
 
@@ -66,96 +66,82 @@ def sent_frames(
     rng: np.random.Generator, count: int, shaking: CameraJitter, offsets: Array = CAMERA_OFFSETS
 ) -> list[SentFrame]:
     """The frames of `count` instants in order of arrival; true instant = stamp + offset, a camera's stamps rise."""
-    out: list[SentFrame] = []
+    frames: list[SentFrame] = []
+    exposed, rising = np.arange(count) * FRAME_PERIOD, 1e-9 * np.arange(count)
     for camera, offset in enumerate(offsets):
-        exposed = np.arange(count) * FRAME_PERIOD
         noise = rng.standard_normal(count) if shaking.normal else rng.uniform(-1, 1, count)
-        stamps = np.maximum.accumulate(exposed - offset + shaking.jitter * noise + 1e-9 * np.arange(count))
-        arrivals = np.maximum.accumulate(
-            exposed + TRANSPORT + rng.exponential(MEAN_DELAY, count) + 1e-9 * np.arange(count)
-        )
-        kept = np.flatnonzero(rng.random(count) >= shaking.drop)
-        out += [SentFrame(camera, int(k), float(stamps[k]), float(arrivals[k])) for k in kept]
-    return sorted(out, key=lambda one: one.arrival)
+        stamps = np.maximum.accumulate(exposed - offset + shaking.jitter * noise + rising)
+        arrivals = np.maximum.accumulate(exposed + TRANSPORT_S + rng.exponential(MEAN_DELAY, count) + rising)
+        delivered = np.flatnonzero(rng.random(count) >= shaking.drop)
+        frames += [SentFrame(camera, int(k), float(stamps[k]), float(arrivals[k])) for k in delivered]
+    return sorted(frames, key=lambda frame: frame.arrival)
 
 
 @dataclass(frozen=True, slots=True)
 class FramePairing:
-    """What became of frames that were put into sets."""
+    """How frames were put into sets."""
 
-    complete: float  # share of the instants that all cameras delivered, found as one set
-    wrong: int  # sets of two instants
-    sets: int  # given out
-    wait: float  # s, the longest from the arrival of a set's first frame until it was given out
+    complete: float  # share of the instants delivered by all cameras that came out as one set
+    wrong: int  # sets that mix two instants
+    sets: int  # in all
+    wait: float  # s, the longest from the arrival of a set's first frame until the set was complete or overdue
 
 
 def pair_frames(frames: Sequence[SentFrame], offsets: Array, period: float | None = FRAME_PERIOD) -> FramePairing:
     """Put frames into sets with these offsets (C,), s, looking every 5 ms as live cameras do."""
     cameras = len(offsets)
-    gathering, stampings = (
-        FrameSetBuilder(cameras, FRAME_PERIOD, offsets),
-        [FrameStamper(period) for _ in range(cameras)],
-    )
-    instant_of: dict[tuple[int, float], SentFrame] = {}
+    builder, stampers = FrameSetBuilder(cameras, FRAME_PERIOD, offsets), [FrameStamper(period) for _ in range(cameras)]
+    sent_of: dict[tuple[int, float], SentFrame] = {}
     sets: list[tuple[float, FrameSet]] = []
-    for one, following in pairwise([*frames, None]):
-        assert one is not None
-        stamped = stampings[one.camera](one.arrival, one.stamp, True)
-        frame = Frame(one.camera, stamped.stamp, IMAGE, stamped.by)
-        instant_of[one.camera, stamped.stamp] = one
-        arrival = Arrival(frame, stamped.steady, stampings[one.camera].pll.period, one.arrival)
-        sets += [(one.arrival, s) for s in gathering.add(arrival)]
-        until = one.arrival + 1.0 if following is None else following.arrival
-        for look in np.arange(one.arrival + 0.005, until, 0.005):
-            sets += [(float(look), s) for s in gathering.due(float(look))]
-    return _judged(frames, [(now, [instant_of[f.camera, f.stamp] for f in s.frames]) for now, s in sets], cameras)
-
-
-def _judged(frames: Sequence[SentFrame], sets: Sequence[tuple[float, list[SentFrame]]], cameras: int) -> FramePairing:
-    delivered = np.bincount([one.instant for one in frames])
-    instants = [{one.instant for one in members} for _, members in sets]
-    whole = sum(len(i) == 1 and len(m) == cameras for i, (_, m) in zip(instants, sets, strict=True))
-    return FramePairing(
-        complete=whole / int((delivered == cameras).sum()),
-        wrong=sum(len(i) > 1 for i in instants),
-        sets=len(sets),
-        wait=max(now - min(one.arrival for one in members) for now, members in sets),
-    )
+    for sent, following in pairwise([*frames, None]):
+        assert sent is not None
+        stamped = stampers[sent.camera](sent.arrival, sent.stamp, True)
+        frame = Frame(sent.camera, stamped.stamp, IMAGE, stamped.by)
+        sent_of[sent.camera, stamped.stamp] = sent
+        arrival = Arrival(frame, stamped.steady, stampers[sent.camera].pll.period, sent.arrival)
+        sets += [(sent.arrival, s) for s in builder.add(arrival)]
+        until = sent.arrival + 1.0 if following is None else following.arrival
+        for now in np.arange(sent.arrival + 0.005, until, 0.005):
+            sets += [(float(now), s) for s in builder.due(float(now))]
+    members = [[sent_of[f.camera, f.stamp] for f in s.frames] for _, s in sets]
+    instants = [{sent.instant for sent in of_set} for of_set in members]
+    delivered = np.bincount([sent.instant for sent in frames])
+    whole = sum(len(i) == 1 and len(m) == cameras for i, m in zip(instants, members, strict=True))
+    waits = [now - min(sent.arrival for sent in of_set) for (now, _), of_set in zip(sets, members, strict=True)]
+    wrong = sum(len(i) > 1 for i in instants)
+    return FramePairing(whole / int((delivered == cameras).sum()), wrong, len(sets), max(waits))
 
 
 def run_cameras(options: argparse.Namespace) -> list[Figure]:
-    """Pairing under the target's jitter, with the rate told and not, and under a normal one; what a frame costs."""
+    """Pairing under the target's jitter, with a known and an unknown frame rate, and under a normal one; CPU time."""
     rng = np.random.default_rng(options.seed)
     count = round(60 * options.minutes / FRAME_PERIOD)
     learned = CAMERA_OFFSETS + OFFSET_SIGMA * rng.standard_normal(len(CAMERA_OFFSETS))
     at_target = pair_frames(sent_frames(rng, count, CameraJitter()), learned)
     normal = pair_frames(sent_frames(rng, count, CameraJitter(normal=True)), learned)
-    untold = pair_frames(sent_frames(rng, count, CameraJitter()), learned, None)
+    no_rate = pair_frames(sent_frames(rng, count, CameraJitter()), learned, None)
     figures, longest = list[Figure](), at_most(1e3 * MAX_SET_WAIT)
-    for how, pairing in (("+-5 ms", at_target), ("+-5 ms, rate not told", untold), ("5 ms sigma", normal)):
+    for how, pairing in (("+-5 ms", at_target), ("+-5 ms, rate not told", no_rate), ("5 ms sigma", normal)):
         name = f"offsets +-16 ms, 2 % drops, jitter {how}"
         figures += [
             Figure(f"{name}: complete sets not found", 100 * (1 - pairing.complete), "%", at_most(0.5)),
             Figure(f"{name}: wrong pairs", pairing.wrong, "", at_most(0), note=f"of {pairing.sets} sets"),
             Figure(f"{name}: longest wait", 1e3 * pairing.wait, "ms", longest, note="after its first frame"),
         ]
-    return [*figures, _cost(rng)]
-
-
-def _cost(rng: np.random.Generator) -> Figure:
     images: list[Image] = [rng.integers(0, 255, (720, 1280, 3), np.uint8) for _ in range(2)]
-    clock, watch, stamping, frames = CpuClock(), FrameWatch((1280, 720)), FrameStamper(FRAME_PERIOD), 200
+    clock, watch, stamper, frames = CpuClock(), FrameWatch((1280, 720)), FrameStamper(FRAME_PERIOD), 200
     start = clock.now()
     for k in range(frames):
-        stamping(k * FRAME_PERIOD, k * FRAME_PERIOD, True)
+        stamper(k * FRAME_PERIOD, k * FRAME_PERIOD, True)
         watch.fault(images[k % 2])
     each = 1e3 * (clock.now() - start) / frames
-    return Figure("a 1280x720 frame watched and stamped", each, "ms", at_most(1.0), note="CPU, without its decoding")
+    what = "a 1280x720 frame watched and stamped"
+    return [*figures, Figure(what, each, "ms", at_most(1.0), note="CPU, without its decoding")]
 
 
 BUMP_RATE = 30.0  # Hz
 CALM_BEFORE, WATCHED_AFTER = 6.0, 4.0  # s before a bump, and after it
-TRACK_NOISE_PX = 0.3  # px
+TRACK_NOISE_PX = 0.3
 LANDMARKS = 60
 NO_REFERENCE = "none"
 
@@ -168,9 +154,9 @@ class Knock:
     shift: float = 0.0  # mm
     turn: float = 0.0  # degrees
     scale: float = 1.0  # of the focal length
-    wanted: bool = True
+    detectable: bool = True  # whether it must be flagged and named
 
-    def struck(self, rig: Rig, camera: int, rng: np.random.Generator) -> Rig:
+    def knocked(self, rig: Rig, camera: int, rng: np.random.Generator) -> Rig:
         """The rig with one camera knocked."""
         own, angle = rig.cameras[camera], rng.uniform(0, 2 * np.pi)
         across = np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -182,49 +168,47 @@ class Knock:
 
 
 KNOCKS = (
-    Knock("0.25 mm", shift=0.25, wanted=False),
+    Knock("0.25 mm", shift=0.25, detectable=False),
     Knock("0.5 mm", shift=0.5),
     Knock("1 mm", shift=1.0),
     Knock("2 mm", shift=2.0),
     Knock("0.2 degrees", turn=0.2),
-    Knock("lens 0.5 %", scale=1.005, wanted=False),
+    Knock("lens 0.5 %", scale=1.005, detectable=False),
     Knock("lens 1 %", scale=1.01),
     Knock("lens -1 %", scale=0.99),
 )
 
 
 def run_bumps(options: argparse.Namespace) -> list[Figure]:
-    """Knocks found, named and how soon; and false alarms of a calm run."""
+    """Knocks flagged, named and how soon; and false alarms of a calm run."""
     cases = [(kind, number) for kind in range(len(KNOCKS)) for number in range(options.count)]
     results: list[list[KnockResult]] = [[] for _ in KNOCKS]
     for kind, number in with_progress("knocks", "runs", cases, len(cases)):
-        results[kind].append(_knocked(KNOCKS[kind], number % 3, options.seed + 1000 * kind + number))
+        results[kind].append(_knock_result(KNOCKS[kind], number % 3, options.seed + 1000 * kind + number))
     figures = [f for knock, of_kind in zip(KNOCKS, results, strict=True) for f in _knock_figures(knock, of_kind)]
-    if options.minutes > 0:
-        figures.append(_calm(options.seed, options.minutes))
-    return figures
+    return [*figures, _calm(options.seed, options.minutes)] if options.minutes > 0 else figures
 
 
 @dataclass(frozen=True, slots=True)
 class KnockResult:
-    """s until the state was no longer TRACKING, until the right camera was named, and as what; inf: never."""
+    """What came of one knock; inf: never."""
 
-    flagged: float
-    named: float
-    right: bool
+    flagged: float  # s until the state was no longer TRACKING
+    named: float  # s until the right camera was named
+    right: bool  # whether a shift was called a shift, and a turned lens a turned lens
 
 
 def _knock_figures(knock: Knock, results: list[KnockResult]) -> Iterator[Figure]:
-    flagged, named = (np.array([getattr(r, name) for r in results]) for name in ("flagged", "named"))
-    target = at_least(1.0) if knock.wanted else None
+    flagged, named, right = columns(results, "flagged", "named", "right")
+    target = at_least(1.0) if knock.detectable else None
     share = float(np.isfinite(flagged).mean())
     note = f"{len(results)} knocks, each camera in turn, {TRACK_NOISE_PX:g} px, {LANDMARKS} landmarks"
     yield Figure(f"{knock.name}: DEGRADED, share", share, "", target, NO_REFERENCE, note)
     longest = 1000 * float(max(flagged[np.isfinite(flagged)], default=np.nan))
     yield Figure(f"{knock.name}: time, largest", longest, "ms")
-    yield Figure(f"{knock.name}: camera named, share", float(np.isfinite(named).mean()), "", target)
-    right = [r.right for r in results if np.isfinite(r.named)]
-    yield Figure(f"{knock.name}: bump told from lens, share", float(np.mean(right)) if right else float("nan"), "")
+    known = np.isfinite(named)
+    yield Figure(f"{knock.name}: camera named, share", float(known.mean()), "", target)
+    yield Figure(f"{knock.name}: bump told from lens, share", float(right[known].mean()) if known.any() else np.nan)
 
 
 class _BreathingTracks:
@@ -239,21 +223,20 @@ class _BreathingTracks:
 
     def step(self, rig: Rig, stamp: float) -> SurfacePose:
         """The pose at `stamp`, s, from what the cameras of `rig` see."""
-        seen = observations(
-            rig, self._landmarks, BASE_FROM_REST @ self._motion(stamp), stamp, self._rng, TRACK_NOISE_PX
-        )
-        fit = self.estimator.fit(seen, self.estimator.predict(stamp))
-        return self.estimator.accept(fit, seen) if fit.measured else self.estimator.coast(fit)
+        truth = BASE_FROM_REST @ self._motion(stamp)
+        tracks = observations(rig, self._landmarks, truth, stamp, self._rng, TRACK_NOISE_PX)
+        fit = self.estimator.fit(tracks, self.estimator.predict(stamp))
+        return self.estimator.accept(fit, tracks) if fit.measured else self.estimator.coast(fit)
 
 
-def _knocked(knock: Knock, camera: int, seed: int) -> KnockResult:
+def _knock_result(knock: Knock, camera: int, seed: int) -> KnockResult:
     rng = np.random.default_rng([seed, 101])
     tracks = _BreathingTracks(rng)
-    rig, struck = tracks.rig, knock.struck(tracks.rig, camera, rng)
+    rig, knocked = tracks.rig, knock.knocked(tracks.rig, camera, rng)
     flagged, named, right = np.inf, np.inf, False
     for number in range(1, round((CALM_BEFORE + WATCHED_AFTER) * BUMP_RATE)):
         stamp = number / BUMP_RATE
-        pose = tracks.step(struck if stamp >= CALM_BEFORE else rig, stamp)
+        pose = tracks.step(knocked if stamp >= CALM_BEFORE else rig, stamp)
         if stamp >= CALM_BEFORE and pose.state is not TrackState.TRACKING:
             flagged = min(flagged, stamp - CALM_BEFORE)
             if rig.cameras[camera].name in pose.reason:
@@ -276,51 +259,47 @@ def _calm(seed: int, minutes: float) -> Figure:
 
 
 STEP_RATE = 30.0  # Hz
-FRAMES_AN_HOUR = 108_000  # frames
-FRAMES_A_STEP = 90  # frames between steps: 3 s, of which a second is spent until it counts as rest again
-LASTING_NOISE = 0.5  # share of the white noise: what tracks drag along from frame to frame
-LASTING_TIME = 2.0  # s
-MAX_FLAG_FRAMES = 2  # frames
+FRAMES_AN_HOUR = 108_000
+FRAMES_A_STEP = 90  # between steps: 3 s, of which the detector needs one until it takes the surface as at rest again
+CORRELATED_NOISE = 0.5  # share of the white noise: errors that tracks carry from frame to frame
+CORRELATION_TIME = 2.0  # s
+MAX_FLAG_FRAMES = 2
 STEP_SIZES = np.array([np.deg2rad(0.1), 0.3])  # rad, mm
 
 
 def run_steps(options: argparse.Namespace) -> list[Figure]:
     """Measure steps, turns and rest."""
     rng = np.random.default_rng(options.seed)
-    covariance = _covariance(options.noise)
-    note = f"{options.noise:g} px, white, and {LASTING_NOISE:.0%} of it over {LASTING_TIME:g} s"
-    figures, asked = [], at_least(99.9)
+    world = synthetic_world("still", seconds=0.1, noise=options.noise)
+    pose = world.base_from_surface(np.array(0.0))
+    # of the pose from one frame set's tracks, by Fisher's information
+    information = pose_information(world.true_rig, pose, world.landmarks.points, next(iter(world)))
+    covariance = np.asarray(np.linalg.inv(information))
+    note = f"{options.noise:g} px, white, and {CORRELATED_NOISE:.0%} of it over {CORRELATION_TIME:g} s"
+    figures, target = [], at_least(99.9)
     for kind, name in enumerate(("turns of 0.1 degree", "steps of 300 um")):
-        late = _lateness(kind, options.steps, covariance, rng)
-        share = 100 * float(np.mean(late < MAX_FLAG_FRAMES))
+        delay = _flag_delays(kind, options.steps, covariance, rng)
+        share = 100 * float(np.mean(delay < MAX_FLAG_FRAMES))
         what = f"{name} flagged within {MAX_FLAG_FRAMES} frames"
-        figures.append(Figure(what, share, "%", asked, "thesis: asked", note))
-        figures.append(Figure(f"{name}, latest", float(late.max()) + 1, "frames", note=f"of {len(late)}"))
-    false = _false_alarms(round(options.hours * FRAMES_AN_HOUR), covariance, rng) / options.hours
+        figures.append(Figure(what, share, "%", target, "thesis: asked", note))
+        figures.append(Figure(f"{name}, latest", float(delay.max()) + 1, "frames", note=f"of {len(delay)}"))
+    moving = _moving(se3.exp(_noise(round(options.hours * FRAMES_AN_HOUR), covariance, rng)), covariance)
+    false = int(np.sum(moving[1:] & ~moving[:-1])) / options.hours
     return [*figures, Figure("false alarms at rest", false, "1/h", at_most(1.0), note=f"{options.hours:g} h; {note}")]
 
 
-def _covariance(noise: float) -> Array:
-    """Of the pose (6, 6) from one frame set's tracks, by Fisher's information."""
-    world = synthetic_world("still", seconds=0.1, noise=noise)
-    pose = world.base_from_surface(np.array(0.0))
-    information = pose_information(world.true_rig, pose, world.landmarks.points, next(iter(world)))
-    return np.asarray(np.linalg.inv(information))
-
-
 def _noise(count: int, covariance: Array, rng: np.random.Generator) -> Array:
-    """Right perturbations (count, 6): white ones, and ones that last, LASTING_NOISE times as large."""
+    """Right perturbations (count, 6): white noise, and CORRELATED_NOISE times as much Gauss-Markov noise."""
     root = np.linalg.cholesky(covariance)
-    keep = np.exp(-1 / (LASTING_TIME * STEP_RATE))
-    lasting = np.empty((count, 6))
+    keep = np.exp(-1 / (CORRELATION_TIME * STEP_RATE))
+    correlated = np.empty((count, 6))
     now = rng.normal(size=6)
     for k, drive in enumerate(np.sqrt(1 - keep**2) * rng.normal(size=(count, 6))):
-        now = keep * now + drive
-        lasting[k] = now
-    return np.asarray((rng.normal(size=(count, 6)) + LASTING_NOISE * lasting) @ root.T)
+        correlated[k] = now = keep * now + drive
+    return np.asarray((rng.normal(size=(count, 6)) + CORRELATED_NOISE * correlated) @ root.T)
 
 
-def _lateness(kind: int, steps: int, covariance: Array, rng: np.random.Generator) -> Array:
+def _flag_delays(kind: int, steps: int, covariance: Array, rng: np.random.Generator) -> Array:
     """Frames (steps,) from the first pose of each movement, 0, to its flag; kind: 0 turns, 1 shifts."""
     first = FRAMES_A_STEP * np.arange(1, steps + 1)
     places = np.zeros((FRAMES_A_STEP * (steps + 2), 6))
@@ -334,17 +313,11 @@ def _lateness(kind: int, steps: int, covariance: Array, rng: np.random.Generator
     poses = se3.exp(places) @ se3.exp(_noise(len(places), covariance, rng))
     moving = _moving(poses, covariance)
     after = [moving[start : start + FRAMES_A_STEP] for start in first]
-    late = [int(np.argmax(flags)) if flags.any() else FRAMES_A_STEP for flags in after]
-    return np.where(moving[first - 1], FRAMES_A_STEP, late)  # one that was not at rest before was not seen to begin
-
-
-def _false_alarms(count: int, covariance: Array, rng: np.random.Generator) -> int:
-    """Movements flagged in `count` frames at rest."""
-    moving = _moving(se3.exp(_noise(count, covariance, rng)), covariance)
-    return int(np.sum(moving[1:] & ~moving[:-1]))
+    delays = [int(np.argmax(flags)) if flags.any() else FRAMES_A_STEP for flags in after]
+    return np.where(moving[first - 1], FRAMES_A_STEP, delays)  # not at rest just before: its beginning was missed
 
 
 def _moving(poses: Array, covariance: Array) -> NDArray[np.bool_]:
-    """What the detector says (N,) of poses (N, 4, 4)."""
+    """Whether the detector takes the surface as moving (N,) at poses (N, 4, 4)."""
     detector = MotionDetector(np.zeros(3))
     return np.array([detector(k / STEP_RATE, pose, covariance).moving for k, pose in enumerate(poses)], bool)

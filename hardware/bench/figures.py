@@ -1,4 +1,4 @@
-"""Figures beside their targets, as a table and as files, with the machine; and what subjects share to get them."""
+"""Figures beside their targets, as a table and as files, with the machine; and what the subjects share to measure."""
 
 from __future__ import annotations
 
@@ -136,34 +136,29 @@ def save(
     """Write figures.json and figures.csv into an existing folder; a number that does not exist is null, or empty."""
     from hardware.report.summary import finite
 
-    rows = [_row(figure) for figure in figures]
     plain = {name: value if isinstance(value, (int, float, bool)) else str(value) for name, value in options.items()}
-    whole = {"subject": subject, "options": plain, "machine": asdict(machine), "figures": rows}
-    (folder / "figures.json").write_text(json.dumps(finite(whole), indent=2) + "\n", encoding="utf-8")
+    table = {"subject": subject, "options": plain, "machine": asdict(machine), "figures": [*map(_row, figures)]}
+    (folder / "figures.json").write_text(json.dumps(finite(table), indent=2) + "\n", encoding="utf-8")
     with (folder / "figures.csv").open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, FIGURE_COLUMNS)
         writer.writeheader()
-        writer.writerows(finite(rows))
+        writer.writerows(finite(table["figures"]))
 
 
 def _row(figure: Figure) -> dict[str, object]:
-    low, high = (None, None) if figure.target is None else (figure.target.low, figure.target.high)
-    values = (figure.what, figure.value, figure.unit, low, high, figure.verdict, figure.reference, figure.note)
-    return dict(zip(FIGURE_COLUMNS, values, strict=True))
+    target = figure.target or Target()  # infinite bounds are written as none
+    values = figure.what, figure.value, figure.unit, target.low, target.high, figure.verdict
+    return dict(zip(FIGURE_COLUMNS, (*values, figure.reference, figure.note), strict=True))
 
 
 def read_figures(file: Path) -> list[Figure]:
     """The figures that `save` wrote."""
-    return [_figure(row) for row in json.loads(file.read_text(encoding="utf-8"))["figures"]]
-
-
-def _figure(row: Mapping[str, Any]) -> Figure:
-    low, high = row["low"], row["high"]
-    target = None
-    if row["verdict"]:
-        target = Target(-math.inf if low is None else low, math.inf if high is None else high)
-    value = math.nan if row["value"] is None else row["value"]
-    return Figure(row["what"], value, row["unit"], target, row["reference"], row["note"])
+    figures, absent = [], {"low": -math.inf, "high": math.inf, "value": math.nan}
+    for row in json.loads(file.read_text(encoding="utf-8"))["figures"]:
+        low, high, value = (none if row[name] is None else row[name] for name, none in absent.items())
+        target = Target(low, high) if row["verdict"] else None
+        figures.append(Figure(row["what"], value, row["unit"], target, row["reference"], row["note"]))
+    return figures
 
 
 def whole_text(parts: Mapping[str, Sequence[Figure]], machine: Machine) -> str:
@@ -183,18 +178,16 @@ TABLE_HEADER = ("figure", "value", "unit", "target", "", "reference", "note")
 
 def table_text(figures: Sequence[Figure]) -> str:
     """The figures, a line each, and a line that counts the missed ones."""
-    rows = [TABLE_HEADER, *map(_cells, figures)]
+    from hardware.report.summary import figure as digits
+
+    rows: list[tuple[str, ...]] = [TABLE_HEADER]
+    for f in figures:
+        target = "" if f.target is None else str(f.target)
+        rows.append((f.what, digits(f.value), f.unit, target, f.verdict, f.reference, f.note))
     shown = [i for i in range(len(TABLE_HEADER)) if any(row[i] for row in rows[1:])]
     text = aligned([[row[i] for i in shown] for row in rows], [shown.index(1)] if 1 in shown else [])
     verdicts = [figure.verdict for figure in figures if figure.target is not None]
     return f"{text}\n\n{verdicts.count('met')} of {len(verdicts)} targets met"
-
-
-def _cells(figure: Figure) -> tuple[str, ...]:
-    from hardware.report.summary import figure as digits
-
-    target = "" if figure.target is None else str(figure.target)
-    return (figure.what, digits(figure.value), figure.unit, target, figure.verdict, figure.reference, figure.note)
 
 
 def aligned(rows: Sequence[Sequence[str]], right: Collection[int]) -> str:
@@ -243,13 +236,29 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def percentile(values: Array, share: float) -> float:
+def percentile(values: Array | Sequence[float], share: float) -> float:
     """The value that `share` % of all lie below; nan where there are none."""
     return float(np.percentile(values, share)) if len(values) else math.nan
 
 
+def milliseconds(seconds: Array | Sequence[float], share: float) -> float:
+    """Percentile, ms, of times in s; nan where there are none."""
+    return 1000 * percentile(seconds, share)
+
+
+def columns(records: Iterable[object], *names: str) -> list[Array]:
+    """An array (N, ...) for each field that is named, of N records."""
+    rows = list(records)
+    return [np.array([getattr(row, name) for row in rows], float) for name in names]
+
+
+def relative_nees(errors: Array, covariance: Array) -> float:
+    """Squared error (N,) by a covariance (N, N), per number."""
+    return float(errors @ np.linalg.solve(covariance, errors)) / len(errors)
+
+
 def with_progress(what: str, unit: str, items: Iterable[Item], count: int) -> Iterator[Item]:
-    """The items one by one; how many of `count` are done with is told on stderr."""
+    """The items one by one; stderr shows how many of `count` are done."""
     with Progress(what, unit, WallClock().now) as progress:
         for done, item in enumerate(items, 1):
             yield item
@@ -262,13 +271,13 @@ def workers(count: int) -> Iterator[ProcessPoolExecutor]:
 
     Where the block is left early, what has not begun is left out; Ctrl-C ends what has, too.
     """
-    with ProcessPoolExecutor(count, get_context("spawn"), _settle) as pool:
+    with ProcessPoolExecutor(count, get_context("spawn"), _end_with_parent) as pool:
         try:
             yield pool
         finally:
             pool.shutdown(cancel_futures=True)
 
 
-def _settle() -> None:
+def _end_with_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     exit_with_parent()

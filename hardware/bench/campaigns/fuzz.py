@@ -1,8 +1,10 @@
-"""`stillbed bench fuzz`: every reader of what comes from outside, given inputs that are valid but for a few places.
+"""`stillbed bench fuzz`: every reader of outside data, given inputs that are valid except in a few places.
 
-A reader may take an input or refuse it with one of our own errors. Anything else counts: another exception, more than
-`MAX_SECONDS` of processor time, more than `MAX_MEMORY` of memory, the end of the process. What made it so is kept.
-`--log` keeps how far each reader is, and what went wrong; a run goes on from there.
+A reader may accept an input or refuse it with one of our own errors. Anything else counts as a failure: another
+exception, more than `MAX_SECONDS` of processor time, more than `MAX_MEMORY` of memory, the end of the process. The
+input that caused it is kept. `--log` records how far each reader is and what failed; a run goes on from there.
+
+The video among the valid inputs is made by hand: JPEGs in an AVI container (Microsoft, AVI RIFF File Reference).
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import re
-import shutil
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,51 +20,30 @@ from pathlib import Path
 import numpy as np
 
 from estimation import se3
+from estimation.batch.smoothed import Instants
 from estimation.errors import InputError
 from estimation.observations import no_observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
+from hardware.arm import protocol
 from hardware.arm.profile import ArmProfile
-from hardware.arm.protocol import (
-    FRAME_LENGTH,
-    FRAME_TAILS,
-    G1,
-    REPLY_LENGTH,
-    REPLY_TAILS,
-    THESIS_DIALECT,
-    FrameStream,
-    Reply,
-    ReplyKind,
-    decode,
-    decode_reply,
-    encode_reply,
-)
-from hardware.arm.protocol import encode as frame_of
-from hardware.bench.campaigns.fuzz_inputs import (
-    FOLDER_READERS,
-    FRAME_COUNT,
-    SMALL_SIZE,
-    make_binary_ply,
-    make_binary_stl,
-    make_obj,
-    make_ply,
-    make_skin,
-    make_stl,
-    skin,
-    small_picture,
-)
+from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, REPLY_LENGTH, REPLY_TAILS, FrameStream, Reply, ReplyKind
 from hardware.bench.campaigns.fuzz_process import Block, Reader, Task, append_log, read_log, run_tasks
 from hardware.bench.figures import Figure, at_most, require_positive
+from hardware.calibration.corners import read_corners, write_corners
 from hardware.calibration.rig_formats import FORMATS
 from hardware.files.arm_file import read_arm, write_arm
-from hardware.files.folder_tables import read_rows
+from hardware.files.folder_tables import read_heads, read_rows, write_heads
 from hardware.files.images import encode
-from hardware.files.mesh_file import read_mesh
+from hardware.files.mesh_file import STL_TRIANGLE, in_mm, read_mesh, read_raw_mesh
 from hardware.files.path_file import read_contour, read_path, read_progress, write_progress_durably
+from hardware.files.ply_file import write_ply
 from hardware.files.pose_file import PoseWriter, read_poses
 from hardware.files.rig_file import ImageSource, read_board, read_rig, write_board, write_rig
+from hardware.files.session import PrintHeadLog
 from hardware.live.prepared import SurfacePlacement, read_placement, write_placement
 from hardware.live.settings import read_settings, settings_text
+from hardware.offline.trajectory_files import read_pose_series, write_instants
 from hardware.operator.broadcast import parse_message
 from hardware.process.clock import WallClock
 from hardware.process.faults import fault_from_text
@@ -73,10 +54,12 @@ from hardware.simulator.arm.settings import ArmSettings, read_virtual_arm, write
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.trace_file import read_trace
 from perception.boards.board import Board
-from perception.frames import Frame
+from perception.boards.corners import CornerTable
+from perception.frames import Frame, Image
 from perception.tracking.step import STAGES, report_without_offsets
 from perception.wound.network import WoundNetwork, shipped_model
 from perception.wound.shape_matching import read_shape_model
+from planning.layers.repair import repair_mesh
 from planning.progress import fingerprint
 
 PATH_TEXT = (
@@ -105,43 +88,80 @@ offset_s = [0, 0.01, 0]
 p95_mm = 0.5
 """
 TRACE_TEXT = "t_s,tx_mm,ty_mm,tz_mm\n" + "".join(f"{k / 10},{k / 5},0,0\n" for k in range(12))
+CONTOUR_TEXT = "x_mm,y_mm\n0,0\n10,0\n10,8\n0,8\n"
 PAGE_MESSAGE = b'{"ask": "pause", "turn": 3, "tag": 5}'
+OBJ_TEXT = "v 0 0 0\nv 20 0 0\nv 0 20 0\nv 20 20 1\nvn 0 0 1\nf 1 2 3\nf 2//1 4//1 -2//1\n"
+STL_FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 20 0 0\nvertex 0 20 0\nendloop\nendfacet\n"
+BINARY_PLY_HEADER = (
+    "ply\nformat binary_big_endian 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
+    "property uchar red\nelement face 5\nproperty list uchar uint vertex_indices\nend_header\n"
+)
+SCAN_VERTICES = np.array([[0.0, 0, 0], [20, 0, 1], [20, 20, 0], [0, 20, 2], [10, 10, 3]])
+SCAN_TRIANGLES = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+SKIN_NODES = 6  # a side of the scan that is planned on, so that it has the triangles that repair asks for
+SMALL_SIZE, VIDEO_RATE, FRAME_COUNT = (48, 32), 30, 3  # px, Hz
+CORNERS_KEY = "0123456789abcdef" * 4  # of the recording that the corners belong to
+HAS_INDEX, KEY_FRAME = 0x10, 0x10  # flags of an AVI
+FORMAT_SUFFIX = {"kalibr": ".yaml", "anipose": ".toml"}
 
 
-def _text(text: str | bytes, name: str) -> Callable[[Path], None]:
-    def make(folder: Path) -> None:
-        (folder / name).write_bytes(text.encode() if isinstance(text, str) else text)
-
-    return make
+def _small_picture(number: int) -> Image:
+    """Noise (H, W, 3) that follows from the number."""
+    return np.random.default_rng(number).integers(0, 256, (SMALL_SIZE[1], SMALL_SIZE[0], 3), np.uint8)
 
 
-def _frames(path: Path) -> object:
-    return FrameStream(FRAME_LENGTH, FRAME_TAILS, decode)(path.read_bytes())
+def _mjpeg_avi(pictures: Sequence[bytes]) -> bytes:
+    """The file of pictures of SMALL_SIZE px that are encoded as JPEG, with its index."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return name + struct.pack("<I", len(data)) + data + b"\0" * (len(data) % 2)
+
+    largest, (width, height), count = max(map(len, pictures)), SMALL_SIZE, len(pictures)
+    main = 1_000_000 // VIDEO_RATE, largest * VIDEO_RATE, 0, HAS_INDEX, count, 0, 1, largest, width, height, 0, 0, 0, 0
+    timing = 0, 0, 0, 0, 1, VIDEO_RATE, 0, count, largest, -1, 0, 0, 0, width, height
+    stream = chunk(b"strh", struct.pack("<4s4sIHHIIIIIIiI4H", b"vids", b"MJPG", *timing))
+    bitmap = struct.pack("<IiiHH4sIiiII", 40, width, height, 1, 24, b"MJPG", 3 * width * height, 0, 0, 0, 0)
+    chunks, entries, offset = [], [], 4
+    for picture in pictures:
+        chunks.append(chunk(b"00dc", picture))
+        entries.append(struct.pack("<4sIII", b"00dc", KEY_FRAME, offset, len(picture)))
+        offset += len(chunks[-1])
+    streams = chunk(b"LIST", b"strl" + stream + chunk(b"strf", bitmap))
+    header = chunk(b"LIST", b"hdrl" + chunk(b"avih", struct.pack("<14I", *main)) + streams)
+    body = header + chunk(b"LIST", b"movi" + b"".join(chunks)) + chunk(b"idx1", b"".join(entries))
+    return chunk(b"RIFF", b"AVI " + body)
 
 
-def _replies(path: Path) -> object:
-    return FrameStream(REPLY_LENGTH, REPLY_TAILS, decode_reply)(path.read_bytes())
+def _write_cameras(folder: Path, kind: str, pattern: str) -> list[str]:
+    """rig.toml and frames.csv of a small session; the names of its cameras."""
+    rig = arc_rig(size=SMALL_SIZE, focal=40)
+    names = [camera.name for camera in rig.cameras]
+    write_rig(folder / "rig.toml", rig, [ImageSource(kind, pattern.format(name)) for name in names])
+    rows = [f"{name},{k},{k / VIDEO_RATE!r}" for name in names for k in range(FRAME_COUNT)]
+    (folder / "frames.csv").write_text("\n".join(["camera,frame,stamp_s", *rows]) + "\n")
+    return names
 
 
-def _whole_session(path: Path) -> object:
-    return [frames.stamp for frames in open_session(path).frame_sets()]
+def _make_videos(folder: Path) -> None:
+    for name in _write_cameras(folder, "video", "{}.avi"):
+        pictures = [encode(_small_picture(k), 90)[1] for k in range(FRAME_COUNT)]
+        (folder / f"{name}.avi").write_bytes(_mjpeg_avi(pictures))
 
 
 def _make_session(folder: Path) -> None:
-    rig = arc_rig(size=SMALL_SIZE, focal=40)
-    names = [camera.name for camera in rig.cameras]
-    write_rig(folder / "rig.toml", rig, [ImageSource("images", f"{name}/*.png") for name in names])
-    lines = ["camera,frame,stamp_s"]
+    names = _write_cameras(folder, "images", "{}/*.png")
     for name in names:
         (folder / name).mkdir()
         for k in range(FRAME_COUNT):
-            (folder / name / f"{k}.png").write_bytes(encode(small_picture(k))[1])
-            lines.append(f"{name},{k},{k / 30!r}")
-    (folder / "frames.csv").write_text("\n".join(lines) + "\n")
+            (folder / name / f"{k}.png").write_bytes(encode(_small_picture(k))[1])
     region = f'camera = "{names[0]}"\nframe = 1\npolygon = [[1, 2], [40, 3], [20, 30]]'
     (folder / "roi.toml").write_text(f"[[roi]]\n{region}\n")
-    rows = [f"{k / 30} 1 2 {300 + k} 0 0 0 1" for k in range(FRAME_COUNT)]
+    rows = [f"{k / VIDEO_RATE} 1 2 {300 + k} 0 0 0 1" for k in range(FRAME_COUNT)]
     (folder / "truth.tum").write_text("\n".join(rows) + "\n")
+
+
+def _read_session(path: Path) -> object:
+    return [frames.stamp for frames in open_session(path).frame_sets()]
 
 
 def _make_recording(folder: Path) -> None:
@@ -149,8 +169,8 @@ def _make_recording(folder: Path) -> None:
     with Recorder(folder / "x.mcap", rig) as recorder:
         for k in range(FRAME_COUNT):
             for camera in range(len(rig)):
-                recorder.frame(Frame(camera, k / 30, small_picture(k)))
-            recorder.event(k / 30, "something", 1)
+                recorder.frame(Frame(camera, k / VIDEO_RATE, _small_picture(k)))
+            recorder.event(k / VIDEO_RATE, "something", 1)
 
 
 def _make_scenario(folder: Path) -> None:
@@ -163,23 +183,70 @@ def _make_progress(folder: Path) -> None:
     write_progress_durably(folder / "x.toml", fingerprint(read_path(folder / "path.csv")), 1.25)
 
 
-def _make_found(folder: Path) -> None:
+def _make_placement(folder: Path) -> None:
     (folder / "x.mcap").write_bytes(b"")
-    write_placement(
-        folder / "x.toml", SurfacePlacement(folder / "x.mcap", 1.0, se3.inverse(BASE_FROM_REST), BASE_FROM_REST)
-    )
+    placement = SurfacePlacement(folder / "x.mcap", 1.0, se3.inverse(BASE_FROM_REST), BASE_FROM_REST)
+    write_placement(folder / "x.toml", placement)
 
 
 def _make_poses(folder: Path) -> None:
     with PoseWriter(folder, ["a", "b"], STAGES) as writer:
         for k in range(FRAME_COUNT):
-            pose = SurfacePose(k / 30, BASE_FROM_REST, np.eye(6) * 1e-4, np.zeros(6), TrackState.TRACKING)
-            report = report_without_offsets(no_observations(k / 30), np.zeros(2, np.int64), np.zeros(len(STAGES)))
-            writer.write(pose, 2, report, 0.01)
+            pose = SurfacePose(k / VIDEO_RATE, BASE_FROM_REST, np.eye(6) * 1e-4, np.zeros(6), TrackState.TRACKING)
+            tracks = no_observations(k / VIDEO_RATE)
+            writer.write(pose, 2, report_without_offsets(tracks, np.zeros(2, np.int64), np.zeros(len(STAGES))), 0.01)
+
+
+def _make_heads(folder: Path) -> None:
+    rows = np.array([[k / VIDEO_RATE, 1.0, 2.0, 300.0 + k, 0, 0, 0, 1] for k in range(FRAME_COUNT)])
+    write_heads(folder / "head.csv", PrintHeadLog(rows, np.array([False, True, True])))
+
+
+def _make_corners(folder: Path) -> None:
+    count, cameras = 4, np.zeros(2, np.int64)
+    pixels = np.random.default_rng(1).uniform(0, 48, (2, count, 2))
+    ones, instants = np.ones(2), np.arange(2)
+    table = CornerTable(cameras, instants, instants / VIDEO_RATE, pixels, ones, ones, ones, cameras, cameras[:0], 2)
+    write_corners(folder / "corners.npz", CORNERS_KEY, table)
+
+
+def _make_smoothed(folder: Path) -> None:
+    stamps = np.arange(FRAME_COUNT) / VIDEO_RATE
+    spread = np.broadcast_to(np.eye(6) * 1e-4, (FRAME_COUNT, 6, 6))
+    poses = BASE_FROM_REST @ se3.exp(np.outer(stamps, [0.1, 0, 0, 0, 0, 1.0]))
+    write_instants(folder / "smoothed.csv", Instants(stamps, poses, spread, np.zeros((FRAME_COUNT, 6)), spread))
+
+
+def _make_binary_ply(folder: Path) -> None:
+    """Big-endian, with a colour, and with a polygon of four corners among the triangles."""
+    vertices = b"".join(np.array(place, ">f4").tobytes() + b"\x7f" for place in SCAN_VERTICES)
+    faces = b"".join(bytes([len(face)]) + np.array(face, ">u4").tobytes() for face in [*SCAN_TRIANGLES, [0, 3, 2, 1]])
+    (folder / "x.ply").write_bytes(BINARY_PLY_HEADER.encode() + vertices + faces)
+
+
+def _make_binary_stl(folder: Path) -> None:
+    table = np.zeros(len(SCAN_TRIANGLES), STL_TRIANGLE)
+    table["corners"] = SCAN_VERTICES[SCAN_TRIANGLES]
+    (folder / "x.stl").write_bytes(bytes(80) + np.uint32(len(table)).tobytes() + table.tobytes())
+
+
+def _make_skin(folder: Path) -> None:
+    """A curved square with enough triangles to be planned on."""
+    x, y = (each.ravel() for each in np.meshgrid(*2 * [np.linspace(0, 60, SKIN_NODES)]))
+    corner = (np.arange(SKIN_NODES - 1)[:, None] * SKIN_NODES + np.arange(SKIN_NODES - 1)).ravel()
+    low = np.column_stack([corner, corner + 1, corner + SKIN_NODES])
+    high = np.column_stack([corner + 1, corner + SKIN_NODES + 1, corner + SKIN_NODES])
+    write_ply(folder / "x.ply", np.column_stack([x, y, 3 + x * y / 1000]), np.concatenate([low, high]))
+
+
+def _read_skin(path: Path) -> object:
+    """A scan as `stillbed plan` reads it: its unit checked, and repaired."""
+    raw = read_raw_mesh(path)
+    return repair_mesh(in_mm(raw.vertices, raw.triangles, "mm", path), raw.triangles, path)
 
 
 def _make_model(folder: Path) -> None:
-    """What its settings take for the network: anything else is refused by its hash before anybody looks at it."""
+    """A file whose hash its settings state: any other network is refused before its content is read."""
     data = bytes(range(256)) * 4
     (folder / "wound.onnx").write_bytes(data)
     settings = shipped_model(suffix=".toml").read_text(encoding="utf-8")
@@ -187,85 +254,87 @@ def _make_model(folder: Path) -> None:
     (folder / "wound.toml").write_text(re.sub(r'sha256 = ".*"', f'sha256 = "{digest}"', settings), encoding="utf-8")
 
 
-def _model(path: Path) -> object:
+def _read_model(path: Path) -> object:
     return WoundNetwork(path.with_suffix(".onnx"), threads=1)
 
 
-def _make_shape(folder: Path) -> None:
-    shutil.copyfile(shipped_model("shape", ".toml"), folder / "shape.toml")
+def _plain(file: str, content: str | bytes, read: Callable[[Path], object]) -> Reader:
+    """A reader of one file with this content."""
+    data = content.encode() if isinstance(content, str) else content
+    return Reader(file, lambda folder: (folder / file).write_bytes(data), read)
+
+
+def _format_reader(name: str) -> Reader:
+    """A reader of another program's rig format."""
+    form = FORMATS[name]
+    file = "cam_0.yaml" if form.folder else f"x{FORMAT_SUFFIX[name]}"
+    return Reader(file, lambda folder: form.write(folder / ("." if form.folder else file), arc_rig()), form.read)
+
+
+def _decoded(path: Path) -> str:
+    return path.read_bytes().decode("utf-8", "replace")
 
 
 def readers() -> dict[str, Reader]:
     """All of them by name."""
-    move = frame_of(G1(np.array([202.5, 225, 113, 0, 0.1, 0]), 5.0), THESIS_DIALECT) * 4
-    answer = encode_reply(Reply(ReplyKind.PLACE, np.array([1.0, 2, 3]))) * 6
-    found = {
-        "frames of the arm": Reader("x.bin", _text(move, "x.bin"), _frames),
-        "answers of the arm": Reader("x.bin", _text(answer, "x.bin"), _replies),
-        "messages of the page": Reader(
-            "x.json", _text(PAGE_MESSAGE, "x.json"), lambda p: parse_message(p.read_bytes().decode("utf-8", "replace"))
-        ),
-        "faults": Reader(
-            "x.txt",
-            _text("camera0 bump 2mm at 5s for 2s seed 3", "x.txt"),
-            lambda p: fault_from_text(p, "fault", p.read_bytes().decode("utf-8", "replace")),
-        ),
-        "rig": Reader(
-            "x.toml",
-            lambda f: write_rig(f / "x.toml", arc_rig(), [ImageSource("video", f"{k}.avi") for k in range(3)]),
-            read_rig,
-        ),
+    move = protocol.encode(protocol.G1(np.array([202.5, 225, 113, 0, 0.1, 0]), 5.0), protocol.THESIS_DIALECT) * 4
+    reply = protocol.encode_reply(Reply(ReplyKind.PLACE, np.array([1.0, 2, 3]))) * 6
+    frames, replies = (FRAME_LENGTH, FRAME_TAILS, protocol.decode), (REPLY_LENGTH, REPLY_TAILS, protocol.decode_reply)
+    sources = [ImageSource("video", f"{k}.avi") for k in range(3)]
+    fault, rows = "camera0 bump 2mm at 5s for 2s seed 3", "".join(f"{k} 1 2 3 0 0 0 1\n" for k in range(5))
+    solid = f"solid x\n{STL_FACET}{STL_FACET.replace('20', '30')}endsolid x\n"
+    series = "".join(f"{k / VIDEO_RATE},1,2,{300 + k},0,0,0,1\n" for k in range(FRAME_COUNT))
+    return {
+        "frames of the arm": _plain("x.bin", move, lambda p: FrameStream(*frames)(p.read_bytes())),
+        "answers of the arm": _plain("x.bin", reply, lambda p: FrameStream(*replies)(p.read_bytes())),
+        "messages of the page": _plain("x.json", PAGE_MESSAGE, lambda p: parse_message(_decoded(p))),
+        "faults": _plain("x.txt", fault, lambda p: fault_from_text(p, "fault", _decoded(p))),
+        "rig": Reader("x.toml", lambda f: write_rig(f / "x.toml", arc_rig(), sources), read_rig),
         "arm": Reader("x.toml", lambda f: write_arm(f / "x.toml", ArmProfile(), "an arm"), read_arm),
-        "session.toml": Reader("x.toml", lambda f: _text(settings_text(), "x.toml")(f), read_settings),
+        "session.toml": _plain("x.toml", settings_text(), read_settings),
         "scenario": Reader("x.toml", _make_scenario, read_scenario),
         "virtual arm": Reader("x.toml", lambda f: write_virtual_arm(f / "x.toml", ArmSettings(), ()), read_virtual_arm),
-        "path": Reader("x.csv", _text(PATH_TEXT, "x.csv"), read_path),
-        "contour": Reader("x.csv", _text("x_mm,y_mm\n0,0\n10,0\n10,8\n0,8\n", "x.csv"), read_contour),
+        "path": _plain("x.csv", PATH_TEXT, read_path),
+        "contour": _plain("x.csv", CONTOUR_TEXT, read_contour),
         "progress": Reader("x.toml", _make_progress, lambda p: read_progress(p, read_path(p.with_name("path.csv")))),
-        "surface": Reader("x.toml", _make_found, read_placement),
+        "surface": Reader("x.toml", _make_placement, read_placement),
         "board": Reader("x.toml", lambda f: write_board(f / "x.toml", Board()), read_board),
         "poses": Reader("poses.csv", _make_poses, read_poses),
-        "TUM": Reader("x.tum", _text("".join(f"{k} 1 2 3 0 0 0 1\n" for k in range(5)), "x.tum"), read_rows),
-        "trace": Reader("x.csv", _text(TRACE_TEXT, "x.csv"), read_trace),
+        "TUM": _plain("x.tum", rows, read_rows),
+        "trace": _plain("x.csv", TRACE_TEXT, read_trace),
         "table of frames": Reader("frames.csv", _make_session, lambda p: open_session(p.parent)),
         "region": Reader("roi.toml", _make_session, lambda p: open_session(p.parent)),
-        "picture": Reader("cam_0/1.png", _make_session, lambda p: _whole_session(p.parent.parent)),
-        "recording": Reader("x.mcap", _make_recording, _whole_session),
-        "PLY": Reader("x.ply", make_ply, read_mesh),
-        "binary PLY": Reader("x.ply", make_binary_ply, read_mesh),
-        "STL": Reader("x.stl", make_stl, read_mesh),
-        "binary STL": Reader("x.stl", make_binary_stl, read_mesh),
-        "OBJ": Reader("x.obj", make_obj, read_mesh),
-        "scan to plan on": Reader("x.ply", make_skin, skin),
-        "settings of a network": Reader("wound.toml", _make_model, _model),
-        "network": Reader("wound.onnx", _make_model, _model),
-        "shape model": Reader("shape.toml", _make_shape, read_shape_model),
+        "picture": Reader("cam_0/1.png", _make_session, lambda p: _read_session(p.parent.parent)),
+        "recording": Reader("x.mcap", _make_recording, _read_session),
+        "PLY": Reader("x.ply", lambda f: write_ply(f / "x.ply", SCAN_VERTICES, SCAN_TRIANGLES), read_mesh),
+        "binary PLY": Reader("x.ply", _make_binary_ply, read_mesh),
+        "STL": _plain("x.stl", solid, read_mesh),
+        "binary STL": Reader("x.stl", _make_binary_stl, read_mesh),
+        "OBJ": _plain("x.obj", OBJ_TEXT, read_mesh),
+        "scan to plan on": Reader("x.ply", _make_skin, _read_skin),
+        "settings of a network": Reader("wound.toml", _make_model, _read_model),
+        "network": Reader("wound.onnx", _make_model, _read_model),
+        "shape model": _plain("shape.toml", shipped_model("shape", ".toml").read_bytes(), read_shape_model),
+        "video": Reader("cam_0.avi", _make_videos, lambda p: _read_session(p.parent)),
+        "print head": Reader("head.csv", _make_heads, read_heads),
+        "corners": Reader("corners.npz", _make_corners, lambda p: read_corners(p, CORNERS_KEY)),
+        "smoothed": Reader("smoothed.csv", _make_smoothed, lambda p: read_pose_series(str(p))),
+        "trajectory": _plain("x.csv", series, lambda p: read_pose_series(str(p))),
+        **{f"rig of {name}": _format_reader(name) for name in FORMATS},
     }
-    found |= {name: Reader(*entry) for name, entry in FOLDER_READERS.items()}
-    for name, each in FORMATS.items():
-        file = "cam_0.yaml" if each.folder else f"x{FORMAT_SUFFIX[name]}"
-        found[f"rig of {name}"] = Reader(file, _exported(name, "." if each.folder else file), each.read)
-    return found
 
 
-FORMAT_SUFFIX = {"kalibr": ".yaml", "anipose": ".toml"}
-
-
-def _exported(name: str, file: str) -> Callable[[Path], None]:
-    return lambda folder: FORMATS[name].write(folder / file, arc_rig())
-
-
-MAX_KEPT = 5  # inputs of each reader that are kept; the others can be made again from their seed and number
+MAX_SAVED_INPUTS = 5  # of each reader; the others can be made again from their seed and number
 
 
 @dataclass(slots=True)
 class ReaderSum:
-    """What came of one reader so far."""
+    """What one reader did so far."""
 
-    count: int = 0
-    refused: int = 0
-    seconds: float = 0.0
-    wrong: int = 0
+    count: int = 0  # inputs
+    refused: int = 0  # with one of our own errors
+    seconds: float = 0.0  # of processor time
+    wrong: int = 0  # inputs that failed
 
     def add(self, block: Block) -> None:
         """Count a block."""
@@ -276,7 +345,7 @@ class ReaderSum:
 
 
 def run_fuzz(options: argparse.Namespace) -> list[Figure]:
-    """Fuzz the readers, in processes of their own, and say what they did."""
+    """Fuzz the readers, in processes of their own; print, save and log each failure as it happens."""
     names = list(readers())
     if options.only is not None and options.only not in names:
         raise InputError("command line", "--only", options.only, f"one of {', '.join(names)}")
@@ -286,18 +355,10 @@ def run_fuzz(options: argparse.Namespace) -> list[Figure]:
         for block in read_log(options.log, options.seed):
             if block.name in sums:
                 sums[block.name].add(block)
-                _tell(block, "")
+                _print_failure(block)
     share = -(-options.count // len(sums))
-    _go_on(options, sums, [Task(name, range(done.count, share)) for name, done in sums.items() if done.count < share])
-    for name, done in sums.items():
-        each = 1e6 * done.seconds / max(done.count, 1)
-        print(f"{name:<24}{done.count:>9}  refused {done.refused:>9}  wrong {done.wrong:>3}  {each:>7.0f} us each")
-    return fuzz_figures(list(sums.values()))
-
-
-def _go_on(options: argparse.Namespace, sums: dict[str, ReaderSum], tasks: list[Task]) -> None:
-    """Do the tasks; whatever goes wrong is said, kept and logged when it does."""
-    done, total = 0, sum(len(task.numbers) for task in tasks)
+    tasks = [Task(name, range(done.count, share)) for name, done in sums.items() if done.count < share]
+    count, total = 0, sum(len(task.numbers) for task in tasks)
     with Progress("fuzz", "inputs", WallClock().now) as progress:
         for block in run_tasks(tasks, options.seed, options.jobs, readers):
             sums[block.name].add(block)
@@ -305,22 +366,25 @@ def _go_on(options: argparse.Namespace, sums: dict[str, ReaderSum], tasks: list[
                 append_log(options.log, options.seed, block)
             if block.wrong:
                 progress.close()
-                keep = options.out is not None and sums[block.name].wrong <= MAX_KEPT
-                _tell(block, _kept(options.out, block) if keep else "")
-            done += block.count
-            progress(done, total)
+                save = options.out is not None and sums[block.name].wrong <= MAX_SAVED_INPUTS
+                _print_failure(block, options.out if save else None)
+            count += block.count
+            progress(count, total)
+    for name, done in sums.items():
+        each = 1e6 * done.seconds / max(done.count, 1)
+        print(f"{name:<24}{done.count:>9}  refused {done.refused:>9}  wrong {done.wrong:>3}  {each:>7.0f} us each")
+    return fuzz_figures(list(sums.values()))
 
 
-def _tell(block: Block, kept: str) -> None:
+def _print_failure(block: Block, out: Path | None = None) -> None:
+    """Print what failed, if anything. out: the folder in which the input is saved, too."""
+    text = ""
+    if out is not None:
+        file = out / f"{block.name.replace(' ', '_')}_{block.number}.bin"
+        file.write_bytes(block.case)
+        text = f"; kept as {file}"
     if block.wrong:
-        print(f"{block.name}, input {block.number}: {block.wrong}{kept}", flush=True)
-
-
-def _kept(out: Path, block: Block) -> str:
-    """Where an input that went wrong is kept, in words."""
-    file = out / f"{block.name.replace(' ', '_')}_{block.number}.bin"
-    file.write_bytes(block.case)
-    return f"; kept as {file}"
+        print(f"{block.name}, input {block.number}: {block.wrong}{text}", flush=True)
 
 
 def fuzz_figures(sums: Sequence[ReaderSum]) -> list[Figure]:

@@ -1,7 +1,7 @@
-"""One reader before inputs that are valid but for a few places, in a process of its own, which may end of it.
+"""One reader before inputs that are valid except in a few places, in a process of its own, which may crash.
 
-Valid input is made wrong in one to four places, as broken disks, other programs and hostile people do. What came of it
-is kept as a CSV file that a later run goes on from.
+Valid input is damaged in one to four places, as broken disks, other programs and hostile people do. The results are
+written to a CSV file from which a later run goes on.
 """
 
 from __future__ import annotations
@@ -34,93 +34,60 @@ BAD_VALUES = (
     *(b"[" * 400, b"{" * 400, b'{"a":' * 300, b"9" * 5000, b"\n", b",,,,", b"=", b"2026-01-01", b"../../etc/passwd"),
 )
 EDGE_BYTES = (0x00, 0x01, 0x7F, 0x80, 0xFF, 0x0A)
-MAX_PLACES = 4  # places
+MAX_PLACES = 4  # that are damaged in one input
+MUTATIONS = ("flip", "overwrite", "cut", "delete", "double", "insert", "renumber", "renumber", "shuffle lines")
 
 
 def mutated(data: bytes, rng: np.random.Generator) -> bytes:
-    """The data with something wrong; it may come out the same, seldom."""
-    mutator = _Mutator(rng)
+    """The data with one to MAX_PLACES places damaged; rarely it comes out the same."""
     for _ in range(int(rng.integers(1, MAX_PLACES + 1))):
-        data = MUTATIONS[int(rng.integers(len(MUTATIONS)))](mutator, data)
+        data = _mutated_once(MUTATIONS[int(rng.integers(len(MUTATIONS)))], data, rng)
     return data
 
 
-class _Mutator:
-    """Each method makes one place of some data wrong."""
-
-    def __init__(self, rng: np.random.Generator) -> None:
-        self._rng = rng
-
-    def _place(self, data: bytes) -> int:
-        return int(self._rng.integers(len(data) + 1))
-
-    def _span(self, data: bytes) -> tuple[int, int]:
-        start = self._place(data)
-        return start, min(start + int(np.exp(self._rng.uniform(0, np.log(len(data) + 2)))), len(data))
-
-    def _bad_value(self) -> bytes:
-        return BAD_VALUES[int(self._rng.integers(len(BAD_VALUES)))]
-
-    def flip(self, data: bytes) -> bytes:
-        if not data:
-            return data
-        at = int(self._rng.integers(len(data)))
-        return data[:at] + bytes([data[at] ^ (1 << int(self._rng.integers(8)))]) + data[at + 1 :]
-
-    def overwrite(self, data: bytes) -> bytes:
-        at = self._place(data)
-        return data[:at] + bytes([EDGE_BYTES[int(self._rng.integers(len(EDGE_BYTES)))]]) + data[at + 1 :]
-
-    def cut(self, data: bytes) -> bytes:
-        return data[: self._place(data)]
-
-    def delete(self, data: bytes) -> bytes:
-        start, end = self._span(data)
-        return data[:start] + data[end:]
-
-    def double(self, data: bytes) -> bytes:
-        start, end = self._span(data)
-        return data[:end] + data[start:end] + data[end:]
-
-    def insert(self, data: bytes) -> bytes:
-        at = self._place(data)
-        return data[:at] + self._bad_value() + data[at:]
-
-    def renumber(self, data: bytes) -> bytes:
-        """One number, or what looks like one, becomes something else."""
-        numbers = list(NUMBER_TEXT.finditer(data))
-        if not numbers:
-            return self.insert(data)
-        one = numbers[int(self._rng.integers(len(numbers)))]
-        return data[: one.start()] + self._bad_value() + data[one.end() :]
-
-    def shuffle_lines(self, data: bytes) -> bytes:
-        """Two lines change places, or one is there twice, or no more."""
-        lines = data.split(b"\n")
-        one, other = self._rng.integers(len(lines), size=2)
-        match int(self._rng.integers(3)):
-            case 0:
-                lines[one], lines[other] = lines[other], lines[one]
-            case 1:
-                lines.insert(int(one), lines[other])
-            case _:
-                del lines[one]
-        return b"\n".join(lines)
+def _mutated_once(mutation: str, data: bytes, rng: np.random.Generator) -> bytes:
+    numbers = list(NUMBER_TEXT.finditer(data)) if mutation == "renumber" else []
+    if mutation == "flip" and not data:
+        return data
+    if mutation == "shuffle lines":
+        return _shuffled_lines(data, rng)
+    if numbers:  # one number, or what looks like one, becomes something else
+        number = numbers[int(rng.integers(len(numbers)))]
+        return data[: number.start()] + BAD_VALUES[int(rng.integers(len(BAD_VALUES)))] + data[number.end() :]
+    start = int(rng.integers(len(data) + (mutation != "flip")))
+    match mutation:
+        case "flip":
+            return data[:start] + bytes([data[start] ^ (1 << int(rng.integers(8)))]) + data[start + 1 :]
+        case "overwrite":
+            return data[:start] + bytes([EDGE_BYTES[int(rng.integers(len(EDGE_BYTES)))]]) + data[start + 1 :]
+        case "cut":
+            return data[:start]
+        case "delete" | "double":
+            end = min(start + int(np.exp(rng.uniform(0, np.log(len(data) + 2)))), len(data))
+            return data[:end] + data[start:] if mutation == "double" else data[:start] + data[end:]
+        case _:
+            return data[:start] + BAD_VALUES[int(rng.integers(len(BAD_VALUES)))] + data[start:]
 
 
-_M = _Mutator
-MUTATIONS = (_M.flip, _M.overwrite, _M.cut, _M.delete, _M.double, _M.insert, _M.renumber, _M.renumber, _M.shuffle_lines)
+def _shuffled_lines(data: bytes, rng: np.random.Generator) -> bytes:
+    """Two lines change places, or one is doubled, or deleted."""
+    lines = data.split(b"\n")
+    one, other = rng.integers(len(lines), size=2)
+    match int(rng.integers(3)):
+        case 0:
+            lines[one], lines[other] = lines[other], lines[one]
+        case 1:
+            lines.insert(int(one), lines[other])
+        case _:
+            del lines[one]
+    return b"\n".join(lines)
 
 
-MAX_SECONDS, MAX_MEMORY = (
-    3.0,
-    1 << 30,
-)  # of one input: s of processor time, bytes beyond what the reader's libraries take
-HANG_SECONDS = (
-    20  # s of processor time of one input that is within a library and hears of no signal: the process is ended
-)
-BLOCK_INPUTS = 1000  # inputs that are told of together
-TRACEBACK_LINES = 3  # lines of a traceback
+MAX_SECONDS = 3.0  # s of processor time for one input
+MAX_MEMORY = 1 << 30  # bytes for one input, beyond what the reader's libraries take
+HANG_SECONDS = 20  # s of processor time for one input inside a library that handles no signal: the process is ended
+BLOCK_INPUTS = 1000  # inputs that are reported together
+TRACEBACK_LINES = 3
 NUMBER_FILE = ".number"  # the file that holds the number of the input that is being read, 8 bytes
 
 
@@ -128,20 +95,20 @@ NUMBER_FILE = ".number"  # the file that holds the number of the input that is b
 class Reader:
     """One reader."""
 
-    struck: str  # the file in the folder that is made wrong
-    make: Callable[[Path], None]  # writes valid input into a folder
-    read: Callable[[Path], object]  # given the file that was struck
+    struck: str  # the file in the folder that is damaged
+    make: Callable[[Path], object]  # writes valid input into a folder
+    read: Callable[[Path], object]  # given the damaged file
 
 
 @dataclass(slots=True)
 class Block:
-    """What came of some inputs of a reader."""
+    """What a reader did with some inputs."""
 
     name: str
     count: int = 0
     refused: int = 0  # with one of our errors
     seconds: float = 0.0  # of processor
-    wrong: str = ""  # what the reader did that it must not with the last of them
+    wrong: str = ""  # how the reader failed on the last of them
     number: int = 0  # of that one
     case: bytes = b""  # that one
 
@@ -157,12 +124,12 @@ def fuzzed(name: str, reader: Reader, numbers: range, seed: int, folder: Path) -
     with suppress(StillbedError):
         reader.read(file)  # loads its libraries
     block, begun = Block(name), clock.now()
-    with _bounded(), (folder / NUMBER_FILE).open("wb", buffering=0) as told:
+    with _bounded(), (folder / NUMBER_FILE).open("wb", buffering=0) as number_file:
         for number in numbers:
             case = mutated(valid, np.random.default_rng([seed, number]))
             file.write_bytes(case)
-            os.pwrite(told.fileno(), number.to_bytes(8, "little"), 0)
-            block.wrong = _tried(reader, file, block)
+            os.pwrite(number_file.fileno(), number.to_bytes(8, "little"), 0)
+            block.wrong = _failure(reader, file, block)
             block.count, block.number = block.count + 1, number
             if block.wrong or block.count == BLOCK_INPUTS or number == numbers[-1]:
                 block.seconds, block.case = clock.now() - begun, case if block.wrong else b""
@@ -193,8 +160,8 @@ def _bounded() -> Iterator[None]:
         signal.signal(signal.SIGPROF, handler)
 
 
-def _tried(reader: Reader, file: Path, block: Block) -> str:
-    """What a reader did that it must not, "" where it took or refused the input."""
+def _failure(reader: Reader, file: Path, block: Block) -> str:
+    """How a reader failed, "" where it accepted or refused the input."""
     limit = int(ProcessorClock().now()) + HANG_SECONDS
     resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.getrlimit(resource.RLIMIT_CPU)[1]))
     signal.setitimer(signal.ITIMER_PROF, MAX_SECONDS)
@@ -213,7 +180,7 @@ def _tried(reader: Reader, file: Path, block: Block) -> str:
     return ""
 
 
-Readers = Callable[[], dict[str, Reader]]  # a function of a module: a process asks for them again
+Readers = Callable[[], dict[str, Reader]]  # a function of a module: each process calls it again
 MEMORY_DISK = Path("/dev/shm")  # inputs are written by the million
 
 
@@ -234,7 +201,7 @@ class _Running:
 
 
 def run_tasks(tasks: list[Task], seed: int, jobs: int, known: Readers) -> Iterator[Block]:
-    """What comes of the tasks, as it comes, `jobs` of them at a time. Where an input ends its process, another goes on.
+    """The blocks of the tasks as they are done, `jobs` tasks at a time. A process that an input ends is replaced.
 
     StillbedError: a process ended before it had an input.
     """
@@ -289,10 +256,10 @@ def _work(task: Task, seed: int, folder: Path, known: Readers, answers: Connecti
 def _last(over: _Running, reader: Reader, rest: range) -> Block:
     """The block whose last input ended the process."""
     folder, code = Path(over.folder.name), over.process.exitcode
-    told = folder / NUMBER_FILE
-    if not told.exists() or not told.stat().st_size:
+    number_file = folder / NUMBER_FILE
+    if not number_file.exists() or not number_file.stat().st_size:
         raise StillbedError(f"the process that reads {over.task.name} ended with {code} before its first input")
-    number = max(int.from_bytes(told.read_bytes(), "little"), rest[0])
+    number = max(int.from_bytes(number_file.read_bytes(), "little"), rest[0])
     case = (folder / reader.struck).read_bytes()
     return Block(over.task.name, number - rest[0] + 1, wrong=f"the process ended with {code}", number=number, case=case)
 
